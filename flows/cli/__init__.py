@@ -1,0 +1,1 @@
+"""The `lidarpainter` command, a file per group."""

@@ -1,0 +1,1 @@
+"""Where scenes, Gaussians and painters meet."""

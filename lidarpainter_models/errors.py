@@ -1,0 +1,41 @@
+"""Every error a caller may want to catch, each also a built-in type.
+
+The command line turns a `LidarPainterError` into one line and exit code 2: its message says what
+is wrong, where, and what was expected.
+"""
+
+
+class LidarPainterError(Exception):
+    """Something given from outside cannot be used as it is."""
+
+
+class DataError(LidarPainterError, ValueError):
+    """A dataset file, table or value is missing, damaged or makes no sense."""
+
+
+class UnsafePickleError(DataError):
+    """A pickle names a class outside the allow-list; nothing of it was run."""
+
+
+class SceneError(LidarPainterError, ValueError):
+    """A stored scene is incomplete, damaged, or lacks what was asked of it."""
+
+
+class ShapeError(LidarPainterError, ValueError):
+    """A tensor has another shape than the function can use."""
+
+
+class ConfigError(LidarPainterError, ValueError):
+    """A setting has a value that cannot be used."""
+
+
+class WeightsError(LidarPainterError, ValueError):
+    """A weights file is missing, damaged, or belongs to another network."""
+
+
+class BackendError(LidarPainterError, RuntimeError):
+    """A kernel backend was asked for that cannot run here."""
+
+
+class StorageError(LidarPainterError, OSError):
+    """The store cannot be written or read (disk full, permissions)."""

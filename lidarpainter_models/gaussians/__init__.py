@@ -1,0 +1,1 @@
+"""Dynamic 3D Gaussian scenes and how they are fitted."""

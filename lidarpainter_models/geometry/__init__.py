@@ -1,0 +1,1 @@
+"""Rigid transforms, cameras, boxes and trajectories; nothing here knows of Gaussians or files."""

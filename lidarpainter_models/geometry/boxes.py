@@ -1,0 +1,31 @@
+"""Oriented boxes of actors.
+
+Box frame: x along the length, y to the left, z up, origin at the centre; sizes are (length,
+width, height) in metres.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
+
+
+def is_inside_box(
+    points_world: Float[Tensor, "points 3"],
+    world_from_box: Float[Tensor, "4 4"],
+    size_m: Float[Tensor, "3"],
+    *,
+    margin_m: float = 0.0,
+) -> Bool[Tensor, " points"]:
+    """Which points lie in the box, grown by `margin_m` on every side."""
+    box_from_world = invert_rigid(world_from_box).to(points_world)
+    points_box = transform_points(box_from_world, points_world)
+    half_m = size_m.to(points_world) / 2 + margin_m
+    return (points_box.abs() <= half_m).all(dim=-1)
+
+
+def box_corners(size_m: Float[Tensor, "3"]) -> Float[Tensor, "8 3"]:
+    """The eight corners in the box frame; x varies slowest, z fastest."""
+    signs = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5], dtype=size_m.dtype)] * 3)
+    return signs * size_m

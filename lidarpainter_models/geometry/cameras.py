@@ -1,0 +1,108 @@
+"""Pinhole cameras.
+
+Camera frame: x right, y down, z forward. The top-left pixel has its centre at (0.5, 0.5), so a
+point projects to u = fx x / z + cx with cx measured from the picture's left edge.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.geometry.transforms import invert_rigid, is_rigid, transform_points
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Camera:
+    """One pinhole view: where it stands (float64) and how it projects."""
+
+    world_from_camera: Float[Tensor, "4 4"]
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    width_px: int
+    height_px: int
+
+    def __post_init__(self) -> None:
+        """Refuse poses and focal lengths that cannot project."""
+        if not bool(is_rigid(self.world_from_camera)):
+            raise ConfigError("a camera needs a finite rigid world_from_camera")
+        if min(self.fx_px, self.fy_px) <= 0 or min(self.width_px, self.height_px) <= 0:
+            raise ConfigError(
+                f"a camera needs positive focal lengths and size, got fx {self.fx_px}, "
+                f"fy {self.fy_px}, {self.width_px} x {self.height_px} px"
+            )
+
+    @property
+    def camera_from_world(self) -> Float[Tensor, "4 4"]:
+        """The inverse pose, float64."""
+        return invert_rigid(self.world_from_camera)
+
+    @property
+    def centre_world(self) -> Float[Tensor, "3"]:
+        """Where the camera stands, metres."""
+        return self.world_from_camera[:3, 3]
+
+    def at(self, world_from_camera: Float[Tensor, "4 4"]) -> Self:
+        """The same lens at another pose."""
+        return replace(self, world_from_camera=world_from_camera)
+
+    def resized(self, *, width_px: int, height_px: int) -> Self:
+        """The same view on another pixel grid (pixel edges stay aligned)."""
+        scale_x, scale_y = width_px / self.width_px, height_px / self.height_px
+        return replace(
+            self,
+            fx_px=self.fx_px * scale_x,
+            fy_px=self.fy_px * scale_y,
+            cx_px=self.cx_px * scale_x,
+            cy_px=self.cy_px * scale_y,
+            width_px=width_px,
+            height_px=height_px,
+        )
+
+    def project(
+        self, points_world: Float[Tensor, "points 3"]
+    ) -> tuple[Float[Tensor, "points 2"], Float[Tensor, " points"]]:
+        """Continuous pixel positions and depth (camera z, metres) of world points.
+
+        A point with depth <= 0 is behind the camera: its pixel position means nothing.
+        """
+        camera_from_world = self.camera_from_world.to(points_world)
+        points = transform_points(camera_from_world, points_world)
+        depth_m = points[:, 2]
+        safe = torch.where(depth_m.abs() < 1e-9, torch.full_like(depth_m, 1e-9), depth_m)
+        u = points[:, 0] / safe * self.fx_px + self.cx_px
+        v = points[:, 1] / safe * self.fy_px + self.cy_px
+        return torch.stack([u, v], dim=-1), depth_m
+
+    def contains(
+        self,
+        pixels_uv: Float[Tensor, "points 2"],
+        depth_m: Float[Tensor, " points"],
+        *,
+        near_m: float = 0.1,
+    ) -> Bool[Tensor, " points"]:
+        """Whether projected points fall into the picture, in front of `near_m`."""
+        u, v = pixels_uv.unbind(-1)
+        inside = (u >= 0) & (u < self.width_px) & (v >= 0) & (v < self.height_px)
+        return inside & (depth_m > near_m)
+
+    def pixel_directions(self) -> Float[Tensor, "height width 3"]:
+        """Camera-frame directions through the pixel centres with z = 1, float32.
+
+        Multiplied by a depth map they give camera-frame points.
+        """
+        u = (torch.arange(self.width_px, dtype=torch.float32) + 0.5 - self.cx_px) / self.fx_px
+        v = (torch.arange(self.height_px, dtype=torch.float32) + 0.5 - self.cy_px) / self.fy_px
+        grid_v, grid_u = torch.meshgrid(v, u, indexing="ij")
+        return torch.stack([grid_u, grid_v, torch.ones_like(grid_u)], dim=-1)
+
+    def unproject(self, depth_m: Float[Tensor, "height width"]) -> Float[Tensor, "height width 3"]:
+        """World points (float32) seen at each pixel centre at the given camera z."""
+        points_camera = self.pixel_directions() * depth_m[..., None]
+        world_from_camera = self.world_from_camera.to(torch.float32)
+        return points_camera @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]

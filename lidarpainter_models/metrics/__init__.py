@@ -1,0 +1,1 @@
+"""How good a picture, a depth map or a scene is."""

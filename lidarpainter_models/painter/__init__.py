@@ -1,0 +1,1 @@
+"""Painters repair a degraded render, guided by LiDAR and warped pictures."""

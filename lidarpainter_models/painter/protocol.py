@@ -1,0 +1,57 @@
+"""What a painter is given and what it gives back.
+
+All pictures of one request share the camera's pixel grid; rgb is float32 in [0, 1], depth is
+camera z in metres with 0 where there is none.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+DEFAULT_PROMPT = "clear"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PaintingConditions:
+    """Everything known about one view before it is painted."""
+
+    render_rgb: Float[Tensor, "height width 3"]
+    """The artefact-corrupted Gaussian render, sky included."""
+    render_depth_m: Float[Tensor, "height width"]
+    render_alpha: Float[Tensor, "height width"]
+    """Opacity of the Gaussians alone, before the sky."""
+    lidar_rgb: Float[Tensor, "height width 3"]
+    """Coloured LiDAR points splatted into the view, 0 where none hits."""
+    lidar_depth_m: Float[Tensor, "height width"]
+    lidar_hit: Bool[Tensor, "height width"]
+    warp_rgb: Float[Tensor, "sources height width 3"]
+    """The nearest recorded training pictures carried here by depth, best first."""
+    warp_valid: Bool[Tensor, "sources height width"]
+    prompt: str = DEFAULT_PROMPT
+
+    @property
+    def height_width_px(self) -> tuple[int, int]:
+        """Rows and columns of every picture."""
+        return self.render_rgb.shape[0], self.render_rgb.shape[1]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Painting:
+    """A repaired view and how far it can be trusted."""
+
+    rgb: Float[Tensor, "height width 3"]
+    confidence: Float[Tensor, "height width"]
+    """In [0, 1]: 1 where the painter expects no error."""
+
+
+@runtime_checkable
+class Painter(Protocol):
+    """Turns conditions into a picture; deterministic, keeps no state between views."""
+
+    name: str
+
+    def paint(self, conditions: PaintingConditions) -> Painting:
+        """Repair one view."""
+        ...

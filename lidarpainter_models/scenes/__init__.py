@@ -1,0 +1,1 @@
+"""The unified driving scene: its stored form, readers, the synthetic street, LiDAR maps."""

@@ -1,0 +1,1 @@
+"""One module per dataset; a dataset's oddities end here."""

@@ -1,0 +1,1 @@
+"""A seeded procedural street with exact pictures, depth and LiDAR from any pose."""

@@ -1,0 +1,1 @@
+"""Thin Prefect tasks: read the catalog, call the library, write the catalog."""

@@ -1,0 +1,36 @@
+"""Check shapes while testing, and find the real log where there is one.
+
+The jaxtyping hook rewrites functions, which numba cannot compile: modules that hold numba code are
+left out of it.
+"""
+
+import os
+from pathlib import Path
+
+import pytest
+from jaxtyping import install_import_hook
+
+ROOT = Path(__file__).resolve().parents[1]
+SHARED_ENVIRONMENT = "LIDARPAINTER_SHARED"
+
+
+def checked_modules() -> list[str]:
+    """Every library module whose annotations can be checked at run time."""
+    paths = sorted((ROOT / "lidarpainter_models").rglob("*.py"))
+    return [
+        ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        for path in paths
+        if path.name != "__init__.py" and "import numba" not in path.read_text("utf-8")
+    ]
+
+
+install_import_hook(checked_modules(), "beartype.beartype")
+
+
+@pytest.fixture(scope="session")
+def shared_folder() -> Path:
+    """The folder with real logs and small public networks; tests skip where it is absent."""
+    folder = Path(os.environ.get(SHARED_ENVIRONMENT, ROOT.parent / "shared"))
+    if not (folder / "data").is_dir():
+        pytest.skip(f"no real data at {folder} (set {SHARED_ENVIRONMENT})")
+    return folder
