@@ -24,7 +24,7 @@ def checked_modules() -> list[str]:
     ]
 
 
-install_import_hook(checked_modules(), "beartype.beartype")
+install_import_hook(checked_modules(), "tests.typechecking.check")
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,6 @@ point projects to u = fx x / z + cx with cx measured from the picture's left edg
 """
 
 from dataclasses import dataclass, replace
-from typing import Self
 
 import torch
 from jaxtyping import Bool, Float
@@ -47,11 +46,11 @@ class Camera:
         """Where the camera stands, metres."""
         return self.world_from_camera[:3, 3]
 
-    def at(self, world_from_camera: Float[Tensor, "4 4"]) -> Self:
+    def at(self, world_from_camera: Float[Tensor, "4 4"]) -> "Camera":
         """The same lens at another pose."""
         return replace(self, world_from_camera=world_from_camera)
 
-    def resized(self, *, width_px: int, height_px: int) -> Self:
+    def resized(self, *, width_px: int, height_px: int) -> "Camera":
         """The same view on another pixel grid (pixel edges stay aligned)."""
         scale_x, scale_y = width_px / self.width_px, height_px / self.height_px
         return replace(

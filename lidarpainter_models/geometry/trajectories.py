@@ -80,6 +80,4 @@ def shift_pose(
     cosine, sine = torch.cos(yaw), torch.sin(yaw)
     zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
     turn = torch.stack([cosine, -sine, zero, sine, cosine, zero, zero, zero, one]).reshape(3, 3)
-    return rigid_from_rotation(
-        turn @ world_from_camera[:3, :3], world_from_camera[:3, 3] + offset
-    )
+    return rigid_from_rotation(turn @ world_from_camera[:3, :3], world_from_camera[:3, 3] + offset)

@@ -29,7 +29,9 @@ def available_backends(kernel: str) -> tuple[str, ...]:
     return tuple(found)
 
 
-def implementation(kernel: str, function: str, backend: Backend, device: torch.device) -> Callable[..., Any]:
+def implementation(
+    kernel: str, function: str, backend: Backend, device: torch.device
+) -> Callable[..., Any]:
     """The function of a kernel's backend; `auto` takes cuda for GPU tensors and cpu for others.
 
     Raises:

@@ -1,0 +1,44 @@
+# `make demo` and `make test` do all the set-up on a fresh machine.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+SYSTEM := $(VENV)/.system-libraries
+
+# spinning OpenMP threads turn shared cores into many times the CPU time
+export OMP_WAIT_POLICY := passive
+export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba-cache
+
+.PHONY: demo test lint slow bench clean
+
+demo: $(INSTALLED) $(SYSTEM)
+	$(BIN)/lidarpainter demo --out demo
+
+test: lint
+	$(BIN)/python -m pytest
+
+slow: $(INSTALLED) $(SYSTEM)
+	$(BIN)/python -m pytest -m slow
+
+lint: $(INSTALLED) $(SYSTEM)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	$(BIN)/mypy
+
+bench: $(INSTALLED)
+	$(BIN)/python tests/benchmarks/bench_gaussian_raster.py
+
+$(INSTALLED): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	touch $@
+
+# open3d loads these shared libraries; apt is used where it may be
+$(SYSTEM): $(INSTALLED)
+	@sh scripts/system_libraries.sh $(BIN)/python
+	touch $@
+
+clean:
+	rm -rf $(VENV) demo
