@@ -24,7 +24,7 @@ def checked_modules() -> list[str]:
     ]
 
 
-install_import_hook(checked_modules(), "tests.typechecking.check")
+install_import_hook(checked_modules(), "shape_checking.check")
 
 
 @pytest.fixture(scope="session")
