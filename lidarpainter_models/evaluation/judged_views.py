@@ -1,0 +1,97 @@
+"""Views with a known true picture, and what it takes to score a renderer on them.
+
+A renderer is any function from a camera and a time to a picture: the Gaussian scene itself, or
+the scene followed by a painter. So every figure exists painted and unpainted.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidarpainter_models.geometry.boxes import box_corners
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.transforms import transform_points
+from lidarpainter_models.metrics.pictures import PictureScores, pooled_psnr, score_picture
+from lidarpainter_models.metrics.squeezenet import SqueezeNetDistance
+from lidarpainter_models.scenes.driving_scene import ActorTrack
+
+Renderer = Callable[[Camera, int], Float[Tensor, "height width 3"]]
+"""Picture of a camera (fit resolution) at a time in nanoseconds."""
+
+NEAR_M = 0.5
+"""Boxes with a corner nearer than this to the image plane are left out of actor masks."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JudgedView:
+    """A view whose true picture is known and was never used for fitting."""
+
+    name: str
+    camera: Camera
+    timestamp_ns: int
+    truth_rgb: Float[Tensor, "height width 3"]
+    actor_mask: Bool[Tensor, "height width"]
+    """Pixels inside the projected boxes of moving actors."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewScores:
+    """Means over views; `actors_psnr` pools the pixels of all actor boxes."""
+
+    psnr: float
+    ssim: float
+    actors_psnr: float | None
+    feature_distance: float | None
+    num_views: int
+    per_view_psnr: tuple[float, ...]
+
+
+def actor_mask(
+    camera: Camera, tracks: Sequence[ActorTrack], timestamp_ns: int
+) -> Bool[Tensor, "height width"]:
+    """Pixels inside the projected boxes of the moving tracks present at that time."""
+    mask = np.zeros((camera.height_px, camera.width_px), np.uint8)
+    for track in tracks:
+        if not track.is_moving or not track.is_present(timestamp_ns):
+            continue
+        corners = box_corners(track.size_m.double())
+        pixels, depth_m = camera.project(
+            transform_points(track.pose_at(timestamp_ns).double(), corners)
+        )
+        if float(depth_m.min()) < NEAR_M:
+            continue
+        limit = 4.0 * max(camera.width_px, camera.height_px)
+        hull = cv2.convexHull(pixels.clamp(-limit, limit).numpy().astype(np.float32))
+        cv2.fillConvexPoly(mask, np.round(hull - 0.5).astype(np.int32), 1)
+    return torch.from_numpy(mask.astype(bool))
+
+
+def score_views(
+    render: Renderer,
+    views: Sequence[JudgedView],
+    *,
+    feature_distance: SqueezeNetDistance | None = None,
+) -> ViewScores | None:
+    """Render every view and average its scores; None without views."""
+    if not views:
+        return None
+    scores: list[PictureScores] = []
+    distances: list[float] = []
+    for view in views:
+        picture = render(view.camera, view.timestamp_ns).clamp(0, 1)
+        scores.append(score_picture(picture, view.truth_rgb, view.actor_mask))
+        if feature_distance is not None:
+            distances.append(float(feature_distance(picture, view.truth_rgb)))
+    return ViewScores(
+        psnr=sum(score.psnr_db for score in scores) / len(scores),
+        ssim=sum(score.ssim for score in scores) / len(scores),
+        actors_psnr=pooled_psnr(scores),
+        feature_distance=sum(distances) / len(distances) if distances else None,
+        num_views=len(scores),
+        per_view_psnr=tuple(score.psnr_db for score in scores),
+    )

@@ -1,0 +1,209 @@
+"""Cross-camera strips: real pictures of a view that lies beside the fitted one.
+
+A camera left out of training sees part of the same surfaces from elsewhere. Before it may judge,
+two constants per camera are fitted on *training* frames: a rotation (mounts are calibrated to
+about half a degree) and an affine colour (exposures differ). Then held-out frames are scored on
+the strip: pixels whose LiDAR surface the fitted camera sees as well.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.optimize import least_squares
+from torch import Tensor
+
+from lidarpainter_models.errors import DataError
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.transforms import rigid_from_tangent, rotation_from_vector
+from lidarpainter_models.kernels.point_splat import splat_points
+from lidarpainter_models.metrics.colour import (
+    MIN_PIXELS,
+    apply_affine_colour,
+    fit_affine_colour,
+)
+from lidarpainter_models.metrics.depth import visible_points
+from lidarpainter_models.metrics.pictures import psnr_from_error, squared_error
+
+GROW_PX = 1
+"""The strip mask is grown by this much around its LiDAR pixels."""
+SUPERSAMPLING = 2
+"""Side cameras see the fitted detail coarser: they are rendered finer and box-averaged."""
+SAME_SURFACE = 0.05
+"""A point is seen by the other camera when its z-buffer lies within 5 % of the point's depth."""
+MAX_ROTATION_RAD = 0.03
+"""A fitted rotation at this bound means that the fit failed."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StripView:
+    """One picture of the judging camera, and the fitted camera of the same frame."""
+
+    camera: Camera
+    timestamp_ns: int
+    truth_rgb: Float[Tensor, "height width 3"]
+    fitted_camera: Camera
+    points_world: Float[Tensor, "points 3"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StripCalibration:
+    """What differs by mount and exposure, fitted on training frames."""
+
+    rotation_rad: tuple[float, float, float]
+    """Rotation vector in the judging camera's frame."""
+    affine: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StripScores:
+    """Strip PSNR pooled over the pixels of all frames, before and after calibration."""
+
+    psnr: float
+    uncalibrated_psnr: float
+    num_views: int
+    num_pixels: int
+    calibration: StripCalibration
+
+
+Rendered = tuple[Float[Tensor, "height width 3"], Bool[Tensor, "height width"]]
+
+
+def strip_mask(view: StripView) -> Bool[Tensor, "height width"]:
+    """Pixels of the judging camera whose LiDAR surface both cameras see, grown a little."""
+    pixels, depth_m = visible_points(view.camera, view.points_world)
+    columns, rows = pixels[:, 0].long(), pixels[:, 1].long()
+    depth_map = torch.zeros(view.camera.height_px, view.camera.width_px)
+    depth_map[rows, columns] = depth_m
+    world = view.camera.unproject(depth_map)[rows, columns]
+    uv, other_m = view.fitted_camera.project(world)
+    inside = view.fitted_camera.contains(uv, other_m)
+    seen, seen_m = visible_points(view.fitted_camera, view.points_world)
+    nearest = splat_points(
+        seen,
+        seen_m,
+        height_px=view.fitted_camera.height_px,
+        width_px=view.fitted_camera.width_px,
+        radius_px=2,
+    )
+    size = torch.tensor([view.fitted_camera.width_px - 1, view.fitted_camera.height_px - 1])
+    cell = torch.minimum(uv.nan_to_num().clamp(min=0).long(), size)
+    index = nearest[cell[:, 1], cell[:, 0]].long()
+    front_m = seen_m[index.clamp(min=0)]
+    same = inside & (index >= 0) & ((other_m - front_m).abs() <= SAME_SURFACE * front_m)
+    mask = np.zeros(depth_map.shape, np.uint8)
+    mask[rows[same].numpy(), columns[same].numpy()] = 1
+    kernel = np.ones((2 * GROW_PX + 1, 2 * GROW_PX + 1), np.uint8)
+    return torch.from_numpy(cv2.dilate(mask, kernel).astype(bool))
+
+
+def render_supersampled(
+    render: Callable[[Camera, int], Tensor], view: StripView
+) -> Float[Tensor, "height width 3"]:
+    """Render the judging camera on a finer grid and average it down."""
+    camera = view.camera
+    fine = camera.resized(
+        width_px=camera.width_px * SUPERSAMPLING, height_px=camera.height_px * SUPERSAMPLING
+    )
+    picture = render(fine, view.timestamp_ns).clamp(0, 1).permute(2, 0, 1)[None]
+    return torch.nn.functional.avg_pool2d(picture, SUPERSAMPLING)[0].permute(1, 2, 0)
+
+
+def rotate_picture(
+    rgb: Float[Tensor, "height width 3"], camera: Camera, rotation_rad: np.ndarray
+) -> np.ndarray:
+    """What the camera would show when turned: a pure rotation is a homography."""
+    rotation = rotation_from_vector(torch.from_numpy(np.asarray(rotation_rad))).numpy()
+    intrinsics = np.array(
+        [[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1.0]]
+    )
+    half = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])  # OpenCV's pixel centres are whole
+    turned = half @ intrinsics @ rotation @ np.linalg.inv(half @ intrinsics)
+    return cv2.warpPerspective(
+        rgb.numpy(),
+        turned,
+        (camera.width_px, camera.height_px),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+
+
+def calibrate_strip(
+    render: Callable[[Camera, int], Tensor], views: Sequence[StripView]
+) -> StripCalibration:
+    """Fit one rotation and one affine colour on training frames.
+
+    Raises:
+        DataError: the two cameras share too few pixels, or no small rotation explains them.
+    """
+    pictures = [render_supersampled(render, view) for view in views]
+    masks = [strip_mask(view) for view in views]
+    if sum(int(mask.sum()) for mask in masks) < MIN_PIXELS:
+        raise DataError("the judging camera shares too few LiDAR surfaces with the fitted one")
+    truth = torch.cat([view.truth_rgb[mask] for view, mask in zip(views, masks, strict=True)])
+
+    def turned_pixels(rotation_rad: np.ndarray) -> Tensor:
+        turned = [
+            torch.from_numpy(rotate_picture(picture, view.camera, rotation_rad))[mask]
+            for picture, view, mask in zip(pictures, views, masks, strict=True)
+        ]
+        return torch.cat(turned)
+
+    def residuals(rotation_rad: np.ndarray) -> np.ndarray:
+        rendered = turned_pixels(rotation_rad)
+        affine = fit_affine_colour(rendered, truth)
+        return (apply_affine_colour(rendered, affine) - truth).numpy().ravel()
+
+    # robust, coarse steps first: the picture is not smooth at the scale of one pixel
+    best = least_squares(
+        residuals, np.zeros(3), loss="soft_l1", f_scale=0.05, diff_step=1e-3, x_scale=2e-3
+    )
+    if np.abs(best.x).max() > MAX_ROTATION_RAD:
+        raise DataError(
+            f"no rotation under {MAX_ROTATION_RAD} rad explains the judging camera, got {best.x}"
+        )
+    affine = fit_affine_colour(turned_pixels(best.x), truth)
+    return StripCalibration(
+        rotation_rad=tuple(float(angle) for angle in best.x),
+        affine=tuple(tuple(float(value) for value in row) for row in affine),
+    )
+
+
+def score_strips(
+    render: Callable[[Camera, int], Tensor],
+    views: Sequence[StripView],
+    calibration: StripCalibration,
+) -> StripScores:
+    """Score held-out frames of the judging camera on the strip."""
+    affine = torch.tensor(calibration.affine)
+    turn = rigid_from_tangent(
+        torch.tensor([*calibration.rotation_rad, 0.0, 0.0, 0.0], dtype=torch.float64)
+    )
+    raw_error = calibrated_error = 0.0
+    num_pixels = 0
+    for view in views:
+        mask = strip_mask(view)
+        raw = render_supersampled(render, view)
+        turned_view = StripView(
+            camera=view.camera.at(view.camera.world_from_camera @ turn),
+            timestamp_ns=view.timestamp_ns,
+            truth_rgb=view.truth_rgb,
+            fitted_camera=view.fitted_camera,
+            points_world=view.points_world,
+        )
+        turned = apply_affine_colour(render_supersampled(render, turned_view), affine)
+        raw_error += float(squared_error(raw, view.truth_rgb)[mask].double().sum())
+        calibrated_error += float(squared_error(turned, view.truth_rgb)[mask].double().sum())
+        num_pixels += int(mask.sum())
+    if num_pixels == 0:
+        raise DataError("the judging camera shares no LiDAR surface with the fitted one")
+    return StripScores(
+        psnr=psnr_from_error(calibrated_error / num_pixels),
+        uncalibrated_psnr=psnr_from_error(raw_error / num_pixels),
+        num_views=len(views),
+        num_pixels=num_pixels,
+        calibration=calibration,
+    )

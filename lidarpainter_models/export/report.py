@@ -1,0 +1,136 @@
+"""One self-contained HTML page about a run: pictures, curves, tables, provenance.
+
+Nothing is loaded from elsewhere: styles, script and pictures stand in the page. Every text is
+escaped by the template, since names come from datasets.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+
+import jinja2
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.export.pictures import jpeg_data_url
+
+PLOT_WIDTH, PLOT_HEIGHT = 460, 240
+PLOT_MARGIN = 46
+SERIES_COLOURS = ("#0b6e99", "#d1495b", "#5c8001", "#8f5db7")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Comparison:
+    """One view before and after, with the pictures it was made from."""
+
+    title: str
+    before_label: str
+    before_rgb: Float[Tensor, "height width 3"]
+    after_label: str
+    after_rgb: Float[Tensor, "height width 3"]
+    inputs: Mapping[str, Tensor] = field(default_factory=dict)
+    """Label to rgb picture: LiDAR image, warped reference, confidence, truth."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """Rows under column heads; a None cell prints as a dash."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str | float | int | None]]
+    note: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plot:
+    """Lines over a common axis."""
+
+    title: str
+    x_label: str
+    y_label: str
+    series: Mapping[str, Sequence[tuple[float, float]]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Everything the page shows, in order."""
+
+    title: str
+    summary: str
+    comparisons: Sequence[Comparison] = ()
+    tables: Sequence[Table] = ()
+    plots: Sequence[Plot] = ()
+    provenance: Mapping[str, str] = field(default_factory=dict)
+
+
+def format_cell(value: str | float | int | None) -> str:
+    """Print a cell: numbers with three decimals at most, None as a dash."""
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.3f}" if abs(value) < 100 else f"{value:.1f}"
+    return str(value)
+
+
+def plot_geometry(plot: Plot) -> dict[str, object]:
+    """Screen coordinates of a plot's lines and axis marks."""
+    points = [point for line in plot.series.values() for point in line]
+    xs = [point[0] for point in points] or [0.0]
+    ys = [point[1] for point in points] or [0.0]
+    low_x, high_x, low_y, high_y = min(xs), max(xs), min(ys), max(ys)
+    span_x, span_y = (high_x - low_x) or 1.0, (high_y - low_y) or 1.0
+
+    def place(x: float, y: float) -> str:
+        across = PLOT_MARGIN + (x - low_x) / span_x * (PLOT_WIDTH - PLOT_MARGIN - 10)
+        down = PLOT_HEIGHT - PLOT_MARGIN - (y - low_y) / span_y * (PLOT_HEIGHT - PLOT_MARGIN - 10)
+        return f"{across:.1f},{down:.1f}"
+
+    return {
+        "title": plot.title,
+        "x_label": plot.x_label,
+        "y_label": plot.y_label,
+        "x_range": (format_cell(float(low_x)), format_cell(float(high_x))),
+        "y_range": (format_cell(float(low_y)), format_cell(float(high_y))),
+        "lines": [
+            {"label": label, "colour": colour, "points": " ".join(place(*p) for p in line)}
+            for (label, line), colour in zip(plot.series.items(), SERIES_COLOURS, strict=False)
+        ],
+        "width": PLOT_WIDTH,
+        "height": PLOT_HEIGHT,
+        "margin": PLOT_MARGIN,
+    }
+
+
+def render_report(report: Report) -> str:
+    """The page as one HTML string."""
+    source = files("lidarpainter_models.export").joinpath("report.html.j2").read_text("utf-8")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+    comparisons = [
+        {
+            "title": item.title,
+            "before_label": item.before_label,
+            "after_label": item.after_label,
+            "before": jpeg_data_url(item.before_rgb),
+            "after": jpeg_data_url(item.after_rgb),
+            "inputs": {label: jpeg_data_url(rgb) for label, rgb in item.inputs.items()},
+        }
+        for item in report.comparisons
+    ]
+    tables = [
+        {
+            "title": table.title,
+            "note": table.note,
+            "columns": table.columns,
+            "rows": [[format_cell(cell) for cell in row] for row in table.rows],
+        }
+        for table in report.tables
+    ]
+    return environment.from_string(source).render(
+        title=report.title,
+        summary=report.summary,
+        comparisons=comparisons,
+        tables=tables,
+        plots=[plot_geometry(plot) for plot in report.plots],
+        provenance=report.provenance,
+    )

@@ -1,0 +1,45 @@
+"""The feature distance is zero for equal pictures and refuses foreign weights."""
+
+import pytest
+import torch
+
+from lidarpainter_models.errors import WeightsError
+from lidarpainter_models.metrics.squeezenet import (
+    SqueezeNetDistance,
+    load_squeezenet_distance,
+)
+
+
+def test_distance_grows_with_blur(shared_folder):
+    path = shared_folder / "weights/squeezenet_keras/squeezenet1_1_caffe_features.pth"
+    distance = load_squeezenet_distance(path)
+    picture = torch.rand(96, 128, 3, generator=torch.Generator().manual_seed(0))
+    pooled = torch.nn.functional.avg_pool2d(picture.permute(2, 0, 1)[None], 3, 1, 1)
+    blurred = pooled[0].permute(1, 2, 0)
+    assert float(distance(picture, picture)) == 0
+    assert float(distance(blurred, picture)) > float(distance(0.9 * picture, picture)) > 0
+
+
+@pytest.mark.parametrize("fault", ["missing", "garbage", "foreign", "list"])
+def test_wrong_weights_are_refused_in_one_line(tmp_path, fault):
+    path = tmp_path / "weights.pth"
+    if fault == "garbage":
+        path.write_bytes(b"not a network")
+    elif fault == "foreign":
+        torch.save({"conv.weight": torch.zeros(3)}, path)
+    elif fault == "list":
+        torch.save([1, 2], path)
+    with pytest.raises(WeightsError) as caught:
+        load_squeezenet_distance(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_own_weights_round_trip(tmp_path):
+    network = SqueezeNetDistance()
+    path = tmp_path / "weights.pth"
+    state = {key.removeprefix("layers."): value for key, value in network.state_dict().items()}
+    torch.save(state, path)
+    picture = torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(3))
+    loaded = load_squeezenet_distance(path)
+    assert torch.equal(loaded(picture, picture * 0.5), network(picture, picture * 0.5))
