@@ -1,0 +1,76 @@
+"""Painting conditions stacked for a network: channels first, one row per view.
+
+Pictures are (batch, channels, height, width), rgb in [0, 1]; depth is camera z in metres with 0
+where there is none; masks are float, 1 where true. Warps beyond those a view has are invalid.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Self
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.errors import ShapeError
+from lidarpainter_models.painter.protocol import PaintingConditions
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ConditionBatch:
+    """The conditions of several views of one size."""
+
+    render: Float[Tensor, "batch 3 height width"]
+    render_depth_m: Float[Tensor, "batch 1 height width"]
+    render_alpha: Float[Tensor, "batch 1 height width"]
+    lidar: Float[Tensor, "batch 3 height width"]
+    lidar_depth_m: Float[Tensor, "batch 1 height width"]
+    lidar_hit: Float[Tensor, "batch 1 height width"]
+    warp: Float[Tensor, "batch sources 3 height width"]
+    warp_valid: Float[Tensor, "batch sources height width"]
+
+    def to(self, device: torch.device) -> Self:
+        """The same batch on another device."""
+        return type(self)(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+
+def stack_conditions(views: Sequence[PaintingConditions], *, num_sources: int) -> ConditionBatch:
+    """Stack views of one size, keeping the best `num_sources` warps of each.
+
+    Raises:
+        ShapeError: no view, or views of different sizes.
+    """
+    sizes = sorted({view.height_width_px for view in views})
+    if len(sizes) != 1:
+        raise ShapeError(f"a batch needs views of one size (height, width), got {sizes}")
+    warps = [_first_sources(view, num_sources) for view in views]
+    return ConditionBatch(
+        render=_stack_rgb([view.render_rgb for view in views]),
+        render_depth_m=_stack_map([view.render_depth_m for view in views]),
+        render_alpha=_stack_map([view.render_alpha for view in views]),
+        lidar=_stack_rgb([view.lidar_rgb for view in views]),
+        lidar_depth_m=_stack_map([view.lidar_depth_m for view in views]),
+        lidar_hit=_stack_map([view.lidar_hit for view in views]),
+        warp=torch.stack([rgb for rgb, _ in warps]),
+        warp_valid=torch.stack([valid for _, valid in warps]),
+    )
+
+
+def _stack_rgb(pictures: Sequence[Tensor]) -> Float[Tensor, "batch 3 height width"]:
+    return torch.stack([picture.permute(2, 0, 1) for picture in pictures]).contiguous()
+
+
+def _stack_map(maps: Sequence[Tensor]) -> Float[Tensor, "batch 1 height width"]:
+    return torch.stack([one.float() for one in maps])[:, None]
+
+
+def _first_sources(
+    view: PaintingConditions, num_sources: int
+) -> tuple[Float[Tensor, "sources 3 height width"], Float[Tensor, "sources height width"]]:
+    height_px, width_px = view.height_width_px
+    rgb = view.render_rgb.new_zeros(num_sources, 3, height_px, width_px)
+    valid = view.render_rgb.new_zeros(num_sources, height_px, width_px)
+    kept = min(num_sources, len(view.warp_rgb))
+    rgb[:kept] = view.warp_rgb[:kept].permute(0, 3, 1, 2)
+    valid[:kept] = view.warp_valid[:kept].float()
+    return rgb * valid[:, None], valid

@@ -1,0 +1,163 @@
+"""The pictures that the small painter mixes, each with the pixels where it exists.
+
+Candidates are the render, the filled LiDAR picture, the warped training pictures, the mean of
+render and warps, and blurred copies that trade detail for less noise. The filling is the
+push-pull pyramid of Gortler et al., "The Lumigraph" (1996), section 3.4.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F  # noqa: N812 - the name everyone knows
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.painter.batches import ConditionBatch
+
+PAINTING_INPUTS = frozenset({"render", "lidar", "warp"})
+BLUR_SIGMA_PX = 1.5  # about the size of a speckle at 480 pixels across
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Candidates:
+    """Pictures to choose from in every pixel; `base` is the one that needs no learning."""
+
+    names: tuple[str, ...]
+    pictures: Float[Tensor, "batch candidates 3 height width"]
+    exists: Float[Tensor, "batch candidates height width"]
+    """1 where the candidate may be chosen; the base exists everywhere."""
+    base: str
+
+    @property
+    def base_picture(self) -> Float[Tensor, "batch 3 height width"]:
+        """The candidate that an untrained painter gives back."""
+        return self.pictures[:, self.names.index(self.base)]
+
+
+def check_inputs(inputs: Iterable[str]) -> frozenset[str]:
+    """The inputs a painter may see, as a set.
+
+    Raises:
+        ConfigError: an unknown input, or warps without the render that fills their gaps.
+    """
+    chosen = frozenset(inputs)
+    if chosen - PAINTING_INPUTS:
+        raise ConfigError(f"inputs must be of {sorted(PAINTING_INPUTS)}, got {sorted(chosen)}")
+    if not chosen & {"render", "lidar"} or ("warp" in chosen and "render" not in chosen):
+        raise ConfigError(
+            f"inputs need the render or the LiDAR, and warps the render, got {sorted(chosen)}"
+        )
+    return chosen
+
+
+def candidate_names(inputs: frozenset[str], num_sources: int) -> tuple[str, ...]:
+    """The candidates a painter with these inputs has, in channel order."""
+    names: list[str] = []
+    if "render" in inputs:
+        names += ["render", "render_blurred"]
+    if "lidar" in inputs:
+        names += ["lidar_filled", "lidar_blurred"]
+    if "warp" in inputs:
+        names += [f"warp_{source + 1}" for source in range(num_sources)]
+        names += ["mean", "warp_1_blurred"]
+    return tuple(names)
+
+
+def base_candidate(inputs: frozenset[str]) -> str:
+    """The candidate that exists everywhere and is right without learning."""
+    if "warp" in inputs:
+        return "mean"
+    return "render" if "render" in inputs else "lidar_filled"
+
+
+def build_candidates(
+    conditions: ConditionBatch,
+    inputs: frozenset[str],
+    lidar_filled: Float[Tensor, "batch 3 height width"],
+) -> Candidates:
+    """Every candidate picture of a batch, in the order of `candidate_names`."""
+    num_sources = conditions.warp.shape[1]
+    made: dict[str, Tensor] = {}
+    exists: dict[str, Tensor] = {}
+    everywhere = torch.ones_like(conditions.render[:, 0])
+    if "render" in inputs:
+        made["render"] = conditions.render
+        made["render_blurred"] = blur(conditions.render)
+    if "lidar" in inputs:
+        some = conditions.lidar_hit.amax(dim=(1, 2, 3))[:, None, None] * everywhere
+        made["lidar_filled"], exists["lidar_filled"] = lidar_filled, some
+        made["lidar_blurred"], exists["lidar_blurred"] = blur(lidar_filled), some
+    if "warp" in inputs:
+        for source in range(num_sources):
+            made[f"warp_{source + 1}"] = conditions.warp[:, source]
+            exists[f"warp_{source + 1}"] = conditions.warp_valid[:, source]
+        made["mean"] = mean_of_render_and_warps(
+            conditions.render, conditions.warp, conditions.warp_valid
+        )
+        made["warp_1_blurred"] = masked_blur(conditions.warp[:, 0], conditions.warp_valid[:, :1])
+        exists["warp_1_blurred"] = conditions.warp_valid[:, 0]
+    base = base_candidate(inputs)
+    exists[base] = everywhere
+    names = candidate_names(inputs, num_sources)
+    return Candidates(
+        names=names,
+        pictures=torch.stack([made[name] for name in names], dim=1),
+        exists=torch.stack([exists.get(name, everywhere) for name in names], dim=1),
+        base=base,
+    )
+
+
+def mean_of_render_and_warps(
+    render: Float[Tensor, "batch 3 height width"],
+    warp: Float[Tensor, "batch sources 3 height width"],
+    warp_valid: Float[Tensor, "batch sources height width"],
+) -> Float[Tensor, "batch 3 height width"]:
+    """The mean of the render and of the warps that are valid in a pixel."""
+    total = render + (warp * warp_valid[:, :, None]).sum(dim=1)
+    return total / (1 + warp_valid.sum(dim=1, keepdim=True))
+
+
+def blur(
+    picture: Float[Tensor, "batch channels height width"], *, sigma_px: float = BLUR_SIGMA_PX
+) -> Float[Tensor, "batch channels height width"]:
+    """A Gaussian blur that repeats the border."""
+    radius_px = int(round(2.5 * sigma_px))
+    offsets = torch.arange(-radius_px, radius_px + 1, dtype=picture.dtype, device=picture.device)
+    kernel = torch.exp(-0.5 * (offsets / sigma_px) ** 2)
+    kernel = (kernel / kernel.sum()).expand(picture.shape[1], 1, -1)
+    padded = F.pad(picture, (radius_px, radius_px, radius_px, radius_px), mode="replicate")
+    rows = F.conv2d(padded, kernel[:, :, None], groups=picture.shape[1])
+    return F.conv2d(rows, kernel[..., None], groups=picture.shape[1])
+
+
+def masked_blur(
+    picture: Float[Tensor, "batch 3 height width"], valid: Float[Tensor, "batch 1 height width"]
+) -> Float[Tensor, "batch 3 height width"]:
+    """A Gaussian blur over the valid pixels alone; 0 where none is near."""
+    blurred = blur(torch.cat([picture * valid, valid], dim=1))
+    return blurred[:, :3] / blurred[:, 3:].clamp_min(1e-3)
+
+
+def fill_push_pull(
+    picture: Float[Tensor, "batch 3 height width"], known: Float[Tensor, "batch 1 height width"]
+) -> Float[Tensor, "batch 3 height width"]:
+    """Keep the known pixels and fill the others from a pyramid of their averages.
+
+    A picture without any known pixel becomes black.
+    """
+    weighted = torch.cat([picture * known, known], dim=1)
+    pyramid = [weighted]
+    while max(pyramid[-1].shape[2:]) > 1:
+        pyramid.append(F.avg_pool2d(pyramid[-1], 2, ceil_mode=True))
+    filled = pyramid[-1][:, :3] / pyramid[-1][:, 3:].clamp_min(1e-6)
+    for level in reversed(pyramid[:-1]):
+        coarse = F.interpolate(
+            filled, size=level.shape[2:], mode="bilinear", align_corners=False
+        )
+        weight = level[:, 3:]
+        # half covered cells lean on the coarser level, so that single points do not spread
+        share = (2 * weight).clamp_max(1)
+        filled = share * level[:, :3] / weight.clamp_min(1e-6) + (1 - share) * coarse
+    return filled

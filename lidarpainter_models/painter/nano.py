@@ -1,0 +1,195 @@
+"""The small fusion network: chooses, per pixel, among pictures that already exist.
+
+A residual U-Net (Ronneberger et al., 2015) at a quarter of the resolution gives a softmax over the
+candidate pictures of `candidates.py`, a bounded residual, and the log of the error it expects.
+Because colours come from the inputs it cannot invent much; at first it returns the base candidate
+(the mean of render and warps), so training only departs from it where that pays.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import Any, Self
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.painter.batches import ConditionBatch
+from lidarpainter_models.painter.candidates import (
+    PAINTING_INPUTS,
+    base_candidate,
+    build_candidates,
+    candidate_names,
+    check_inputs,
+)
+from lidarpainter_models.painter.features import count_features, painting_features
+from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
+
+CELL_PX = 4
+"""Side of the pixel block that one position of the network stands for."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NanoConfig:
+    """The shape of the small painter."""
+
+    inputs: frozenset[str] = PAINTING_INPUTS
+    """What it may see and mix: `render`, `lidar`, `warp`; fewer for ablations."""
+    widths: tuple[int, int, int] = (48, 96, 160)
+    """Channels at 1/4, 1/8 and 1/16 of the resolution."""
+    blocks: tuple[int, int, int] = (2, 2, 3)
+    """Residual blocks per level; the upper two have as many again on the way up."""
+    num_sources: int = 2
+    """Warped pictures it looks at; missing ones count as invalid, further ones are left out."""
+    residual_limit: float = 0.25
+    """Largest change beyond the mix, in units of rgb: enough for a glint, too little to paint."""
+    base_logit: float = 9.0
+    """First logit of the base candidate: the others then move a picture by less than half a byte."""
+    confidence_error: float = 0.05
+    """Mean absolute error at which the confidence has fallen to 1/e."""
+    prompts: tuple[str, ...] = (DEFAULT_PROMPT,)
+    """Prompts the network was trained for, each with its own embedding."""
+
+    def __post_init__(self) -> None:
+        """Refuse shapes that cannot be built."""
+        check_inputs(self.inputs)
+        counts = (*self.widths, *self.blocks, self.num_sources, len(self.prompts))
+        if len(self.widths) != 3 or len(self.blocks) != 3 or min(counts) < 1:
+            raise ConfigError(
+                "nano needs three positive widths and blocks, a source and a prompt, got "
+                f"{self.widths}, {self.blocks}, {self.num_sources}, {self.prompts}"
+            )
+
+    @property
+    def candidates(self) -> tuple[str, ...]:
+        """The pictures it mixes, in channel order."""
+        return candidate_names(self.inputs, self.num_sources)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as JSON types."""
+        return asdict(self) | {"inputs": sorted(self.inputs)}
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Self:
+        """Undo `to_dict`.
+
+        Raises:
+            ConfigError: a field is missing, unknown or of the wrong type.
+        """
+        try:
+            changed = {key: tuple(values[key]) for key in ("widths", "blocks", "prompts")}
+            return cls(**values | changed | {"inputs": frozenset(values["inputs"])})
+        except (KeyError, TypeError) as error:
+            raise ConfigError(f"not the settings of a nano painter: {error}") from None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NanoOutput:
+    """What the network says about a batch of views."""
+
+    rgb: Float[Tensor, "batch 3 height width"]
+    """Not clamped, so that gradients pass."""
+    base: Float[Tensor, "batch 3 height width"]
+    """The base candidate, for comparison."""
+    log_error: Float[Tensor, "batch height width"]
+    """Logarithm of the mean absolute error it expects."""
+    weights: Float[Tensor, "batch candidates height width"]
+    """Shares of the candidates; they sum to one."""
+
+
+class ResidualBlock(nn.Module):
+    """Two 3x3 convolutions beside an identity; starts as the identity."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(width, width, 3, padding=1)
+        self.second = nn.Conv2d(width, width, 3, padding=1)
+        nn.init.zeros_(self.second.weight)
+        nn.init.zeros_(self.second.bias)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Add the block's change to its input."""
+        return x + self.second(F.silu(self.first(F.silu(x))))
+
+
+class NanoNetwork(nn.Module):
+    """The fusion network of one `NanoConfig`; deterministic, free of normalisation by picture."""
+
+    def __init__(self, config: NanoConfig) -> None:
+        super().__init__()
+        self.config = config
+        fine, middle, coarse = config.widths
+        in_channels = count_features(config.inputs, config.num_sources) * CELL_PX**2
+        self.stem = nn.Conv2d(in_channels, fine, 3, padding=1)
+        self.encode_fine = _blocks(fine, config.blocks[0])
+        self.down_middle = nn.Conv2d(fine, middle, 2, stride=2)
+        self.encode_middle = _blocks(middle, config.blocks[1])
+        self.down_coarse = nn.Conv2d(middle, coarse, 2, stride=2)
+        self.encode_coarse = _blocks(coarse, config.blocks[2])
+        self.prompt = nn.Embedding(len(config.prompts), coarse)
+        self.up_middle = nn.Conv2d(coarse, middle * 4, 1)
+        self.decode_middle = _blocks(middle, config.blocks[1])
+        self.up_fine = nn.Conv2d(middle, fine * 4, 1)
+        self.decode_fine = _blocks(fine, config.blocks[0])
+        self.head = nn.Conv2d(fine, (len(config.candidates) + 4) * CELL_PX**2, 3, padding=1)
+        self._start_as_base()
+
+    @torch.no_grad()
+    def _start_as_base(self) -> None:
+        """Zero the head; its biases choose the base candidate and expect an error of 0.03."""
+        for parameter in (self.head.weight, self.head.bias, self.prompt.weight):
+            nn.init.zeros_(parameter)
+        bias = self.head.bias.view(-1, CELL_PX**2)
+        base = self.config.candidates.index(base_candidate(self.config.inputs))
+        bias[base] = self.config.base_logit
+        bias[-1] = -3.5
+
+    def prompt_index(self, prompt: str) -> int:
+        """Row of a prompt's embedding.
+
+        Raises:
+            ConfigError: the network was not trained for this prompt.
+        """
+        if prompt not in self.config.prompts:
+            known = ", ".join(self.config.prompts)
+            raise ConfigError(f"the nano painter knows no prompt {prompt!r}, only: {known}")
+        return self.config.prompts.index(prompt)
+
+    def forward(self, conditions: ConditionBatch, prompt: str = DEFAULT_PROMPT) -> NanoOutput:
+        """Mix the candidates of every view."""
+        features, lidar_filled = painting_features(conditions, self.config.inputs)
+        candidates = build_candidates(conditions, self.config.inputs, lidar_filled)
+        head = self._head(features, self.prompt_index(prompt)).float()
+        num_candidates = len(candidates.names)
+        logits = head[:, :num_candidates].masked_fill(candidates.exists == 0, -torch.inf)
+        weights = torch.softmax(logits, dim=1)
+        mixed = (weights[:, :, None] * candidates.pictures).sum(dim=1)
+        residual = torch.tanh(head[:, num_candidates : num_candidates + 3])
+        return NanoOutput(
+            rgb=mixed + self.config.residual_limit * residual,
+            base=candidates.base_picture,
+            log_error=head[:, -1].clamp(-8, 1),
+            weights=weights,
+        )
+
+    def _head(
+        self, features: Float[Tensor, "batch features height width"], prompt_index: int
+    ) -> Float[Tensor, "batch outputs height width"]:
+        """Run the U-Net on a picture of any size, padded to whole cells by repeating the edge."""
+        height_px, width_px = features.shape[2:]
+        step_px = CELL_PX * 4
+        padding = (0, -width_px % step_px, 0, -height_px % step_px)
+        padded = F.pad(features, padding, mode="replicate")
+        fine = self.encode_fine(self.stem(F.pixel_unshuffle(padded, CELL_PX)))
+        middle = self.encode_middle(self.down_middle(fine))
+        coarse = self.down_coarse(middle) + self.prompt.weight[prompt_index][:, None, None]
+        coarse = self.encode_coarse(coarse)
+        middle = self.decode_middle(middle + F.pixel_shuffle(self.up_middle(coarse), 2))
+        fine = self.decode_fine(fine + F.pixel_shuffle(self.up_fine(middle), 2))
+        outputs = F.pixel_shuffle(self.head(F.silu(fine)), CELL_PX)
+        return outputs[..., :height_px, :width_px]
+
+
+def _blocks(width: int, number: int) -> nn.Sequential:
+    return nn.Sequential(*[ResidualBlock(width) for _ in range(number)])
