@@ -1,0 +1,266 @@
+"""Content-addressed artefacts: what a stage made, stored under what it was made from.
+
+`<store>/artefacts/<kind>/<digest>/` holds the files of one artefact and a `manifest.json`. The
+digest covers the kind, the digests of the inputs, the configuration and the source of the library
+code that runs, so equal recipes meet and a changed one never finds an old result. A folder is
+written aside and renamed whole, with the manifest in it: what has a name is complete.
+`<store>/work/<digest>/` is scratch that survives a killed process (checkpoints) and goes when the
+artefact is there.
+"""
+
+import json
+import os
+import shutil
+import time
+import uuid
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from catalog.digests import canonical_json, digest_file, digest_text, plain
+from catalog.errors import DamagedArtefactError, UnknownRecordError, storage_errors
+from catalog.locks import held_lock
+
+MANIFEST_NAME = "manifest.json"
+MANIFEST_VERSION = 1
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class ArtefactRef:
+    """A name for a stored artefact: small enough to pass between processes."""
+
+    kind: str
+    digest: str
+    path: str
+    """Folder of the artefact, as text."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the artefact."""
+        return Path(self.path)
+
+    @property
+    def artefact_id(self) -> str:
+        """`kind/digest`, its id in the catalog."""
+        return f"{self.kind}/{self.digest}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """What an artefact is made from; equal recipes make equal artefacts."""
+
+    kind: str
+    inputs: Mapping[str, str]
+    """Digest of every input, by the part it plays."""
+    config: Any
+    """Any value with a canonical JSON form (see `digests.canonical_json`)."""
+    source_digest: str
+    """Digest of the source of the library code that runs."""
+    software_version: str = ""
+    """For the record only: not part of the digest, the source is."""
+
+    @property
+    def digest(self) -> str:
+        """The name of what this recipe makes."""
+        parts = [self.kind, dict(self.inputs), plain(self.config), self.source_digest]
+        return digest_text(canonical_json(parts))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Workplace:
+    """Where a stage writes while it runs."""
+
+    output: Path
+    """Becomes the artefact when the stage returns."""
+    scratch: Path
+    """Kept when the process dies, found again by the next one; gone once the stage is done."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Manifest:
+    """What is known about a stored artefact."""
+
+    kind: str
+    digest: str
+    inputs: dict[str, str]
+    config: Any
+    source_digest: str
+    software_version: str
+    created_at: str
+    """ISO 8601, UTC."""
+    seconds: float
+    """Wall time of the process that finished it; a resumed stage counts its last part only."""
+    files: dict[str, dict[str, Any]]
+    """Per file name: `num_bytes` and `sha256`."""
+    summary: dict[str, Any] = field(default_factory=dict)
+    """What the stage wants to have said about its result, such as the number of Gaussians."""
+    manifest_version: int = MANIFEST_VERSION
+
+    @property
+    def num_bytes(self) -> int:
+        """Size of all files together."""
+        return sum(file["num_bytes"] for file in self.files.values())
+
+
+Build = Callable[[Workplace], Mapping[str, Any] | None]
+"""Writes the files of an artefact below `output`; returns its summary."""
+
+
+class ArtefactStore:
+    """The artefacts below one folder."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def ref(self, kind: str, digest: str) -> ArtefactRef:
+        """The name of an artefact, whether it exists or not."""
+        return ArtefactRef(kind, digest, str(self.root / "artefacts" / kind / digest))
+
+    def find(self, recipe: Recipe) -> ArtefactRef | None:
+        """What was made from this recipe before, or None; damaged folders count as absent."""
+        ref = self.ref(recipe.kind, recipe.digest)
+        try:
+            manifest = self.manifest(ref)
+        except (UnknownRecordError, DamagedArtefactError):
+            return None
+        return ref if _sizes_agree(ref, manifest) else None
+
+    def produce(
+        self, recipe: Recipe, build: Build, *, on_wait: Callable[[str], None] | None = None
+    ) -> tuple[ArtefactRef, bool]:
+        """The artefact of a recipe, made now if nobody made it before.
+
+        Of several processes that ask at once, one computes and the others wait for it; where it
+        dies, the next one takes over, with the scratch folder as it was left.
+
+        Args:
+            recipe: what to make.
+            build: makes it.
+            on_wait: called once with the other process's id if there is one to wait for.
+
+        Returns:
+            The artefact, and whether this call computed it.
+
+        Raises:
+            StorageError: the disk is full or may not be written; nothing half-written stays.
+        """
+        if found := self.find(recipe):
+            return found, False
+        with held_lock(self.root / "locks" / f"{recipe.digest}.lock", on_wait=on_wait):
+            if found := self.find(recipe):
+                return found, False
+            ref = self._build(recipe, build)
+        return ref, True
+
+    def manifest(self, ref: ArtefactRef) -> Manifest:
+        """The manifest of a stored artefact.
+
+        Raises:
+            UnknownRecordError: there is no such artefact.
+            DamagedArtefactError: its manifest cannot be read.
+        """
+        path = ref.folder / MANIFEST_NAME
+        try:
+            content = json.loads(path.read_text("utf-8"))
+            return Manifest(**content)
+        except (FileNotFoundError, NotADirectoryError):
+            raise UnknownRecordError(f"no {ref.kind} artefact at {ref.folder}") from None
+        except (ValueError, TypeError) as error:
+            raise DamagedArtefactError(f"unreadable manifest {path}: {error}") from None
+
+    def verified(self, ref: ArtefactRef) -> Manifest:
+        """The manifest, after every byte of the artefact was checked against it.
+
+        Raises:
+            UnknownRecordError: there is no such artefact.
+            DamagedArtefactError: a file is missing or is not what was written.
+        """
+        manifest = self.manifest(ref)
+        for name, known in manifest.files.items():
+            path = ref.folder / name
+            if not path.is_file():
+                raise DamagedArtefactError(f"{path} is missing; delete {ref.folder} and run again")
+            if digest_file(path) != known["sha256"]:
+                raise DamagedArtefactError(
+                    f"{path} is not what was written; delete {ref.folder} and run again"
+                )
+        return manifest
+
+    def _build(self, recipe: Recipe, build: Build) -> ArtefactRef:
+        """Write aside, then rename; the caller holds the lock."""
+        ref = self.ref(recipe.kind, recipe.digest)
+        aside = self.root / "aside"
+        scratch = self.root / "work" / recipe.digest
+        with storage_errors(f"cannot store {ref.artefact_id} below {self.root}"):
+            for leftover in aside.glob(f"{recipe.digest}-*"):  # of a killed process
+                shutil.rmtree(leftover)
+            output = aside / f"{recipe.digest}-{uuid.uuid4().hex[:8]}"
+            output.mkdir(parents=True)
+            scratch.mkdir(parents=True, exist_ok=True)
+            started = time.perf_counter()
+            try:
+                summary = build(Workplace(output=output, scratch=scratch))
+                _write_manifest(output, recipe, summary or {}, time.perf_counter() - started)
+                _put_in_place(output, ref.folder)
+            finally:
+                shutil.rmtree(output, ignore_errors=True)
+        shutil.rmtree(scratch, ignore_errors=True)
+        return ref
+
+
+def _write_manifest(
+    output: Path, recipe: Recipe, summary: Mapping[str, Any], seconds: float
+) -> None:
+    files = {
+        path.relative_to(output).as_posix(): {
+            "num_bytes": path.stat().st_size,
+            "sha256": digest_file(path),
+        }
+        for path in sorted(output.rglob("*"))
+        if path.is_file()
+    }
+    content = {
+        "manifest_version": MANIFEST_VERSION,
+        "kind": recipe.kind,
+        "digest": recipe.digest,
+        "inputs": dict(recipe.inputs),
+        "config": plain(recipe.config),
+        "source_digest": recipe.source_digest,
+        "software_version": recipe.software_version,
+        "created_at": datetime.now(UTC).isoformat(timespec="milliseconds"),
+        "seconds": round(seconds, 3),
+        "files": files,
+        "summary": plain(summary),
+    }
+    text = json.dumps(content, indent=1, sort_keys=True, allow_nan=False)
+    (output / MANIFEST_NAME).write_text(text + "\n", "utf-8")
+
+
+def _put_in_place(output: Path, folder: Path) -> None:
+    """Rename the finished folder to its name, over a damaged one if there is one."""
+    for path in sorted(output.rglob("*")):
+        _flush(path)  # names must not reach the disk before the bytes do
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    if folder.exists():
+        shutil.rmtree(folder)
+    output.rename(folder)
+    _flush(folder.parent)
+
+
+def _flush(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _sizes_agree(ref: ArtefactRef, manifest: Manifest) -> bool:
+    """Whether every file is there at its size: cheap, finds cut files, not flipped bits."""
+    for name, known in manifest.files.items():
+        path = ref.folder / name
+        if not path.is_file() or path.stat().st_size != known["num_bytes"]:
+            return False
+    return True

@@ -1,0 +1,83 @@
+"""What can go wrong in the store, each also a built-in type.
+
+The catalog is a stranger to the library, so it has errors of its own; the command line turns both
+families into one line and exit code 2.
+"""
+
+import errno
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+class CatalogError(Exception):
+    """The store cannot do what was asked of it."""
+
+
+class StorageError(CatalogError, OSError):
+    """The store cannot be written or read: disk full, permissions, a broken disk."""
+
+
+class DamagedArtefactError(CatalogError, ValueError):
+    """A stored artefact is not what its manifest says."""
+
+
+class UnknownRecordError(CatalogError, LookupError):
+    """The catalog holds no such scene, run or artefact, or more than one matches."""
+
+
+class IdentityError(CatalogError, TypeError):
+    """A configuration holds something that has no canonical form, so it has no digest."""
+
+
+class ConflictError(CatalogError, RuntimeError):
+    """Another writer kept winning: a table could not be committed within the retries."""
+
+
+REASONS = {
+    errno.ENOSPC: "no space left on the device",
+    errno.EDQUOT: "the disk quota is used up",
+    errno.EFBIG: "the file would be larger than is allowed",
+    errno.EROFS: "the file system is read-only",
+    errno.EACCES: "permission denied",
+    errno.EPERM: "operation not permitted",
+    errno.EIO: "input/output error",
+    errno.ENOTDIR: "a part of the path is not a folder",
+    errno.EEXIST: "a file is in the way",
+}
+
+_FOREIGN_CODE = re.compile(r"\(os error (\d+)\)|\bOs \{ code: (\d+),")
+
+
+@contextmanager
+def storage_errors(doing: str) -> Iterator[None]:
+    """Turn a failing disk into one clear `StorageError`; everything else passes.
+
+    Writers in Rust (safetensors, Delta) report a full disk only in their text, as `(os error 28)`
+    or `Os { code: 28, ...`, so that is read too.
+
+    Args:
+        doing: what was being done and where, for the message.
+    """
+    try:
+        yield
+    except StorageError:
+        raise
+    except Exception as error:
+        code = _disk_error(error)
+        if code is None:
+            raise
+        raise StorageError(f"{doing}: {REASONS[code]}") from error
+
+
+def _disk_error(error: BaseException) -> int | None:
+    """The errno of the failing disk behind an error or its causes, or None."""
+    seen: BaseException | None = error
+    while seen is not None:
+        if isinstance(seen, OSError) and seen.errno in REASONS:
+            return seen.errno
+        if found := _FOREIGN_CODE.search(str(seen)):
+            code = int(found[1] or found[2])
+            return code if code in REASONS else None
+        seen = seen.__cause__
+    return None

@@ -1,0 +1,73 @@
+"""Locks between processes that die with their holder.
+
+`flock` on a small file: the kernel drops it when the process ends, however it ends, so a killed
+run never blocks the next one. Lock files are left in place: deleting them would let two processes
+hold locks on two files of one name.
+"""
+
+import fcntl
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from catalog.errors import storage_errors
+
+POLL_S = 0.2
+
+
+@contextmanager
+def held_lock(path: Path, *, on_wait: Callable[[str], None] | None = None) -> Iterator[bool]:
+    """Hold the lock while the block runs; wait for as long as another process holds it.
+
+    Args:
+        path: the lock file, made if absent.
+        on_wait: called once, with the holder's process id as text, when the lock is taken.
+
+    Yields:
+        Whether another holder had to be waited for.
+
+    Raises:
+        StorageError: the lock file cannot be made.
+    """
+    with storage_errors(f"cannot lock {path}"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        waited = _acquire(descriptor, on_wait)
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, str(os.getpid()).encode(), 0)
+        yield waited
+    finally:
+        os.close(descriptor)  # closing the only descriptor releases the lock
+
+
+def is_locked(path: Path) -> bool:
+    """Whether some process holds the lock right now."""
+    if not path.exists():
+        return False
+    descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+    try:
+        return not _try_acquire(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _acquire(descriptor: int, on_wait: Callable[[str], None] | None) -> bool:
+    if _try_acquire(descriptor):
+        return False
+    if on_wait is not None:
+        on_wait(os.pread(descriptor, 32, 0).decode(errors="replace") or "unknown")
+    # polling, not a blocking flock: Ctrl-C is then answered at once, in any thread
+    while not _try_acquire(descriptor):
+        time.sleep(POLL_S)
+    return True
+
+
+def _try_acquire(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True

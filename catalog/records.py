@@ -1,0 +1,120 @@
+"""Rows of the catalog and their deterministic ids."""
+
+import platform
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from typing import Any, Literal
+
+from catalog.artefacts import ArtefactRef, Manifest
+from catalog.digests import canonical_json, digest_text
+
+RunStatus = Literal["running", "complete", "failed"]
+RUN_ID_LENGTH = 16
+
+
+def run_id_of(scene_digest: str, parameters: Any, source_digest: str) -> str:  # noqa: ANN401
+    """The id of a run: the same scene content, parameters and library make the same run."""
+    return digest_text(canonical_json([scene_digest, parameters, source_digest]))[:RUN_ID_LENGTH]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneRecord:
+    """A row of the table `scenes`; the columns say what each field means."""
+
+    scene_id: str
+    dataset: str
+    sequence: str
+    content_digest: str
+    licence: str
+    path: str
+    num_frames: int
+    num_views: int
+    cameras: tuple[str, ...]
+    num_points: int
+    num_actors: int
+    num_moving_actors: int
+    duration_s: float
+    num_bytes: int
+    software_version: str
+
+    def row(self) -> dict[str, Any]:
+        """The row."""
+        return {**asdict(self), "cameras": list(self.cameras)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunRecord:
+    """A row of the table `runs`; the columns say what each field means."""
+
+    run_id: str
+    scene_id: str
+    scene_digest: str
+    preset: str
+    painter: str
+    parameters: str
+    source_digest: str
+    software_version: str
+    started_at: datetime
+    device: str
+    status: RunStatus = "running"
+    error: str | None = None
+    finished_at: datetime | None = None
+    stage_seconds: str | None = None
+    peak_memory_bytes: int | None = None
+    num_gaussians: int | None = None
+    artefacts: tuple[str, ...] = ()
+    result: str | None = None
+    report: str | None = None
+
+    def row(self) -> dict[str, Any]:
+        """The row."""
+        finished_at = self.finished_at
+        return {
+            **asdict(self),
+            "artefacts": list(self.artefacts),
+            "seconds": (finished_at - self.started_at).total_seconds() if finished_at else None,
+            "host": platform.node(),
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricRecord:
+    """A row of the table `metrics`; the columns say what each field means."""
+
+    run_id: str
+    scene_id: str
+    protocol: str
+    trajectory: str
+    variant: str
+    name: str
+    value: float | None
+    reason: str | None = None
+
+    def row(self) -> dict[str, Any]:
+        """The row."""
+        names = [self.run_id, self.protocol, self.trajectory, self.variant, self.name]
+        return {"metric_id": digest_text(canonical_json(names)), **asdict(self)}
+
+
+def artefact_row(ref: ArtefactRef, manifest: Manifest) -> dict[str, Any]:
+    """The row of the table `artefacts` for a stored artefact."""
+    return {
+        "artefact_id": ref.artefact_id,
+        "kind": ref.kind,
+        "digest": ref.digest,
+        "inputs": canonical_json(manifest.inputs),
+        "config": canonical_json(manifest.config),
+        "source_digest": manifest.source_digest,
+        "path": ref.path,
+        "num_bytes": manifest.num_bytes,
+        "seconds": manifest.seconds,
+        "created_at": datetime.fromisoformat(manifest.created_at),
+        "summary": canonical_json(manifest.summary),
+        "software_version": manifest.software_version,
+    }
+
+
+def metric_rows(records: Iterable[MetricRecord]) -> list[Mapping[str, Any]]:
+    """Rows of many metrics."""
+    return [record.row() for record in records]

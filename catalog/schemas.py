@@ -1,0 +1,156 @@
+"""The catalog's tables: every column once, with its type, unit and meaning."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import pyarrow as pa
+
+ColumnType = Literal["text", "integer", "number", "flag", "time", "texts"]
+
+ARROW_TYPES: dict[ColumnType, pa.DataType] = {
+    "text": pa.string(),
+    "integer": pa.int64(),
+    "number": pa.float64(),
+    "flag": pa.bool_(),
+    "time": pa.timestamp("us", tz="UTC"),
+    "texts": pa.list_(pa.string()),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One column of a table."""
+
+    name: str
+    type: ColumnType
+    description: str
+    unit: str = ""
+
+    @property
+    def arrow(self) -> pa.Field:
+        """The Arrow field, with unit and description as metadata."""
+        metadata = {"description": self.description, "unit": self.unit}
+        return pa.field(self.name, ARROW_TYPES[self.type], metadata=metadata)
+
+
+@dataclass(frozen=True, slots=True)
+class TableSchema:
+    """One table; its first column is the deterministic id that rows are merged on."""
+
+    name: str
+    description: str
+    columns: tuple[Column, ...]
+
+    @property
+    def key(self) -> str:
+        """Name of the id column."""
+        return self.columns[0].name
+
+    @property
+    def arrow(self) -> pa.Schema:
+        """The Arrow schema."""
+        return pa.schema([column.arrow for column in self.columns])
+
+
+SCENES = TableSchema(
+    "scenes",
+    "Driving sequences in the store, in the canonical form.",
+    (
+        Column("scene_id", "text", "dataset/sequence"),
+        Column("dataset", "text", "where the log comes from"),
+        Column("sequence", "text", "name of the log in its dataset"),
+        Column("content_digest", "text", "digest of everything the stored scene holds"),
+        Column("licence", "text", "terms of the data"),
+        Column("path", "text", "folder of the scene"),
+        Column("num_frames", "integer", "frames"),
+        Column("num_views", "integer", "camera pictures"),
+        Column("cameras", "texts", "names of the cameras"),
+        Column("num_points", "integer", "LiDAR points of all sweeps"),
+        Column("num_actors", "integer", "annotated tracks"),
+        Column("num_moving_actors", "integer", "annotated tracks that move"),
+        Column("duration_s", "number", "first frame to last frame", "s"),
+        Column("num_bytes", "integer", "size on disk", "byte"),
+        Column("software_version", "text", "version that last recorded it"),
+    ),
+)
+
+RUNS = TableSchema(
+    "runs",
+    "Reconstructions: one row for one scene content, parameters and source of the library.",
+    (
+        Column("run_id", "text", "digest of scene content, parameters and library source"),
+        Column("scene_id", "text", "dataset/sequence"),
+        Column("scene_digest", "text", "content digest of the scene it was run on"),
+        Column("preset", "text", "name of the preset it started from"),
+        Column("painter", "text", "name of the painter, or none"),
+        Column("parameters", "text", "all parameters, canonical JSON"),
+        Column("status", "text", "running, complete or failed"),
+        Column("error", "text", "why it failed"),
+        Column("started_at", "time", "when it was last started"),
+        Column("finished_at", "time", "when it was last finished"),
+        Column("seconds", "number", "wall time of the last start, start to end", "s"),
+        Column("stage_seconds", "text", "wall time by stage as computed, JSON", "s"),
+        Column("peak_memory_bytes", "integer", "largest resident memory of any stage", "byte"),
+        Column("num_gaussians", "integer", "Gaussians of the final scene"),
+        Column("device", "text", "what the fit ran on"),
+        Column("host", "text", "machine it ran on"),
+        Column("artefacts", "texts", "kind/digest of everything it made or reused"),
+        Column("result", "text", "what `reconstruct --json` printed, JSON"),
+        Column("report", "text", "path of the report"),
+        Column("software_version", "text", "version of lidarpainter"),
+        Column("source_digest", "text", "digest of the library source"),
+    ),
+)
+
+ARTEFACTS = TableSchema(
+    "artefacts",
+    "What the stages made: content-addressed folders with a manifest.",
+    (
+        Column("artefact_id", "text", "kind/digest"),
+        Column("kind", "text", "which stage made it"),
+        Column("digest", "text", "digest of inputs, configuration and source"),
+        Column("inputs", "text", "digest of every input by its part, JSON"),
+        Column("config", "text", "configuration of the stage, canonical JSON"),
+        Column("source_digest", "text", "digest of the library source it was made with"),
+        Column("path", "text", "folder of the artefact"),
+        Column("num_bytes", "integer", "size of its files", "byte"),
+        Column("seconds", "number", "wall time of the process that finished it", "s"),
+        Column("created_at", "time", "when it was finished"),
+        Column("summary", "text", "what the stage said about its result, JSON"),
+        Column("software_version", "text", "version of lidarpainter"),
+    ),
+)
+
+METRICS = TableSchema(
+    "metrics",
+    "One number of one run: what was measured, against which truth, before or after painting.",
+    (
+        Column("metric_id", "text", "digest of the run and the four columns that name the number"),
+        Column("run_id", "text", "the run"),
+        Column("scene_id", "text", "dataset/sequence"),
+        Column("protocol", "text", "which truth: recorded, truth, cross-camera, forward, depth"),
+        Column("trajectory", "text", "where the camera was: recorded, left-2m, up-1.5m, ..."),
+        Column("variant", "text", "unpainted, painted, or painted at view time"),
+        Column("name", "text", "what was measured: psnr, ssim, ..."),
+        Column("value", "number", "the number, or null with a reason", "see name"),
+        Column("reason", "text", "why there is no number"),
+    ),
+)
+
+PAINTERS = TableSchema(
+    "painters",
+    "Trained painters.",
+    (
+        Column("painter_id", "text", "digest of the weights file"),
+        Column("name", "text", "name of the painter"),
+        Column("path", "text", "weights file"),
+        Column("num_bytes", "integer", "size of the weights", "byte"),
+        Column("record", "text", "how it was trained, JSON"),
+        Column("created_at", "time", "when training ended"),
+        Column("software_version", "text", "version of lidarpainter"),
+    ),
+)
+
+TABLES: dict[str, TableSchema] = {
+    table.name: table for table in (SCENES, RUNS, ARTEFACTS, METRICS, PAINTERS)
+}

@@ -1,0 +1,102 @@
+"""Where everything is: one folder with scenes, artefacts, tables and locks."""
+
+import os
+import re
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from catalog.artefacts import ArtefactStore
+from catalog.errors import CatalogError, UnknownRecordError, storage_errors
+from catalog.locks import held_lock
+from catalog.tables import CatalogTables, Row
+
+STORE_ENVIRONMENT = "LIDARPAINTER_STORE"
+DEFAULT_STORE = "lidarpainter-store"
+LATEST = "latest"
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+
+
+@dataclass(frozen=True)
+class Store:
+    """A LidarPainter store."""
+
+    root: Path
+
+    @cached_property
+    def artefacts(self) -> ArtefactStore:
+        """The content-addressed artefacts."""
+        return ArtefactStore(self.root)
+
+    @cached_property
+    def tables(self) -> CatalogTables:
+        """The catalog's tables."""
+        return CatalogTables(str(self.root / "tables"))
+
+    def scene_folder(self, scene_id: str) -> Path:
+        """Folder of the scene `<dataset>/<sequence>`, whether it exists or not.
+
+        Raises:
+            UnknownRecordError: the id is no dataset and sequence, or tries to leave the store.
+        """
+        dataset, sequence = split_scene_id(scene_id)
+        return self.root / "scenes" / dataset / sequence
+
+    def scene_lock(
+        self, scene_id: str, *, on_wait: Callable[[str], None] | None = None
+    ) -> AbstractContextManager[bool]:
+        """The lock that whoever writes this scene must hold."""
+        dataset, sequence = split_scene_id(scene_id)
+        return held_lock(self.root / "locks" / f"scene-{dataset}-{sequence}.lock", on_wait=on_wait)
+
+    def run_folder(self, run_id: str) -> Path:
+        """Folder for what a user may look for by run: reports, rendered trajectories."""
+        return self.root / "runs" / run_id
+
+    def run(self, run_id: str) -> Row:
+        """The row of a run by id, unique prefix, or `latest` (the last that completed).
+
+        Raises:
+            UnknownRecordError: there is no such run.
+        """
+        if run_id != LATEST:
+            return self.tables.row("runs", run_id)
+        complete = [row for row in self.tables.rows("runs") if row["status"] == "complete"]
+        if not complete:
+            raise UnknownRecordError(f"no complete run in {self.root}")
+        return max(complete, key=lambda row: row["finished_at"])
+
+
+def open_store(path: Path | str | None = None) -> Store:
+    """The store at a path, else at `LIDARPAINTER_STORE`, else at `./lidarpainter-store`.
+
+    Made if absent.
+
+    Raises:
+        CatalogError: something that is not a folder is in the way.
+        StorageError: the folder cannot be made.
+    """
+    chosen = Path(path or os.environ.get(STORE_ENVIRONMENT) or DEFAULT_STORE).expanduser()
+    root = chosen.absolute()
+    if root.exists() and not root.is_dir():
+        raise CatalogError(f"the store {root} is a file, expected a folder")
+    with storage_errors(f"cannot make the store {root}"):
+        root.mkdir(parents=True, exist_ok=True)
+    return Store(root)
+
+
+def split_scene_id(scene_id: str) -> tuple[str, str]:
+    """Dataset and sequence of a scene id.
+
+    Raises:
+        UnknownRecordError: the id is not `<dataset>/<sequence>` of plain names.
+    """
+    parts = scene_id.split("/")
+    if len(parts) != 2 or not all(_NAME.fullmatch(part) for part in parts):
+        raise UnknownRecordError(
+            f"{scene_id!r} is no scene id, expected dataset/sequence such as pandaset/002"
+        )
+    return parts[0], parts[1]

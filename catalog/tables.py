@@ -1,0 +1,151 @@
+"""Delta Lake tables with deterministic ids: merging the same row twice changes nothing.
+
+Writers take no lock: Delta Lake commits are optimistic, the loser of a race reloads and tries
+again, a bounded number of times with growing, jittered pauses. The root is a folder or a URI such
+as `s3://bucket/store`.
+"""
+
+import random
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import pyarrow as pa
+from deltalake import DeltaTable, Field
+from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
+
+from catalog.errors import ConflictError, UnknownRecordError, storage_errors
+from catalog.schemas import TABLES, TableSchema
+
+COMMIT_ATTEMPTS = 25
+FIRST_PAUSE_S = 0.05
+LONGEST_PAUSE_S = 2.0
+
+Row = dict[str, Any]
+
+
+class CatalogTables:
+    """The tables below one root."""
+
+    def __init__(self, root: str, *, storage_options: Mapping[str, str] | None = None) -> None:
+        self.root = root.rstrip("/")
+        self.storage_options = dict(storage_options or {})
+
+    def merge(self, table: str, rows: Sequence[Row]) -> None:
+        """Insert rows, or replace those with the same id; all of them or none.
+
+        Raises:
+            ValueError: a row has a column the table lacks, or two rows share an id.
+            ConflictError: other writers won every attempt.
+            StorageError: the table cannot be written.
+        """
+        if not rows:
+            return
+        schema = _schema(table)
+        source = _as_arrow(schema, rows)
+        with storage_errors(f"cannot write table {self._uri(schema)}"):
+            for attempt in range(COMMIT_ATTEMPTS):
+                if attempt:
+                    pause_s = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2**attempt)
+                    time.sleep(pause_s * random.random())  # noqa: S311 - jitter, not a secret
+                if self._try_merge(schema, source):
+                    return
+        raise ConflictError(
+            f"table {self._uri(schema)} had other writers in {COMMIT_ATTEMPTS} attempts"
+        )
+
+    def rows(self, table: str) -> list[Row]:
+        """All rows of a table, by id; none if nothing was ever written."""
+        arrow = self.arrow(table)
+        return arrow.sort_by(_schema(table).key).to_pylist()
+
+    def arrow(self, table: str) -> pa.Table:
+        """A table as Arrow, with exactly the columns of its schema."""
+        schema = _schema(table)
+        with storage_errors(f"cannot read table {self._uri(schema)}"):
+            try:
+                found = DeltaTable(self._uri(schema), storage_options=self.storage_options)
+            except TableNotFoundError:
+                return schema.arrow.empty_table()
+            stored = found.to_pyarrow_table()
+        columns = [
+            stored[field.name].cast(field.type)
+            if field.name in stored.column_names
+            else pa.nulls(stored.num_rows, field.type)
+            for field in schema.arrow
+        ]
+        return pa.table(columns, schema=schema.arrow)
+
+    def row(self, table: str, id_or_prefix: str) -> Row:
+        """The one row with this id, or whose id starts with it.
+
+        Raises:
+            UnknownRecordError: none matches, or more than one.
+        """
+        key = _schema(table).key
+        rows = self.rows(table)
+        exact = [row for row in rows if row[key] == id_or_prefix]
+        matches = exact or [row for row in rows if row[key].startswith(id_or_prefix)]
+        if len(matches) == 1:
+            return matches[0]
+        if not matches:
+            raise UnknownRecordError(f"no {key} {id_or_prefix!r} among {len(rows)} {table}")
+        ids = ", ".join(row[key] for row in matches[:5])
+        raise UnknownRecordError(f"{key} {id_or_prefix!r} is not unique: {ids}")
+
+    def _uri(self, schema: TableSchema) -> str:
+        return f"{self.root}/{schema.name}"
+
+    def _try_merge(self, schema: TableSchema, source: pa.Table) -> bool:
+        """One commit; whether it won."""
+        key = schema.key
+        try:
+            target = self._opened(schema)
+            merger = target.merge(
+                source,
+                predicate=f"target.{key} = source.{key}",
+                source_alias="source",
+                target_alias="target",
+            )
+            merger.when_matched_update_all().when_not_matched_insert_all().execute()
+        except CommitFailedError:
+            return False
+        except DeltaError as error:
+            if "version already exists" in str(error).lower():  # lost the race to create it
+                return False
+            raise
+        return True
+
+    def _opened(self, schema: TableSchema) -> DeltaTable:
+        """The table, made if absent and given the columns that newer software added."""
+        table = DeltaTable.create(
+            self._uri(schema),
+            schema=schema.arrow,
+            mode="ignore",
+            name=schema.name,
+            description=schema.description,
+            storage_options=self.storage_options,
+        )
+        known = {field.name for field in table.schema().fields}
+        if missing := [column for column in schema.columns if column.name not in known]:
+            table.alter.add_columns([Field.from_arrow(column.arrow) for column in missing])
+            table = DeltaTable(self._uri(schema), storage_options=self.storage_options)
+        return table
+
+
+def _schema(table: str) -> TableSchema:
+    try:
+        return TABLES[table]
+    except KeyError:
+        raise UnknownRecordError(f"no table {table!r}; there are {', '.join(TABLES)}") from None
+
+
+def _as_arrow(schema: TableSchema, rows: Sequence[Row]) -> pa.Table:
+    names = set(schema.arrow.names)
+    for row in rows:
+        if unknown := sorted(set(row) - names):
+            raise ValueError(f"table {schema.name} has no column {', '.join(unknown)}")
+    ids = [row[schema.key] for row in rows]
+    if len(set(ids)) != len(ids):
+        raise ValueError(f"two rows for table {schema.name} share a {schema.key}")
+    return pa.Table.from_pylist(list(rows), schema=schema.arrow)

@@ -1,0 +1,97 @@
+"""A store is one folder, and names never lead out of it."""
+
+from datetime import UTC, datetime
+
+import pytest
+
+from catalog.errors import CatalogError, StorageError, UnknownRecordError
+from catalog.records import MetricRecord, RunRecord, run_id_of
+from catalog.store import STORE_ENVIRONMENT, open_store
+
+
+def run_record(run_id="r1", **changes):
+    values = {
+        "run_id": run_id,
+        "scene_id": "synthetic/street-0001",
+        "scene_digest": "d",
+        "preset": "preview",
+        "painter": "none",
+        "parameters": "{}",
+        "source_digest": "s",
+        "software_version": "0.1.0",
+        "started_at": datetime(2026, 1, 1, tzinfo=UTC),
+        "device": "cpu",
+    }
+    return RunRecord(**{**values, **changes})
+
+
+def test_a_given_path_wins_over_the_environment(tmp_path, monkeypatch):
+    monkeypatch.setenv(STORE_ENVIRONMENT, str(tmp_path / "environment"))
+    assert open_store(tmp_path / "given").root == tmp_path / "given"
+    assert open_store().root == tmp_path / "environment"
+    monkeypatch.delenv(STORE_ENVIRONMENT)
+    monkeypatch.chdir(tmp_path)
+    assert open_store().root == tmp_path / "lidarpainter-store"
+
+
+def test_a_file_in_the_place_of_the_store_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CatalogError, match="is a file, expected a folder"):
+        open_store(tmp_path / "file")
+    with pytest.raises(StorageError, match="cannot make the store"):
+        open_store(tmp_path / "file" / "store")
+
+
+@pytest.mark.parametrize(
+    "scene_id", ["pandaset", "pandaset/../../etc", "../x", "a/b/c", "a/", "/a", "a/.b", ""]
+)
+def test_scene_ids_cannot_leave_the_store(tmp_path, scene_id):
+    with pytest.raises(UnknownRecordError, match="no scene id"):
+        open_store(tmp_path).scene_folder(scene_id)
+
+
+def test_a_scene_has_its_folder(tmp_path):
+    folder = open_store(tmp_path).scene_folder("pandaset/002")
+    assert folder == tmp_path / "scenes" / "pandaset" / "002"
+
+
+def test_latest_is_the_run_that_completed_last(tmp_path):
+    store = open_store(tmp_path)
+    with pytest.raises(UnknownRecordError, match="no complete run"):
+        store.run("latest")
+    records = [
+        run_record("early", status="complete", finished_at=datetime(2026, 1, 2, tzinfo=UTC)),
+        run_record("late", status="complete", finished_at=datetime(2026, 1, 3, tzinfo=UTC)),
+        run_record("newest-but-running"),
+    ]
+    store.tables.merge("runs", [record.row() for record in records])
+    assert store.run("latest")["run_id"] == "late"
+    assert store.run("ear")["seconds"] == 86_400.0
+
+
+def test_run_ids_follow_content_parameters_and_source():
+    ids = {
+        run_id_of("scene", {"steps": 1}, "source"),
+        run_id_of("scene", {"steps": 1}, "other"),
+        run_id_of("scene", {"steps": 2}, "source"),
+        run_id_of("other", {"steps": 1}, "source"),
+    }
+    assert len(ids) == 4
+    assert run_id_of("scene", {"steps": 1}, "source") in ids
+
+
+def test_a_metric_has_one_id_per_place_and_variant():
+    def row(**changes):
+        values = {
+            "run_id": "r",
+            "scene_id": "s",
+            "protocol": "truth",
+            "trajectory": "left-2m",
+            "variant": "painted",
+            "name": "psnr",
+            "value": 21.5,
+        }
+        return MetricRecord(**{**values, **changes}).row()
+
+    assert row(value=3.0)["metric_id"] == row()["metric_id"]
+    assert row(variant="unpainted")["metric_id"] != row()["metric_id"]

@@ -1,0 +1,111 @@
+"""Tables merge on their id, whoever writes and how often."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+from deltalake import write_deltalake
+
+from catalog.errors import StorageError, UnknownRecordError
+from catalog.schemas import TABLES
+from catalog.tables import CatalogTables
+
+ROOT = Path(__file__).resolve().parents[2]
+WRITER = """
+import sys
+from catalog.tables import CatalogTables
+tables, writer = CatalogTables(sys.argv[1]), sys.argv[2]
+for number in range(4):
+    tables.merge("metrics", [
+        {"metric_id": f"{writer}-{number}", "name": "psnr", "value": float(number)},
+        {"metric_id": "shared", "name": "psnr", "value": 1.0},
+    ])
+"""
+
+
+@pytest.fixture
+def tables(tmp_path):
+    return CatalogTables(str(tmp_path / "tables"))
+
+
+def test_merging_twice_changes_nothing(tables):
+    row = {"run_id": "a", "scene_id": "synthetic/street-0001", "artefacts": ["fit/1"]}
+    tables.merge("runs", [row])
+    before = tables.rows("runs")
+    tables.merge("runs", [row])
+    assert tables.rows("runs") == before
+    assert len(before) == 1
+
+
+def test_a_row_with_a_known_id_is_replaced_and_others_stay(tables):
+    tables.merge("runs", [{"run_id": "a", "status": "running"}, {"run_id": "b"}])
+    tables.merge("runs", [{"run_id": "a", "status": "complete"}])
+    assert [(row["run_id"], row["status"]) for row in tables.rows("runs")] == [
+        ("a", "complete"),
+        ("b", None),
+    ]
+
+
+def test_a_table_never_written_is_empty(tables):
+    assert tables.rows("scenes") == []
+    tables.merge("scenes", [])
+    assert tables.rows("scenes") == []
+
+
+def test_every_column_has_a_description_and_ids_come_first():
+    for table in TABLES.values():
+        assert all(column.description for column in table.columns)
+        assert table.key.endswith("_id")
+        assert len({column.name for column in table.columns}) == len(table.columns)
+
+
+def test_descriptions_are_stored_with_the_columns(tables):
+    tables.merge("scenes", [{"scene_id": "a/b"}])
+    field = tables.arrow("scenes").schema.field("duration_s")
+    assert field.metadata[b"unit"] == b"s"
+
+
+def test_a_unique_prefix_finds_a_row(tables):
+    tables.merge("runs", [{"run_id": "abc"}, {"run_id": "abd"}, {"run_id": "ab"}])
+    assert tables.row("runs", "abc")["run_id"] == "abc"
+    assert tables.row("runs", "ab")["run_id"] == "ab"
+    with pytest.raises(UnknownRecordError, match="not unique"):
+        tables.row("runs", "a")
+    with pytest.raises(UnknownRecordError, match="no run_id 'x' among 3 runs"):
+        tables.row("runs", "x")
+
+
+def test_unknown_columns_and_repeated_ids_are_refused(tables):
+    with pytest.raises(ValueError, match="no column colour"):
+        tables.merge("runs", [{"run_id": "a", "colour": "red"}])
+    with pytest.raises(ValueError, match="share a run_id"):
+        tables.merge("runs", [{"run_id": "a"}, {"run_id": "a"}])
+    assert tables.rows("runs") == []
+
+
+def test_a_table_of_older_software_gets_the_new_columns(tables):
+    old = pa.table({"painter_id": ["a"], "name": ["nano"]})
+    write_deltalake(f"{tables.root}/painters", old)
+    assert tables.row("painters", "a")["num_bytes"] is None
+    tables.merge("painters", [{"painter_id": "b", "num_bytes": 5}])
+    assert [row["num_bytes"] for row in tables.rows("painters")] == [None, 5]
+
+
+def test_four_processes_at_once_lose_nothing(tables):
+    writers = [
+        subprocess.Popen([sys.executable, "-c", WRITER, tables.root, str(index)], cwd=ROOT)
+        for index in range(4)
+    ]
+    assert [writer.wait(timeout=60) for writer in writers] == [0] * 4
+    ids = [row["metric_id"] for row in tables.rows("metrics")]
+    expected = sorted([f"{writer}-{number}" for writer in range(4) for number in range(4)])
+    assert ids == [*expected, "shared"]
+
+
+def test_a_table_that_cannot_be_written_is_a_storage_error(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    tables = CatalogTables(str(tmp_path / "file"))
+    with pytest.raises(StorageError, match="cannot write table"):
+        tables.merge("runs", [{"run_id": "a"}])
