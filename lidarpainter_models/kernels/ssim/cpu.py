@@ -58,7 +58,8 @@ class _SsimMap(torch.autograd.Function):
         return torch.from_numpy(similarity).view(first_rgb.shape)
 
     @staticmethod
-    def backward(ctx: BackwardCFunction, gradient: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: BackwardCFunction, *grad_outputs: Tensor) -> tuple[Tensor, None]:
+        (gradient,) = grad_outputs
         first, second = (_rows(picture) for picture in ctx.saved_tensors)
         _, partials = _partial_rows(_blurred_along_rows(first, second), _rows(gradient))
         gradient_first = _gradient_rows(first, second, partials)
@@ -90,9 +91,9 @@ class _L1SsimLoss(torch.autograd.Function):
         return torch.tensor(loss, dtype=torch.float32)
 
     @staticmethod
-    def backward(ctx: BackwardCFunction, gradient: Tensor) -> tuple[Tensor, None, None, None]:
+    def backward(ctx: BackwardCFunction, *grad_outputs: Tensor) -> tuple[Tensor, None, None, None]:
         (gradient_of_unit,) = ctx.saved_tensors
-        return gradient_of_unit * gradient, None, None, None
+        return gradient_of_unit * grad_outputs[0], None, None, None
 
 
 def _rows(picture: Tensor) -> np.ndarray:

@@ -1,0 +1,122 @@
+import numba
+import pytest
+import torch
+
+from lidarpainter_models.errors import ShapeError
+from lidarpainter_models.kernels.point_splat import splat_points
+
+
+def random_splat(num_points, seed, *, height_px=37, width_px=53, max_radius_px=3):
+    """Points in and around the picture, many at equal depth, some behind or not finite."""
+    generator = torch.Generator().manual_seed(seed)
+    u = torch.randint(-6, width_px + 6, (num_points,), generator=generator)
+    v = torch.randint(-6, height_px + 6, (num_points,), generator=generator)
+    depth_m = torch.randint(-1, 20, (num_points,), generator=generator) / 2.0
+    depth_m[::17] = torch.inf
+    depth_m[5::29] = torch.nan
+    return {
+        "pixels_uv": torch.stack([u, v], dim=-1),
+        "depth_m": depth_m,
+        "radius_px": torch.randint(0, max_radius_px + 1, (num_points,), generator=generator),
+        "height_px": height_px,
+        "width_px": width_px,
+    }
+
+
+@pytest.mark.parametrize("num_points", [0, 1, 255, 256, 257, 20_000])
+def test_fast_splat_keeps_the_same_points(num_points):
+    inputs = random_splat(num_points, seed=num_points)
+    expected = splat_points(**inputs, backend="reference")
+    actual = splat_points(**inputs, backend="cpu")
+    assert torch.equal(actual, expected)  # a selection, so no tolerance
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize(("radius_px", "covered"), [(0, 1), (1, 9), (2, 21), (3, 37)])
+def test_a_disc_covers_its_pixels(radius_px, covered, backend):
+    picture = splat_points(
+        torch.tensor([[5, 4]]),
+        torch.tensor([2.0]),
+        height_px=10,
+        width_px=11,
+        radius_px=radius_px,
+        backend=backend,
+    )
+    assert int((picture == 0).sum()) == covered
+    assert picture[4, 5] == 0
+    assert picture[4, 5 + radius_px] == 0
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_the_nearest_point_wins_and_ties_go_to_the_lower_index(backend):
+    pixels = torch.tensor([[1, 1], [1, 1], [1, 1], [0, 0], [0, 0]])
+    depth_m = torch.tensor([3.0, 2.0, 2.0, 7.0, -1.0])
+    picture = splat_points(pixels, depth_m, height_px=2, width_px=2, backend=backend)
+    assert picture.tolist() == [[3, -1], [-1, 1]]
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_a_near_point_grows_over_its_neighbours(backend):
+    pixels, depth_m = torch.tensor([[2, 2], [3, 2], [5, 2]]), torch.tensor([1.0, 5.0, 5.0])
+    radius_px = torch.tensor([1, 0, 0])
+    picture = splat_points(
+        pixels, depth_m, height_px=5, width_px=6, radius_px=radius_px, backend=backend
+    )
+    assert picture[2].tolist() == [-1, 0, 0, 0, -1, 2]
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_a_point_outside_still_reaches_into_the_picture(backend):
+    picture = splat_points(
+        torch.tensor([[-1, 1]]),
+        torch.tensor([1.0]),
+        height_px=3,
+        width_px=3,
+        radius_px=1,
+        backend=backend,
+    )
+    assert picture.tolist() == [[0, -1, -1]] * 3
+
+
+def test_the_number_of_threads_changes_nothing():
+    inputs = random_splat(5000, seed=4)
+    threads = numba.get_num_threads()
+    try:
+        pictures = []
+        for num_threads in (1, min(2, numba.config.NUMBA_NUM_THREADS)):
+            numba.set_num_threads(num_threads)
+            pictures.append(splat_points(**inputs, backend="cpu"))
+    finally:
+        numba.set_num_threads(threads)
+    assert torch.equal(*pictures)
+
+
+def test_strided_and_float64_points_are_taken_as_they_are():
+    inputs = random_splat(300, seed=5)
+    strided = inputs | {
+        "pixels_uv": inputs["pixels_uv"].T.contiguous().T,
+        "depth_m": inputs["depth_m"].double(),
+        "radius_px": inputs["radius_px"].int(),
+    }
+    assert torch.equal(splat_points(**strided), splat_points(**inputs))
+
+
+def test_points_that_do_not_fit_together_are_refused():
+    with pytest.raises(ShapeError, match="one depth per point"):
+        splat_points(torch.zeros(3, 2, dtype=torch.int64), torch.ones(2), height_px=2, width_px=2)
+    with pytest.raises(ShapeError, match="one radius per point"):
+        splat_points(
+            torch.zeros(2, 2, dtype=torch.int64),
+            torch.ones(2),
+            height_px=2,
+            width_px=2,
+            radius_px=torch.zeros(3, dtype=torch.int64),
+        )
+    with pytest.raises(ShapeError, match=">= 0"):
+        splat_points(
+            torch.zeros(1, 2, dtype=torch.int64),
+            torch.ones(1),
+            height_px=2,
+            width_px=2,
+            radius_px=-1,
+        )
