@@ -1,0 +1,142 @@
+"""Draw 3D Gaussians into a picture and carry gradients back (Kerbl et al. 2023).
+
+Gaussians live in *bodies*: body 0 is the street (the world frame), the others are actors in their
+box frames; `camera_from_body` places each. The camera frame is x right, y down, z forward; lengths
+are metres; the top-left pixel has its centre at (0.5, 0.5).
+"""
+
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lidarpainter_models.errors import ShapeError
+from lidarpainter_models.kernels.backends import Backend, implementation
+from lidarpainter_models.kernels.gaussian_raster.splat_inputs import SplatInputs, SplatView
+
+__all__ = ["SplatImage", "render_gaussians"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SplatImage:
+    """What the blended Gaussians show, and what densification needs to know about them.
+
+    With a_i the alpha of the i-th Gaussian from the front and T_i the light that reaches it, each
+    picture is a sum over Gaussians of a_i T_i times the Gaussian's own value.
+    """
+
+    rgb: Float[Tensor, "height width 3"]
+    """Colour, without background."""
+    depth_m: Float[Tensor, "height width"]
+    """Camera z of the Gaussians' centres; accumulated, not divided by alpha."""
+    alpha: Float[Tensor, "height width"]
+    """One minus the light that passes everything."""
+    features: Float[Tensor, "height width features"]
+    """The given features; zero channels if none were given."""
+    visible: Bool[Tensor, " gaussians"]
+    """Whether the Gaussian can reach any pixel; carries no gradient."""
+    radius_px: Float[Tensor, " gaussians"]
+    """Three standard deviations along the footprint's longer axis; 0 where not visible."""
+
+
+def render_gaussians(  # noqa: PLR0913 - the one door to the kernel; the scalars are the camera
+    means: Float[Tensor, "gaussians 3"],
+    rotation_wxyz: Float[Tensor, "gaussians 4"],
+    scale_m: Float[Tensor, "gaussians 3"],
+    opacity: Float[Tensor, " gaussians"],
+    sh: Float[Tensor, "gaussians coefficients 3"],
+    body_index: Int[Tensor, " gaussians"],
+    camera_from_body: Float[Tensor, "bodies 4 4"],
+    *,
+    fx_px: float,
+    fy_px: float,
+    cx_px: float,
+    cy_px: float,
+    width_px: int,
+    height_px: int,
+    features: Float[Tensor, "gaussians features"] | None = None,
+    near_m: float = 0.1,
+    blur_px2: float = 0.3,
+    antialias: bool = False,
+    screen_offset: Float[Tensor, "gaussians 2"] | None = None,
+    screen_gradient_out: Float[Tensor, " gaussians"] | None = None,
+    backend: Backend = "auto",
+) -> SplatImage:
+    """Blend Gaussians front to back.
+
+    Gradients flow to every float tensor. A Gaussian whose centre is nearer than `near_m`, or whose
+    values are not finite, is left out; equal depths are drawn in the order of their index.
+
+    Args:
+        means: centres in the frame of the Gaussian's body, metres.
+        rotation_wxyz: body-from-Gaussian rotation as a quaternion of any length above zero.
+        scale_m: standard deviations along the Gaussian's own axes, above zero.
+        opacity: 0 to 1.
+        sh: spherical harmonics of degree 0 to 3 (1, 4, 9 or 16 coefficients), in the order and
+            signs of Kerbl et al.; colour is 0.5 plus their sum, not under 0. The direction runs
+            from the camera to the centre, in the frame of the body.
+        body_index: which body a Gaussian belongs to.
+        camera_from_body: rigid transforms of this view.
+        fx_px: focal length; with `fy_px`, `cx_px`, `cy_px` a pinhole camera.
+        fy_px: see `fx_px`.
+        cx_px: principal point from the picture's left edge.
+        cy_px: principal point from the picture's top edge.
+        width_px: size of the picture.
+        height_px: size of the picture.
+        features: further values to blend like colours.
+        near_m: Gaussians with a smaller camera z are not drawn.
+        blur_px2: added to the variance of every footprint, so that none is thinner than a pixel.
+        antialias: dim a Gaussian by what `blur_px2` widened it (Yu et al. 2024, "Mip-Splatting").
+        screen_offset: added to the projected centres, pixels; a leaf of zeros receives the
+            gradient with respect to them.
+        screen_gradient_out: overwritten by every backward pass with the length of
+            (sum over pixels of |dL/dx|, of |dL/dy|), x and y being the projected centre in pixels
+            (Ye et al. 2024, "AbsGS").
+        backend: which implementation draws.
+
+    Raises:
+        ShapeError: the tensors do not belong together.
+        ConfigError: the camera or a setting makes no sense.
+        BackendError: the backend cannot run here.
+    """
+    count = means.shape[0]
+    if features is None:
+        features = means.new_zeros((count, 0))
+    if screen_offset is None:
+        screen_offset = means.new_zeros((count, 2))
+    inputs = SplatInputs(
+        means=means,
+        rotation_wxyz=rotation_wxyz,
+        scale_m=scale_m,
+        opacity=opacity,
+        sh=sh,
+        body_index=body_index,
+        camera_from_body=camera_from_body,
+        features=features,
+        screen_offset=screen_offset,
+    )
+    view = SplatView(
+        fx_px=float(fx_px),
+        fy_px=float(fy_px),
+        cx_px=float(cx_px),
+        cy_px=float(cy_px),
+        width_px=int(width_px),
+        height_px=int(height_px),
+        near_m=float(near_m),
+        blur_px2=float(blur_px2),
+        antialias=bool(antialias),
+    )
+    if screen_gradient_out is not None and screen_gradient_out.shape != (count,):
+        raise ShapeError(
+            f"screen_gradient_out needs shape ({count},), got {tuple(screen_gradient_out.shape)}"
+        )
+    draw = implementation("gaussian_raster", "draw_gaussians", backend, means.device)
+    rgb, depth_m, alpha, feature_image, visible, radius_px = draw(inputs, view, screen_gradient_out)
+    return SplatImage(
+        rgb=rgb,
+        depth_m=depth_m,
+        alpha=alpha,
+        features=feature_image,
+        visible=visible,
+        radius_px=radius_px,
+    )

@@ -1,0 +1,189 @@
+"""Blend the Gaussians of each screen tile front to back: compiled code, float32 lanes.
+
+A tile's pixels lie in one flat work array, quantity after quantity, row after row, so that the
+loop over pixels has no branch and no call and becomes vector instructions.
+"""
+
+import math
+
+import numba
+import numpy as np
+
+from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
+    ALPHA_CUT,
+    MAX_ALPHA,
+    MIN_TRANSMITTANCE,
+    TILE_PX,
+)
+from lidarpainter_models.kernels.gaussian_raster.lane_exponential import lane_exp
+from lidarpainter_models.kernels.gaussian_raster.projection import (
+    ACROSS,
+    ALONG,
+    BLUE,
+    DEPTH,
+    GREEN,
+    HALF_HEIGHT,
+    LOG_OPACITY,
+    MEAN_X,
+    MEAN_X_FRACTION,
+    MEAN_Y,
+    MEAN_Y_FRACTION,
+    RED,
+    SHEAR,
+)
+
+PIXELS = TILE_PX * TILE_PX
+CHECK_EVERY = 16
+"""Gaussians between two looks at whether the whole tile has stopped."""
+
+# Where each quantity of a tile begins in its work array; unsigned, because a signed index could
+# be negative and its wrap-around keeps loops scalar.
+LIGHT, LANE_RED, LANE_GREEN, LANE_BLUE, LANE_DEPTH, WEIGHT, PIXEL_X, PIXEL_Y = (
+    np.uint64(k * PIXELS) for k in range(8)
+)
+LANES = 8 * PIXELS
+FEATURES = 8 * PIXELS
+
+CUT = np.float32(ALPHA_CUT)
+TOP = np.float32(MAX_ALPHA)
+STOP = np.float32(MIN_TRANSMITTANCE)
+ZERO = np.float32(0.0)
+ONE = np.float32(1.0)
+FAR = np.float32(-5.7)
+"""Exponents are held above this, where `lane_exp` is accurate and alpha is under the cut."""
+
+LANE_MATH = {"contract", "reassoc", "nsz", "arcp"}
+"""Freedom for the compiler that leaves NaN and infinity alone; the same on every thread."""
+
+
+@numba.njit(cache=True)
+def tile_order(place, tiles):
+    """A shuffled tile number, so that equal shares of tiles are about equal work.
+
+    Sky tiles are empty and road tiles are full; threads take contiguous shares.
+    """
+    return place * 2 if place * 2 < tiles else (place - (tiles + 1) // 2) * 2 + 1
+
+
+@numba.njit(cache=True)
+def local_centre(record, tile_x, tile_y):
+    """Centre of a Gaussian from the corner of a tile, pixels; exact to float32."""
+    return (
+        (record[MEAN_X] - np.float32(tile_x)) + record[MEAN_X_FRACTION],
+        (record[MEAN_Y] - np.float32(tile_y)) + record[MEAN_Y_FRACTION],
+    )
+
+
+@numba.njit(cache=True)
+def tile_rows_of(y, half_height):
+    """First and one past the last row of a tile that a Gaussian can reach."""
+    first = math.ceil(max(y - half_height - 0.5, 0.0))
+    end = math.floor(min(y + half_height + 0.5, TILE_PX + 0.0))
+    return int(min(first, TILE_PX)), int(max(end, 0.0))
+
+
+@numba.njit(cache=True)
+def place_pixels(lanes):
+    """Write the pixel centres of a tile, from its corner, into its work array."""
+    for row in range(TILE_PX):
+        for column in range(TILE_PX):
+            pixel = np.uint64(row * TILE_PX + column)
+            lanes[PIXEL_X + pixel] = column + 0.5
+            lanes[PIXEL_Y + pixel] = row + 0.5
+
+
+@numba.njit(cache=True)
+def has_light(lanes):
+    """Whether any pixel of a tile still takes Gaussians."""
+    brightest = lanes[LIGHT]
+    for pixel in range(np.uint64(1), np.uint64(PIXELS)):
+        brightest = max(brightest, lanes[LIGHT + pixel])
+    return brightest > ZERO
+
+
+@numba.njit(cache=True, fastmath=LANE_MATH)
+def _blend(lanes, first_row, end_row, x, y, record):
+    """Blend one Gaussian into rows of a tile. A stopped pixel has its light negated."""
+    across, shear, along = record[ACROSS], record[SHEAR], record[ALONG]
+    log_opacity = record[LOG_OPACITY]
+    red, green, blue, depth = record[RED], record[GREEN], record[BLUE], record[DEPTH]
+    for pixel in range(np.uint64(first_row * TILE_PX), np.uint64(end_row * TILE_PX)):
+        dy = lanes[PIXEL_Y + pixel] - y
+        u = lanes[PIXEL_X + pixel] - x + shear * dy
+        alpha = lane_exp(max(log_opacity - along * dy * dy - across * u * u, FAR))
+        alpha = min(alpha, TOP) if alpha >= CUT else ZERO
+        light = lanes[LIGHT + pixel]
+        weight = light * alpha
+        left = light - weight
+        goes_on = left >= STOP
+        weight = weight if goes_on else ZERO
+        lanes[LIGHT + pixel] = left if goes_on else -abs(light)
+        lanes[WEIGHT + pixel] = weight
+        lanes[LANE_RED + pixel] += weight * red
+        lanes[LANE_GREEN + pixel] += weight * green
+        lanes[LANE_BLUE + pixel] += weight * blue
+        lanes[LANE_DEPTH + pixel] += weight * depth
+
+
+@numba.njit(cache=True, fastmath=LANE_MATH)
+def _blend_features(lanes, first_row, end_row, features):
+    for channel in range(len(features)):
+        value = features[channel]
+        start = np.uint64(FEATURES + channel * PIXELS)
+        for pixel in range(np.uint64(first_row * TILE_PX), np.uint64(end_row * TILE_PX)):
+            lanes[start + pixel] += lanes[WEIGHT + pixel] * value
+
+
+@numba.njit(cache=True)
+def _blend_tile(records, features, lists, tile, tile_x, tile_y, lanes):
+    first, end = lists.tile_first[tile], lists.tile_first[tile + 1]
+    for entry in range(first, end):
+        if (entry - first) % CHECK_EVERY == CHECK_EVERY - 1 and not has_light(lanes):
+            break
+        index = lists.gaussian[entry]
+        record = records[index]
+        x, y = local_centre(record, tile_x, tile_y)
+        first_row, end_row = tile_rows_of(y, record[HALF_HEIGHT])
+        _blend(lanes, first_row, end_row, x, y, record)
+        if features.shape[1]:
+            _blend_features(lanes, first_row, end_row, features[index])
+
+
+@numba.njit(cache=True)
+def _store_tile(lanes, tile_x, tile_y, picture, light):
+    height, width, channels = picture.shape
+    for row in range(min(TILE_PX, height - tile_y)):
+        for column in range(min(TILE_PX, width - tile_x)):
+            pixel = row * TILE_PX + column
+            light[tile_y + row, tile_x + column] = abs(lanes[pixel])
+            out = picture[tile_y + row, tile_x + column]
+            for channel in range(4):
+                out[channel] = lanes[(1 + channel) * PIXELS + pixel]
+            for channel in range(4, channels):
+                out[channel] = lanes[FEATURES + (channel - 4) * PIXELS + pixel]
+
+
+@numba.njit(cache=True)
+def _draw_tile(records, features, lists, tile, picture, light):
+    tile_x, tile_y = tile % lists.columns * TILE_PX, tile // lists.columns * TILE_PX
+    lanes = np.zeros(LANES + features.shape[1] * PIXELS, np.float32)
+    lanes[:PIXELS] = ONE
+    place_pixels(lanes)
+    _blend_tile(records, features, lists, tile, tile_x, tile_y, lanes)
+    _store_tile(lanes, tile_x, tile_y, picture, light)
+
+
+@numba.njit(cache=True, parallel=True)
+def blend(records, features, lists, width, height):
+    """Draw all tiles.
+
+    Returns:
+        The picture (height, width, red green blue depth and features) and the light that passes
+        everything (height, width).
+    """
+    picture = np.empty((height, width, 4 + features.shape[1]), np.float32)
+    light = np.empty((height, width), np.float32)
+    tiles = lists.columns * lists.rows
+    for place in numba.prange(tiles):
+        _draw_tile(records, features, lists, tile_order(place, tiles), picture, light)
+    return picture, light

@@ -1,0 +1,27 @@
+"""The constants that decide which Gaussians a pixel sees, the same in every backend.
+
+They are those of Kerbl et al. (2023), "3D Gaussian Splatting for Real-Time Radiance Field
+Rendering", except that a Gaussian ends where its alpha falls under `ALPHA_CUT` and not at three
+standard deviations (Hanson et al. 2025, "Speedy-Splat").
+"""
+
+TILE_PX = 16
+"""Side of a square screen tile."""
+
+ALPHA_CUT = 1.0 / 255.0
+"""A Gaussian is not blended where its alpha is under this."""
+
+MAX_ALPHA = 0.99
+"""Alpha is clamped here, so that something always passes and the gradient stays finite."""
+
+MIN_TRANSMITTANCE = 1e-4
+"""A pixel stops before the Gaussian that would bring its transmittance under this."""
+
+TANGENT_MARGIN = 0.3
+"""How far outside the picture, in half field-of-view tangents, the projection stays linearised."""
+
+MIN_COMPENSATION = 1e-12
+"""Floor of the squared antialiasing factor, where its square root still has a finite slope."""
+
+COLOUR_OFFSET = 0.5
+"""Grey that spherical harmonics of zero stand for."""

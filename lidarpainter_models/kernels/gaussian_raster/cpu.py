@@ -1,0 +1,142 @@
+"""The rasteriser on the CPU: numba kernels behind one autograd function.
+
+Pictures and gradients are bitwise the same for any number of threads (numba's setting,
+`numba.set_num_threads`). Input is read as float32 (transforms as float64) and must lie on the CPU.
+"""
+
+import threading
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lidarpainter_models.errors import BackendError
+from lidarpainter_models.kernels.gaussian_raster.binning import list_tiles
+from lidarpainter_models.kernels.gaussian_raster.blending import blend
+from lidarpainter_models.kernels.gaussian_raster.blending_gradients import gaussian_sums
+from lidarpainter_models.kernels.gaussian_raster.projection import (
+    IS_VISIBLE,
+    SIGMA,
+    Gaussians,
+    View,
+    project,
+)
+from lidarpainter_models.kernels.gaussian_raster.projection_gradients import unproject
+from lidarpainter_models.kernels.gaussian_raster.splat_inputs import SplatInputs, SplatView
+
+ONE_AT_A_TIME = threading.Lock()
+"""numba's thread pools may not be entered by two Python threads at once."""
+
+DrawnPictures = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+
+
+def draw_gaussians(
+    inputs: SplatInputs, view: SplatView, screen_gradient_out: Tensor | None
+) -> DrawnPictures:
+    """Picture as `SplatImage` lists it: rgb, depth, alpha, features, visible, radius.
+
+    Raises:
+        BackendError: the tensors are not on the CPU.
+    """
+    if inputs.means.device.type != "cpu":
+        raise BackendError(f"the cpu backend needs tensors on the CPU, got {inputs.means.device}")
+    picture, light, visible, radius_px = _DrawGaussians.apply(
+        inputs.means,
+        inputs.rotation_wxyz,
+        inputs.scale_m,
+        inputs.opacity,
+        inputs.sh,
+        inputs.features,
+        inputs.screen_offset,
+        inputs.camera_from_body,
+        inputs.body_index,
+        view,
+        screen_gradient_out,
+    )
+    return picture[..., :3], picture[..., 3], 1.0 - light, picture[..., 4:], visible, radius_px
+
+
+def _array(tensor: Tensor, dtype: torch.dtype = torch.float32) -> np.ndarray:
+    return tensor.detach().to(dtype).contiguous().numpy()
+
+
+def _gaussians(tensors: tuple[Tensor, ...]) -> Gaussians:
+    means, rotation, scale, opacity, sh, features, offset, transforms, body_index = tensors
+    return Gaussians(
+        means=_array(means),
+        rotation_wxyz=_array(rotation),
+        scale_m=_array(scale),
+        opacity=_array(opacity),
+        sh=_array(sh),
+        body_index=_array(body_index, torch.int32),
+        features=_array(features),
+        screen_offset=_array(offset),
+        camera_from_body=_array(transforms, torch.float64),
+    )
+
+
+def _compiled_view(view: SplatView) -> View:
+    return View(
+        fx=view.fx_px,
+        fy=view.fy_px,
+        cx=view.cx_px,
+        cy=view.cy_px,
+        width=view.width_px,
+        height=view.height_px,
+        near=view.near_m,
+        blur=view.blur_px2,
+        antialias=view.antialias,
+    )
+
+
+class _DrawGaussians(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # noqa: ANN401
+        *tensors, view, screen_gradient_out = arguments
+        gaussians, compiled_view = _gaussians(tuple(tensors)), _compiled_view(view)
+        with ONE_AT_A_TIME:
+            records = project(gaussians, compiled_view)
+            lists = list_tiles(records, view.width_px, view.height_px)
+            picture, light = blend(
+                records, gaussians.features, lists, view.width_px, view.height_px
+            )
+        visible = torch.from_numpy(records[:, IS_VISIBLE] > 0.0)
+        radius_px = torch.from_numpy(np.where(visible, 3.0 * records[:, SIGMA], np.float32(0.0)))
+        outputs = (torch.from_numpy(picture), torch.from_numpy(light), visible, radius_px)
+        ctx.save_for_backward(*tensors, *outputs[:2])
+        ctx.mark_non_differentiable(visible, radius_px)
+        ctx.view, ctx.records, ctx.lists = compiled_view, records, lists
+        ctx.screen_gradient_out = screen_gradient_out
+        return outputs
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *output_gradients: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
+        *tensors, picture, light = ctx.saved_tensors
+        to_picture, to_light = output_gradients[:2]
+        gaussians = _gaussians(tuple(tensors))
+        image = (_array(picture), _array(light), _array(to_picture), _array(-to_light))
+        with ONE_AT_A_TIME:
+            sums, to_features = gaussian_sums(ctx.records, gaussians.features, ctx.lists, image)
+            found = unproject(gaussians, ctx.view, ctx.records, sums)
+        if ctx.screen_gradient_out is not None:
+            ctx.screen_gradient_out.copy_(torch.from_numpy(found.absolute))
+        to_transforms = np.zeros((len(gaussians.camera_from_body), 4, 4))
+        for run in found.camera_from_body:
+            to_transforms[:, :3] += run
+        arrays = (
+            found.means,
+            found.rotation_wxyz,
+            found.scale_m,
+            found.opacity,
+            found.sh,
+            to_features,
+            found.screen_offset,
+            to_transforms,
+        )
+        gradients = [
+            torch.from_numpy(array).to(tensor.dtype)
+            for array, tensor in zip(arrays, tensors, strict=False)
+        ]
+        return (*gradients, None, None, None)

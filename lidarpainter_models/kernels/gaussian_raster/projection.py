@@ -1,0 +1,263 @@
+"""Place Gaussians on the screen: compiled code, one Gaussian at a time, in float64.
+
+The footprint of a Gaussian is that of Zwicker et al. (2001), "EWA splatting": covariance
+J W S W^T J^T plus a blur. It is kept in the form
+
+    alpha(x, y) = exp(log_opacity - across (x - mx + shear (y - my))^2 - along (y - my)^2),
+
+which, unlike the inverse covariance, stays exact in float32 for needles, and whose row terms are
+shared by all pixels of a row.
+"""
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from lidarpainter_models.kernels.gaussian_raster import small_vectors as v3
+from lidarpainter_models.kernels.gaussian_raster import spherical_harmonics
+from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
+    ALPHA_CUT,
+    COLOUR_OFFSET,
+    MIN_COMPENSATION,
+    TANGENT_MARGIN,
+)
+
+RECORD_FLOATS = 16
+"""A Gaussian's screen record fills one 64-byte cache line."""
+
+# Columns of a record. Centres are split into a whole and a fraction, so that float32 places them
+# to 1e-7 px at any picture size.
+MEAN_X, MEAN_X_FRACTION, MEAN_Y, MEAN_Y_FRACTION = 0, 1, 2, 3
+ACROSS, SHEAR, ALONG, LOG_OPACITY = 4, 5, 6, 7
+RED, GREEN, BLUE, DEPTH = 8, 9, 10, 11
+HALF_WIDTH, HALF_HEIGHT, SIGMA, IS_VISIBLE = 12, 13, 14, 15
+
+LOG_CUT = math.log(ALPHA_CUT)
+LARGEST_PX2 = 1e30
+"""A footprint of more variance would overflow float32; nothing real comes near."""
+CHUNKS = 64
+"""Gaussians are shared out in this many runs, whatever the number of threads."""
+
+
+class Gaussians(NamedTuple):
+    """C-contiguous float32 arrays as `render_gaussians` names them, float64 transforms."""
+
+    means: np.ndarray
+    rotation_wxyz: np.ndarray
+    scale_m: np.ndarray
+    opacity: np.ndarray
+    sh: np.ndarray
+    body_index: np.ndarray
+    features: np.ndarray
+    screen_offset: np.ndarray
+    camera_from_body: np.ndarray
+
+
+class View(NamedTuple):
+    """The numbers of a `SplatView`, in the order compiled code reads them."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    near: float
+    blur: float
+    antialias: bool
+
+
+class Footprint(NamedTuple):
+    """One Gaussian between body frame and screen; vectors are tuples (`small_vectors`)."""
+
+    point: tuple
+    rotation: tuple
+    translation: tuple
+    unit_wxyz: tuple
+    wxyz_length: float
+    from_axes: tuple
+    axes_in_camera: tuple
+    tangent_x: float
+    tangent_y: float
+    row_x: tuple
+    row_y: tuple
+    xx: float
+    xy: float
+    yy: float
+
+
+@numba.njit(cache=True)
+def transform_of(gaussians, index):
+    """Rotation rows and translation of the body a Gaussian belongs to."""
+    t = gaussians.camera_from_body[gaussians.body_index[index]]
+    rotation = (
+        (t[0, 0], t[0, 1], t[0, 2]),
+        (t[1, 0], t[1, 1], t[1, 2]),
+        (t[2, 0], t[2, 1], t[2, 2]),
+    )
+    return rotation, (t[0, 3], t[1, 3], t[2, 3])
+
+
+@numba.njit(cache=True)
+def vector_of(array, index):
+    """A row of three as float64."""
+    return (
+        np.float64(array[index, 0]),
+        np.float64(array[index, 1]),
+        np.float64(array[index, 2]),
+    )
+
+
+@numba.njit(cache=True)
+def tangent_limits(view):
+    """Lowest and highest x/z and y/z at which the projection is linearised."""
+    margin_x = TANGENT_MARGIN * 0.5 * view.width / view.fx
+    margin_y = TANGENT_MARGIN * 0.5 * view.height / view.fy
+    return (
+        -view.cx / view.fx - margin_x,
+        (view.width - view.cx) / view.fx + margin_x,
+        -view.cy / view.fy - margin_y,
+        (view.height - view.cy) / view.fy + margin_y,
+    )
+
+
+@numba.njit(cache=True)
+def footprint_of(gaussians, index, point, rotation, translation, view):
+    """Screen covariance of a Gaussian whose centre lies at `point` in the camera frame."""
+    q = gaussians.rotation_wxyz[index]
+    w, x, y, z = np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])
+    length = max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
+    unit = (w / length, x / length, y / length, z / length)
+    scale = vector_of(gaussians.scale_m, index)
+    turned = v3.rotation_matrix(unit)
+    from_axes = (
+        (turned[0][0] * scale[0], turned[0][1] * scale[1], turned[0][2] * scale[2]),
+        (turned[1][0] * scale[0], turned[1][1] * scale[1], turned[1][2] * scale[2]),
+        (turned[2][0] * scale[0], turned[2][1] * scale[1], turned[2][2] * scale[2]),
+    )
+    axes = v3.product(rotation, from_axes)
+    lowest_x, highest_x, lowest_y, highest_y = tangent_limits(view)
+    tangent_x = min(max(point[0] / point[2], lowest_x), highest_x)
+    tangent_y = min(max(point[1] / point[2], lowest_y), highest_y)
+    row_x = v3.scaled(v3.add(axes[0], v3.scaled(axes[2], -tangent_x)), view.fx / point[2])
+    row_y = v3.scaled(v3.add(axes[1], v3.scaled(axes[2], -tangent_y)), view.fy / point[2])
+    return Footprint(
+        point,
+        rotation,
+        translation,
+        unit,
+        length,
+        from_axes,
+        axes,
+        tangent_x,
+        tangent_y,
+        row_x,
+        row_y,
+        v3.dot(row_x, row_x) + view.blur,
+        v3.dot(row_x, row_y),
+        v3.dot(row_y, row_y) + view.blur,
+    )
+
+
+@numba.njit(cache=True)
+def compensation_ratio(footprint, determinant, blur):
+    """Area of the footprint before blurring over its area after, squared."""
+    bare = (footprint.xx - blur) * (footprint.yy - blur) - footprint.xy * footprint.xy
+    return bare / determinant
+
+
+@numba.njit(cache=True)
+def view_direction(mean, rotation, translation):
+    """Vector from the camera to a Gaussian in the frame of its body, metres."""
+    return v3.add(mean, v3.apply(v3.transposed(rotation), translation))
+
+
+@numba.njit(cache=True)
+def _write_colour(gaussians, index, footprint, weights, record):
+    mean = vector_of(gaussians.means, index)
+    offset = view_direction(mean, footprint.rotation, footprint.translation)
+    direction, _ = v3.direction_of(offset)
+    coefficients = gaussians.sh.shape[1]
+    spherical_harmonics.basis(coefficients, direction, weights)
+    for channel in range(3):
+        colour = COLOUR_OFFSET
+        for k in range(coefficients):
+            colour += weights[k] * gaussians.sh[index, k, channel]
+        record[RED + channel] = max(colour, 0.0)
+    return math.isfinite(record[RED] + record[GREEN] + record[BLUE])
+
+
+@numba.njit(cache=True)
+def _write_centre(position, record, column):
+    whole = math.floor(position)
+    record[column] = whole
+    record[column + 1] = position - whole
+
+
+@numba.njit(cache=True)
+def _write_shape(footprint, determinant, log_opacity, record):
+    reach = 2.0 * (log_opacity - LOG_CUT)
+    record[ACROSS] = 0.5 * footprint.yy / determinant
+    record[SHEAR] = -footprint.xy / footprint.yy
+    record[ALONG] = 0.5 / footprint.yy
+    record[LOG_OPACITY] = log_opacity
+    record[HALF_WIDTH] = math.sqrt(reach * footprint.xx)
+    record[HALF_HEIGHT] = math.sqrt(reach * footprint.yy)
+    middle = 0.5 * (footprint.xx + footprint.yy)
+    spread = math.sqrt(max(middle * middle - determinant, 0.0))
+    record[SIGMA] = math.sqrt(middle + spread)
+
+
+@numba.njit(cache=True)
+def _project_one(gaussians, index, view, weights, record):
+    """Fill a Gaussian's record; return whether it can reach a pixel."""
+    rotation, translation = transform_of(gaussians, index)
+    point = v3.add(v3.apply(rotation, vector_of(gaussians.means, index)), translation)
+    if not point[2] >= view.near:
+        return False
+    opacity = np.float64(gaussians.opacity[index])
+    if not opacity >= ALPHA_CUT:
+        return False
+    footprint = footprint_of(gaussians, index, point, rotation, translation, view)
+    determinant = footprint.xx * footprint.yy - footprint.xy * footprint.xy
+    if not (determinant > 0.0 and footprint.xx + footprint.yy < LARGEST_PX2):
+        return False
+    if view.antialias:
+        ratio = compensation_ratio(footprint, determinant, view.blur)
+        opacity *= math.sqrt(max(ratio, MIN_COMPENSATION))
+        if not opacity >= ALPHA_CUT:
+            return False
+    _write_shape(footprint, determinant, math.log(opacity), record)
+    offset = gaussians.screen_offset
+    x = view.fx * point[0] / point[2] + view.cx + (offset[index, 0] if len(offset) else 0.0)
+    y = view.fy * point[1] / point[2] + view.cy + (offset[index, 1] if len(offset) else 0.0)
+    half_width, half_height = record[HALF_WIDTH], record[HALF_HEIGHT]
+    inside_x = x + half_width >= 0.5 and x - half_width <= view.width - 0.5
+    inside_y = y + half_height >= 0.5 and y - half_height <= view.height - 0.5
+    if not (inside_x and inside_y):
+        return False
+    _write_centre(x, record, MEAN_X)
+    _write_centre(y, record, MEAN_Y)
+    record[DEPTH] = point[2]
+    return _write_colour(gaussians, index, footprint, weights, record)
+
+
+@numba.njit(cache=True)
+def _project_run(gaussians, view, first, end, records):
+    weights = np.empty(16)
+    for index in range(first, end):
+        visible = _project_one(gaussians, index, view, weights, records[index])
+        records[index, IS_VISIBLE] = 1.0 if visible else 0.0
+
+
+@numba.njit(cache=True, parallel=True)
+def project(gaussians, view):
+    """Screen records of all Gaussians; only `IS_VISIBLE` is set in those that cannot be seen."""
+    count = len(gaussians.means)
+    records = np.empty((count, RECORD_FLOATS), np.float32)
+    for run in numba.prange(CHUNKS):
+        first, end = run * count // CHUNKS, (run + 1) * count // CHUNKS
+        _project_run(gaussians, view, first, end, records)
+    return records

@@ -1,0 +1,246 @@
+"""Carry screen gradients back through the projection: compiled code, one Gaussian at a time.
+
+The projection is computed again rather than kept. Everything is float64; the gradient of
+`camera_from_body` is summed over fixed runs of Gaussians and then over runs, in order, so it does
+not depend on the number of threads.
+"""
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from lidarpainter_models.kernels.gaussian_raster import small_vectors as v3
+from lidarpainter_models.kernels.gaussian_raster import spherical_harmonics
+from lidarpainter_models.kernels.gaussian_raster.blending_gradients import (
+    SUM_ABS_X,
+    SUM_ABS_Y,
+    SUM_DEPTH,
+    SUM_G,
+    SUM_GU,
+    SUM_GUU,
+    SUM_GUY,
+    SUM_GY,
+    SUM_GYY,
+    SUM_RED,
+)
+from lidarpainter_models.kernels.gaussian_raster.blending_limits import MIN_COMPENSATION
+from lidarpainter_models.kernels.gaussian_raster.projection import (
+    ACROSS,
+    ALONG,
+    CHUNKS,
+    IS_VISIBLE,
+    RED,
+    SHEAR,
+    compensation_ratio,
+    footprint_of,
+    tangent_limits,
+    transform_of,
+    vector_of,
+    view_direction,
+)
+
+
+class Gradients(NamedTuple):
+    """Gradients of the arrays in `projection.Gaussians`; transforms per run in float64."""
+
+    means: np.ndarray
+    rotation_wxyz: np.ndarray
+    scale_m: np.ndarray
+    opacity: np.ndarray
+    sh: np.ndarray
+    screen_offset: np.ndarray
+    absolute: np.ndarray
+    camera_from_body: np.ndarray
+
+
+@numba.njit(cache=True)
+def _screen_gradient(sums, record):
+    """Gradient with respect to the projected centre, pixels."""
+    across, shear, along = record[ACROSS], record[SHEAR], record[ALONG]
+    x = 2.0 * across * sums[SUM_GU]
+    return x, x * shear + 2.0 * along * sums[SUM_GY]
+
+
+@numba.njit(cache=True)
+def _covariance_gradient(sums, footprint):
+    """Gradient with respect to the blurred screen covariance's xx, xy and yy."""
+    yy = footprint.yy
+    slope = footprint.xy / yy
+    remaining = footprint.xx - slope * footprint.xy
+    across = 0.5 / remaining
+    # exponent = -u^2 / (2 remaining) - dy^2 / (2 yy), u = dx - slope dy
+    to_remaining = 0.5 * sums[SUM_GUU] / (remaining * remaining)
+    to_slope = 2.0 * across * sums[SUM_GUY]
+    to_yy = 0.5 * sums[SUM_GYY] / (yy * yy)
+    return (
+        to_remaining,
+        -2.0 * slope * to_remaining + to_slope / yy,
+        slope * slope * to_remaining - slope / yy * to_slope + to_yy,
+    )
+
+
+@numba.njit(cache=True)
+def _add_compensation_gradient(footprint, blur, to_log, covariance_gradient):
+    """Add the gradient of log(compensation) with respect to the blurred covariance."""
+    xx, xy, yy = footprint.xx, footprint.xy, footprint.yy
+    determinant = xx * yy - xy * xy
+    ratio = compensation_ratio(footprint, determinant, blur)
+    if ratio < MIN_COMPENSATION:
+        return covariance_gradient
+    to_bare = 0.5 * to_log / (ratio * determinant)
+    to_blurred = -0.5 * to_log / determinant
+    to_xx, to_xy, to_yy = covariance_gradient
+    return (
+        to_xx + to_bare * (yy - blur) + to_blurred * yy,
+        to_xy - 2.0 * xy * (to_bare + to_blurred),
+        to_yy + to_bare * (xx - blur) + to_blurred * xx,
+    )
+
+
+@numba.njit(cache=True)
+def _axes_gradient(footprint, covariance_gradient, view):
+    """Gradients of the Gaussian's axes in the camera frame and of its centre there."""
+    to_xx, to_xy, to_yy = covariance_gradient
+    row_x, row_y, axes = footprint.row_x, footprint.row_y, footprint.axes_in_camera
+    x, y, z = footprint.point
+    to_row_x = v3.add(v3.scaled(row_x, 2.0 * to_xx), v3.scaled(row_y, to_xy))
+    to_row_y = v3.add(v3.scaled(row_y, 2.0 * to_yy), v3.scaled(row_x, to_xy))
+    to_axis_x = v3.scaled(to_row_x, view.fx / z)
+    to_axis_y = v3.scaled(to_row_y, view.fy / z)
+    to_axis_z = v3.add(
+        v3.scaled(to_axis_x, -footprint.tangent_x), v3.scaled(to_axis_y, -footprint.tangent_y)
+    )
+    to_z = -(v3.dot(to_row_x, row_x) + v3.dot(to_row_y, row_y)) / z
+    lowest_x, highest_x, lowest_y, highest_y = tangent_limits(view)
+    to_x, to_y = 0.0, 0.0
+    if lowest_x <= x / z <= highest_x:
+        to_x = -v3.dot(to_axis_x, axes[2]) / z
+    if lowest_y <= y / z <= highest_y:
+        to_y = -v3.dot(to_axis_y, axes[2]) / z
+    to_point = (to_x, to_y, to_z - (to_x * x + to_y * y) / z)
+    return (to_axis_x, to_axis_y, to_axis_z), to_point
+
+
+@numba.njit(cache=True)
+def _centre_gradient(point, to_screen, to_depth, view):
+    """Gradient of the centre in the camera frame through its pixel position and depth."""
+    x, y, z = point
+    to_x, to_y = to_screen[0] * view.fx / z, to_screen[1] * view.fy / z
+    return (to_x, to_y, to_depth - (to_x * x + to_y * y) / z)
+
+
+@numba.njit(cache=True)
+def _store_shape(gaussians, index, footprint, to_axes, gradients):
+    """Store gradients of scale and rotation; return that of the transform's rotation."""
+    to_from_axes = v3.product(v3.transposed(footprint.rotation), to_axes)
+    turned = v3.rotation_matrix(footprint.unit_wxyz)
+    scale = vector_of(gaussians.scale_m, index)
+    by_axis, turned_axes = v3.transposed(to_from_axes), v3.transposed(turned)
+    gradients.scale_m[index, 0] = v3.dot(by_axis[0], turned_axes[0])
+    gradients.scale_m[index, 1] = v3.dot(by_axis[1], turned_axes[1])
+    gradients.scale_m[index, 2] = v3.dot(by_axis[2], turned_axes[2])
+    to_turned = v3.transposed(
+        (
+            v3.scaled(by_axis[0], scale[0]),
+            v3.scaled(by_axis[1], scale[1]),
+            v3.scaled(by_axis[2], scale[2]),
+        )
+    )
+    unit = footprint.unit_wxyz
+    to_unit = v3.rotation_gradient(unit, to_turned)
+    along = to_unit[0] * unit[0] + to_unit[1] * unit[1] + to_unit[2] * unit[2]
+    along += to_unit[3] * unit[3]
+    for k in range(4):
+        gradients.rotation_wxyz[index, k] = (to_unit[k] - along * unit[k]) / footprint.wxyz_length
+    return v3.product(to_axes, v3.transposed(footprint.from_axes))
+
+
+@numba.njit(cache=True)
+def _store_colour(gaussians, index, footprint, record, sums, weights, gradients):
+    """Store the gradient of the coefficients; return that of the view direction, metres."""
+    mean = vector_of(gaussians.means, index)
+    offset = view_direction(mean, footprint.rotation, footprint.translation)
+    direction, length = v3.direction_of(offset)
+    coefficients = gaussians.sh.shape[1]
+    spherical_harmonics.basis(coefficients, direction, weights)
+    to_colour = (
+        sums[SUM_RED] if record[RED] > 0.0 else 0.0,
+        sums[SUM_RED + 1] if record[RED + 1] > 0.0 else 0.0,
+        sums[SUM_RED + 2] if record[RED + 2] > 0.0 else 0.0,
+    )
+    for k in range(coefficients):
+        weight = weights[k]
+        for channel in range(3):
+            gradients.sh[index, k, channel] = weight * to_colour[channel]
+        weights[k] = v3.dot(vector_of(gaussians.sh[index], k), to_colour)
+    to_direction = spherical_harmonics.direction_gradient(coefficients, direction, weights)
+    return v3.direction_of_gradient(direction, length, to_direction)
+
+
+@numba.njit(cache=True)
+def _store_transform(to_rotation, to_translation, out):
+    for row in range(3):
+        for column in range(3):
+            out[row, column] += to_rotation[row][column]
+        out[row, 3] += to_translation[row]
+
+
+@numba.njit(cache=True)
+def _unproject_one(gaussians, index, view, record, sums, weights, gradients, run):
+    rotation, translation = transform_of(gaussians, index)
+    mean = vector_of(gaussians.means, index)
+    point = v3.add(v3.apply(rotation, mean), translation)
+    footprint = footprint_of(gaussians, index, point, rotation, translation, view)
+    to_screen = _screen_gradient(sums, record)
+    gradients.screen_offset[index, 0], gradients.screen_offset[index, 1] = to_screen
+    gradients.absolute[index] = 2.0 * math.hypot(record[ACROSS] * sums[SUM_ABS_X], sums[SUM_ABS_Y])
+    gradients.opacity[index] = sums[SUM_G] / gaussians.opacity[index]
+    to_covariance = _covariance_gradient(sums, footprint)
+    if view.antialias:
+        to_covariance = _add_compensation_gradient(footprint, view.blur, sums[SUM_G], to_covariance)
+    to_axes, to_point = _axes_gradient(footprint, to_covariance, view)
+    to_centre = _centre_gradient(point, to_screen, sums[SUM_DEPTH], view)
+    to_point = v3.add(to_point, to_centre)
+    to_rotation = _store_shape(gaussians, index, footprint, to_axes, gradients)
+    to_direction = _store_colour(gaussians, index, footprint, record, sums, weights, gradients)
+    to_mean = v3.add(v3.apply(v3.transposed(rotation), to_point), to_direction)
+    for axis in range(3):
+        gradients.means[index, axis] = to_mean[axis]
+    # the direction is mean + rotation^T translation
+    to_rotation = v3.added(to_rotation, v3.outer(to_point, mean))
+    to_rotation = v3.added(to_rotation, v3.outer(translation, to_direction))
+    to_translation = v3.add(to_point, v3.apply(rotation, to_direction))
+    body = gaussians.body_index[index]
+    _store_transform(to_rotation, to_translation, gradients.camera_from_body[run, body])
+
+
+@numba.njit(cache=True)
+def _unproject_run(gaussians, view, records, sums, gradients, run):
+    weights = np.empty(16)
+    count = len(records)
+    for index in range(run * count // CHUNKS, (run + 1) * count // CHUNKS):
+        if records[index, IS_VISIBLE] > 0.0:
+            record, own_sums = records[index], sums[index]
+            _unproject_one(gaussians, index, view, record, own_sums, weights, gradients, run)
+
+
+@numba.njit(cache=True, parallel=True)
+def unproject(gaussians, view, records, sums):
+    """Gradients of everything `project` read; zero where a Gaussian was not visible."""
+    count, coefficients, _ = gaussians.sh.shape
+    bodies = len(gaussians.camera_from_body)
+    gradients = Gradients(
+        np.zeros((count, 3), np.float32),
+        np.zeros((count, 4), np.float32),
+        np.zeros((count, 3), np.float32),
+        np.zeros(count, np.float32),
+        np.zeros((count, coefficients, 3), np.float32),
+        np.zeros((count, 2), np.float32),
+        np.zeros(count, np.float32),
+        np.zeros((CHUNKS, bodies, 3, 4)),
+    )
+    for run in numba.prange(CHUNKS):
+        _unproject_run(gaussians, view, records, sums, gradients, run)
+    return gradients

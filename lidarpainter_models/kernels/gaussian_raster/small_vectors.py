@@ -1,0 +1,99 @@
+"""Vectors of three and 3x3 matrices as tuples, for compiled code that works on one Gaussian.
+
+A matrix is a tuple of its rows. Tuples stay in registers; small arrays would go through memory.
+"""
+
+import math
+
+import numba
+
+
+@numba.njit(cache=True)
+def dot(first, second):
+    """Inner product."""
+    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
+
+
+@numba.njit(cache=True)
+def add(first, second):
+    """Sum of two vectors."""
+    return (first[0] + second[0], first[1] + second[1], first[2] + second[2])
+
+
+@numba.njit(cache=True)
+def scaled(vector, factor):
+    """Vector times a number."""
+    return (vector[0] * factor, vector[1] * factor, vector[2] * factor)
+
+
+@numba.njit(cache=True)
+def transposed(matrix):
+    """Rows become columns."""
+    return (
+        (matrix[0][0], matrix[1][0], matrix[2][0]),
+        (matrix[0][1], matrix[1][1], matrix[2][1]),
+        (matrix[0][2], matrix[1][2], matrix[2][2]),
+    )
+
+
+@numba.njit(cache=True)
+def apply(matrix, vector):
+    """Matrix times column vector."""
+    return (dot(matrix[0], vector), dot(matrix[1], vector), dot(matrix[2], vector))
+
+
+@numba.njit(cache=True)
+def product(first, second):
+    """Matrix times matrix."""
+    columns = transposed(second)
+    return (apply(columns, first[0]), apply(columns, first[1]), apply(columns, first[2]))
+
+
+@numba.njit(cache=True)
+def outer(column, row):
+    """Column vector times row vector."""
+    return (scaled(row, column[0]), scaled(row, column[1]), scaled(row, column[2]))
+
+
+@numba.njit(cache=True)
+def added(first, second):
+    """Sum of two matrices."""
+    return (add(first[0], second[0]), add(first[1], second[1]), add(first[2], second[2]))
+
+
+@numba.njit(cache=True)
+def rotation_matrix(wxyz):
+    """Rotation of a unit quaternion, scalar first."""
+    w, x, y, z = wxyz
+    return (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+
+
+@numba.njit(cache=True)
+def rotation_gradient(wxyz, gradient):
+    """Gradient of the unit quaternion from that of its rotation matrix."""
+    w, x, y, z = wxyz
+    (g00, g01, g02), (g10, g11, g12), (g20, g21, g22) = gradient
+    return (
+        2.0 * (x * (g21 - g12) + y * (g02 - g20) + z * (g10 - g01)),
+        2.0 * (y * (g01 + g10) + z * (g02 + g20) + w * (g21 - g12) - 2.0 * x * (g11 + g22)),
+        2.0 * (x * (g01 + g10) + z * (g12 + g21) + w * (g02 - g20) - 2.0 * y * (g00 + g22)),
+        2.0 * (x * (g02 + g20) + y * (g12 + g21) + w * (g10 - g01) - 2.0 * z * (g00 + g11)),
+    )
+
+
+@numba.njit(cache=True)
+def direction_of(vector):
+    """Unit vector along `vector`, and the length it was divided by."""
+    length = max(math.sqrt(dot(vector, vector)), 1e-12)
+    return scaled(vector, 1.0 / length), length
+
+
+@numba.njit(cache=True)
+def direction_of_gradient(unit, length, gradient):
+    """Gradient of a vector from that of the unit vector along it."""
+    across = add(gradient, scaled(unit, -dot(unit, gradient)))
+    return scaled(across, 1.0 / length)

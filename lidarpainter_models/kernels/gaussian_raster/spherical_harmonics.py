@@ -1,0 +1,77 @@
+"""Colour of a Gaussian seen from one direction: real spherical harmonics up to degree 3.
+
+Order, signs and constants are those of Kerbl et al. (2023). Compiled code on one Gaussian.
+"""
+
+import numba
+
+BAND_0 = 0.28209479177387814
+BAND_1 = 0.4886025119029199
+BAND_2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+BAND_3 = (
+    0.5900435899266435,
+    2.890611442640554,
+    0.4570457994644658,
+    0.3731763325901154,
+    1.445305721320277,
+)
+
+
+@numba.njit(cache=True)
+def basis(coefficients, direction, out):
+    """Fill `out` with the first `coefficients` basis values at a unit direction."""
+    x, y, z = direction
+    out[0] = BAND_0
+    if coefficients > 1:
+        out[1] = -BAND_1 * y
+        out[2] = BAND_1 * z
+        out[3] = -BAND_1 * x
+    if coefficients > 4:
+        out[4] = BAND_2[0] * x * y
+        out[5] = -BAND_2[0] * y * z
+        out[6] = BAND_2[1] * (2.0 * z * z - x * x - y * y)
+        out[7] = -BAND_2[0] * x * z
+        out[8] = BAND_2[2] * (x * x - y * y)
+    if coefficients > 9:
+        out[9] = -BAND_3[0] * y * (3.0 * x * x - y * y)
+        out[10] = BAND_3[1] * x * y * z
+        out[11] = -BAND_3[2] * y * (4.0 * z * z - x * x - y * y)
+        out[12] = BAND_3[3] * z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y)
+        out[13] = -BAND_3[2] * x * (4.0 * z * z - x * x - y * y)
+        out[14] = BAND_3[4] * z * (x * x - y * y)
+        out[15] = -BAND_3[0] * x * (x * x - 3.0 * y * y)
+
+
+@numba.njit(cache=True)
+def direction_gradient(coefficients, direction, weight):
+    """Gradient of sum_k weight[k] basis[k] with respect to the direction."""
+    x, y, z = direction
+    gx, gy, gz = 0.0, 0.0, 0.0
+    if coefficients > 1:
+        gx, gy, gz = -BAND_1 * weight[3], -BAND_1 * weight[1], BAND_1 * weight[2]
+    if coefficients > 4:
+        w4, w5, w7 = BAND_2[0] * weight[4], -BAND_2[0] * weight[5], -BAND_2[0] * weight[7]
+        w6, w8 = 2.0 * BAND_2[1] * weight[6], 2.0 * BAND_2[2] * weight[8]
+        gx += w4 * y - w6 * x + w7 * z + w8 * x
+        gy += w4 * x + w5 * z - w6 * y - w8 * y
+        gz += w5 * y + 2.0 * w6 * z + w7 * x
+    if coefficients > 9:
+        third = _band_3_gradient(direction, weight)
+        gx, gy, gz = gx + third[0], gy + third[1], gz + third[2]
+    return (gx, gy, gz)
+
+
+@numba.njit(cache=True)
+def _band_3_gradient(direction, weight):
+    x, y, z = direction
+    xx, yy, zz = x * x, y * y, z * z
+    w9, w10, w11 = -BAND_3[0] * weight[9], BAND_3[1] * weight[10], -BAND_3[2] * weight[11]
+    w12, w13, w14 = BAND_3[3] * weight[12], -BAND_3[2] * weight[13], BAND_3[4] * weight[14]
+    w15 = -BAND_3[0] * weight[15]
+    gx = w9 * 6.0 * x * y + w10 * y * z - w11 * 2.0 * x * y - w12 * 6.0 * x * z
+    gx += w13 * (4.0 * zz - 3.0 * xx - yy) + w14 * 2.0 * x * z + w15 * 3.0 * (xx - yy)
+    gy = w9 * 3.0 * (xx - yy) + w10 * x * z + w11 * (4.0 * zz - xx - 3.0 * yy)
+    gy -= w12 * 6.0 * y * z + w13 * 2.0 * x * y + w14 * 2.0 * y * z + w15 * 6.0 * x * y
+    gz = w10 * x * y + w11 * 8.0 * y * z + w12 * (6.0 * zz - 3.0 * xx - 3.0 * yy)
+    gz += w13 * 8.0 * x * z + w14 * (xx - yy)
+    return (gx, gy, gz)
