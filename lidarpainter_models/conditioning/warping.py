@@ -1,0 +1,211 @@
+"""Carry recorded pictures into another view by depth.
+
+Backward warping: every pixel of the target is lifted to its world point, moved with its actor to
+the time of the source, projected into the source and sampled there, if the source saw the same
+surface (its depth agrees). Sky is a surface at infinity.
+
+Frames: world z up; camera x right, y down, z forward; depth is camera z in metres, 0 = none;
+pixel centres at half-integers.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
+from lidarpainter_models.scenes.driving_scene import ActorTrack
+
+SKY_DEPTH_M = 1e5
+"""Far enough for any parallax to vanish, near enough for float32."""
+BACKGROUND = -1
+"""Actor index of a pixel that no moving box contains."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WarpConfig:
+    """When a recorded pixel may stand for one of another view."""
+
+    depth_tolerance: float = 0.04
+    """Relative difference of depth up to which two views see the same surface."""
+    sky_alpha: float = 0.5
+    """A pixel more transparent than this, and without depth, is sky."""
+    box_margin_m: float = 0.15
+    """Boxes are grown by this much to the sides and upwards before points are tested."""
+    box_floor_m: float = 0.1
+    """Points lower than this over the bottom of a box are road, unless inside the true box."""
+    time_weight_m_s: float = 2.0
+    """Metres a source may stand nearer for each second it is older."""
+    angle_weight_m_rad: float = 8.0
+    """Metres a source may stand nearer for each radian it looks elsewhere."""
+
+    def __post_init__(self) -> None:
+        """Refuse tolerances that accept nothing or everything."""
+        if not 0 < self.depth_tolerance < 1:
+            raise ConfigError(f"depth_tolerance must be in (0, 1), got {self.depth_tolerance}")
+        if not 0 < self.sky_alpha < 1:
+            raise ConfigError(f"sky_alpha must be in (0, 1), got {self.sky_alpha}")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SourcePicture:
+    """A recorded picture with the surfaces it shows."""
+
+    key: tuple[int, str]
+    """(frame index, camera name)."""
+    camera: Camera
+    timestamp_ns: int
+    rgb: Float[Tensor, "height width 3"]
+    depth_m: Float[Tensor, "height width"]
+    alpha: Float[Tensor, "height width"]
+
+
+def nearest_sources(
+    target_camera: Camera,
+    timestamp_ns: int,
+    sources: Sequence[SourcePicture],
+    *,
+    count: int,
+    exclude: frozenset[tuple[int, str]] = frozenset(),
+    config: WarpConfig | None = None,
+) -> tuple[SourcePicture, ...]:
+    """The `count` sources nearest in place, direction and time; ties go to the earlier one."""
+    config = config or WarpConfig()
+    axis = target_camera.world_from_camera[:3, 2]
+
+    def cost_m(source: SourcePicture) -> float:
+        distance_m = (source.camera.centre_world - target_camera.centre_world).norm()
+        cosine = (source.camera.world_from_camera[:3, 2] @ axis).clamp(-1, 1)
+        seconds = abs(source.timestamp_ns - timestamp_ns) * 1e-9
+        angle_rad = torch.arccos(cosine)
+        return float(
+            distance_m + config.angle_weight_m_rad * angle_rad + config.time_weight_m_s * seconds
+        )
+
+    allowed = [source for source in sources if source.key not in exclude]
+    return tuple(sorted(allowed, key=cost_m)[:count])
+
+
+def warp_pictures(
+    target_camera: Camera,
+    target_timestamp_ns: int,
+    target_depth_m: Float[Tensor, "height width"],
+    target_alpha: Float[Tensor, "height width"],
+    sources: Sequence[SourcePicture],
+    tracks: Sequence[ActorTrack],
+    *,
+    config: WarpConfig | None = None,
+) -> tuple[Float[Tensor, "sources height width 3"], Bool[Tensor, "sources height width"]]:
+    """Every source as the target camera would see it, and where that is known.
+
+    A pixel without depth is sky if its alpha is low, else nothing is known of it. `tracks` are
+    the moving actors. Pictures are 0 where they are not valid.
+    """
+    config = config or WarpConfig()
+    height_px, width_px = target_depth_m.shape
+    has_depth = target_depth_m > 0
+    is_sky = ~has_depth & (target_alpha < config.sky_alpha)
+    depth_m = torch.where(has_depth, target_depth_m, SKY_DEPTH_M)
+    points_world = target_camera.unproject(depth_m).reshape(-1, 3)
+    known = (has_depth | is_sky).reshape(-1)
+    actors = actor_of_points(points_world, target_timestamp_ns, tracks, config=config)
+    pictures, valids = [], []
+    for source in sources:
+        points, present = _move_with_actors(
+            points_world, actors, tracks, target_timestamp_ns, source.timestamp_ns
+        )
+        rgb, seen = _sample(source, points, is_sky.reshape(-1), config)
+        valid = (seen & present & known).reshape(height_px, width_px)
+        pictures.append(torch.where(valid[..., None], rgb.reshape(height_px, width_px, 3), 0))
+        valids.append(valid)
+    if not pictures:
+        empty = target_depth_m.new_zeros(0, height_px, width_px)
+        return empty[..., None].expand(-1, -1, -1, 3), empty.to(torch.bool)
+    return torch.stack(pictures), torch.stack(valids)
+
+
+def actor_of_points(
+    points_world: Float[Tensor, "points 3"],
+    timestamp_ns: int,
+    tracks: Sequence[ActorTrack],
+    *,
+    config: WarpConfig | None = None,
+) -> Int[Tensor, " points"]:
+    """Index of the moving box that holds each point at a time, or `BACKGROUND`.
+
+    Boxes are grown a little, but not into the road beside and under the actor.
+    """
+    config = config or WarpConfig()
+    owner = torch.full(points_world.shape[:1], BACKGROUND, device=points_world.device)
+    for index, track in enumerate(tracks):
+        if not track.is_present(timestamp_ns):
+            continue
+        world_from_box = track.pose_at(timestamp_ns)
+        half_m = track.size_m.to(points_world) / 2
+        reach_m = float(half_m.norm()) + 2 * config.box_margin_m
+        centre = world_from_box[:3, 3].to(points_world)
+        near = ((points_world - centre).abs() <= reach_m).all(dim=-1).nonzero()[:, 0]
+        points = transform_points(invert_rigid(world_from_box).to(points_world), points_world[near])
+        over_floor_m = points[:, 2] + half_m[2]
+        grown = (points.abs() <= half_m + config.box_margin_m).all(dim=-1)
+        inside = (points[:, :2].abs() <= half_m[:2]).all(dim=-1) & (over_floor_m > 0)
+        held = grown & (inside | (over_floor_m > config.box_floor_m))
+        owner[near[held]] = index
+    return owner
+
+
+def _move_with_actors(
+    points_world: Float[Tensor, "points 3"],
+    actors: Int[Tensor, " points"],
+    tracks: Sequence[ActorTrack],
+    from_ns: int,
+    to_ns: int,
+) -> tuple[Float[Tensor, "points 3"], Bool[Tensor, " points"]]:
+    """Where the points are at another time, and whether their actor is there then."""
+    moved = points_world.clone()
+    present = torch.ones_like(actors, dtype=torch.bool)
+    for index in actors.unique().tolist():
+        if index == BACKGROUND:
+            continue
+        held = actors == index
+        if not tracks[index].is_present(to_ns):
+            present[held] = False
+            continue
+        later_from_box = tracks[index].pose_at(to_ns)
+        later_from_world = later_from_box @ invert_rigid(tracks[index].pose_at(from_ns))
+        moved[held] = transform_points(later_from_world.to(points_world), points_world[held])
+    return moved, present
+
+
+def _sample(
+    source: SourcePicture,
+    points_world: Float[Tensor, "points 3"],
+    is_sky: Bool[Tensor, " points"],
+    config: WarpConfig,
+) -> tuple[Float[Tensor, "points 3"], Bool[Tensor, " points"]]:
+    """Colour of world points in a source, and whether the source saw just these points.
+
+    Inverse depth is interpolated, not depth: on a plane it is linear in the picture, so a surface
+    at a grazing angle passes the test, while a depth edge lies between both sides and fails it.
+    """
+    camera = source.camera
+    pixels_uv, depth_m = camera.project(points_world)
+    size = pixels_uv.new_tensor([camera.width_px, camera.height_px])
+    rim_px = 0.49  # half a pixel less rounding: outside it nothing can be interpolated
+    inside = ((pixels_uv >= rim_px) & (pixels_uv <= size - rim_px)).all(dim=-1) & (depth_m > 0.1)
+    grid = torch.where(inside[:, None], pixels_uv / size * 2 - 1, 0)
+    has_depth = source.depth_m > 0
+    inverse = torch.where(has_depth, 1 / source.depth_m.clamp(min=1e-3), 0)
+    is_source_sky = (~has_depth & (source.alpha < config.sky_alpha)).to(source.rgb)
+    layers = torch.cat([source.rgb, inverse[..., None], is_source_sky[..., None]], dim=-1)
+    sampled = torch.nn.functional.grid_sample(
+        layers.permute(2, 0, 1)[None], grid[None, None], padding_mode="border", align_corners=False
+    )[0, :, 0].T
+    same = (sampled[:, 3] * depth_m - 1).abs() <= config.depth_tolerance
+    same_surface = same & (sampled[:, 4] < config.sky_alpha)
+    same_sky = sampled[:, 4] > 1 - 1e-3
+    return sampled[:, :3], inside & torch.where(is_sky, same_sky, same_surface)
