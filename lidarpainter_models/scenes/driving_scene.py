@@ -1,0 +1,213 @@
+"""A driving scene in its canonical form, whatever dataset it came from.
+
+World: x forward, y left, z up, origin at the first ego pose. A `DrivingScene` is a lazy handle: the
+tables are in memory, pictures and points are read when asked for.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from lidarpainter_models.errors import SceneError
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.scenes.records import Distortion, RecordedView, Sweep, SweepPoints
+from lidarpainter_models.scenes.stored import StoredScene
+from lidarpainter_models.scenes.tracks import ActorTrack, tracks_from_boxes
+from lidarpainter_models.scenes.undistortion import pinhole_of, undistort
+
+__all__ = ["ActorTrack", "DrivingScene", "RecordedView", "Sweep", "SweepPoints", "scene_path"]
+
+_POINT_COLUMNS = {
+    "xyz_m": "point_xyz_m",
+    "intensity": "point_intensity",
+    "time_offset_ns": "point_time_offset_ns",
+    "ring": "point_ring",
+    "return_index": "point_return",
+    "lidar": "point_lidar",
+}
+
+
+def scene_path(store: Path, dataset: str, sequence: str) -> Path:
+    """Where a scene lies in a store."""
+    return Path(store) / "scenes" / dataset / sequence
+
+
+class DrivingScene:
+    """One stored sequence: poses, pictures, sweeps and actor tracks."""
+
+    def __init__(self, stored: StoredScene) -> None:
+        """Take the tables into memory; `DrivingScene.open` is the usual way in."""
+        self._stored = stored
+        self.path = stored.path
+        self.manifest: dict[str, Any] = stored.manifest
+        self.dataset: str = self.manifest["dataset"]
+        self.sequence: str = self.manifest["sequence"]
+        self.content_digest: str = self.manifest["content_digest"]
+        """Same digest, same content: what derived work is keyed by."""
+        self.camera_names: tuple[str, ...] = tuple(self.manifest["camera_names"])
+        self.lidar_names: tuple[str, ...] = tuple(self.manifest["lidar_names"])
+        self.semantic_classes: dict[int, str] = {
+            int(number): name for number, name in self.manifest["semantic_classes"].items()
+        }
+        """Names of the point classes; empty where the dataset has none."""
+        frames = stored.table("frames")
+        self.frame_indices: tuple[int, ...] = tuple(frames["frame_index"].to_pylist())
+        self.frame_timestamps_ns = torch.tensor(frames["timestamp_ns"].to_pylist())
+        self.world_from_ego: Float[Tensor, "frames 4 4"] = _poses(frames, "world_from_ego")
+        self._read_tables()
+
+    @classmethod
+    def open(cls, path: Path) -> "DrivingScene":
+        """Open the scene at a path.
+
+        Raises:
+            SceneError: there is no scene, or it is incomplete or damaged.
+        """
+        return cls(StoredScene(Path(path)))
+
+    @property
+    def global_from_world(self) -> Float[Tensor, "4 4"]:
+        """The dataset's own frame from the world, float64."""
+        return torch.tensor(self.manifest["global_from_world"], dtype=torch.float64).reshape(4, 4)
+
+    def frame_position(self, frame_index: int) -> int:
+        """Position of a frame in `frame_indices` and its tensors."""
+        try:
+            return self.frame_indices.index(frame_index)
+        except ValueError:
+            raise SceneError(
+                f"{self.path}: no frame {frame_index}; frames go from {self.frame_indices[0]} "
+                f"to {self.frame_indices[-1]}"
+            ) from None
+
+    def views_of(self, camera_name: str) -> tuple[RecordedView, ...]:
+        """The pictures of one camera, frame by frame.
+
+        Raises:
+            SceneError: the scene has no such camera.
+        """
+        if camera_name not in self.camera_names:
+            raise SceneError(
+                f"{self.path}: no camera {camera_name!r}; it has {', '.join(self.camera_names)}"
+            )
+        return tuple(view for view in self.views if view.camera_name == camera_name)
+
+    def view(self, frame_index: int, camera_name: str) -> RecordedView:
+        """One picture by frame and camera."""
+        for view in self.views_of(camera_name):
+            if view.frame_index == frame_index:
+                return view
+        raise SceneError(f"{self.path}: camera {camera_name!r} has no frame {frame_index}")
+
+    def read_image(self, view: RecordedView) -> UInt8[Tensor, "height width 3"]:
+        """The recorded picture as RGB bytes; a distorted lens is undone."""
+        jpeg = self.read_jpeg(view)
+        picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+        if picture is None:
+            raise SceneError(f"{self.path}: the picture {view.key} cannot be decoded")
+        picture = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+        lens, distortion = self._lenses[view.index]
+        return torch.from_numpy(undistort(picture, lens, distortion, view.camera))
+
+    def read_jpeg(self, view: RecordedView) -> bytes:
+        """The recorded picture as the camera's own JPEG bytes."""
+        offset, num_bytes = self._image_ranges[view.index]
+        return self._stored.read_rows("image_bytes", offset, num_bytes).tobytes()
+
+    def read_sweep(self, sweep: Sweep) -> SweepPoints:
+        """The points of one sweep, in the world."""
+        columns = {
+            name: torch.from_numpy(self._stored.read_rows(array, sweep.offset, sweep.num_points))
+            for name, array in _POINT_COLUMNS.items()
+        }
+        return SweepPoints(**columns)
+
+    def sweeps_of(self, frame_index: int) -> tuple[Sweep, ...]:
+        """The sweeps of all LiDARs in one frame."""
+        return tuple(sweep for sweep in self.sweeps if sweep.frame_index == frame_index)
+
+    def read_points(self, frame_index: int) -> SweepPoints:
+        """The points of all LiDARs of one frame; time offsets are those of each own sweep."""
+        sweeps = self._sweeps_required(frame_index)
+        return SweepPoints.concatenate([self.read_sweep(sweep) for sweep in sweeps])
+
+    def read_semantics(self, frame_index: int) -> UInt8[Tensor, " points"] | None:
+        """Class of each point of `read_points`, or None where the dataset has no classes."""
+        if not self._stored.has_array("point_semantics"):
+            return None
+        parts = [
+            self._stored.read_rows("point_semantics", sweep.offset, sweep.num_points)
+            for sweep in self._sweeps_required(frame_index)
+        ]
+        return torch.from_numpy(np.concatenate(parts))
+
+    def verify_content(self) -> None:
+        """Read the whole scene and compare it with its digests (SceneError where it differs)."""
+        self._stored.verify_content()
+
+    def _sweeps_required(self, frame_index: int) -> tuple[Sweep, ...]:
+        sweeps = self.sweeps_of(frame_index)
+        if not sweeps:
+            raise SceneError(f"{self.path}: frame {frame_index} has no LiDAR sweep")
+        return sweeps
+
+    def _read_tables(self) -> None:
+        cameras = self._stored.table("cameras")
+        rows = cameras.drop_columns(["world_from_camera"]).to_pylist()
+        poses = _poses(cameras, "world_from_camera")
+        self._image_ranges = [(row["offset"], row["num_bytes"]) for row in rows]
+        self._lenses = [
+            (_lens(row, pose), Distortion(row["distortion_model"], tuple(row["distortion_terms"])))
+            for row, pose in zip(rows, poses, strict=True)
+        ]
+        self.views: tuple[RecordedView, ...] = tuple(
+            RecordedView(
+                frame_index=row["frame_index"],
+                camera_name=row["camera"],
+                timestamp_ns=row["timestamp_ns"],
+                camera=pinhole_of(*self._lenses[index]),
+                index=index,
+            )
+            for index, row in enumerate(rows)
+        )
+        sweeps = self._stored.table("sweeps")
+        poses = _poses(sweeps, "world_from_lidar")
+        self.sweeps: tuple[Sweep, ...] = tuple(
+            Sweep(
+                frame_index=row["frame_index"],
+                lidar_name=row["lidar"],
+                timestamp_ns=row["timestamp_ns"],
+                world_from_lidar=pose,
+                offset=row["offset"],
+                num_points=row["num_points"],
+            )
+            for row, pose in zip(sweeps.to_pylist(), poses, strict=True)
+        )
+        boxes = self._stored.table("boxes")
+        columns = boxes.drop_columns(["world_from_box"]).to_pydict()
+        self.tracks: tuple[ActorTrack, ...] = tracks_from_boxes(
+            columns, _poses(boxes, "world_from_box")
+        )
+
+
+def _poses(table: pa.Table, column: str) -> Float[Tensor, "rows 4 4"]:
+    flat = table[column].combine_chunks().flatten().to_numpy(zero_copy_only=False)
+    return torch.from_numpy(np.array(flat, dtype=np.float64)).reshape(-1, 4, 4)
+
+
+def _lens(row: dict[str, Any], world_from_camera: Float[Tensor, "4 4"]) -> Camera:
+    return Camera(
+        world_from_camera=world_from_camera,
+        fx_px=row["fx_px"],
+        fy_px=row["fy_px"],
+        cx_px=row["cx_px"],
+        cy_px=row["cy_px"],
+        width_px=row["width_px"],
+        height_px=row["height_px"],
+    )

@@ -1,0 +1,62 @@
+"""Read the files of a downloaded log and remember what was read, for provenance."""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from lidarpainter_models.errors import DataError
+from lidarpainter_models.scenes.readers.dataframe_pickle import Table, read_table_bytes
+
+
+class SourceFolder:
+    """A folder of a dataset as downloaded."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = Path(root)
+        self._digests: dict[str, str] = {}
+
+    def read_bytes(self, name: str) -> bytes:
+        """The content of one file.
+
+        Raises:
+            DataError: the file is missing or cannot be read.
+        """
+        path = self.root / name
+        try:
+            content = path.read_bytes()
+        except (FileNotFoundError, NotADirectoryError):
+            raise DataError(f"{path}: the file is missing") from None
+        except OSError as error:
+            raise DataError(f"{path}: cannot be read ({error.strerror})") from None
+        self._digests[name] = hashlib.sha256(content).hexdigest()
+        return content
+
+    def read_json(self, name: str, kind: type) -> Any:  # noqa: ANN401
+        """A JSON file whose outermost value is a list or a dict."""
+        try:
+            value = json.loads(self.read_bytes(name))
+        except (ValueError, RecursionError) as error:
+            if isinstance(error, DataError):
+                raise
+            raise DataError(f"{self.root / name}: not a JSON file ({error})") from None
+        if not isinstance(value, kind):
+            raise DataError(f"{self.root / name}: holds no {kind.__name__}")
+        return value
+
+    def read_table(self, name: str, columns: tuple[str, ...]) -> Table:
+        """A pickled pandas table that has at least these columns; nothing of it is run."""
+        path = self.root / name
+        table = read_table_bytes(self.read_bytes(name), path)
+        missing = [column for column in columns if column not in table]
+        if missing:
+            raise DataError(f"{path}: no column {', '.join(missing)}; it has {', '.join(table)}")
+        return table
+
+    def provenance(self) -> dict[str, object]:
+        """How many files were read, and one digest over their names and contents."""
+        content = json.dumps(sorted(self._digests.items()))
+        return {
+            "num_files": len(self._digests),
+            "sha256": hashlib.sha256(content.encode()).hexdigest(),
+        }

@@ -1,0 +1,148 @@
+"""The stored form of a scene: every table column and array, defined once.
+
+The writer, the reader, the checks and the documentation of the format all take their names, types
+and units from here. Every `a_from_b` is a row-major 4x4 rigid transform in float64.
+"""
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+
+SCHEMA_VERSION = 1
+"""Raised when a reader of the last version could misread the new one."""
+MANIFEST_NAME = "manifest.json"
+ARRAYS_NAME = "scene.zarr"
+NAME_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+"""Datasets, sequences, cameras and LiDARs are named so: safe as a folder of their own."""
+
+POSE_TYPE = pa.list_(pa.float64(), 16)
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One column of a Parquet table."""
+
+    name: str
+    type: pa.DataType
+    unit: str
+    description: str
+    is_optional: bool = False
+    """Whether a row may leave it empty."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayLayout:
+    """One array of `scene.zarr`; its first axis grows while the scene is written."""
+
+    name: str
+    dtype: np.dtype
+    row_shape: tuple[int, ...]
+    chunk_rows: int
+    unit: str
+    description: str
+    is_optional: bool = False
+
+
+_FRAME_INDEX = Column("frame_index", pa.int64(), "1", "number of the frame in its log")
+_TIMESTAMP = "since the epoch of the dataset"
+
+FRAMES = (
+    _FRAME_INDEX,
+    Column("timestamp_ns", pa.int64(), "ns", f"when the ego pose holds, {_TIMESTAMP}"),
+    Column("world_from_ego", POSE_TYPE, "m", "ego: x forward, y left, z up"),
+)
+CAMERAS = (
+    _FRAME_INDEX,
+    Column("camera", pa.string(), "", "name of the camera"),
+    Column("timestamp_ns", pa.int64(), "ns", f"middle of the exposure, {_TIMESTAMP}"),
+    Column("world_from_camera", POSE_TYPE, "m", "at exposure; x right, y down, z forward"),
+    Column("fx_px", pa.float64(), "px", "focal length along x"),
+    Column("fy_px", pa.float64(), "px", "focal length along y"),
+    Column("cx_px", pa.float64(), "px", "principal point; the first pixel's centre is 0.5"),
+    Column("cy_px", pa.float64(), "px", "principal point; the first pixel's centre is 0.5"),
+    Column("distortion_model", pa.string(), "", "none, brown or fisheye, as OpenCV defines them"),
+    Column("distortion_terms", pa.list_(pa.float64()), "1", "coefficients in OpenCV's order"),
+    Column("width_px", pa.int64(), "px", "width of the stored picture"),
+    Column("height_px", pa.int64(), "px", "height of the stored picture"),
+    Column("rolling_shutter_s", pa.float64(), "s", "first to last row read", is_optional=True),
+    Column("rolling_shutter_direction", pa.string(), "", "down, up, left, right", is_optional=True),
+    Column("offset", pa.int64(), "byte", "start of the JPEG in image_bytes"),
+    Column("num_bytes", pa.int64(), "byte", "length of the JPEG"),
+)
+SWEEPS = (
+    _FRAME_INDEX,
+    Column("lidar", pa.string(), "", "name of the LiDAR"),
+    Column("timestamp_ns", pa.int64(), "ns", f"middle of the sweep, {_TIMESTAMP}"),
+    Column("world_from_lidar", POSE_TYPE, "m", "at the timestamp; the origin is the sensor"),
+    Column("offset", pa.int64(), "1", "first row of the sweep in the point arrays"),
+    Column("num_points", pa.int64(), "1", "rows of the sweep"),
+)
+BOXES = (
+    _FRAME_INDEX,
+    Column("actor_id", pa.string(), "", "the same over all frames of one actor"),
+    Column("category", pa.string(), "", "the dataset's class name"),
+    Column("timestamp_ns", pa.int64(), "ns", f"when the box holds, {_TIMESTAMP}"),
+    Column("world_from_box", POSE_TYPE, "m", "x along the length, y left, z up, origin central"),
+    Column("length_m", pa.float64(), "m", "size along the box's x"),
+    Column("width_m", pa.float64(), "m", "size along the box's y"),
+    Column("height_m", pa.float64(), "m", "size along the box's z"),
+    Column("is_moving", pa.bool_(), "", "whether the actor moves at any time of the log"),
+    Column("num_points", pa.int64(), "1", "LiDAR points of this frame inside"),
+)
+TABLES: dict[str, tuple[Column, ...]] = {
+    "frames": FRAMES,
+    "cameras": CAMERAS,
+    "sweeps": SWEEPS,
+    "boxes": BOXES,
+}
+
+_POINT_CHUNK = 1 << 18
+
+
+def _points(name: str, dtype: str, unit: str, description: str, **more: object) -> ArrayLayout:
+    row_shape = more.get("row_shape", ())
+    return ArrayLayout(
+        name, np.dtype(dtype), row_shape, _POINT_CHUNK, unit, description, "is_optional" in more
+    )
+
+
+ARRAYS: dict[str, ArrayLayout] = {
+    layout.name: layout
+    for layout in (
+        ArrayLayout(
+            "image_bytes", np.dtype("uint8"), (), 1 << 20, "byte", "the JPEG files, one by one"
+        ),
+        _points("point_xyz_m", "float32", "m", "motion-compensated, in the world", row_shape=(3,)),
+        _points("point_intensity", "float32", "1", "returned strength as the dataset scales it"),
+        _points("point_time_offset_ns", "int32", "ns", "measured this long after the sweep's time"),
+        _points("point_ring", "int16", "1", "laser of the sensor, -1 where unknown"),
+        _points("point_return", "int8", "1", "number of the echo, 0 the strongest or only one"),
+        _points("point_lidar", "uint8", "1", "position of the LiDAR's name in the manifest"),
+        _points(
+            "point_semantics", "uint8", "1", "class number; names in the manifest", is_optional=True
+        ),
+    )
+}
+POINT_ARRAYS = tuple(name for name in ARRAYS if name.startswith("point_"))
+
+
+def arrow_schema(table: str) -> pa.Schema:
+    """The Arrow schema of a table, with units and descriptions as field metadata."""
+    return pa.schema(
+        [
+            pa.field(
+                column.name,
+                column.type,
+                nullable=column.is_optional,
+                metadata={"unit": column.unit, "description": column.description},
+            )
+            for column in TABLES[table]
+        ]
+    )
+
+
+def is_safe_name(name: str) -> bool:
+    """Whether a name can be a folder below the store and nothing else."""
+    return NAME_PATTERN.fullmatch(name) is not None

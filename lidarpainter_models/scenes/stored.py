@@ -1,0 +1,137 @@
+"""Open a stored scene: its manifest, tables and arrays, refused unless complete.
+
+Zarr reads a missing chunk as zeros, so completeness is checked against the manifest's list of
+files and sizes when a scene is opened; every read chunk is checked by its CRC-32C. The full digest
+of the content is recomputed on demand (`verify_content`).
+"""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import zarr
+
+from lidarpainter_models.errors import SceneError
+from lidarpainter_models.scenes import schema
+
+_VERIFY_ROWS = 1 << 20
+
+
+def content_digest(value: object) -> str:
+    """Digest of JSON-able content; Python writes floats exactly, so equal means equal."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def stored_digest(path: Path) -> str | None:
+    """The content digest of the complete scene at a path, or None where there is none."""
+    try:
+        return read_manifest(path)["content_digest"]
+    except SceneError:
+        return None
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """The manifest of a scene, after checking that every file it lists is there.
+
+    Raises:
+        SceneError: there is no scene, it is incomplete, or another version wrote it.
+    """
+    file = path / schema.MANIFEST_NAME
+    try:
+        manifest = json.loads(file.read_text("utf-8"))
+    except FileNotFoundError:
+        raise SceneError(f"{path}: no scene here (no {schema.MANIFEST_NAME})") from None
+    except (OSError, ValueError) as error:
+        raise SceneError(f"{file}: cannot be read ({error})") from None
+    if not isinstance(manifest, dict) or manifest.get("is_complete") is not True:
+        raise SceneError(f"{path}: the scene is not complete; ingest it again")
+    if manifest.get("schema_version") != schema.SCHEMA_VERSION:
+        raise SceneError(
+            f"{path}: the scene has schema version {manifest.get('schema_version')}, "
+            f"expected {schema.SCHEMA_VERSION}; ingest it again"
+        )
+    for name, num_bytes in manifest["files"].items():
+        _require_file(path / name, num_bytes)
+    return manifest
+
+
+def _require_file(file: Path, num_bytes: int) -> None:
+    try:
+        found = file.stat().st_size
+    except FileNotFoundError:
+        raise SceneError(f"{file}: missing; the scene is damaged, ingest it again") from None
+    if found != num_bytes:
+        raise SceneError(
+            f"{file}: {found} bytes, expected {num_bytes}; the scene is damaged, ingest it again"
+        )
+
+
+class StoredScene:
+    """The files of one scene, read lazily."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        self.manifest = read_manifest(self.path)
+        self._group: zarr.Group | None = None
+
+    def table(self, name: str) -> pa.Table:
+        """One of the tables of the schema, whole; its columns are checked."""
+        file = self.path / f"{name}.parquet"
+        try:
+            table = pq.read_table(file)
+        except (OSError, pa.ArrowException) as error:
+            raise SceneError(f"{file}: cannot be read ({error})") from None
+        expected = schema.arrow_schema(name)
+        if not table.schema.equals(expected):
+            raise SceneError(
+                f"{file}: columns {', '.join(table.schema.names)}, "
+                f"expected {', '.join(expected.names)} with the types of the schema"
+            )
+        return table
+
+    def has_array(self, name: str) -> bool:
+        """Whether the scene holds an optional array."""
+        return name in self.manifest["arrays"]
+
+    def read_rows(self, name: str, offset: int, num_rows: int) -> np.ndarray:
+        """Rows of an array as a new numpy array.
+
+        Raises:
+            SceneError: the rows do not exist or a chunk is damaged.
+        """
+        total = self.manifest["arrays"][name]["shape"][0]
+        if not 0 <= offset <= offset + num_rows <= total:
+            raise SceneError(
+                f"{self.path}: rows {offset} to {offset + num_rows} of {name}, which has {total}"
+            )
+        try:
+            if self._group is None:
+                self._group = zarr.open_group(self.path / schema.ARRAYS_NAME, mode="r")
+            rows = self._group[name][offset : offset + num_rows]  # type: ignore[index]
+        except (OSError, ValueError, KeyError, RuntimeError) as error:
+            raise SceneError(
+                f"{self.path}: array {name} cannot be read ({error}); ingest the scene again"
+            ) from None
+        return np.asarray(rows)
+
+    def verify_content(self) -> None:
+        """Read everything and compare it with the digests in the manifest.
+
+        Raises:
+            SceneError: a table or array is not what was written.
+        """
+        for name, entry in self.manifest["tables"].items():
+            if content_digest(self.table(name).to_pylist()) != entry["sha256"]:
+                raise SceneError(f"{self.path}: table {name} is not what was written")
+        for name, entry in self.manifest["arrays"].items():
+            digest = hashlib.sha256()
+            total = entry["shape"][0]
+            for offset in range(0, total, _VERIFY_ROWS):
+                rows = self.read_rows(name, offset, min(_VERIFY_ROWS, total - offset))
+                digest.update(np.ascontiguousarray(rows).tobytes())
+            if digest.hexdigest() != entry["sha256"]:
+                raise SceneError(f"{self.path}: array {name} is not what was written")

@@ -1,0 +1,111 @@
+"""Checks at the border: what a reader hands to the writer must make sense.
+
+Every check takes `where`, the place to name in the error (dataset, sequence, frame, sensor), and
+raises a one-line `DataError` that says what is wrong there and what was expected.
+"""
+
+import math
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.errors import DataError
+from lidarpainter_models.geometry.transforms import is_rigid
+from lidarpainter_models.scenes.schema import is_safe_name
+
+_JPEG_START = b"\xff\xd8"
+_JPEG_END = b"\xff\xd9"
+# every start-of-frame marker; C4, C8 and CC in the same range mean other things
+_START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+MAX_COORDINATE_M = 100_000.0
+"""Farther from the first ego pose than this, float32 is no longer exact to a centimetre."""
+
+
+def require_name(name: str, kind: str) -> str:
+    """Refuse names that would not be one plain folder, `../x` above all."""
+    if not is_safe_name(name):
+        raise DataError(
+            f"{kind} name {name!r} cannot be used: expected letters, digits, '.', '_' or '-', "
+            "starting with a letter or digit"
+        )
+    return name
+
+
+def require_pose(target_from_source: Float[Tensor, "4 4"], where: str) -> Float[Tensor, "4 4"]:
+    """Refuse a pose that is not a finite rigid transform."""
+    if not bool(torch.isfinite(target_from_source).all()):
+        raise DataError(f"{where}: the pose is not finite")
+    if not bool(is_rigid(target_from_source)):
+        raise DataError(f"{where}: the pose is not a rotation and a translation")
+    return target_from_source
+
+
+def require_points(xyz_m: np.ndarray, where: str) -> None:
+    """Refuse a sweep without points, or with points that are not finite or absurdly far."""
+    if len(xyz_m) == 0:
+        raise DataError(f"{where}: zero points, expected at least one")
+    finite = np.isfinite(xyz_m).all(axis=1)
+    if not finite.all():
+        raise DataError(f"{where}: {int((~finite).sum())} of {len(xyz_m)} points are not finite")
+    farthest_m = float(np.abs(xyz_m).max())
+    if farthest_m > MAX_COORDINATE_M:
+        raise DataError(
+            f"{where}: a point is {farthest_m:.0f} m from the world origin, expected less than "
+            f"{MAX_COORDINATE_M:.0f} m (the origin is the first ego pose)"
+        )
+
+
+def require_size(size_m: tuple[float, float, float], where: str) -> None:
+    """Refuse a box whose length, width or height is zero, negative or not finite."""
+    if not all(math.isfinite(size) and size > 0 for size in size_m):
+        shown = " x ".join(f"{size:g}" for size in size_m)
+        raise DataError(f"{where}: the box measures {shown} m, expected positive sizes")
+
+
+def require_jpeg(jpeg: bytes, *, width_px: int, height_px: int, where: str) -> None:
+    """Refuse bytes that are no complete JPEG picture of the stated size."""
+    found_px = _decoded_size(jpeg, where)
+    if found_px != (width_px, height_px):
+        raise DataError(
+            f"{where}: the picture is {found_px[0]} x {found_px[1]} px, "
+            f"expected {width_px} x {height_px}"
+        )
+
+
+def _decoded_size(jpeg: bytes, where: str) -> tuple[int, int]:
+    """Width and height of a JPEG that is complete and decodes.
+
+    A decoder fills a cut-off picture with grey and says nothing, so the end-of-image marker is
+    looked for as well.
+    """
+    if not jpeg.startswith(_JPEG_START):
+        raise DataError(f"{where}: not a JPEG picture")
+    if not jpeg.rstrip(b"\x00").endswith(_JPEG_END):
+        raise DataError(f"{where}: the JPEG picture is cut off ({len(jpeg)} bytes, no end marker)")
+    picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise DataError(f"{where}: the JPEG picture cannot be decoded")
+    return picture.shape[1], picture.shape[0]
+
+
+def jpeg_header_size(jpeg: bytes, where: str) -> tuple[int, int]:
+    """Width and height a JPEG's header states, read without decoding the picture.
+
+    Segments follow each other as marker, big-endian length, content (ITU-T T.81, annex B); the
+    size stands in the start-of-frame segment.
+    """
+    position = len(_JPEG_START)
+    while jpeg.startswith(_JPEG_START) and position + 9 <= len(jpeg) and jpeg[position] == 0xFF:
+        marker = jpeg[position + 1]
+        if marker in _START_OF_FRAME:
+            height_px = int.from_bytes(jpeg[position + 5 : position + 7], "big")
+            width_px = int.from_bytes(jpeg[position + 7 : position + 9], "big")
+            return width_px, height_px
+        if marker == 0xFF:  # padding before a marker
+            position += 1
+            continue
+        position += 2 + int.from_bytes(jpeg[position + 2 : position + 4], "big")
+    raise DataError(f"{where}: not a JPEG picture with a readable header")
