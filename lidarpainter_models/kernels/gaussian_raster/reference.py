@@ -1,0 +1,244 @@
+"""The rasteriser in plain torch: the law for the other backends.
+
+Any float type (float64 if asked), any device, gradients by autograd. Projection after Zwicker et
+al. (2001), "EWA splatting", blending after Kerbl et al. (2023); `blending_limits` holds the
+constants. Gaussians that cannot reach a tile are left out of it, which changes no value.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
+    ALPHA_CUT,
+    COLOUR_OFFSET,
+    MAX_ALPHA,
+    MIN_COMPENSATION,
+    MIN_TRANSMITTANCE,
+    TANGENT_MARGIN,
+    TILE_PX,
+)
+from lidarpainter_models.kernels.gaussian_raster.reference_harmonics import harmonic_basis
+from lidarpainter_models.kernels.gaussian_raster.splat_inputs import SplatInputs, SplatView
+
+DrawnPictures = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ScreenGaussians:
+    """Gaussians on the screen, nearest first; only those that may be seen."""
+
+    index: Tensor
+    centre_px: Float[Tensor, "visible 2"]
+    covariance_px2: Float[Tensor, "visible 2 2"]
+    """Blurred."""
+    opacity: Float[Tensor, " visible"]
+    values: Float[Tensor, "visible channels"]
+    """Red, green, blue, depth and features."""
+    half_size_px: Float[Tensor, "visible 2"]
+    """Half width and height of the region where alpha reaches `ALPHA_CUT`; no gradient."""
+
+
+def draw_gaussians(
+    inputs: SplatInputs, view: SplatView, screen_gradient_out: Tensor | None
+) -> DrawnPictures:
+    """Picture as `SplatImage` lists it: rgb, depth, alpha, features, visible, radius."""
+    screen = project_gaussians(inputs, view)
+    watch = None
+    if screen_gradient_out is not None:
+        watch = ScreenGradientWatch(screen.index, screen_gradient_out)
+    rows = []
+    for top in range(0, view.height_px, TILE_PX):
+        tiles = [
+            _draw_tile(screen, left, top, view, watch) for left in range(0, view.width_px, TILE_PX)
+        ]
+        rows.append(torch.cat(tiles, dim=1))
+    picture = torch.cat(rows, dim=0)
+    if watch is not None and picture.requires_grad:
+        picture.register_hook(watch.restart)
+    visible = torch.zeros(len(inputs.means), dtype=torch.bool, device=picture.device)
+    visible[screen.index] = True
+    radius_px = inputs.means.new_zeros(len(inputs.means))
+    largest = torch.linalg.eigvalsh(screen.covariance_px2.detach())[:, 1]
+    radius_px[screen.index] = 3.0 * largest.sqrt()
+    alpha, values = picture[..., 0], picture[..., 1:]
+    return values[..., :3], values[..., 3], alpha, values[..., 4:], visible, radius_px
+
+
+def project_gaussians(inputs: SplatInputs, view: SplatView) -> ScreenGaussians:
+    """Project, drop what no pixel can see, and sort by depth."""
+    camera_from_body = inputs.camera_from_body.to(inputs.means)[inputs.body_index.long()]
+    rotation, translation = camera_from_body[:, :3, :3], camera_from_body[:, :3, 3]
+    point = torch.einsum("gij,gj->gi", rotation, inputs.means) + translation
+    kept = torch.nonzero((point[:, 2] >= view.near_m) & (inputs.opacity >= ALPHA_CUT))[:, 0]
+    # stable: equal depths keep the order of their index
+    kept = kept[torch.sort(point[kept, 2].detach(), stable=True).indices]
+    point, rotation, translation = point[kept], rotation[kept], translation[kept]
+    bare = _screen_covariance(inputs, kept, point, rotation, view)
+    covariance = bare + view.blur_px2 * torch.eye(2).to(bare)
+    opacity = inputs.opacity[kept]
+    if view.antialias:
+        ratio = torch.linalg.det(bare) / torch.linalg.det(covariance)
+        opacity = opacity * ratio.clamp_min(MIN_COMPENSATION).sqrt()
+    focal = point.new_tensor([view.fx_px, view.fy_px])
+    principal = point.new_tensor([view.cx_px, view.cy_px])
+    centre = focal * point[:, :2] / point[:, 2:] + principal + inputs.screen_offset[kept]
+    colour = _colour(inputs, kept, rotation, translation)
+    values = torch.cat([colour, point[:, 2:], inputs.features[kept]], dim=1)
+    return _seen(
+        ScreenGaussians(
+            index=kept,
+            centre_px=centre,
+            covariance_px2=covariance,
+            opacity=opacity,
+            values=values,
+            half_size_px=_half_size(covariance.detach(), opacity.detach()),
+        ),
+        view,
+    )
+
+
+def _rotation_matrices(rotation_wxyz: Float[Tensor, "visible 4"]) -> Float[Tensor, "visible 3 3"]:
+    w, x, y, z = torch.nn.functional.normalize(rotation_wxyz, dim=1).unbind(dim=1)
+    entries = [
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    ]
+    return torch.stack(entries, dim=1).reshape(-1, 3, 3)
+
+
+def _screen_covariance(
+    inputs: SplatInputs,
+    kept: Tensor,
+    point: Float[Tensor, "visible 3"],
+    rotation: Float[Tensor, "visible 3 3"],
+    view: SplatView,
+) -> Float[Tensor, "visible 2 2"]:
+    """J W S W^T J^T before blurring; J is taken at a tangent not far outside the picture."""
+    axes = rotation @ _rotation_matrices(inputs.rotation_wxyz[kept]) * inputs.scale_m[kept, None]
+    z = point[:, 2]
+    margin_x = TANGENT_MARGIN * 0.5 * view.width_px / view.fx_px
+    margin_y = TANGENT_MARGIN * 0.5 * view.height_px / view.fy_px
+    tangent_x = (point[:, 0] / z).clamp(
+        -view.cx_px / view.fx_px - margin_x,
+        (view.width_px - view.cx_px) / view.fx_px + margin_x,
+    )
+    tangent_y = (point[:, 1] / z).clamp(
+        -view.cy_px / view.fy_px - margin_y,
+        (view.height_px - view.cy_px) / view.fy_px + margin_y,
+    )
+    row_x = (axes[:, 0] - tangent_x[:, None] * axes[:, 2]) * (view.fx_px / z)[:, None]
+    row_y = (axes[:, 1] - tangent_y[:, None] * axes[:, 2]) * (view.fy_px / z)[:, None]
+    rows = torch.stack([row_x, row_y], dim=1)
+    return rows @ rows.transpose(1, 2)
+
+
+def _colour(
+    inputs: SplatInputs,
+    kept: Tensor,
+    rotation: Float[Tensor, "visible 3 3"],
+    translation: Float[Tensor, "visible 3"],
+) -> Float[Tensor, "visible 3"]:
+    camera_in_body = -torch.einsum("gji,gj->gi", rotation, translation)
+    direction = torch.nn.functional.normalize(inputs.means[kept] - camera_in_body, dim=1)
+    basis = harmonic_basis(direction, inputs.sh.shape[1])
+    return torch.relu(COLOUR_OFFSET + torch.einsum("gk,gkc->gc", basis, inputs.sh[kept]))
+
+
+def _half_size(
+    covariance: Float[Tensor, "visible 2 2"], opacity: Float[Tensor, " visible"]
+) -> Float[Tensor, "visible 2"]:
+    reach = 2.0 * (torch.log(opacity) - math.log(ALPHA_CUT))
+    return (reach[:, None] * torch.diagonal(covariance, dim1=1, dim2=2)).sqrt()
+
+
+def _seen(screen: ScreenGaussians, view: SplatView) -> ScreenGaussians:
+    """Those whose region reaches a pixel centre; a value that is not finite fails."""
+    centre, half = screen.centre_px.detach(), screen.half_size_px
+    highest = centre.new_tensor([view.width_px - 0.5, view.height_px - 0.5])
+    reaches = ((centre + half >= 0.5) & (centre - half <= highest)).all(dim=1)
+    finite = torch.linalg.det(screen.covariance_px2.detach()) > 0
+    finite &= torch.isfinite(screen.values[:, :3].detach()).all(dim=1)
+    kept = torch.nonzero(reaches & finite & (screen.opacity.detach() >= ALPHA_CUT))[:, 0]
+    return _chosen(screen, kept)
+
+
+def _chosen(screen: ScreenGaussians, kept: Tensor) -> ScreenGaussians:
+    return ScreenGaussians(
+        index=screen.index[kept],
+        centre_px=screen.centre_px[kept],
+        covariance_px2=screen.covariance_px2[kept],
+        opacity=screen.opacity[kept],
+        values=screen.values[kept],
+        half_size_px=screen.half_size_px[kept],
+    )
+
+
+class ScreenGradientWatch:
+    """Adds up |dL/dx| and |dL/dy| over pixels while a backward pass runs ("absgrad")."""
+
+    def __init__(self, index: Tensor, out: Tensor) -> None:
+        self._index, self._out = index, out
+        self._sums = out.new_zeros((len(index), 2))
+
+    def restart(self, gradient: Tensor) -> None:
+        """Forget the last pass; called with the picture's gradient before any other."""
+        del gradient
+        self._sums.zero_()
+        self._out.zero_()
+
+    def add(self, kept: Tensor, gradient: Float[Tensor, "pixels chosen 2"]) -> None:
+        """Add one tile's gradients of the centre, pixel by pixel."""
+        self._sums.index_add_(0, kept, gradient.abs().sum(dim=0).to(self._sums))
+        self._out[self._index] = torch.linalg.vector_norm(self._sums, dim=1)
+
+
+def _draw_tile(
+    screen: ScreenGaussians, left: int, top: int, view: SplatView, watch: ScreenGradientWatch | None
+) -> Float[Tensor, "rows columns channels"]:
+    """Alpha and blended values of one tile."""
+    rows, columns = min(TILE_PX, view.height_px - top), min(TILE_PX, view.width_px - left)
+    low = screen.half_size_px.new_tensor([left, top])
+    size = screen.half_size_px.new_tensor([columns, rows])
+    centre, half = screen.centre_px.detach(), screen.half_size_px
+    touches = ((centre + half >= low) & (centre - half <= low + size)).all(dim=1)
+    kept = torch.nonzero(touches)[:, 0]
+    chosen = _chosen(screen, kept)
+    y, x = torch.meshgrid(
+        torch.arange(rows).to(low) + 0.5 + top,
+        torch.arange(columns).to(low) + 0.5 + left,
+        indexing="ij",
+    )
+    pixel_px = torch.stack([x, y], dim=-1).reshape(-1, 1, 2)
+    centre_px = chosen.centre_px[None].expand(len(pixel_px), -1, -1)
+    if watch is not None and centre_px.requires_grad:
+        centre_px.register_hook(lambda gradient: watch.add(kept, gradient))
+    return _blended(chosen, pixel_px - centre_px).reshape(rows, columns, -1)
+
+
+def _blended(
+    chosen: ScreenGaussians, offset_px: Float[Tensor, "pixels chosen 2"]
+) -> Float[Tensor, "pixels channels"]:
+    """Front-to-back blending of Gaussians at offsets from their centres."""
+    precision = torch.linalg.inv(chosen.covariance_px2)
+    power = 0.5 * torch.einsum("pgi,gij,pgj->pg", offset_px, precision, offset_px)
+    alpha = (chosen.opacity * torch.exp(-power)).clamp(max=MAX_ALPHA)
+    alpha = torch.where(alpha >= ALPHA_CUT, alpha, torch.zeros_like(alpha))
+    light_after = torch.cumprod(1.0 - alpha, dim=1)
+    goes_on: Bool[Tensor, "pixels chosen"] = light_after.detach() >= MIN_TRANSMITTANCE
+    alpha = alpha * goes_on
+    light_after = torch.cumprod(1.0 - alpha, dim=1)
+    ones = light_after.new_ones((len(light_after), 1))
+    light_before = torch.cat([ones, light_after], dim=1)[:, :-1]
+    blended = (alpha * light_before) @ chosen.values
+    return torch.cat([1.0 - torch.cat([ones, light_after], dim=1)[:, -1:], blended], dim=1)
