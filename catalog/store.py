@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 
 from catalog.artefacts import ArtefactStore
-from catalog.errors import CatalogError, UnknownRecordError, storage_errors
+from catalog.errors import CatalogError, UnknownRecordError
 from catalog.locks import held_lock
 from catalog.tables import CatalogTables, Row
 
@@ -73,18 +73,15 @@ class Store:
 def open_store(path: Path | str | None = None) -> Store:
     """The store at a path, else at `LIDARPAINTER_STORE`, else at `./lidarpainter-store`.
 
-    Made if absent.
+    Nothing is made before something is written.
 
     Raises:
         CatalogError: something that is not a folder is in the way.
-        StorageError: the folder cannot be made.
     """
     chosen = Path(path or os.environ.get(STORE_ENVIRONMENT) or DEFAULT_STORE).expanduser()
     root = chosen.absolute()
     if root.exists() and not root.is_dir():
         raise CatalogError(f"the store {root} is a file, expected a folder")
-    with storage_errors(f"cannot make the store {root}"):
-        root.mkdir(parents=True, exist_ok=True)
     return Store(root)
 
 

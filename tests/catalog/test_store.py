@@ -4,7 +4,7 @@ from datetime import UTC, datetime
 
 import pytest
 
-from catalog.errors import CatalogError, StorageError, UnknownRecordError
+from catalog.errors import CatalogError, UnknownRecordError
 from catalog.records import MetricRecord, RunRecord, run_id_of
 from catalog.store import STORE_ENVIRONMENT, open_store
 
@@ -38,8 +38,14 @@ def test_a_file_in_the_place_of_the_store_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(CatalogError, match="is a file, expected a folder"):
         open_store(tmp_path / "file")
-    with pytest.raises(StorageError, match="cannot make the store"):
-        open_store(tmp_path / "file" / "store")
+
+
+def test_looking_into_a_store_that_is_not_there_makes_nothing(tmp_path):
+    store = open_store(tmp_path / "store")
+    assert store.tables.rows("scenes") == []
+    with pytest.raises(UnknownRecordError):
+        store.tables.row("runs", "a")
+    assert not store.root.exists()
 
 
 @pytest.mark.parametrize(

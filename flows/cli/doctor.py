@@ -1,0 +1,48 @@
+"""`lidarpainter doctor`: is this machine, this scene or this dataset fit for work?"""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flows.cli.output import print_json, print_table
+
+UNFIT = 2
+
+
+def doctor(
+    subject: Annotated[
+        str | None,
+        typer.Argument(help="A scene (dataset/sequence), or a dataset's name; nothing: the setup."),
+    ] = None,
+    root: Annotated[
+        Path | None, typer.Argument(help="With a dataset's name: its folder, as downloaded.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Where the overlay picture goes; beside the scene if absent")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Check the setup, a stored scene, or a dataset on disk."""
+    from catalog.store import open_store
+    from tasks import health
+
+    store = open_store()
+    if subject is None:
+        findings = health.check_environment(store.root)
+    elif root is not None:
+        findings = health.check_dataset(subject, root)
+    else:
+        findings = health.check_stored_scene(store, subject, out)
+    is_fit = all(finding.verdict != "failure" for finding in findings)
+    if as_json:
+        rows = [
+            {"name": finding.name, "verdict": finding.verdict, "detail": finding.detail}
+            for finding in findings
+        ]
+        print_json({"subject": subject or "environment", "is_fit": is_fit, "findings": rows})
+    else:
+        cells = [[finding.name, finding.verdict, finding.detail] for finding in findings]
+        print_table(subject or "environment", ["what", "verdict", "detail"], cells)
+    if not is_fit:
+        raise typer.Exit(UNFIT)

@@ -1,0 +1,105 @@
+"""`lidarpainter ingest`: from a dataset as downloaded to scenes in the store."""
+
+import re
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flows.cli.output import complain, format_bytes, print_json, print_table
+from lidarpainter_models.errors import ConfigError, LidarPainterError
+
+SOME_FAILED = 2
+RANGE = re.compile(r"(\d*):(\d*)")
+
+
+def ingest(
+    dataset: Annotated[str, typer.Argument(help="pandaset, ...")],
+    root: Annotated[Path, typer.Argument(help="The dataset's folder, as downloaded.")],
+    sequences: Annotated[
+        list[str] | None, typer.Argument(help="Sequences to take; all found if none is named.")
+    ] = None,
+    frames: Annotated[
+        str | None, typer.Option(help="Frames A:B to take, B excluded; all if absent.")
+    ] = None,
+    cameras: Annotated[
+        str | None, typer.Option(help="Cameras to take, with commas between; all if absent.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Bring sequences of a dataset into the store."""
+    chosen_frames = parse_frames(frames)
+    chosen_cameras = parse_names(cameras)
+
+    from catalog.errors import CatalogError
+    from catalog.store import open_store
+    from flows.cli.progress import shown_progress
+    from lidarpainter_models.scenes.readers import list_sequences
+    from tasks.ingest import ingest_sequence
+
+    store = open_store()
+    names = sequences or list_sequences(dataset, root)
+    rows, failures = [], []
+    with shown_progress():
+        for name in names:
+            try:
+                rows.append(
+                    ingest_sequence.fn(
+                        store.root, dataset, root, name, chosen_frames, chosen_cameras
+                    )
+                )
+            except (LidarPainterError, CatalogError) as error:
+                if len(names) == 1:
+                    raise
+                failures.append({"sequence": name, "error": str(error)})
+                complain(str(error))
+    if as_json:
+        print_json({"store": str(store.root), "scenes": rows, "failures": failures})
+    else:
+        columns = ["scene", "frames", "pictures", "points", "actors", "moving", "size"]
+        cells = [
+            [
+                row["scene_id"],
+                row["num_frames"],
+                row["num_views"],
+                row["num_points"],
+                row["num_actors"],
+                row["num_moving_actors"],
+                format_bytes(row["num_bytes"]),
+            ]
+            for row in rows
+        ]
+        print_table(f"scenes in {store.root}", columns, cells)
+    if failures:
+        raise typer.Exit(SOME_FAILED)
+
+
+def parse_frames(text: str | None) -> slice | None:
+    """`A:B`, `A:` or `:B` as a slice of frames.
+
+    Raises:
+        ConfigError: the text says something else.
+    """
+    if text is None:
+        return None
+    match = RANGE.fullmatch(text)
+    if match is None:
+        raise ConfigError(f"frames {text!r}: expected A:B, such as 0:17")
+    start, stop = (int(part) if part else None for part in match.groups())
+    if stop is not None and stop <= (start or 0):
+        raise ConfigError(f"frames {text!r}: expected A < B")
+    return slice(start, stop)
+
+
+def parse_names(text: str | None) -> tuple[str, ...] | None:
+    """Names with commas between.
+
+    Raises:
+        ConfigError: a name is empty.
+    """
+    if text is None:
+        return None
+    names = tuple(name.strip() for name in text.split(","))
+    if not all(names):
+        raise ConfigError(f"{text!r}: expected names with commas between")
+    return names

@@ -1,0 +1,117 @@
+"""The `lidarpainter` command: global options, groups, and how errors end it.
+
+Exit codes: 0 on success, 2 for input that cannot be used (one line on stderr), 1 for anything
+unexpected, 130 when interrupted. Commands import what they need when they run, so that help is
+fast.
+"""
+
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from catalog.errors import CatalogError
+from catalog.store import STORE_ENVIRONMENT
+from flows.cli import catalog, doctor, ingest
+from flows.cli.output import complain
+from flows.server import prepare_environment
+from lidarpainter_models import __version__
+from lidarpainter_models.errors import LidarPainterError
+
+BAD_INPUT = 2
+UNEXPECTED = 1
+INTERRUPTED = 130
+GLOBAL_OPTIONS = ("--store",)
+GLOBAL_FLAGS = ("--debug",)
+
+app = typer.Typer(
+    name="lidarpainter",
+    help="Editable 3D Gaussian driving scenes that still look right a lane away.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command("doctor")(doctor.doctor)
+app.command("ingest")(ingest.ingest)
+app.add_typer(catalog.app, name="catalog")
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        sys.stdout.write(f"lidarpainter {__version__}\n")
+        raise typer.Exit
+
+
+@app.callback()
+def settings(
+    store: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the store.", envvar=STORE_ENVIRONMENT, show_default=False),
+    ] = None,
+    debug: Annotated[  # noqa: ARG001 - `main` reads it; here it is only documented
+        bool, typer.Option("--debug", help="Show tracebacks and Prefect's log.")
+    ] = False,
+    version: Annotated[  # noqa: ARG001 - its callback answers
+        bool,
+        typer.Option(
+            "--version", help="Print the version.", callback=_print_version, is_eager=True
+        ),
+    ] = False,
+) -> None:
+    """Options of every command; they may also stand after it."""
+    if store is not None:
+        os.environ[STORE_ENVIRONMENT] = str(store)  # for every later `open_store()`
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run one command and return its exit code."""
+    is_debug = "--debug" in arguments
+    prepare_environment(is_quiet=not is_debug)
+    try:
+        app(args=globals_first(arguments), prog_name="lidarpainter")
+    except SystemExit as leaving:  # typer's way out of everything it knows, Ctrl-C included
+        if leaving.code == INTERRUPTED:
+            complain("interrupted; the same command goes on where this one stopped")
+        return leaving.code if isinstance(leaving.code, int) else UNEXPECTED
+    except (LidarPainterError, CatalogError) as error:
+        _explain(error, str(error), is_debug=is_debug)
+        return BAD_INPUT
+    except Exception as error:  # noqa: BLE001 - the last resort of a command
+        hint = "" if is_debug else " (--debug shows where)"
+        _explain(error, f"unexpected {type(error).__name__}: {error}{hint}", is_debug=is_debug)
+        return UNEXPECTED
+    return 0
+
+
+def run() -> None:
+    """Entry point of the installed command."""
+    sys.exit(main(sys.argv[1:]))
+
+
+def globals_first(arguments: Sequence[str]) -> list[str]:
+    """Move global options to the front, so that they may stand anywhere before a `--`."""
+    front: list[str] = []
+    rest: list[str] = []
+    waiting = list(arguments)
+    while waiting:
+        word = waiting.pop(0)
+        if word == "--":
+            rest += [word, *waiting]
+            break
+        if word in GLOBAL_FLAGS or word.startswith(tuple(f"{name}=" for name in GLOBAL_OPTIONS)):
+            front.append(word)
+        elif word in GLOBAL_OPTIONS and waiting:
+            front += [word, waiting.pop(0)]
+        else:
+            rest.append(word)
+    return front + rest
+
+
+def _explain(error: Exception, message: str, *, is_debug: bool) -> None:
+    if is_debug:
+        traceback.print_exception(error)
+    complain(message)

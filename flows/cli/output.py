@@ -1,0 +1,79 @@
+"""What commands say: a table or one JSON object on stdout, everything else on stderr."""
+
+import json
+import math
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+Cell = str | int | float | bool | None
+FILE_WIDTH = 200
+"""Columns of a table that is not written to a terminal."""
+
+
+def print_json(result: Mapping[str, Any]) -> None:
+    """One JSON object on stdout; numbers that JSON lacks (infinite, not a number) become null."""
+    text = json.dumps(finite(result), indent=2, allow_nan=False, ensure_ascii=False)
+    sys.stdout.write(text + "\n")
+
+
+def print_table(
+    title: str, columns: Sequence[str], rows: Iterable[Sequence[Cell]], note: str = ""
+) -> None:
+    """A table on stdout; an absent value is a dash."""
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=FILE_WIDTH)
+    table = Table(title=title, title_justify="left", title_style="bold")
+    for index, column in enumerate(columns):
+        table.add_column(column, overflow="fold", justify="left" if index == 0 else "right")
+    for row in rows:
+        table.add_row(*(format_cell(cell) for cell in row))
+    console.print(table)
+    if note:
+        console.print(note, markup=False, highlight=False)
+
+
+def print_pairs(title: str, pairs: Mapping[str, Cell], note: str = "") -> None:
+    """A table of two columns: what, and its value."""
+    print_table(title, ["what", "value"], list(pairs.items()), note)
+
+
+def complain(message: str) -> None:
+    """One line on stderr."""
+    line = " ".join(message.split())
+    sys.stderr.write(f"lidarpainter: {line}\n")
+
+
+def format_cell(value: Cell) -> str:
+    """Print a value: floats with three decimals, absent ones as a dash."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.3f}"
+    return str(value).replace("[", "\\[")  # rich would read brackets as its markup
+
+
+def format_bytes(num_bytes: float) -> str:
+    """A size for people: 12.3 MB."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if num_bytes < 1000:
+            return f"{num_bytes:.0f} {unit}" if unit == "B" else f"{num_bytes:.1f} {unit}"
+        num_bytes /= 1000
+    return f"{num_bytes:.1f} TB"
+
+
+def finite(value: Any) -> Any:  # noqa: ANN401 - any JSON-like value
+    """The same value with infinite and not-a-number floats as None."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(item) for item in value]
+    return value

@@ -1,0 +1,124 @@
+"""A Prefect server for one command, which ends with it however it ends.
+
+Where the user has configured an API (`PREFECT_API_URL` or a profile), that one is used and nothing
+is started. Prefect's own temporary server outlives a killed flow and writes to its output; this one
+is told by the kernel when the flow's process is gone, and logs to a file.
+"""
+
+import http.client
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+ENVIRONMENT = {
+    "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "120",
+    "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+    "PREFECT_CLOUD_ENABLE_ORCHESTRATION_TELEMETRY": "false",
+    "DO_NOT_TRACK": "1",
+}
+"""Set before Prefect is imported, unless the user set them."""
+QUIET = {"PREFECT_LOGGING_LEVEL": "CRITICAL"}
+"""Errors reach the user as one line of ours, not as Prefect's traceback."""
+
+STARTUP_TIMEOUT_S = 120.0
+STOP_TIMEOUT_S = 5.0
+APPLICATION = "prefect.server.api.server:create_app"
+# prctl(PR_SET_PDEATHSIG): the kernel ends the server when its parent dies, even of SIGKILL
+LAUNCHER = """
+import ctypes, os, signal, sys
+parent = int(sys.argv[1])
+if sys.platform == "linux":
+    ctypes.CDLL(None).prctl(1, signal.SIGTERM)
+    if os.getppid() != parent:
+        sys.exit(1)
+os.execv(sys.executable, [sys.executable, "-m", "uvicorn", *sys.argv[2:]])
+"""
+
+
+def prepare_environment(*, is_quiet: bool) -> None:
+    """Set what Prefect reads at import; what the user has set stays."""
+    for name, value in {**ENVIRONMENT, **(QUIET if is_quiet else {})}.items():
+        os.environ.setdefault(name, value)
+
+
+@contextmanager
+def prefect_server(log_path: Path) -> Iterator[None]:
+    """Run the block against the user's Prefect API, or against a server of its own.
+
+    Args:
+        log_path: file for what a server of its own has to say.
+
+    Raises:
+        RuntimeError: the server does not start.
+    """
+    from prefect.settings import PREFECT_API_URL, temporary_settings
+
+    if PREFECT_API_URL.value():
+        yield
+        return
+    port = _free_port()
+    log_path.parent.mkdir(parents=True, exist_ok=True)
+    with log_path.open("ab") as log:
+        process = _start(port, log.fileno())
+    try:
+        _wait_until_healthy(process, port, log_path)
+        with temporary_settings({PREFECT_API_URL: f"http://127.0.0.1:{port}/api"}):
+            yield
+    finally:
+        _stop(process)
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def _start(port: int, log: int) -> subprocess.Popen[bytes]:
+    place = ["--host", "127.0.0.1", "--port", str(port)]
+    arguments = ["--factory", APPLICATION, *place, "--log-level", "error", "--lifespan", "on"]
+    environment = {
+        **os.environ,
+        "PREFECT_UI_ENABLED": "0",
+        "PREFECT__SERVER_EPHEMERAL": "1",
+        "PREFECT__SERVER_FINAL": "1",
+    }
+    return subprocess.Popen(  # noqa: S603 - our own interpreter and arguments
+        [sys.executable, "-c", LAUNCHER, str(os.getpid()), *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=log,
+        stderr=log,
+        env=environment,
+    )
+
+
+def _wait_until_healthy(process: subprocess.Popen[bytes], port: int, log_path: Path) -> None:
+    deadline = time.monotonic() + STARTUP_TIMEOUT_S
+    while time.monotonic() < deadline:
+        if process.poll() is not None:
+            break
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
+        try:
+            connection.request("GET", "/api/health")
+            if connection.getresponse().status == http.HTTPStatus.OK:
+                return
+        except OSError:
+            time.sleep(0.1)
+        finally:
+            connection.close()
+    raise RuntimeError(f"Prefect's server did not start; see {log_path}")
+
+
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    process.send_signal(signal.SIGTERM)
+    try:
+        process.wait(STOP_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()

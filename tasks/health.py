@@ -1,0 +1,124 @@
+"""Whether this machine can do the work: packages, system libraries, devices, disk."""
+
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Literal
+
+Verdict = Literal["ok", "warning", "failure"]
+PYTHON_RANGE = ((3, 11), (3, 14))
+REQUIRED = ("torch", "numpy", "scipy", "numba", "pyarrow", "zarr", "deltalake", "prefect", "typer")
+MIN_FREE_BYTES = 5_000_000_000
+"""A reconstruction of a full sequence keeps a few GB of artefacts."""
+MIN_MEMORY_BYTES = 6_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was checked."""
+
+    name: str
+    verdict: Verdict
+    detail: str
+
+
+def check_environment(store_path: Path) -> list[Finding]:
+    """Check everything a reconstruction needs here.
+
+    Args:
+        store_path: folder of the store, which must be writable and have room.
+    """
+    checks: list[Callable[[], Finding]] = [
+        _python,
+        *(_package_check(name) for name in REQUIRED),
+        _open3d,
+        _numba,
+        _device,
+        _memory,
+        lambda: _disk(store_path),
+        _painter,
+    ]
+    return [check() for check in checks]
+
+
+def _python() -> Finding:
+    low, high = PYTHON_RANGE
+    is_fit = low <= sys.version_info[:2] < high
+    detail = f"{platform.python_version()}, expected >={low[0]}.{low[1]},<{high[0]}.{high[1]}"
+    return Finding("python", "ok" if is_fit else "failure", detail)
+
+
+def _package_check(name: str) -> Callable[[], Finding]:
+    def check() -> Finding:
+        try:
+            return Finding(name, "ok", version(name))
+        except PackageNotFoundError:
+            return Finding(name, "failure", f"not installed: pip install {name}")
+
+    return check
+
+
+def _open3d() -> Finding:
+    try:
+        module = import_module("open3d")
+    except (ImportError, OSError) as error:
+        advice = "apt-get install libegl1 libgl1 libx11-6 libusb-1.0-0"
+        return Finding("open3d", "warning", f"{error}; try: {advice}")
+    return Finding("open3d", "ok", module.__version__)
+
+
+def _numba() -> Finding:
+    """Whether kernels compile, which a broken LLVM or an unwritable cache prevents."""
+    try:
+        numba = import_module("numba")
+        answer = numba.njit(lambda number: number + 1)(1)
+    except Exception as error:  # noqa: BLE001 - whatever it is, the kernels will not run
+        return Finding("kernels", "failure", f"numba cannot compile: {error}")
+    is_right = answer == 2
+    detail = f"compile; {numba.get_num_threads()} threads of {os.cpu_count()} cores"
+    return Finding("kernels", "ok" if is_right else "failure", detail)
+
+
+def _device() -> Finding:
+    torch = import_module("torch")
+    if not torch.cuda.is_available():
+        return Finding("device", "ok", "cpu (no CUDA device)")
+    name = torch.cuda.get_device_name()
+    try:
+        gsplat = version("gsplat")
+    except PackageNotFoundError:
+        return Finding("device", "warning", f"{name}, but gsplat is absent: pip install '.[cuda]'")
+    return Finding("device", "ok", f"{name}, gsplat {gsplat}")
+
+
+def _memory() -> Finding:
+    pages, page_bytes = os.sysconf("SC_PHYS_PAGES"), os.sysconf("SC_PAGE_SIZE")
+    total = pages * page_bytes
+    verdict: Verdict = "ok" if total >= MIN_MEMORY_BYTES else "warning"
+    return Finding("memory", verdict, f"{total / 1e9:.1f} GB")
+
+
+def _disk(store_path: Path) -> Finding:
+    existing = next(path for path in (store_path, *store_path.parents) if path.exists())
+    if not os.access(existing, os.W_OK):
+        return Finding("store", "failure", f"{existing} cannot be written")
+    free = shutil.disk_usage(existing).free
+    verdict: Verdict = "ok" if free >= MIN_FREE_BYTES else "warning"
+    return Finding("store", verdict, f"{store_path}, {free / 1e9:.1f} GB free")
+
+
+def _painter() -> Finding:
+    from lidarpainter_models.errors import WeightsError
+    from lidarpainter_models.painter import BUNDLED_NANO, load_painter
+
+    try:
+        load_painter("nano")
+    except WeightsError as error:
+        return Finding("painter nano", "failure", str(error))
+    return Finding("painter nano", "ok", f"{BUNDLED_NANO.stat().st_size / 1e6:.1f} MB of weights")

@@ -1,0 +1,57 @@
+"""Wall time and peak memory of a stage."""
+
+import resource
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+CLEAR_REFS = Path("/proc/self/clear_refs")
+STATUS = Path("/proc/self/status")
+RESET_PEAK = "5"
+"""Written to `clear_refs`, this starts the peak of the resident set anew (proc(5))."""
+
+
+@dataclass
+class Measurement:
+    """What a block took; filled in when the block ends."""
+
+    seconds: float = 0.0
+    peak_memory_bytes: int = 0
+    """Largest resident set of this process while the block ran."""
+
+
+@contextmanager
+def measured() -> Iterator[Measurement]:
+    """Measure a block.
+
+    Where the kernel does not let the peak be reset, it is that of the whole process so far.
+    """
+    measurement = Measurement()
+    can_reset = _reset_peak()
+    started = time.perf_counter()
+    try:
+        yield measurement
+    finally:
+        measurement.seconds = time.perf_counter() - started
+        measurement.peak_memory_bytes = _peak_bytes() if can_reset else _process_peak_bytes()
+
+
+def _reset_peak() -> bool:
+    try:
+        CLEAR_REFS.write_text(RESET_PEAK)
+    except OSError:
+        return False
+    return True
+
+
+def _peak_bytes() -> int:
+    for line in STATUS.read_text().splitlines():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) * 1024
+    return _process_peak_bytes()
+
+
+def _process_peak_bytes() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

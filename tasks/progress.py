@@ -1,0 +1,66 @@
+"""How far a stage is, told to whoever listens.
+
+Tasks report here; the command line listens and draws. Nobody has to listen: a flow on a work pool
+reports into silence. The listener belongs to the running context, so two flows in one process do
+not hear each other.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Protocol
+
+
+class ProgressListener(Protocol):
+    """Hears about stages; a stage is named by the word used in `seconds` of the results."""
+
+    def started(self, stage: str) -> None:
+        """A stage begins."""
+        ...
+
+    def advanced(self, stage: str, done: float, total: float, note: str) -> None:
+        """A part of a stage is done; `note` is a short figure worth showing, or empty."""
+        ...
+
+    def waiting(self, stage: str, process_id: str) -> None:
+        """Another process computes the same; this one waits for its result."""
+        ...
+
+    def finished(self, stage: str, seconds: float, *, is_new: bool) -> None:
+        """A stage is over; `is_new` tells whether it was computed now."""
+        ...
+
+
+class Silence:
+    """Listens to nothing."""
+
+    def started(self, stage: str) -> None:
+        """Ignore it."""
+
+    def advanced(self, stage: str, done: float, total: float, note: str) -> None:
+        """Ignore it."""
+
+    def waiting(self, stage: str, process_id: str) -> None:
+        """Ignore it."""
+
+    def finished(self, stage: str, seconds: float, *, is_new: bool) -> None:
+        """Ignore it."""
+
+
+_SILENCE = Silence()
+_listener: ContextVar[ProgressListener | None] = ContextVar("progress_listener", default=None)
+
+
+def listener() -> ProgressListener:
+    """Who listens in this context."""
+    return _listener.get() or _SILENCE
+
+
+@contextmanager
+def listening(to: ProgressListener) -> Iterator[None]:
+    """Let a listener hear everything that runs inside the block."""
+    token = _listener.set(to)
+    try:
+        yield
+    finally:
+        _listener.reset(token)
