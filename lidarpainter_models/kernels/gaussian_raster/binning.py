@@ -50,7 +50,7 @@ class TileLists(NamedTuple):
     """(entries): numbers of the entries, Gaussian by Gaussian, tiles in reading order."""
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def depth_order(records):
     """Indices of the visible Gaussians by depth; equal depths keep the order of their index."""
     count = 0
@@ -68,7 +68,7 @@ def depth_order(records):
     return _radix_sorted(depth.view(np.uint32), order)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _radix_sorted(keys, order):
     digits = 1 << RADIX_BITS
     mask = np.uint32(digits - 1)
@@ -90,7 +90,7 @@ def _radix_sorted(keys, order):
     return order
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _tile_span(low_px, high_px, tiles):
     """First and one past the last tile whose pixel centres lie between two positions."""
     first = math.ceil(max(low_px - ROUNDING_PX, 0.0) - 0.5)
@@ -98,7 +98,7 @@ def _tile_span(low_px, high_px, tiles):
     return int(first) // TILE_PX, min(int(last) // TILE_PX + 1, tiles)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _reach_across(record, y_low, y_high):
     """Leftmost and rightmost offset from the centre of the ellipse between two row offsets."""
     half_height = np.float64(record[HALF_HEIGHT])
@@ -116,13 +116,13 @@ def _reach_across(record, y_low, y_high):
     return left, right
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _tile_rows(record, rows):
     y = np.float64(record[MEAN_Y]) + record[MEAN_Y_FRACTION]
     return _tile_span(y - record[HALF_HEIGHT], y + record[HALF_HEIGHT], rows)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _tile_columns(record, row, columns):
     x = np.float64(record[MEAN_X]) + record[MEAN_X_FRACTION]
     y = np.float64(record[MEAN_Y]) + record[MEAN_Y_FRACTION]
@@ -131,7 +131,7 @@ def _tile_columns(record, row, columns):
     return _tile_span(x + left, x + right, columns)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _count_run(records, order, first, end, columns, rows, entry_count, tile_count):
     for place in range(first, end):
         record = records[order[place]]
@@ -145,7 +145,7 @@ def _count_run(records, order, first, end, columns, rows, entry_count, tile_coun
         entry_count[place] = total
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _list_run(records, lists, first, end, cursor):
     for place in range(first, end):
         index = lists.order[place]
@@ -163,7 +163,7 @@ def _list_run(records, lists, first, end, cursor):
                 position += 1
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _starts(tile_count, entry_count):
     """Turn counts into first places; `tile_count` becomes each run's first entry in each tile."""
     runs, tiles = tile_count.shape
@@ -185,7 +185,7 @@ def _starts(tile_count, entry_count):
     return tile_first, entry_first
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, error_model="numpy", parallel=True)
 def list_tiles(records, width, height):
     """The tile lists of projected Gaussians; the same for any number of threads."""
     columns, rows = (width + TILE_PX - 1) // TILE_PX, (height + TILE_PX - 1) // TILE_PX

@@ -59,7 +59,7 @@ LANES = 10 * PIXELS
 FEATURES = 10 * PIXELS
 
 
-@numba.njit(cache=True, fastmath=LANE_MATH)
+@numba.njit(cache=True, error_model="numpy", fastmath=LANE_MATH)
 def _entry_sums(lanes, first_row, end_row, x, y, record, slot):
     """Sums of one Gaussian over rows of a tile; moves the pixels' light and rest along."""
     across, shear, along = record[ACROSS], record[SHEAR], record[ALONG]
@@ -89,7 +89,8 @@ def _entry_sums(lanes, first_row, end_row, x, y, record, slot):
         lanes[BEHIND + pixel] = behind
         # d loss / d log(alpha); a clamped alpha does not move
         g = weight * value - alpha * behind / (ONE - alpha)
-        g = g if goes_on and raw <= TOP else ZERO
+        g = g if goes_on else ZERO
+        g = g if raw <= TOP else ZERO
         step_u, step_y = g * u, g * dy
         g0 += g
         gu += step_u
@@ -109,7 +110,7 @@ def _entry_sums(lanes, first_row, end_row, x, y, record, slot):
     slot[SUM_DEPTH], slot[SUM_ABS_X], slot[SUM_ABS_Y] = sum_depth, abs_x, abs_y
 
 
-@numba.njit(cache=True, fastmath=LANE_MATH)
+@numba.njit(cache=True, error_model="numpy", fastmath=LANE_MATH)
 def _feature_values(lanes, first_row, end_row, features):
     """Features of a Gaussian dotted with the picture's feature gradient, pixel by pixel."""
     for channel in range(len(features)):
@@ -120,7 +121,7 @@ def _feature_values(lanes, first_row, end_row, features):
             lanes[FEATURE_VALUE + pixel] = before + lanes[start + pixel] * value
 
 
-@numba.njit(cache=True, fastmath=LANE_MATH)
+@numba.njit(cache=True, error_model="numpy", fastmath=LANE_MATH)
 def _feature_sums(lanes, first_row, end_row, slot):
     for channel in range(len(slot)):
         start = np.uint64(FEATURES + channel * PIXELS)
@@ -130,7 +131,7 @@ def _feature_sums(lanes, first_row, end_row, slot):
         slot[channel] = total
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _load_tile(tile_x, tile_y, picture, light, picture_gradient, alpha_gradient, lanes):
     """Pixel gradients, and the gradient-weighted total of what each pixel blended."""
     height, width, channels = picture.shape
@@ -150,7 +151,7 @@ def _load_tile(tile_x, tile_y, picture, light, picture_gradient, alpha_gradient,
             lanes[BEHIND + np.uint64(pixel)] = total
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _walk_tile(records, features, lists, tile, lanes, slots, feature_slots):
     tile_x, tile_y = tile % lists.columns * TILE_PX, tile // lists.columns * TILE_PX
     first, end = lists.tile_first[tile], lists.tile_first[tile + 1]
@@ -170,7 +171,7 @@ def _walk_tile(records, features, lists, tile, lanes, slots, feature_slots):
             _feature_sums(lanes, first_row, end_row, feature_slots[entry])
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _tile_sums(records, features, lists, tile, image, slots, feature_slots):
     tile_x, tile_y = tile % lists.columns * TILE_PX, tile // lists.columns * TILE_PX
     lanes = np.zeros(LANES + features.shape[1] * PIXELS, np.float32)
@@ -180,7 +181,7 @@ def _tile_sums(records, features, lists, tile, image, slots, feature_slots):
     _walk_tile(records, features, lists, tile, lanes, slots, feature_slots)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _add_entries(lists, slots, feature_slots, first, end, sums, feature_sums):
     for place in range(first, end):
         index = lists.order[place]
@@ -192,7 +193,7 @@ def _add_entries(lists, slots, feature_slots, first, end, sums, feature_sums):
                 feature_sums[index, k] += feature_slots[entry, k]
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, error_model="numpy", parallel=True)
 def gaussian_sums(records, features, lists, image):
     """Sums over all pixels of each Gaussian.
 

@@ -88,7 +88,7 @@ class Footprint(NamedTuple):
     yy: float
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def transform_of(gaussians, index):
     """Rotation rows and translation of the body a Gaussian belongs to."""
     t = gaussians.camera_from_body[gaussians.body_index[index]]
@@ -100,7 +100,7 @@ def transform_of(gaussians, index):
     return rotation, (t[0, 3], t[1, 3], t[2, 3])
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def vector_of(array, index):
     """A row of three as float64."""
     return (
@@ -110,7 +110,7 @@ def vector_of(array, index):
     )
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def tangent_limits(view):
     """Lowest and highest x/z and y/z at which the projection is linearised."""
     margin_x = TANGENT_MARGIN * 0.5 * view.width / view.fx
@@ -123,7 +123,7 @@ def tangent_limits(view):
     )
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def footprint_of(gaussians, index, point, rotation, translation, view):
     """Screen covariance of a Gaussian whose centre lies at `point` in the camera frame."""
     q = gaussians.rotation_wxyz[index]
@@ -161,20 +161,20 @@ def footprint_of(gaussians, index, point, rotation, translation, view):
     )
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def compensation_ratio(footprint, determinant, blur):
     """Area of the footprint before blurring over its area after, squared."""
     bare = (footprint.xx - blur) * (footprint.yy - blur) - footprint.xy * footprint.xy
     return bare / determinant
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def view_direction(mean, rotation, translation):
     """Vector from the camera to a Gaussian in the frame of its body, metres."""
     return v3.add(mean, v3.apply(v3.transposed(rotation), translation))
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _write_colour(gaussians, index, footprint, weights, record):
     mean = vector_of(gaussians.means, index)
     offset = view_direction(mean, footprint.rotation, footprint.translation)
@@ -189,14 +189,14 @@ def _write_colour(gaussians, index, footprint, weights, record):
     return math.isfinite(record[RED] + record[GREEN] + record[BLUE])
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _write_centre(position, record, column):
     whole = math.floor(position)
     record[column] = whole
     record[column + 1] = position - whole
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _write_shape(footprint, determinant, log_opacity, record):
     reach = 2.0 * (log_opacity - LOG_CUT)
     record[ACROSS] = 0.5 * footprint.yy / determinant
@@ -210,7 +210,7 @@ def _write_shape(footprint, determinant, log_opacity, record):
     record[SIGMA] = math.sqrt(middle + spread)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _project_one(gaussians, index, view, weights, record):
     """Fill a Gaussian's record; return whether it can reach a pixel."""
     rotation, translation = transform_of(gaussians, index)
@@ -244,7 +244,7 @@ def _project_one(gaussians, index, view, weights, record):
     return _write_colour(gaussians, index, footprint, weights, record)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _project_run(gaussians, view, first, end, records):
     weights = np.empty(16)
     for index in range(first, end):
@@ -252,7 +252,7 @@ def _project_run(gaussians, view, first, end, records):
         records[index, IS_VISIBLE] = 1.0 if visible else 0.0
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, error_model="numpy", parallel=True)
 def project(gaussians, view):
     """Screen records of all Gaussians; only `IS_VISIBLE` is set in those that cannot be seen."""
     count = len(gaussians.means)

@@ -55,7 +55,7 @@ class Gradients(NamedTuple):
     camera_from_body: np.ndarray
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _screen_gradient(sums, record):
     """Gradient with respect to the projected centre, pixels."""
     across, shear, along = record[ACROSS], record[SHEAR], record[ALONG]
@@ -63,7 +63,7 @@ def _screen_gradient(sums, record):
     return x, x * shear + 2.0 * along * sums[SUM_GY]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _covariance_gradient(sums, footprint):
     """Gradient with respect to the blurred screen covariance's xx, xy and yy."""
     yy = footprint.yy
@@ -81,7 +81,7 @@ def _covariance_gradient(sums, footprint):
     )
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _add_compensation_gradient(footprint, blur, to_log, covariance_gradient):
     """Add the gradient of log(compensation) with respect to the blurred covariance."""
     xx, xy, yy = footprint.xx, footprint.xy, footprint.yy
@@ -99,7 +99,7 @@ def _add_compensation_gradient(footprint, blur, to_log, covariance_gradient):
     )
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _axes_gradient(footprint, covariance_gradient, view):
     """Gradients of the Gaussian's axes in the camera frame and of its centre there."""
     to_xx, to_xy, to_yy = covariance_gradient
@@ -123,7 +123,7 @@ def _axes_gradient(footprint, covariance_gradient, view):
     return (to_axis_x, to_axis_y, to_axis_z), to_point
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _centre_gradient(point, to_screen, to_depth, view):
     """Gradient of the centre in the camera frame through its pixel position and depth."""
     x, y, z = point
@@ -131,7 +131,7 @@ def _centre_gradient(point, to_screen, to_depth, view):
     return (to_x, to_y, to_depth - (to_x * x + to_y * y) / z)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _store_shape(gaussians, index, footprint, to_axes, gradients):
     """Store gradients of scale and rotation; return that of the transform's rotation."""
     to_from_axes = v3.product(v3.transposed(footprint.rotation), to_axes)
@@ -157,7 +157,7 @@ def _store_shape(gaussians, index, footprint, to_axes, gradients):
     return v3.product(to_axes, v3.transposed(footprint.from_axes))
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _store_colour(gaussians, index, footprint, record, sums, weights, gradients):
     """Store the gradient of the coefficients; return that of the view direction, metres."""
     mean = vector_of(gaussians.means, index)
@@ -179,7 +179,7 @@ def _store_colour(gaussians, index, footprint, record, sums, weights, gradients)
     return v3.direction_of_gradient(direction, length, to_direction)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _store_transform(to_rotation, to_translation, out):
     for row in range(3):
         for column in range(3):
@@ -187,7 +187,7 @@ def _store_transform(to_rotation, to_translation, out):
         out[row, 3] += to_translation[row]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _unproject_one(gaussians, index, view, record, sums, weights, gradients, run):
     rotation, translation = transform_of(gaussians, index)
     mean = vector_of(gaussians.means, index)
@@ -216,7 +216,7 @@ def _unproject_one(gaussians, index, view, record, sums, weights, gradients, run
     _store_transform(to_rotation, to_translation, gradients.camera_from_body[run, body])
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _unproject_run(gaussians, view, records, sums, gradients, run):
     weights = np.empty(16)
     count = len(records)
@@ -226,7 +226,7 @@ def _unproject_run(gaussians, view, records, sums, gradients, run):
             _unproject_one(gaussians, index, view, record, own_sums, weights, gradients, run)
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, error_model="numpy", parallel=True)
 def unproject(gaussians, view, records, sums):
     """Gradients of everything `project` read; zero where a Gaussian was not visible."""
     count, coefficients, _ = gaussians.sh.shape

@@ -17,7 +17,7 @@ BAND_3 = (
 )
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def basis(coefficients, direction, out):
     """Fill `out` with the first `coefficients` basis values at a unit direction."""
     x, y, z = direction
@@ -42,7 +42,7 @@ def basis(coefficients, direction, out):
         out[15] = -BAND_3[0] * x * (x * x - 3.0 * y * y)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def direction_gradient(coefficients, direction, weight):
     """Gradient of sum_k weight[k] basis[k] with respect to the direction."""
     x, y, z = direction
@@ -61,7 +61,7 @@ def direction_gradient(coefficients, direction, weight):
     return (gx, gy, gz)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _band_3_gradient(direction, weight):
     x, y, z = direction
     xx, yy, zz = x * x, y * y, z * z
