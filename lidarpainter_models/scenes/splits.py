@@ -1,0 +1,84 @@
+"""Which recorded pictures a fit may see and which judge it.
+
+A spec is one of
+- `alternate`: frames at even positions train, those at odd positions test (the paper's protocol);
+- `forward:N:M`: every second of the first N frames trains, the last M frames test, farther along;
+- `all`: every frame trains, nothing is held out.
+
+Frames are split and not pictures, so what a held-out picture shows was never seen by a neighbouring
+camera at the same moment, and the LiDAR sweeps of test frames stay out as well.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.records import RecordedView
+
+SPECS = "alternate, forward:N:M or all"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewSplit:
+    """Recorded views on both sides of a split, in frame order."""
+
+    train: tuple[RecordedView, ...]
+    test: tuple[RecordedView, ...]
+    train_frames: tuple[int, ...]
+    """Frames whose pictures and sweeps may be used."""
+    test_frames: tuple[int, ...]
+
+
+def split_views(
+    scene: DrivingScene, spec: str, cameras: tuple[str, ...] | None = None
+) -> ViewSplit:
+    """Split a scene's views, of some cameras or all, by a spec.
+
+    Raises:
+        ConfigError: the spec is not understood or leaves no frame to train on.
+        SceneError: a camera is not in the scene.
+    """
+    for name in cameras or ():
+        if name not in scene.camera_names:
+            raise SceneError(
+                f"{scene.path}: no camera {name!r}; it has {', '.join(scene.camera_names)}"
+            )
+    train_frames, test_frames = split_frames(scene.frame_indices, spec)
+    chosen = [view for view in scene.views if cameras is None or view.camera_name in cameras]
+    return ViewSplit(
+        train=tuple(view for view in chosen if view.frame_index in set(train_frames)),
+        test=tuple(view for view in chosen if view.frame_index in set(test_frames)),
+        train_frames=train_frames,
+        test_frames=test_frames,
+    )
+
+
+def split_frames(
+    frame_indices: Sequence[int], spec: str
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Training and test frames; positions count, whatever the frames are called."""
+    frames = tuple(frame_indices)
+    kind, *numbers = spec.split(":")
+    if kind == "alternate" and not numbers:
+        train, test = frames[0::2], frames[1::2]
+    elif kind == "all" and not numbers:
+        train, test = frames, ()
+    elif kind == "forward" and len(numbers) == 2 and all(part.isdigit() for part in numbers):
+        train, test = _forward(frames, *(int(part) for part in numbers))
+    else:
+        raise ConfigError(f"split {spec!r} is not understood, expected {SPECS}")
+    if not train:
+        raise ConfigError(f"split {spec!r} leaves no frame to train on ({len(frames)} frames)")
+    return train, test
+
+
+def _forward(
+    frames: tuple[int, ...], num_first: int, num_last: int
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    if num_first < 1 or num_last < 1 or num_first + num_last > len(frames):
+        raise ConfigError(
+            f"split forward:{num_first}:{num_last} needs at least one frame on each side and no "
+            f"overlap, the scene has {len(frames)} frames"
+        )
+    return frames[:num_first:2], frames[-num_last:]
