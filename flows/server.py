@@ -16,16 +16,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-ENVIRONMENT = {
-    "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "120",
-    "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
-    "PREFECT_CLOUD_ENABLE_ORCHESTRATION_TELEMETRY": "false",
-    "DO_NOT_TRACK": "1",
-}
-"""Set before Prefect is imported, unless the user set them."""
-QUIET = {"PREFECT_LOGGING_LEVEL": "CRITICAL"}
-"""Errors reach the user as one line of ours, not as Prefect's traceback."""
-
 STARTUP_TIMEOUT_S = 120.0
 STOP_TIMEOUT_S = 5.0
 APPLICATION = "prefect.server.api.server:create_app"
@@ -39,12 +29,6 @@ if sys.platform == "linux":
         sys.exit(1)
 os.execv(sys.executable, [sys.executable, "-m", "uvicorn", *sys.argv[2:]])
 """
-
-
-def prepare_environment(*, is_quiet: bool) -> None:
-    """Set what Prefect reads at import; what the user has set stays."""
-    for name, value in {**ENVIRONMENT, **(QUIET if is_quiet else {})}.items():
-        os.environ.setdefault(name, value)
 
 
 @contextmanager

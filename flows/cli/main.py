@@ -18,7 +18,7 @@ from catalog.errors import CatalogError
 from catalog.store import STORE_ENVIRONMENT
 from flows.cli import catalog, doctor, ingest
 from flows.cli.output import complain
-from flows.server import prepare_environment
+from flows.environment import prepare_environment
 from lidarpainter_models import __version__
 from lidarpainter_models.errors import LidarPainterError
 
