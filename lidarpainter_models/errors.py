@@ -33,6 +33,10 @@ class WeightsError(LidarPainterError, ValueError):
     """A weights file is missing, damaged, or belongs to another network."""
 
 
+class TrainingError(LidarPainterError, RuntimeError):
+    """A training cannot go on: its loss is no longer a number."""
+
+
 class BackendError(LidarPainterError, RuntimeError):
     """A kernel backend was asked for that cannot run here."""
 

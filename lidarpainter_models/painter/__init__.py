@@ -28,9 +28,7 @@ __all__ = [
 BUNDLED_NANO = Path(__file__).parent / "bundled" / "nano.safetensors"
 """Weights of the small painter that come with the package."""
 
-_UNLEARNED = {
-    painter.name: painter for painter in (UnpaintedPainter, OverlayPainter, WarpPainter)
-}
+_UNLEARNED = {painter.name: painter for painter in (UnpaintedPainter, OverlayPainter, WarpPainter)}
 PAINTER_NAMES = (*_UNLEARNED, "nano")
 
 

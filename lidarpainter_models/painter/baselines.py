@@ -24,9 +24,7 @@ class UnpaintedPainter:
 
     def paint(self, conditions: PaintingConditions) -> Painting:
         """Return the render as it is."""
-        return Painting(
-            rgb=conditions.render_rgb, confidence=conditions.render_alpha.clamp(0, 1)
-        )
+        return Painting(rgb=conditions.render_rgb, confidence=conditions.render_alpha.clamp(0, 1))
 
 
 class OverlayPainter:

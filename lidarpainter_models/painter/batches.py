@@ -6,7 +6,6 @@ where there is none; masks are float, 1 where true. Warps beyond those a view ha
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Self
 
 import torch
 from jaxtyping import Float
@@ -29,7 +28,7 @@ class ConditionBatch:
     warp: Float[Tensor, "batch sources 3 height width"]
     warp_valid: Float[Tensor, "batch sources height width"]
 
-    def to(self, device: torch.device) -> Self:
+    def to(self, device: torch.device) -> "ConditionBatch":
         """The same batch on another device."""
         return type(self)(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 

@@ -123,7 +123,7 @@ def blur(
     picture: Float[Tensor, "batch channels height width"], *, sigma_px: float = BLUR_SIGMA_PX
 ) -> Float[Tensor, "batch channels height width"]:
     """A Gaussian blur that repeats the border."""
-    radius_px = int(round(2.5 * sigma_px))
+    radius_px = round(2.5 * sigma_px)
     offsets = torch.arange(-radius_px, radius_px + 1, dtype=picture.dtype, device=picture.device)
     kernel = torch.exp(-0.5 * (offsets / sigma_px) ** 2)
     kernel = (kernel / kernel.sum()).expand(picture.shape[1], 1, -1)
@@ -153,9 +153,7 @@ def fill_push_pull(
         pyramid.append(F.avg_pool2d(pyramid[-1], 2, ceil_mode=True))
     filled = pyramid[-1][:, :3] / pyramid[-1][:, 3:].clamp_min(1e-6)
     for level in reversed(pyramid[:-1]):
-        coarse = F.interpolate(
-            filled, size=level.shape[2:], mode="bilinear", align_corners=False
-        )
+        coarse = F.interpolate(filled, size=level.shape[2:], mode="bilinear", align_corners=False)
         weight = level[:, 3:]
         # half covered cells lean on the coarser level, so that single points do not spread
         share = (2 * weight).clamp_max(1)

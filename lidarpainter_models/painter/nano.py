@@ -6,8 +6,9 @@ Because colours come from the inputs it cannot invent much; at first it returns 
 (the mean of render and warps), so training only departs from it where that pays.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Self
+from typing import Any
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -45,7 +46,7 @@ class NanoConfig:
     residual_limit: float = 0.25
     """Largest change beyond the mix, in units of rgb: enough for a glint, too little to paint."""
     base_logit: float = 9.0
-    """First logit of the base candidate: the others then move a picture by less than half a byte."""
+    """First logit of the base candidate: the others then move it by less than half a byte."""
     confidence_error: float = 0.05
     """Mean absolute error at which the confidence has fallen to 1/e."""
     prompts: tuple[str, ...] = (DEFAULT_PROMPT,)
@@ -71,7 +72,7 @@ class NanoConfig:
         return asdict(self) | {"inputs": sorted(self.inputs)}
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> Self:
+    def from_dict(cls, values: dict[str, Any]) -> "NanoConfig":
         """Undo `to_dict`.
 
         Raises:
@@ -156,11 +157,29 @@ class NanoNetwork(nn.Module):
             raise ConfigError(f"the nano painter knows no prompt {prompt!r}, only: {known}")
         return self.config.prompts.index(prompt)
 
-    def forward(self, conditions: ConditionBatch, prompt: str = DEFAULT_PROMPT) -> NanoOutput:
-        """Mix the candidates of every view."""
+    def forward(
+        self,
+        conditions: ConditionBatch,
+        prompts: Sequence[str],
+        *,
+        half_precision: bool = False,
+    ) -> NanoOutput:
+        """Mix the candidates of every view.
+
+        Args:
+            conditions: the views.
+            prompts: one per view.
+            half_precision: run the U-Net in bfloat16; the pictures stay in float32.
+
+        Raises:
+            ConfigError: the network was not trained for a prompt.
+        """
         features, lidar_filled = painting_features(conditions, self.config.inputs)
         candidates = build_candidates(conditions, self.config.inputs, lidar_filled)
-        head = self._head(features, self.prompt_index(prompt)).float()
+        rows = torch.tensor([self.prompt_index(prompt) for prompt in prompts])
+        embedding = self.prompt(rows.to(features.device))
+        with torch.autocast(features.device.type, torch.bfloat16, enabled=half_precision):
+            head = self._head(features, embedding).float()
         num_candidates = len(candidates.names)
         logits = head[:, :num_candidates].masked_fill(candidates.exists == 0, -torch.inf)
         weights = torch.softmax(logits, dim=1)
@@ -174,16 +193,20 @@ class NanoNetwork(nn.Module):
         )
 
     def _head(
-        self, features: Float[Tensor, "batch features height width"], prompt_index: int
+        self,
+        features: Float[Tensor, "batch features height width"],
+        embedding: Float[Tensor, "batch channels"],
     ) -> Float[Tensor, "batch outputs height width"]:
         """Run the U-Net on a picture of any size, padded to whole cells by repeating the edge."""
         height_px, width_px = features.shape[2:]
         step_px = CELL_PX * 4
         padding = (0, -width_px % step_px, 0, -height_px % step_px)
-        padded = F.pad(features, padding, mode="replicate")
+        if torch.is_autocast_enabled(features.device.type):
+            features = features.bfloat16()  # halves what the next two lines move
+        padded = F.pad(features, padding, mode="replicate") if any(padding) else features
         fine = self.encode_fine(self.stem(F.pixel_unshuffle(padded, CELL_PX)))
         middle = self.encode_middle(self.down_middle(fine))
-        coarse = self.down_coarse(middle) + self.prompt.weight[prompt_index][:, None, None]
+        coarse = self.down_coarse(middle) + embedding[..., None, None]
         coarse = self.encode_coarse(coarse)
         middle = self.decode_middle(middle + F.pixel_shuffle(self.up_middle(coarse), 2))
         fine = self.decode_fine(fine + F.pixel_shuffle(self.up_fine(middle), 2))

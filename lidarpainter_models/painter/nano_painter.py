@@ -50,8 +50,7 @@ class NanoPainter:
         config = self.network.config
         device = self.network.head.weight.device
         batch = stack_conditions([conditions], num_sources=config.num_sources).to(device)
-        with torch.autocast(device.type, torch.bfloat16, enabled=self.half_precision):
-            output = self.network(batch, conditions.prompt)
+        output = self.network(batch, [conditions.prompt], half_precision=self.half_precision)
         confidence = torch.exp(-output.log_error[0].exp() / config.confidence_error)
         home = conditions.render_rgb.device
         return Painting(

@@ -13,9 +13,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from lidarpainter_models.errors import ConfigError, StorageError, WeightsError
+from lidarpainter_models.errors import WeightsError
 from lidarpainter_models.painter.nano import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.nano_painter import NanoPainter
+from lidarpainter_models.painter.whole_files import write_whole
 
 WEIGHTS_FORMAT = "lidarpainter-nano/1"
 LARGEST_FLOAT16 = torch.finfo(torch.float16).max
@@ -35,20 +36,15 @@ def save_weights(
         if not bool((tensor.abs() <= LARGEST_FLOAT16).all()):
             raise WeightsError(f"weight {name!r} of {path} is not a finite float16 number")
         tensors[name] = tensor.detach().cpu().to(torch.float16).contiguous()
-    metadata = {
+    header = {
         "format": WEIGHTS_FORMAT,
-        "config": json.dumps(network.config.to_dict(), sort_keys=True),
+        "config": network.config.to_dict(),
         "licence": licence,
-        "provenance": json.dumps(provenance, sort_keys=True),
+        "provenance": provenance,
     }
-    aside = path.with_name(path.name + ".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        aside.write_bytes(save(tensors, metadata))
-        aside.replace(path)
-    except OSError as error:
-        aside.unlink(missing_ok=True)
-        raise StorageError(f"cannot write painter weights {path}: {error.strerror}") from error
+    # one entry, because safetensors writes several in random order
+    metadata = {"lidarpainter": json.dumps(header, sort_keys=True)}
+    write_whole(path, save(tensors, metadata))
 
 
 def load_weights(path: Path) -> NanoPainter:
@@ -57,8 +53,8 @@ def load_weights(path: Path) -> NanoPainter:
     Raises:
         WeightsError: the file is missing, damaged, or holds another network.
     """
-    metadata, tensors = _read(path)
-    config = _config_of(metadata, path)
+    header, tensors = _read(path)
+    config = _config_of(header, path)
     network = NanoNetwork(config)
     expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
@@ -71,11 +67,10 @@ def load_weights(path: Path) -> NanoPainter:
     if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
         raise WeightsError(f"weights file {path} holds values that are not finite")
     network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
-    provenance = json.loads(metadata.get("provenance", "{}"))
-    return NanoPainter(network, provenance=provenance | {"licence": metadata.get("licence")})
+    return NanoPainter(network, provenance=header["provenance"] | {"licence": header["licence"]})
 
 
-def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     if not path.is_file():
         raise WeightsError(f"no painter weights at {path}: expected a .safetensors file")
     try:
@@ -84,14 +79,21 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise WeightsError(f"{path} is not a readable safetensors file: {error}") from None
-    found = metadata.get("format", "no format mark")
-    if found != WEIGHTS_FORMAT:
-        raise WeightsError(f"weights file {path} has {found!r}, expected {WEIGHTS_FORMAT!r}")
-    return metadata, tensors
-
-
-def _config_of(metadata: dict[str, str], path: Path) -> NanoConfig:
     try:
-        return NanoConfig.from_dict(json.loads(metadata["config"]))
-    except (KeyError, ValueError) as error:  # ConfigError and JSON errors are ValueErrors
+        header = {"format": "no format mark"} | json.loads(metadata.get("lidarpainter", "{}"))
+    except (ValueError, TypeError) as error:
+        raise WeightsError(f"weights file {path} has a damaged header: {error}") from None
+    if header["format"] != WEIGHTS_FORMAT:
+        found = header["format"]
+        raise WeightsError(f"weights file {path} has {found!r}, expected {WEIGHTS_FORMAT!r}")
+    return header, tensors
+
+
+def _config_of(header: dict[str, Any], path: Path) -> NanoConfig:
+    missing = {"config", "licence", "provenance"} - header.keys()
+    if missing:
+        raise WeightsError(f"weights file {path} lacks {sorted(missing)} in its header")
+    try:
+        return NanoConfig.from_dict(header["config"])
+    except (KeyError, TypeError, ValueError) as error:  # a ConfigError is a ValueError
         raise WeightsError(f"weights file {path} has unusable settings: {error}") from None

@@ -1,0 +1,217 @@
+"""Turn pairs into training batches: random windows, flips, light, and things taken away.
+
+Everything follows from one generator per step, so a batch depends on the seed and the step alone
+and a resumed training sees the batches it would have seen.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.painter.batches import ConditionBatch, stack_conditions
+from lidarpainter_models.painter.examples import PaintingPair, PairSource, Window
+from lidarpainter_models.painter.render_damage import damage_render
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AugmentationConfig:
+    """How pairs are varied; every number ending in `_share` is a share of the samples."""
+
+    crop_px: int = 128
+    """Side of the windows; a multiple of the network's 16 px."""
+    lidar_dropout_share: float = 0.2
+    """Samples without any LiDAR: the painter must also serve logs and views that have none."""
+    lidar_thinning_share: float = 0.2
+    """Samples that keep only a random part of the LiDAR hits."""
+    warp_dropout_share: float = 0.2
+    """Samples without any warp, as in places no camera saw."""
+    warp_swap_share: float = 0.2
+    """Samples that lose the best warp only."""
+    damage_share: float = 0.25
+    """Samples with damage painted onto the render."""
+    identity_share: float = 0.05
+    """Samples whose render is already perfect: it has to stay as it is."""
+    gain_range: float = 0.35
+    """Largest change of the logarithm of exposure, of all pictures of a sample alike."""
+    tint_range: float = 0.1
+    """The same for each channel by itself."""
+    mismatch_range: float = 0.06
+    """Largest change of the logarithm of exposure of one warp or the LiDAR alone."""
+
+    def __post_init__(self) -> None:
+        """Refuse shares outside [0, 1] and windows of broken cells."""
+        if self.crop_px < 32 or self.crop_px % 16:
+            raise ConfigError(f"crop_px must be a multiple of 16 and >= 32, got {self.crop_px}")
+        for name in self.__slots__:
+            if name.endswith("_share") and not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f"{name} must be in [0, 1], got {getattr(self, name)}")
+
+
+class TrainingBatch(NamedTuple):
+    """What the network is shown, and what it should give."""
+
+    conditions: ConditionBatch
+    target: Float[Tensor, "batch 3 height width"]
+    target_valid: Float[Tensor, "batch height width"]
+    prompts: tuple[str, ...]
+
+    def to(self, device: torch.device) -> "TrainingBatch":
+        """The same batch on another device."""
+        return self._replace(
+            conditions=self.conditions.to(device),
+            target=self.target.to(device),
+            target_valid=self.target_valid.to(device),
+        )
+
+
+def draw_batch(
+    sources: Sequence[PairSource],
+    source_shares: Sequence[float],
+    *,
+    batch_size: int,
+    num_warps: int,
+    config: AugmentationConfig,
+    generator: Generator,
+) -> TrainingBatch:
+    """Draw windows from the sources, each source by its share, and vary them."""
+    shares = torch.tensor(source_shares, dtype=torch.float64)
+    pairs = []
+    for _ in range(batch_size):
+        source = sources[int(torch.multinomial(shares, 1, generator=generator))]
+        index = int(torch.randint(len(source), (), generator=generator))
+        pairs.append(source.read(index, random_window(source.size_px(index), config, generator)))
+    return augment(batch_pairs(pairs, num_warps), config, generator)
+
+
+def random_window(
+    size_px: tuple[int, int], config: AugmentationConfig, generator: Generator
+) -> Window:
+    """A square window anywhere in a picture.
+
+    Raises:
+        ConfigError: the picture is smaller than the window.
+    """
+    side = config.crop_px
+    room = (size_px[0] - side, size_px[1] - side)
+    if min(room) < 0:
+        raise ConfigError(f"pairs of {size_px[1]}x{size_px[0]} px are smaller than crop_px {side}")
+    top, left = (int(torch.randint(free + 1, (), generator=generator)) for free in room)
+    return Window(top, left, side, side)
+
+
+def batch_pairs(pairs: Sequence[PaintingPair], num_warps: int) -> TrainingBatch:
+    """Stack pairs of one size."""
+    conditions = stack_conditions([pair.conditions for pair in pairs], num_sources=num_warps)
+    target = torch.stack([pair.target_rgb.permute(2, 0, 1) for pair in pairs]).contiguous()
+    valid = torch.stack([pair.target_valid.float() for pair in pairs])
+    return TrainingBatch(conditions, target, valid, tuple(p.conditions.prompt for p in pairs))
+
+
+def augment(
+    batch: TrainingBatch, config: AugmentationConfig, generator: Generator
+) -> TrainingBatch:
+    """Vary a batch; masks keep meaning what they mean."""
+    batch = _change_light(batch, config, generator)
+    batch = _take_away(batch, config, generator)
+    batch = _change_render(batch, config, generator)
+    flipped = _chosen(0.5, len(batch.target), generator)
+    return _flip(batch, flipped)
+
+
+def _change_light(
+    batch: TrainingBatch, config: AugmentationConfig, generator: Generator
+) -> TrainingBatch:
+    """One exposure and tint for a whole sample, and a small mismatch of warps and LiDAR."""
+    size = len(batch.target)
+    gain = torch.exp(config.gain_range * _signed((size, 1, 1, 1), generator))
+    gain = gain * torch.exp(config.tint_range * _signed((size, 3, 1, 1), generator))
+    old = batch.conditions
+    num_warps = old.warp.shape[1]
+    lidar_gain = torch.exp(config.mismatch_range * _signed((size, 1, 1, 1), generator))
+    warp_gain = torch.exp(config.mismatch_range * _signed((size, num_warps, 1, 1, 1), generator))
+    conditions = replace(
+        old,
+        render=(old.render * gain).clamp_max(1),
+        lidar=(old.lidar * gain * lidar_gain).clamp_max(1),
+        warp=(old.warp * gain[:, None] * warp_gain).clamp_max(1),
+    )
+    return batch._replace(conditions=conditions, target=(batch.target * gain).clamp_max(1))
+
+
+def _take_away(
+    batch: TrainingBatch, config: AugmentationConfig, generator: Generator
+) -> TrainingBatch:
+    """Leave out LiDAR, part of it, the best warp or all of them."""
+    size = len(batch.target)
+    old = batch.conditions
+    no_lidar = _chosen(config.lidar_dropout_share, size, generator)
+    thinned = _chosen(config.lidar_thinning_share, size, generator)
+    kept_share = torch.rand((size, 1, 1, 1), generator=generator)
+    drawn = torch.rand(old.lidar_hit.shape, generator=generator)
+    kept = ((drawn < kept_share) | ~thinned[:, None, None, None]).float()
+    kept = kept * (~no_lidar[:, None, None, None]).float()
+    no_warp = _chosen(config.warp_dropout_share, size, generator)
+    swapped = _chosen(config.warp_swap_share, size, generator)
+    warp, valid = old.warp.clone(), old.warp_valid.clone()
+    warp[swapped], valid[swapped] = warp[swapped].roll(-1, 1), valid[swapped].roll(-1, 1)
+    gone = torch.zeros_like(valid[:, :, :1, :1])
+    gone[no_warp] = 1
+    gone[swapped, -1] = 1
+    conditions = replace(
+        old,
+        lidar=old.lidar * kept,
+        lidar_depth_m=old.lidar_depth_m * kept,
+        lidar_hit=old.lidar_hit * kept,
+        warp=warp * (1 - gone)[:, :, None],
+        warp_valid=valid * (1 - gone),
+    )
+    return batch._replace(conditions=conditions)
+
+
+def _change_render(
+    batch: TrainingBatch, config: AugmentationConfig, generator: Generator
+) -> TrainingBatch:
+    """Damage some renders and replace some by the truth."""
+    size = len(batch.target)
+    damaged = _chosen(config.damage_share, size, generator)
+    perfect = _chosen(config.identity_share, size, generator)
+    render = batch.conditions.render.clone()
+    for index in damaged.nonzero()[:, 0].tolist():
+        render[index] = damage_render(render[index], generator)
+    known = batch.target_valid[:, None] > 0
+    replaced = perfect[:, None, None, None] & known
+    render = torch.where(replaced, batch.target, render)
+    return batch._replace(conditions=replace(batch.conditions, render=render))
+
+
+def _flip(batch: TrainingBatch, flipped: Tensor) -> TrainingBatch:
+    """Mirror the chosen samples left to right."""
+
+    def turn(values: Tensor) -> Tensor:
+        mirrored = values.clone()
+        mirrored[flipped] = values[flipped].flip(-1)
+        return mirrored
+
+    old = batch.conditions
+    conditions = ConditionBatch(
+        **{name: turn(getattr(old, name)) for name in ConditionBatch.__dataclass_fields__}
+    )
+    return batch._replace(
+        conditions=conditions,
+        target=turn(batch.target),
+        target_valid=turn(batch.target_valid),
+    )
+
+
+def _chosen(share: float, size: int, generator: Generator) -> Tensor:
+    return torch.rand(size, generator=generator) < share
+
+
+def _signed(shape: tuple[int, ...], generator: Generator) -> Tensor:
+    """Uniform in [-1, 1)."""
+    return 2 * torch.rand(shape, generator=generator) - 1

@@ -1,0 +1,90 @@
+"""What a painter learns from: conditions beside the true picture, and where such pairs come from.
+
+Painters know the shape of a pair and how to ask for one; `conditioning.pairs` stores and makes
+them.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidarpainter_models.errors import ShapeError
+from lidarpainter_models.painter.protocol import PaintingConditions
+
+
+class Window(NamedTuple):
+    """A rectangle of pixels."""
+
+    top_px: int
+    left_px: int
+    height_px: int
+    width_px: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PaintingPair:
+    """A damaged view with everything known about it, and what was really there."""
+
+    conditions: PaintingConditions
+    target_rgb: Float[Tensor, "height width 3"]
+    target_valid: Bool[Tensor, "height width"]
+    """Where the target may be learnt from."""
+
+    def __post_init__(self) -> None:
+        """Refuse a target on another pixel grid."""
+        size = self.conditions.height_width_px
+        if self.target_rgb.shape[:2] != size or self.target_valid.shape != size:
+            raise ShapeError(
+                f"a pair needs one pixel grid, got conditions {size} and target "
+                f"{tuple(self.target_rgb.shape[:2])}"
+            )
+
+    def cropped(self, window: Window) -> "PaintingPair":
+        """The pair inside a window."""
+        rows = slice(window.top_px, window.top_px + window.height_px)
+        columns = slice(window.left_px, window.left_px + window.width_px)
+        old = self.conditions
+        conditions = PaintingConditions(
+            render_rgb=old.render_rgb[rows, columns],
+            render_depth_m=old.render_depth_m[rows, columns],
+            render_alpha=old.render_alpha[rows, columns],
+            lidar_rgb=old.lidar_rgb[rows, columns],
+            lidar_depth_m=old.lidar_depth_m[rows, columns],
+            lidar_hit=old.lidar_hit[rows, columns],
+            warp_rgb=old.warp_rgb[:, rows, columns],
+            warp_valid=old.warp_valid[:, rows, columns],
+            prompt=old.prompt,
+        )
+        return type(self)(
+            conditions=conditions,
+            target_rgb=self.target_rgb[rows, columns],
+            target_valid=self.target_valid[rows, columns],
+        )
+
+
+@runtime_checkable
+class PairSource(Protocol):
+    """A set of pairs that gives windows of them; reading has no side effect."""
+
+    def __len__(self) -> int:
+        """Number of pairs."""
+        ...
+
+    @property
+    def digest(self) -> str:
+        """Says exactly which pairs these are."""
+        ...
+
+    def size_px(self, index: int) -> tuple[int, int]:
+        """Height and width of a pair."""
+        ...
+
+    def read(self, index: int, window: Window | None = None) -> PaintingPair:
+        """A pair, or the part of it inside a window."""
+        ...
+
+    def describe(self) -> dict[str, Any]:
+        """Where the pairs come from, as JSON types."""
+        ...

@@ -1,0 +1,151 @@
+"""What the small painter is trained to lower; every term stands alone and is averaged over pixels.
+
+Pictures are (batch, 3, height, width); masks (batch, height, width), 1 where the target is known.
+A term over no pixel is 0.
+"""
+
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.kernels.ssim import ssim_map
+from lidarpainter_models.painter.batches import ConditionBatch
+from lidarpainter_models.painter.nano import NanoOutput
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LossWeights:
+    """How much each term counts."""
+
+    absolute: float = 1.0
+    squared: float = 2.0
+    """The measure of PSNR itself."""
+    structure: float = 0.12
+    """Factor of 1 - SSIM."""
+    gradient: float = 0.25
+    """Edges; without it distant things come out soft."""
+    expected_error: float = 0.02
+    """Laplace likelihood of the error head; small, because its picture is a side product."""
+    keep: float = 0.1
+    """Against changing what render and warps already agree on."""
+    agreement: float = 0.03
+    """Mean absolute rgb difference up to which render and warp agree."""
+
+    def __post_init__(self) -> None:
+        """Refuse negative weights."""
+        for field in fields(self):
+            if getattr(self, field.name) < 0:
+                raise ConfigError(f"loss weight {field.name} must not be negative")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LossTerms:
+    """The terms before weighting, and their weighted sum."""
+
+    absolute: Float[Tensor, ""]
+    squared: Float[Tensor, ""]
+    structure: Float[Tensor, ""]
+    gradient: Float[Tensor, ""]
+    expected_error: Float[Tensor, ""]
+    keep: Float[Tensor, ""]
+    total: Float[Tensor, ""]
+
+    def to_dict(self) -> dict[str, float]:
+        """Plain numbers for a log."""
+        return {field.name: float(getattr(self, field.name).detach()) for field in fields(self)}
+
+
+def painting_loss(
+    output: NanoOutput,
+    conditions: ConditionBatch,
+    target: Float[Tensor, "batch 3 height width"],
+    target_valid: Float[Tensor, "batch height width"],
+    weights: LossWeights,
+) -> LossTerms:
+    """All terms of a batch and `total`, the sum that is minimised."""
+    agreeing = agreement_mask(conditions, weights.agreement) * target_valid
+    terms = {
+        "absolute": absolute_loss(output.rgb, target, target_valid),
+        "squared": squared_loss(output.rgb, target, target_valid),
+        "structure": structure_loss(output.rgb, target, target_valid),
+        "gradient": gradient_loss(output.rgb, target, target_valid),
+        "expected_error": expected_error_loss(output, target, target_valid),
+        "keep": absolute_loss(output.rgb, output.base, agreeing),
+    }
+    total = torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum()
+    return LossTerms(**terms, total=total)
+
+
+def absolute_loss(
+    picture: Float[Tensor, "batch 3 height width"],
+    target: Float[Tensor, "batch 3 height width"],
+    mask: Float[Tensor, "batch height width"],
+) -> Float[Tensor, ""]:
+    """Mean absolute difference inside the mask."""
+    return _masked_mean((picture - target).abs().mean(dim=1), mask)
+
+
+def squared_loss(
+    picture: Float[Tensor, "batch 3 height width"],
+    target: Float[Tensor, "batch 3 height width"],
+    mask: Float[Tensor, "batch height width"],
+) -> Float[Tensor, ""]:
+    """Mean squared difference inside the mask."""
+    return _masked_mean((picture - target).square().mean(dim=1), mask)
+
+
+def structure_loss(
+    picture: Float[Tensor, "batch 3 height width"],
+    target: Float[Tensor, "batch 3 height width"],
+    mask: Float[Tensor, "batch height width"],
+) -> Float[Tensor, ""]:
+    """Mean of 1 - SSIM inside the mask; outside it the picture counts as equal to the target."""
+    known = torch.where(mask[:, None] > 0, picture, target)
+    rows = zip(known.permute(0, 2, 3, 1), target.permute(0, 2, 3, 1), strict=True)
+    similarity = torch.stack([ssim_map(ours, truth).mean(dim=-1) for ours, truth in rows])
+    return _masked_mean(1 - similarity, mask)
+
+
+def gradient_loss(
+    picture: Float[Tensor, "batch 3 height width"],
+    target: Float[Tensor, "batch 3 height width"],
+    mask: Float[Tensor, "batch height width"],
+) -> Float[Tensor, ""]:
+    """Mean absolute difference of horizontal and vertical steps between known neighbours."""
+    gap = picture - target
+    across = (gap[..., 1:] - gap[..., :-1]).abs().mean(dim=1)
+    down = (gap[..., 1:, :] - gap[..., :-1, :]).abs().mean(dim=1)
+    horizontal = _masked_mean(across, mask[..., 1:] * mask[..., :-1])
+    return horizontal + _masked_mean(down, mask[..., 1:, :] * mask[..., :-1, :])
+
+
+def expected_error_loss(
+    output: NanoOutput,
+    target: Float[Tensor, "batch 3 height width"],
+    mask: Float[Tensor, "batch height width"],
+) -> Float[Tensor, ""]:
+    """Negative log likelihood of the error under a Laplace law of scale exp(log_error).
+
+    The error is taken as given, so this term never changes the picture.
+    """
+    error = (output.rgb.detach().clamp(0, 1) - target).abs().mean(dim=1)
+    return _masked_mean(error * torch.exp(-output.log_error) + output.log_error, mask)
+
+
+def agreement_mask(
+    conditions: ConditionBatch, difference: float
+) -> Float[Tensor, "batch height width"]:
+    """1 where a warp is valid and every valid warp agrees with the render."""
+    gaps = (conditions.warp - conditions.render[:, None]).abs().mean(dim=2)
+    disagreeing = (gaps > difference) & (conditions.warp_valid > 0)
+    some = conditions.warp_valid.amax(dim=1) > 0
+    return (some & ~disagreeing.any(dim=1)).float()
+
+
+def _masked_mean(
+    values: Float[Tensor, "batch rows columns"], mask: Float[Tensor, "batch rows columns"]
+) -> Float[Tensor, ""]:
+    return (values * mask).sum() / mask.sum().clamp_min(1)

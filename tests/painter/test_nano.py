@@ -1,0 +1,191 @@
+"""The fusion network."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from lidarpainter_models.errors import ConfigError, ShapeError
+from lidarpainter_models.painter import load_painter
+from lidarpainter_models.painter.batches import stack_conditions
+from lidarpainter_models.painter.candidates import (
+    blur,
+    build_candidates,
+    candidate_names,
+    fill_push_pull,
+    masked_blur,
+)
+from lidarpainter_models.painter.nano import NanoConfig, NanoNetwork
+from lidarpainter_models.painter.nano_painter import NanoPainter
+
+SMALL = {"widths": (8, 8, 8), "blocks": (1, 1, 1)}
+
+
+def scrambled(config):
+    """A network whose every weight is random, so that nothing is hidden by a zero."""
+    network = NanoNetwork(config)
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.copy_(0.1 * torch.randn(parameter.shape, generator=generator))
+    return network
+
+
+def test_untrained_network_equals_the_warp_painter(make_conditions):
+    conditions = make_conditions(33, 50)
+    painted = NanoPainter(NanoNetwork(NanoConfig())).paint(conditions).rgb
+    expected = load_painter("warp").paint(conditions).rgb
+    # the base candidate holds all but 7 exp(-9) of the weight
+    assert float((painted - expected).abs().max()) < 0.5 / 255
+
+
+@pytest.mark.parametrize("half_precision", [False, True])
+def test_mix_weights_sum_to_one(half_precision, make_conditions):
+    network = scrambled(NanoConfig(**SMALL))
+    batch = stack_conditions([make_conditions(seed=1), make_conditions(seed=2)], num_sources=2)
+    output = network(batch, ["clear", "clear"], half_precision=half_precision)
+    torch.testing.assert_close(output.weights.sum(dim=1), torch.ones(2, 24, 40))
+    assert output.weights.shape[1] == len(network.config.candidates) == 8
+
+
+def test_what_does_not_exist_is_never_chosen(make_conditions):
+    network = scrambled(NanoConfig(**SMALL))
+    conditions = make_conditions()
+    bare = replace(
+        conditions,
+        lidar_hit=torch.zeros_like(conditions.lidar_hit),
+        lidar_rgb=torch.zeros_like(conditions.lidar_rgb),
+    )
+    with torch.no_grad():
+        weights = network(stack_conditions([bare], num_sources=2), ["clear"]).weights[0]
+    names = network.config.candidates
+    assert float(weights[names.index("lidar_filled")].max()) == 0
+    assert float(weights[names.index("warp_1")][~bare.warp_valid[0]].max()) == 0
+    assert float(weights[names.index("warp_2")][bare.warp_valid[1]].min()) > 0
+
+
+@pytest.mark.parametrize(
+    ("inputs", "blind_to"),
+    [
+        ({"render"}, {"lidar_rgb", "warp_rgb"}),
+        ({"lidar"}, {"render_rgb", "warp_rgb"}),
+        ({"render", "lidar"}, {"warp_rgb"}),
+        ({"render", "warp"}, {"lidar_rgb"}),
+        ({"render", "lidar", "warp"}, set()),
+    ],
+)
+def test_ablated_network_ignores_what_it_may_not_see(inputs, blind_to, make_conditions):
+    network = scrambled(NanoConfig(inputs=frozenset(inputs), **SMALL))
+    painter = NanoPainter(network)
+    conditions, other = make_conditions(seed=1), make_conditions(seed=2)
+    before = painter.paint(conditions)
+    for name in ("render_rgb", "lidar_rgb", "warp_rgb"):
+        changed = painter.paint(replace(conditions, **{name: getattr(other, name)}))
+        is_same = torch.equal(changed.rgb, before.rgb)
+        assert is_same == (name in blind_to), name
+
+
+@pytest.mark.parametrize("size_px", [(1, 1), (5, 3), (16, 16), (17, 31), (48, 33)])
+def test_padding_does_not_change_the_picture_size(size_px, make_conditions):
+    painting = NanoPainter(scrambled(NanoConfig(**SMALL))).paint(make_conditions(*size_px))
+    assert painting.rgb.shape == (*size_px, 3)
+    assert painting.confidence.shape == size_px
+    assert bool(painting.rgb.isfinite().all())
+    assert 0 <= float(painting.rgb.min()) <= float(painting.rgb.max()) <= 1
+    assert 0 <= float(painting.confidence.min()) <= float(painting.confidence.max()) <= 1
+
+
+@pytest.mark.parametrize("num_sources", [0, 1, 3])
+def test_views_with_any_number_of_warps_are_painted(num_sources, make_conditions):
+    painting = NanoPainter(scrambled(NanoConfig(**SMALL))).paint(
+        make_conditions(num_sources=num_sources)
+    )
+    assert bool(painting.rgb.isfinite().all())
+
+
+def test_painting_twice_gives_the_same_bits(make_conditions):
+    painter = NanoPainter(scrambled(NanoConfig(**SMALL)))
+    conditions = make_conditions()
+    assert torch.equal(painter.paint(conditions).rgb, painter.paint(conditions).rgb)
+
+
+def test_residual_is_bounded(make_conditions):
+    config = NanoConfig(**SMALL)
+    network = scrambled(config)
+    batch = stack_conditions([make_conditions()], num_sources=2)
+    output = network(batch, ["clear"])
+    candidates = build_candidates(
+        batch, config.inputs, fill_push_pull(batch.lidar, batch.lidar_hit)
+    )
+    low = candidates.pictures.amin(dim=1) - config.residual_limit
+    high = candidates.pictures.amax(dim=1) + config.residual_limit
+    assert bool(((output.rgb >= low - 1e-6) & (output.rgb <= high + 1e-6)).all())
+
+
+def test_unknown_prompt_is_refused_in_one_line(make_conditions):
+    painter = NanoPainter(NanoNetwork(NanoConfig(**SMALL)))
+    with pytest.raises(ConfigError, match="no prompt 'foggy', only: clear") as caught:
+        painter.paint(make_conditions(prompt="foggy"))
+    assert "\n" not in str(caught.value)
+
+
+def test_prompts_of_one_batch_are_told_apart(make_conditions):
+    network = scrambled(NanoConfig(prompts=("clear", "foggy"), **SMALL))
+    batch = stack_conditions([make_conditions(), make_conditions()], num_sources=2)
+    rgb = network(batch, ["clear", "foggy"]).rgb
+    assert not torch.equal(rgb[0], rgb[1])
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"inputs": frozenset({"warp"})},
+        {"inputs": frozenset({"lidar", "warp"})},
+        {"inputs": frozenset({"radar"})},
+        {"widths": (8, 0, 8)},
+        {"num_sources": 0},
+    ],
+)
+def test_impossible_networks_are_refused(settings):
+    with pytest.raises(ConfigError):
+        NanoConfig(**settings)
+
+
+def test_config_survives_json():
+    config = NanoConfig(inputs=frozenset({"render", "lidar"}), widths=(8, 16, 24))
+    assert NanoConfig.from_dict(config.to_dict()) == config
+
+
+def test_views_of_different_sizes_do_not_stack(make_conditions):
+    with pytest.raises(ShapeError, match="one size"):
+        stack_conditions([make_conditions(8, 8), make_conditions(8, 9)], num_sources=2)
+
+
+def test_filling_keeps_known_pixels_and_reaches_everywhere():
+    picture = torch.zeros(1, 3, 13, 21)
+    known = torch.zeros(1, 1, 13, 21)
+    picture[0, :, 2, 3], known[0, 0, 2, 3] = 0.75, 1
+    filled = fill_push_pull(picture, known)
+    torch.testing.assert_close(filled, torch.full_like(filled, 0.75))
+    assert float(fill_push_pull(picture, torch.zeros_like(known)).abs().max()) == 0
+
+
+def test_filling_a_full_picture_changes_nothing():
+    picture = torch.rand(2, 3, 9, 11, generator=torch.Generator().manual_seed(0))
+    filled = fill_push_pull(picture, torch.ones(2, 1, 9, 11))
+    torch.testing.assert_close(filled, picture)
+
+
+def test_blur_keeps_constants_and_masked_blur_ignores_the_unknown():
+    constant = torch.full((1, 3, 9, 9), 0.3)
+    torch.testing.assert_close(blur(constant), constant)
+    valid = torch.ones(1, 1, 9, 9)
+    valid[..., 4:] = 0
+    spoiled = torch.where(valid > 0, constant, 1.0)
+    torch.testing.assert_close(masked_blur(spoiled, valid)[..., :4], constant[..., :4])
+
+
+def test_candidates_follow_the_inputs():
+    assert candidate_names(frozenset({"render"}), 2) == ("render", "render_blurred")
+    assert candidate_names(frozenset({"lidar"}), 2) == ("lidar_filled", "lidar_blurred")
+    assert len(candidate_names(frozenset({"render", "lidar", "warp"}), 2)) == 8
