@@ -1,0 +1,90 @@
+"""Change single settings of a preset by their dotted path: `fit.steps=500`."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, TypeVar, get_type_hints
+
+from pydantic import BaseModel, TypeAdapter, ValidationError
+
+from lidarpainter_models.errors import ConfigError
+
+Parameters = TypeVar("Parameters", bound=BaseModel)
+
+
+def with_overrides(parameters: Parameters, assignments: Sequence[str]) -> Parameters:
+    """The same parameters with some settings changed, each checked against its type.
+
+    Args:
+        parameters: a model whose fields may be config dataclasses, at any depth.
+        assignments: `path=value`; the value is JSON, or plain text, or values with commas
+            between for a sequence.
+
+    Raises:
+        ConfigError: no such setting, or a value that does not fit it.
+    """
+    for assignment in assignments:
+        path, separator, text = assignment.partition("=")
+        if not separator or not path:
+            raise ConfigError(f"{assignment!r}: expected a setting as key=value")
+        parameters = _assigned(parameters, path.strip().split("."), text.strip(), path)
+    return parameters
+
+
+def _assigned(owner: Any, names: list[str], text: str, path: str) -> Any:  # noqa: ANN401
+    """A copy of a model or dataclass with one setting below it changed."""
+    known = _field_names(owner)
+    name = names[0]
+    if name not in known:
+        place = path.split(".")[: -len(names)]
+        raise ConfigError(
+            f"no setting {path!r}: {'.'.join(place) or 'the parameters'} "
+            f"{'has' if place else 'have'} {', '.join(known) or 'nothing to set'}"
+        )
+    if len(names) > 1:
+        value = _assigned(getattr(owner, name), names[1:], text, path)
+    else:
+        value = _parsed(get_type_hints(type(owner))[name], text, path)
+    return _replaced(owner, name, value, path)
+
+
+def _field_names(owner: Any) -> list[str]:  # noqa: ANN401 - a model, a dataclass or a plain value
+    if isinstance(owner, BaseModel):
+        return list(type(owner).model_fields)
+    if is_dataclass(owner):
+        return [field.name for field in fields(owner) if field.init]
+    return []
+
+
+def _replaced(owner: Any, name: str, value: Any, path: str) -> Any:  # noqa: ANN401
+    if not isinstance(owner, BaseModel):
+        return replace(owner, **{name: value})
+    values = {field: getattr(owner, field) for field in type(owner).model_fields}
+    try:
+        return type(owner)(**{**values, name: value})
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {error.errors()[0]['msg']}") from None
+
+
+def _parsed(expected: Any, text: str, path: str) -> Any:  # noqa: ANN401 - any type of a setting
+    adapter = TypeAdapter(expected)
+    complaint = ""
+    for candidate in _readings(text):
+        try:
+            return adapter.validate_python(candidate)
+        except ValidationError as error:
+            complaint = complaint or error.errors()[0]["msg"]
+    raise ConfigError(f"{path}={text}: {complaint}")
+
+
+def _readings(text: str) -> list[Any]:
+    """What a text may mean, the likeliest first."""
+    readings: list[Any] = []
+    for source in (text, f"[{text}]"):
+        try:
+            readings.append(json.loads(source))
+        except ValueError:
+            continue
+    if text.lower() in ("none", "null"):
+        readings.append(None)
+    return [*readings, text, [part.strip() for part in text.split(",")]]
