@@ -34,6 +34,8 @@ SUPERSAMPLING = 2
 """Side cameras see the fitted detail coarser: they are rendered finer and box-averaged."""
 SAME_SURFACE = 0.05
 """A point is seen by the other camera when its z-buffer lies within 5 % of the point's depth."""
+DIFFERENCE_STEP_RAD = 5e-4
+"""Slopes are taken over about a quarter pixel: bilinear pictures are not smooth below that."""
 MAX_ROTATION_RAD = 0.03
 """A fitted rotation at this bound means that the fit failed."""
 
@@ -82,6 +84,8 @@ def strip_mask(view: StripView) -> Bool[Tensor, "height width"]:
     uv, other_m = view.fitted_camera.project(world)
     inside = view.fitted_camera.contains(uv, other_m)
     seen, seen_m = visible_points(view.fitted_camera, view.points_world)
+    if len(seen) == 0:
+        return torch.zeros_like(depth_map, dtype=torch.bool)
     nearest = splat_points(
         seen,
         seen_m,
@@ -157,9 +161,14 @@ def calibrate_strip(
         affine = fit_affine_colour(rendered, truth)
         return (apply_affine_colour(rendered, affine) - truth).numpy().ravel()
 
-    # robust, coarse steps first: the picture is not smooth at the scale of one pixel
+    def slopes(rotation_rad: np.ndarray) -> np.ndarray:
+        steps = DIFFERENCE_STEP_RAD * np.eye(3)
+        ahead = [residuals(rotation_rad + step) for step in steps]
+        behind = [residuals(rotation_rad - step) for step in steps]
+        return (np.stack(ahead, axis=1) - np.stack(behind, axis=1)) / (2 * DIFFERENCE_STEP_RAD)
+
     best = least_squares(
-        residuals, np.zeros(3), loss="soft_l1", f_scale=0.05, diff_step=1e-3, x_scale=2e-3
+        residuals, np.zeros(3), jac=slopes, loss="soft_l1", f_scale=0.05, x_scale=2e-3
     )
     if np.abs(best.x).max() > MAX_ROTATION_RAD:
         raise DataError(

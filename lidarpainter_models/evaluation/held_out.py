@@ -1,0 +1,104 @@
+"""Held-out views of a scene, at recorded poses, at interpolated poses, and beside the path.
+
+No picture and no sweep of a held-out frame was used for fitting. `interpolated` poses come from
+the refined training poses around the frame, so no test picture enters them; `recorded` poses are
+the log's own. The two are reported side by side and never mixed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.evaluation.judged_views import JudgedView, actor_mask
+from lidarpainter_models.gaussians.observations import (
+    ObservationConfig,
+    fit_camera,
+    shrink_picture,
+)
+from lidarpainter_models.gaussians.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.sparse_depth import move_actor_points
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.trajectories import Shift, road_directions, shift_pose
+from lidarpainter_models.scenes.driving_scene import DrivingScene, RecordedView
+from lidarpainter_models.scenes.synthetic.street import SyntheticStreet
+
+Poses = Literal["interpolated", "recorded"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldOut:
+    """What a fitted scene is judged on."""
+
+    scene: DrivingScene
+    test_views: Sequence[RecordedView]
+    observation: ObservationConfig
+
+    def camera_of(self, fitted: GaussianScene, view: RecordedView, poses: Poses) -> Camera:
+        """The view's camera at fit size, at its recorded or its interpolated pose."""
+        camera = fit_camera(view, self.observation)
+        if poses == "recorded":
+            return camera
+        return fitted.corrected_camera(
+            camera, timestamp_ns=view.timestamp_ns, camera_name=view.camera_name
+        )
+
+    def shifted_camera(self, fitted: GaussianScene, view: RecordedView, shift: Shift) -> Camera:
+        """The interpolated camera moved beside the path."""
+        camera = self.camera_of(fitted, view, "interpolated")
+        directions = road_directions(self.scene.world_from_ego)
+        direction = directions[self.scene.frame_position(view.frame_index)]
+        return camera.at(shift_pose(camera.world_from_camera, direction, shift))
+
+    def recorded_views(self, fitted: GaussianScene, poses: Poses) -> list[JudgedView]:
+        """The held-out pictures."""
+        judged = []
+        for view in self.test_views:
+            camera = self.camera_of(fitted, view, poses)
+            picture = shrink_picture(
+                self.scene.read_image(view), width_px=camera.width_px, height_px=camera.height_px
+            )
+            judged.append(
+                JudgedView(
+                    name=f"{view.camera_name}/{view.frame_index}",
+                    camera=camera,
+                    timestamp_ns=view.timestamp_ns,
+                    truth_rgb=picture.float() / 255,
+                    actor_mask=actor_mask(camera, self.scene.tracks, view.timestamp_ns),
+                )
+            )
+        return judged
+
+    def synthetic_views(
+        self, fitted: GaussianScene, street: SyntheticStreet, shift: Shift
+    ) -> list[JudgedView]:
+        """Exact pictures of the synthetic street beside the path, at the held-out times."""
+        judged = []
+        for view in self.test_views:
+            camera = self.shifted_camera(fitted, view, shift)
+            judged.append(
+                JudgedView(
+                    name=f"{shift.name}/{view.frame_index}",
+                    camera=camera,
+                    timestamp_ns=view.timestamp_ns,
+                    truth_rgb=street.render(camera, view.timestamp_ns).rgb,
+                    actor_mask=actor_mask(camera, self.scene.tracks, view.timestamp_ns),
+                )
+            )
+        return judged
+
+    def points_at(self, view: RecordedView) -> Float[Tensor, "points 3"]:
+        """The frame's sweeps in the world, actors moved to the view's exposure."""
+        clouds = [
+            move_actor_points(
+                self.scene.read_sweep(sweep).xyz_m,
+                [track for track in self.scene.tracks if track.is_moving],
+                from_ns=sweep.timestamp_ns,
+                to_ns=view.timestamp_ns,
+            )
+            for sweep in self.scene.sweeps_of(view.frame_index)
+        ]
+        return torch.cat(clouds) if clouds else torch.zeros(0, 3)

@@ -1,0 +1,126 @@
+"""All the figures of one fitted scene, each under the truth it was taken against."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.conditioning.conditions import ConditionBuilder
+from lidarpainter_models.evaluation.held_out import HeldOut
+from lidarpainter_models.evaluation.judged_views import Renderer, ViewScores, score_views
+from lidarpainter_models.gaussians.scene_graph import GaussianScene
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.trajectories import Shift
+from lidarpainter_models.metrics.depth import pooled_inlier_fraction, score_depth
+from lidarpainter_models.metrics.squeezenet import SqueezeNetDistance
+from lidarpainter_models.painter.protocol import Painter
+from lidarpainter_models.scenes.synthetic.street import SyntheticStreet
+
+JUDGED_SHIFTS = (
+    Shift(lateral_m=2.0),
+    Shift(lateral_m=-2.0),
+    Shift(lateral_m=3.0),
+    Shift(lateral_m=-3.0),
+    Shift(up_m=1.5),
+)
+"""The paper's trajectories: 2 m and 3 m to both sides, 1.5 m up."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoringConfig:
+    """Which trajectories are judged."""
+
+    shifts: tuple[Shift, ...] = JUDGED_SHIFTS
+
+
+def scene_renderer(fitted: GaussianScene, camera_name: str | None = None) -> Renderer:
+    """The scene as it is, without painting."""
+
+    def render(camera: Camera, timestamp_ns: int) -> Float[Tensor, "height width 3"]:
+        return fitted.render(camera, timestamp_ns, camera_name=camera_name).rgb
+
+    return render
+
+
+def painted_renderer(builder: ConditionBuilder, painter: Painter) -> Renderer:
+    """The scene followed by a painter: painting at view time."""
+
+    def render(camera: Camera, timestamp_ns: int) -> Float[Tensor, "height width 3"]:
+        return painter.paint(builder.conditions(camera, timestamp_ns)).rgb
+
+    return render
+
+
+def _view_scores(scores: ViewScores | None) -> dict[str, Any]:
+    """Scores as the report's JSON names them; absent perceptual figures say why."""
+    if scores is None:
+        return {"psnr": None, "ssim": None, "num_views": 0}
+    found = asdict(scores)
+    found.pop("per_view_psnr")
+    found["lpips"] = None
+    found["lpips_reason"] = "LPIPS backbone weights are user-supplied and none were given"
+    return found
+
+
+def score_recorded(
+    render: Renderer,
+    held_out: HeldOut,
+    fitted: GaussianScene,
+    *,
+    feature_distance: SqueezeNetDistance | None = None,
+) -> dict[str, Any]:
+    """Held-out pictures with interpolated poses, and beside them with recorded poses."""
+    interpolated = score_views(
+        render,
+        held_out.recorded_views(fitted, "interpolated"),
+        feature_distance=feature_distance,
+    )
+    recorded = score_views(
+        render, held_out.recorded_views(fitted, "recorded"), feature_distance=feature_distance
+    )
+    return {**_view_scores(interpolated), "recorded_poses": _view_scores(recorded)}
+
+
+def score_synthetic(
+    render: Renderer,
+    held_out: HeldOut,
+    fitted: GaussianScene,
+    street: SyntheticStreet,
+    shifts: Sequence[Shift],
+    *,
+    feature_distance: SqueezeNetDistance | None = None,
+) -> dict[str, Any]:
+    """Exact truth beside the path, per trajectory."""
+    return {
+        shift.name: _view_scores(
+            score_views(
+                render,
+                held_out.synthetic_views(fitted, street, shift),
+                feature_distance=feature_distance,
+            )
+        )
+        for shift in shifts
+    }
+
+
+def score_geometry(
+    held_out: HeldOut,
+    fitted: GaussianScene,
+    shifts: Sequence[Shift],
+    *,
+    progress: Callable[[str], None] | None = None,
+) -> dict[str, float | None]:
+    """Part of held-out LiDAR pixels that the rendered depth meets within 5 %, per trajectory."""
+    fractions: dict[str, float | None] = {}
+    for shift in (Shift(), *shifts):
+        if progress is not None:
+            progress(shift.name)
+        scores = []
+        for view in held_out.test_views:
+            camera = held_out.shifted_camera(fitted, view, shift)
+            depth_m = fitted.render(camera, view.timestamp_ns).depth_m
+            scores.append(score_depth(depth_m, camera, held_out.points_at(view)))
+        fractions[shift.name] = pooled_inlier_fraction(scores)
+    return fractions
