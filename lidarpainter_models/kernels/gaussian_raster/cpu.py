@@ -15,6 +15,7 @@ from lidarpainter_models.errors import BackendError
 from lidarpainter_models.kernels.gaussian_raster.binning import list_tiles
 from lidarpainter_models.kernels.gaussian_raster.blending import blend
 from lidarpainter_models.kernels.gaussian_raster.blending_gradients import gaussian_sums
+from lidarpainter_models.kernels.gaussian_raster.blending_limits import TANGENT_MARGIN
 from lidarpainter_models.kernels.gaussian_raster.projection import (
     IS_VISIBLE,
     SIGMA,
@@ -77,6 +78,8 @@ def _gaussians(tensors: tuple[Tensor, ...]) -> Gaussians:
 
 
 def _compiled_view(view: SplatView) -> View:
+    margin_x = TANGENT_MARGIN * 0.5 * view.width_px / view.fx_px
+    margin_y = TANGENT_MARGIN * 0.5 * view.height_px / view.fy_px
     return View(
         fx=view.fx_px,
         fy=view.fy_px,
@@ -87,6 +90,10 @@ def _compiled_view(view: SplatView) -> View:
         near=view.near_m,
         blur=view.blur_px2,
         antialias=view.antialias,
+        lowest_x=-view.cx_px / view.fx_px - margin_x,
+        highest_x=(view.width_px - view.cx_px) / view.fx_px + margin_x,
+        lowest_y=-view.cy_px / view.fy_px - margin_y,
+        highest_y=(view.height_px - view.cy_px) / view.fy_px + margin_y,
     )
 
 

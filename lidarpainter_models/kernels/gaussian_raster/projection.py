@@ -23,6 +23,7 @@ from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
     MIN_COMPENSATION,
     TANGENT_MARGIN,
 )
+from lidarpainter_models.kernels.gaussian_raster.small_vectors import EXACT
 
 RECORD_FLOATS = 16
 """A Gaussian's screen record fills one 64-byte cache line."""
@@ -56,7 +57,7 @@ class Gaussians(NamedTuple):
 
 
 class View(NamedTuple):
-    """The numbers of a `SplatView`, in the order compiled code reads them."""
+    """The numbers of a `SplatView`, and the tangents x/z, y/z where projection stays linear."""
 
     fx: float
     fy: float
@@ -67,6 +68,10 @@ class View(NamedTuple):
     near: float
     blur: float
     antialias: bool
+    lowest_x: float
+    highest_x: float
+    lowest_y: float
+    highest_y: float
 
 
 class Footprint(NamedTuple):
@@ -88,7 +93,7 @@ class Footprint(NamedTuple):
     yy: float
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def transform_of(gaussians, index):
     """Rotation rows and translation of the body a Gaussian belongs to."""
     t = gaussians.camera_from_body[gaussians.body_index[index]]
@@ -100,7 +105,7 @@ def transform_of(gaussians, index):
     return rotation, (t[0, 3], t[1, 3], t[2, 3])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def vector_of(array, index):
     """A row of three as float64."""
     return (
@@ -110,26 +115,14 @@ def vector_of(array, index):
     )
 
 
-@numba.njit(cache=True, error_model="numpy")
-def tangent_limits(view):
-    """Lowest and highest x/z and y/z at which the projection is linearised."""
-    margin_x = TANGENT_MARGIN * 0.5 * view.width / view.fx
-    margin_y = TANGENT_MARGIN * 0.5 * view.height / view.fy
-    return (
-        -view.cx / view.fx - margin_x,
-        (view.width - view.cx) / view.fx + margin_x,
-        -view.cy / view.fy - margin_y,
-        (view.height - view.cy) / view.fy + margin_y,
-    )
-
-
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def footprint_of(gaussians, index, point, rotation, translation, view):
     """Screen covariance of a Gaussian whose centre lies at `point` in the camera frame."""
     q = gaussians.rotation_wxyz[index]
     w, x, y, z = np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])
     length = max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
-    unit = (w / length, x / length, y / length, z / length)
+    inverse = 1.0 / length
+    unit = (w * inverse, x * inverse, y * inverse, z * inverse)
     scale = vector_of(gaussians.scale_m, index)
     turned = v3.rotation_matrix(unit)
     from_axes = (
@@ -138,11 +131,13 @@ def footprint_of(gaussians, index, point, rotation, translation, view):
         (turned[2][0] * scale[0], turned[2][1] * scale[1], turned[2][2] * scale[2]),
     )
     axes = v3.product(rotation, from_axes)
-    lowest_x, highest_x, lowest_y, highest_y = tangent_limits(view)
-    tangent_x = min(max(point[0] / point[2], lowest_x), highest_x)
-    tangent_y = min(max(point[1] / point[2], lowest_y), highest_y)
-    row_x = v3.scaled(v3.add(axes[0], v3.scaled(axes[2], -tangent_x)), view.fx / point[2])
-    row_y = v3.scaled(v3.add(axes[1], v3.scaled(axes[2], -tangent_y)), view.fy / point[2])
+    inverse_z = 1.0 / point[2]
+    tangent_x = min(max(point[0] * inverse_z, view.lowest_x), view.highest_x)
+    tangent_y = min(max(point[1] * inverse_z, view.lowest_y), view.highest_y)
+    row_x = v3.add(axes[0], v3.scaled(axes[2], -tangent_x))
+    row_y = v3.add(axes[1], v3.scaled(axes[2], -tangent_y))
+    row_x = v3.scaled(row_x, view.fx * inverse_z)
+    row_y = v3.scaled(row_y, view.fy * inverse_z)
     return Footprint(
         point,
         rotation,
@@ -161,20 +156,20 @@ def footprint_of(gaussians, index, point, rotation, translation, view):
     )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def compensation_ratio(footprint, determinant, blur):
     """Area of the footprint before blurring over its area after, squared."""
     bare = (footprint.xx - blur) * (footprint.yy - blur) - footprint.xy * footprint.xy
     return bare / determinant
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def view_direction(mean, rotation, translation):
     """Vector from the camera to a Gaussian in the frame of its body, metres."""
     return v3.add(mean, v3.apply(v3.transposed(rotation), translation))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _write_colour(gaussians, index, footprint, weights, record):
     mean = vector_of(gaussians.means, index)
     offset = view_direction(mean, footprint.rotation, footprint.translation)
@@ -189,62 +184,74 @@ def _write_colour(gaussians, index, footprint, weights, record):
     return math.isfinite(record[RED] + record[GREEN] + record[BLUE])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _write_centre(position, record, column):
     whole = math.floor(position)
     record[column] = whole
     record[column + 1] = position - whole
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _write_shape(footprint, determinant, log_opacity, record):
-    reach = 2.0 * (log_opacity - LOG_CUT)
+    inverse_yy = 1.0 / footprint.yy
     record[ACROSS] = 0.5 * footprint.yy / determinant
-    record[SHEAR] = -footprint.xy / footprint.yy
-    record[ALONG] = 0.5 / footprint.yy
+    record[SHEAR] = -footprint.xy * inverse_yy
+    record[ALONG] = 0.5 * inverse_yy
     record[LOG_OPACITY] = log_opacity
-    record[HALF_WIDTH] = math.sqrt(reach * footprint.xx)
-    record[HALF_HEIGHT] = math.sqrt(reach * footprint.yy)
     middle = 0.5 * (footprint.xx + footprint.yy)
     spread = math.sqrt(max(middle * middle - determinant, 0.0))
     record[SIGMA] = math.sqrt(middle + spread)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
+def _screen_opacity(gaussians, index, footprint, determinant, view):
+    """Opacity after antialiasing; NaN where the footprint cannot be drawn."""
+    if not (determinant > 0.0 and footprint.xx + footprint.yy < LARGEST_PX2):
+        return math.nan
+    opacity = np.float64(gaussians.opacity[index])
+    if view.antialias:
+        ratio = compensation_ratio(footprint, determinant, view.blur)
+        opacity *= math.sqrt(max(ratio, MIN_COMPENSATION))
+    return opacity
+
+
+@numba.njit(**EXACT)
+def _write_place(gaussians, index, footprint, reach, view, record):
+    """Write where a Gaussian lies and how far it reaches; return whether that is in the picture."""
+    x, y, z = footprint.point
+    x, y = view.fx * x / z + view.cx, view.fy * y / z + view.cy
+    if len(gaussians.screen_offset):
+        x += gaussians.screen_offset[index, 0]
+        y += gaussians.screen_offset[index, 1]
+    half_width, half_height = math.sqrt(reach * footprint.xx), math.sqrt(reach * footprint.yy)
+    record[HALF_WIDTH], record[HALF_HEIGHT], record[DEPTH] = half_width, half_height, z
+    _write_centre(x, record, MEAN_X)
+    _write_centre(y, record, MEAN_Y)
+    inside_x = x + half_width >= 0.5 and x - half_width <= view.width - 0.5
+    return inside_x and y + half_height >= 0.5 and y - half_height <= view.height - 0.5
+
+
+@numba.njit(**EXACT)
 def _project_one(gaussians, index, view, weights, record):
     """Fill a Gaussian's record; return whether it can reach a pixel."""
     rotation, translation = transform_of(gaussians, index)
     point = v3.add(v3.apply(rotation, vector_of(gaussians.means, index)), translation)
-    if not point[2] >= view.near:
-        return False
-    opacity = np.float64(gaussians.opacity[index])
-    if not opacity >= ALPHA_CUT:
+    if not (point[2] >= view.near and gaussians.opacity[index] >= ALPHA_CUT):
         return False
     footprint = footprint_of(gaussians, index, point, rotation, translation, view)
     determinant = footprint.xx * footprint.yy - footprint.xy * footprint.xy
-    if not (determinant > 0.0 and footprint.xx + footprint.yy < LARGEST_PX2):
+    opacity = _screen_opacity(gaussians, index, footprint, determinant, view)
+    if not opacity >= ALPHA_CUT:
         return False
-    if view.antialias:
-        ratio = compensation_ratio(footprint, determinant, view.blur)
-        opacity *= math.sqrt(max(ratio, MIN_COMPENSATION))
-        if not opacity >= ALPHA_CUT:
-            return False
-    _write_shape(footprint, determinant, math.log(opacity), record)
-    offset = gaussians.screen_offset
-    x = view.fx * point[0] / point[2] + view.cx + (offset[index, 0] if len(offset) else 0.0)
-    y = view.fy * point[1] / point[2] + view.cy + (offset[index, 1] if len(offset) else 0.0)
-    half_width, half_height = record[HALF_WIDTH], record[HALF_HEIGHT]
-    inside_x = x + half_width >= 0.5 and x - half_width <= view.width - 0.5
-    inside_y = y + half_height >= 0.5 and y - half_height <= view.height - 0.5
-    if not (inside_x and inside_y):
+    log_opacity = math.log(opacity)
+    reach = 2.0 * (log_opacity - LOG_CUT)
+    if not _write_place(gaussians, index, footprint, reach, view, record):
         return False
-    _write_centre(x, record, MEAN_X)
-    _write_centre(y, record, MEAN_Y)
-    record[DEPTH] = point[2]
+    _write_shape(footprint, determinant, log_opacity, record)
     return _write_colour(gaussians, index, footprint, weights, record)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _project_run(gaussians, view, first, end, records):
     weights = np.empty(16)
     for index in range(first, end):
@@ -252,7 +259,7 @@ def _project_run(gaussians, view, first, end, records):
         records[index, IS_VISIBLE] = 1.0 if visible else 0.0
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True)
+@numba.njit(parallel=True, **EXACT)
 def project(gaussians, view):
     """Screen records of all Gaussians; only `IS_VISIBLE` is set in those that cannot be seen."""
     count = len(gaussians.means)

@@ -35,11 +35,11 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
     SHEAR,
     compensation_ratio,
     footprint_of,
-    tangent_limits,
     transform_of,
     vector_of,
     view_direction,
 )
+from lidarpainter_models.kernels.gaussian_raster.small_vectors import EXACT
 
 
 class Gradients(NamedTuple):
@@ -55,7 +55,7 @@ class Gradients(NamedTuple):
     camera_from_body: np.ndarray
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _screen_gradient(sums, record):
     """Gradient with respect to the projected centre, pixels."""
     across, shear, along = record[ACROSS], record[SHEAR], record[ALONG]
@@ -63,7 +63,7 @@ def _screen_gradient(sums, record):
     return x, x * shear + 2.0 * along * sums[SUM_GY]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _covariance_gradient(sums, footprint):
     """Gradient with respect to the blurred screen covariance's xx, xy and yy."""
     yy = footprint.yy
@@ -81,7 +81,7 @@ def _covariance_gradient(sums, footprint):
     )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _add_compensation_gradient(footprint, blur, to_log, covariance_gradient):
     """Add the gradient of log(compensation) with respect to the blurred covariance."""
     xx, xy, yy = footprint.xx, footprint.xy, footprint.yy
@@ -99,7 +99,7 @@ def _add_compensation_gradient(footprint, blur, to_log, covariance_gradient):
     )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _axes_gradient(footprint, covariance_gradient, view):
     """Gradients of the Gaussian's axes in the camera frame and of its centre there."""
     to_xx, to_xy, to_yy = covariance_gradient
@@ -113,17 +113,16 @@ def _axes_gradient(footprint, covariance_gradient, view):
         v3.scaled(to_axis_x, -footprint.tangent_x), v3.scaled(to_axis_y, -footprint.tangent_y)
     )
     to_z = -(v3.dot(to_row_x, row_x) + v3.dot(to_row_y, row_y)) / z
-    lowest_x, highest_x, lowest_y, highest_y = tangent_limits(view)
     to_x, to_y = 0.0, 0.0
-    if lowest_x <= x / z <= highest_x:
+    if view.lowest_x <= x / z <= view.highest_x:
         to_x = -v3.dot(to_axis_x, axes[2]) / z
-    if lowest_y <= y / z <= highest_y:
+    if view.lowest_y <= y / z <= view.highest_y:
         to_y = -v3.dot(to_axis_y, axes[2]) / z
     to_point = (to_x, to_y, to_z - (to_x * x + to_y * y) / z)
     return (to_axis_x, to_axis_y, to_axis_z), to_point
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _centre_gradient(point, to_screen, to_depth, view):
     """Gradient of the centre in the camera frame through its pixel position and depth."""
     x, y, z = point
@@ -131,7 +130,7 @@ def _centre_gradient(point, to_screen, to_depth, view):
     return (to_x, to_y, to_depth - (to_x * x + to_y * y) / z)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _store_shape(gaussians, index, footprint, to_axes, gradients):
     """Store gradients of scale and rotation; return that of the transform's rotation."""
     to_from_axes = v3.product(v3.transposed(footprint.rotation), to_axes)
@@ -157,7 +156,7 @@ def _store_shape(gaussians, index, footprint, to_axes, gradients):
     return v3.product(to_axes, v3.transposed(footprint.from_axes))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _store_colour(gaussians, index, footprint, record, sums, weights, gradients):
     """Store the gradient of the coefficients; return that of the view direction, metres."""
     mean = vector_of(gaussians.means, index)
@@ -179,7 +178,7 @@ def _store_colour(gaussians, index, footprint, record, sums, weights, gradients)
     return v3.direction_of_gradient(direction, length, to_direction)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _store_transform(to_rotation, to_translation, out):
     for row in range(3):
         for column in range(3):
@@ -187,7 +186,7 @@ def _store_transform(to_rotation, to_translation, out):
         out[row, 3] += to_translation[row]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _unproject_one(gaussians, index, view, record, sums, weights, gradients, run):
     rotation, translation = transform_of(gaussians, index)
     mean = vector_of(gaussians.means, index)
@@ -216,7 +215,7 @@ def _unproject_one(gaussians, index, view, record, sums, weights, gradients, run
     _store_transform(to_rotation, to_translation, gradients.camera_from_body[run, body])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _unproject_run(gaussians, view, records, sums, gradients, run):
     weights = np.empty(16)
     count = len(records)
@@ -226,7 +225,7 @@ def _unproject_run(gaussians, view, records, sums, gradients, run):
             _unproject_one(gaussians, index, view, record, own_sums, weights, gradients, run)
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True)
+@numba.njit(parallel=True, **EXACT)
 def unproject(gaussians, view, records, sums):
     """Gradients of everything `project` read; zero where a Gaussian was not visible."""
     count, coefficients, _ = gaussians.sh.shape

@@ -7,26 +7,29 @@ import math
 
 import numba
 
+EXACT = {"cache": True, "error_model": "numpy", "fastmath": {"contract"}, "forceinline": True}
+"""How code on single Gaussians is compiled: fused multiply-add, otherwise as written."""
 
-@numba.njit(cache=True, error_model="numpy")
+
+@numba.njit(**EXACT)
 def dot(first, second):
     """Inner product."""
     return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def add(first, second):
     """Sum of two vectors."""
     return (first[0] + second[0], first[1] + second[1], first[2] + second[2])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def scaled(vector, factor):
     """Vector times a number."""
     return (vector[0] * factor, vector[1] * factor, vector[2] * factor)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def transposed(matrix):
     """Rows become columns."""
     return (
@@ -36,32 +39,32 @@ def transposed(matrix):
     )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def apply(matrix, vector):
     """Matrix times column vector."""
     return (dot(matrix[0], vector), dot(matrix[1], vector), dot(matrix[2], vector))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def product(first, second):
     """Matrix times matrix."""
     columns = transposed(second)
     return (apply(columns, first[0]), apply(columns, first[1]), apply(columns, first[2]))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def outer(column, row):
     """Column vector times row vector."""
     return (scaled(row, column[0]), scaled(row, column[1]), scaled(row, column[2]))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def added(first, second):
     """Sum of two matrices."""
     return (add(first[0], second[0]), add(first[1], second[1]), add(first[2], second[2]))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def rotation_matrix(wxyz):
     """Rotation of a unit quaternion, scalar first."""
     w, x, y, z = wxyz
@@ -72,7 +75,7 @@ def rotation_matrix(wxyz):
     )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def rotation_gradient(wxyz, gradient):
     """Gradient of the unit quaternion from that of its rotation matrix."""
     w, x, y, z = wxyz
@@ -85,14 +88,14 @@ def rotation_gradient(wxyz, gradient):
     )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def direction_of(vector):
     """Unit vector along `vector`, and the length it was divided by."""
     length = max(math.sqrt(dot(vector, vector)), 1e-12)
     return scaled(vector, 1.0 / length), length
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def direction_of_gradient(unit, length, gradient):
     """Gradient of a vector from that of the unit vector along it."""
     across = add(gradient, scaled(unit, -dot(unit, gradient)))

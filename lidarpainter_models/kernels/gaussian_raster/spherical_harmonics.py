@@ -5,6 +5,8 @@ Order, signs and constants are those of Kerbl et al. (2023). Compiled code on on
 
 import numba
 
+from lidarpainter_models.kernels.gaussian_raster.small_vectors import EXACT
+
 BAND_0 = 0.28209479177387814
 BAND_1 = 0.4886025119029199
 BAND_2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
@@ -17,7 +19,7 @@ BAND_3 = (
 )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def basis(coefficients, direction, out):
     """Fill `out` with the first `coefficients` basis values at a unit direction."""
     x, y, z = direction
@@ -42,7 +44,7 @@ def basis(coefficients, direction, out):
         out[15] = -BAND_3[0] * x * (x * x - 3.0 * y * y)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def direction_gradient(coefficients, direction, weight):
     """Gradient of sum_k weight[k] basis[k] with respect to the direction."""
     x, y, z = direction
@@ -61,7 +63,7 @@ def direction_gradient(coefficients, direction, weight):
     return (gx, gy, gz)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _band_3_gradient(direction, weight):
     x, y, z = direction
     xx, yy, zz = x * x, y * y, z * z
