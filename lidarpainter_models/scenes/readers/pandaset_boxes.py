@@ -8,8 +8,10 @@ What the dataset does and what is made of it here:
   (`cuboids.sensor_id` 0 spinning, 1 forward), linked by `cuboids.sibling_id`: each is drawn around
   the points of its LiDAR, which saw the actor at another moment. One track is kept, under the id
   of the spinning LiDAR; the other LiDAR's boxes fill the frames where it has none.
-- A box has no time. The points inside have: their median is when the box holds. A sweep takes
-  0.1 s, so a car at 10 m/s would otherwise be up to half a metre off.
+- A box has no time. The points inside have: the median of its LiDAR's is when the box holds. A
+  sweep takes 0.1 s, so a car at 10 m/s would otherwise be up to half a metre off. (Moved along the
+  track by 20 ms either way, the boxes of sequence 002 lose 2 % and 8 % of the spinning LiDAR's
+  points; the forward LiDAR's fit the same boxes when carried by their own times.)
 - `stationary` is per box. A track moves if it travels at least `MOVING_M`, or if a box is marked
   as moving and its mean speed is at least `MOVING_MPS` (short tracks). Neither a person who stands
   and gestures nor the jitter of a parked car's boxes counts as motion.
@@ -26,11 +28,11 @@ SPINNING, FORWARD = 0, 1
 """Values of `cuboids.sensor_id` and of a point's `d`; -1 is a box outside the overlap."""
 MOVING_M = 1.0
 MOVING_MPS = 1.0
-BOX_COLUMNS = (
-    *("uuid", "label", "yaw", "stationary", "position.x", "position.y", "position.z"),
-    *("dimensions.x", "dimensions.y", "dimensions.z"),
-    *("cuboids.sibling_id", "cuboids.sensor_id"),
+BOX_NUMBERS = (
+    *("yaw", "stationary", "position.x", "position.y", "position.z"),
+    *("dimensions.x", "dimensions.y", "dimensions.z", "cuboids.sensor_id"),
 )
+BOX_TEXTS = ("uuid", "label", "cuboids.sibling_id")
 MIN_POINTS_FOR_TIME = 5
 _AZIMUTH_WINDOW_RAD = np.radians(1.5)
 
@@ -57,7 +59,7 @@ def merge_boxes(tables: dict[int, Table]) -> dict[int, list[SourceBox]]:
     for frame_index, table in tables.items():
         chosen: dict[str, SourceBox] = {}
         # the spinning LiDAR's boxes come last, so that theirs stay
-        for row in np.argsort(-table["cuboids.sensor_id"].astype(int), kind="stable"):
+        for row in np.argsort(-table["cuboids.sensor_id"], kind="stable"):
             box = _source_box(table, int(row), track_of)
             chosen[box.actor_id] = box
         frames[frame_index] = list(chosen.values())

@@ -60,7 +60,7 @@ class _Machine:
         self.allowed = allowed
         self.stack: list[Any] = []
         self.memo: dict[int, Any] = {}
-        self.actions: dict[str, Callable[[Any], None]] = {
+        self.actions: dict[str, Callable[[Any], object]] = {
             **dict.fromkeys(_LITERALS, self.stack.append),
             **{name: self._push_constant(make) for name, make in _CONSTANTS.items()},
             **{name: self._push_tuple(size) for name, size in _TUPLE_SIZES.items()},

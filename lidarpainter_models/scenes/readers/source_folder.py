@@ -5,6 +5,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.scenes.readers.dataframe_pickle import Table, read_table_bytes
 
@@ -44,14 +46,22 @@ class SourceFolder:
             raise DataError(f"{self.root / name}: holds no {kind.__name__}")
         return value
 
-    def read_table(self, name: str, columns: tuple[str, ...]) -> Table:
-        """A pickled pandas table that has at least these columns; nothing of it is run."""
+    def read_table(
+        self, name: str, numbers: tuple[str, ...], *, texts: tuple[str, ...] = ()
+    ) -> Table:
+        """The named columns of a pickled pandas table; nothing of it is run.
+
+        Columns of numbers and flags come as float64 or int64, columns of texts as they are.
+        """
         path = self.root / name
         table = read_table_bytes(self.read_bytes(name), path)
-        missing = [column for column in columns if column not in table]
+        missing = [column for column in (*numbers, *texts) if column not in table]
         if missing:
             raise DataError(f"{path}: no column {', '.join(missing)}; it has {', '.join(table)}")
-        return table
+        return {
+            **{column: _numbers(table[column], f"{path}, column {column}") for column in numbers},
+            **{column: table[column] for column in texts},
+        }
 
     def provenance(self) -> dict[str, object]:
         """How many files were read, and one digest over their names and contents."""
@@ -60,3 +70,11 @@ class SourceFolder:
             "num_files": len(self._digests),
             "sha256": hashlib.sha256(content.encode()).hexdigest(),
         }
+
+
+def _numbers(column: np.ndarray, where: str) -> np.ndarray:
+    kind = np.int64 if column.dtype.kind in "biu" else np.float64
+    try:
+        return column.astype(kind)
+    except (TypeError, ValueError):
+        raise DataError(f"{where}: holds something other than numbers") from None

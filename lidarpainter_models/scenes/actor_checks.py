@@ -1,0 +1,103 @@
+"""Checks of the boxes of a scene: do they hold points, point ahead, and stand for one actor each?
+
+Wrong conventions (length along y, yaw from another axis, boxes at another moment) show here first.
+"""
+
+from typing import Literal
+
+import numpy as np
+import torch
+
+from lidarpainter_models.geometry.boxes import is_inside_box
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.tracks import ActorTrack
+
+Verdict = Literal["ok", "warn", "fail"]
+
+NEAR_M = 40.0
+"""Boxes nearer than this should hold points."""
+MIN_HELD_SHARE = 0.7
+MIN_AHEAD_SHARE = 0.8
+_MIN_TRAVEL_M = 2.0
+_DUPLICATE_SHARE = 0.5
+"""Two boxes closer than this share of the smaller one's width are the same place."""
+_NUM_RECOUNTED = 20
+
+
+def check_box_points(scene: DrivingScene) -> tuple[Verdict, str]:
+    """Whether near moving boxes hold LiDAR points, and as many as stated."""
+    held = total = 0
+    for track in scene.tracks:
+        if track.is_moving:
+            for position, frame_index in enumerate(track.frame_indices.tolist()):
+                ego = scene.world_from_ego[scene.frame_position(frame_index), :3, 3]
+                if (track.world_from_box[position, :3, 3] - ego).norm() < NEAR_M:
+                    total += 1
+                    held += int(track.num_points[position] > 0)
+    if total == 0:
+        return "ok", f"no moving box within {NEAR_M:.0f} m"
+    detail = f"{held} of {total} moving boxes within {NEAR_M:.0f} m hold points"
+    worst = _largest_miscount(scene)
+    if worst:
+        return "warn", f"{detail}; {worst}"
+    if held < MIN_HELD_SHARE * total:
+        return "fail" if held < total / 2 else "warn", detail
+    return "ok", detail
+
+
+def check_box_axes(scene: DrivingScene) -> tuple[Verdict, str]:
+    """Whether the x axis of moving boxes points where they go."""
+    cosines = []
+    for track in scene.tracks:
+        path = track.world_from_box[-1, :3, 3] - track.world_from_box[0, :3, 3]
+        if track.is_moving and path.norm() >= _MIN_TRAVEL_M:
+            middle = track.world_from_box[len(track.world_from_box) // 2]
+            cosines.append(float(middle[:3, 0] @ path / path.norm()))
+    if not cosines:
+        return "ok", "no actor travels far enough to tell"
+    ahead = int((np.array(cosines) > 0.7).sum())
+    across = int((np.abs(cosines) < 0.5).sum())
+    detail = f"{ahead} of {len(cosines)} moving actors drive along their x axis"
+    if across > len(cosines) / 2:
+        return "fail", f"{detail}, {across} across it: is the length along x?"
+    return ("ok" if ahead >= MIN_AHEAD_SHARE * len(cosines) else "warn"), detail
+
+
+def check_duplicate_tracks(scene: DrivingScene) -> tuple[Verdict, str]:
+    """Whether two tracks stand for the same actor."""
+    twins = [
+        f"{first.actor_id} = {second.actor_id}"
+        for index, first in enumerate(scene.tracks)
+        for second in scene.tracks[index + 1 :]
+        if _are_twins(first, second)
+    ]
+    if twins:
+        return "warn", f"{len(twins)} pairs stand in the same place: {', '.join(twins[:3])}"
+    return "ok", f"{len(scene.tracks)} tracks, each in a place of its own"
+
+
+def _are_twins(first: ActorTrack, second: ActorTrack) -> bool:
+    common, rows, others = np.intersect1d(
+        first.frame_indices.numpy(), second.frame_indices.numpy(), return_indices=True
+    )
+    if len(common) < 2:
+        return False
+    apart = first.world_from_box[rows, :3, 3] - second.world_from_box[others, :3, 3]
+    reach_m = _DUPLICATE_SHARE * float(torch.minimum(first.size_m[1], second.size_m[1]))
+    return float(apart.norm(dim=1).median()) < reach_m
+
+
+def _largest_miscount(scene: DrivingScene) -> str:
+    """Recount the points of some well-filled boxes; names the worst if it is far off."""
+    frame_index = scene.sweeps[len(scene.sweeps) // 2].frame_index
+    xyz_m = scene.read_points(frame_index).xyz_m
+    for track in scene.tracks[:_NUM_RECOUNTED]:
+        rows = (track.frame_indices == frame_index).nonzero()[:, 0]
+        for row in rows.tolist():
+            stated = int(track.num_points[row])
+            counted = int(is_inside_box(xyz_m, track.world_from_box[row], track.size_m).sum())
+            if abs(stated - counted) > max(20, stated // 2):
+                return (
+                    f"{track.actor_id} states {stated} points in frame {frame_index}, has {counted}"
+                )
+    return ""

@@ -1,0 +1,146 @@
+"""Poses, times and lenses of PandaSet, read from its JSON files and checked.
+
+Poses are `global_from_x` (the dataset's own frame, z up), rotations unit quaternions. Times are
+seconds in the files, nanoseconds here.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.errors import DataError
+from lidarpainter_models.geometry.transforms import (
+    interpolate_rigid,
+    rigid_from_rotation,
+    rotation_from_quaternion,
+)
+from lidarpainter_models.scenes.readers.source_folder import SourceFolder
+
+NS_PER_S = 1_000_000_000
+CAMERA_NAMES = (
+    *("front_camera", "front_left_camera", "front_right_camera"),
+    *("left_camera", "right_camera", "back_camera"),
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PandasetCamera:
+    """One camera of a log, without the size of its pictures, which only they know."""
+
+    global_from_camera: Float[Tensor, "frames 4 4"]
+    """At exposure."""
+    timestamps_ns: list[int]
+    intrinsics: dict[str, float]
+    """fx_px, fy_px, cx_px, cy_px."""
+
+
+def read_camera(source: SourceFolder, name: str, num_frames: int) -> PandasetCamera:
+    """Poses, times and lens of one camera.
+
+    Raises:
+        DataError: a file is missing, or does not say one thing per frame.
+    """
+    folder = f"camera/{name}"
+    if not (source.root / folder).is_dir():
+        raise DataError(f"{source.root / folder}: the camera folder is missing")
+    file = f"{folder}/intrinsics.json"
+    values, where = source.read_json(file, dict), str(source.root / file)
+    intrinsics = {f"{key}_px": _number(values, key, where) for key in ("fx", "fy", "cx", "cy")}
+    if min(intrinsics["fx_px"], intrinsics["fy_px"]) <= 0:
+        raise DataError(f"{where}: focal lengths must be positive")
+    return PandasetCamera(
+        global_from_camera=read_poses(source, folder, num_frames),
+        timestamps_ns=read_timestamps(source, folder, num_frames),
+        intrinsics=intrinsics,
+    )
+
+
+def read_timestamps(source: SourceFolder, folder: str, num_frames: int | None = None) -> list[int]:
+    """The times of a sensor, one per frame."""
+    file = f"{folder}/timestamps.json"
+    where = str(source.root / file)
+    values = source.read_json(file, list)
+    if not values or not all(_is_number(value) for value in values):
+        raise DataError(f"{where}: expected a list of times in seconds")
+    return _one_per_frame([nanoseconds(value) for value in values], num_frames, where)
+
+
+def read_poses(source: SourceFolder, folder: str, num_frames: int) -> Float[Tensor, "frames 4 4"]:
+    """The poses of a sensor, one per frame, float64."""
+    file = f"{folder}/poses.json"
+    where = str(source.root / file)
+    entries = _one_per_frame(source.read_json(file, list), num_frames, where)
+    return torch.stack(
+        [_pose(entry, f"{where}, frame {index}") for index, entry in enumerate(entries)]
+    )
+
+
+def pose_at(
+    global_from_body: Float[Tensor, "frames 4 4"], timestamps_ns: list[int], timestamp_ns: int
+) -> Float[Tensor, "4 4"]:
+    """A pose between the recorded ones; before the first and after the last the motion goes on."""
+    if len(timestamps_ns) == 1:
+        return global_from_body[0]
+    after = int(np.clip(np.searchsorted(timestamps_ns, timestamp_ns), 1, len(timestamps_ns) - 1))
+    start_ns, end_ns = timestamps_ns[after - 1], timestamps_ns[after]
+    fraction = (timestamp_ns - start_ns) / (end_ns - start_ns)
+    return interpolate_rigid(
+        global_from_body[after - 1],
+        global_from_body[after],
+        torch.tensor(fraction, dtype=torch.float64),
+    )
+
+
+def level_frame(global_from_ego: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+    """A frame at the ego's place whose x is its heading in the level plane and z is up."""
+    heading_rad = torch.atan2(global_from_ego[1, 0], global_from_ego[0, 0])
+    return turned_about_up(float(heading_rad), global_from_ego[:3, 3])
+
+
+def turned_about_up(angle_rad: float, translation_m: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
+    """A frame at a place, turned counter-clockwise about the vertical."""
+    cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
+    rotation = [[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]
+    return rigid_from_rotation(torch.tensor(rotation, dtype=torch.float64), translation_m)
+
+
+def nanoseconds(time_s: float) -> int:
+    """Seconds since the epoch as whole nanoseconds (a float64 holds them to 0.2 us)."""
+    return round(time_s * NS_PER_S)
+
+
+def _pose(entry: Any, where: str) -> Float[Tensor, "4 4"]:  # noqa: ANN401
+    position, heading = (
+        (entry.get("position"), entry.get("heading")) if isinstance(entry, dict) else (None, None)
+    )
+    if not (isinstance(position, dict) and isinstance(heading, dict)):
+        raise DataError(f"{where}: expected a position and a heading")
+    numbers = [_number(position, axis, where) for axis in "xyz"]
+    translation_m = torch.tensor(numbers, dtype=torch.float64)
+    numbers = [_number(heading, axis, where) for axis in "wxyz"]
+    rotation_wxyz = torch.tensor(numbers, dtype=torch.float64)
+    if not 0.99 < float(rotation_wxyz.norm()) < 1.01:
+        raise DataError(f"{where}: the heading is no unit quaternion")
+    return rigid_from_rotation(rotation_from_quaternion(rotation_wxyz), translation_m)
+
+
+def _one_per_frame(values: list, num_frames: int | None, where: str) -> list:
+    if num_frames is not None and len(values) != num_frames:
+        raise DataError(f"{where}: {len(values)} entries, expected {num_frames}, one per frame")
+    return values
+
+
+def _number(values: dict[str, Any], key: str, where: str) -> float:
+    value = values.get(key)
+    if not _is_number(value):
+        raise DataError(f"{where}: {key} is {value!r}, expected a finite number")
+    return float(value)  # type: ignore[arg-type]
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
