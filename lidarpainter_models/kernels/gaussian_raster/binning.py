@@ -25,6 +25,7 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
     MEAN_Y_FRACTION,
     SHEAR,
 )
+from lidarpainter_models.kernels.gaussian_raster.small_vectors import EXACT
 
 RUNS = 16
 """The depth order is cut into this many runs that are listed independently of each other."""
@@ -50,7 +51,7 @@ class TileLists(NamedTuple):
     """(entries): numbers of the entries, Gaussian by Gaussian, tiles in reading order."""
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def depth_order(records):
     """Indices of the visible Gaussians by depth; equal depths keep the order of their index."""
     count = 0
@@ -68,7 +69,7 @@ def depth_order(records):
     return _radix_sorted(depth.view(np.uint32), order)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _radix_sorted(keys, order):
     digits = 1 << RADIX_BITS
     mask = np.uint32(digits - 1)
@@ -90,7 +91,7 @@ def _radix_sorted(keys, order):
     return order
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _tile_span(low_px, high_px, tiles):
     """First and one past the last tile whose pixel centres lie between two positions."""
     first = math.ceil(max(low_px - ROUNDING_PX, 0.0) - 0.5)
@@ -98,7 +99,7 @@ def _tile_span(low_px, high_px, tiles):
     return int(first) // TILE_PX, min(int(last) // TILE_PX + 1, tiles)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _reach_across(record, y_low, y_high):
     """Leftmost and rightmost offset from the centre of the ellipse between two row offsets."""
     half_height = np.float64(record[HALF_HEIGHT])
@@ -116,44 +117,56 @@ def _reach_across(record, y_low, y_high):
     return left, right
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _tile_rows(record, rows):
-    y = np.float64(record[MEAN_Y]) + record[MEAN_Y_FRACTION]
-    return _tile_span(y - record[HALF_HEIGHT], y + record[HALF_HEIGHT], rows)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _tile_columns(record, row, columns):
+@numba.njit(**EXACT)
+def _centre_of(record):
     x = np.float64(record[MEAN_X]) + record[MEAN_X_FRACTION]
-    y = np.float64(record[MEAN_Y]) + record[MEAN_Y_FRACTION]
+    return x, np.float64(record[MEAN_Y]) + record[MEAN_Y_FRACTION]
+
+
+@numba.njit(**EXACT)
+def _tile_box(record, columns, rows):
+    """Tile columns and rows (first, end, first, end) that a Gaussian's bounding box covers."""
+    x, y = _centre_of(record)
+    first_column, end_column = _tile_span(x - record[HALF_WIDTH], x + record[HALF_WIDTH], columns)
+    first_row, end_row = _tile_span(y - record[HALF_HEIGHT], y + record[HALF_HEIGHT], rows)
+    return first_column, end_column, first_row, end_row
+
+
+@numba.njit(**EXACT)
+def _tile_columns(record, row, columns, box):
+    """First and one past the last tile column a Gaussian reaches in a tile row."""
+    if box[1] - box[0] <= 1 or box[3] - box[2] <= 1:
+        return box[0], box[1]  # the box is as tight as the ellipse
+    x, y = _centre_of(record)
     top = row * TILE_PX + 0.5 - y
     left, right = _reach_across(record, top, top + TILE_PX - 1.0)
     return _tile_span(x + left, x + right, columns)
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _count_run(records, order, first, end, columns, rows, entry_count, tile_count):
-    for place in range(first, end):
+@numba.njit(**EXACT)
+def _count_run(records, order, span, grid, entry_count, tile_count):
+    columns, rows = grid
+    for place in range(span[0], span[1]):
         record = records[order[place]]
-        first_row, end_row = _tile_rows(record, rows)
+        box = _tile_box(record, columns, rows)
         total = 0
-        for row in range(first_row, end_row):
-            first_column, end_column = _tile_columns(record, row, columns)
+        for row in range(box[2], box[3]):
+            first_column, end_column = _tile_columns(record, row, columns, box)
             for column in range(first_column, end_column):
                 tile_count[row * columns + column] += 1
             total += max(end_column - first_column, 0)
         entry_count[place] = total
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _list_run(records, lists, first, end, cursor):
-    for place in range(first, end):
+@numba.njit(**EXACT)
+def _list_run(records, lists, span, cursor):
+    for place in range(span[0], span[1]):
         index = lists.order[place]
         record = records[index]
         position = lists.entry_first[place]
-        first_row, end_row = _tile_rows(record, lists.rows)
-        for row in range(first_row, end_row):
-            first_column, end_column = _tile_columns(record, row, lists.columns)
+        box = _tile_box(record, lists.columns, lists.rows)
+        for row in range(box[2], box[3]):
+            first_column, end_column = _tile_columns(record, row, lists.columns, box)
             for column in range(first_column, end_column):
                 tile = row * lists.columns + column
                 entry = cursor[tile]
@@ -163,7 +176,7 @@ def _list_run(records, lists, first, end, cursor):
                 position += 1
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _starts(tile_count, entry_count):
     """Turn counts into first places; `tile_count` becomes each run's first entry in each tile."""
     runs, tiles = tile_count.shape
@@ -185,7 +198,7 @@ def _starts(tile_count, entry_count):
     return tile_first, entry_first
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True)
+@numba.njit(parallel=True, **EXACT)
 def list_tiles(records, width, height):
     """The tile lists of projected Gaussians; the same for any number of threads."""
     columns, rows = (width + TILE_PX - 1) // TILE_PX, (height + TILE_PX - 1) // TILE_PX
@@ -194,13 +207,13 @@ def list_tiles(records, width, height):
     entry_count = np.empty(count, np.int64)
     tile_count = np.zeros((RUNS, columns * rows), np.int64)
     for run in numba.prange(RUNS):
-        first, end = run * count // RUNS, (run + 1) * count // RUNS
-        _count_run(records, order, first, end, columns, rows, entry_count, tile_count[run])
+        span = (run * count // RUNS, (run + 1) * count // RUNS)
+        _count_run(records, order, span, (columns, rows), entry_count, tile_count[run])
     tile_first, entry_first = _starts(tile_count, entry_count)
     gaussian = np.empty(tile_first[-1], np.int32)
     entry = np.empty(tile_first[-1], np.int32)
     lists = TileLists(columns, rows, tile_first, gaussian, order, entry_first, entry)
     for run in numba.prange(RUNS):
-        first, end = run * count // RUNS, (run + 1) * count // RUNS
-        _list_run(records, lists, first, end, tile_count[run])
+        span = (run * count // RUNS, (run + 1) * count // RUNS)
+        _list_run(records, lists, span, tile_count[run])
     return lists

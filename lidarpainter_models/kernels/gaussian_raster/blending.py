@@ -31,6 +31,7 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
     RED,
     SHEAR,
 )
+from lidarpainter_models.kernels.gaussian_raster.small_vectors import EXACT
 
 PIXELS = TILE_PX * TILE_PX
 CHECK_EVERY = 16
@@ -56,7 +57,7 @@ LANE_MATH = {"contract", "reassoc", "nsz", "arcp"}
 """Freedom for the compiler that leaves NaN and infinity alone; the same on every thread."""
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def tile_order(place, tiles):
     """A shuffled tile number, so that equal shares of tiles are about equal work.
 
@@ -65,7 +66,7 @@ def tile_order(place, tiles):
     return place * 2 if place * 2 < tiles else (place - (tiles + 1) // 2) * 2 + 1
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def local_centre(record, tile_x, tile_y):
     """Centre of a Gaussian from the corner of a tile, pixels; exact to float32."""
     return (
@@ -74,7 +75,7 @@ def local_centre(record, tile_x, tile_y):
     )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def tile_rows_of(y, half_height):
     """First and one past the last row of a tile that a Gaussian can reach."""
     first = math.ceil(max(y - half_height - 0.5, 0.0))
@@ -82,7 +83,7 @@ def tile_rows_of(y, half_height):
     return int(min(first, TILE_PX)), int(max(end, 0.0))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def place_pixels(lanes):
     """Write the pixel centres of a tile, from its corner, into its work array."""
     for row in range(TILE_PX):
@@ -92,7 +93,7 @@ def place_pixels(lanes):
             lanes[PIXEL_Y + pixel] = row + 0.5
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def has_light(lanes):
     """Whether any pixel of a tile still takes Gaussians."""
     brightest = lanes[LIGHT]
@@ -134,7 +135,7 @@ def _blend_features(lanes, first_row, end_row, features):
             lanes[start + pixel] += lanes[WEIGHT + pixel] * value
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _blend_tile(records, features, lists, tile, tile_x, tile_y, lanes):
     first, end = lists.tile_first[tile], lists.tile_first[tile + 1]
     for entry in range(first, end):
@@ -149,7 +150,7 @@ def _blend_tile(records, features, lists, tile, tile_x, tile_y, lanes):
             _blend_features(lanes, first_row, end_row, features[index])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _store_tile(lanes, tile_x, tile_y, picture, light):
     height, width, channels = picture.shape
     for row in range(min(TILE_PX, height - tile_y)):
@@ -163,7 +164,7 @@ def _store_tile(lanes, tile_x, tile_y, picture, light):
                 out[channel] = lanes[FEATURES + (channel - 4) * PIXELS + pixel]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _draw_tile(records, features, lists, tile, picture, light):
     tile_x, tile_y = tile % lists.columns * TILE_PX, tile // lists.columns * TILE_PX
     lanes = np.zeros(LANES + features.shape[1] * PIXELS, np.float32)
@@ -173,7 +174,7 @@ def _draw_tile(records, features, lists, tile, picture, light):
     _store_tile(lanes, tile_x, tile_y, picture, light)
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True)
+@numba.njit(parallel=True, **EXACT)
 def blend(records, features, lists, width, height):
     """Draw all tiles.
 

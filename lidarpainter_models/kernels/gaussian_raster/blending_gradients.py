@@ -42,6 +42,7 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
     RED,
     SHEAR,
 )
+from lidarpainter_models.kernels.gaussian_raster.small_vectors import EXACT
 
 # Sums over pixels of an entry, with g the gradient of the exponent, u and dy the pixel's offset
 # in the sheared frame of the footprint (`projection`).
@@ -131,7 +132,7 @@ def _feature_sums(lanes, first_row, end_row, slot):
         slot[channel] = total
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _load_tile(tile_x, tile_y, picture, light, picture_gradient, alpha_gradient, lanes):
     """Pixel gradients, and the gradient-weighted total of what each pixel blended."""
     height, width, channels = picture.shape
@@ -151,7 +152,7 @@ def _load_tile(tile_x, tile_y, picture, light, picture_gradient, alpha_gradient,
             lanes[BEHIND + np.uint64(pixel)] = total
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _walk_tile(records, features, lists, tile, lanes, slots, feature_slots):
     tile_x, tile_y = tile % lists.columns * TILE_PX, tile // lists.columns * TILE_PX
     first, end = lists.tile_first[tile], lists.tile_first[tile + 1]
@@ -171,7 +172,7 @@ def _walk_tile(records, features, lists, tile, lanes, slots, feature_slots):
             _feature_sums(lanes, first_row, end_row, feature_slots[entry])
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _tile_sums(records, features, lists, tile, image, slots, feature_slots):
     tile_x, tile_y = tile % lists.columns * TILE_PX, tile // lists.columns * TILE_PX
     lanes = np.zeros(LANES + features.shape[1] * PIXELS, np.float32)
@@ -181,7 +182,7 @@ def _tile_sums(records, features, lists, tile, image, slots, feature_slots):
     _walk_tile(records, features, lists, tile, lanes, slots, feature_slots)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(**EXACT)
 def _add_entries(lists, slots, feature_slots, first, end, sums, feature_sums):
     for place in range(first, end):
         index = lists.order[place]
@@ -193,7 +194,7 @@ def _add_entries(lists, slots, feature_slots, first, end, sums, feature_sums):
                 feature_sums[index, k] += feature_slots[entry, k]
 
 
-@numba.njit(cache=True, error_model="numpy", parallel=True)
+@numba.njit(parallel=True, **EXACT)
 def gaussian_sums(records, features, lists, image):
     """Sums over all pixels of each Gaussian.
 

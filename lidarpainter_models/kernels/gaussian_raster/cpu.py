@@ -109,7 +109,7 @@ class _DrawGaussians(torch.autograd.Function):
                 records, gaussians.features, lists, view.width_px, view.height_px
             )
         visible = torch.from_numpy(records[:, IS_VISIBLE] > 0.0)
-        radius_px = torch.from_numpy(np.where(visible, 3.0 * records[:, SIGMA], np.float32(0.0)))
+        radius_px = torch.from_numpy(3.0 * records[:, SIGMA])
         outputs = (torch.from_numpy(picture), torch.from_numpy(light), visible, radius_px)
         ctx.save_for_backward(*tensors, *outputs[:2])
         ctx.mark_non_differentiable(visible, radius_px)

@@ -257,11 +257,14 @@ def _project_run(gaussians, view, first, end, records):
     for index in range(first, end):
         visible = _project_one(gaussians, index, view, weights, records[index])
         records[index, IS_VISIBLE] = 1.0 if visible else 0.0
+        if not visible:
+            records[index, SIGMA] = 0.0
 
 
 @numba.njit(parallel=True, **EXACT)
 def project(gaussians, view):
-    """Screen records of all Gaussians; only `IS_VISIBLE` is set in those that cannot be seen."""
+    """Screen records of all Gaussians; only `IS_VISIBLE` and `SIGMA` (0) mean
+    anything in those that cannot be seen."""
     count = len(gaussians.means)
     records = np.empty((count, RECORD_FLOATS), np.float32)
     for run in numba.prange(CHUNKS):
