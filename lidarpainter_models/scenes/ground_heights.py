@@ -1,0 +1,45 @@
+"""Height of the ground on a grid, from the points of the street.
+
+World frame, z up, metres. In each cell it is a low quantile of the points' z: low, because what
+stands on the ground is higher; a quantile, because a few returns lie below the ground (reflections
+in glass and water).
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+class GroundHeights:
+    """Looks up the ground under a place; where no point fell it is unknown (NaN)."""
+
+    def __init__(
+        self,
+        xyz_m: Float[Tensor, "points 3"],
+        *,
+        cell_m: float = 1.0,
+        quantile: float = 0.1,
+        least_points: int = 4,
+    ) -> None:
+        """Sort points into square cells and take a quantile of each cell with enough of them."""
+        self._cell_m = cell_m
+        keys = self._keys(xyz_m[:, :2])
+        by_height = torch.argsort(xyz_m[:, 2])
+        order = by_height[torch.argsort(keys[by_height], stable=True)]
+        self._cells, counts = torch.unique_consecutive(keys[order], return_counts=True)
+        starts = counts.cumsum(0) - counts
+        low = order[starts + (quantile * (counts - 1)).long()]
+        self._height_m = torch.where(counts >= least_points, xyz_m[low, 2], torch.nan)
+
+    def at(self, xy_m: Float[Tensor, "points 2"]) -> Float[Tensor, " points"]:
+        """Ground z below or above each place, NaN where it is unknown."""
+        if self._cells.numel() == 0:
+            return torch.full_like(xy_m[:, 0], torch.nan)
+        keys = self._keys(xy_m)
+        found = torch.searchsorted(self._cells, keys).clamp(max=self._cells.numel() - 1)
+        is_known = self._cells[found] == keys
+        return torch.where(is_known, self._height_m[found].to(xy_m), torch.nan)
+
+    def _keys(self, xy_m: Float[Tensor, "points 2"]) -> Tensor:
+        column, row = (xy_m / self._cell_m).floor().long().unbind(-1)
+        return column * (1 << 31) + row

@@ -1,0 +1,127 @@
+"""What a camera can see of a cloud of points: surfaces, what hides behind them, and edges.
+
+All pictures of this module lie on a coarse grid over the camera's picture; depth is camera z in
+metres. A cloud is full of gaps between scan lines, so a plain z-buffer lets the background shine
+through. A point counts as hidden when nearer surface stands on both sides of it, left and right
+or above and below; a road seen at a grazing angle has nearer surface below it alone and stays.
+Dark and glass bodies return few points: boxes of actors hide what lies behind them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lidarpainter_models.geometry.boxes import box_corners
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.transforms import transform_points
+from lidarpainter_models.kernels.point_splat import splat_points
+
+_FAR_M = 1e6
+_BOX_NEAR_M = 0.3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Visibility:
+    """What stands before and around each cell of the grid."""
+
+    hidden_from_m: Float[Tensor, "rows columns"]
+    """Beyond this depth a point has nearer surface on both sides."""
+    nearest_m: Float[Tensor, "rows columns"]
+    """Nearest surface in the neighbourhood."""
+    furthest_m: Float[Tensor, "rows columns"]
+    """Furthest surface in the neighbourhood, 0 where there is none."""
+    box_m: Float[Tensor, "rows columns"]
+    """Far end of the nearest actor box that covers the cell."""
+
+
+def surface_visibility(
+    cells_uv: Int[Tensor, "points 2"],
+    depth_m: Float[Tensor, " points"],
+    radius_px: Int[Tensor, " points"],
+    *,
+    height_px: int,
+    width_px: int,
+    gap_px: int,
+    edge_px: int,
+) -> tuple[Float[Tensor, "rows columns"], ...]:
+    """`hidden_from_m`, `nearest_m` and `furthest_m` of a cloud of discs.
+
+    Args:
+        cells_uv: column and row of each point.
+        depth_m: camera z.
+        radius_px: radius of each point's disc.
+        height_px: rows of the grid.
+        width_px: columns of the grid.
+        gap_px: how far to each side nearer surface is looked for.
+        edge_px: how far around a cell the neighbourhood reaches.
+    """
+    seen = splat_points(
+        cells_uv, depth_m, height_px=height_px, width_px=width_px, radius_px=radius_px
+    )
+    is_surface = seen >= 0
+    depth = torch.where(is_surface, depth_m[seen.clamp(min=0)], _FAR_M).numpy()
+    sides = [_nearest_towards(depth, gap_px, *step) for step in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+    hidden = np.minimum(np.maximum(sides[0], sides[1]), np.maximum(sides[2], sides[3]))
+    kernel = np.ones((2 * edge_px + 1, 2 * edge_px + 1), np.uint8)
+    nearest = cv2.erode(depth, kernel, borderType=cv2.BORDER_REPLICATE)
+    known = np.where(is_surface.numpy(), depth, np.float32(0))
+    furthest = cv2.dilate(known, kernel, borderType=cv2.BORDER_REPLICATE)
+    return torch.from_numpy(hidden), torch.from_numpy(nearest), torch.from_numpy(furthest)
+
+
+def box_far_ends(
+    boxes: Sequence[tuple[Float[Tensor, "4 4"], Float[Tensor, "3"]]], camera: Camera
+) -> Float[Tensor, "rows columns"]:
+    """Depth of the far end of the nearest box over each pixel, very far where there is none.
+
+    Args:
+        boxes: `world_from_box` and size of each.
+        camera: its pixels are the cells.
+    """
+    far_ends = np.full((camera.height_px, camera.width_px), _FAR_M, np.float32)
+    for world_from_box, size_m in boxes:
+        corners = transform_points(world_from_box.double(), box_corners(size_m.double()))
+        corners = transform_points(camera.camera_from_world, corners)
+        z = corners[:, 2]
+        if float(z.max()) <= _BOX_NEAR_M:
+            continue
+        # a box that reaches behind the camera is drawn from just before it
+        u = corners[:, 0] / z.clamp(min=_BOX_NEAR_M) * camera.fx_px + camera.cx_px
+        v = corners[:, 1] / z.clamp(min=_BOX_NEAR_M) * camera.fy_px + camera.cy_px
+        outline = torch.stack([u, v], dim=-1).clamp(-1e4, 1e4).floor().int().numpy()
+        mask = np.zeros(far_ends.shape, np.uint8)
+        cv2.fillConvexPoly(mask, cv2.convexHull(outline), 1)
+        np.minimum(far_ends, np.float32(z.max()), out=far_ends, where=mask > 0)
+    return torch.from_numpy(far_ends)
+
+
+def visible_points(
+    cells_uv: Int[Tensor, "points 2"],
+    depth_m: Float[Tensor, " points"],
+    visibility: Visibility,
+    *,
+    tolerance: float,
+) -> Bool[Tensor, " points"]:
+    """Whether nothing known stands before each point."""
+    column, row = cells_uv.long().unbind(-1)
+    is_open = depth_m * (1 - tolerance) <= visibility.hidden_from_m[row, column]
+    return is_open & (depth_m <= visibility.box_m[row, column])
+
+
+def _nearest_towards(depth_m: np.ndarray, reach_px: int, step_u: int, step_v: int) -> np.ndarray:
+    """Smallest depth in the cell and up to `reach_px` from it in one direction."""
+    shape = (1, reach_px + 1) if step_u else (reach_px + 1, 1)
+    end = 0 if step_u + step_v > 0 else reach_px
+    anchor = (end, 0) if step_u else (0, end)
+    return cv2.erode(
+        depth_m,
+        np.ones(shape, np.uint8),
+        anchor=anchor,
+        borderType=cv2.BORDER_CONSTANT,
+        borderValue=_FAR_M,
+    )
