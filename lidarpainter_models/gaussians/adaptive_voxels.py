@@ -1,0 +1,104 @@
+"""Thin out a point cloud so that every view keeps about the same detail per pixel.
+
+A voxel's size follows the size of a pixel at its distance from the nearest camera that sees it:
+near things get small voxels, far ones large. Sizes are powers of two times a factor that is
+searched so that a given number of voxels comes out. Metres; world or box frame alike.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VoxelPoints:
+    """One point per occupied voxel."""
+
+    xyz_m: Float[Tensor, "voxels 3"]
+    """Mean of the points inside."""
+    rgb: Float[Tensor, "voxels 3"]
+    """Mean colour of the coloured points inside."""
+    has_colour: Bool[Tensor, " voxels"]
+    size_m: Float[Tensor, " voxels"]
+    """Edge of the voxel."""
+
+
+def voxel_keys(
+    xyz_m: Float[Tensor, "points 3"], size_m: Float[Tensor, " points"]
+) -> Int[Tensor, " points"]:
+    """A number per point, equal exactly for points in the same voxel of the same size.
+
+    Collisions of the 63-bit mix are possible and harmless: two far voxels would share a mean.
+    """
+    cell = torch.floor(xyz_m.double() / size_m.double()[:, None]).long()
+    level = torch.round(torch.log2(size_m.double()) * 8).long()
+    key = (cell[:, 0] * 73_856_093) ^ (cell[:, 1] * 19_349_669_117) ^ (cell[:, 2] * 83_492_791_363)
+    return key ^ (level * 2_654_435_761_123)
+
+
+def adaptive_sizes(
+    footprint_m: Float[Tensor, " points"], factor: float, *, least_m: float, most_m: float
+) -> Float[Tensor, " points"]:
+    """Voxel edge of each point: about `factor` pixels, as a power of two times the least."""
+    wanted = (footprint_m * factor).clamp(least_m, most_m)
+    return least_m * 2 ** torch.floor(torch.log2(wanted / least_m) + 0.5)
+
+
+def adaptive_voxels(
+    xyz_m: Float[Tensor, "points 3"],
+    rgb: Float[Tensor, "points 3"],
+    has_colour: Bool[Tensor, " points"],
+    footprint_m: Float[Tensor, " points"],
+    *,
+    budget: int,
+    least_m: float = 0.03,
+    most_m: float = 2.0,
+) -> VoxelPoints:
+    """At most about `budget` voxels with the finest detail per pixel that allows.
+
+    Args:
+        xyz_m: the cloud.
+        rgb: colours, in [0, 1].
+        has_colour: which of them mean anything.
+        footprint_m: size of a pixel at each point.
+        budget: how many voxels are wanted; fewer come out if the cloud is smaller.
+        least_m: smallest edge.
+        most_m: largest edge.
+    """
+    low, high = 0.25, 64.0
+    keys = voxel_keys(xyz_m, adaptive_sizes(footprint_m, low, least_m=least_m, most_m=most_m))
+    best = low
+    if torch.unique(keys).numel() > budget:
+        for _ in range(7):
+            middle = (low * high) ** 0.5
+            sizes = adaptive_sizes(footprint_m, middle, least_m=least_m, most_m=most_m)
+            is_few = torch.unique(voxel_keys(xyz_m, sizes)).numel() <= budget
+            low, high = (low, middle) if is_few else (middle, high)
+        best = high
+    sizes = adaptive_sizes(footprint_m, best, least_m=least_m, most_m=most_m)
+    return mean_by_voxel(xyz_m, rgb, has_colour, sizes)
+
+
+def mean_by_voxel(
+    xyz_m: Float[Tensor, "points 3"],
+    rgb: Float[Tensor, "points 3"],
+    has_colour: Bool[Tensor, " points"],
+    size_m: Float[Tensor, " points"],
+) -> VoxelPoints:
+    """Average points and colours inside every voxel."""
+    unique, voxel = torch.unique(voxel_keys(xyz_m, size_m), return_inverse=True)
+    count = torch.bincount(voxel, minlength=unique.numel())
+    coloured = torch.bincount(voxel[has_colour], minlength=unique.numel())
+    xyz = torch.zeros(unique.numel(), 3, dtype=torch.float64)
+    xyz.index_add_(0, voxel, xyz_m.double())
+    colour = torch.zeros(unique.numel(), 3, dtype=torch.float64)
+    colour.index_add_(0, voxel[has_colour], rgb[has_colour].double())
+    edge = torch.zeros(unique.numel()).scatter_reduce(0, voxel, size_m, reduce="amax")
+    return VoxelPoints(
+        xyz_m=(xyz / count[:, None]).float(),
+        rgb=(colour / coloured.clamp(min=1)[:, None]).float(),
+        has_colour=coloured > 0,
+        size_m=edge,
+    )

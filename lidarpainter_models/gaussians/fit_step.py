@@ -1,0 +1,233 @@
+"""Gradients of one recorded or painted view, and the steps of everything but the Gaussians."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.gaussians.fit_config import FitConfig
+from lidarpainter_models.gaussians.fit_pictures import FitPicture
+from lidarpainter_models.gaussians.fit_state import FitState
+from lidarpainter_models.gaussians.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.losses import (
+    actor_boundary_loss,
+    clear_sky_loss,
+    depth_loss,
+    pose_prior,
+    project_boxes,
+)
+from lidarpainter_models.gaussians.observations import GuidanceView
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.kernels.gaussian_raster import SplatImage
+from lidarpainter_models.kernels.ssim import l1_ssim_loss
+
+Perceptual = Callable[
+    [Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]], Float[Tensor, ""]
+]
+"""Distance of a rendered and a true picture, differentiable in the first."""
+
+
+def recorded_step(
+    state: FitState,
+    picture: FitPicture,
+    row: int,
+    config: FitConfig,
+    perceptual: Perceptual | None,
+) -> tuple[float, float]:
+    """Collect the Gaussians' gradients from one recorded view; step poses, exposure and sky.
+
+    Returns the loss and the mean squared error of the picture.
+    """
+    scene, refinement = state.scene, config.refinement
+    is_refined = state.step >= refinement.start_step
+    tangent = scene.cameras.tangent(row)
+    pose = scene.cameras.world_from_camera(row)
+    if not (refinement.cameras and is_refined):
+        pose = pose.detach()
+    camera = picture.camera.at(pose.detach())
+    bodies = scene.camera_from_body(pose, picture.timestamp_ns)
+    with_actors = bool(scene.recorded_tracks) and state.step % config.losses.actors_every == 0
+    screen_gradient = torch.zeros(scene.num_gaussians)
+    image = scene.splat(
+        camera, bodies, with_actor_alpha=with_actors, screen_gradient_out=screen_gradient
+    )
+    sky_rgb = scene.sky.sample(camera).requires_grad_(True)
+    shown = composed(image, sky_rgb, config.initialisation.sky.min_transmittance)
+    shown = scene.exposure.apply(shown, picture.camera_name)
+    loss = _picture_loss(shown, picture, config, perceptual)
+    loss = loss + _regularisers(state, image, picture, camera, config)
+    loss = loss + _priors(state, tangent, picture.timestamp_ns, config)
+    loss.backward()
+    state.tally.add(screen_gradient, image.visible)
+    _step_poses(state, config)
+    _step_sky(state, sky_rgb, image, picture, camera, config)
+    squared_error = (shown.detach() - picture.rgb).square().mean()
+    return float(loss.detach()), float(squared_error)
+
+
+def add_guidance_gradients(state: FitState, view: GuidanceView, config: FitConfig) -> None:
+    """Add one painted view's gradients to the Gaussians; nothing else is changed by it.
+
+    With the freedom `appearance` only colour and opacity receive any.
+    """
+    scene, settings = state.scene, config.guidance
+    gaussians = scene.gaussians
+    if settings.freedom == "appearance":
+        gaussians = _with_fixed_geometry(gaussians)
+    with torch.no_grad():
+        bodies = scene.camera_from_body(view.camera.world_from_camera, view.timestamp_ns)
+        sky_rgb = scene.sky.sample(view.camera)
+    image = scene.splat(view.camera, bodies, gaussians=gaussians)
+    shown = image.rgb + (1 - image.alpha)[..., None] * sky_rgb
+    loss = settings.weight * l1_ssim_loss(
+        shown, view.rgb, ssim_weight=settings.ssim, pixel_weight=view.weight
+    )
+    if settings.depth > 0 and settings.freedom == "all":
+        loss = loss + settings.depth * depth_loss(
+            image.depth_m, image.alpha, view.lidar_depth_m, cap=config.losses.depth_cap
+        )
+    loss.backward()
+
+
+def composed(
+    image: SplatImage, sky_rgb: Float[Tensor, "height width 3"], min_transmittance: float
+) -> Float[Tensor, "height width 3"]:
+    """Gaussians over sky; the sky gets a gradient only where it is seen clearly enough."""
+    clear = (1 - image.alpha)[..., None]
+    gated = torch.where(clear.detach() > min_transmittance, sky_rgb, sky_rgb.detach())
+    return image.rgb + clear * gated
+
+
+def _with_fixed_geometry(gaussians: GaussianSet) -> GaussianSet:
+    """The same Gaussians, of which only colour and opacity collect gradients."""
+    return GaussianSet(
+        means=gaussians.means.detach(),
+        rotation_wxyz=gaussians.rotation_wxyz.detach(),
+        log_scale=gaussians.log_scale.detach(),
+        opacity_logit=gaussians.opacity_logit,
+        sh_dc=gaussians.sh_dc,
+        sh_rest=gaussians.sh_rest,
+        body_index=gaussians.body_index,
+    )
+
+
+def _picture_loss(
+    shown: Float[Tensor, "height width 3"],
+    picture: FitPicture,
+    config: FitConfig,
+    perceptual: Perceptual | None,
+) -> Float[Tensor, ""]:
+    target = picture.rgb
+    loss = l1_ssim_loss(shown, target, ssim_weight=config.losses.ssim)
+    if perceptual is not None and config.losses.perceptual > 0:
+        loss = loss + config.losses.perceptual * perceptual(shown, target)
+    return loss
+
+
+def _regularisers(
+    state: FitState, image: SplatImage, picture: FitPicture, camera: Camera, config: FitConfig
+) -> Float[Tensor, ""]:
+    """L_g: clear sky, actors inside their boxes, LiDAR depth."""
+    weights, scene = config.losses, state.scene
+    total = image.alpha.new_zeros(())
+    if weights.sky > 0:
+        total = total + weights.sky * clear_sky_loss(image.alpha, picture.sky_mask)
+    if weights.depth > 0:
+        total = total + weights.depth * depth_loss(
+            image.depth_m, image.alpha, picture.lidar_depth_m, cap=weights.depth_cap
+        )
+    if weights.actors > 0 and image.features.shape[-1] == 1:
+        with torch.no_grad():
+            world_from_actors, present = scene.world_from_actors(picture.timestamp_ns)
+            sizes = [track.size_m for track in scene.recorded_tracks]
+            in_boxes = project_boxes(camera, world_from_actors, sizes, present > 0)
+        total = total + weights.actors * actor_boundary_loss(image.features[..., 0], in_boxes)
+    return total
+
+
+def _priors(
+    state: FitState, tangent: Float[Tensor, "6"], timestamp_ns: int, config: FitConfig
+) -> Float[Tensor, ""]:
+    """Corrections are small, and an actor's change little from one knot to the next."""
+    scene, refinement, weights = state.scene, config.refinement, config.losses
+    total = tangent.new_zeros(())
+    if state.step < refinement.start_step:
+        return total
+    if refinement.cameras:
+        total = total + weights.pose_prior * pose_prior(
+            tangent[None],
+            rotation_rad=refinement.camera_noise_rad,
+            translation_m=refinement.camera_noise_m,
+        )
+    if refinement.actors and scene.recorded_tracks:
+        noise = {
+            "rotation_rad": refinement.actor_noise_rad,
+            "translation_m": refinement.actor_noise_m,
+        }
+        now = scene.actors.at(timestamp_ns)
+        total = total + weights.actor_prior * pose_prior(now, **noise)
+        before, after, _ = scene.actors.neighbours(timestamp_ns)
+        last = scene.actors.knots_ns.numel() - 1
+        for neighbour in {max(before - 1, 0), min(after + 1, last)}:
+            step = now - scene.actors.tangent[:, neighbour].detach()
+            total = total + weights.actor_smoothness * pose_prior(step, **noise)
+    return total
+
+
+def _step_poses(state: FitState, config: FitConfig) -> None:
+    """Step the corrections that received gradients, and drop these."""
+    scene, rates, refinement = state.scene, config.learning_rates, config.refinement
+    fraction, is_refined = state.step / config.steps, state.step >= refinement.start_step
+    if refinement.cameras and is_refined:
+        rate = _tangent_rate(
+            rates.at("camera_rotation_rad", fraction), rates.at("camera_translation_m", fraction)
+        )
+        state.camera_adam.step(scene.cameras.view_tangent, scene.cameras.view_tangent.grad, rate)
+        scene.cameras.recentre(keep_mean=refinement.extrinsics)
+    if refinement.actors and is_refined and scene.recorded_tracks:
+        rate = _tangent_rate(
+            rates.at("actor_rotation_rad", fraction), rates.at("actor_translation_m", fraction)
+        )
+        with torch.no_grad():
+            table = scene.actors.tangent.view(-1, 6)
+            state.actor_adam.step(table, scene.actors.tangent.grad.view(-1, 6), rate)
+    if refinement.exposure or len(scene.exposure.camera_names) > 1:
+        with torch.no_grad():
+            rate = torch.full((12,), rates.at("exposure", fraction))
+            gradient = scene.exposure.matrix.grad.flatten(1)
+            if len(scene.exposure.camera_names) > 1:
+                gradient[0] = 0  # the reference: all cameras together would be free to drift
+            state.exposure_adam.step(scene.exposure.matrix.view(-1, 12), gradient, rate)
+    for table in (scene.cameras.view_tangent, scene.actors.tangent, scene.exposure.matrix):
+        table.grad = None
+
+
+def _tangent_rate(rotation_rad: float, translation_m: float) -> Float[Tensor, "6"]:
+    return torch.tensor([rotation_rad] * 3 + [translation_m] * 3, dtype=torch.float64)
+
+
+def _step_sky(
+    state: FitState,
+    sky_rgb: Float[Tensor, "height width 3"],
+    image: SplatImage,
+    picture: FitPicture,
+    camera: Camera,
+    config: FitConfig,
+) -> None:
+    """Move the texels that were seen clearly enough."""
+    settings = config.initialisation.sky
+    if sky_rgb.grad is None:
+        return
+    clear = 1 - image.alpha.detach()
+    learns = clear > settings.min_transmittance
+    if config.sky_in_mask_only:
+        learns &= picture.sky_mask
+    fraction = state.step / config.steps
+    ratio = settings.final_learning_rate / settings.learning_rate
+    state.scene.sky.observe(
+        sky_rgb.grad,
+        torch.where(learns, clear, torch.zeros_like(clear)),
+        camera,
+        settings.learning_rate * ratio**fraction,
+    )

@@ -1,0 +1,118 @@
+"""What a fit minimises besides the picture difference.
+
+The regularisers are those that StreetCrafter (Yan et al., 2025) calls L_g, as the paper takes them
+over: the sky stays clear, actors stay in their boxes, LiDAR says how far things are. Depth is
+camera z in metres, alpha the opacity of the Gaussians in [0, 1].
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidarpainter_models.geometry.boxes import box_corners
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.transforms import transform_points
+
+_EDGE = 1e-4  # keeps logarithms finite
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LossWeights:
+    """How much each part of the loss counts."""
+
+    ssim: float = 0.2
+    """Of 1 - SSIM beside the mean absolute difference."""
+    perceptual: float = 0.0
+    """Of the perceptual distance, where one is given to the fit."""
+    sky: float = 0.05
+    """Of the clear-sky term."""
+    actors: float = 0.1
+    """Of the term that keeps actors inside their boxes."""
+    actors_every: int = 10
+    """Steps between two actor terms: it needs one more blended channel."""
+    depth: float = 0.1
+    """Of the relative LiDAR depth error."""
+    depth_cap: float = 0.2
+    """Relative depth errors count up to this: more is an occlusion, not a wrong surface."""
+    pose_prior: float = 1e-4
+    """Of squared camera corrections in units of the expected noise."""
+    actor_prior: float = 1e-6
+    """Of squared actor corrections, likewise: an actor fills a small part of the picture."""
+    actor_smoothness: float = 1e-5
+    """Of squared jumps between an actor's neighbouring corrections, likewise."""
+
+
+def clear_sky_loss(
+    alpha: Float[Tensor, "height width"], sky_mask: Bool[Tensor, "height width"]
+) -> Float[Tensor, ""]:
+    """Mean of -log(1 - alpha) in the sky and of the binary entropy of alpha elsewhere."""
+    inside = alpha.clamp(_EDGE, 1 - _EDGE)
+    log_clear = torch.log1p(-inside)
+    entropy = -(inside * inside.log() + (1 - inside) * log_clear)
+    return torch.where(sky_mask, -log_clear, entropy).mean()
+
+
+def actor_boundary_loss(
+    actor_alpha: Float[Tensor, "height width"], in_boxes: Bool[Tensor, "height width"]
+) -> Float[Tensor, ""]:
+    """Mean of -log(1 - actor_alpha) outside the projected boxes, of its entropy inside."""
+    return clear_sky_loss(actor_alpha, ~in_boxes)
+
+
+def depth_loss(
+    accumulated_m: Float[Tensor, "height width"],
+    alpha: Float[Tensor, "height width"],
+    lidar_depth_m: Float[Tensor, "height width"],
+    *,
+    cap: float,
+    weight: Float[Tensor, "height width"] | None = None,
+) -> Float[Tensor, ""]:
+    """Mean relative error of the expected depth where LiDAR hit, each capped.
+
+    A mean over all pixels of the picture with a return; pixels that the Gaussians leave clear do
+    not count (there the expected depth means nothing).
+    """
+    is_known = (lidar_depth_m > 0) & (alpha.detach() > 0.3)
+    safe_m = torch.where(is_known, lidar_depth_m, torch.ones_like(lidar_depth_m))
+    expected_m = accumulated_m / alpha.clamp(min=0.05)
+    error = ((expected_m - safe_m).abs() / safe_m).clamp(max=cap)
+    counts = is_known.float() if weight is None else is_known.float() * weight
+    return (error * counts).sum() / is_known.sum().clamp(min=1)
+
+
+def pose_prior(
+    tangents: Float[Tensor, "rows 6"], *, rotation_rad: float, translation_m: float
+) -> Float[Tensor, ""]:
+    """Sum of squared corrections in units of the noise that is expected."""
+    unit = torch.tensor([rotation_rad] * 3 + [translation_m] * 3, dtype=tangents.dtype)
+    return (tangents / unit).square().sum()
+
+
+def project_boxes(
+    camera: Camera,
+    world_from_boxes: Float[Tensor, "actors 4 4"],
+    sizes_m: Sequence[Float[Tensor, "3"]],
+    present: Bool[Tensor, " actors"],
+    *,
+    margin: float = 1.1,
+) -> Bool[Tensor, "height width"]:
+    """Pixels covered by any of the boxes, slightly grown; a box across the camera covers all."""
+    mask = np.zeros((camera.height_px, camera.width_px), np.uint8)
+    for pose, size_m, is_present in zip(world_from_boxes, sizes_m, present.tolist(), strict=True):
+        if not is_present:
+            continue
+        corners = transform_points(pose.double(), box_corners(size_m.double() * margin))
+        pixels_uv, depth_m = camera.project(corners)
+        if bool((depth_m < 0.5).all()):
+            continue
+        if bool((depth_m < 0.5).any()):
+            mask[:] = 1
+            break
+        hull = cv2.convexHull(pixels_uv.numpy().clip(-1e4, 1e4).round().astype(np.int32))
+        cv2.fillConvexPoly(mask, hull, 1)
+    return torch.from_numpy(mask.astype(bool))
