@@ -12,6 +12,7 @@ import numba
 import numpy as np
 
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import TILE_PX
+from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry
 from lidarpainter_models.kernels.gaussian_raster.projection import (
     ACROSS,
     ALONG,
@@ -25,7 +26,6 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
     MEAN_Y_FRACTION,
     SHEAR,
 )
-from lidarpainter_models.kernels.gaussian_raster.small_vectors import EXACT
 
 RUNS = 16
 """The depth order is cut into this many runs that are listed independently of each other."""
@@ -52,7 +52,7 @@ class TileLists(NamedTuple):
 
 
 @numba.njit(**EXACT)
-def depth_order(records):
+def depth_order(records: np.ndarray) -> np.ndarray:
     """Indices of the visible Gaussians by depth; equal depths keep the order of their index."""
     count = 0
     for index in range(len(records)):
@@ -70,7 +70,7 @@ def depth_order(records):
 
 
 @numba.njit(**EXACT)
-def _radix_sorted(keys, order):
+def _radix_sorted(keys: np.ndarray, order: np.ndarray) -> np.ndarray:
     digits = 1 << RADIX_BITS
     mask = np.uint32(digits - 1)
     other_keys, other_order = np.empty_like(keys), np.empty_like(order)
@@ -92,7 +92,7 @@ def _radix_sorted(keys, order):
 
 
 @numba.njit(**EXACT)
-def _tile_span(low_px, high_px, tiles):
+def _tile_span(low_px: float, high_px: float, tiles: int) -> tuple[int, int]:
     """First and one past the last tile whose pixel centres lie between two positions."""
     first = math.ceil(max(low_px - ROUNDING_PX, 0.0) - 0.5)
     last = math.floor(min(high_px + ROUNDING_PX, tiles * TILE_PX + 0.0) - 0.5)
@@ -100,7 +100,7 @@ def _tile_span(low_px, high_px, tiles):
 
 
 @numba.njit(**EXACT)
-def _reach_across(record, y_low, y_high):
+def _reach_across(record: np.ndarray, y_low: float, y_high: float) -> tuple[float, float]:
     """Leftmost and rightmost offset from the centre of the ellipse between two row offsets."""
     half_height = np.float64(record[HALF_HEIGHT])
     half_width = np.float64(record[HALF_WIDTH])
@@ -118,13 +118,13 @@ def _reach_across(record, y_low, y_high):
 
 
 @numba.njit(**EXACT)
-def _centre_of(record):
+def _centre_of(record: np.ndarray) -> tuple[float, float]:
     x = np.float64(record[MEAN_X]) + record[MEAN_X_FRACTION]
     return x, np.float64(record[MEAN_Y]) + record[MEAN_Y_FRACTION]
 
 
 @numba.njit(**EXACT)
-def _tile_box(record, columns, rows):
+def _tile_box(record: np.ndarray, columns: int, rows: int) -> tuple[int, int, int, int]:
     """Tile columns and rows (first, end, first, end) that a Gaussian's bounding box covers."""
     x, y = _centre_of(record)
     first_column, end_column = _tile_span(x - record[HALF_WIDTH], x + record[HALF_WIDTH], columns)
@@ -133,7 +133,9 @@ def _tile_box(record, columns, rows):
 
 
 @numba.njit(**EXACT)
-def _tile_columns(record, row, columns, box):
+def _tile_columns(
+    record: np.ndarray, row: int, columns: int, box: tuple[int, int, int, int]
+) -> tuple[int, int]:
     """First and one past the last tile column a Gaussian reaches in a tile row."""
     if box[1] - box[0] <= 1 or box[3] - box[2] <= 1:
         return box[0], box[1]  # the box is as tight as the ellipse
@@ -144,7 +146,14 @@ def _tile_columns(record, row, columns, box):
 
 
 @numba.njit(**EXACT)
-def _count_run(records, order, span, grid, entry_count, tile_count):
+def _count_run(
+    records: np.ndarray,
+    order: np.ndarray,
+    span: tuple[int, int],
+    grid: tuple[int, int],
+    entry_count: np.ndarray,
+    tile_count: np.ndarray,
+) -> None:
     columns, rows = grid
     for place in range(span[0], span[1]):
         record = records[order[place]]
@@ -159,7 +168,9 @@ def _count_run(records, order, span, grid, entry_count, tile_count):
 
 
 @numba.njit(**EXACT)
-def _list_run(records, lists, span, cursor):
+def _list_run(
+    records: np.ndarray, lists: TileLists, span: tuple[int, int], cursor: np.ndarray
+) -> None:
     for place in range(span[0], span[1]):
         index = lists.order[place]
         record = records[index]
@@ -177,7 +188,7 @@ def _list_run(records, lists, span, cursor):
 
 
 @numba.njit(**EXACT)
-def _starts(tile_count, entry_count):
+def _starts(tile_count: np.ndarray, entry_count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Turn counts into first places; `tile_count` becomes each run's first entry in each tile."""
     runs, tiles = tile_count.shape
     tile_first = np.empty(tiles + 1, np.int64)
@@ -198,8 +209,8 @@ def _starts(tile_count, entry_count):
     return tile_first, entry_first
 
 
-@numba.njit(parallel=True, **EXACT)
-def list_tiles(records, width, height):
+@compiled_entry
+def list_tiles(records: np.ndarray, width: int, height: int) -> TileLists:
     """The tile lists of projected Gaussians; the same for any number of threads."""
     columns, rows = (width + TILE_PX - 1) // TILE_PX, (height + TILE_PX - 1) // TILE_PX
     order = depth_order(records)

@@ -9,12 +9,14 @@ import math
 import numba
 import numpy as np
 
+from lidarpainter_models.kernels.gaussian_raster.binning import TileLists
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
     ALPHA_CUT,
     MAX_ALPHA,
     MIN_TRANSMITTANCE,
     TILE_PX,
 )
+from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, LANE_LOOP, compiled_entry
 from lidarpainter_models.kernels.gaussian_raster.lane_exponential import lane_exp
 from lidarpainter_models.kernels.gaussian_raster.projection import (
     ACROSS,
@@ -31,7 +33,6 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
     RED,
     SHEAR,
 )
-from lidarpainter_models.kernels.gaussian_raster.small_vectors import EXACT
 
 PIXELS = TILE_PX * TILE_PX
 CHECK_EVERY = 16
@@ -53,12 +54,9 @@ ONE = np.float32(1.0)
 FAR = np.float32(-5.7)
 """Exponents are held above this, where `lane_exp` is accurate and alpha is under the cut."""
 
-LANE_MATH = {"contract", "reassoc", "nsz", "arcp"}
-"""Freedom for the compiler that leaves NaN and infinity alone; the same on every thread."""
-
 
 @numba.njit(**EXACT)
-def tile_order(place, tiles):
+def tile_order(place: int, tiles: int) -> int:
     """A shuffled tile number, so that equal shares of tiles are about equal work.
 
     Sky tiles are empty and road tiles are full; threads take contiguous shares.
@@ -67,7 +65,7 @@ def tile_order(place, tiles):
 
 
 @numba.njit(**EXACT)
-def local_centre(record, tile_x, tile_y):
+def local_centre(record: np.ndarray, tile_x: int, tile_y: int) -> tuple[float, float]:
     """Centre of a Gaussian from the corner of a tile, pixels; exact to float32."""
     return (
         (record[MEAN_X] - np.float32(tile_x)) + record[MEAN_X_FRACTION],
@@ -76,7 +74,7 @@ def local_centre(record, tile_x, tile_y):
 
 
 @numba.njit(**EXACT)
-def tile_rows_of(y, half_height):
+def tile_rows_of(y: float, half_height: float) -> tuple[int, int]:
     """First and one past the last row of a tile that a Gaussian can reach."""
     first = math.ceil(max(y - half_height - 0.5, 0.0))
     end = math.floor(min(y + half_height + 0.5, TILE_PX + 0.0))
@@ -84,7 +82,7 @@ def tile_rows_of(y, half_height):
 
 
 @numba.njit(**EXACT)
-def place_pixels(lanes):
+def place_pixels(lanes: np.ndarray) -> None:
     """Write the pixel centres of a tile, from its corner, into its work array."""
     for row in range(TILE_PX):
         for column in range(TILE_PX):
@@ -94,7 +92,7 @@ def place_pixels(lanes):
 
 
 @numba.njit(**EXACT)
-def has_light(lanes):
+def has_light(lanes: np.ndarray) -> bool:
     """Whether any pixel of a tile still takes Gaussians."""
     brightest = lanes[LIGHT]
     for pixel in range(np.uint64(1), np.uint64(PIXELS)):
@@ -102,8 +100,10 @@ def has_light(lanes):
     return brightest > ZERO
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=LANE_MATH)
-def _blend(lanes, first_row, end_row, x, y, record):
+@numba.njit(**LANE_LOOP)
+def _blend(
+    lanes: np.ndarray, first_row: int, end_row: int, x: float, y: float, record: np.ndarray
+) -> None:
     """Blend one Gaussian into rows of a tile. A stopped pixel has its light negated."""
     across, shear, along = record[ACROSS], record[SHEAR], record[ALONG]
     log_opacity = record[LOG_OPACITY]
@@ -126,8 +126,8 @@ def _blend(lanes, first_row, end_row, x, y, record):
         lanes[LANE_DEPTH + pixel] += weight * depth
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=LANE_MATH)
-def _blend_features(lanes, first_row, end_row, features):
+@numba.njit(**LANE_LOOP)
+def _blend_features(lanes: np.ndarray, first_row: int, end_row: int, features: np.ndarray) -> None:
     for channel in range(len(features)):
         value = features[channel]
         start = np.uint64(FEATURES + channel * PIXELS)
@@ -136,7 +136,15 @@ def _blend_features(lanes, first_row, end_row, features):
 
 
 @numba.njit(**EXACT)
-def _blend_tile(records, features, lists, tile, tile_x, tile_y, lanes):
+def _blend_tile(
+    records: np.ndarray,
+    features: np.ndarray,
+    lists: TileLists,
+    tile: int,
+    tile_x: int,
+    tile_y: int,
+    lanes: np.ndarray,
+) -> None:
     first, end = lists.tile_first[tile], lists.tile_first[tile + 1]
     for entry in range(first, end):
         if (entry - first) % CHECK_EVERY == CHECK_EVERY - 1 and not has_light(lanes):
@@ -151,7 +159,9 @@ def _blend_tile(records, features, lists, tile, tile_x, tile_y, lanes):
 
 
 @numba.njit(**EXACT)
-def _store_tile(lanes, tile_x, tile_y, picture, light):
+def _store_tile(
+    lanes: np.ndarray, tile_x: int, tile_y: int, picture: np.ndarray, light: np.ndarray
+) -> None:
     height, width, channels = picture.shape
     for row in range(min(TILE_PX, height - tile_y)):
         for column in range(min(TILE_PX, width - tile_x)):
@@ -165,7 +175,14 @@ def _store_tile(lanes, tile_x, tile_y, picture, light):
 
 
 @numba.njit(**EXACT)
-def _draw_tile(records, features, lists, tile, picture, light):
+def _draw_tile(
+    records: np.ndarray,
+    features: np.ndarray,
+    lists: TileLists,
+    tile: int,
+    picture: np.ndarray,
+    light: np.ndarray,
+) -> None:
     tile_x, tile_y = tile % lists.columns * TILE_PX, tile // lists.columns * TILE_PX
     lanes = np.zeros(LANES + features.shape[1] * PIXELS, np.float32)
     lanes[:PIXELS] = ONE
@@ -174,8 +191,10 @@ def _draw_tile(records, features, lists, tile, picture, light):
     _store_tile(lanes, tile_x, tile_y, picture, light)
 
 
-@numba.njit(parallel=True, **EXACT)
-def blend(records, features, lists, width, height):
+@compiled_entry
+def blend(
+    records: np.ndarray, features: np.ndarray, lists: TileLists, width: int, height: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Draw all tiles.
 
     Returns:

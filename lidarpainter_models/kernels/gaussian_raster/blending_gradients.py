@@ -6,14 +6,16 @@ blended value dotted with the picture's gradient. Every (tile, Gaussian) entry w
 and each Gaussian adds up its entries in a fixed order, so results do not depend on the threads.
 """
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 
+from lidarpainter_models.kernels.gaussian_raster.binning import TileLists
 from lidarpainter_models.kernels.gaussian_raster.blending import (
     CHECK_EVERY,
     CUT,
     FAR,
-    LANE_MATH,
     LIGHT,
     ONE,
     PIXEL_X,
@@ -29,6 +31,7 @@ from lidarpainter_models.kernels.gaussian_raster.blending import (
     tile_rows_of,
 )
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import TILE_PX
+from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, LANE_LOOP, compiled_entry
 from lidarpainter_models.kernels.gaussian_raster.lane_exponential import lane_exp
 from lidarpainter_models.kernels.gaussian_raster.projection import (
     ACROSS,
@@ -42,7 +45,6 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
     RED,
     SHEAR,
 )
-from lidarpainter_models.kernels.gaussian_raster.small_vectors import EXACT
 
 # Sums over pixels of an entry, with g the gradient of the exponent, u and dy the pixel's offset
 # in the sheared frame of the footprint (`projection`).
@@ -60,8 +62,25 @@ LANES = 10 * PIXELS
 FEATURES = 10 * PIXELS
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=LANE_MATH)
-def _entry_sums(lanes, first_row, end_row, x, y, record, slot):
+class DrawnImage(NamedTuple):
+    """What `blending.blend` returned, and the gradients of the loss."""
+
+    picture: np.ndarray
+    light: np.ndarray
+    to_picture: np.ndarray
+    to_alpha: np.ndarray
+
+
+@numba.njit(**LANE_LOOP)
+def _entry_sums(  # noqa: PLR0915 - one loop body; calls would be no clearer
+    lanes: np.ndarray,
+    first_row: int,
+    end_row: int,
+    x: float,
+    y: float,
+    record: np.ndarray,
+    slot: np.ndarray,
+) -> None:
     """Sums of one Gaussian over rows of a tile; moves the pixels' light and rest along."""
     across, shear, along = record[ACROSS], record[SHEAR], record[ALONG]
     log_opacity = record[LOG_OPACITY]
@@ -111,8 +130,8 @@ def _entry_sums(lanes, first_row, end_row, x, y, record, slot):
     slot[SUM_DEPTH], slot[SUM_ABS_X], slot[SUM_ABS_Y] = sum_depth, abs_x, abs_y
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=LANE_MATH)
-def _feature_values(lanes, first_row, end_row, features):
+@numba.njit(**LANE_LOOP)
+def _feature_values(lanes: np.ndarray, first_row: int, end_row: int, features: np.ndarray) -> None:
     """Features of a Gaussian dotted with the picture's feature gradient, pixel by pixel."""
     for channel in range(len(features)):
         value = features[channel]
@@ -122,8 +141,8 @@ def _feature_values(lanes, first_row, end_row, features):
             lanes[FEATURE_VALUE + pixel] = before + lanes[start + pixel] * value
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=LANE_MATH)
-def _feature_sums(lanes, first_row, end_row, slot):
+@numba.njit(**LANE_LOOP)
+def _feature_sums(lanes: np.ndarray, first_row: int, end_row: int, slot: np.ndarray) -> None:
     for channel in range(len(slot)):
         start = np.uint64(FEATURES + channel * PIXELS)
         total = ZERO
@@ -133,27 +152,35 @@ def _feature_sums(lanes, first_row, end_row, slot):
 
 
 @numba.njit(**EXACT)
-def _load_tile(tile_x, tile_y, picture, light, picture_gradient, alpha_gradient, lanes):
+def _load_tile(tile_x: int, tile_y: int, image: DrawnImage, lanes: np.ndarray) -> None:
     """Pixel gradients, and the gradient-weighted total of what each pixel blended."""
-    height, width, channels = picture.shape
+    height, width, channels = image.picture.shape
     for row in range(min(TILE_PX, height - tile_y)):
         for column in range(min(TILE_PX, width - tile_x)):
             pixel = row * TILE_PX + column
             y, x = tile_y + row, tile_x + column
             lanes[pixel] = ONE
-            total = -np.float64(alpha_gradient[y, x]) * light[y, x]
+            total = -np.float64(image.to_alpha[y, x]) * image.light[y, x]
             for channel in range(channels):
-                gradient = picture_gradient[y, x, channel]
+                gradient = image.to_picture[y, x, channel]
                 begin = (
                     (1 + channel) * PIXELS if channel < 4 else (FEATURES + (channel - 4) * PIXELS)
                 )
                 lanes[begin + pixel] = gradient
-                total += np.float64(gradient) * picture[y, x, channel]
+                total += np.float64(gradient) * image.picture[y, x, channel]
             lanes[BEHIND + np.uint64(pixel)] = total
 
 
 @numba.njit(**EXACT)
-def _walk_tile(records, features, lists, tile, lanes, slots, feature_slots):
+def _walk_tile(
+    records: np.ndarray,
+    features: np.ndarray,
+    lists: TileLists,
+    tile: int,
+    lanes: np.ndarray,
+    slots: np.ndarray,
+    feature_slots: np.ndarray,
+) -> None:
     tile_x, tile_y = tile % lists.columns * TILE_PX, tile // lists.columns * TILE_PX
     first, end = lists.tile_first[tile], lists.tile_first[tile + 1]
     for entry in range(first, end):
@@ -173,17 +200,32 @@ def _walk_tile(records, features, lists, tile, lanes, slots, feature_slots):
 
 
 @numba.njit(**EXACT)
-def _tile_sums(records, features, lists, tile, image, slots, feature_slots):
+def _tile_sums(
+    records: np.ndarray,
+    features: np.ndarray,
+    lists: TileLists,
+    tile: int,
+    image: DrawnImage,
+    slots: np.ndarray,
+    feature_slots: np.ndarray,
+) -> None:
     tile_x, tile_y = tile % lists.columns * TILE_PX, tile // lists.columns * TILE_PX
     lanes = np.zeros(LANES + features.shape[1] * PIXELS, np.float32)
     place_pixels(lanes)
-    picture, light, picture_gradient, alpha_gradient = image
-    _load_tile(tile_x, tile_y, picture, light, picture_gradient, alpha_gradient, lanes)
+    _load_tile(tile_x, tile_y, image, lanes)
     _walk_tile(records, features, lists, tile, lanes, slots, feature_slots)
 
 
 @numba.njit(**EXACT)
-def _add_entries(lists, slots, feature_slots, first, end, sums, feature_sums):
+def _add_entries(
+    lists: TileLists,
+    slots: np.ndarray,
+    feature_slots: np.ndarray,
+    first: int,
+    end: int,
+    sums: np.ndarray,
+    feature_sums: np.ndarray,
+) -> None:
     for place in range(first, end):
         index = lists.order[place]
         for position in range(lists.entry_first[place], lists.entry_first[place + 1]):
@@ -194,16 +236,17 @@ def _add_entries(lists, slots, feature_slots, first, end, sums, feature_sums):
                 feature_sums[index, k] += feature_slots[entry, k]
 
 
-@numba.njit(parallel=True, **EXACT)
-def gaussian_sums(records, features, lists, image):
+@compiled_entry
+def gaussian_sums(
+    records: np.ndarray, features: np.ndarray, lists: TileLists, image: DrawnImage
+) -> tuple[np.ndarray, np.ndarray]:
     """Sums over all pixels of each Gaussian.
 
     Args:
         records: from `projection.project`.
         features: of the Gaussians, float32.
         lists: from `binning.list_tiles`.
-        image: picture and light from `blending.blend`, and the loss's gradients with respect to
-            the picture and to alpha.
+        image: what was drawn and the gradients it received.
 
     Returns:
         Sums (gaussians, `SUMS`) in the order of the constants above, and the gradient of the

@@ -14,7 +14,7 @@ from torch import Tensor
 from lidarpainter_models.errors import BackendError
 from lidarpainter_models.kernels.gaussian_raster.binning import list_tiles
 from lidarpainter_models.kernels.gaussian_raster.blending import blend
-from lidarpainter_models.kernels.gaussian_raster.blending_gradients import gaussian_sums
+from lidarpainter_models.kernels.gaussian_raster.blending_gradients import DrawnImage, gaussian_sums
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import TANGENT_MARGIN
 from lidarpainter_models.kernels.gaussian_raster.projection import (
     IS_VISIBLE,
@@ -123,7 +123,7 @@ class _DrawGaussians(torch.autograd.Function):
         *tensors, picture, light = ctx.saved_tensors
         to_picture, to_light = output_gradients[:2]
         gaussians = _gaussians(tuple(tensors))
-        image = (_array(picture), _array(light), _array(to_picture), _array(-to_light))
+        image = DrawnImage(_array(picture), _array(light), _array(to_picture), _array(-to_light))
         with ONE_AT_A_TIME:
             sums, to_features = gaussian_sums(ctx.records, gaussians.features, ctx.lists, image)
             found = unproject(gaussians, ctx.view, ctx.records, sums)

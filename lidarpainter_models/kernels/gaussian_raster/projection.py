@@ -21,9 +21,9 @@ from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
     ALPHA_CUT,
     COLOUR_OFFSET,
     MIN_COMPENSATION,
-    TANGENT_MARGIN,
 )
-from lidarpainter_models.kernels.gaussian_raster.small_vectors import EXACT
+from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry
+from lidarpainter_models.kernels.gaussian_raster.small_vectors import Matrix, Quaternion, Vector
 
 RECORD_FLOATS = 16
 """A Gaussian's screen record fills one 64-byte cache line."""
@@ -77,24 +77,24 @@ class View(NamedTuple):
 class Footprint(NamedTuple):
     """One Gaussian between body frame and screen; vectors are tuples (`small_vectors`)."""
 
-    point: tuple
-    rotation: tuple
-    translation: tuple
-    unit_wxyz: tuple
+    point: Vector
+    rotation: Matrix
+    translation: Vector
+    unit_wxyz: Quaternion
     wxyz_length: float
-    from_axes: tuple
-    axes_in_camera: tuple
+    from_axes: Matrix
+    axes_in_camera: Matrix
     tangent_x: float
     tangent_y: float
-    row_x: tuple
-    row_y: tuple
+    row_x: Vector
+    row_y: Vector
     xx: float
     xy: float
     yy: float
 
 
 @numba.njit(**EXACT)
-def transform_of(gaussians, index):
+def transform_of(gaussians: Gaussians, index: int) -> tuple[Matrix, Vector]:
     """Rotation rows and translation of the body a Gaussian belongs to."""
     t = gaussians.camera_from_body[gaussians.body_index[index]]
     rotation = (
@@ -106,7 +106,7 @@ def transform_of(gaussians, index):
 
 
 @numba.njit(**EXACT)
-def vector_of(array, index):
+def vector_of(array: np.ndarray, index: int) -> Vector:
     """A row of three as float64."""
     return (
         np.float64(array[index, 0]),
@@ -116,7 +116,14 @@ def vector_of(array, index):
 
 
 @numba.njit(**EXACT)
-def footprint_of(gaussians, index, point, rotation, translation, view):
+def footprint_of(
+    gaussians: Gaussians,
+    index: int,
+    point: Vector,
+    rotation: Matrix,
+    translation: Vector,
+    view: View,
+) -> Footprint:
     """Screen covariance of a Gaussian whose centre lies at `point` in the camera frame."""
     q = gaussians.rotation_wxyz[index]
     w, x, y, z = np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])
@@ -157,20 +164,22 @@ def footprint_of(gaussians, index, point, rotation, translation, view):
 
 
 @numba.njit(**EXACT)
-def compensation_ratio(footprint, determinant, blur):
+def compensation_ratio(footprint: Footprint, determinant: float, blur: float) -> float:
     """Area of the footprint before blurring over its area after, squared."""
     bare = (footprint.xx - blur) * (footprint.yy - blur) - footprint.xy * footprint.xy
     return bare / determinant
 
 
 @numba.njit(**EXACT)
-def view_direction(mean, rotation, translation):
+def view_direction(mean: Vector, rotation: Matrix, translation: Vector) -> Vector:
     """Vector from the camera to a Gaussian in the frame of its body, metres."""
     return v3.add(mean, v3.apply(v3.transposed(rotation), translation))
 
 
 @numba.njit(**EXACT)
-def _write_colour(gaussians, index, footprint, weights, record):
+def _write_colour(
+    gaussians: Gaussians, index: int, footprint: Footprint, weights: np.ndarray, record: np.ndarray
+) -> bool:
     mean = vector_of(gaussians.means, index)
     offset = view_direction(mean, footprint.rotation, footprint.translation)
     direction, _ = v3.direction_of(offset)
@@ -185,14 +194,16 @@ def _write_colour(gaussians, index, footprint, weights, record):
 
 
 @numba.njit(**EXACT)
-def _write_centre(position, record, column):
+def _write_centre(position: float, record: np.ndarray, column: int) -> None:
     whole = math.floor(position)
     record[column] = whole
     record[column + 1] = position - whole
 
 
 @numba.njit(**EXACT)
-def _write_shape(footprint, determinant, log_opacity, record):
+def _write_shape(
+    footprint: Footprint, determinant: float, log_opacity: float, record: np.ndarray
+) -> None:
     inverse_yy = 1.0 / footprint.yy
     record[ACROSS] = 0.5 * footprint.yy / determinant
     record[SHEAR] = -footprint.xy * inverse_yy
@@ -204,7 +215,9 @@ def _write_shape(footprint, determinant, log_opacity, record):
 
 
 @numba.njit(**EXACT)
-def _screen_opacity(gaussians, index, footprint, determinant, view):
+def _screen_opacity(
+    gaussians: Gaussians, index: int, footprint: Footprint, determinant: float, view: View
+) -> float:
     """Opacity after antialiasing; NaN where the footprint cannot be drawn."""
     if not (determinant > 0.0 and footprint.xx + footprint.yy < LARGEST_PX2):
         return math.nan
@@ -216,7 +229,14 @@ def _screen_opacity(gaussians, index, footprint, determinant, view):
 
 
 @numba.njit(**EXACT)
-def _write_place(gaussians, index, footprint, reach, view, record):
+def _write_place(
+    gaussians: Gaussians,
+    index: int,
+    footprint: Footprint,
+    reach: float,
+    view: View,
+    record: np.ndarray,
+) -> bool:
     """Write where a Gaussian lies and how far it reaches; return whether that is in the picture."""
     x, y, z = footprint.point
     x, y = view.fx * x / z + view.cx, view.fy * y / z + view.cy
@@ -232,7 +252,9 @@ def _write_place(gaussians, index, footprint, reach, view, record):
 
 
 @numba.njit(**EXACT)
-def _project_one(gaussians, index, view, weights, record):
+def _project_one(
+    gaussians: Gaussians, index: int, view: View, weights: np.ndarray, record: np.ndarray
+) -> bool:
     """Fill a Gaussian's record; return whether it can reach a pixel."""
     rotation, translation = transform_of(gaussians, index)
     point = v3.add(v3.apply(rotation, vector_of(gaussians.means, index)), translation)
@@ -252,7 +274,9 @@ def _project_one(gaussians, index, view, weights, record):
 
 
 @numba.njit(**EXACT)
-def _project_run(gaussians, view, first, end, records):
+def _project_run(
+    gaussians: Gaussians, view: View, first: int, end: int, records: np.ndarray
+) -> None:
     weights = np.empty(16)
     for index in range(first, end):
         visible = _project_one(gaussians, index, view, weights, records[index])
@@ -261,10 +285,12 @@ def _project_run(gaussians, view, first, end, records):
             records[index, SIGMA] = 0.0
 
 
-@numba.njit(parallel=True, **EXACT)
-def project(gaussians, view):
-    """Screen records of all Gaussians; only `IS_VISIBLE` and `SIGMA` (0) mean
-    anything in those that cannot be seen."""
+@compiled_entry
+def project(gaussians: Gaussians, view: View) -> np.ndarray:
+    """Screen records of all Gaussians.
+
+    In those that cannot be seen only `IS_VISIBLE` and `SIGMA`, both 0, mean anything.
+    """
     count = len(gaussians.means)
     records = np.empty((count, RECORD_FLOATS), np.float32)
     for run in numba.prange(CHUNKS):

@@ -26,6 +26,7 @@ from lidarpainter_models.kernels.gaussian_raster.blending_gradients import (
     SUM_RED,
 )
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import MIN_COMPENSATION
+from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry
 from lidarpainter_models.kernels.gaussian_raster.projection import (
     ACROSS,
     ALONG,
@@ -33,13 +34,16 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
     IS_VISIBLE,
     RED,
     SHEAR,
+    Footprint,
+    Gaussians,
+    View,
     compensation_ratio,
     footprint_of,
     transform_of,
     vector_of,
     view_direction,
 )
-from lidarpainter_models.kernels.gaussian_raster.small_vectors import EXACT
+from lidarpainter_models.kernels.gaussian_raster.small_vectors import Matrix, Vector
 
 
 class Gradients(NamedTuple):
@@ -56,7 +60,7 @@ class Gradients(NamedTuple):
 
 
 @numba.njit(**EXACT)
-def _screen_gradient(sums, record):
+def _screen_gradient(sums: np.ndarray, record: np.ndarray) -> tuple[float, float]:
     """Gradient with respect to the projected centre, pixels."""
     across, shear, along = record[ACROSS], record[SHEAR], record[ALONG]
     x = 2.0 * across * sums[SUM_GU]
@@ -64,7 +68,7 @@ def _screen_gradient(sums, record):
 
 
 @numba.njit(**EXACT)
-def _covariance_gradient(sums, footprint):
+def _covariance_gradient(sums: np.ndarray, footprint: Footprint) -> Vector:
     """Gradient with respect to the blurred screen covariance's xx, xy and yy."""
     yy = footprint.yy
     slope = footprint.xy / yy
@@ -82,7 +86,9 @@ def _covariance_gradient(sums, footprint):
 
 
 @numba.njit(**EXACT)
-def _add_compensation_gradient(footprint, blur, to_log, covariance_gradient):
+def _add_compensation_gradient(
+    footprint: Footprint, blur: float, to_log: float, covariance_gradient: Vector
+) -> Vector:
     """Add the gradient of log(compensation) with respect to the blurred covariance."""
     xx, xy, yy = footprint.xx, footprint.xy, footprint.yy
     determinant = xx * yy - xy * xy
@@ -100,7 +106,9 @@ def _add_compensation_gradient(footprint, blur, to_log, covariance_gradient):
 
 
 @numba.njit(**EXACT)
-def _axes_gradient(footprint, covariance_gradient, view):
+def _axes_gradient(
+    footprint: Footprint, covariance_gradient: Vector, view: View
+) -> tuple[Matrix, Vector]:
     """Gradients of the Gaussian's axes in the camera frame and of its centre there."""
     to_xx, to_xy, to_yy = covariance_gradient
     row_x, row_y, axes = footprint.row_x, footprint.row_y, footprint.axes_in_camera
@@ -123,7 +131,9 @@ def _axes_gradient(footprint, covariance_gradient, view):
 
 
 @numba.njit(**EXACT)
-def _centre_gradient(point, to_screen, to_depth, view):
+def _centre_gradient(
+    point: Vector, to_screen: tuple[float, float], to_depth: float, view: View
+) -> Vector:
     """Gradient of the centre in the camera frame through its pixel position and depth."""
     x, y, z = point
     to_x, to_y = to_screen[0] * view.fx / z, to_screen[1] * view.fy / z
@@ -131,7 +141,9 @@ def _centre_gradient(point, to_screen, to_depth, view):
 
 
 @numba.njit(**EXACT)
-def _store_shape(gaussians, index, footprint, to_axes, gradients):
+def _store_shape(
+    gaussians: Gaussians, index: int, footprint: Footprint, to_axes: Matrix, gradients: Gradients
+) -> Matrix:
     """Store gradients of scale and rotation; return that of the transform's rotation."""
     to_from_axes = v3.product(v3.transposed(footprint.rotation), to_axes)
     turned = v3.rotation_matrix(footprint.unit_wxyz)
@@ -157,7 +169,15 @@ def _store_shape(gaussians, index, footprint, to_axes, gradients):
 
 
 @numba.njit(**EXACT)
-def _store_colour(gaussians, index, footprint, record, sums, weights, gradients):
+def _store_colour(
+    gaussians: Gaussians,
+    index: int,
+    footprint: Footprint,
+    record: np.ndarray,
+    sums: np.ndarray,
+    weights: np.ndarray,
+    gradients: Gradients,
+) -> Vector:
     """Store the gradient of the coefficients; return that of the view direction, metres."""
     mean = vector_of(gaussians.means, index)
     offset = view_direction(mean, footprint.rotation, footprint.translation)
@@ -179,7 +199,7 @@ def _store_colour(gaussians, index, footprint, record, sums, weights, gradients)
 
 
 @numba.njit(**EXACT)
-def _store_transform(to_rotation, to_translation, out):
+def _store_transform(to_rotation: Matrix, to_translation: Vector, out: np.ndarray) -> None:
     for row in range(3):
         for column in range(3):
             out[row, column] += to_rotation[row][column]
@@ -187,7 +207,16 @@ def _store_transform(to_rotation, to_translation, out):
 
 
 @numba.njit(**EXACT)
-def _unproject_one(gaussians, index, view, record, sums, weights, gradients, run):
+def _unproject_one(  # noqa: PLR0913 - a compiled loop body
+    gaussians: Gaussians,
+    index: int,
+    view: View,
+    record: np.ndarray,
+    sums: np.ndarray,
+    weights: np.ndarray,
+    gradients: Gradients,
+    run: int,
+) -> None:
     rotation, translation = transform_of(gaussians, index)
     mean = vector_of(gaussians.means, index)
     point = v3.add(v3.apply(rotation, mean), translation)
@@ -216,7 +245,14 @@ def _unproject_one(gaussians, index, view, record, sums, weights, gradients, run
 
 
 @numba.njit(**EXACT)
-def _unproject_run(gaussians, view, records, sums, gradients, run):
+def _unproject_run(
+    gaussians: Gaussians,
+    view: View,
+    records: np.ndarray,
+    sums: np.ndarray,
+    gradients: Gradients,
+    run: int,
+) -> None:
     weights = np.empty(16)
     count = len(records)
     for index in range(run * count // CHUNKS, (run + 1) * count // CHUNKS):
@@ -225,8 +261,8 @@ def _unproject_run(gaussians, view, records, sums, gradients, run):
             _unproject_one(gaussians, index, view, record, own_sums, weights, gradients, run)
 
 
-@numba.njit(parallel=True, **EXACT)
-def unproject(gaussians, view, records, sums):
+@compiled_entry
+def unproject(gaussians: Gaussians, view: View, records: np.ndarray, sums: np.ndarray) -> Gradients:
     """Gradients of everything `project` read; zero where a Gaussian was not visible."""
     count, coefficients, _ = gaussians.sh.shape
     bodies = len(gaussians.camera_from_body)

@@ -7,30 +7,34 @@ import math
 
 import numba
 
-EXACT = {"cache": True, "error_model": "numpy", "fastmath": {"contract"}, "forceinline": True}
-"""How code on single Gaussians is compiled: fused multiply-add, otherwise as written."""
+from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT
+
+Vector = tuple[float, float, float]
+Matrix = tuple[Vector, Vector, Vector]
+Quaternion = tuple[float, float, float, float]
+"""Scalar first."""
 
 
 @numba.njit(**EXACT)
-def dot(first, second):
+def dot(first: Vector, second: Vector) -> float:
     """Inner product."""
     return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
 
 
 @numba.njit(**EXACT)
-def add(first, second):
+def add(first: Vector, second: Vector) -> Vector:
     """Sum of two vectors."""
     return (first[0] + second[0], first[1] + second[1], first[2] + second[2])
 
 
 @numba.njit(**EXACT)
-def scaled(vector, factor):
+def scaled(vector: Vector, factor: float) -> Vector:
     """Vector times a number."""
     return (vector[0] * factor, vector[1] * factor, vector[2] * factor)
 
 
 @numba.njit(**EXACT)
-def transposed(matrix):
+def transposed(matrix: Matrix) -> Matrix:
     """Rows become columns."""
     return (
         (matrix[0][0], matrix[1][0], matrix[2][0]),
@@ -40,32 +44,32 @@ def transposed(matrix):
 
 
 @numba.njit(**EXACT)
-def apply(matrix, vector):
+def apply(matrix: Matrix, vector: Vector) -> Vector:
     """Matrix times column vector."""
     return (dot(matrix[0], vector), dot(matrix[1], vector), dot(matrix[2], vector))
 
 
 @numba.njit(**EXACT)
-def product(first, second):
+def product(first: Matrix, second: Matrix) -> Matrix:
     """Matrix times matrix."""
     columns = transposed(second)
     return (apply(columns, first[0]), apply(columns, first[1]), apply(columns, first[2]))
 
 
 @numba.njit(**EXACT)
-def outer(column, row):
+def outer(column: Vector, row: Vector) -> Matrix:
     """Column vector times row vector."""
     return (scaled(row, column[0]), scaled(row, column[1]), scaled(row, column[2]))
 
 
 @numba.njit(**EXACT)
-def added(first, second):
+def added(first: Matrix, second: Matrix) -> Matrix:
     """Sum of two matrices."""
     return (add(first[0], second[0]), add(first[1], second[1]), add(first[2], second[2]))
 
 
 @numba.njit(**EXACT)
-def rotation_matrix(wxyz):
+def rotation_matrix(wxyz: Quaternion) -> Matrix:
     """Rotation of a unit quaternion, scalar first."""
     w, x, y, z = wxyz
     return (
@@ -76,7 +80,7 @@ def rotation_matrix(wxyz):
 
 
 @numba.njit(**EXACT)
-def rotation_gradient(wxyz, gradient):
+def rotation_gradient(wxyz: Quaternion, gradient: Matrix) -> Quaternion:
     """Gradient of the unit quaternion from that of its rotation matrix."""
     w, x, y, z = wxyz
     (g00, g01, g02), (g10, g11, g12), (g20, g21, g22) = gradient
@@ -89,14 +93,14 @@ def rotation_gradient(wxyz, gradient):
 
 
 @numba.njit(**EXACT)
-def direction_of(vector):
+def direction_of(vector: Vector) -> tuple[Vector, float]:
     """Unit vector along `vector`, and the length it was divided by."""
     length = max(math.sqrt(dot(vector, vector)), 1e-12)
     return scaled(vector, 1.0 / length), length
 
 
 @numba.njit(**EXACT)
-def direction_of_gradient(unit, length, gradient):
+def direction_of_gradient(unit: Vector, length: float, gradient: Vector) -> Vector:
     """Gradient of a vector from that of the unit vector along it."""
     across = add(gradient, scaled(unit, -dot(unit, gradient)))
     return scaled(across, 1.0 / length)

@@ -4,8 +4,10 @@ Order, signs and constants are those of Kerbl et al. (2023). Compiled code on on
 """
 
 import numba
+import numpy as np
 
-from lidarpainter_models.kernels.gaussian_raster.small_vectors import EXACT
+from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT
+from lidarpainter_models.kernels.gaussian_raster.small_vectors import Vector
 
 BAND_0 = 0.28209479177387814
 BAND_1 = 0.4886025119029199
@@ -20,7 +22,7 @@ BAND_3 = (
 
 
 @numba.njit(**EXACT)
-def basis(coefficients, direction, out):
+def basis(coefficients: int, direction: Vector, out: np.ndarray) -> None:
     """Fill `out` with the first `coefficients` basis values at a unit direction."""
     x, y, z = direction
     out[0] = BAND_0
@@ -45,7 +47,7 @@ def basis(coefficients, direction, out):
 
 
 @numba.njit(**EXACT)
-def direction_gradient(coefficients, direction, weight):
+def direction_gradient(coefficients: int, direction: Vector, weight: np.ndarray) -> Vector:
     """Gradient of sum_k weight[k] basis[k] with respect to the direction."""
     x, y, z = direction
     gx, gy, gz = 0.0, 0.0, 0.0
@@ -64,7 +66,7 @@ def direction_gradient(coefficients, direction, weight):
 
 
 @numba.njit(**EXACT)
-def _band_3_gradient(direction, weight):
+def _band_3_gradient(direction: Vector, weight: np.ndarray) -> Vector:
     x, y, z = direction
     xx, yy, zz = x * x, y * y, z * z
     w9, w10, w11 = -BAND_3[0] * weight[9], BAND_3[1] * weight[10], -BAND_3[2] * weight[11]

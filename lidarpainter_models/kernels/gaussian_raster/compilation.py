@@ -1,0 +1,33 @@
+"""How the rasteriser's compiled code is built and when its cache is stale.
+
+numba notices a changed function only in its own file, but these functions call each other across
+files. So only the outermost functions are cached, under a name that changes with any source file
+here; everything they call is compiled into them.
+"""
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numba
+
+EXACT = {"error_model": "numpy", "fastmath": {"contract"}, "forceinline": True}
+"""Code on single Gaussians: fused multiply-add, otherwise as written; divisions do not raise."""
+
+LANE_LOOP = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
+"""Loops over pixels, with freedom to use vectors that leaves NaN and infinity alone."""
+
+
+def _sources_digest() -> str:
+    sources = sorted(Path(__file__).parent.glob("*.py"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:12]
+
+
+SOURCES = _sources_digest()
+
+
+def compiled_entry(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function with `prange` loops that Python calls; cache it for these sources."""
+    function.__qualname__ = f"{function.__qualname__}_{SOURCES}"
+    return numba.njit(cache=True, parallel=True, error_model="numpy")(function)
