@@ -18,7 +18,7 @@ NEAR_M = 40.0
 """Boxes nearer than this should hold points."""
 MIN_HELD_SHARE = 0.7
 MIN_AHEAD_SHARE = 0.8
-_MIN_TRAVEL_M = 2.0
+_MIN_TRAVEL_M = 1.0
 _DUPLICATE_SHARE = 0.5
 """Two boxes closer than this share of the smaller one's width are the same place."""
 _NUM_RECOUNTED = 20

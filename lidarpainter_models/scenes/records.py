@@ -5,7 +5,7 @@ float32, already motion-compensated to the world.
 """
 
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int, Shaped
@@ -14,7 +14,6 @@ from torch import Tensor
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.cameras import Camera
 
-DistortionModel = Literal["none", "brown", "fisheye"]
 _TERM_COUNTS: dict[str, tuple[int, ...]] = {"none": (0,), "brown": (4, 5, 8), "fisheye": (4,)}
 
 
@@ -22,15 +21,16 @@ _TERM_COUNTS: dict[str, tuple[int, ...]] = {"none": (0,), "brown": (4, 5, 8), "f
 class Distortion:
     """How a lens departs from a pinhole; models and terms as OpenCV defines them."""
 
-    model: DistortionModel = "none"
+    model: str = "none"
+    """none, brown or fisheye."""
     terms: tuple[float, ...] = ()
     """brown: k1 k2 p1 p2 [k3 [k4 k5 k6]]; fisheye: k1 k2 k3 k4."""
 
     def __post_init__(self) -> None:
-        if self.model not in get_args(DistortionModel):
+        if self.model not in _TERM_COUNTS:
             raise DataError(
                 f"distortion model {self.model!r} is not known, expected one of "
-                f"{', '.join(get_args(DistortionModel))}"
+                f"{', '.join(_TERM_COUNTS)}"
             )
         if len(self.terms) not in _TERM_COUNTS[self.model]:
             raise DataError(

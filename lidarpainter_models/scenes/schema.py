@@ -101,10 +101,17 @@ TABLES: dict[str, tuple[Column, ...]] = {
 _POINT_CHUNK = 1 << 18
 
 
-def _points(name: str, dtype: str, unit: str, description: str, **more: object) -> ArrayLayout:
-    row_shape = more.get("row_shape", ())
+def _points(
+    name: str,
+    dtype: str,
+    unit: str,
+    description: str,
+    *,
+    row_shape: tuple[int, ...] = (),
+    is_optional: bool = False,
+) -> ArrayLayout:
     return ArrayLayout(
-        name, np.dtype(dtype), row_shape, _POINT_CHUNK, unit, description, "is_optional" in more
+        name, np.dtype(dtype), row_shape, _POINT_CHUNK, unit, description, is_optional
     )
 
 

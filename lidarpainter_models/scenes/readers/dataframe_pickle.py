@@ -152,16 +152,22 @@ def _array(made: Made) -> np.ndarray:
         content, dtype, shape, order = made.arguments
     else:
         raise DataError(f"an array is made by {made.by}, which is not understood")
-    kind = _dtype(dtype)
     if isinstance(content, Made) and content.by == _ENCODE:
         content = content.arguments[0]
+    return _flat_array(content, _dtype(dtype)).reshape(shape, order="F" if order == "F" else "C")
+
+
+def _flat_array(content: object, kind: np.dtype) -> np.ndarray:
     if kind.hasobject:
+        if not isinstance(content, list):
+            raise DataError("a column of texts holds something else")
         flat = np.empty(len(content), dtype=object)
         flat[:] = [_plain_value(item) for item in content]
-    else:
-        raw = content.encode("latin1") if isinstance(content, str) else content
-        flat = np.frombuffer(raw, dtype=kind)
-    return flat.reshape(shape, order="F" if order == "F" else "C")
+        return flat
+    raw = content.encode("latin1") if isinstance(content, str) else content
+    if not isinstance(raw, bytes | bytearray):
+        raise DataError("a column of numbers holds something else")
+    return np.frombuffer(raw, dtype=kind)
 
 
 def _dtype(dtype: Made) -> np.dtype:

@@ -1,0 +1,63 @@
+"""Frames are split by position, and every camera of a frame goes the same way."""
+
+import pytest
+
+from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.scenes.splits import split_frames, split_views
+
+
+def test_alternate_frames_train_and_test():
+    train, test = split_frames(range(28), "alternate")
+    assert train == tuple(range(0, 28, 2))
+    assert test == tuple(range(1, 28, 2))
+
+
+def test_forward_split_trains_behind_and_tests_ahead():
+    train, test = split_frames(range(28), "forward:17:8")
+    assert train == (0, 2, 4, 6, 8, 10, 12, 14, 16)
+    assert test == tuple(range(20, 28))
+
+
+def test_all_holds_nothing_out():
+    assert split_frames(range(3), "all") == ((0, 1, 2), ())
+
+
+def test_positions_count_and_not_frame_numbers():
+    assert split_frames([11, 13, 15, 18], "alternate") == ((11, 15), (13, 18))
+
+
+@pytest.mark.parametrize(
+    "spec", ["", "odd", "alternate:2", "forward", "forward:17", "forward:a:b", "forward:-1:3"]
+)
+def test_unknown_spec_names_the_known_ones(spec):
+    with pytest.raises(ConfigError, match="expected alternate, forward:N:M or all"):
+        split_frames(range(28), spec)
+
+
+@pytest.mark.parametrize("spec", ["forward:20:9", "forward:0:3", "forward:3:0"])
+def test_forward_split_that_does_not_fit_is_refused(spec):
+    with pytest.raises(ConfigError, match="the scene has 28 frames"):
+        split_frames(range(28), spec)
+
+
+def test_no_frame_to_train_on_is_refused():
+    with pytest.raises(ConfigError, match="leaves no frame"):
+        split_frames([], "alternate")
+
+
+def test_views_of_a_scene_follow_their_frames(small_scene):
+    split = split_views(small_scene, "alternate", ("front_camera", "left_camera"))
+    assert {view.key for view in split.train} == {
+        (frame, camera) for frame in (0, 2) for camera in ("front_camera", "left_camera")
+    }
+    assert {view.frame_index for view in split.test} == {1}
+    assert (split.train_frames, split.test_frames) == ((0, 2), (1,))
+
+
+def test_all_cameras_are_split_unless_named(small_scene):
+    assert len(split_views(small_scene, "all").train) == 18
+
+
+def test_unknown_camera_is_refused(small_scene):
+    with pytest.raises(SceneError, match="no camera 'roof'; it has front_camera"):
+        split_views(small_scene, "all", ("roof",))
