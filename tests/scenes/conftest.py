@@ -88,29 +88,47 @@ def _index(kind: str, data: dict[str, bytes]) -> bytes:
     return new_index + _tuple(_name(module, kind), _dict(data)) + b"R"
 
 
-def pickled_table(columns: dict[str, np.ndarray]) -> bytes:
-    """A table as pandas 1 pickles it: one block per column type."""
-    num_rows = len(next(iter(columns.values())))
-    names = np.array(list(columns), dtype=object)
-    axes = _list(
-        _index("Index", {"data": _array(names), "name": b"N"}),
-        _index(
-            "RangeIndex",
-            {"name": b"N", "start": _integer(0), "stop": _integer(num_rows), "step": _integer(1)},
-        ),
-    )
+def _blocks(columns: dict[str, np.ndarray]) -> list[tuple[bytes, bytes]]:
+    """One block per column type: its values and the places of its columns."""
     blocks = []
     for kind in dict.fromkeys(column.dtype for column in columns.values()):
         places = [i for i, column in enumerate(columns.values()) if column.dtype == kind]
         values = np.stack([list(columns.values())[place] for place in places])
-        where = _array(np.array(places, dtype=np.int64))
-        blocks.append(_dict({"values": _array(values), "mgr_locs": where}))
-    layout = _dict({"0.14.1": _dict({"axes": axes, "blocks": _list(*blocks)})})
-    manager = _name("pandas.core.internals.managers", "BlockManager") + b")\x81"
-    manager += _tuple(axes, _list(), _list(), layout) + b"b"
+        blocks.append((_array(values), _array(np.array(places, dtype=np.int64))))
+    return blocks
+
+
+def pickled_table(columns: dict[str, np.ndarray], *, as_pandas: int = 1) -> bytes:
+    """A table as pandas 1 or pandas 2 pickles it."""
+    num_rows = len(next(iter(columns.values())))
+    names = np.array(list(columns), dtype=object)
+    steps = {"start": _integer(0), "stop": _integer(num_rows), "step": _integer(1)}
+    axes = _list(
+        _index("Index", {"data": _array(names), "name": b"N"}),
+        _index("RangeIndex", {"name": b"N", **steps}),
+    )
+    manager = _name("pandas.core.internals.managers", "BlockManager")
+    if as_pandas == 1:
+        blocks = [
+            _dict({"values": values, "mgr_locs": places}) for values, places in _blocks(columns)
+        ]
+        layout = _dict({"0.14.1": _dict({"axes": axes, "blocks": _list(*blocks)})})
+        manager += b")\x81" + _tuple(axes, _list(), _list(), layout) + b"b"
+    else:
+        make = _name("pandas._libs.internals", "_unpickle_block")
+        blocks = [
+            make + _tuple(values, places, _integer(2)) + b"R" for values, places in _blocks(columns)
+        ]
+        manager += _tuple(_tuple(*blocks), axes) + b"R"
     frame = _name("pandas.core.frame", "DataFrame") + b")\x81"
-    frame += _dict({"_data": manager, "_typ": _text("dataframe")}) + b"b"
-    return b"\x80\x03" + frame + b"."
+    state = {"_data" if as_pandas == 1 else "_mgr": manager, "_typ": _text("dataframe")}
+    return b"\x80\x03" + frame + _dict(state) + b"b."
+
+
+@pytest.fixture(name="pickled_table")
+def pickled_table_maker():
+    """The function above, for tests that write tables themselves."""
+    return pickled_table
 
 
 # --- the world those tables describe
