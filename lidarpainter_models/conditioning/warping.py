@@ -9,21 +9,19 @@ pixel centres at half-integers.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from lidarpainter_models.conditioning.moving_boxes import BoxConfig, MovingBoxes
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.scenes.driving_scene import ActorTrack
 
 SKY_DEPTH_M = 1e5
 """Far enough for any parallax to vanish, near enough for float32."""
-BACKGROUND = -1
-"""Actor index of a pixel that no moving box contains."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,10 +32,7 @@ class WarpConfig:
     """Relative difference of depth up to which two views see the same surface."""
     sky_alpha: float = 0.5
     """A pixel more transparent than this, and without depth, is sky."""
-    box_margin_m: float = 0.15
-    """Boxes are grown by this much to the sides and upwards before points are tested."""
-    box_floor_m: float = 0.1
-    """Points lower than this over the bottom of a box are road, unless inside the true box."""
+    boxes: BoxConfig = field(default_factory=BoxConfig)
     time_weight_m_s: float = 2.0
     """Metres a source may stand nearer for each second it is older."""
     angle_weight_m_rad: float = 8.0
@@ -64,6 +59,19 @@ class SourcePicture:
     alpha: Float[Tensor, "height width"]
 
 
+def source_cost_m(
+    target_camera: Camera, timestamp_ns: int, camera: Camera, taken_ns: int, config: WarpConfig
+) -> float:
+    """How far a recorded view is from a target in place, direction and time, as metres."""
+    distance_m = (camera.centre_world - target_camera.centre_world).norm()
+    axis, target_axis = camera.world_from_camera[:3, 2], target_camera.world_from_camera[:3, 2]
+    angle_rad = torch.arccos((axis @ target_axis).clamp(-1, 1))
+    seconds = abs(taken_ns - timestamp_ns) * 1e-9
+    return float(
+        distance_m + config.angle_weight_m_rad * angle_rad + config.time_weight_m_s * seconds
+    )
+
+
 def nearest_sources(
     target_camera: Camera,
     timestamp_ns: int,
@@ -75,19 +83,13 @@ def nearest_sources(
 ) -> tuple[SourcePicture, ...]:
     """The `count` sources nearest in place, direction and time; ties go to the earlier one."""
     config = config or WarpConfig()
-    axis = target_camera.world_from_camera[:3, 2]
-
-    def cost_m(source: SourcePicture) -> float:
-        distance_m = (source.camera.centre_world - target_camera.centre_world).norm()
-        cosine = (source.camera.world_from_camera[:3, 2] @ axis).clamp(-1, 1)
-        seconds = abs(source.timestamp_ns - timestamp_ns) * 1e-9
-        angle_rad = torch.arccos(cosine)
-        return float(
-            distance_m + config.angle_weight_m_rad * angle_rad + config.time_weight_m_s * seconds
-        )
-
     allowed = [source for source in sources if source.key not in exclude]
-    return tuple(sorted(allowed, key=cost_m)[:count])
+    allowed.sort(
+        key=lambda source: source_cost_m(
+            target_camera, timestamp_ns, source.camera, source.timestamp_ns, config
+        )
+    )
+    return tuple(allowed[:count])
 
 
 def warp_pictures(
@@ -112,13 +114,14 @@ def warp_pictures(
     depth_m = torch.where(has_depth, target_depth_m, SKY_DEPTH_M)
     points_world = target_camera.unproject(depth_m).reshape(-1, 3)
     known = (has_depth | is_sky).reshape(-1)
-    actors = actor_of_points(points_world, target_timestamp_ns, tracks, config=config)
+    boxes = MovingBoxes(tracks, config.boxes)
+    owners = boxes.owners(points_world, target_timestamp_ns)
     pictures, valids = [], []
     for source in sources:
-        points, present = _move_with_actors(
-            points_world, actors, tracks, target_timestamp_ns, source.timestamp_ns
+        points, present = boxes.moved(
+            points_world, owners, from_ns=target_timestamp_ns, to_ns=source.timestamp_ns
         )
-        rgb, seen = _sample(source, points, is_sky.reshape(-1), config)
+        rgb, seen = sample_source(source, points, is_sky.reshape(-1), config=config)
         valid = (seen & present & known).reshape(height_px, width_px)
         pictures.append(torch.where(valid[..., None], rgb.reshape(height_px, width_px, 3), 0))
         valids.append(valid)
@@ -128,63 +131,11 @@ def warp_pictures(
     return torch.stack(pictures), torch.stack(valids)
 
 
-def actor_of_points(
-    points_world: Float[Tensor, "points 3"],
-    timestamp_ns: int,
-    tracks: Sequence[ActorTrack],
-    *,
-    config: WarpConfig | None = None,
-) -> Int[Tensor, " points"]:
-    """Index of the moving box that holds each point at a time, or `BACKGROUND`.
-
-    Boxes are grown a little, but not into the road beside and under the actor.
-    """
-    config = config or WarpConfig()
-    owner = torch.full(points_world.shape[:1], BACKGROUND, device=points_world.device)
-    for index, track in enumerate(tracks):
-        if not track.is_present(timestamp_ns):
-            continue
-        world_from_box = track.pose_at(timestamp_ns)
-        half_m = track.size_m.to(points_world) / 2
-        reach_m = float(half_m.norm()) + 2 * config.box_margin_m
-        centre = world_from_box[:3, 3].to(points_world)
-        near = ((points_world - centre).abs() <= reach_m).all(dim=-1).nonzero()[:, 0]
-        points = transform_points(invert_rigid(world_from_box).to(points_world), points_world[near])
-        over_floor_m = points[:, 2] + half_m[2]
-        grown = (points.abs() <= half_m + config.box_margin_m).all(dim=-1)
-        inside = (points[:, :2].abs() <= half_m[:2]).all(dim=-1) & (over_floor_m > 0)
-        held = grown & (inside | (over_floor_m > config.box_floor_m))
-        owner[near[held]] = index
-    return owner
-
-
-def _move_with_actors(
-    points_world: Float[Tensor, "points 3"],
-    actors: Int[Tensor, " points"],
-    tracks: Sequence[ActorTrack],
-    from_ns: int,
-    to_ns: int,
-) -> tuple[Float[Tensor, "points 3"], Bool[Tensor, " points"]]:
-    """Where the points are at another time, and whether their actor is there then."""
-    moved = points_world.clone()
-    present = torch.ones_like(actors, dtype=torch.bool)
-    for index in actors.unique().tolist():
-        if index == BACKGROUND:
-            continue
-        held = actors == index
-        if not tracks[index].is_present(to_ns):
-            present[held] = False
-            continue
-        later_from_box = tracks[index].pose_at(to_ns)
-        later_from_world = later_from_box @ invert_rigid(tracks[index].pose_at(from_ns))
-        moved[held] = transform_points(later_from_world.to(points_world), points_world[held])
-    return moved, present
-
-
-def _sample(
+def sample_source(
     source: SourcePicture,
     points_world: Float[Tensor, "points 3"],
     is_sky: Bool[Tensor, " points"],
+    *,
     config: WarpConfig,
 ) -> tuple[Float[Tensor, "points 3"], Bool[Tensor, " points"]]:
     """Colour of world points in a source, and whether the source saw just these points.

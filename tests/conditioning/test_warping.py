@@ -1,10 +1,9 @@
 import pytest
 import torch
 
+from lidarpainter_models.conditioning.moving_boxes import BACKGROUND, MovingBoxes
 from lidarpainter_models.conditioning.warping import (
-    BACKGROUND,
     WarpConfig,
-    actor_of_points,
     nearest_sources,
     warp_pictures,
 )
@@ -128,7 +127,7 @@ def test_the_road_under_an_actor_stays_with_the_street(moving_track):
     points = torch.tensor(
         [[10.0, 0, 1.5], [10.0, 1.1, 0.5], [10.0, 1.1, 0.02], [10.0, 0, -0.05], [13.0, 0, 1.0]]
     )
-    owners = actor_of_points(points, 0, [track])
+    owners = MovingBoxes([track]).owners(points, 0)
     assert owners.tolist() == [0, 0, BACKGROUND, BACKGROUND, BACKGROUND]
 
 

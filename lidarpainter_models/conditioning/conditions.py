@@ -1,0 +1,187 @@
+"""Everything a painter is told about one view: render, LiDAR image and warped references.
+
+Pictures are on the view's own pixel grid, rgb in [0, 1], depth camera z in metres with 0 where
+there is none. Colours are those of the scene before any camera's exposure, unless a camera is
+named whose exposure all of them then take.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.conditioning.lidar_images import LidarImageConfig, render_lidar
+from lidarpainter_models.conditioning.moving_boxes import MovingBoxes
+from lidarpainter_models.conditioning.references import WarpTarget, warped_references
+from lidarpainter_models.conditioning.warping import SourcePicture, WarpConfig, source_cost_m
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.gaussians.calibration import ViewKey
+from lidarpainter_models.gaussians.observations import TrainingView
+from lidarpainter_models.gaussians.scene_graph import GaussianScene
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.painter.protocol import DEFAULT_PROMPT, PaintingConditions
+from lidarpainter_models.scenes.lidar_map import LidarMap
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConditionConfig:
+    """What is gathered for a painter."""
+
+    num_references: int = 2
+    """Warped references given to the painter."""
+    num_sources: int = 6
+    """Recorded pictures they are patched together from: the nearest, then ever sparser ones."""
+    lidar: LidarImageConfig = field(default_factory=LidarImageConfig)
+    warp: WarpConfig = field(default_factory=WarpConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse fewer sources than references."""
+        if not 1 <= self.num_references <= self.num_sources:
+            raise ConfigError(
+                f"need 1 <= num_references <= num_sources, got {self.num_references} and "
+                f"{self.num_sources}"
+            )
+
+
+class ConditionBuilder:
+    """Gathers painting conditions at any camera and time of one scene.
+
+    Depth and opacity of a training view are rendered when it first serves as a source and kept.
+    """
+
+    def __init__(
+        self,
+        scene: GaussianScene,
+        lidar_map: LidarMap,
+        training_views: Sequence[TrainingView],
+        *,
+        config: ConditionConfig | None = None,
+    ) -> None:
+        """Take the scene as it is now; build another one after the fit went on."""
+        self.scene = scene
+        self.lidar_map = lidar_map
+        self.config = config or ConditionConfig()
+        self.tracks = scene.tracks
+        self._boxes = MovingBoxes(self.tracks, self.config.warp.boxes)
+        self._views = {view.key: view for view in training_views}
+        self._cameras = {
+            view.key: scene.corrected_camera(
+                view.camera,
+                timestamp_ns=view.timestamp_ns,
+                camera_name=view.key[1],
+                key=view.key,
+            )
+            for view in training_views
+        }
+        self._sources: dict[ViewKey, SourcePicture] = {}
+
+    @property
+    def recorded_cameras(self) -> tuple[Camera, ...]:
+        """The training views' cameras at their refined poses."""
+        return tuple(self._cameras.values())
+
+    def source(self, key: ViewKey) -> SourcePicture:
+        """A training picture with the surfaces it shows, colours before its exposure."""
+        if key not in self._sources:
+            view, camera = self._views[key], self._cameras[key]
+            render = self.scene.render(camera, view.timestamp_ns)
+            # the sky mask knows better than the render where there is sky; what is neither sky
+            # nor rendered is a hole of the render, which shows nothing for certain
+            is_hole = (render.alpha < self.config.warp.sky_alpha) & ~view.sky_mask
+            alpha = torch.where(view.sky_mask, 0.0, torch.where(is_hole, 1.0, render.alpha))
+            self._sources[key] = SourcePicture(
+                key=key,
+                camera=camera,
+                timestamp_ns=view.timestamp_ns,
+                rgb=self._without_exposure(view.rgb, key[1]),
+                depth_m=torch.where(view.sky_mask | is_hole, 0.0, render.depth_m),
+                alpha=alpha,
+            )
+        return self._sources[key]
+
+    def sources_for(
+        self, camera: Camera, timestamp_ns: int, *, exclude: frozenset[ViewKey] = frozenset()
+    ) -> tuple[SourcePicture, ...]:
+        """The pictures a view is patched from: nearest first, then spread over all others.
+
+        Neighbours of a slow drive show the same; pictures further off see round corners and
+        past the edge of the frame.
+        """
+        allowed = [key for key in self._views if key not in exclude]
+        allowed.sort(
+            key=lambda key: source_cost_m(
+                camera,
+                timestamp_ns,
+                self._cameras[key],
+                self._views[key].timestamp_ns,
+                self.config.warp,
+            )
+        )
+        near = min(self.config.num_references, len(allowed))
+        rest = allowed[near:]
+        num_rest = min(self.config.num_sources - near, len(rest))
+        spread = [rest[round((i + 1) * len(rest) / num_rest) - 1] for i in range(num_rest)]
+        return tuple(self.source(key) for key in (*allowed[:near], *spread))
+
+    def conditions(
+        self,
+        camera: Camera,
+        timestamp_ns: int,
+        *,
+        exclude: frozenset[ViewKey] = frozenset(),
+        camera_name: str | None = None,
+        prompt: str = DEFAULT_PROMPT,
+    ) -> PaintingConditions:
+        """Gather what is known about a view.
+
+        Args:
+            camera: Taken as it stands; correct it first if it was recorded.
+            timestamp_ns: When the actors stand where they are drawn.
+            exclude: Training views that must not serve as references.
+            camera_name: Give all pictures this camera's exposure.
+            prompt: Passed on to the painter.
+        """
+        render = self.scene.render(camera, timestamp_ns)
+        lidar = render_lidar(
+            self.lidar_map, self.tracks, camera, timestamp_ns, config=self.config.lidar
+        )
+        is_sky = (render.alpha < self.config.warp.sky_alpha) & (lidar.depth_m == 0)
+        references = warped_references(
+            WarpTarget(camera, timestamp_ns, [render.depth_m, lidar.depth_m], is_sky),
+            self.sources_for(camera, timestamp_ns, exclude=exclude),
+            self._boxes,
+            count=self.config.num_references,
+            config=self.config.warp,
+        )
+        expose = self.scene.exposure.apply
+        references_rgb = torch.stack([expose(rgb, camera_name) for rgb in references.rgb])
+        return PaintingConditions(
+            render_rgb=expose(render.rgb, camera_name).clamp(0, 1),
+            render_depth_m=render.depth_m,
+            render_alpha=render.alpha,
+            lidar_rgb=_masked(expose(lidar.rgb, camera_name), lidar.hit),
+            lidar_depth_m=lidar.depth_m,
+            lidar_hit=lidar.hit,
+            warp_rgb=_masked(references_rgb, references.valid),
+            warp_valid=references.valid,
+            prompt=prompt,
+        )
+
+    def _without_exposure(
+        self, rgb: Float[Tensor, "height width 3"], camera_name: str
+    ) -> Float[Tensor, "height width 3"]:
+        """A recorded picture in the colours of the scene itself."""
+        exposure = self.scene.exposure
+        if camera_name not in exposure.camera_names:
+            return rgb
+        matrix = exposure.matrix[exposure.camera_names.index(camera_name)].detach()
+        return (rgb - matrix[:, 3]) @ torch.linalg.inv(matrix[:, :3]).T
+
+
+def _masked(
+    rgb: Float[Tensor, "*batch height width 3"], valid: Tensor
+) -> Float[Tensor, "*batch height width 3"]:
+    """Displayable colours where they are valid, else 0."""
+    return torch.where(valid[..., None], rgb.clamp(0, 1), 0)

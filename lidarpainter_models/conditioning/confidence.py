@@ -1,0 +1,185 @@
+"""How far a painted view can be trusted, pixel by pixel, and whether it helps at all.
+
+Geometry says where a painter had something to go by:
+
+    support = 1 - (1 - w_warp V) (1 - w_lidar L) (1 - w_surface A)
+    confidence = painter confidence * support * seen
+
+V is 1 where a recorded picture could be warped here (its surface agrees in depth, sky with sky);
+L = exp(-d / reach) with d the distance to the nearest pixel a LiDAR point coloured; A rises
+smoothly from 0 to 1 with the opacity of the render; `seen` is 1 where the surface fell into any
+training picture, hidden or not, and 0 outside all of them: nothing is known there.
+
+The gate compares: where recorded pixels are known (warped pictures first, LiDAR colours
+elsewhere), a painting that departs from them by more than the plain render did is weighed down,
+locally and, if it does so on the whole, as a view; far beyond that it is refused.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from lidarpainter_models.conditioning.warping import SKY_DEPTH_M
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.painter.protocol import Painting, PaintingConditions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConfidenceConfig:
+    """What each kind of evidence is worth, and when painting counts as harm."""
+
+    warp_weight: float = 0.9
+    """Support of a pixel that a recorded picture shows."""
+    lidar_weight: float = 0.6
+    """Support of a pixel with a coloured LiDAR point in it."""
+    surface_weight: float = 0.3
+    """Support of an opaque render with nothing else to confirm it."""
+    lidar_reach_rad: float = 0.006
+    """Angle at which LiDAR support has fallen to 1/e: 3 px at 500 px focal length."""
+    alpha_range: tuple[float, float] = (0.5, 0.95)
+    """Opacity where a surface starts to count, and where it counts fully."""
+    gate_window_px: int = 11
+    """Side of the square over which painting and evidence are compared; odd."""
+    gate_slack: float = 0.01
+    """Mean difference by which a painting may exceed the render unpunished."""
+    gate_scale: float = 0.03
+    """Further difference at which the weight has fallen to 1/e."""
+    refuse_excess: float = 0.05
+    """A view that exceeds the render by this mean difference is refused."""
+    min_evidence: float = 0.02
+    """Share of pixels with evidence under which no view is gated as a whole."""
+
+    def __post_init__(self) -> None:
+        """Refuse weights outside [0, 1] and empty ranges."""
+        for name in ("warp_weight", "lidar_weight", "surface_weight", "min_evidence"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f"{name} must be in [0, 1], got {getattr(self, name)}")
+        if not 0 <= self.alpha_range[0] < self.alpha_range[1] <= 1:
+            raise ConfigError(f"alpha_range must rise within [0, 1], got {self.alpha_range}")
+        if self.gate_window_px < 1 or self.gate_window_px % 2 == 0:
+            raise ConfigError(f"gate_window_px must be odd, got {self.gate_window_px}")
+        if min(self.lidar_reach_rad, self.gate_scale, self.refuse_excess) <= 0:
+            raise ConfigError("lidar_reach_rad, gate_scale and refuse_excess must be positive")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GuidanceGate:
+    """What the comparison with recorded pixels says about one painting."""
+
+    weight: Float[Tensor, "height width"]
+    """Factor on the confidence, in [0, 1]; all 0 when refused."""
+    painted_difference: float
+    """Mean absolute difference from the evidence; NaN without evidence."""
+    render_difference: float
+    """The same for the render before painting."""
+    evidence_share: float
+    """Share of pixels with evidence."""
+    is_refused: bool
+
+
+def is_seen(
+    camera: Camera,
+    depth_m: Float[Tensor, "height width"],
+    recorded_cameras: Iterable[Camera],
+) -> Bool[Tensor, "height width"]:
+    """Whether the point in each pixel falls into any recorded picture, occluded or not.
+
+    Pixels without depth (0) are taken as sky: only their direction counts.
+    """
+    points_world = camera.unproject(torch.where(depth_m > 0, depth_m, SKY_DEPTH_M)).reshape(-1, 3)
+    seen = torch.zeros_like(depth_m, dtype=torch.bool).reshape(-1)
+    for recorded in recorded_cameras:
+        seen |= recorded.contains(*recorded.project(points_world))
+    return seen.reshape(depth_m.shape)
+
+
+def geometric_confidence(
+    conditions: PaintingConditions,
+    camera: Camera,
+    seen: Bool[Tensor, "height width"],
+    *,
+    config: ConfidenceConfig | None = None,
+) -> Float[Tensor, "height width"]:
+    """`support * seen` of the module's formula, in [0, 1]."""
+    config = config or ConfidenceConfig()
+    warp = conditions.warp_valid.any(dim=0).to(torch.float32)
+    distance_px = torch.full_like(conditions.render_alpha, torch.inf)
+    if bool(conditions.lidar_hit.any()):
+        distance = distance_transform_edt(~conditions.lidar_hit.cpu().numpy())
+        distance_px = torch.as_tensor(distance).to(conditions.render_alpha)
+    lidar = torch.exp(-distance_px / (config.lidar_reach_rad * camera.fx_px))
+    low, high = config.alpha_range
+    rise = ((conditions.render_alpha - low) / (high - low)).clamp(0, 1)
+    surface = rise * rise * (3 - 2 * rise)
+    doubt = (1 - config.warp_weight * warp) * (1 - config.lidar_weight * lidar)
+    return (1 - doubt * (1 - config.surface_weight * surface)) * seen
+
+
+def guidance_gate(
+    painting: Painting,
+    conditions: PaintingConditions,
+    *,
+    config: ConfidenceConfig | None = None,
+) -> GuidanceGate:
+    """Weigh a painting down where it departs from recorded pixels more than the render did."""
+    config = config or ConfidenceConfig()
+    evidence, known = _evidence(conditions)
+    share = float(known.to(torch.float32).mean())
+    painted = (painting.rgb - evidence).abs().mean(dim=-1) * known
+    rendered = (conditions.render_rgb - evidence).abs().mean(dim=-1) * known
+    if share == 0:
+        return _gate(torch.ones_like(painted), float("nan"), float("nan"), share)
+    count = known.sum()
+    painted_mean, render_mean = float(painted.sum() / count), float(rendered.sum() / count)
+    view_weight = 1.0
+    if share >= config.min_evidence:
+        excess = painted_mean - render_mean
+        view_weight = 0.0 if excess > config.refuse_excess else _falloff(excess, config)
+    local = _box_sum(painted - rendered, config.gate_window_px) / _box_sum(
+        known.to(torch.float32), config.gate_window_px
+    ).clamp(min=1.0)
+    fall = torch.exp(-(local - config.gate_slack).clamp(min=0) / config.gate_scale)
+    return _gate(view_weight * fall, painted_mean, render_mean, share)
+
+
+def _evidence(
+    conditions: PaintingConditions,
+) -> tuple[Float[Tensor, "height width 3"], Bool[Tensor, "height width"]]:
+    """The best recorded colour known for each pixel: warped pictures, then LiDAR."""
+    rgb, known = conditions.lidar_rgb, conditions.lidar_hit
+    for source in reversed(range(len(conditions.warp_valid))):
+        valid = conditions.warp_valid[source]
+        rgb = torch.where(valid[..., None], conditions.warp_rgb[source], rgb)
+        known = known | valid
+    return rgb, known
+
+
+def _falloff(excess: float, config: ConfidenceConfig) -> float:
+    """1 up to the slack, then an exponential fall."""
+    beyond = torch.tensor(max(excess - config.gate_slack, 0.0))
+    return float(torch.exp(-beyond / config.gate_scale))
+
+
+def _box_sum(picture: Float[Tensor, "height width"], side_px: int) -> Float[Tensor, "height width"]:
+    """Sum over a square window around each pixel; outside the picture is 0."""
+    mean = torch.nn.functional.avg_pool2d(
+        picture[None, None], side_px, stride=1, padding=side_px // 2
+    )
+    return mean[0, 0] * side_px**2
+
+
+def _gate(
+    weight: Float[Tensor, "height width"], painted: float, rendered: float, share: float
+) -> GuidanceGate:
+    return GuidanceGate(
+        weight=weight,
+        painted_difference=painted,
+        render_difference=rendered,
+        evidence_share=share,
+        is_refused=bool((weight == 0).all()),
+    )

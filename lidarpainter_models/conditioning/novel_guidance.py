@@ -1,0 +1,228 @@
+"""Painted pictures of views that nobody recorded, to guide the fit on.
+
+The recorded cameras are moved sideways and up relative to the road, what the scene shows there is
+painted, and every pixel gets a weight: painter confidence times geometric confidence times the
+gate of `confidence`. Views from inside a car or a wall are left out; refused paintings stay in the
+result, for the report, but give no guidance. World: x forward, y left, z up; metres.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from lidarpainter_models.conditioning.conditions import ConditionBuilder
+from lidarpainter_models.conditioning.confidence import (
+    ConfidenceConfig,
+    GuidanceGate,
+    geometric_confidence,
+    guidance_gate,
+    is_seen,
+)
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.gaussians.calibration import ViewKey
+from lidarpainter_models.gaussians.observations import GuidanceView, TrainingView
+from lidarpainter_models.geometry.boxes import is_inside_box
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.trajectories import Shift, road_directions, shift_pose
+from lidarpainter_models.painter.protocol import Painter, Painting, PaintingConditions
+from lidarpainter_models.scenes.lidar_map import LidarMap
+from lidarpainter_models.scenes.tracks import ActorTrack
+
+DEFAULT_SHIFTS = (
+    Shift(lateral_m=2.0),
+    Shift(lateral_m=-2.0),
+    Shift(lateral_m=3.0),
+    Shift(lateral_m=-3.0),
+    Shift(up_m=1.5),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NovelGuidanceConfig:
+    """Which views are painted and what becomes of them."""
+
+    shifts: tuple[Shift, ...] = DEFAULT_SHIFTS
+    """Where the recorded cameras are moved to; the paper's 2 and 3 m to both sides and 1.5 m up."""
+    every_nth: int = 2
+    """Of the training frames, every n-th is painted at every shift."""
+    room_m: float = 0.6
+    """No surface may be nearer to a moved camera than this."""
+    max_points_in_room: int = 10
+    """LiDAR points nearer than `room_m` that still count as noise."""
+    confidence: ConfidenceConfig = field(default_factory=ConfidenceConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse to paint nothing."""
+        if not self.shifts:
+            raise ConfigError("novel guidance needs at least one shift")
+        if self.every_nth < 1:
+            raise ConfigError(f"every_nth must be at least 1, got {self.every_nth}")
+        if not self.room_m > 0:
+            raise ConfigError(f"room_m must be positive, got {self.room_m}")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NovelCamera:
+    """A camera nobody had."""
+
+    camera: Camera
+    timestamp_ns: int
+    shift: Shift
+    key: ViewKey
+    """The training view it was moved from."""
+
+    @property
+    def name(self) -> str:
+        """Names the view in files and tables, such as `front_camera-004-left-2m`."""
+        return f"{self.key[1]}-{self.key[0]:03d}-{self.shift.name}"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NovelPainting:
+    """One painted view: guidance for the fit and pictures for a report."""
+
+    novel: NovelCamera
+    guidance: GuidanceView
+    """Its weight is 0 everywhere if the gate refused the painting."""
+    gate: GuidanceGate
+    pictures: dict[str, UInt8[Tensor, "height width 3"]]
+    """By name: render, lidar, warp, painted, confidence."""
+
+    @property
+    def mean_weight(self) -> float:
+        """Mean weight of the guidance, 0 to 1."""
+        return float(self.guidance.weight.mean())
+
+
+def novel_cameras(
+    training_views: Sequence[TrainingView],
+    frame_indices: Sequence[int],
+    world_from_ego: Float[Tensor, "frames 4 4"],
+    *,
+    config: NovelGuidanceConfig | None = None,
+    start: int = 0,
+) -> list[NovelCamera]:
+    """The training cameras of every n-th training frame, at every shift.
+
+    Args:
+        training_views: Whose cameras are moved.
+        frame_indices: Frames of `world_from_ego`, in order of time.
+        world_from_ego: The path driven, which gives the road's direction.
+        config: Shifts and spacing.
+        start: Training frame counted from, so that another round may paint other frames.
+
+    Raises:
+        ConfigError: a view's frame is not among `frame_indices`.
+    """
+    config = config or NovelGuidanceConfig()
+    directions = dict(zip(frame_indices, road_directions(world_from_ego), strict=True))
+    frames = sorted({view.key[0] for view in training_views})
+    unknown = [frame for frame in frames if frame not in directions]
+    if unknown:
+        raise ConfigError(f"no ego pose is given for the frames {unknown} of training views")
+    chosen = set(frames[start % config.every_nth :: config.every_nth])
+    return [
+        NovelCamera(
+            camera=view.camera.at(
+                shift_pose(view.camera.world_from_camera, directions[view.key[0]], shift)
+            ),
+            timestamp_ns=view.timestamp_ns,
+            shift=shift,
+            key=view.key,
+        )
+        for shift in config.shifts
+        for view in training_views
+        if view.key[0] in chosen
+    ]
+
+
+def has_room(
+    novel: NovelCamera,
+    lidar_map: LidarMap,
+    tracks: Sequence[ActorTrack],
+    *,
+    config: NovelGuidanceConfig | None = None,
+) -> bool:
+    """Whether a camera stands in free space: not in or at a moving actor, a parked car, a wall."""
+    config = config or NovelGuidanceConfig()
+    centre = novel.camera.centre_world.to(lidar_map.street.xyz_m)
+    for track in tracks:
+        if track.is_present(novel.timestamp_ns):
+            box = track.pose_at(novel.timestamp_ns)
+            if bool(is_inside_box(centre[None], box, track.size_m, margin_m=config.room_m)):
+                return False
+    distance_m = (lidar_map.street.xyz_m - centre).norm(dim=-1)
+    return int((distance_m < config.room_m).sum()) <= config.max_points_in_room
+
+
+def paint_novel_views(
+    builder: ConditionBuilder,
+    painter: Painter,
+    cameras: Sequence[NovelCamera],
+    *,
+    config: NovelGuidanceConfig | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[NovelPainting]:
+    """Paint every view that has room to stand in.
+
+    Args:
+        builder: Gives conditions of the scene as it is now.
+        painter: Repairs the views.
+        cameras: Where from, see `novel_cameras`.
+        config: Room and confidence.
+        progress: Told after each camera how many of how many are done.
+    """
+    config = config or NovelGuidanceConfig()
+    paintings = []
+    for done, novel in enumerate(cameras, start=1):
+        if has_room(novel, builder.lidar_map, builder.tracks, config=config):
+            paintings.append(_paint(builder, painter, novel, config.confidence))
+        if progress is not None:
+            progress(done, len(cameras))
+    return paintings
+
+
+def guidance_views(paintings: Sequence[NovelPainting]) -> list[GuidanceView]:
+    """What the fit is given: every painting that was not refused."""
+    return [painting.guidance for painting in paintings if not painting.gate.is_refused]
+
+
+def _paint(
+    builder: ConditionBuilder, painter: Painter, novel: NovelCamera, config: ConfidenceConfig
+) -> NovelPainting:
+    conditions = builder.conditions(novel.camera, novel.timestamp_ns)
+    painting = painter.paint(conditions)
+    gate = guidance_gate(painting, conditions, config=config)
+    depth_m = torch.where(
+        conditions.render_depth_m > 0, conditions.render_depth_m, conditions.lidar_depth_m
+    )
+    seen = is_seen(novel.camera, depth_m, builder.recorded_cameras)
+    geometric = geometric_confidence(conditions, novel.camera, seen, config=config)
+    weight = (painting.confidence * geometric * gate.weight).clamp(0, 1)
+    guidance = GuidanceView(
+        camera=novel.camera,
+        timestamp_ns=novel.timestamp_ns,
+        rgb=painting.rgb,
+        weight=weight,
+        lidar_depth_m=conditions.lidar_depth_m,
+    )
+    return NovelPainting(
+        novel=novel, guidance=guidance, gate=gate, pictures=_pictures(conditions, painting, weight)
+    )
+
+
+def _pictures(
+    conditions: PaintingConditions, painting: Painting, weight: Float[Tensor, "height width"]
+) -> dict[str, UInt8[Tensor, "height width 3"]]:
+    """What a report shows of one view."""
+    floats = {
+        "render": conditions.render_rgb,
+        "lidar": conditions.lidar_rgb,
+        "warp": conditions.warp_rgb[0],
+        "painted": painting.rgb,
+        "confidence": weight[..., None].expand(-1, -1, 3),
+    }
+    return {name: (rgb.clamp(0, 1) * 255).round().to(torch.uint8) for name, rgb in floats.items()}

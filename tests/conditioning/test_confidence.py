@@ -1,0 +1,127 @@
+import math
+
+import pytest
+import torch
+
+from lidarpainter_models.conditioning.confidence import (
+    ConfidenceConfig,
+    geometric_confidence,
+    guidance_gate,
+    is_seen,
+)
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.painter.protocol import Painting, PaintingConditions
+
+HEIGHT, WIDTH = 40, 60
+
+
+def camera(x_m=0.0):
+    world_from_camera = torch.eye(4, dtype=torch.float64)
+    world_from_camera[0, 3] = x_m
+    return Camera(
+        world_from_camera=world_from_camera,
+        fx_px=50.0,
+        fy_px=50.0,
+        cx_px=WIDTH / 2,
+        cy_px=HEIGHT / 2,
+        width_px=WIDTH,
+        height_px=HEIGHT,
+    )
+
+
+def conditions(**changes):
+    generator = torch.Generator().manual_seed(0)
+    truth = torch.rand(HEIGHT, WIDTH, 3, generator=generator)
+    fields = {
+        "render_rgb": truth,
+        "render_depth_m": torch.full((HEIGHT, WIDTH), 10.0),
+        "render_alpha": torch.ones(HEIGHT, WIDTH),
+        "lidar_rgb": torch.zeros(HEIGHT, WIDTH, 3),
+        "lidar_depth_m": torch.zeros(HEIGHT, WIDTH),
+        "lidar_hit": torch.zeros(HEIGHT, WIDTH, dtype=torch.bool),
+        "warp_rgb": truth[None],
+        "warp_valid": torch.ones(1, HEIGHT, WIDTH, dtype=torch.bool),
+    }
+    return PaintingConditions(**{**fields, **changes})
+
+
+def painting(rgb):
+    return Painting(rgb=rgb, confidence=torch.ones(HEIGHT, WIDTH))
+
+
+EVERYWHERE = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+
+
+def test_confidence_follows_its_formula():
+    hit = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    hit[10, 10] = True
+    given = conditions(lidar_hit=hit, warp_valid=torch.zeros(1, HEIGHT, WIDTH, dtype=torch.bool))
+    config = ConfidenceConfig(lidar_reach_rad=0.04)  # 2 px
+    confidence = geometric_confidence(given, camera(), EVERYWHERE, config=config)
+    expected = 1 - (1 - 0.6 * math.exp(-3 / 2)) * (1 - 0.3)
+    assert confidence[10, 13] == pytest.approx(expected, rel=1e-5)
+    assert confidence[10, 10] == pytest.approx(1 - 0.4 * 0.7, rel=1e-5)
+
+
+def test_a_warped_pixel_is_trusted_more_than_a_bare_render_and_a_hole_not_at_all():
+    bare = torch.zeros(1, HEIGHT, WIDTH, dtype=torch.bool)
+    warped = geometric_confidence(conditions(), camera(), EVERYWHERE)
+    rendered = geometric_confidence(conditions(warp_valid=bare), camera(), EVERYWHERE)
+    hole = geometric_confidence(
+        conditions(warp_valid=bare, render_alpha=torch.zeros(HEIGHT, WIDTH)), camera(), EVERYWHERE
+    )
+    assert (warped > 0.9).all()
+    assert torch.allclose(rendered, torch.tensor(0.3))
+    assert (hole == 0).all()
+
+
+def test_nothing_outside_every_recorded_picture_is_trusted():
+    depth_m = torch.full((HEIGHT, WIDTH), 10.0)
+    seen = is_seen(camera(2.0), depth_m, [camera(), camera(-1.0)])
+    assert seen[:, :50].all()  # 2 m at 10 m and 50 px focal length are 10 px
+    assert not seen[:, 50:].any()
+    assert (geometric_confidence(conditions(), camera(2.0), seen)[:, 50:] == 0).all()
+
+
+def test_sky_is_seen_by_its_direction():
+    sky = torch.zeros(HEIGHT, WIDTH)
+    assert is_seen(camera(30.0), sky, [camera()]).float().mean() > 0.95
+    assert not is_seen(camera(), sky, []).any()
+
+
+def test_the_gate_lets_a_better_painting_pass():
+    truth = conditions().warp_rgb[0]
+    given = conditions(render_rgb=(truth + 0.2).clamp(0, 1))
+    gate = guidance_gate(painting(truth), given)
+    assert torch.equal(gate.weight, torch.ones(HEIGHT, WIDTH))
+    assert gate.painted_difference == 0
+    assert gate.render_difference > 0.1
+    assert not gate.is_refused
+
+
+def test_the_gate_finds_a_hallucinated_block():
+    painted = conditions().warp_rgb[0].clone()
+    painted[:15, :15] = 1 - painted[:15, :15]
+    gate = guidance_gate(painting(painted), conditions(), config=ConfidenceConfig(gate_slack=0.1))
+    assert (gate.weight[3:12, 3:12] < 0.01).all()
+    assert (gate.weight[25:, 30:] == 1).all()
+
+
+def test_the_gate_refuses_a_view_made_worse_everywhere():
+    truth = conditions().warp_rgb[0]
+    gate = guidance_gate(painting(1 - truth), conditions())
+    assert gate.is_refused
+    assert (gate.weight == 0).all()
+
+
+def test_without_evidence_nothing_is_gated():
+    nothing = torch.zeros(1, HEIGHT, WIDTH, dtype=torch.bool)
+    gate = guidance_gate(painting(torch.zeros(HEIGHT, WIDTH, 3)), conditions(warp_valid=nothing))
+    assert (gate.weight == 1).all()
+    assert math.isnan(gate.painted_difference)
+
+
+def test_impossible_weights_are_refused():
+    with pytest.raises(ConfigError, match="warp_weight"):
+        ConfidenceConfig(warp_weight=1.5)
