@@ -86,6 +86,17 @@ def plain(value: Any, where: str = "value") -> Any:  # noqa: ANN401 - any config
     return _plain_container(value, where)
 
 
+def finite_or_none(value: Any) -> Any:  # noqa: ANN401 - any JSON-like value
+    """The same value with infinite and not-a-number floats as None: JSON has neither."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): finite_or_none(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite_or_none(item) for item in value]
+    return value
+
+
 def _plain_container(value: Any, where: str) -> Any:  # noqa: ANN401 - any configuration
     if is_dataclass(value) and not isinstance(value, type):
         return {

@@ -1,4 +1,7 @@
-"""Whether this machine can do the work: packages, system libraries, devices, disk."""
+"""Whether this machine can do the work: packages, system libraries, devices, disk.
+
+`tasks.data_checks` looks at scenes and datasets.
+"""
 
 import os
 import platform
@@ -11,7 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal
 
-Verdict = Literal["ok", "warning", "failure"]
+Verdict = Literal["ok", "warn", "fail"]
 PYTHON_RANGE = ((3, 11), (3, 14))
 REQUIRED = ("torch", "numpy", "scipy", "numba", "pyarrow", "zarr", "deltalake", "prefect", "typer")
 MIN_FREE_BYTES = 5_000_000_000
@@ -51,7 +54,7 @@ def _python() -> Finding:
     low, high = PYTHON_RANGE
     is_fit = low <= sys.version_info[:2] < high
     detail = f"{platform.python_version()}, expected >={low[0]}.{low[1]},<{high[0]}.{high[1]}"
-    return Finding("python", "ok" if is_fit else "failure", detail)
+    return Finding("python", "ok" if is_fit else "fail", detail)
 
 
 def _package_check(name: str) -> Callable[[], Finding]:
@@ -59,7 +62,7 @@ def _package_check(name: str) -> Callable[[], Finding]:
         try:
             return Finding(name, "ok", version(name))
         except PackageNotFoundError:
-            return Finding(name, "failure", f"not installed: pip install {name}")
+            return Finding(name, "fail", f"not installed: pip install {name}")
 
     return check
 
@@ -69,7 +72,7 @@ def _open3d() -> Finding:
         module = import_module("open3d")
     except (ImportError, OSError) as error:
         advice = "apt-get install libegl1 libgl1 libx11-6 libusb-1.0-0"
-        return Finding("open3d", "warning", f"{error}; try: {advice}")
+        return Finding("open3d", "warn", f"{error}; try: {advice}")
     return Finding("open3d", "ok", module.__version__)
 
 
@@ -79,10 +82,10 @@ def _numba() -> Finding:
         numba = import_module("numba")
         answer = numba.njit(lambda number: number + 1)(1)
     except Exception as error:  # noqa: BLE001 - whatever it is, the kernels will not run
-        return Finding("kernels", "failure", f"numba cannot compile: {error}")
+        return Finding("kernels", "fail", f"numba cannot compile: {error}")
     is_right = answer == 2
     detail = f"compile; {numba.get_num_threads()} threads of {os.cpu_count()} cores"
-    return Finding("kernels", "ok" if is_right else "failure", detail)
+    return Finding("kernels", "ok" if is_right else "fail", detail)
 
 
 def _device() -> Finding:
@@ -93,23 +96,23 @@ def _device() -> Finding:
     try:
         gsplat = version("gsplat")
     except PackageNotFoundError:
-        return Finding("device", "warning", f"{name}, but gsplat is absent: pip install '.[cuda]'")
+        return Finding("device", "warn", f"{name}, but gsplat is absent: pip install '.[cuda]'")
     return Finding("device", "ok", f"{name}, gsplat {gsplat}")
 
 
 def _memory() -> Finding:
     pages, page_bytes = os.sysconf("SC_PHYS_PAGES"), os.sysconf("SC_PAGE_SIZE")
     total = pages * page_bytes
-    verdict: Verdict = "ok" if total >= MIN_MEMORY_BYTES else "warning"
+    verdict: Verdict = "ok" if total >= MIN_MEMORY_BYTES else "warn"
     return Finding("memory", verdict, f"{total / 1e9:.1f} GB")
 
 
 def _disk(store_path: Path) -> Finding:
     existing = next(path for path in (store_path, *store_path.parents) if path.exists())
     if not os.access(existing, os.W_OK):
-        return Finding("store", "failure", f"{existing} cannot be written")
+        return Finding("store", "fail", f"{existing} cannot be written")
     free = shutil.disk_usage(existing).free
-    verdict: Verdict = "ok" if free >= MIN_FREE_BYTES else "warning"
+    verdict: Verdict = "ok" if free >= MIN_FREE_BYTES else "warn"
     return Finding("store", verdict, f"{store_path}, {free / 1e9:.1f} GB free")
 
 
@@ -120,5 +123,5 @@ def _painter() -> Finding:
     try:
         load_painter("nano")
     except WeightsError as error:
-        return Finding("painter nano", "failure", str(error))
+        return Finding("painter nano", "fail", str(error))
     return Finding("painter nano", "ok", f"{BUNDLED_NANO.stat().st_size / 1e6:.1f} MB of weights")

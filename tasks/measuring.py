@@ -1,4 +1,4 @@
-"""Wall time and peak memory of a stage."""
+"""Wall time, CPU time and peak memory of a stage."""
 
 import resource
 import time
@@ -18,6 +18,8 @@ class Measurement:
     """What a block took; filled in when the block ends."""
 
     seconds: float = 0.0
+    cpu_seconds: float = 0.0
+    """Of all threads of this process."""
     peak_memory_bytes: int = 0
     """Largest resident set of this process while the block ran."""
 
@@ -30,11 +32,12 @@ def measured() -> Iterator[Measurement]:
     """
     measurement = Measurement()
     can_reset = _reset_peak()
-    started = time.perf_counter()
+    started, cpu_started = time.perf_counter(), time.process_time()
     try:
         yield measurement
     finally:
         measurement.seconds = time.perf_counter() - started
+        measurement.cpu_seconds = time.process_time() - cpu_started
         measurement.peak_memory_bytes = _peak_bytes() if can_reset else _process_peak_bytes()
 
 

@@ -49,6 +49,8 @@ class StageResult:
     ref: ArtefactRef
     seconds: float
     """Wall time of the computation, whenever it took place."""
+    cpu_seconds: float
+    """CPU time of the same, over all threads."""
     peak_memory_bytes: int
     is_new: bool
     """Whether it was computed in this run."""
@@ -87,7 +89,11 @@ def run_stage(
     def measured_build(place: Workplace) -> dict[str, Any]:
         with measured() as cost:
             summary = build(place)
-        return {**summary, "peak_memory_bytes": cost.peak_memory_bytes}
+        return {
+            **summary,
+            "cpu_seconds": round(cost.cpu_seconds, 3),
+            "peak_memory_bytes": cost.peak_memory_bytes,
+        }
 
     listener().started(stage)
     ref, is_new = store.artefacts.produce(
@@ -100,6 +106,7 @@ def run_stage(
     return StageResult(
         ref=ref,
         seconds=manifest.seconds,
+        cpu_seconds=manifest.summary["cpu_seconds"],
         peak_memory_bytes=manifest.summary["peak_memory_bytes"],
         is_new=is_new,
         summary=manifest.summary,

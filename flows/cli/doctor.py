@@ -25,16 +25,16 @@ def doctor(
 ) -> None:
     """Check the setup, a stored scene, or a dataset on disk."""
     from catalog.store import open_store
-    from tasks import health
+    from tasks import data_checks, health
 
     store = open_store()
     if subject is None:
         findings = health.check_environment(store.root)
     elif root is not None:
-        findings = health.check_dataset(subject, root)
+        findings = data_checks.check_dataset(subject, root)
     else:
-        findings = health.check_stored_scene(store, subject, out)
-    is_fit = all(finding.verdict != "failure" for finding in findings)
+        findings = data_checks.check_stored_scene(store, subject, out)
+    is_fit = all(finding.verdict != "fail" for finding in findings)
     if as_json:
         rows = [
             {"name": finding.name, "verdict": finding.verdict, "detail": finding.detail}

@@ -16,7 +16,7 @@ import typer
 
 from catalog.errors import CatalogError
 from catalog.store import STORE_ENVIRONMENT
-from flows.cli import catalog, doctor, ingest
+from flows.cli import catalog, doctor, ingest, reconstruct
 from flows.cli.output import complain
 from flows.environment import prepare_environment
 from lidarpainter_models import __version__
@@ -37,6 +37,7 @@ app = typer.Typer(
 )
 app.command("doctor")(doctor.doctor)
 app.command("ingest")(ingest.ingest)
+app.command("reconstruct")(reconstruct.reconstruct)
 app.add_typer(catalog.app, name="catalog")
 
 

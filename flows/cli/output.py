@@ -1,13 +1,14 @@
 """What commands say: a table or one JSON object on stdout, everything else on stderr."""
 
 import json
-import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
+
+from catalog.digests import finite_or_none
 
 Cell = str | int | float | bool | None
 FILE_WIDTH = 200
@@ -16,7 +17,7 @@ FILE_WIDTH = 200
 
 def print_json(result: Mapping[str, Any]) -> None:
     """One JSON object on stdout; numbers that JSON lacks (infinite, not a number) become null."""
-    text = json.dumps(finite(result), indent=2, allow_nan=False, ensure_ascii=False)
+    text = json.dumps(finite_or_none(result), indent=2, allow_nan=False, ensure_ascii=False)
     sys.stdout.write(text + "\n")
 
 
@@ -66,14 +67,3 @@ def format_bytes(num_bytes: float) -> str:
             return f"{num_bytes:.0f} {unit}" if unit == "B" else f"{num_bytes:.1f} {unit}"
         num_bytes /= 1000
     return f"{num_bytes:.1f} TB"
-
-
-def finite(value: Any) -> Any:  # noqa: ANN401 - any JSON-like value
-    """The same value with infinite and not-a-number floats as None."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {str(key): finite(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [finite(item) for item in value]
-    return value

@@ -1,0 +1,96 @@
+"""`lidarpainter reconstruct`: fit, paint, judge and report one scene."""
+
+from typing import Annotated, Any
+
+import typer
+
+from flows.cli.output import Cell, format_bytes, print_json, print_pairs, print_table
+from lidarpainter_models.errors import ConfigError
+
+
+def reconstruct(  # noqa: PLR0913 - the options of a command
+    scene: Annotated[str, typer.Argument(help="dataset/sequence, as ingested.")],
+    preset: Annotated[str, typer.Option(help="preview, balanced or paper.")] = "preview",
+    painter: Annotated[
+        str | None,
+        typer.Option(help="none, overlay, warp, nano, or weights; the preset's if absent."),
+    ] = None,
+    shift: Annotated[
+        str | None, typer.Option(help="Metres to both sides to paint at, such as 2,3.")
+    ] = None,
+    up: Annotated[str | None, typer.Option(help="Metres up to paint at, such as 1.5.")] = None,
+    rounds: Annotated[int | None, typer.Option(help="How often to paint and go on.")] = None,
+    split: Annotated[
+        str | None, typer.Option(help="alternate, forward:17:8 (fit:judge), or all.")
+    ] = None,
+    train_cameras: Annotated[
+        str | None, typer.Option(help="Cameras to train on, with commas between.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Any other setting: fit.steps=500. May be repeated."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Turn a stored scene into a fitted, painted, judged and reported one."""
+    from flows.cli.ingest import parse_names
+    from flows.cli.running import run_reconstruction
+    from flows.overrides import with_overrides
+    from flows.presets import preset as preset_named
+
+    parameters = preset_named(preset, scene)
+    changes: dict[str, Any] = {
+        "painter": painter,
+        "rounds": rounds,
+        "split": split,
+        "train_cameras": parse_names(train_cameras),
+    }
+    changes = {name: value for name, value in changes.items() if value is not None}
+    if shift is not None or up is not None:
+        changes["novel"] = shifted(parameters.novel, shift, up)
+    parameters = with_overrides(parameters.model_copy(update=changes), settings or [])
+    result = run_reconstruction(parameters)
+    if as_json:
+        print_json(result)
+    else:
+        show(result)
+
+
+def shifted(novel: Any, shift: str | None, up: str | None) -> Any:  # noqa: ANN401 - imported late
+    """Guidance settings that paint at the given distances instead.
+
+    Raises:
+        ConfigError: a distance is no positive number.
+    """
+    from dataclasses import replace
+
+    from lidarpainter_models.geometry.trajectories import Shift
+
+    sideways = [Shift(lateral_m=side * metres) for metres in _distances(shift) for side in (1, -1)]
+    return replace(novel, shifts=(*sideways, *(Shift(up_m=metres) for metres in _distances(up))))
+
+
+def show(result: dict[str, Any]) -> None:
+    """The result as tables."""
+    from tasks.scores import SCORE_COLUMNS, SCORE_NOTE, score_rows
+
+    title = f"{result['scene']}, painter {result['painter']}"
+    print_table(title, SCORE_COLUMNS, score_rows(result), SCORE_NOTE)
+    pairs: dict[str, Cell] = {
+        "run": result["run_id"],
+        "Gaussians": result["num_gaussians"],
+        "peak memory": format_bytes(result["peak_memory_bytes"]),
+        **{f"{name}, s": seconds for name, seconds in result["seconds"].items()},
+        "report": result["report"],
+    }
+    print_pairs("run", pairs)
+
+
+def _distances(text: str | None) -> list[float]:
+    try:
+        values = [float(part) for part in text.split(",")] if text else []
+    except ValueError:
+        values = [0.0]
+    if not all(0 < value < float("inf") for value in values):
+        raise ConfigError(f"{text!r}: expected positive metres with commas between, such as 2,3")
+    return values

@@ -1,0 +1,65 @@
+"""`lidarpainter render`: pictures of a run along a trajectory."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flows.cli.output import print_json, print_pairs
+
+
+def render(  # noqa: PLR0913 - the options of a command
+    run: Annotated[str, typer.Argument(help="A run id, a unique prefix of one, or latest.")],
+    trajectory: Annotated[
+        str,
+        typer.Option(help="recorded, lateral:2, up:1.5, yaw:15, lane-change:3.5; parts with +."),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the pictures.")],
+    camera: Annotated[
+        str | None, typer.Option(help="Camera whose path is followed; the first if absent.")
+    ] = None,
+    frames: Annotated[
+        str | None, typer.Option(help="Recorded frames A:B to follow, B excluded.")
+    ] = None,
+    postpaint: Annotated[
+        bool, typer.Option("--postpaint", help="Paint every picture as well.")
+    ] = False,
+    painter: Annotated[
+        str | None, typer.Option(help="Painter for --postpaint; the run's own if absent.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Render a finished run where nobody drove."""
+    from catalog.store import open_store
+    from flows.cli.ingest import parse_frames
+    from flows.cli.progress import shown_progress
+    from flows.parameters import ReconstructParameters
+    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+    from tasks.render import RenderRequest
+    from tasks.render import render as render_task
+    from tasks.runs import open_run
+
+    path = parse_trajectory(trajectory)
+    store = open_store()
+    finished = open_run(store, run)
+    parameters = ReconstructParameters.model_validate(finished.parameters)
+    request = RenderRequest(
+        trajectory=path,
+        camera=camera,
+        frames=parse_frames(frames),
+        painter=(painter or parameters.painter) if postpaint or painter else None,
+        observation=parameters.observation,
+        conditions=parameters.conditions,
+    )
+    with shown_progress():
+        made = render_task.fn(store.root, finished, request, out.absolute())
+    result = {
+        "run_id": finished.run_id,
+        "trajectory": path.spec,
+        "painter": request.painter,
+        **made,
+    }
+    if as_json:
+        print_json(result)
+    else:
+        print_pairs(f"pictures of {finished.scene_id}", result)

@@ -1,0 +1,66 @@
+"""What a flow is given: frozen models that hold the library's settings as fields."""
+
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from lidarpainter_models.conditioning.conditions import ConditionConfig
+from lidarpainter_models.conditioning.novel_guidance import NovelGuidanceConfig
+from lidarpainter_models.evaluation.scene_scores import ScoringConfig
+from lidarpainter_models.gaussians.fit_config import FitConfig
+from lidarpainter_models.gaussians.observations import ObservationConfig
+from tasks.evaluate import JudgeSettings
+from tasks.paint import PaintSettings
+from tasks.scenes import SplitSpec
+
+
+class ReconstructParameters(BaseModel):
+    """One scene, and everything that decides what becomes of it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    scene: str
+    """`<dataset>/<sequence>`."""
+    preset: str
+    """Name of the preset these parameters started from."""
+    split: str = "alternate"
+    """Which frames train and which judge: `alternate`, `forward:17:8`, `all`."""
+    train_cameras: tuple[str, ...] | None = None
+    """Cameras to train on and to judge; None takes all."""
+    observation: ObservationConfig
+    fit: FitConfig
+    """The fit to what was recorded."""
+    painter: str
+    """Name of a painter, path of its weights, or `none`: then the fit goes on as long without
+    painted views, which is the control for the painted one."""
+    novel: NovelGuidanceConfig
+    conditions: ConditionConfig
+    rounds: int = Field(ge=0)
+    """How often views are painted and the fit goes on."""
+    refine: FitConfig
+    """The fit of one round."""
+    scoring: ScoringConfig
+    judge_view_time: bool = False
+    """Also judge what the final scene shows when it is painted at view time."""
+    feature_weights: Path | None = None
+    """SqueezeNet 1.1 weights for the feature distance; None leaves it out."""
+
+    @property
+    def split_spec(self) -> SplitSpec:
+        """Which views may be seen."""
+        return SplitSpec(scene_id=self.scene, spec=self.split, cameras=self.train_cameras)
+
+    @property
+    def paint_settings(self) -> PaintSettings:
+        """How novel views are painted."""
+        return PaintSettings(painter=self.painter, novel=self.novel, conditions=self.conditions)
+
+    @property
+    def judge_settings(self) -> JudgeSettings:
+        """How scenes are judged."""
+        return JudgeSettings(
+            observation=self.observation,
+            scoring=self.scoring,
+            conditions=self.conditions,
+            feature_weights=self.feature_weights,
+        )

@@ -1,0 +1,169 @@
+"""One sequence, from stored scene to a fitted, painted, judged and reported one."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from prefect import flow
+
+from catalog.records import RunRecord
+from flows.parameters import ReconstructParameters
+from tasks.evaluate import evaluate
+from tasks.fit import fit, refine
+from tasks.paint import paint
+from tasks.painters import NO_PAINTER, painter_digest
+from tasks.prepare import prepare
+from tasks.publish import begin_run, complete_run, fail_run
+from tasks.report import GUIDANCE_COLUMNS, ReportInputs, report_path, write_report
+from tasks.scores import Scores, load_scores
+from tasks.stages import StageResult
+from tasks.stored import FittedRef
+
+DEVICE = "cpu"
+
+
+@dataclass
+class Course:
+    """What happened in a run so far, stage by stage."""
+
+    stages: dict[str, StageResult] = field(default_factory=dict)
+
+    def add(self, stage: str, result: StageResult) -> StageResult:
+        """Remember a stage and hand its result on."""
+        self.stages[stage] = result
+        return result
+
+
+@flow(name="reconstruct")
+def reconstruct(parameters: ReconstructParameters, store_path: Path) -> dict[str, Any]:
+    """Fit a scene, paint shifted views of it, go on fitting with them, judge and report."""
+    painter_digest(parameters.painter)  # a wrong painter is told before the fit, not after it
+    record = begin_run(store_path, parameters, DEVICE)
+    with failure_recorded(store_path, record):
+        return _run(parameters, store_path, record)
+
+
+def _run(parameters: ReconstructParameters, store_path: Path, record: RunRecord) -> dict[str, Any]:
+    started = time.perf_counter()
+    course = Course()
+    seen = course.add("prepare", prepare(store_path, parameters.split_spec, parameters.observation))
+    first = course.add("fit", fit(store_path, seen.ref, parameters.fit))
+    fitted = FittedRef(seen.ref, first.ref)
+    final = _rounds(parameters, store_path, course, fitted)
+    scores = _judged(parameters, store_path, course, fitted, final)
+    result = _result(parameters, record, course, scores, final)
+    report = course.add(
+        "report",
+        write_report(
+            store_path,
+            ReportInputs(
+                result=result,
+                split=parameters.split_spec,
+                settings=parameters.judge_settings,
+                painter=parameters.painter,
+                unpainted=fitted,
+                final=final,
+                stages=dict(course.stages),
+            ),
+        ),
+    )
+    result["report"] = str(report_path(report.ref))
+    result["seconds"]["report"] = report.seconds
+    result["cpu_seconds"]["report"] = report.cpu_seconds
+    result["seconds"]["total"] = time.perf_counter() - started
+    refs = tuple(stage.ref for stage in course.stages.values())
+    return complete_run(store_path, record, result, scores, refs)
+
+
+def _rounds(
+    parameters: ReconstructParameters, store_path: Path, course: Course, fitted: FittedRef
+) -> FittedRef:
+    """Paint and go on fitting; without a painter the fit goes on alone, just as long."""
+    for number in range(1, parameters.rounds + 1):
+        guidance = None
+        if parameters.painter != NO_PAINTER:
+            stage = f"paint-{number}"
+            guidance = course.add(
+                stage,
+                paint(
+                    store_path,
+                    stage,
+                    parameters.scene,
+                    fitted,
+                    parameters.paint_settings,
+                    number - 1,
+                ),
+            ).ref
+        stage = f"refine-{number}"
+        refined = refine(
+            store_path, stage, fitted.observations, fitted.gaussians, guidance, parameters.refine
+        )
+        fitted = FittedRef(fitted.observations, course.add(stage, refined).ref)
+    return fitted
+
+
+def _judged(
+    parameters: ReconstructParameters,
+    store_path: Path,
+    course: Course,
+    unpainted: FittedRef,
+    final: FittedRef,
+) -> dict[str, Scores]:
+    """Scores before painting, after it, and if asked for, painted at view time."""
+    split, settings = parameters.split_spec, parameters.judge_settings
+    before = evaluate(store_path, "evaluate-unpainted", split, unpainted, settings)
+    scores = {"unpainted": load_scores(course.add("evaluate-unpainted", before).ref)}
+    after = evaluate(store_path, "evaluate", split, final, settings)
+    scores["painted"] = load_scores(course.add("evaluate", after).ref)
+    if parameters.judge_view_time and parameters.painter != NO_PAINTER:
+        stage = "evaluate-view-time"
+        shown = evaluate(store_path, stage, split, final, settings, parameters.painter)
+        scores["view-time"] = load_scores(course.add(stage, shown).ref)
+    return scores
+
+
+def _result(
+    parameters: ReconstructParameters,
+    record: RunRecord,
+    course: Course,
+    scores: dict[str, Scores],
+    final: FittedRef,
+) -> dict[str, Any]:
+    """What `reconstruct --json` prints, but for the report."""
+    stages = course.stages
+    last_fit = next(stage for stage in stages.values() if stage.ref == final.gaussians)
+    return {
+        "run_id": record.run_id,
+        "scene": parameters.scene,
+        "preset": parameters.preset,
+        "painter": parameters.painter,
+        "split": parameters.split,
+        "rounds": parameters.rounds,
+        "seconds": {name: stage.seconds for name, stage in stages.items()},
+        "cpu_seconds": {name: stage.cpu_seconds for name, stage in stages.items()},
+        "computed_now": {name: stage.is_new for name, stage in stages.items()},
+        "peak_memory_bytes": max(stage.peak_memory_bytes for stage in stages.values()),
+        "num_gaussians": last_fit.summary["num_gaussians"],
+        **scores["painted"],
+        "unpainted": scores["unpainted"],
+        "view_time": scores.get("view-time"),
+        "guidance": {
+            name: {key: stage.summary[key] for key in GUIDANCE_COLUMNS}
+            for name, stage in stages.items()
+            if stage.ref.kind == "guidance"
+        },
+        "artefacts": {name: stage.ref.path for name, stage in stages.items()},
+    }
+
+
+@contextmanager
+def failure_recorded(store_path: Path, record: RunRecord) -> Iterator[None]:
+    """Enter into the catalog why a run failed, and let the error go on."""
+    try:
+        yield
+    except Exception as error:
+        fail_run(store_path, record, f"{type(error).__name__}: {error}")
+        raise

@@ -1,0 +1,126 @@
+"""Render a finished run along a trajectory, painted at view time if asked for."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from prefect import task
+from torch import Tensor
+
+from catalog.store import open_store
+from lidarpainter_models.conditioning.conditions import ConditionBuilder, ConditionConfig
+from lidarpainter_models.errors import SceneError
+from lidarpainter_models.export.pictures import write_png
+from lidarpainter_models.gaussians.observations import ObservationConfig, fit_camera
+from lidarpainter_models.gaussians.scene_graph import GaussianScene
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.trajectories import road_directions, shift_pose
+from lidarpainter_models.geometry.trajectory_specs import Trajectory
+from lidarpainter_models.painter import load_painter
+from lidarpainter_models.painter.protocol import Painter
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.records import RecordedView
+from tasks.progress import listener
+from tasks.runs import FinishedRun
+from tasks.scenes import open_scene
+from tasks.stages import STAGE_OPTIONS
+from tasks.stored import load_observations, load_scene, write_json
+
+STAGE = "render"
+POSES_FILE = "trajectory.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderRequest:
+    """Which pictures are wanted."""
+
+    trajectory: Trajectory
+    camera: str | None = None
+    """Camera whose path is shifted; None takes the first that was trained on."""
+    frames: slice | None = None
+    """Positions of the recorded frames to follow."""
+    painter: str | None = None
+    """Painter applied to every picture; None shows the scene as it is."""
+    observation: ObservationConfig
+    conditions: ConditionConfig
+
+
+@task(**STAGE_OPTIONS)
+def render(store_path: Path, run: FinishedRun, request: RenderRequest, out: Path) -> dict[str, Any]:
+    """Write a picture for every recorded moment, and where each was taken.
+
+    Raises:
+        SceneError: the run did not train on that camera, or no frame is left.
+    """
+    store = open_store(store_path)
+    recorded = open_scene(store, run.scene_id)
+    seen = load_observations(store, run.final.observations)
+    scene = load_scene(store, run.final.gaussians)
+    builder = ConditionBuilder(scene, seen.lidar_map, seen.views, config=request.conditions)
+    painter = None if request.painter is None else load_painter(request.painter)
+    camera_name = request.camera or seen.camera_names[0]
+    if camera_name not in seen.camera_names:
+        raise SceneError(
+            f"run {run.run_id} has no camera {camera_name!r}, it has {', '.join(seen.camera_names)}"
+        )
+    views = recorded.views_of(camera_name)[request.frames or slice(None)]
+    if not views:
+        raise SceneError(f"{run.scene_id}: no frame of {camera_name} is left to render")
+    listener().started(STAGE)
+    rows = []
+    for number, view in enumerate(views):
+        camera = _shifted(recorded, scene, view, request, number / max(len(views) - 1, 1))
+        rgb = _picture(builder, painter, camera, view)
+        path = write_png(rgb.clamp(0, 1), out / f"{view.frame_index:04d}.png")
+        rows.append(_row(path, camera, view))
+        listener().advanced(STAGE, number + 1, len(views), "")
+    write_json(out / POSES_FILE, {"trajectory": request.trajectory.spec, "pictures": rows})
+    return {"folder": str(out), "num_pictures": len(rows), "camera": camera_name}
+
+
+def _shifted(
+    recorded: DrivingScene,
+    scene: GaussianScene,
+    view: RecordedView,
+    request: RenderRequest,
+    progress: float,
+) -> Camera:
+    """The recorded camera where the fit found it, moved along the trajectory."""
+    camera = scene.corrected_camera(
+        fit_camera(view, request.observation),
+        timestamp_ns=view.timestamp_ns,
+        camera_name=view.camera_name,
+        key=view.key,
+    )
+    directions = road_directions(recorded.world_from_ego)
+    direction = directions[recorded.frame_position(view.frame_index)]
+    shift = request.trajectory.shift_at(progress)
+    return camera.at(shift_pose(camera.world_from_camera, direction, shift))
+
+
+def _picture(
+    builder: ConditionBuilder, painter: Painter | None, camera: Camera, view: RecordedView
+) -> Float[Tensor, "height width 3"]:
+    if painter is None:
+        shown = builder.scene.render(camera, view.timestamp_ns, camera_name=view.camera_name)
+        return shown.rgb
+    conditions = builder.conditions(camera, view.timestamp_ns, camera_name=view.camera_name)
+    with torch.inference_mode():
+        return painter.paint(conditions).rgb
+
+
+def _row(path: Path, camera: Camera, view: RecordedView) -> dict[str, Any]:
+    return {
+        "file": path.name,
+        "frame_index": view.frame_index,
+        "timestamp_ns": view.timestamp_ns,
+        "world_from_camera": camera.world_from_camera.reshape(-1).tolist(),
+        "fx_px": camera.fx_px,
+        "fy_px": camera.fy_px,
+        "cx_px": camera.cx_px,
+        "cy_px": camera.cy_px,
+        "width_px": camera.width_px,
+        "height_px": camera.height_px,
+    }

@@ -1,0 +1,53 @@
+"""What a finished run left in the store."""
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from catalog.artefacts import ArtefactRef
+from catalog.errors import UnknownRecordError
+from catalog.store import Store
+from tasks.stored import FittedRef
+
+
+@dataclass(frozen=True, kw_only=True)
+class FinishedRun:
+    """A complete run and its artefacts."""
+
+    run_id: str
+    scene_id: str
+    parameters: dict[str, Any]
+    """As JSON; the flow's model reads them."""
+    result: dict[str, Any]
+    unpainted: FittedRef
+    """After the first fit."""
+    final: FittedRef
+    """After the last round."""
+
+
+def open_run(store: Store, run_id: str) -> FinishedRun:
+    """A complete run by id, unique prefix, or `latest`.
+
+    Raises:
+        UnknownRecordError: there is no such run, or it did not complete.
+    """
+    row = store.run(run_id)
+    if row["status"] != "complete":
+        why = f": {row['error']}" if row["error"] else ""
+        raise UnknownRecordError(f"run {row['run_id']} is {row['status']}, not complete{why}")
+    refs = [_ref(store, artefact_id) for artefact_id in row["artefacts"]]
+    observations = next(ref for ref in refs if ref.kind == "observations")
+    fits = [ref for ref in refs if ref.kind == "gaussians"]
+    return FinishedRun(
+        run_id=row["run_id"],
+        scene_id=row["scene_id"],
+        parameters=json.loads(row["parameters"]),
+        result=json.loads(row["result"]),
+        unpainted=FittedRef(observations, fits[0]),
+        final=FittedRef(observations, fits[-1]),
+    )
+
+
+def _ref(store: Store, artefact_id: str) -> ArtefactRef:
+    kind, _, digest = artefact_id.partition("/")
+    return store.artefacts.ref(kind, digest)

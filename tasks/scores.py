@@ -1,0 +1,83 @@
+"""Scores of an evaluation: where they lie, every number by name, and the table of them."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from catalog.artefacts import ArtefactRef
+from tasks.stored import read_json
+
+SCORES_FILE = "scores.json"
+DEPTH = "depth_within_5_percent"
+SCORE_COLUMNS = (
+    "view",
+    "unpainted PSNR",
+    "painted PSNR",
+    "unpainted SSIM",
+    "painted SSIM",
+    "unpainted depth",
+    "painted depth",
+    "views",
+)
+SCORE_NOTE = "PSNR in dB; depth: part of unseen LiDAR pixels that the rendered depth meets in 5 %."
+
+ScoreCell = str | float | int | None
+Scores = dict[str, Any]
+"""`recorded` and `novel` as `reconstruct --json` prints them."""
+
+
+def load_scores(ref: ArtefactRef) -> Scores:
+    """Read the scores of an evaluation."""
+    return read_json(ref.folder / SCORES_FILE)
+
+
+def metric_values(
+    scores: Mapping[str, Any],
+) -> list[tuple[str, str, str, float | None, str | None]]:
+    """Every number as (protocol, trajectory, name, value, reason why there is none)."""
+    found = []
+    for name, value in _numbers(scores["recorded"]):
+        found.append(
+            ("recorded", "recorded", name, value, scores["recorded"].get(f"{name}_reason"))
+        )
+    for name, value in _numbers(scores["recorded"].get("recorded_poses", {})):
+        found.append(("recorded-poses", "recorded", name, value, None))
+    for trajectory, values in scores["novel"].items():
+        for name, value in _numbers(values):
+            protocol = "depth" if name.startswith("depth") else "truth"
+            found.append((protocol, trajectory, name, value, values.get(f"{name}_reason")))
+    return found
+
+
+def _numbers(values: Mapping[str, Any]) -> list[tuple[str, float | None]]:
+    return [
+        (name, None if value is None else float(value))
+        for name, value in values.items()
+        if value is None or isinstance(value, (int, float))
+    ]
+
+
+def score_rows(result: Mapping[str, Any]) -> list[list[ScoreCell]]:
+    """One row per place the camera was at; `result` is that of `reconstruct`."""
+    before, after = result["unpainted"], result
+    rows = [
+        _row("recorded, interpolated poses", before["recorded"], after["recorded"]),
+        _row(
+            "recorded, recorded poses",
+            before["recorded"].get("recorded_poses", {}),
+            after["recorded"].get("recorded_poses", {}),
+        ),
+        _actors(before["recorded"], after["recorded"]),
+    ]
+    for name, values in after["novel"].items():
+        rows.append(_row(name, before["novel"].get(name, {}), values))
+    return rows
+
+
+def _row(name: str, before: Mapping[str, Any], after: Mapping[str, Any]) -> list[ScoreCell]:
+    numbers = [values.get(key) for key in ("psnr", "ssim", DEPTH) for values in (before, after)]
+    return [name, *numbers, after.get("num_views")]
+
+
+def _actors(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[ScoreCell]:
+    psnr = [values.get("actors_psnr") for values in (before, after)]
+    return ["recorded, inside actor boxes", *psnr, None, None, None, None, after.get("num_views")]

@@ -1,0 +1,70 @@
+"""Library objects as artefacts and back: observations, fitted scenes, painted views.
+
+Each kind has one file of tensors (`FILES`); reading one checks every byte first.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from catalog.artefacts import ArtefactRef
+from catalog.digests import finite_or_none
+from catalog.store import Store
+from lidarpainter_models.gaussians.observations import SceneObservations
+from lidarpainter_models.gaussians.scene_graph import GaussianScene
+from tasks.tensors import read_tensors, write_tensors
+
+OBSERVATIONS_FILE = "observations.safetensors"
+SCENE_FILE = "scene.safetensors"
+HISTORY_FILE = "history.json"
+
+
+@dataclass(frozen=True, slots=True)
+class FittedRef:
+    """A fitted scene and what it was fitted to."""
+
+    observations: ArtefactRef
+    gaussians: ArtefactRef
+
+
+History = list[dict[str, float]]
+
+
+def save_observations(folder: Path, observations: SceneObservations) -> None:
+    """Write observations into a folder."""
+    write_tensors(folder / OBSERVATIONS_FILE, *observations.to_arrays())
+
+
+def load_observations(store: Store, ref: ArtefactRef) -> SceneObservations:
+    """Read the observations of an artefact."""
+    store.artefacts.verified(ref)
+    return SceneObservations.from_arrays(*read_tensors(ref.folder / OBSERVATIONS_FILE))
+
+
+def save_scene(folder: Path, scene: GaussianScene, history: History) -> None:
+    """Write a fitted scene and the course of its fit into a folder."""
+    write_tensors(folder / SCENE_FILE, *scene.to_arrays())
+    write_json(folder / HISTORY_FILE, history)
+
+
+def load_scene(store: Store, ref: ArtefactRef) -> GaussianScene:
+    """Read the fitted scene of an artefact."""
+    store.artefacts.verified(ref)
+    return GaussianScene.from_arrays(*read_tensors(ref.folder / SCENE_FILE))
+
+
+def load_history(ref: ArtefactRef) -> History:
+    """Read the course of the fit that made an artefact."""
+    return read_json(ref.folder / HISTORY_FILE)
+
+
+def write_json(path: Path, value: Any) -> None:  # noqa: ANN401 - any JSON value
+    """Write a JSON file; numbers that JSON lacks become null."""
+    text = json.dumps(finite_or_none(value), indent=1, sort_keys=True, allow_nan=False)
+    path.write_text(text + "\n", "utf-8")
+
+
+def read_json(path: Path) -> Any:  # noqa: ANN401 - any JSON value
+    """Read a JSON file."""
+    return json.loads(path.read_text("utf-8"))

@@ -1,0 +1,127 @@
+"""A stage is computed once, catalogued, measured, and never stale."""
+
+import pytest
+
+from catalog.errors import ConflictError, StorageError
+from catalog.store import open_store
+from lidarpainter_models.errors import DataError
+from tasks import stages
+from tasks.measuring import measured
+from tasks.progress import listener, listening
+
+
+class Heard:
+    def __init__(self):
+        self.events = []
+
+    def started(self, stage):
+        self.events.append(("started", stage))
+
+    def advanced(self, stage, done, total, note):
+        self.events.append(("advanced", stage, done, total, note))
+
+    def waiting(self, stage, process_id):
+        self.events.append(("waiting", stage, process_id))
+
+    def finished(self, stage, _seconds, *, is_new):
+        self.events.append(("finished", stage, is_new))
+
+
+def write_number(place):
+    (place.output / "number.txt").write_text("7")
+    listener().advanced("fit", 1, 2, "")
+    return {"num_gaussians": 3}
+
+
+def run(store, build=write_number, **changes):
+    values = {"stage": "fit", "kind": "gaussians", "inputs": {"a": "b"}, "config": {"steps": 1}}
+    return stages.run_stage(store, **{**values, **changes}, build=build)
+
+
+def test_a_stage_is_computed_once_and_entered_into_the_catalog(tmp_path):
+    store = open_store(tmp_path)
+    first = run(store)
+    second = run(store, build=pytest.fail)
+    assert (first.is_new, second.is_new) == (True, False)
+    assert first.summary["num_gaussians"] == second.summary["num_gaussians"] == 3
+    assert first.peak_memory_bytes > 1e7
+    assert first.seconds == second.seconds
+    row = store.tables.row("artefacts", first.ref.artefact_id)
+    assert row["config"] == '{"steps":1}'
+
+
+def test_a_changed_library_is_never_served_a_stale_result(tmp_path, monkeypatch):
+    store = open_store(tmp_path)
+    first = run(store)
+    monkeypatch.setattr(stages, "library_digest", lambda _kind: "another source")
+    second = run(store)
+    assert second.is_new
+    assert second.ref != first.ref
+
+
+@pytest.mark.parametrize("kind", sorted(stages.SOURCES))
+def test_every_kind_names_source_that_exists(kind):
+    assert len(stages.library_digest(kind)) == 32
+
+
+def test_the_whole_library_has_a_digest_of_its_own():
+    assert stages.library_digest() not in {stages.library_digest(kind) for kind in stages.SOURCES}
+
+
+def test_who_listens_hears_a_stage_from_start_to_end(tmp_path):
+    heard = Heard()
+    with listening(heard):
+        run(open_store(tmp_path))
+        run(open_store(tmp_path))
+    assert heard.events == [
+        ("started", "fit"),
+        ("advanced", "fit", 1, 2, ""),
+        ("finished", "fit", True),
+        ("started", "fit"),
+        ("finished", "fit", False),
+    ]
+    listener().started("fit")  # and afterwards nobody does
+    assert len(heard.events) == 5
+
+
+def test_a_failing_stage_leaves_no_artefact_and_no_row(tmp_path):
+    def fail(place):
+        (place.output / "half.txt").write_text("1")
+        raise DataError("no such picture")
+
+    store = open_store(tmp_path)
+    with pytest.raises(DataError, match="no such picture"):
+        run(store, build=fail)
+    assert store.tables.rows("artefacts") == []
+    assert list((tmp_path / "aside").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (ConflictError("busy"), True),
+        (ConnectionError("reset"), True),
+        (DataError("bad"), False),
+        (StorageError("full"), False),
+        (RuntimeError("bug"), False),
+    ],
+)
+def test_only_what_may_pass_by_itself_is_tried_again(error, expected):
+    class State:
+        def result(self, raise_on_failure):
+            assert not raise_on_failure
+            return error
+
+    assert stages.is_worth_retrying(None, None, State()) is expected
+
+
+def test_a_measurement_sees_time_and_memory():
+    with measured() as small:
+        pass
+    with measured() as large:
+        block = bytearray(200_000_000)
+        block[::4096] = b"1" * len(block[::4096])
+    del block
+    assert large.peak_memory_bytes > small.peak_memory_bytes + 150_000_000
+    assert large.seconds >= 0
+    assert large.cpu_seconds > 0
