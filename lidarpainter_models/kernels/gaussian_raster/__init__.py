@@ -6,7 +6,9 @@ are metres; the top-left pixel has its centre at (0.5, 0.5).
 """
 
 from dataclasses import dataclass
+from typing import Any
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -14,7 +16,7 @@ from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.kernels.backends import Backend, implementation
 from lidarpainter_models.kernels.gaussian_raster.splat_inputs import SplatInputs, SplatView
 
-__all__ = ["SplatImage", "render_gaussians"]
+__all__ = ["SplatImage", "accumulate_pixel_error", "render_gaussians"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -140,3 +142,30 @@ def render_gaussians(  # noqa: PLR0913 - the one door to the kernel; the scalars
         visible=visible,
         radius_px=radius_px,
     )
+
+
+def accumulate_pixel_error(
+    pixel_error: Float[Tensor, "height width"],
+    *gaussians: Tensor,
+    **camera: Any,  # noqa: ANN401 - passed on
+) -> Float[Tensor, " gaussians"]:
+    """How much of a picture's error each Gaussian drew: the sum over pixels of a_i T_i error.
+
+    Where it is large, the scene needs more Gaussians (Bulo et al. 2024, "Revising Densification
+    in Gaussian Splatting"). It is the gradient of a blended feature, so a training step that
+    already draws and goes back gets it almost for free with a feature channel of its own: give
+    zeros that require a gradient as `features` and add `(image.features[..., 0] * error).sum()` to
+    the loss.
+
+    Args:
+        pixel_error: error of the drawn picture.
+        gaussians: positional arguments of `render_gaussians`.
+        camera: keyword arguments of `render_gaussians` other than `features`.
+    """
+    share = pixel_error.new_zeros((len(gaussians[0]), 1), requires_grad=True)
+    with torch.enable_grad():
+        image = render_gaussians(
+            *(tensor.detach() for tensor in gaussians), features=share, **camera
+        )
+        (sums,) = torch.autograd.grad(image.features[..., 0], share, pixel_error.detach())
+    return sums[:, 0]

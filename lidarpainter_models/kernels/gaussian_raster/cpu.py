@@ -24,12 +24,14 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
     project,
 )
 from lidarpainter_models.kernels.gaussian_raster.projection_gradients import unproject
-from lidarpainter_models.kernels.gaussian_raster.splat_inputs import SplatInputs, SplatView
+from lidarpainter_models.kernels.gaussian_raster.splat_inputs import (
+    DrawnPictures,
+    SplatInputs,
+    SplatView,
+)
 
 ONE_AT_A_TIME = threading.Lock()
 """numba's thread pools may not be entered by two Python threads at once."""
-
-DrawnPictures = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 def draw_gaussians(

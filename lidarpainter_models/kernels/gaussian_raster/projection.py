@@ -36,8 +36,8 @@ RED, GREEN, BLUE, DEPTH = 8, 9, 10, 11
 HALF_WIDTH, HALF_HEIGHT, SIGMA, IS_VISIBLE = 12, 13, 14, 15
 
 LOG_CUT = math.log(ALPHA_CUT)
-LARGEST_PX2 = 1e30
-"""A footprint of more variance would overflow float32; nothing real comes near."""
+LARGEST = 1e30
+"""Depths, variances and opacities above this could overflow float32; nothing real comes near."""
 CHUNKS = 64
 """Gaussians are shared out in this many runs, whatever the number of threads."""
 
@@ -219,7 +219,7 @@ def _screen_opacity(
     gaussians: Gaussians, index: int, footprint: Footprint, determinant: float, view: View
 ) -> float:
     """Opacity after antialiasing; NaN where the footprint cannot be drawn."""
-    if not (determinant > 0.0 and footprint.xx + footprint.yy < LARGEST_PX2):
+    if not (determinant > 0.0 and footprint.xx + footprint.yy < LARGEST):
         return math.nan
     opacity = np.float64(gaussians.opacity[index])
     if view.antialias:
@@ -258,12 +258,14 @@ def _project_one(
     """Fill a Gaussian's record; return whether it can reach a pixel."""
     rotation, translation = transform_of(gaussians, index)
     point = v3.add(v3.apply(rotation, vector_of(gaussians.means, index)), translation)
-    if not (point[2] >= view.near and gaussians.opacity[index] >= ALPHA_CUT):
+    if not view.near <= point[2] < LARGEST:
+        return False
+    if not gaussians.opacity[index] >= ALPHA_CUT:
         return False
     footprint = footprint_of(gaussians, index, point, rotation, translation, view)
     determinant = footprint.xx * footprint.yy - footprint.xy * footprint.xy
     opacity = _screen_opacity(gaussians, index, footprint, determinant, view)
-    if not opacity >= ALPHA_CUT:
+    if not ALPHA_CUT <= opacity < LARGEST:
         return False
     log_opacity = math.log(opacity)
     reach = 2.0 * (log_opacity - LOG_CUT)

@@ -22,9 +22,11 @@ from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
     TILE_PX,
 )
 from lidarpainter_models.kernels.gaussian_raster.reference_harmonics import harmonic_basis
-from lidarpainter_models.kernels.gaussian_raster.splat_inputs import SplatInputs, SplatView
-
-DrawnPictures = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+from lidarpainter_models.kernels.gaussian_raster.splat_inputs import (
+    DrawnPictures,
+    SplatInputs,
+    SplatView,
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,11 +61,7 @@ def draw_gaussians(
     picture = torch.cat(rows, dim=0)
     if watch is not None and picture.requires_grad:
         picture.register_hook(watch.restart)
-    visible = torch.zeros(len(inputs.means), dtype=torch.bool, device=picture.device)
-    visible[screen.index] = True
-    radius_px = inputs.means.new_zeros(len(inputs.means))
-    largest = torch.linalg.eigvalsh(screen.covariance_px2.detach())[:, 1]
-    radius_px[screen.index] = 3.0 * largest.sqrt()
+    visible, radius_px = screen_radii(screen, len(inputs.means))
     alpha, values = picture[..., 0], picture[..., 1:]
     return values[..., :3], values[..., 3], alpha, values[..., 4:], visible, radius_px
 
@@ -99,6 +97,17 @@ def project_gaussians(inputs: SplatInputs, view: SplatView) -> ScreenGaussians:
         ),
         view,
     )
+
+
+def screen_radii(screen: ScreenGaussians, count: int) -> tuple[Tensor, Tensor]:
+    """Which of all Gaussians are visible, and three deviations along their longer axis, pixels."""
+    visible = torch.zeros(count, dtype=torch.bool, device=screen.index.device)
+    visible[screen.index] = True
+    radius_px = screen.half_size_px.new_zeros(count)
+    xx, xy, yy = screen.covariance_px2.detach().reshape(-1, 4)[:, [0, 1, 3]].unbind(dim=1)
+    largest = 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
+    radius_px[screen.index] = 3.0 * largest.sqrt()
+    return visible, radius_px
 
 
 def _rotation_matrices(rotation_wxyz: Float[Tensor, "visible 4"]) -> Float[Tensor, "visible 3 3"]:
@@ -168,7 +177,8 @@ def _seen(screen: ScreenGaussians, view: SplatView) -> ScreenGaussians:
     highest = centre.new_tensor([view.width_px - 0.5, view.height_px - 0.5])
     reaches = ((centre + half >= 0.5) & (centre - half <= highest)).all(dim=1)
     finite = torch.linalg.det(screen.covariance_px2.detach()) > 0
-    finite &= torch.isfinite(screen.values[:, :3].detach()).all(dim=1)
+    finite &= torch.isfinite(screen.values[:, :4].detach()).all(dim=1)
+    finite &= torch.isfinite(half).all(dim=1)
     kept = torch.nonzero(reaches & finite & (screen.opacity.detach() >= ALPHA_CUT))[:, 0]
     return _chosen(screen, kept)
 

@@ -4,10 +4,12 @@ import math
 from dataclasses import dataclass, fields
 
 import torch
-from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError, ShapeError
+
+DrawnPictures = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+"""What a backend returns: rgb, depth, alpha, features, visible and radius, as in `SplatImage`."""
 
 SH_COEFFICIENTS = (1, 4, 9, 16)
 """Number of spherical-harmonics coefficients for degree 0, 1, 2, 3."""
@@ -15,21 +17,21 @@ SH_COEFFICIENTS = (1, 4, 9, 16)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SplatInputs:
-    """The tensors of one picture; `render_gaussians` says what each means.
+    """The tensors of one picture; `render_gaussians` says what each means and its shape.
 
     Raises:
         ShapeError: sizes or kinds of numbers do not belong together.
     """
 
-    means: Float[Tensor, "gaussians 3"]
-    rotation_wxyz: Float[Tensor, "gaussians 4"]
-    scale_m: Float[Tensor, "gaussians 3"]
-    opacity: Float[Tensor, " gaussians"]
-    sh: Float[Tensor, "gaussians coefficients 3"]
-    body_index: Int[Tensor, " gaussians"]
-    camera_from_body: Float[Tensor, "bodies 4 4"]
-    features: Float[Tensor, "gaussians features"]
-    screen_offset: Float[Tensor, "gaussians 2"]
+    means: Tensor
+    rotation_wxyz: Tensor
+    scale_m: Tensor
+    opacity: Tensor
+    sh: Tensor
+    body_index: Tensor
+    camera_from_body: Tensor
+    features: Tensor
+    screen_offset: Tensor
 
     def __post_init__(self) -> None:
         """Check shapes, kinds, devices and the range of the body index."""

@@ -1,0 +1,163 @@
+"""Whatever is given, nothing crashes and no number is NaN."""
+
+import pytest
+import torch
+
+from lidarpainter_models.errors import BackendError, ConfigError, ShapeError
+from lidarpainter_models.kernels.gaussian_raster import render_gaussians
+
+BACKENDS = ["reference", "cpu"]
+
+
+def assert_finite(drawn):
+    for name in ("rgb", "depth_m", "alpha", "features"):
+        assert bool(torch.isfinite(getattr(drawn.image, name)).all()), name
+    for name, gradient in drawn.gradients.items():
+        assert bool(torch.isfinite(gradient).all()), name
+    assert bool(torch.isfinite(drawn.absolute_gradient).all())
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_no_gaussians_give_black_pictures(splats, draw, backend):
+    drawn = draw(splats(0, features=2), backend=backend, dtype=torch.float32)
+    assert drawn.image.rgb.shape == (50, 70, 3)
+    assert drawn.image.features.shape == (50, 70, 2)
+    assert drawn.image.alpha.abs().max() == 0
+    assert drawn.gradients["camera_from_body"].abs().max() == 0
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_gaussians_behind_the_camera_give_black_pictures_and_no_gradient(splats, draw, backend):
+    inputs = splats(20)
+    inputs["means"][:, 2] = -inputs["means"][:, 2].abs() - 2.0
+    drawn = draw(inputs, backend=backend, dtype=torch.float32)
+    assert drawn.image.alpha.abs().max() == 0
+    assert not drawn.image.visible.any()
+    assert not any(gradient.any() for gradient in drawn.gradients.values())
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("size_px", [(1, 1), (1, 40), (17, 15), (16, 16), (33, 1)])
+def test_any_picture_size_is_drawn(splats, draw, backend, size_px):
+    width_px, height_px = size_px
+    inputs = splats(40, width_px=width_px, height_px=height_px, features=1)
+    drawn = draw(inputs, backend=backend, dtype=torch.float32)
+    assert drawn.image.rgb.shape == (height_px, width_px, 3)
+    assert_finite(drawn)
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+@pytest.mark.parametrize(
+    "scale_m",
+    [
+        (1e-6, 1e-6, 1e-6),
+        (1e3, 1e3, 1e3),
+        (1e6, 1e-6, 1e-6),
+        (1e4, 1e4, 1e-8),
+        (0.0, 0.0, 0.0),
+        (1e-30, 1.0, 1e30),
+    ],
+)
+def test_huge_tiny_flat_and_needle_gaussians_stay_finite(splats, draw, scale_m, antialias):
+    inputs = splats(30, features=1)
+    inputs["scale_m"] = torch.tensor(scale_m).double().repeat(30, 1)
+    assert_finite(draw(inputs, backend="cpu", dtype=torch.float32, antialias=antialias))
+
+
+@pytest.mark.parametrize("scale_m", [(30.0, 0.01, 0.01), (20.0, 20.0, 0.01), (200.0, 0.01, 5.0)])
+def test_needles_and_walls_match_the_reference(splats, draw, scale_m):
+    inputs = splats(15, seed=7)
+    inputs["scale_m"] = torch.tensor(scale_m).double().repeat(15, 1)
+    inputs["opacity"] = inputs["opacity"].clamp(max=0.5)
+    expected = draw(inputs, backend="reference", dtype=torch.float64)
+    actual = draw(inputs, backend="cpu", dtype=torch.float32)
+    assert (actual.image.alpha - expected.image.alpha).detach().abs().mean() < 1e-5
+    for name in ("opacity", "sh"):
+        difference = actual.gradients[name] - expected.gradients[name]
+        # needles are sensitive: a row's place on one moves by float32 rounding times its slope
+        assert difference.norm() < 1e-4 * expected.gradients[name].norm()
+
+
+@pytest.mark.parametrize("opacity", [0.0, 1.0 / 256.0, 1.0])
+def test_extreme_opacities_stay_finite(splats, draw, opacity):
+    inputs = splats(40)
+    inputs["opacity"] = torch.full((40,), opacity).double()
+    drawn = draw(inputs, backend="cpu", dtype=torch.float32)
+    assert_finite(drawn)
+    assert bool(drawn.image.visible.any()) == (opacity == 1.0)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("name", ["means", "rotation_wxyz", "scale_m", "opacity", "sh"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_gaussian_that_is_not_finite_is_left_out(splats, backend, name, value):
+    inputs = splats(30, coefficients=1)
+    inputs = {
+        k: v.float() if torch.is_tensor(v) and v.is_floating_point() else v
+        for k, v in inputs.items()
+    }
+    rest = dict(inputs)
+    for key in (
+        "means",
+        "rotation_wxyz",
+        "scale_m",
+        "opacity",
+        "sh",
+        "body_index",
+        "features",
+        "screen_offset",
+    ):
+        rest[key] = inputs[key][1:]
+    inputs[name].view(30, -1)[0] = value
+    image = render_gaussians(**inputs, backend=backend)
+    assert not image.visible[0]
+    expected = render_gaussians(**rest, backend=backend)
+    assert torch.equal(image.rgb, expected.rgb)
+
+
+@pytest.mark.parametrize("position_m", [1e-4, 0.1, 0.100001])
+def test_gaussian_at_the_near_plane_and_far_aside_stays_finite(splats, draw, position_m):
+    inputs = splats(8)
+    inputs["camera_from_body"] = torch.eye(4).double().repeat(3, 1, 1)
+    inputs["means"] = torch.tensor([[1e4, -1e3, position_m]]).double().repeat(8, 1)
+    assert_finite(draw(inputs, backend="cpu", dtype=torch.float32))
+
+
+def test_input_that_does_not_belong_together_is_refused(splats):
+    inputs = splats(4)
+    with pytest.raises(ShapeError, match=r"opacity needs shape \(4,\)"):
+        render_gaussians(**inputs | {"opacity": torch.ones(3)})
+    with pytest.raises(ShapeError, match="1, 4, 9 or 16"):
+        render_gaussians(**inputs | {"sh": torch.ones(4, 5, 3)})
+    with pytest.raises(ShapeError, match="holds 3 bodies"):
+        render_gaussians(**inputs | {"body_index": torch.full((4,), 3)})
+    with pytest.raises(ShapeError, match="screen_gradient_out"):
+        render_gaussians(**inputs, screen_gradient_out=torch.ones(3))
+    with pytest.raises(ConfigError, match="positive focal"):
+        render_gaussians(**inputs | {"fx_px": 0.0})
+    with pytest.raises(ConfigError, match="near_m"):
+        render_gaussians(**inputs, near_m=0.0)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a CUDA device is present")
+def test_cuda_backend_is_refused_in_one_line_without_a_gpu(splats):
+    with pytest.raises(BackendError, match="no 'cuda' backend here"):
+        render_gaussians(**splats(4), backend="cuda")
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_cuda_backend_draws_as_the_reference_does(splats):
+    pytest.importorskip("gsplat")
+    inputs = splats(300, features=2)
+    inputs["opacity"] = inputs["opacity"].clamp(max=0.98)  # gsplat clamps alpha elsewhere
+    on_gpu = {
+        name: (value.float() if value.is_floating_point() else value).cuda()
+        if torch.is_tensor(value)
+        else value
+        for name, value in inputs.items()
+    }
+    expected = render_gaussians(**inputs, backend="reference")
+    actual = render_gaussians(**on_gpu, backend="cuda")
+    assert (actual.rgb.cpu() - expected.rgb).abs().mean() < 1e-5
+    assert (actual.depth_m.cpu() - expected.depth_m).abs().mean() < 1e-4
