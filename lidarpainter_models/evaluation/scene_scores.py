@@ -13,7 +13,11 @@ from lidarpainter_models.evaluation.judged_views import Renderer, ViewScores, sc
 from lidarpainter_models.gaussians.scene_graph import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectories import Shift
-from lidarpainter_models.metrics.depth import pooled_inlier_fraction, score_depth
+from lidarpainter_models.metrics.depth import (
+    DepthScores,
+    pooled_inlier_fraction,
+    score_depth,
+)
 from lidarpainter_models.metrics.squeezenet import SqueezeNetDistance
 from lidarpainter_models.painter.protocol import Painter
 from lidarpainter_models.scenes.synthetic.street import SyntheticStreet
@@ -110,17 +114,16 @@ def score_geometry(
     fitted: GaussianScene,
     shifts: Sequence[Shift],
     *,
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, float | None]:
     """Part of held-out LiDAR pixels that the rendered depth meets within 5 %, per trajectory."""
-    fractions: dict[str, float | None] = {}
-    for shift in (Shift(), *shifts):
-        if progress is not None:
-            progress(shift.name)
-        scores = []
-        for view in held_out.test_views:
+    scores: dict[str, list[DepthScores]] = {shift.name: [] for shift in (Shift(), *shifts)}
+    for done, view in enumerate(held_out.test_views, start=1):
+        points = held_out.points_at(view)  # costs more than all the renders of the view
+        for shift in (Shift(), *shifts):
             camera = held_out.shifted_camera(fitted, view, shift)
             depth_m = fitted.render(camera, view.timestamp_ns).depth_m
-            scores.append(score_depth(depth_m, camera, held_out.points_at(view)))
-        fractions[shift.name] = pooled_inlier_fraction(scores)
-    return fractions
+            scores[shift.name].append(score_depth(depth_m, camera, points))
+        if progress is not None:
+            progress(done, len(held_out.test_views))
+    return {name: pooled_inlier_fraction(found) for name, found in scores.items()}
