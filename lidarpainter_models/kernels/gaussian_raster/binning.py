@@ -26,6 +26,7 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
     MEAN_Y_FRACTION,
     SHEAR,
 )
+from lidarpainter_models.kernels.gaussian_raster.work_sharing import jump_of
 
 RUNS = 16
 """The depth order is cut into this many runs that are listed independently of each other."""
@@ -217,14 +218,17 @@ def list_tiles(records: np.ndarray, width: int, height: int) -> TileLists:
     count = len(order)
     entry_count = np.empty(count, np.int64)
     tile_count = np.zeros((RUNS, columns * rows), np.int64)
-    for run in numba.prange(RUNS):
+    jump = jump_of(RUNS)
+    for place in numba.prange(RUNS):
+        run = place * jump % RUNS
         span = (run * count // RUNS, (run + 1) * count // RUNS)
         _count_run(records, order, span, (columns, rows), entry_count, tile_count[run])
     tile_first, entry_first = _starts(tile_count, entry_count)
     gaussian = np.empty(tile_first[-1], np.int32)
     entry = np.empty(tile_first[-1], np.int32)
     lists = TileLists(columns, rows, tile_first, gaussian, order, entry_first, entry)
-    for run in numba.prange(RUNS):
+    for place in numba.prange(RUNS):
+        run = place * jump % RUNS
         span = (run * count // RUNS, (run + 1) * count // RUNS)
         _list_run(records, lists, span, tile_count[run])
     return lists

@@ -33,6 +33,7 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
     RED,
     SHEAR,
 )
+from lidarpainter_models.kernels.gaussian_raster.work_sharing import jump_of
 
 PIXELS = TILE_PX * TILE_PX
 CHECK_EVERY = 16
@@ -53,15 +54,6 @@ ZERO = np.float32(0.0)
 ONE = np.float32(1.0)
 FAR = np.float32(-5.7)
 """Exponents are held above this, where `lane_exp` is accurate and alpha is under the cut."""
-
-
-@numba.njit(**EXACT)
-def tile_order(place: int, tiles: int) -> int:
-    """A shuffled tile number, so that equal shares of tiles are about equal work.
-
-    Sky tiles are empty and road tiles are full; threads take contiguous shares.
-    """
-    return place * 2 if place * 2 < tiles else (place - (tiles + 1) // 2) * 2 + 1
 
 
 @numba.njit(**EXACT)
@@ -204,6 +196,7 @@ def blend(
     picture = np.empty((height, width, 4 + features.shape[1]), np.float32)
     light = np.empty((height, width), np.float32)
     tiles = lists.columns * lists.rows
+    jump = jump_of(tiles)
     for place in numba.prange(tiles):
-        _draw_tile(records, features, lists, tile_order(place, tiles), picture, light)
+        _draw_tile(records, features, lists, place * jump % tiles, picture, light)
     return picture, light

@@ -27,7 +27,6 @@ from lidarpainter_models.kernels.gaussian_raster.blending import (
     has_light,
     local_centre,
     place_pixels,
-    tile_order,
     tile_rows_of,
 )
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import TILE_PX
@@ -45,6 +44,7 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
     RED,
     SHEAR,
 )
+from lidarpainter_models.kernels.gaussian_raster.work_sharing import jump_of
 
 # Sums over pixels of an entry, with g the gradient of the exponent, u and dy the pixel's offset
 # in the sheared frame of the footprint (`projection`).
@@ -256,13 +256,16 @@ def gaussian_sums(
     entries, channels = len(lists.gaussian), features.shape[1]
     slots = np.empty((entries, SLOT_FLOATS), np.float32)
     feature_slots = np.empty((entries, channels), np.float32)
+    jump = jump_of(tiles)
     for place in numba.prange(tiles):
-        tile = tile_order(place, tiles)
+        tile = place * jump % tiles
         _tile_sums(records, features, lists, tile, image, slots, feature_slots)
     sums = np.zeros((len(records), SUMS), np.float64)
     feature_sums = np.zeros((len(records), channels), np.float64)
     visible = len(lists.order)
-    for run in numba.prange(CHUNKS):
+    jump = jump_of(CHUNKS)
+    for place in numba.prange(CHUNKS):
+        run = place * jump % CHUNKS
         first, end = run * visible // CHUNKS, (run + 1) * visible // CHUNKS
         _add_entries(lists, slots, feature_slots, first, end, sums, feature_sums)
     return sums, feature_sums

@@ -24,6 +24,7 @@ from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
 )
 from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry
 from lidarpainter_models.kernels.gaussian_raster.small_vectors import Matrix, Quaternion, Vector
+from lidarpainter_models.kernels.gaussian_raster.work_sharing import jump_of
 
 RECORD_FLOATS = 16
 """A Gaussian's screen record fills one 64-byte cache line."""
@@ -295,7 +296,9 @@ def project(gaussians: Gaussians, view: View) -> np.ndarray:
     """
     count = len(gaussians.means)
     records = np.empty((count, RECORD_FLOATS), np.float32)
-    for run in numba.prange(CHUNKS):
+    jump = jump_of(CHUNKS)
+    for place in numba.prange(CHUNKS):
+        run = place * jump % CHUNKS
         first, end = run * count // CHUNKS, (run + 1) * count // CHUNKS
         _project_run(gaussians, view, first, end, records)
     return records

@@ -44,6 +44,7 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
     view_direction,
 )
 from lidarpainter_models.kernels.gaussian_raster.small_vectors import Matrix, Vector
+from lidarpainter_models.kernels.gaussian_raster.work_sharing import jump_of
 
 
 class Gradients(NamedTuple):
@@ -276,6 +277,7 @@ def unproject(gaussians: Gaussians, view: View, records: np.ndarray, sums: np.nd
         np.zeros(count, np.float32),
         np.zeros((CHUNKS, bodies, 3, 4)),
     )
-    for run in numba.prange(CHUNKS):
-        _unproject_run(gaussians, view, records, sums, gradients, run)
+    jump = jump_of(CHUNKS)
+    for place in numba.prange(CHUNKS):
+        _unproject_run(gaussians, view, records, sums, gradients, place * jump % CHUNKS)
     return gradients
