@@ -35,8 +35,9 @@ DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -
 class LidarImageConfig:
     """How LiDAR points become a picture. Angles make every length follow the resolution."""
 
-    window_s: float = 1.0
-    """Street points measured at most this long before or after the picture are used."""
+    window_s: float = 2.0
+    """Street points measured at most this long before or after the picture are used: the street
+    stands still, and views ahead of the log have only older points."""
     recency_s: float = 0.4
     """A point this much older weighs e times less in the blend."""
     beam_spacing_rad: float = 0.004
