@@ -1,0 +1,67 @@
+"""How the recording car moves: along its lane, a little unsteady, never perfectly level."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarpainter_models.scenes.synthetic.street_line import StreetLine
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EgoMotion:
+    """Pose of the ego frame (on the ground below the LiDAR) over time; the identity at time 0."""
+
+    line: StreetLine
+    speed_mps: float
+    acceleration_mps2: float
+    sway_m: float
+    sway_hz: float
+    wobble_rad: tuple[float, float]
+    """Amplitude of roll and pitch."""
+    wobble_hz: tuple[float, float]
+    phase_rad: tuple[float, float]
+
+    def travelled_m(self, time_s: np.ndarray | float) -> np.ndarray:
+        """Distance along the street."""
+        time_s = np.asarray(time_s, float)
+        return self.speed_mps * time_s + 0.5 * self.acceleration_mps2 * time_s**2
+
+    def world_from_ego(self, time_s: np.ndarray) -> np.ndarray:
+        """(n, 4, 4)."""
+        time_s = np.atleast_1d(np.asarray(time_s, float))
+        swing = 2 * np.pi * self.sway_hz
+        aside = self.sway_m * (1 - np.cos(swing * time_s))
+        speed = self.speed_mps + self.acceleration_mps2 * time_s
+        yaw = np.arctan2(self.sway_m * swing * np.sin(swing * time_s), np.maximum(speed, 0.5))
+        poses = self.line.poses(self.travelled_m(time_s), aside, yaw)
+        for axis in (0, 1):
+            angle = self._wobble(time_s, axis)
+            cosine, sine = np.cos(angle), np.sin(angle)
+            turn = np.tile(np.eye(4), (time_s.size, 1, 1))
+            first, second = ((1, 2), (2, 0))[axis]
+            turn[:, first, first], turn[:, second, second] = cosine, cosine
+            turn[:, second, first], turn[:, first, second] = sine, -sine
+            poses = poses @ turn
+        return poses
+
+    def _wobble(self, time_s: np.ndarray, axis: int) -> np.ndarray:
+        """Roll (0) or pitch (1), zero at time 0."""
+        rate, phase = 2 * np.pi * self.wobble_hz[axis], self.phase_rad[axis]
+        fast = np.sin(rate * time_s + phase) - np.sin(phase)
+        slow = np.sin(0.37 * rate * time_s)
+        return self.wobble_rad[axis] * (0.6 * fast + 0.4 * slow)
+
+
+def draw_ego_motion(line: StreetLine, rng: np.random.Generator, *, duration_s: float) -> EgoMotion:
+    """A drive between 4 and 9 m/s."""
+    first, last = rng.uniform(4.0, 8.0), rng.uniform(5.0, 9.0)
+    return EgoMotion(
+        line=line,
+        speed_mps=first,
+        acceleration_mps2=float(np.clip((last - first) / max(duration_s, 1.0), -1.5, 1.5)),
+        sway_m=rng.uniform(-0.08, 0.08),
+        sway_hz=rng.uniform(0.1, 0.25),
+        wobble_rad=(rng.uniform(0.0005, 0.0015), rng.uniform(0.0008, 0.002)),
+        wobble_hz=(rng.uniform(0.7, 1.4), rng.uniform(1.0, 1.9)),
+        phase_rad=(rng.uniform(0, 6.28), rng.uniform(0, 6.28)),
+    )
