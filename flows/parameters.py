@@ -2,20 +2,22 @@
 
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from lidarpainter_models.conditioning.conditions import ConditionConfig
 from lidarpainter_models.conditioning.novel_guidance import NovelGuidanceConfig
+from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.scene_scores import ScoringConfig
 from lidarpainter_models.gaussians.fit_config import FitConfig
 from lidarpainter_models.gaussians.observations import ObservationConfig
 from tasks.evaluate import JudgeSettings
 from tasks.paint import PaintSettings
+from tasks.runs import FinishedRun
 from tasks.scenes import SplitSpec
 
 
-class ReconstructParameters(BaseModel):
-    """One scene, and everything that decides what becomes of it."""
+class ViewParameters(BaseModel):
+    """What decides how a fitted scene is seen and judged."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -28,20 +30,11 @@ class ReconstructParameters(BaseModel):
     train_cameras: tuple[str, ...] | None = None
     """Cameras to train on and to judge; None takes all."""
     observation: ObservationConfig
-    fit: FitConfig
-    """The fit to what was recorded."""
     painter: str
     """Name of a painter, path of its weights, or `none`: then the fit goes on as long without
     painted views, which is the control for the painted one."""
-    novel: NovelGuidanceConfig
     conditions: ConditionConfig
-    rounds: int = Field(ge=0)
-    """How often views are painted and the fit goes on."""
-    refine: FitConfig
-    """The fit of one round."""
     scoring: ScoringConfig
-    judge_view_time: bool = False
-    """Also judge what the final scene shows when it is painted at view time."""
     feature_weights: Path | None = None
     """SqueezeNet 1.1 weights for the feature distance; None leaves it out."""
 
@@ -49,11 +42,6 @@ class ReconstructParameters(BaseModel):
     def split_spec(self) -> SplitSpec:
         """Which views may be seen."""
         return SplitSpec(scene_id=self.scene, spec=self.split, cameras=self.train_cameras)
-
-    @property
-    def paint_settings(self) -> PaintSettings:
-        """How novel views are painted."""
-        return PaintSettings(painter=self.painter, novel=self.novel, conditions=self.conditions)
 
     @property
     def judge_settings(self) -> JudgeSettings:
@@ -64,3 +52,40 @@ class ReconstructParameters(BaseModel):
             conditions=self.conditions,
             feature_weights=self.feature_weights,
         )
+
+
+class ReconstructParameters(ViewParameters):
+    """One scene, and everything that decides what becomes of it."""
+
+    fit: FitConfig
+    """The fit to what was recorded."""
+    novel: NovelGuidanceConfig
+    rounds: int = Field(ge=0)
+    """How often views are painted and the fit goes on."""
+    refine: FitConfig
+    """The fit of one round."""
+    judge_view_time: bool = False
+    """Also judge what the final scene shows when it is painted at view time."""
+
+    @property
+    def paint_settings(self) -> PaintSettings:
+        """How novel views are painted."""
+        return PaintSettings(painter=self.painter, novel=self.novel, conditions=self.conditions)
+
+
+def view_parameters(run: FinishedRun) -> ViewParameters:
+    """How a finished run was seen and judged; how it was fitted may be of another version.
+
+    Raises:
+        ConfigError: this version knows other settings.
+    """
+    known = {name: run.parameters.get(name) for name in ViewParameters.model_fields}
+    try:
+        return ViewParameters.model_validate(known)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise ConfigError(
+            f"run {run.run_id} has settings of another version: {place}: {first['msg']}; "
+            "reconstruct the scene again"
+        ) from None

@@ -124,7 +124,8 @@ def _scores(
     only_camera = cameras[0] if len(cameras) == 1 else None
     recorded = score_recorded(render(only_camera), held_out, scene, feature_distance=distance)
     told.next()
-    novel: dict[str, dict[str, Any]] = {shift.name: {} for shift in shifts}
+    num_views = len(held_out.test_views)
+    novel = {shift.name: _without_truth(num_views) for shift in shifts}
     if GENERATOR_ENTRY in held_out.scene.manifest:
         street = SyntheticStreet.from_manifest(held_out.scene.manifest)
         novel = score_synthetic(
@@ -136,6 +137,20 @@ def _scores(
         place["depth_within_5_percent"] = fraction
     told.next()
     return {"recorded": recorded, "novel": novel}
+
+
+def _without_truth(num_views: int) -> dict[str, Any]:
+    """The figures of a place where nobody took a picture."""
+    missing = dict.fromkeys(("psnr", "ssim", "lpips", "fid", "kid"))
+    return {
+        **missing,
+        "psnr_reason": "nobody took pictures there",
+        "ssim_reason": "nobody took pictures there",
+        "lpips_reason": "nobody took pictures there",
+        "fid_reason": "Inception weights are user-supplied and none were given",
+        "kid_reason": "Inception weights are user-supplied and none were given",
+        "num_views": num_views,
+    }
 
 
 class _Steps:

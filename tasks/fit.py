@@ -17,7 +17,7 @@ from tasks.progress import listener
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
 from tasks.stored import load_observations, load_scene, save_scene
 
-CHECKPOINT_EVERY_S = 20.0
+CHECKPOINT_EVERY_S = 10.0
 """A killed fit repeats at most this much."""
 
 

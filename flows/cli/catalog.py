@@ -19,6 +19,8 @@ SHOWN_COLUMNS = {
 }
 JSON_COLUMNS = ("parameters", "stage_seconds", "result", "inputs", "config", "summary", "record")
 """Columns that hold JSON text: shown as what they hold."""
+LONGEST_JSON = 120
+"""Characters of such a column in a table."""
 
 
 @app.command("list")
@@ -95,4 +97,7 @@ def _cell(name: str, value: Any) -> Cell:  # noqa: ANN401 - any value of a table
         return format_bytes(value) if value is not None and name.endswith("bytes") else value
     if isinstance(value, list):
         return ", ".join(value)
-    return value.isoformat(timespec="seconds") if hasattr(value, "isoformat") else str(value)
+    if hasattr(value, "isoformat"):
+        return value.isoformat(timespec="seconds")
+    is_long = name in JSON_COLUMNS and len(value) > LONGEST_JSON
+    return f"{value[:LONGEST_JSON]}... (--json shows all)" if is_long else str(value)

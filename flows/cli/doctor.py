@@ -43,6 +43,8 @@ def doctor(
         print_json({"subject": subject or "environment", "is_fit": is_fit, "findings": rows})
     else:
         cells = [[finding.name, finding.verdict, finding.detail] for finding in findings]
-        print_table(subject or "environment", ["what", "verdict", "detail"], cells)
+        print_table(
+            subject or "environment", ["what", "verdict", "detail"], cells, num_text_columns=3
+        )
     if not is_fit:
         raise typer.Exit(UNFIT)

@@ -22,15 +22,22 @@ def print_json(result: Mapping[str, Any]) -> None:
 
 
 def print_table(
-    title: str, columns: Sequence[str], rows: Iterable[Sequence[Cell]], note: str = ""
+    title: str,
+    columns: Sequence[str],
+    rows: Iterable[Sequence[Cell]],
+    note: str = "",
+    *,
+    num_text_columns: int = 1,
 ) -> None:
-    """A table on stdout; an absent value is a dash."""
+    """A table on stdout; an absent value is a dash, columns after the text ones stand right."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=FILE_WIDTH)
     table = Table(title=title, title_justify="left", title_style="bold")
     for index, column in enumerate(columns):
-        table.add_column(column, overflow="fold", justify="left" if index == 0 else "right")
+        table.add_column(
+            column, overflow="fold", justify="left" if index < num_text_columns else "right"
+        )
     for row in rows:
         table.add_row(*(format_cell(cell) for cell in row))
     console.print(table)
@@ -40,7 +47,7 @@ def print_table(
 
 def print_pairs(title: str, pairs: Mapping[str, Cell], note: str = "") -> None:
     """A table of two columns: what, and its value."""
-    print_table(title, ["what", "value"], list(pairs.items()), note)
+    print_table(title, ["what", "value"], list(pairs.items()), note, num_text_columns=2)
 
 
 def complain(message: str) -> None:

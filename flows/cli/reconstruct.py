@@ -33,6 +33,7 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Turn a stored scene into a fitted, painted, judged and reported one."""
+    from catalog.store import open_store
     from flows.cli.ingest import parse_names
     from flows.cli.running import run_reconstruction
     from flows.overrides import with_overrides
@@ -49,7 +50,7 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     if shift is not None or up is not None:
         changes["novel"] = shifted(parameters.novel, shift, up)
     parameters = with_overrides(parameters.model_copy(update=changes), settings or [])
-    result = run_reconstruction(parameters)
+    result = run_reconstruction(parameters, open_store())
     if as_json:
         print_json(result)
     else:

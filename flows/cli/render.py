@@ -33,7 +33,7 @@ def render(  # noqa: PLR0913 - the options of a command
     from catalog.store import open_store
     from flows.cli.ingest import parse_frames
     from flows.cli.progress import shown_progress
-    from flows.parameters import ReconstructParameters
+    from flows.parameters import view_parameters
     from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
     from tasks.render import RenderRequest
     from tasks.render import render as render_task
@@ -42,7 +42,7 @@ def render(  # noqa: PLR0913 - the options of a command
     path = parse_trajectory(trajectory)
     store = open_store()
     finished = open_run(store, run)
-    parameters = ReconstructParameters.model_validate(finished.parameters)
+    parameters = view_parameters(finished)
     request = RenderRequest(
         trajectory=path,
         camera=camera,

@@ -1,16 +1,32 @@
-"""Run a flow from a command: a store, a Prefect server, progress, quiet threads."""
+"""Run a flow from a command: with a Prefect server, and progress on stderr."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
-from catalog.store import open_store
+from catalog.store import Store
 from flows.cli.progress import shown_progress
 from flows.parameters import ReconstructParameters
-from flows.reconstruct import reconstruct
 from flows.server import prefect_server
 
 
-def run_reconstruction(parameters: ReconstructParameters) -> dict[str, Any]:
-    """Reconstruct one scene of the store, drawing progress on stderr."""
-    store = open_store()
-    with prefect_server(store.root / "logs" / "prefect.log"), shown_progress():
+def run_reconstruction(parameters: ReconstructParameters, store: Store) -> dict[str, Any]:
+    """Reconstruct one scene of the store."""
+    from flows.reconstruct import reconstruct
+
+    with _running(store):
         return reconstruct(parameters, store.root)
+
+
+def run_demo(parameters: ReconstructParameters, store: Store) -> dict[str, Any]:
+    """Make the demo's street in the store and reconstruct it."""
+    from flows.demo import demo, demo_street
+
+    with _running(store):
+        return demo(demo_street(), parameters, store.root)
+
+
+@contextmanager
+def _running(store: Store) -> Iterator[None]:
+    with prefect_server(store.root / "logs" / "prefect.log"), shown_progress():
+        yield

@@ -1,0 +1,98 @@
+"""`lidarpainter evaluate`: judge a finished run again, or under another protocol."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from flows.cli.output import print_json, print_table
+from lidarpainter_models.errors import ConfigError
+
+PROTOCOLS = ("paper", "truth")
+
+
+def evaluate(
+    run: Annotated[str, typer.Argument(help="A run id, a unique prefix of one, or latest.")],
+    protocol: Annotated[str, typer.Option(help=f"{' or '.join(PROTOCOLS)}.")] = "paper",
+    postpaint: Annotated[
+        bool, typer.Option("--postpaint", help="Judge what is painted at view time as well.")
+    ] = False,
+    painter: Annotated[
+        str | None, typer.Option(help="Painter for --postpaint; the run's own if absent.")
+    ] = None,
+    feature_weights: Annotated[
+        Path | None, typer.Option(help="SqueezeNet 1.1 weights for the feature distance.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Judge a finished run on views it never saw."""
+    if protocol not in PROTOCOLS:
+        raise ConfigError(f"no protocol {protocol!r}, expected {' or '.join(PROTOCOLS)}")
+
+    from catalog.store import open_store
+    from flows.cli.progress import shown_progress
+    from flows.parameters import view_parameters
+    from tasks.evaluate import evaluate as evaluate_task
+    from tasks.runs import open_run
+    from tasks.scores import load_scores
+
+    store = open_store()
+    finished = open_run(store, run)
+    parameters = view_parameters(finished)
+    if feature_weights is not None:
+        parameters = parameters.model_copy(update={"feature_weights": feature_weights})
+    variants: dict[str, tuple[Any, str | None]] = {
+        "unpainted": (finished.unpainted, None),
+        "painted": (finished.final, None),
+    }
+    if postpaint or painter:
+        variants["view-time"] = (finished.final, painter or parameters.painter)
+    scores = {}
+    with shown_progress():
+        for name, (fitted, chosen) in variants.items():
+            judged = evaluate_task.fn(
+                store.root,
+                f"evaluate-{name}",
+                parameters.split_spec,
+                fitted,
+                parameters.judge_settings,
+                chosen,
+            )
+            scores[name] = load_scores(judged.ref)
+    if protocol == "truth":
+        scores = {name: _with_truth(found, finished.scene_id) for name, found in scores.items()}
+    result = {"run_id": finished.run_id, "scene": finished.scene_id, "protocol": protocol, **scores}
+    if as_json:
+        print_json(result)
+    else:
+        _show(result, list(variants))
+
+
+def _with_truth(scores: dict[str, Any], scene_id: str) -> dict[str, Any]:
+    """Only views whose true picture is known beside the path.
+
+    Raises:
+        ConfigError: the scene has no such truth.
+    """
+    known = {name: found for name, found in scores["novel"].items() if found.get("psnr")}
+    if not known:
+        raise ConfigError(
+            f"scene {scene_id} has no true pictures beside its path; only synthetic streets have"
+        )
+    return {"novel": known}
+
+
+def _show(result: dict[str, Any], variants: list[str]) -> None:
+    from tasks.scores import metric_values
+
+    numbers: dict[tuple[str, str, str], dict[str, float | None]] = {}
+    for variant in variants:
+        for protocol, trajectory, name, value, _reason in metric_values(result[variant]):
+            numbers.setdefault((protocol, trajectory, name), {})[variant] = value
+    rows = [
+        [*key, *(found.get(name) for name in variants)]
+        for key, found in numbers.items()
+        if any(value is not None for value in found.values())
+    ]
+    title = f"{result['scene']}, run {result['run_id']}"
+    print_table(title, ["truth", "view", "figure", *variants], rows, num_text_columns=3)

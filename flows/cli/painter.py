@@ -1,0 +1,239 @@
+"""`lidarpainter painter`: harvest pairs, train painters, judge them, and say what they are."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from flows.cli.output import Cell, format_bytes, print_json, print_pairs, print_table
+from flows.cli.painter_options import (
+    parse_inputs,
+    parse_paths,
+    parse_seeds,
+    with_length,
+    write_painter,
+)
+
+app = typer.Typer(help="Train painters, judge them, say what they are.", no_args_is_help=True)
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Any other setting: training.batch_size=4. May be repeated."),
+]
+Seeds = Annotated[
+    str | None, typer.Option(help="Synthetic streets by seed: 1000:1004 or 1000,1007.")
+]
+Scenes = Annotated[
+    list[str] | None, typer.Option("--scene", help="A stored scene. May be repeated.")
+]
+Split = Annotated[str, typer.Option(help="Split of recorded scenes: forward:17:8, alternate.")]
+Cameras = Annotated[
+    str | None, typer.Option(help="Cameras of recorded scenes, with commas between.")
+]
+Features = Annotated[
+    Path | None, typer.Option(help="SqueezeNet 1.1 weights for the feature distance.")
+]
+Budget = Annotated[float | None, typer.Option(help="CPU seconds of training.")]
+Steps = Annotated[int | None, typer.Option(help="Optimiser steps of training.")]
+
+
+@app.command("harvest")
+def harvest(
+    seeds: Seeds = None,
+    scenes: Scenes = None,
+    split: Split = "alternate",
+    cameras: Cameras = None,
+    settings: Settings = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make pairs for training or judging; seeds below 1000 can only judge."""
+    from flows.cli.training import harvest_parameters, run_harvest
+    from flows.overrides import with_overrides
+
+    parameters = harvest_parameters(parse_seeds(seeds), scenes, split, cameras)
+    result = run_harvest(with_overrides(parameters, settings or []))
+    if as_json:
+        print_json(result)
+    else:
+        _show_pairs(result["pairs"])
+
+
+@app.command("train")
+def train(  # noqa: PLR0913 - the options of a command
+    seeds: Seeds = None,
+    scenes: Scenes = None,
+    split: Split = "alternate",
+    cameras: Cameras = None,
+    pairs: Annotated[
+        list[str] | None,
+        typer.Option(help="A folder of pairs harvested before. May be repeated."),
+    ] = None,
+    budget: Budget = None,
+    steps: Steps = None,
+    inputs: Annotated[
+        str, typer.Option(help="What the painter may see, with commas between.")
+    ] = "render,lidar,warp",
+    held_back: Annotated[
+        float, typer.Option(help="Share of the true pictures kept from training, to judge by.")
+    ] = 0.1,
+    feature_weights: Features = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder, or .safetensors file, for the weights and their record."),
+    ] = None,
+    settings: Settings = None,
+    as_json: AsJson = False,
+) -> None:
+    """Train the small painter; a killed training goes on where it stopped."""
+    from flows.cli.training import run_training, train_parameters
+    from flows.overrides import with_overrides
+
+    parameters = train_parameters(
+        parse_seeds(seeds), scenes, split, cameras, parse_paths(pairs, "--pairs")
+    )
+    training = with_length(parameters.training, parse_inputs(inputs), budget, steps)
+    changes = {"training": training, "held_back": held_back, "feature_weights": feature_weights}
+    parameters = with_overrides(parameters.model_copy(update=changes), settings or [])
+    result = run_training(parameters)
+    if out is not None:
+        result |= write_painter(Path(result["weights"]), result["record"], out)
+    if as_json:
+        print_json(result)
+    else:
+        _show_training(result)
+
+
+@app.command("evaluate")
+def evaluate(
+    painters: Annotated[
+        list[str], typer.Option("--painter", help="A name or a weights file. May be repeated.")
+    ],
+    pairs: Annotated[list[str], typer.Option(help="A folder of pairs. May be repeated.")],
+    feature_weights: Features = None,
+    as_json: AsJson = False,
+) -> None:
+    """Judge painters on pairs that none of them was trained on."""
+    from flows.cli.training import judge
+
+    found = judge(
+        parse_paths(painters, "--painter"), parse_paths(pairs, "--pairs"), feature_weights
+    )
+    if as_json:
+        print_json(found)
+    else:
+        _show_scores(found)
+
+
+@app.command("info")
+def info(
+    painter: Annotated[str, typer.Option(help="A painter's name, or a weights file.")] = "nano",
+    as_json: AsJson = False,
+) -> None:
+    """Say what a painter is and how it was trained."""
+    from lidarpainter_models.painter import BUNDLED_NANO, load_painter
+    from lidarpainter_models.painter.description import describe_painter
+    from tasks.painters import painter_digest
+
+    found = describe_painter(load_painter(painter))
+    path = BUNDLED_NANO if painter == "nano" else Path(painter)
+    result = {
+        "painter": painter,
+        "digest": painter_digest(painter),
+        "num_bytes": path.stat().st_size if path.is_file() else 0,
+        **found,
+    }
+    if as_json:
+        print_json(result)
+    else:
+        _show_info(result)
+
+
+@app.command("ablate")
+def ablate(
+    pairs_train: Annotated[
+        list[str], typer.Option(help="A folder of pairs to learn from. May be repeated.")
+    ],
+    pairs_test: Annotated[
+        list[str], typer.Option(help="A folder of pairs to judge by. May be repeated.")
+    ],
+    budget: Budget = None,
+    steps: Steps = None,
+    feature_weights: Features = None,
+    settings: Settings = None,
+    as_json: AsJson = False,
+) -> None:
+    """Train painters that see only some of the inputs, and judge all of them alike."""
+    from flows.cli.training import ablation_parameters, run_ablation
+    from flows.overrides import with_overrides
+
+    parameters = ablation_parameters(
+        parse_paths(pairs_train, "--pairs-train"), parse_paths(pairs_test, "--pairs-test")
+    )
+    training = parameters.training
+    training = with_length(training, training.network.inputs, budget, steps)
+    changes = {"training": training, "feature_weights": feature_weights}
+    parameters = with_overrides(parameters.model_copy(update=changes), settings or [])
+    result = run_ablation(parameters)
+    if as_json:
+        print_json(result)
+    else:
+        _show_scores(result)
+
+
+def _show_pairs(pairs: list[dict[str, Any]]) -> None:
+    columns = ("set", "num_pairs", "num_targets", "cpu_seconds", "folder")
+    rows = [[made[name] for name in columns] for made in pairs]
+    print_table("pairs", ["set", "pairs", "true pictures", "CPU s", "folder"], rows)
+
+
+def _show_training(result: dict[str, Any]) -> None:
+    if result["held_back"] is not None:
+        from tasks.judge_painter import PAINTING_COLUMNS, PAINTING_NOTE, painting_rows
+
+        rows = painting_rows({"painted": result["held_back"]})
+        count = result["held_back"]["total"]["num_pairs"]
+        print_table(f"{count} pairs held back", PAINTING_COLUMNS, rows, PAINTING_NOTE)
+    pairs: dict[str, Cell] = {
+        "painter": result["painter_id"],
+        "weights": result["weights"],
+        "size": format_bytes(result["num_bytes"]),
+        "steps": result["record"]["steps"],
+        "pairs": result["record"]["num_pairs"],
+        "training, CPU s": result["record"]["cpu_s"],
+        "record": result.get("record_path"),
+    }
+    print_pairs("painter", pairs)
+
+
+def _show_scores(found: dict[str, Any]) -> None:
+    from tasks.judge_painter import PAINTING_COLUMNS, PAINTING_NOTE, painting_rows
+
+    judged = {name: counts for name, counts in found["pairs"].items() if counts["num_judged"]}
+    sources: list[str | None] = [*judged, None] if len(judged) > 1 else [None]
+    for source in sources:
+        count = sum(one["num_judged"] for name, one in judged.items() if source in (None, name))
+        rows = painting_rows(found["painters"], source)
+        note = PAINTING_NOTE if source is None else ""
+        print_table(f"{source or 'all'}: {count} pairs", PAINTING_COLUMNS, rows, note)
+    for name, counts in found["pairs"].items():
+        if counts["num_left_out"]:
+            typer.echo(f"{name}: {counts['num_left_out']} pairs left out, a painter knows them")
+    for label in found["training_unknown"]:
+        typer.echo(f"{label}: its weights do not say which pairs it was trained on")
+
+
+def _show_info(result: dict[str, Any]) -> None:
+    pairs: dict[str, Cell] = {
+        "architecture": result["architecture"]["summary"],
+        "size": format_bytes(result["num_bytes"]),
+        "parameters": result["num_parameters"],
+        **{f"parameters, {name}": count for name, count in result["parameters"].items()},
+        "licence": result["licence"],
+    }
+    for name, value in (*result["architecture"].items(), *result["provenance"].items()):
+        if name == "trained_targets":
+            pairs["true pictures trained on"] = len(value)
+        elif name != "summary":
+            pairs[name] = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+    print_pairs(f"painter {result['painter']}", pairs)

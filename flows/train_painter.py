@@ -1,0 +1,202 @@
+"""From scenes to a trained painter: harvest pairs, train, judge on pairs held back, publish.
+
+The ablation trains painters that see only some of the inputs, on the same pairs at the same
+budget, and judges all of them on the same other pairs.
+"""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from prefect import flow
+from pydantic import BaseModel, ConfigDict
+
+from lidarpainter_models.conditioning.harvest import HarvestConfig
+from lidarpainter_models.conditioning.street_harvest import StreetPlan, default_street_plans
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.evaluation.held_back import (
+    FIRST_TRAINING_SEED,
+    check_street_seed,
+    check_training_scene,
+)
+from lidarpainter_models.painter import OverlayPainter, UnpaintedPainter, WarpPainter
+from lidarpainter_models.painter.training import NanoTrainingConfig
+from lidarpainter_models.scenes.synthetic.config import SyntheticStreetConfig
+from tasks.harvest import (
+    PairSet,
+    harvest_recorded,
+    harvest_street,
+    keep_street,
+    pair_set,
+    street_id,
+)
+from tasks.judge_painter import judge_held_back, judge_painters, load_painting_scores
+from tasks.scenes import SplitSpec
+from tasks.stages import StageResult
+from tasks.train_painter import publish_painter, train, training_record, weights_path
+
+SYNTHETIC = "synthetic/"
+UNLEARNED = (UnpaintedPainter.name, OverlayPainter.name, WarpPainter.name)
+ABLATED_INPUTS = (
+    ("render",),
+    ("lidar",),
+    ("render", "lidar"),
+    ("render", "warp"),
+    ("render", "lidar", "warp"),
+)
+"""What the painters of an ablation may see: the paper's three rows, and what the warp adds."""
+
+
+class HarvestParameters(BaseModel):
+    """Where pairs come from."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    street_seeds: tuple[int, ...] = ()
+    """Synthetic streets to draw and to harvest."""
+    street: SyntheticStreetConfig = SyntheticStreetConfig(seed=FIRST_TRAINING_SEED)
+    """What the streets have in common; each has its own seed."""
+    street_plans: tuple[StreetPlan, ...] = default_street_plans()
+    scenes: tuple[str, ...] = ()
+    """Stored scenes to harvest, `<dataset>/<sequence>`."""
+    split: str = "alternate"
+    """Split of the recorded scenes; only their training frames are used."""
+    cameras: tuple[str, ...] | None = None
+    """Cameras of the recorded scenes; None takes all."""
+    harvest: HarvestConfig = HarvestConfig()
+
+
+class TrainPainterParameters(HarvestParameters):
+    """What a painter is trained on, and how."""
+
+    pair_folders: tuple[Path, ...] = ()
+    """Pairs that were harvested before."""
+    training: NanoTrainingConfig = NanoTrainingConfig()
+    held_back: float = 0.1
+    """Share of the true pictures that are kept from training, to judge by."""
+    feature_weights: Path | None = None
+    """SqueezeNet 1.1 weights for the feature distance; None leaves it out."""
+
+
+class AblationParameters(BaseModel):
+    """Painters with fewer inputs, trained alike and judged alike."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    train_folders: tuple[Path, ...]
+    test_folders: tuple[Path, ...]
+    training: NanoTrainingConfig = NanoTrainingConfig()
+    feature_weights: Path | None = None
+
+
+@flow(name="harvest_pairs")
+def harvest_pairs(parameters: HarvestParameters, store_path: Path) -> dict[str, Any]:
+    """Make training pairs from streets and logs; each scene gives a folder of them."""
+    return {"pairs": [_described(*made) for made in _harvested(parameters, store_path)]}
+
+
+@flow(name="train_painter")
+def train_painter(parameters: TrainPainterParameters, store_path: Path) -> dict[str, Any]:
+    """Harvest, train, judge on what was held back, and enter the painter into the catalog."""
+    check_sources(parameters)
+    harvested = _harvested(parameters, store_path)
+    sets = (*(made for made, _ in harvested), *named_sets(parameters.pair_folders))
+    trained = train(store_path, "train", sets, parameters.training, parameters.held_back)
+    scores = None
+    if parameters.held_back > 0:
+        weights = weights_path(trained.ref)
+        judged = judge_held_back(
+            store_path, "judge", weights, sets, parameters.held_back, parameters.feature_weights
+        )
+        scores = load_painting_scores(judged.ref)
+    row = publish_painter(store_path, trained.ref, scores)
+    return {
+        "painter_id": row["painter_id"],
+        "weights": row["path"],
+        "num_bytes": row["num_bytes"],
+        "pairs": [_described(*made) for made in harvested],
+        "training": _cost(trained),
+        "held_back": scores,
+        "record": training_record(trained.ref, scores),
+    }
+
+
+@flow(name="ablate_painter")
+def ablate_painter(parameters: AblationParameters, store_path: Path) -> dict[str, Any]:
+    """Train one painter per set of inputs and judge them beside those that learn nothing."""
+    learnt = named_sets(parameters.train_folders)
+    painters = {name: name for name in UNLEARNED}
+    costs = {}
+    for inputs in ABLATED_INPUTS:
+        label = "+".join(inputs)
+        network = replace(parameters.training.network, inputs=frozenset(inputs))
+        config = replace(parameters.training, network=network)
+        trained = train(store_path, f"train {label}", learnt, config, 0.0)
+        painters[label] = str(weights_path(trained.ref))
+        costs[label] = _cost(trained)
+    judged = judge_painters(
+        painters, named_sets(parameters.test_folders), parameters.feature_weights
+    )
+    return {**judged, "weights": {label: painters[label] for label in costs}, "training": costs}
+
+
+def check_sources(parameters: TrainPainterParameters) -> None:
+    """Refuse to train on nothing, or on what judges painters.
+
+    Raises:
+        ConfigError: no source of pairs, or a street whose seed is kept for judging.
+    """
+    if not (parameters.street_seeds or parameters.scenes or parameters.pair_folders):
+        raise ConfigError("nothing to train on: expected street seeds, scenes or folders of pairs")
+    for seed in parameters.street_seeds:
+        check_street_seed(seed)
+    for scene_id in parameters.scenes:
+        check_training_scene(*scene_id.split("/", 1))
+
+
+def named_sets(folders: Iterable[Path]) -> tuple[PairSet, ...]:
+    """Folders of pairs under the shortest ends of their paths that tell them apart."""
+    paths = [folder.absolute() for folder in folders]
+    if len(set(paths)) != len(paths):
+        raise ConfigError("a folder of pairs is given twice")
+    depth = 1
+    while len({path.parts[-depth:] for path in paths}) < len(paths):
+        depth += 1
+    return tuple(PairSet(name="/".join(path.parts[-depth:]), folder=path) for path in paths)
+
+
+def _harvested(
+    parameters: HarvestParameters, store_path: Path
+) -> list[tuple[PairSet, StageResult]]:
+    """The pairs of every street and scene, by scene id."""
+    scenes = list(parameters.scenes)
+    for seed in parameters.street_seeds:
+        keep_street(store_path, replace(parameters.street, seed=seed))
+        scenes.append(street_id(seed))
+    made = []
+    for scene_id in dict.fromkeys(scenes):
+        stage = f"harvest {scene_id}"
+        if scene_id.startswith(SYNTHETIC):
+            result = harvest_street(
+                store_path, stage, scene_id, parameters.street_plans, parameters.harvest
+            )
+        else:
+            split = SplitSpec(scene_id=scene_id, spec=parameters.split, cameras=parameters.cameras)
+            result = harvest_recorded(store_path, stage, split, parameters.harvest)
+        made.append((pair_set(scene_id, result.ref), result))
+    return made
+
+
+def _described(made: PairSet, result: StageResult) -> dict[str, Any]:
+    counts = {key: result.summary[key] for key in ("num_pairs", "num_targets")}
+    return {"set": made.name, "folder": str(made.folder), **counts, **_cost(result)}
+
+
+def _cost(result: StageResult) -> dict[str, Any]:
+    return {
+        "seconds": result.seconds,
+        "cpu_seconds": result.cpu_seconds,
+        "peak_memory_bytes": result.peak_memory_bytes,
+        "computed_now": result.is_new,
+    }

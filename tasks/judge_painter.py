@@ -1,0 +1,214 @@
+"""Judge painters on stored pairs that none of them was trained on."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from prefect import task
+
+from catalog.artefacts import ArtefactRef, Workplace
+from catalog.digests import DIGEST_LENGTH, digest_file
+from catalog.store import open_store
+from lidarpainter_models.conditioning.pairs import PairFolder
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.evaluation.held_back import TARGETS_KEY, hold_back, unseen_pairs
+from lidarpainter_models.evaluation.painting import score_painter
+from lidarpainter_models.metrics.squeezenet import SqueezeNetDistance, load_squeezenet_distance
+from lidarpainter_models.painter import load_painter
+from lidarpainter_models.painter.examples import PairSource
+from lidarpainter_models.painter.nano_painter import NanoPainter
+from lidarpainter_models.painter.protocol import Painter
+from tasks.harvest import PairSet
+from tasks.measuring import measured
+from tasks.progress import listener
+from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
+from tasks.stored import read_json, write_json
+
+SCORES_FILE = "painting-scores.json"
+PAINTING_COLUMNS = (
+    "picture",
+    "PSNR",
+    "SSIM",
+    "features",
+    "damaged",
+    "undamaged",
+    "outside hull, %",
+    "confidence AUC",
+    "CPU ms",
+)
+PAINTING_NOTE = (
+    "PSNR, damaged and undamaged in dB; damaged: error of the render above 0.1; outside hull: more "
+    "than 0.05 beyond what any input shows within 9x9 pixels; AUC: of the confidence for an error "
+    "above 0.05; features: SqueezeNet distance, with --feature-weights."
+)
+FIGURES = ("psnr", "ssim", "feature_distance", "damaged_psnr", "undamaged_psnr")
+
+PaintingCell = str | float | None
+
+
+@task(**STAGE_OPTIONS)
+def judge_painters(
+    painters: Mapping[str, str], sets: Sequence[PairSet], feature_weights: Path | None = None
+) -> dict[str, Any]:
+    """Scores of several painters on the same pairs, those left out that any was trained on.
+
+    Args:
+        painters: names or weights files of painters, by what tables call them.
+        sets: the pairs.
+        feature_weights: SqueezeNet 1.1, for the feature distance.
+
+    Returns:
+        `painters`: scores by label; `pairs`: how many of every set were judged and left out;
+        `training_unknown`: learned painters whose weights do not say what they were trained on.
+    """
+    loaded = {label: load_painter(name) for label, name in painters.items()}
+    distance = feature_distance_of(feature_weights)
+    folders = open_sets(sets)
+    provenances = {label: provenance_of(painter) for label, painter in loaded.items()}
+    unseen = unseen_pairs(folders, list(provenances.values()))
+    pairs = {
+        name: {
+            "folder": str(folder.folder),
+            "num_judged": len(unseen.get(name, ())),
+            "num_left_out": len(folder) - len(unseen.get(name, ())),
+        }
+        for name, folder in folders.items()
+    }
+    return {
+        "painters": {
+            label: _told_scores(painter, unseen, distance, f"judge {label}")
+            for label, painter in loaded.items()
+        },
+        "pairs": pairs,
+        "training_unknown": [
+            label
+            for label, painter in loaded.items()
+            if isinstance(painter, NanoPainter) and TARGETS_KEY not in provenances[label]
+        ],
+    }
+
+
+@task(**STAGE_OPTIONS)
+def judge_held_back(
+    store_path: Path,
+    stage: str,
+    weights: Path,
+    sets: Sequence[PairSet],
+    held_back: float,
+    feature_weights: Path | None = None,
+) -> StageResult:
+    """Scores of a freshly trained painter on the pairs that its training held back.
+
+    Raises:
+        ConfigError: none were held back.
+    """
+    folders = open_sets(sets)
+    _, judged = hold_back(folders, held_back)
+    if not judged:
+        raise ConfigError("no pairs were held back, so there is nothing to judge by")
+    inputs = {"painter": digest_file(weights)[:DIGEST_LENGTH]}
+    inputs |= {f"pairs {name}": subset.digest for name, subset in judged.items()}
+    distance = feature_distance_of(feature_weights)
+    if feature_weights is not None:
+        inputs["features"] = digest_file(feature_weights)[:DIGEST_LENGTH]
+
+    def build(place: Workplace) -> dict[str, Any]:
+        scores = _scores(load_painter(weights), judged, distance, stage)
+        write_json(place.output / SCORES_FILE, scores)
+        total = scores["total"]
+        return {
+            "num_pairs": total["num_pairs"],
+            "psnr_input": total["input"]["psnr"],
+            "psnr_painted": total["painted"]["psnr"],
+        }
+
+    return run_stage(
+        open_store(store_path),
+        stage=stage,
+        kind="evaluation",
+        inputs=inputs,
+        config={"held_back": held_back},
+        build=build,
+    )
+
+
+def load_painting_scores(ref: ArtefactRef) -> dict[str, Any]:
+    """Read the scores of `judge_held_back`."""
+    return read_json(ref.folder / SCORES_FILE)
+
+
+def open_sets(sets: Sequence[PairSet]) -> dict[str, PairFolder]:
+    """Every set by its name.
+
+    Raises:
+        ConfigError: no set, or two of one name.
+    """
+    folders = {one.name: one.open() for one in sets}
+    if not sets or len(folders) != len(sets):
+        names = ", ".join(one.name for one in sets)
+        raise ConfigError(f"need pairs under names of their own, got {names or 'none'}")
+    return folders
+
+
+def feature_distance_of(weights: Path | None) -> SqueezeNetDistance | None:
+    """The feature distance, if there are weights for it."""
+    return None if weights is None else load_squeezenet_distance(weights)
+
+
+def provenance_of(painter: Painter) -> dict[str, Any]:
+    """Where a painter's weights come from; nothing for one that has none."""
+    return painter.provenance if isinstance(painter, NanoPainter) else {}
+
+
+def painting_rows(
+    scores: Mapping[str, Mapping[str, Any]], source: str | None = None
+) -> list[list[PaintingCell]]:
+    """A row for the render, one for the mean of the warps, and one per painter.
+
+    Args:
+        scores: those of every painter, by label.
+        source: the set of pairs to show; None for all together.
+    """
+    found = {
+        label: one["total"] if source is None else one["sources"][source]
+        for label, one in scores.items()
+    }
+    first = next(iter(found.values()))
+    rows = [
+        [*_figures("input render", first["input"]), None, None],
+        [*_figures("mean with warps", first["warp_mean"]), None, None],
+    ]
+    for label, one in found.items():
+        painted = _figures(label, one["painted"])
+        rows.append([*painted, one["confidence_auc"], one["cpu_ms_per_frame"]])
+    return rows
+
+
+def _told_scores(
+    painter: Painter,
+    sources: Mapping[str, PairSource],
+    distance: SqueezeNetDistance | None,
+    stage: str,
+) -> dict[str, Any]:
+    """Scores that are not stored, so the listener is told here and not by `run_stage`."""
+    listener().started(stage)
+    with measured() as cost:
+        scores = _scores(painter, sources, distance, stage)
+    listener().finished(stage, cost.seconds, is_new=True)
+    return scores
+
+
+def _scores(
+    painter: Painter,
+    sources: Mapping[str, PairSource],
+    distance: SqueezeNetDistance | None,
+    stage: str,
+) -> dict[str, Any]:
+    def told(done: int, total: int) -> None:
+        listener().advanced(stage, done, total, "")
+
+    return score_painter(painter, sources, feature_distance=distance, progress=told).to_dict()
+
+
+def _figures(label: str, picture: Mapping[str, Any]) -> list[PaintingCell]:
+    return [label, *(picture[name] for name in FIGURES), 100 * picture["outside_hull"]]

@@ -1,0 +1,160 @@
+"""Train the small painter on pairs and enter it into the catalog.
+
+Training is a stage like any other: keyed on the pairs and every setting, resumed from its last
+checkpoint when it was killed.
+"""
+
+from collections.abc import Iterable, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from prefect import task
+
+import lidarpainter_models
+from catalog.artefacts import ArtefactRef, Workplace
+from catalog.digests import DIGEST_LENGTH, canonical_json, digest_file, finite_or_none
+from catalog.store import open_store
+from lidarpainter_models.conditioning.pairs import PairFolder
+from lidarpainter_models.evaluation.held_back import (
+    TARGETS_KEY,
+    PairSubset,
+    check_training_pairs,
+    hold_back,
+)
+from lidarpainter_models.painter.training import NanoTrainingConfig, TrainingProgress, train_nano
+from lidarpainter_models.painter.weights import save_weights
+from lidarpainter_models.scenes.readers.pandaset import LICENCE as PANDASET_LICENCE
+from tasks.harvest import PairSet
+from tasks.judge_painter import open_sets
+from tasks.progress import listener
+from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
+from tasks.stored import read_json, write_json
+
+WEIGHTS_FILE = "nano.safetensors"
+RECORD_FILE = "nano.json"
+PAINTER_NAME = "nano"
+LICENCE = "Apache-2.0"
+ATTRIBUTIONS = {
+    "synthetic": "LidarPainter's synthetic street, Apache-2.0",
+    "pandaset": PANDASET_LICENCE,
+}
+"""Whom to name for data sets whose terms let trained weights be given on."""
+
+
+@task(**STAGE_OPTIONS)
+def train(
+    store_path: Path,
+    stage: str,
+    sets: Sequence[PairSet],
+    config: NanoTrainingConfig,
+    held_back: float,
+) -> StageResult:
+    """Train on all pairs but those held back.
+
+    Raises:
+        ConfigError: pairs of a street that is kept for judging, or nothing left to learn from.
+    """
+    folders = open_sets(sets)
+    for folder in folders.values():
+        check_training_pairs(folder)
+    learnt, judged = hold_back(folders, held_back)
+
+    def told(progress: TrainingProgress) -> None:
+        loss = progress.losses.get("total")
+        note = f"step {progress.step}" + ("" if loss is None else f", loss {loss:.4f}")
+        listener().advanced(stage, progress.share_done, 1.0, note)
+
+    def build(place: Workplace) -> dict[str, Any]:
+        for folder in folders.values():
+            folder.verify()
+        result = train_nano(
+            list(learnt.values()), config, checkpoint_folder=place.scratch, progress=told
+        )
+        licence, attribution = _terms(folders.values())
+        record = {
+            "licence": licence,
+            "attribution": attribution,
+            "held_back": {name: sorted(subset.targets) for name, subset in judged.items()},
+            "software_version": lidarpainter_models.__version__,
+            **result.record,
+        }
+        provenance = _provenance(record, learnt.values())
+        save_weights(
+            result.network, place.output / WEIGHTS_FILE, licence=licence, provenance=provenance
+        )
+        write_json(place.output / RECORD_FILE, record)
+        return {key: record[key] for key in ("num_pairs", "steps", "cpu_s")}
+
+    return run_stage(
+        open_store(store_path),
+        stage=stage,
+        kind="painter",
+        inputs={f"pairs {name}": subset.digest for name, subset in learnt.items()},
+        config={"training": config.to_dict(), "held_back": held_back},
+        build=build,
+    )
+
+
+@task(**STAGE_OPTIONS)
+def publish_painter(
+    store_path: Path, trained: ArtefactRef, scores: dict[str, Any] | None
+) -> dict[str, Any]:
+    """Enter a painter into the catalog; returns its row.
+
+    Args:
+        store_path: the store.
+        trained: what `train` made.
+        scores: its figures on held-back pairs, if there are any.
+    """
+    store = open_store(store_path)
+    weights = weights_path(trained)
+    manifest = store.artefacts.verified(trained)
+    row = {
+        "painter_id": digest_file(weights)[:DIGEST_LENGTH],
+        "name": PAINTER_NAME,
+        "path": str(weights),
+        "num_bytes": weights.stat().st_size,
+        "record": canonical_json(training_record(trained, scores)),
+        "created_at": datetime.fromisoformat(manifest.created_at),
+        "software_version": manifest.software_version,
+    }
+    store.tables.merge("painters", [row])
+    return row
+
+
+def weights_path(trained: ArtefactRef) -> Path:
+    """The weights of a trained painter."""
+    return trained.folder / WEIGHTS_FILE
+
+
+def training_record(trained: ArtefactRef, scores: dict[str, Any] | None) -> dict[str, Any]:
+    """How a painter was trained and what it reached on the pairs held back."""
+    record = read_json(trained.folder / RECORD_FILE)
+    return finite_or_none(record | {"held_back_scores": scores})
+
+
+def _provenance(record: dict[str, Any], learnt: Iterable[PairSubset]) -> dict[str, Any]:
+    """What goes into the weights file: enough to know its origin and what must not judge it."""
+    sets = list(learnt)
+    kept = ("attribution", "training_digest", "num_pairs", "steps", "cpu_s", "seed", "torch")
+    return {
+        **{key: record[key] for key in kept},
+        "software_version": record["software_version"],
+        "pairs": {one.set_name: {"digest": one.digest, "num_pairs": len(one)} for one in sets},
+        TARGETS_KEY: sorted(frozenset().union(*(one.targets for one in sets))),
+    }
+
+
+def _terms(folders: Iterable[PairFolder]) -> tuple[str, list[str]]:
+    """Licence of the weights, and whom to name."""
+    datasets = sorted(
+        {
+            str(folder.provenance(index).get("dataset", "unknown"))
+            for folder in folders
+            for index in range(len(folder))
+        }
+    )
+    foreign = [dataset for dataset in datasets if dataset not in ATTRIBUTIONS]
+    licence = f"terms of the training data: {', '.join(foreign)}" if foreign else LICENCE
+    return licence, [ATTRIBUTIONS.get(dataset, dataset) for dataset in datasets]
