@@ -1,0 +1,240 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from lidarpainter_models.conditioning.conditions import ConditionBuilder, ConditionConfig
+from lidarpainter_models.conditioning.novel_guidance import (
+    NovelGuidanceConfig,
+    guidance_views,
+    has_room,
+    novel_cameras,
+    paint_novel_views,
+)
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.gaussians.calibration import (
+    ActorCorrections,
+    CameraCorrections,
+    ExposureCorrections,
+)
+from lidarpainter_models.gaussians.gaussian_set import GaussianSet, sh_from_rgb
+from lidarpainter_models.gaussians.observations import TrainingView
+from lidarpainter_models.gaussians.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.sky import SkyConfig, SkyTexture, sky_layout
+from lidarpainter_models.geometry.trajectories import Shift
+from lidarpainter_models.painter.protocol import Painting
+from lidarpainter_models.scenes.lidar_map import LidarMap
+from lidarpainter_models.scenes.map_points import MapPoints
+
+WALL_X_M = 12.0
+NUM_VIEWS = 5
+
+
+def wall_points():
+    y_m, z_m = torch.meshgrid(
+        torch.arange(-14, 14, 0.25), torch.arange(-12, 4.0, 0.25), indexing="ij"
+    )
+    return torch.stack([torch.full_like(y_m, WALL_X_M), y_m, z_m], dim=-1).reshape(-1, 3)
+
+
+@pytest.fixture
+def views(camera_at, board, draw):
+    found = []
+    for frame in range(NUM_VIEWS):
+        camera = camera_at(0.4 * frame)
+        rgb, depth_m = draw(camera, [board(WALL_X_M, top_m=4.0)])
+        found.append(
+            TrainingView(
+                key=(2 * frame, "front"),
+                camera=camera,
+                timestamp_ns=frame * 100_000_000,
+                rgb_u8=(rgb * 255).round().to(torch.uint8),
+                sky_mask=depth_m == 0,
+                lidar_depth_m=depth_m,
+            )
+        )
+    return found
+
+
+@pytest.fixture
+def scene(views, board):
+    """A wall of opaque discs in the board's colours under a plain sky."""
+    points = wall_points()
+    count = len(points)
+    gaussians = GaussianSet(
+        means=points,
+        rotation_wxyz=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+        log_scale=torch.tensor([0.01, 0.2, 0.2]).log().repeat(count, 1),
+        opacity_logit=torch.full((count,), 4.0),
+        sh_dc=sh_from_rgb(board(WALL_X_M).colour(points[:, 1], points[:, 2])),
+        sh_rest=torch.zeros(count, 0, 3),
+        body_index=torch.zeros(count, dtype=torch.int64),
+    )
+    keys = [view.key for view in views]
+    times = torch.tensor([view.timestamp_ns for view in views])
+    poses = torch.stack([view.camera.world_from_camera for view in views])
+    layout = sky_layout([view.camera for view in views], SkyConfig())
+    return GaussianScene(
+        gaussians=gaussians,
+        recorded_tracks=(),
+        sky=SkyTexture.constant(layout, torch.tensor([0.5, 0.7, 0.9])),
+        cameras=CameraCorrections.none(keys, times, poses),
+        actors=ActorCorrections.none(0, times),
+        exposure=ExposureCorrections.none(["front"]),
+    )
+
+
+@pytest.fixture
+def lidar_map(board):
+    points = wall_points()[::2]
+    colour = board(WALL_X_M).colour(points[:, 1], points[:, 2])
+    street = replace(
+        MapPoints.uncoloured(
+            xyz_m=points,
+            frame_index=torch.zeros(len(points), dtype=torch.int64),
+            timestamp_ns=torch.full((len(points),), 200_000_000),
+            range_m=points.norm(dim=-1),
+        ),
+        rgb_u8=(colour * 255).to(torch.uint8),
+        has_colour=torch.ones(len(points), dtype=torch.bool),
+    )
+    return LidarMap(street=street, actors={})
+
+
+@pytest.fixture
+def builder(scene, lidar_map, views):
+    return ConditionBuilder(scene, lidar_map, views)
+
+
+class EchoPainter:
+    """Gives back the best warped reference where there is one, else the render."""
+
+    name = "echo"
+
+    def paint(self, conditions):
+        known = conditions.warp_valid[0][..., None]
+        rgb = torch.where(known, conditions.warp_rgb[0], conditions.render_rgb)
+        return Painting(rgb=rgb, confidence=torch.ones(rgb.shape[:2]))
+
+
+class NegativePainter:
+    """Makes everything worse."""
+
+    name = "negative"
+
+    def paint(self, conditions):
+        rgb = 1 - conditions.render_rgb
+        return Painting(rgb=rgb, confidence=torch.ones(rgb.shape[:2]))
+
+
+def test_conditions_hold_render_lidar_and_references(builder, camera_at, board, draw):
+    camera = camera_at(0.6, 0.5)
+    truth, depth_m = draw(camera, [board(WALL_X_M, top_m=4.0)])
+    found = builder.conditions(camera, 150_000_000)
+    on_wall = (depth_m > 0) & found.warp_valid[0]
+    assert found.warp_rgb.shape == (2, 48, 64, 3)
+    assert on_wall.float().mean() > 0.6
+    assert (found.warp_rgb[0] - truth)[on_wall].abs().mean() < 0.01
+    assert (found.lidar_rgb - truth)[found.lidar_hit].abs().mean() < 0.05
+    assert (found.render_depth_m - depth_m)[on_wall].abs().mean() < 0.2
+    assert (found.warp_rgb[~found.warp_valid] == 0).all()
+    assert found.render_rgb.max() <= 1
+
+
+def test_an_excluded_view_is_no_source(builder, views, camera_at):
+    camera = camera_at(0.8)
+    nearest = builder.sources_for(camera, views[2].timestamp_ns)
+    others = builder.sources_for(camera, views[2].timestamp_ns, exclude=frozenset({views[2].key}))
+    assert nearest[0].key == views[2].key
+    assert views[2].key not in [source.key for source in others]
+    assert len({source.key for source in nearest}) == len(nearest) == NUM_VIEWS
+
+
+def test_with_every_view_excluded_no_reference_is_valid(builder, views, camera_at):
+    found = builder.conditions(camera_at(), 0, exclude=frozenset(view.key for view in views))
+    assert not found.warp_valid.any()
+
+
+def test_references_have_the_exposure_asked_for(scene, lidar_map, views, camera_at):
+    brighter = torch.eye(3, 4)[None] * 1.25
+    exposed = replace(scene, exposure=replace(scene.exposure, matrix=brighter))
+    builder = ConditionBuilder(exposed, lidar_map, views)
+    plain = builder.conditions(camera_at(0.8), 200_000_000)
+    named = builder.conditions(camera_at(0.8), 200_000_000, camera_name="front")
+    valid = plain.warp_valid[0]
+    recorded = views[2].rgb[valid]
+    assert torch.allclose(named.warp_rgb[0][valid], recorded, atol=1e-3)
+    assert torch.allclose(plain.warp_rgb[0][valid], recorded / 1.25, atol=1e-3)
+
+
+def test_fewer_sources_than_references_are_refused():
+    with pytest.raises(ConfigError, match="num_references"):
+        ConditionConfig(num_references=3, num_sources=2)
+
+
+def ego_path(num_frames=2 * NUM_VIEWS, step_m=0.2):
+    path = torch.eye(4, dtype=torch.float64).repeat(num_frames, 1, 1)
+    path[:, 0, 3] = step_m * torch.arange(num_frames)
+    return path
+
+
+def test_novel_cameras_stand_beside_and_above_the_path(views):
+    config = NovelGuidanceConfig(shifts=(Shift(lateral_m=2), Shift(up_m=1.5)), every_nth=2)
+    novel = novel_cameras(views, range(10), ego_path(), config=config)
+    assert [camera.key[0] for camera in novel] == [0, 4, 8, 0, 4, 8]
+    offset = novel[1].camera.centre_world - views[2].camera.centre_world
+    assert offset.tolist() == pytest.approx([0, 2, 0])
+    offset = novel[-1].camera.centre_world - views[4].camera.centre_world
+    assert offset.tolist() == pytest.approx([0, 0, 1.5])
+    assert novel[1].name == "front-004-left-2m"
+    later = novel_cameras(views, range(10), ego_path(), config=config, start=1)
+    assert [camera.key[0] for camera in later] == [2, 6, 2, 6]
+
+
+def test_a_standing_car_still_has_a_left_side(views):
+    config = NovelGuidanceConfig(shifts=(Shift(lateral_m=3),))
+    novel = novel_cameras(views, range(10), ego_path(step_m=0.0), config=config)
+    offset = novel[0].camera.centre_world - views[0].camera.centre_world
+    assert offset.tolist() == pytest.approx([0, 3, 0])
+
+
+def test_a_frame_without_an_ego_pose_is_refused(views):
+    with pytest.raises(ConfigError, match="no ego pose"):
+        novel_cameras(views, range(3), ego_path(3))
+
+
+def test_painting_gives_guidance_that_trusts_what_was_recorded(builder, views, board, draw):
+    config = NovelGuidanceConfig(shifts=(Shift(lateral_m=1),), every_nth=3)
+    novel = novel_cameras(views, range(10), ego_path(), config=config)
+    told = []
+    paintings = paint_novel_views(
+        builder, EchoPainter(), novel, config=config, progress=lambda *step: told.append(step)
+    )
+    assert told == [(1, 2), (2, 2)]
+    assert len(guidance_views(paintings)) == 2
+    first = paintings[0]
+    truth, _ = draw(first.novel.camera, [board(WALL_X_M, top_m=4.0)])
+    trusted = first.guidance.weight > 0.8
+    assert trusted.float().mean() > 0.5
+    assert (first.guidance.rgb - truth)[trusted].abs().mean() < 0.02
+    assert set(first.pictures) == {"render", "lidar", "warp", "painted", "confidence"}
+    assert first.pictures["painted"].dtype == torch.uint8
+
+
+def test_a_painter_that_makes_things_worse_gives_no_guidance(builder, views):
+    config = NovelGuidanceConfig(shifts=(Shift(lateral_m=1),), every_nth=5)
+    novel = novel_cameras(views, range(10), ego_path(), config=config)
+    paintings = paint_novel_views(builder, NegativePainter(), novel, config=config)
+    assert [painting.gate.is_refused for painting in paintings] == [True]
+    assert guidance_views(paintings) == []
+    assert paintings[0].mean_weight == 0
+
+
+def test_no_view_is_painted_from_inside_a_wall_or_a_car(lidar_map, views, camera_at, moving_track):
+    config = NovelGuidanceConfig()
+    novel = novel_cameras(views, range(10), ego_path(), config=config)[0]
+    assert has_room(novel, lidar_map, [])
+    in_wall = replace(novel, camera=camera_at(WALL_X_M, 2.0))
+    assert not has_room(in_wall, lidar_map, [])
+    car = moving_track((0.0, 2.0, 1.0), (5.0, 2.0, 1.0))
+    assert not has_room(novel, lidar_map, [car])
