@@ -5,6 +5,7 @@ loop over pixels has no branch and no call and becomes vector instructions.
 """
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -54,6 +55,17 @@ ZERO = np.float32(0.0)
 ONE = np.float32(1.0)
 FAR = np.float32(-5.7)
 """Exponents are held above this, where `lane_exp` is accurate and alpha is under the cut."""
+
+
+class Pictures(NamedTuple):
+    """Blended sums per pixel, float32 (height, width[, channels])."""
+
+    rgb: np.ndarray
+    depth: np.ndarray
+    alpha: np.ndarray
+    features: np.ndarray
+    light: np.ndarray
+    """What passes all Gaussians; 1 - alpha, with all its digits."""
 
 
 @numba.njit(**EXACT)
@@ -151,52 +163,56 @@ def _blend_tile(
 
 
 @numba.njit(**EXACT)
-def _store_tile(
-    lanes: np.ndarray, tile_x: int, tile_y: int, picture: np.ndarray, light: np.ndarray
-) -> None:
-    height, width, channels = picture.shape
+def _light_pixels(lanes: np.ndarray, rows: int, columns: int) -> None:
+    """Give every pixel of a tile that lies in the picture its full light; the rest stay dark."""
+    for row in range(rows):
+        lanes[row * TILE_PX : row * TILE_PX + columns] = ONE
+
+
+@numba.njit(**EXACT)
+def _store_tile(lanes: np.ndarray, tile_x: int, tile_y: int, pictures: Pictures) -> None:
+    height, width, channels = pictures.features.shape
     for row in range(min(TILE_PX, height - tile_y)):
         for column in range(min(TILE_PX, width - tile_x)):
             pixel = row * TILE_PX + column
-            light[tile_y + row, tile_x + column] = abs(lanes[pixel])
-            out = picture[tile_y + row, tile_x + column]
-            for channel in range(4):
-                out[channel] = lanes[(1 + channel) * PIXELS + pixel]
-            for channel in range(4, channels):
-                out[channel] = lanes[FEATURES + (channel - 4) * PIXELS + pixel]
+            y, x = tile_y + row, tile_x + column
+            light = abs(lanes[pixel])
+            pictures.light[y, x] = light
+            pictures.alpha[y, x] = ONE - light
+            for channel in range(3):
+                pictures.rgb[y, x, channel] = lanes[(1 + channel) * PIXELS + pixel]
+            pictures.depth[y, x] = lanes[4 * PIXELS + pixel]
+            for channel in range(channels):
+                pictures.features[y, x, channel] = lanes[FEATURES + channel * PIXELS + pixel]
 
 
 @numba.njit(**EXACT)
 def _draw_tile(
-    records: np.ndarray,
-    features: np.ndarray,
-    lists: TileLists,
-    tile: int,
-    picture: np.ndarray,
-    light: np.ndarray,
+    records: np.ndarray, features: np.ndarray, lists: TileLists, tile: int, pictures: Pictures
 ) -> None:
     tile_x, tile_y = tile % lists.columns * TILE_PX, tile // lists.columns * TILE_PX
+    height, width = pictures.depth.shape
     lanes = np.zeros(LANES + features.shape[1] * PIXELS, np.float32)
-    lanes[:PIXELS] = ONE
+    _light_pixels(lanes, min(TILE_PX, height - tile_y), min(TILE_PX, width - tile_x))
     place_pixels(lanes)
     _blend_tile(records, features, lists, tile, tile_x, tile_y, lanes)
-    _store_tile(lanes, tile_x, tile_y, picture, light)
+    _store_tile(lanes, tile_x, tile_y, pictures)
 
 
 @compiled_entry
 def blend(
     records: np.ndarray, features: np.ndarray, lists: TileLists, width: int, height: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draw all tiles.
-
-    Returns:
-        The picture (height, width, red green blue depth and features) and the light that passes
-        everything (height, width).
-    """
-    picture = np.empty((height, width, 4 + features.shape[1]), np.float32)
-    light = np.empty((height, width), np.float32)
+) -> Pictures:
+    """Draw all tiles."""
+    pictures = Pictures(
+        np.empty((height, width, 3), np.float32),
+        np.empty((height, width), np.float32),
+        np.empty((height, width), np.float32),
+        np.empty((height, width, features.shape[1]), np.float32),
+        np.empty((height, width), np.float32),
+    )
     tiles = lists.columns * lists.rows
     jump = jump_of(tiles)
     for place in numba.prange(tiles):
-        _draw_tile(records, features, lists, place * jump % tiles, picture, light)
-    return picture, light
+        _draw_tile(records, features, lists, place * jump % tiles, pictures)
+    return pictures

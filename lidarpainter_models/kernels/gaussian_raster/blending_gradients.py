@@ -6,8 +6,6 @@ blended value dotted with the picture's gradient. Every (tile, Gaussian) entry w
 and each Gaussian adds up its entries in a fixed order, so results do not depend on the threads.
 """
 
-from typing import NamedTuple
-
 import numba
 import numpy as np
 
@@ -24,6 +22,7 @@ from lidarpainter_models.kernels.gaussian_raster.blending import (
     STOP,
     TOP,
     ZERO,
+    Pictures,
     has_light,
     local_centre,
     place_pixels,
@@ -60,15 +59,6 @@ GRAD_RED, GRAD_GREEN, GRAD_BLUE, GRAD_DEPTH, BEHIND = (
 WEIGHT, FEATURE_VALUE = np.uint64(8 * PIXELS), np.uint64(9 * PIXELS)
 LANES = 10 * PIXELS
 FEATURES = 10 * PIXELS
-
-
-class DrawnImage(NamedTuple):
-    """What `blending.blend` returned, and the gradients of the loss."""
-
-    picture: np.ndarray
-    light: np.ndarray
-    to_picture: np.ndarray
-    to_alpha: np.ndarray
 
 
 @numba.njit(**LANE_LOOP)
@@ -152,22 +142,27 @@ def _feature_sums(lanes: np.ndarray, first_row: int, end_row: int, slot: np.ndar
 
 
 @numba.njit(**EXACT)
-def _load_tile(tile_x: int, tile_y: int, image: DrawnImage, lanes: np.ndarray) -> None:
+def _load_tile(
+    tile_x: int, tile_y: int, drawn: Pictures, gradients: Pictures, lanes: np.ndarray
+) -> None:
     """Pixel gradients, and the gradient-weighted total of what each pixel blended."""
-    height, width, channels = image.picture.shape
+    height, width, channels = drawn.features.shape
     for row in range(min(TILE_PX, height - tile_y)):
         for column in range(min(TILE_PX, width - tile_x)):
             pixel = row * TILE_PX + column
             y, x = tile_y + row, tile_x + column
             lanes[pixel] = ONE
-            total = -np.float64(image.to_alpha[y, x]) * image.light[y, x]
+            total = np.float64(gradients.depth[y, x]) * drawn.depth[y, x]
+            total -= np.float64(gradients.alpha[y, x]) * drawn.light[y, x]
+            lanes[4 * PIXELS + pixel] = gradients.depth[y, x]
+            for channel in range(3):
+                gradient = gradients.rgb[y, x, channel]
+                lanes[(1 + channel) * PIXELS + pixel] = gradient
+                total += np.float64(gradient) * drawn.rgb[y, x, channel]
             for channel in range(channels):
-                gradient = image.to_picture[y, x, channel]
-                begin = (
-                    (1 + channel) * PIXELS if channel < 4 else (FEATURES + (channel - 4) * PIXELS)
-                )
-                lanes[begin + pixel] = gradient
-                total += np.float64(gradient) * image.picture[y, x, channel]
+                gradient = gradients.features[y, x, channel]
+                lanes[FEATURES + channel * PIXELS + pixel] = gradient
+                total += np.float64(gradient) * drawn.features[y, x, channel]
             lanes[BEHIND + np.uint64(pixel)] = total
 
 
@@ -205,15 +200,14 @@ def _tile_sums(
     features: np.ndarray,
     lists: TileLists,
     tile: int,
-    image: DrawnImage,
-    slots: np.ndarray,
-    feature_slots: np.ndarray,
+    pictures: tuple[Pictures, Pictures],
+    slots: tuple[np.ndarray, np.ndarray],
 ) -> None:
     tile_x, tile_y = tile % lists.columns * TILE_PX, tile // lists.columns * TILE_PX
     lanes = np.zeros(LANES + features.shape[1] * PIXELS, np.float32)
     place_pixels(lanes)
-    _load_tile(tile_x, tile_y, image, lanes)
-    _walk_tile(records, features, lists, tile, lanes, slots, feature_slots)
+    _load_tile(tile_x, tile_y, pictures[0], pictures[1], lanes)
+    _walk_tile(records, features, lists, tile, lanes, slots[0], slots[1])
 
 
 @numba.njit(**EXACT)
@@ -238,7 +232,11 @@ def _add_entries(
 
 @compiled_entry
 def gaussian_sums(
-    records: np.ndarray, features: np.ndarray, lists: TileLists, image: DrawnImage
+    records: np.ndarray,
+    features: np.ndarray,
+    lists: TileLists,
+    drawn: Pictures,
+    gradients: Pictures,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sums over all pixels of each Gaussian.
 
@@ -246,7 +244,8 @@ def gaussian_sums(
         records: from `projection.project`.
         features: of the Gaussians, float32.
         lists: from `binning.list_tiles`.
-        image: what was drawn and the gradients it received.
+        drawn: from `blending.blend`.
+        gradients: of the loss with respect to each picture; that of `light` is not read.
 
     Returns:
         Sums (gaussians, `SUMS`) in the order of the constants above, and the gradient of the
@@ -259,7 +258,7 @@ def gaussian_sums(
     jump = jump_of(tiles)
     for place in numba.prange(tiles):
         tile = place * jump % tiles
-        _tile_sums(records, features, lists, tile, image, slots, feature_slots)
+        _tile_sums(records, features, lists, tile, (drawn, gradients), (slots, feature_slots))
     sums = np.zeros((len(records), SUMS), np.float64)
     feature_sums = np.zeros((len(records), channels), np.float64)
     visible = len(lists.order)

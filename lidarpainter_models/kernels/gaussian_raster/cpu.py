@@ -13,8 +13,8 @@ from torch import Tensor
 
 from lidarpainter_models.errors import BackendError
 from lidarpainter_models.kernels.gaussian_raster.binning import list_tiles
-from lidarpainter_models.kernels.gaussian_raster.blending import blend
-from lidarpainter_models.kernels.gaussian_raster.blending_gradients import DrawnImage, gaussian_sums
+from lidarpainter_models.kernels.gaussian_raster.blending import Pictures, blend
+from lidarpainter_models.kernels.gaussian_raster.blending_gradients import gaussian_sums
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import TANGENT_MARGIN
 from lidarpainter_models.kernels.gaussian_raster.projection import (
     IS_VISIBLE,
@@ -23,7 +23,7 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
     View,
     project,
 )
-from lidarpainter_models.kernels.gaussian_raster.projection_gradients import unproject
+from lidarpainter_models.kernels.gaussian_raster.projection_gradients import Gradients, unproject
 from lidarpainter_models.kernels.gaussian_raster.splat_inputs import (
     DrawnPictures,
     SplatInputs,
@@ -44,7 +44,7 @@ def draw_gaussians(
     """
     if inputs.means.device.type != "cpu":
         raise BackendError(f"the cpu backend needs tensors on the CPU, got {inputs.means.device}")
-    picture, light, visible, radius_px = _DrawGaussians.apply(
+    return _DrawGaussians.apply(
         inputs.means,
         inputs.rotation_wxyz,
         inputs.scale_m,
@@ -57,7 +57,6 @@ def draw_gaussians(
         view,
         screen_gradient_out,
     )
-    return picture[..., :3], picture[..., 3], 1.0 - light, picture[..., 4:], visible, radius_px
 
 
 def _array(tensor: Tensor, dtype: torch.dtype = torch.float32) -> np.ndarray:
@@ -101,51 +100,57 @@ def _compiled_view(view: SplatView) -> View:
 
 class _DrawGaussians(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # noqa: ANN401
+    def forward(ctx: Any, *arguments: Any) -> DrawnPictures:  # noqa: ANN401
         *tensors, view, screen_gradient_out = arguments
         gaussians, compiled_view = _gaussians(tuple(tensors)), _compiled_view(view)
         with ONE_AT_A_TIME:
             records = project(gaussians, compiled_view)
             lists = list_tiles(records, view.width_px, view.height_px)
-            picture, light = blend(
-                records, gaussians.features, lists, view.width_px, view.height_px
-            )
+            drawn = blend(records, gaussians.features, lists, view.width_px, view.height_px)
+        pictures = [torch.from_numpy(picture) for picture in drawn[:4]]
         visible = torch.from_numpy(records[:, IS_VISIBLE] > 0.0)
         radius_px = torch.from_numpy(3.0 * records[:, SIGMA])
-        outputs = (torch.from_numpy(picture), torch.from_numpy(light), visible, radius_px)
-        ctx.save_for_backward(*tensors, *outputs[:2])
+        ctx.save_for_backward(*tensors, *pictures)
         ctx.mark_non_differentiable(visible, radius_px)
-        ctx.view, ctx.records, ctx.lists = compiled_view, records, lists
+        ctx.view, ctx.records, ctx.lists, ctx.light = compiled_view, records, lists, drawn.light
         ctx.screen_gradient_out = screen_gradient_out
-        return outputs
+        return (*pictures, visible, radius_px)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *output_gradients: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
-        *tensors, picture, light = ctx.saved_tensors
-        to_picture, to_light = output_gradients[:2]
-        gaussians = _gaussians(tuple(tensors))
-        image = DrawnImage(_array(picture), _array(light), _array(to_picture), _array(-to_light))
+        tensors, pictures = ctx.saved_tensors[:-4], ctx.saved_tensors[-4:]
+        gaussians = _gaussians(tensors)
+        drawn = Pictures(*(_array(picture) for picture in pictures), ctx.light)
+        gradients = Pictures(*(_array(gradient) for gradient in output_gradients[:4]), ctx.light)
         with ONE_AT_A_TIME:
-            sums, to_features = gaussian_sums(ctx.records, gaussians.features, ctx.lists, image)
+            sums, to_features = gaussian_sums(
+                ctx.records, gaussians.features, ctx.lists, drawn, gradients
+            )
             found = unproject(gaussians, ctx.view, ctx.records, sums)
         if ctx.screen_gradient_out is not None:
             ctx.screen_gradient_out.copy_(torch.from_numpy(found.absolute))
-        to_transforms = np.zeros((len(gaussians.camera_from_body), 4, 4))
-        for run in found.camera_from_body:
-            to_transforms[:, :3] += run
-        arrays = (
-            found.means,
-            found.rotation_wxyz,
-            found.scale_m,
-            found.opacity,
-            found.sh,
-            to_features,
-            found.screen_offset,
-            to_transforms,
-        )
-        gradients = [
-            torch.from_numpy(array).to(tensor.dtype)
-            for array, tensor in zip(arrays, tensors, strict=False)
-        ]
-        return (*gradients, None, None, None)
+        return (*_tensor_gradients(found, to_features, tensors), None, None, None)
+
+
+def _tensor_gradients(
+    found: Gradients, to_features: np.ndarray, tensors: tuple[Tensor, ...]
+) -> list[Tensor]:
+    """Gradients in the order and kinds of the float tensors that were given."""
+    to_transforms = np.zeros((found.camera_from_body.shape[1], 4, 4))
+    for run in found.camera_from_body:
+        to_transforms[:, :3] += run
+    arrays = (
+        found.means,
+        found.rotation_wxyz,
+        found.scale_m,
+        found.opacity,
+        found.sh,
+        to_features,
+        found.screen_offset,
+        to_transforms,
+    )
+    return [
+        torch.from_numpy(array).to(tensor.dtype)
+        for array, tensor in zip(arrays, tensors, strict=False)
+    ]
