@@ -5,7 +5,8 @@ near things get small voxels, far ones large. Sizes are powers of two times a fa
 searched so that a given number of voxels comes out. Metres; world or box frame alike.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Self
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -23,6 +24,12 @@ class VoxelPoints:
     has_colour: Bool[Tensor, " voxels"]
     size_m: Float[Tensor, " voxels"]
     """Edge of the voxel."""
+    num_points: Int[Tensor, " voxels"]
+    """How many points lie inside."""
+
+    def keep(self, kept: Bool[Tensor, " voxels"]) -> Self:
+        """The marked voxels."""
+        return type(self)(**{field.name: getattr(self, field.name)[kept] for field in fields(self)})
 
 
 def voxel_keys(
@@ -101,4 +108,5 @@ def mean_by_voxel(
         rgb=(colour / coloured.clamp(min=1)[:, None]).float(),
         has_colour=coloured > 0,
         size_m=edge,
+        num_points=count,
     )

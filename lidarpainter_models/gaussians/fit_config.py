@@ -50,7 +50,7 @@ class GuidanceConfig:
     freedom: GuidanceFreedom = "all"
     """What painted views may change: everything, or only colour and opacity. A painted guess in a
     hole would otherwise pull surfaces off their LiDAR depth."""
-    depth: float = 0.1
+    depth: float = 0.01
     """Of the LiDAR depth term on painted views; without meaning when freedom is `appearance`."""
 
 

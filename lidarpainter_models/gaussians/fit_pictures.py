@@ -22,6 +22,8 @@ class FitPicture:
     rgb_u8: UInt8[Tensor, "height width 3"]
     sky_mask: Bool[Tensor, "height width"]
     lidar_depth_m: Float[Tensor, "height width"]
+    solid_mask: Bool[Tensor, "height width"]
+    """Pixels on or beside a LiDAR return that are not sky."""
 
     @property
     def rgb(self) -> Float[Tensor, "height width 3"]:
@@ -38,6 +40,7 @@ def full_picture(view: TrainingView) -> FitPicture:
         rgb_u8=view.rgb_u8,
         sky_mask=view.sky_mask,
         lidar_depth_m=view.lidar_depth_m,
+        solid_mask=solid_pixels(view.lidar_depth_m, view.sky_mask),
     )
 
 
@@ -48,14 +51,25 @@ def half_picture(view: TrainingView) -> FitPicture:
     mask = cv2.resize(
         view.sky_mask.float().numpy(), (width_px, height_px), interpolation=cv2.INTER_AREA
     )
+    depth_m = shrink_depth(view.lidar_depth_m, width_px=width_px, height_px=height_px)
+    sky_mask = torch.from_numpy(mask) > 0.5
     return FitPicture(
         camera=view.camera.resized(width_px=width_px, height_px=height_px),
         timestamp_ns=view.timestamp_ns,
         camera_name=view.key[1],
         rgb_u8=shrink_picture(view.rgb_u8, width_px=width_px, height_px=height_px),
-        sky_mask=torch.from_numpy(mask) > 0.5,
-        lidar_depth_m=shrink_depth(view.lidar_depth_m, width_px=width_px, height_px=height_px),
+        sky_mask=sky_mask,
+        lidar_depth_m=depth_m,
+        solid_mask=solid_pixels(depth_m, sky_mask),
     )
+
+
+def solid_pixels(
+    lidar_depth_m: Float[Tensor, "height width"], sky_mask: Bool[Tensor, "height width"]
+) -> Bool[Tensor, "height width"]:
+    """Pixels at most one away from a LiDAR return, without the sky."""
+    beside = torch.nn.functional.max_pool2d((lidar_depth_m > 0).float()[None], 3, 1, 1)[0]
+    return (beside > 0) & ~sky_mask
 
 
 def shrink_depth(

@@ -18,6 +18,8 @@ from lidarpainter_models.gaussians.losses import (
     project_boxes,
 )
 from lidarpainter_models.gaussians.observations import GuidanceView
+from lidarpainter_models.gaussians.scene_graph import OPAQUE
+from lidarpainter_models.gaussians.sky_sampling import SkyRays
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
 from lidarpainter_models.kernels.ssim import l1_ssim_loss
@@ -52,16 +54,18 @@ def recorded_step(
     image = scene.splat(
         camera, bodies, with_actor_alpha=with_actors, screen_gradient_out=screen_gradient
     )
-    sky_rgb = scene.sky.sample(camera).requires_grad_(True)
+    rays = scene.sky.rays(camera, image.alpha.detach() < OPAQUE)
+    sky_rgb = scene.sky.sample(rays).requires_grad_(True)
     shown = composed(image, sky_rgb, config.initialisation.sky.min_transmittance)
-    shown = scene.exposure.apply(shown, picture.camera_name)
+    if _fits_exposure(state, config):
+        shown = scene.exposure.apply(shown, picture.camera_name)
     loss = _picture_loss(shown, picture, config, perceptual)
     loss = loss + _regularisers(state, image, picture, camera, config)
     loss = loss + _priors(state, tangent, picture.timestamp_ns, config)
     loss.backward()
     state.tally.add(screen_gradient, image.visible)
     _step_poses(state, config)
-    _step_sky(state, sky_rgb, image, picture, camera, config)
+    _step_sky(state, sky_rgb, rays, image.alpha.detach(), config, picture)
     squared_error = (shown.detach() - picture.rgb).square().mean()
     return float(loss.detach()), float(squared_error)
 
@@ -77,15 +81,15 @@ def add_guidance_gradients(state: FitState, view: GuidanceView, config: FitConfi
         gaussians = _with_fixed_geometry(gaussians)
     with torch.no_grad():
         bodies = scene.camera_from_body(view.camera.world_from_camera, view.timestamp_ns)
-        sky_rgb = scene.sky.sample(view.camera)
     image = scene.splat(view.camera, bodies, gaussians=gaussians)
+    sky_rgb = scene.sky.sample(scene.sky.rays(view.camera, image.alpha.detach() < OPAQUE))
     shown = image.rgb + (1 - image.alpha)[..., None] * sky_rgb
     loss = settings.weight * l1_ssim_loss(
         shown, view.rgb, ssim_weight=settings.ssim, pixel_weight=view.weight
     )
     if settings.depth > 0 and settings.freedom == "all":
         loss = loss + settings.depth * depth_loss(
-            image.depth_m, image.alpha, view.lidar_depth_m, cap=config.losses.depth_cap
+            image.depth_m, image.alpha, view.lidar_depth_m, tolerance=config.losses.depth_tolerance
         )
     loss.backward()
 
@@ -132,10 +136,12 @@ def _regularisers(
     weights, scene = config.losses, state.scene
     total = image.alpha.new_zeros(())
     if weights.sky > 0:
-        total = total + weights.sky * clear_sky_loss(image.alpha, picture.sky_mask)
+        total = total + weights.sky * clear_sky_loss(
+            image.alpha, picture.sky_mask, picture.solid_mask
+        )
     if weights.depth > 0:
         total = total + weights.depth * depth_loss(
-            image.depth_m, image.alpha, picture.lidar_depth_m, cap=weights.depth_cap
+            image.depth_m, image.alpha, picture.lidar_depth_m, tolerance=weights.depth_tolerance
         )
     if weights.actors > 0 and image.features.shape[-1] == 1:
         with torch.no_grad():
@@ -192,7 +198,7 @@ def _step_poses(state: FitState, config: FitConfig) -> None:
         with torch.no_grad():
             table = scene.actors.tangent.view(-1, 6)
             state.actor_adam.step(table, scene.actors.tangent.grad.view(-1, 6), rate)
-    if refinement.exposure or len(scene.exposure.camera_names) > 1:
+    if _fits_exposure(state, config):
         with torch.no_grad():
             rate = torch.full((12,), rates.at("exposure", fraction))
             gradient = scene.exposure.matrix.grad.flatten(1)
@@ -203,6 +209,11 @@ def _step_poses(state: FitState, config: FitConfig) -> None:
         table.grad = None
 
 
+def _fits_exposure(state: FitState, config: FitConfig) -> bool:
+    """One camera alone has no other to differ from."""
+    return config.refinement.exposure or len(state.scene.exposure.camera_names) > 1
+
+
 def _tangent_rate(rotation_rad: float, translation_m: float) -> Float[Tensor, "6"]:
     return torch.tensor([rotation_rad] * 3 + [translation_m] * 3, dtype=torch.float64)
 
@@ -210,24 +221,23 @@ def _tangent_rate(rotation_rad: float, translation_m: float) -> Float[Tensor, "6
 def _step_sky(
     state: FitState,
     sky_rgb: Float[Tensor, "height width 3"],
-    image: SplatImage,
-    picture: FitPicture,
-    camera: Camera,
+    rays: SkyRays,
+    alpha: Float[Tensor, "height width"],
     config: FitConfig,
+    picture: FitPicture,
 ) -> None:
     """Move the texels that were seen clearly enough."""
     settings = config.initialisation.sky
     if sky_rgb.grad is None:
         return
-    clear = 1 - image.alpha.detach()
+    clear = 1 - alpha
     learns = clear > settings.min_transmittance
     if config.sky_in_mask_only:
         learns &= picture.sky_mask
-    fraction = state.step / config.steps
     ratio = settings.final_learning_rate / settings.learning_rate
     state.scene.sky.observe(
         sky_rgb.grad,
         torch.where(learns, clear, torch.zeros_like(clear)),
-        camera,
-        settings.learning_rate * ratio**fraction,
+        rays,
+        settings.learning_rate * ratio ** (state.step / config.steps),
     )

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.gaussians.adaptive_voxels import adaptive_voxels
+from lidarpainter_models.gaussians.adaptive_voxels import VoxelPoints, adaptive_voxels
 from lidarpainter_models.gaussians.calibration import (
     ActorCorrections,
     CameraCorrections,
@@ -24,6 +24,7 @@ from lidarpainter_models.gaussians.observations import SceneObservations, Traini
 from lidarpainter_models.gaussians.scene_graph import GaussianScene
 from lidarpainter_models.gaussians.sky import SkyConfig, sky_from_pictures, sky_layout
 from lidarpainter_models.gaussians.surfels import SurfelConfig, fill_colours, surfels_from_points
+from lidarpainter_models.gaussians.unreached import UnreachedConfig, unreached_gaussians
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import transform_points
 from lidarpainter_models.scenes.driving_scene import ActorTrack
@@ -41,8 +42,10 @@ class InitialisationConfig:
     """Start size; densification brings it to the budget of the fit."""
     most_actor_share: float = 0.4
     """Actors get at most this part of the start size."""
-    unseen_share: float = 0.1
+    unseen_share: float = 0.2
     """Part of the street's share for points that only a camera moved aside would see."""
+    least_unseen_points: int = 3
+    """Voxels there with fewer points are dropped."""
     aside_m: float = 3.5
     """How far aside such a camera may stand."""
     sh_degree: int = 1
@@ -53,6 +56,7 @@ class InitialisationConfig:
     """Smallest voxel on an actor; its points come from the whole log."""
     street_voxel_m: float = 0.03
     """Smallest voxel on the street."""
+    unreached: UnreachedConfig = field(default_factory=UnreachedConfig)
     surfels: SurfelConfig = field(default_factory=SurfelConfig)
     sky: SkyConfig = field(default_factory=SkyConfig)
 
@@ -72,15 +76,23 @@ def initialise_scene(
     """
     views = observations.views
     actors = _actor_gaussians(observations, config)
-    num_actor_gaussians = sum(len(part) for part in actors)
-    street = _street_gaussians(
-        observations.lidar_map.street, views, config, config.num_gaussians - num_actor_gaussians
-    )
-    gaussians = street
+    for_unreached = int(config.num_gaussians * config.unreached.most_share)
+    for_street = config.num_gaussians - for_unreached - sum(len(part) for part in actors)
+    gaussians = _street_gaussians(observations.lidar_map.street, views, config, max(for_street, 1))
     for part in actors:
         gaussians = gaussians.append(part)
     if len(gaussians) == 0:
         raise ConfigError("no LiDAR point lies where a training camera could see it")
+    scene = _scene_around(gaussians, observations, config)
+    seeds = unreached_gaussians(scene, views, config.unreached, budget=for_unreached)
+    return scene.with_gaussians(gaussians.append(seeds))
+
+
+def _scene_around(
+    gaussians: GaussianSet, observations: SceneObservations, config: InitialisationConfig
+) -> GaussianScene:
+    """The Gaussians with a mean sky, and nothing corrected yet."""
+    views = observations.views
     timestamps_ns = torch.tensor([view.timestamp_ns for view in views], dtype=torch.int64)
     cameras = [view.camera for view in views]
     return GaussianScene(
@@ -130,34 +142,40 @@ def _street_gaussians(
     """Surfels on the street: most where pictures show it, some where only a moved camera would."""
     cameras = [view.camera for view in views]
     footprint, in_picture = pixel_footprint(points.xyz_m, cameras, aside_m=config.aside_m)
-    parts, sizes = [], []
-    shares = (
-        (in_picture, 1 - config.unseen_share),
-        (~in_picture & footprint.isfinite(), config.unseen_share),
-    )
-    for chosen, share in shares:
-        rows = chosen.nonzero()[:, 0]
-        voxels = adaptive_voxels(
-            points.xyz_m[rows],
-            points.rgb_u8[rows].float() / 255,
-            points.has_colour[rows],
-            footprint[rows],
-            budget=max(int(budget * share), 1),
-            least_m=config.street_voxel_m,
-        )
-        parts.append(voxels)
-        sizes.append(voxels.size_m)
-    xyz_m = torch.cat([part.xyz_m for part in parts])
-    rgb = torch.cat([part.rgb for part in parts])
-    has_colour = torch.cat([part.has_colour for part in parts])
+    is_aside = ~in_picture & footprint.isfinite()
+    for_aside = int(budget * config.unseen_share)
+    seen = _street_voxels(points, footprint, in_picture, config, max(budget - for_aside, 1))
+    aside = _street_voxels(points, footprint, is_aside, config, max(for_aside, 1))
+    # no picture will ever shrink a lone blob there, and beside the lane it is large in the view
+    aside = aside.keep(aside.num_points >= config.least_unseen_points)
+    xyz_m = torch.cat([seen.xyz_m, aside.xyz_m])
     if xyz_m.shape[0] == 0:
         return GaussianSet.empty(sh_degree=config.sh_degree)
+    rgb = torch.cat([seen.rgb, aside.rgb])
     return surfels_from_points(
         xyz_m,
-        fill_colours(xyz_m, rgb, has_colour),
+        fill_colours(xyz_m, rgb, torch.cat([seen.has_colour, aside.has_colour])),
         config.surfels,
         sh_degree=config.sh_degree,
-        most_sigma_m=2 * torch.cat(sizes),
+        most_sigma_m=torch.cat([2 * seen.size_m, config.surfels.spacing_sigma * aside.size_m]),
+    )
+
+
+def _street_voxels(
+    points: MapPoints,
+    footprint: Float[Tensor, " points"],
+    chosen: Bool[Tensor, " points"],
+    config: InitialisationConfig,
+    budget: int,
+) -> VoxelPoints:
+    """The chosen points, thinned out to a budget."""
+    return adaptive_voxels(
+        points.xyz_m[chosen],
+        points.rgb_u8[chosen].float() / 255,
+        points.has_colour[chosen],
+        footprint[chosen],
+        budget=budget,
+        least_m=config.street_voxel_m,
     )
 
 

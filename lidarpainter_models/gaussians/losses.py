@@ -35,10 +35,10 @@ class LossWeights:
     """Of the term that keeps actors inside their boxes."""
     actors_every: int = 10
     """Steps between two actor terms: it needs one more blended channel."""
-    depth: float = 0.1
-    """Of the relative LiDAR depth error."""
-    depth_cap: float = 0.2
-    """Relative depth errors count up to this: more is an occlusion, not a wrong surface."""
+    depth: float = 0.05
+    """Of the LiDAR depth term."""
+    depth_tolerance: float = 0.05
+    """Relative depth error from which on the pull of the LiDAR weakens."""
     pose_prior: float = 1e-4
     """Of squared camera corrections in units of the expected noise."""
     actor_prior: float = 1e-6
@@ -48,20 +48,28 @@ class LossWeights:
 
 
 def clear_sky_loss(
-    alpha: Float[Tensor, "height width"], sky_mask: Bool[Tensor, "height width"]
+    alpha: Float[Tensor, "height width"],
+    sky_mask: Bool[Tensor, "height width"],
+    solid_mask: Bool[Tensor, "height width"],
 ) -> Float[Tensor, ""]:
-    """Mean of -log(1 - alpha) in the sky and of the binary entropy of alpha elsewhere."""
+    """Mean of -log(1 - alpha) in the sky and of -log(alpha) where LiDAR hit something.
+
+    StreetCrafter takes the entropy of alpha everywhere outside the sky; that also closes the gaps
+    between wires and branches, which are neither sky for certain nor solid. They are left alone.
+    """
     inside = alpha.clamp(_EDGE, 1 - _EDGE)
-    log_clear = torch.log1p(-inside)
-    entropy = -(inside * inside.log() + (1 - inside) * log_clear)
-    return torch.where(sky_mask, -log_clear, entropy).mean()
+    wanted = torch.where(sky_mask, 1 - inside, inside)
+    return -torch.where(sky_mask | solid_mask, wanted.log(), torch.zeros_like(alpha)).mean()
 
 
 def actor_boundary_loss(
     actor_alpha: Float[Tensor, "height width"], in_boxes: Bool[Tensor, "height width"]
 ) -> Float[Tensor, ""]:
     """Mean of -log(1 - actor_alpha) outside the projected boxes, of its entropy inside."""
-    return clear_sky_loss(actor_alpha, ~in_boxes)
+    inside = actor_alpha.clamp(_EDGE, 1 - _EDGE)
+    log_clear = torch.log1p(-inside)
+    entropy = -(inside * inside.log() + (1 - inside) * log_clear)
+    return torch.where(in_boxes, entropy, -log_clear).mean()
 
 
 def depth_loss(
@@ -69,20 +77,19 @@ def depth_loss(
     alpha: Float[Tensor, "height width"],
     lidar_depth_m: Float[Tensor, "height width"],
     *,
-    cap: float,
-    weight: Float[Tensor, "height width"] | None = None,
+    tolerance: float,
 ) -> Float[Tensor, ""]:
-    """Mean relative error of the expected depth where LiDAR hit, each capped.
+    """Robust relative error of the expected depth where LiDAR hit, as a mean over those pixels.
 
-    A mean over all pixels of the picture with a return; pixels that the Gaussians leave clear do
-    not count (there the expected depth means nothing).
+    With e the relative error, log(1 + e / tolerance): the pull weakens beyond the tolerance (an
+    occlusion more likely than a wrong surface) but never ends. Pixels that the Gaussians leave
+    clear do not count: their expected depth means nothing.
     """
     is_known = (lidar_depth_m > 0) & (alpha.detach() > 0.3)
     safe_m = torch.where(is_known, lidar_depth_m, torch.ones_like(lidar_depth_m))
     expected_m = accumulated_m / alpha.clamp(min=0.05)
-    error = ((expected_m - safe_m).abs() / safe_m).clamp(max=cap)
-    counts = is_known.float() if weight is None else is_known.float() * weight
-    return (error * counts).sum() / is_known.sum().clamp(min=1)
+    error = torch.log1p((expected_m - safe_m).abs() / (safe_m * tolerance))
+    return (error * is_known).sum() / is_known.sum().clamp(min=1)
 
 
 def pose_prior(

@@ -32,6 +32,8 @@ from lidarpainter_models.scenes.driving_scene import ActorTrack
 
 PRESENCE_MARGIN_NS = 60_000_000
 """An actor stays for half a 10 Hz frame (and a little) beyond its first and last box."""
+OPAQUE = 1 - 1e-4
+"""From this opacity on nothing is seen of the sky: the rasteriser stops there too."""
 _FAR_BEHIND_M = -1e6
 SCHEMA = 1
 
@@ -160,7 +162,7 @@ class GaussianScene:
             bodies = self.camera_from_body(camera.world_from_camera, timestamp_ns)
             image = self.splat(camera, bodies, with_actor_alpha=True, backend=backend)
             clear = (1 - image.alpha)[..., None]
-            rgb = image.rgb + clear * self.sky.sample(camera)
+            rgb = image.rgb + clear * self.sky.sample(self.sky.rays(camera, image.alpha < OPAQUE))
             depth_m = expected_depth(image.depth_m, image.alpha)
             return SceneRender(
                 rgb=self.exposure.apply(rgb, camera_name),

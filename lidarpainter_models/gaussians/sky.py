@@ -18,8 +18,10 @@ from torch import Tensor
 from lidarpainter_models.gaussians import sky_kernels
 from lidarpainter_models.gaussians.sky_sampling import (
     SkyLayout,
+    SkyRays,
     sample_sky,
     scatter_gradient,
+    sky_rays,
 )
 from lidarpainter_models.geometry.cameras import Camera
 
@@ -71,19 +73,23 @@ class SkyTexture:
             visits=torch.zeros(size, dtype=torch.int32),
         )
 
-    def sample(self, camera: Camera) -> Float[Tensor, "height width 3"]:
-        """Colour of every pixel of the camera; no gradient."""
-        return sample_sky(self.rgb, camera, self.layout)
+    def rays(self, camera: Camera, wanted: Bool[Tensor, "height width"] | None = None) -> SkyRays:
+        """Where the camera's rays (of the wanted pixels) meet the texture."""
+        return sky_rays(camera, self.layout, wanted)
+
+    def sample(self, rays: SkyRays) -> Float[Tensor, "height width 3"]:
+        """Colour along the rays, without gradient."""
+        return sample_sky(self.rgb, rays, self.layout)
 
     def observe(
         self,
         gradient: Float[Tensor, "height width 3"],
         clear: Float[Tensor, "height width"],
-        camera: Camera,
+        rays: SkyRays,
         learning_rate: float,
     ) -> None:
         """One optimiser step on the texels seen through pixels of positive `clear`, in place."""
-        texel_gradient, texel_weight = scatter_gradient(gradient, clear, camera, self.layout)
+        texel_gradient, texel_weight = scatter_gradient(gradient, clear, rays, self.layout)
         self.weight += texel_weight
         if self.rgb.device.type == "cpu":
             sky_kernels.adam(
@@ -170,7 +176,9 @@ def sky_from_pictures(
     total = torch.zeros(layout.rows, layout.columns, 3)
     weight = torch.zeros(layout.rows, layout.columns)
     for camera, picture, mask in zip(cameras, pictures, masks, strict=True):
-        part, part_weight = scatter_gradient(picture, mask.float(), camera, layout)
+        part, part_weight = scatter_gradient(
+            picture, mask.float(), sky_rays(camera, layout, mask), layout
+        )
         total += part
         weight += part_weight
     if not bool((weight > 0).any()):

@@ -35,19 +35,22 @@ def _atan2(y, x):
 
 
 @numba.njit(cache=True)
-def locate(world_from_camera, lens, layout, height, width):
-    """Continuous (column, row) in the texture for every pixel's ray, texel centres at +0.5.
+def locate(world_from_camera, lens, layout, wanted):
+    """Continuous (column, row) in the texture of the wanted pixels' rays, texel centres at +0.5.
 
     lens: fx, fy, cx, cy in pixels. layout: azimuth of the left edge, elevation of the top edge,
     texel size (radians), number of columns.
     """
-    places = np.empty((height, width, 2), np.float32)
+    height, width = wanted.shape
+    places = np.zeros((height, width, 2), np.float32)
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     left, top, texel, columns = layout[0], layout[1], layout[2], layout[3]
     margin = (_TURN - columns * texel) * np.float32(0.5)
     for v in range(height):
         y = (np.float32(v + 0.5) - cy) / fy
         for u in range(width):
+            if not wanted[v, u]:
+                continue
             x = (np.float32(u + 0.5) - cx) / fx
             dx = world_from_camera[0, 0] * x + world_from_camera[0, 1] * y + world_from_camera[0, 2]
             dy = world_from_camera[1, 0] * x + world_from_camera[1, 1] * y + world_from_camera[1, 2]
@@ -81,14 +84,16 @@ def _corners(column, row, columns, rows, wraps):
 
 
 @numba.njit(cache=True)
-def sample(texture, places, wraps):
-    """Bilinear colours at the places."""
+def sample(texture, places, wanted, wraps):
+    """Bilinear colours at the places of the wanted pixels, black elsewhere."""
     rows, columns = texture.shape[:2]
     height, width = places.shape[:2]
-    rgb = np.empty((height, width, 3), np.float32)
+    rgb = np.zeros((height, width, 3), np.float32)
     one = np.float32(1.0)
     for v in range(height):
         for u in range(width):
+            if not wanted[v, u]:
+                continue
             c0, c1, r0, r1, wc, wr = _corners(
                 places[v, u, 0], places[v, u, 1], columns, rows, wraps
             )

@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.gaussians import sky_kernels
@@ -74,47 +74,83 @@ def sample_reference(
     return (texture.flatten(0, 1)[indices] * weights[..., None]).sum(dim=-2)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SkyRays:
+    """Where the rays of a camera meet a sky texture."""
+
+    places: Float[Tensor, "height width 2"]
+    """Continuous (column, row); of pixels that are not wanted, anything."""
+    wanted: Bool[Tensor, "height width"]
+    """Pixels whose sky colour matters."""
+
+
+def sky_rays(
+    camera: Camera, layout: SkyLayout, wanted: Bool[Tensor, "height width"] | None = None
+) -> SkyRays:
+    """The camera's rays in the texture; with `wanted`, only of these pixels."""
+    if wanted is None:
+        wanted = torch.ones(camera.height_px, camera.width_px, dtype=torch.bool)
+    if wanted.device.type != "cpu":
+        return SkyRays(places=locate(camera, layout).to(wanted.device), wanted=wanted)
+    lens = torch.tensor([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]).float()
+    extent = torch.tensor(
+        [layout.azimuth_left_rad, layout.elevation_top_rad, layout.texel_rad, layout.columns]
+    ).float()
+    rotation = camera.world_from_camera[:3, :3].detach().float().contiguous()
+    places = sky_kernels.locate(
+        rotation.numpy(), lens.numpy(), extent.numpy(), wanted.contiguous().numpy()
+    )
+    return SkyRays(places=torch.from_numpy(places), wanted=wanted)
+
+
 def sample_sky(
-    texture: Float[Tensor, "rows columns 3"], camera: Camera, layout: SkyLayout
+    texture: Float[Tensor, "rows columns 3"], rays: SkyRays, layout: SkyLayout
 ) -> Float[Tensor, "height width 3"]:
-    """Bilinear sky colour of every pixel, without gradient."""
+    """Bilinear sky colour of the wanted pixels, black elsewhere; without gradient."""
     if texture.device.type != "cpu":
-        return sample_reference(texture.detach(), camera, layout)
-    rgb = sky_kernels.sample(texture.detach().numpy(), _places(camera, layout), layout.wraps)
+        indices, weights = corners(rays.places, layout)
+        rgb = (texture.detach().flatten(0, 1)[indices] * weights[..., None]).sum(dim=-2)
+        return rgb * rays.wanted[..., None]
+    rgb = sky_kernels.sample(
+        texture.detach().numpy(),
+        rays.places.numpy(),
+        rays.wanted.contiguous().numpy(),
+        layout.wraps,
+    )
     return torch.from_numpy(rgb)
 
 
 def scatter_gradient(
     gradient: Float[Tensor, "height width 3"],
     weight: Float[Tensor, "height width"],
-    camera: Camera,
+    rays: SkyRays,
     layout: SkyLayout,
 ) -> tuple[Float[Tensor, "rows columns 3"], Float[Tensor, "rows columns"]]:
     """Carry pixel gradients to the texels.
 
-    Only pixels of positive weight count. Returns the texels' gradients and the weights summed on
-    each of them.
+    Only pixels of positive weight count; they must be among the wanted ones. Returns the texels'
+    gradients and the weights summed on each of them.
     """
     if gradient.device.type == "cpu":
         texel_gradient, texel_weight = sky_kernels.scatter(
             (layout.rows, layout.columns),
-            _places(camera, layout),
+            rays.places.numpy(),
             gradient.contiguous().numpy(),
             weight.contiguous().numpy(),
             layout.wraps,
         )
         return torch.from_numpy(texel_gradient), torch.from_numpy(texel_weight)
-    return scatter_reference(gradient, weight, camera, layout)
+    return scatter_reference(gradient, weight, rays, layout)
 
 
 def scatter_reference(
     gradient: Float[Tensor, "height width 3"],
     weight: Float[Tensor, "height width"],
-    camera: Camera,
+    rays: SkyRays,
     layout: SkyLayout,
 ) -> tuple[Float[Tensor, "rows columns 3"], Float[Tensor, "rows columns"]]:
     """Plain torch twin of `scatter_gradient`."""
-    indices, shares = corners(locate(camera, layout).to(gradient.device), layout)
+    indices, shares = corners(rays.places, layout)
     counts = weight > 0
     indices, shares = indices[counts].flatten(), shares[counts]
     texel_gradient = gradient.new_zeros(layout.rows * layout.columns, 3)
@@ -124,18 +160,3 @@ def scatter_reference(
     texel_weight.index_add_(0, indices, (shares * weight[counts][:, None]).flatten())
     size = (layout.rows, layout.columns)
     return texel_gradient.unflatten(0, size), texel_weight.unflatten(0, size)
-
-
-def _places(camera: Camera, layout: SkyLayout):  # noqa: ANN202 - a numpy array
-    """Texture places of every pixel by the fast kernel."""
-    numbers = torch.tensor(
-        [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px], dtype=torch.float32
-    )
-    extent = torch.tensor(
-        [layout.azimuth_left_rad, layout.elevation_top_rad, layout.texel_rad, layout.columns],
-        dtype=torch.float32,
-    )
-    rotation = camera.world_from_camera[:3, :3].detach().float().contiguous()
-    return sky_kernels.locate(
-        rotation.numpy(), numbers.numpy(), extent.numpy(), camera.height_px, camera.width_px
-    )
