@@ -1,0 +1,194 @@
+"""Keep what a painter learns from apart from what judges it.
+
+A pair aims at a true picture, its target; the same target can stand in many pairs (several fits,
+damaged copies, several folders). So pairs are held back, and compared with a painter's training
+record, by target and never by file. Synthetic streets of low seeds are for judging only.
+"""
+
+import hashlib
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from lidarpainter_models.conditioning.pairs import PairFolder
+from lidarpainter_models.errors import ConfigError, DataError
+from lidarpainter_models.painter.examples import PaintingPair, Window
+
+FIRST_TRAINING_SEED = 1000
+"""Streets of lower seeds belong to the demo, the tests and the evaluation."""
+TARGETS_KEY = "trained_targets"
+"""Entry of a weights file's provenance: the targets its training saw."""
+_COPY = re.compile(r"-(fit|damaged\d+)$")
+_STREET = re.compile(r"street-(\d+)$")
+
+
+class PairSubset:
+    """Some pairs of a folder, in its order; a `PairSource`."""
+
+    def __init__(self, folder: PairFolder, name: str, indices: Sequence[int]) -> None:
+        """Choose pairs by position; `name` is what records call the set."""
+        self.folder = folder
+        self.set_name = name
+        self.indices = tuple(indices)
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the folder's digest and of what was chosen from it."""
+        chosen = json.dumps([self.folder.digest, self.indices])
+        return hashlib.sha256(chosen.encode()).hexdigest()
+
+    @property
+    def targets(self) -> frozenset[str]:
+        """The true pictures that the pairs aim at."""
+        return frozenset(target_of(self.folder, index) for index in self.indices)
+
+    def size_px(self, index: int) -> tuple[int, int]:
+        """Height and width of a pair."""
+        return self.folder.size_px(self.indices[index])
+
+    def read(self, index: int, window: Window | None = None) -> PaintingPair:
+        """A pair, or the part of it inside a window.
+
+        Raises:
+            DataError: the file is damaged.
+        """
+        return self.folder.read(self.indices[index], window)
+
+    def describe(self) -> dict[str, Any]:
+        """The digest and what every pair came from."""
+        folder = self.folder
+        pairs = {folder.name(index): folder.provenance(index) for index in self.indices}
+        return {"set": self.set_name, "digest": self.digest, "pairs": pairs}
+
+
+def target_of(folder: PairFolder, index: int) -> str:
+    """The true picture of a pair: data set, sequence, and what was photographed from where.
+
+    A pair whose provenance says neither has a target of its own, shared with its damaged copies.
+    """
+    provenance = folder.provenance(index)
+    place = f"{provenance.get('dataset', 'unknown')}/{provenance.get('sequence', 'unknown')}"
+    if "target" in provenance:
+        return f"{place} {json.dumps(provenance['target'])}"
+    if "frame" in provenance and "shift" in provenance:
+        camera = provenance.get("cameras", [None])[0]
+        return f"{place} {json.dumps([provenance['frame'], camera, provenance['shift']])}"
+    return f"{place} {_COPY.sub('', folder.name(index))}"
+
+
+def check_street_seed(seed: int) -> None:
+    """Refuse to train on a street that judges.
+
+    Raises:
+        ConfigError: the seed is below `FIRST_TRAINING_SEED`.
+    """
+    if seed < FIRST_TRAINING_SEED:
+        raise ConfigError(
+            f"street seed {seed} is kept for the demo, tests and judging: painters train on seeds "
+            f"from {FIRST_TRAINING_SEED} up"
+        )
+
+
+def check_training_scene(dataset: str, sequence: str) -> None:
+    """Refuse to train on a stored street that judges.
+
+    Raises:
+        ConfigError: see `check_street_seed`.
+    """
+    found = _STREET.fullmatch(sequence)
+    if dataset == "synthetic" and found:
+        check_street_seed(int(found[1]))
+
+
+def check_training_pairs(folder: PairFolder) -> None:
+    """Refuse to train on pairs of a street that judges.
+
+    Raises:
+        ConfigError: see `check_street_seed`.
+    """
+    for index in range(len(folder)):
+        provenance = folder.provenance(index)
+        dataset, sequence = (str(provenance.get(key)) for key in ("dataset", "sequence"))
+        check_training_scene(dataset, sequence)
+
+
+def hold_back(
+    folders: Mapping[str, PairFolder], share: float
+) -> tuple[dict[str, PairSubset], dict[str, PairSubset]]:
+    """Part the pairs into those to learn from and those to judge by; no target is in both.
+
+    Of every folder's targets the same share is held back, chosen by a digest of their names, so
+    neither the order nor the other folders matter.
+
+    Args:
+        folders: pairs by name.
+        share: part of the targets to hold back, in [0, 1).
+
+    Returns:
+        Pairs to learn from and pairs to judge by, by name; empty sets are left out.
+
+    Raises:
+        ConfigError: the share is outside [0, 1), or nothing is left to learn from.
+    """
+    if not 0 <= share < 1:
+        raise ConfigError(f"the share of pairs held back must be in [0, 1), got {share}")
+    held: set[str] = set()
+    for folder in folders.values():
+        targets = {target_of(folder, index) for index in range(len(folder))}
+        count = math.ceil(share * len(targets)) if len(targets) > 1 else 0
+        held.update(sorted(targets, key=_mixed)[:count])
+    learnt = without_targets(folders, held)
+    judged = {}
+    for name, folder in folders.items():
+        indices = [index for index in range(len(folder)) if target_of(folder, index) in held]
+        if indices:
+            judged[name] = PairSubset(folder, name, indices)
+    if folders and not learnt:
+        raise ConfigError(f"with a share of {share} held back no pair is left to learn from")
+    return learnt, judged
+
+
+def without_targets(
+    folders: Mapping[str, PairFolder], targets: frozenset[str] | set[str]
+) -> dict[str, PairSubset]:
+    """The pairs that aim at none of some targets; empty sets are left out."""
+    kept = {
+        name: PairSubset(
+            folder,
+            name,
+            [index for index in range(len(folder)) if target_of(folder, index) not in targets],
+        )
+        for name, folder in folders.items()
+    }
+    return {name: subset for name, subset in kept.items() if len(subset)}
+
+
+def unseen_pairs(
+    folders: Mapping[str, PairFolder], provenances: Sequence[Mapping[str, Any]]
+) -> dict[str, PairSubset]:
+    """The pairs that no painter was trained on, so that all of them are judged alike.
+
+    Args:
+        folders: pairs by name.
+        provenances: that of every painter; one that names no targets was trained on nothing.
+
+    Raises:
+        DataError: every pair's target was trained on.
+    """
+    seen = {target for provenance in provenances for target in provenance.get(TARGETS_KEY, ())}
+    unseen = without_targets(folders, seen)
+    if not unseen:
+        raise DataError(
+            f"no pair of {', '.join(folders) or 'no folder'} is left to judge by: a painter was "
+            "trained on the target of every one"
+        )
+    return unseen
+
+
+def _mixed(target: str) -> str:
+    return hashlib.sha256(target.encode()).hexdigest()

@@ -1,0 +1,302 @@
+"""How well a painter repairs pairs whose true picture is known.
+
+Figures stand per source of pairs and over all of them. PSNR, SSIM and feature distance are means
+over pairs; damaged and undamaged PSNR, the share outside the hull and the confidence pool the
+pixels. An error is the mean absolute rgb difference of a pixel. Pixels where the target is unknown
+never count; for SSIM and features they show the target.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from statistics import fmean, median
+from typing import Any
+
+import torch
+import torch.nn.functional as F  # noqa: N812 - the name everyone knows
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidarpainter_models.errors import DataError
+from lidarpainter_models.kernels.ssim import ssim_map
+from lidarpainter_models.metrics.pictures import psnr_from_error, squared_error
+from lidarpainter_models.painter.baselines import UnpaintedPainter, WarpPainter
+from lidarpainter_models.painter.examples import PaintingPair, PairSource
+from lidarpainter_models.painter.protocol import Painter, Painting, PaintingConditions
+
+DAMAGED_ERROR = 0.1
+"""A pixel is damaged where the error of the render is above this."""
+WRONG_ERROR = 0.05
+"""A painted pixel is wrong where its error is above this: what the confidence should foretell."""
+HULL_SIDE_PX = 9
+HULL_MARGIN = 0.05
+CONFIDENCE_BINS = 1 << 16
+"""Confidences that share a bin count as equal."""
+
+PictureDistance = Callable[
+    [Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]], Float[Tensor, ""]
+]
+"""Of a picture to the truth, such as `metrics.squeezenet.SqueezeNetDistance`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PictureFigures:
+    """How close one kind of picture comes to the truth."""
+
+    psnr: float
+    ssim: float
+    feature_distance: float | None
+    """SqueezeNet 1.1; None without its weights."""
+    damaged_psnr: float | None
+    """None where no pixel was damaged."""
+    undamaged_psnr: float | None
+    outside_hull: float
+    """Share of pixels further than 0.05 outside what any input shows within 9x9 pixels."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SourceScores:
+    """A painter's figures on one source of pairs, beside those of two pictures it starts from."""
+
+    num_pairs: int
+    damaged_share: float
+    """Share of the pixels that are damaged in the input."""
+    input: PictureFigures
+    """The render as it is."""
+    warp_mean: PictureFigures
+    """The mean of the render and the valid warps."""
+    painted: PictureFigures
+    confidence_auc: float | None
+    """Chance that a right pixel has more confidence than a wrong one (area under the ROC curve,
+    ties count half); None where all pixels are right, or all wrong."""
+    cpu_ms_per_frame: float
+    """Process CPU time of painting one pair, all threads together; the median."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PaintingScores:
+    """A painter's figures on pairs it never saw."""
+
+    painter: str
+    sources: dict[str, SourceScores]
+    total: SourceScores
+    """Over the pairs of all sources."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """The figures as JSON types."""
+        return asdict(self)
+
+
+def score_painter(
+    painter: Painter,
+    sources: Mapping[str, PairSource],
+    *,
+    feature_distance: PictureDistance | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> PaintingScores:
+    """Paint every pair and compare with the truth.
+
+    Args:
+        painter: who paints.
+        sources: pairs by the name their table gets.
+        feature_distance: also compare in feature space.
+        progress: told after each pair how many of how many are done.
+
+    Raises:
+        DataError: a source without a pair whose target is known anywhere, or a damaged pair.
+    """
+    num_pairs, done = sum(len(source) for source in sources.values()), 0
+    tallies: dict[str, _SourceTally] = {}
+    for name, source in sources.items():
+        tally = tallies[name] = _SourceTally()
+        for pair in _pairs_of(source):
+            _score_pair(painter, pair, tally, feature_distance)
+            done += 1
+            if progress is not None:
+                progress(done, num_pairs)
+        if not tally.num_known:
+            raise DataError(f"pairs {name!r}: none has a known target, so nothing can be judged")
+    if not tallies:
+        raise DataError("no pairs to judge a painter on")
+    return PaintingScores(
+        painter=painter.name,
+        sources={name: tally.scores() for name, tally in tallies.items()},
+        total=_joined(list(tallies.values())).scores(),
+    )
+
+
+def outside_hull(
+    picture: Float[Tensor, "height width 3"], conditions: PaintingConditions
+) -> Bool[Tensor, "height width"]:
+    """Pixels with a channel beyond what the inputs show nearby, by more than a margin.
+
+    Nearby is a square of 9 pixels; inputs are the render, LiDAR hits and valid warps.
+    """
+    shown = torch.stack([conditions.render_rgb, conditions.lidar_rgb, *conditions.warp_rgb])
+    everywhere = torch.ones_like(conditions.lidar_hit)
+    exists = torch.stack([everywhere, conditions.lidar_hit, *conditions.warp_valid])[..., None]
+    upper = _largest_nearby(torch.where(exists, shown, -torch.inf).amax(dim=0))
+    lower = -_largest_nearby(torch.where(exists, -shown, -torch.inf).amax(dim=0))
+    return ((picture > upper + HULL_MARGIN) | (picture < lower - HULL_MARGIN)).any(dim=-1)
+
+
+def confidence_auc(
+    num_right: Float[Tensor, " bins"], num_wrong: Float[Tensor, " bins"]
+) -> float | None:
+    """Area under the ROC curve from counts of right and wrong pixels by rising confidence."""
+    total = float(num_right.sum() * num_wrong.sum())
+    if total == 0:
+        return None
+    num_right_above = num_right.sum() - num_right.cumsum(0)
+    return float((num_wrong * (num_right_above + 0.5 * num_right)).sum()) / total
+
+
+def _largest_nearby(values: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 3"]:
+    reach = HULL_SIDE_PX // 2
+    planes = values.permute(2, 0, 1)[None]
+    rows = F.max_pool2d(planes, (1, HULL_SIDE_PX), stride=1, padding=(0, reach))
+    both = F.max_pool2d(rows, (HULL_SIDE_PX, 1), stride=1, padding=(reach, 0))
+    return both[0].permute(1, 2, 0)
+
+
+@dataclass
+class _PictureTally:
+    """Sums for the figures of one kind of picture."""
+
+    psnr: list[float] = field(default_factory=list)
+    ssim: list[float] = field(default_factory=list)
+    feature_distance: list[float] = field(default_factory=list)
+    damaged_error: float = 0.0
+    undamaged_error: float = 0.0
+    num_outside: int = 0
+
+    def add(
+        self,
+        picture: Float[Tensor, "height width 3"],
+        pair: PaintingPair,
+        damaged: Bool[Tensor, "height width"],
+        feature_distance: PictureDistance | None,
+    ) -> None:
+        known, truth = pair.target_valid, pair.target_rgb
+        picture = torch.where(known[..., None], picture.clamp(0, 1), truth).contiguous()
+        error = squared_error(picture, truth).double()
+        self.psnr.append(psnr_from_error(float(error[known].mean())))
+        self.ssim.append(float(ssim_map(picture, truth.contiguous()).mean(dim=-1)[known].mean()))
+        self.damaged_error += float(error[known & damaged].sum())
+        self.undamaged_error += float(error[known & ~damaged].sum())
+        self.num_outside += int((outside_hull(picture, pair.conditions) & known).sum())
+        if feature_distance is not None:
+            self.feature_distance.append(float(feature_distance(picture, truth)))
+
+    def figures(self, num_known: int, num_damaged: int) -> PictureFigures:
+        return PictureFigures(
+            psnr=fmean(self.psnr),
+            ssim=fmean(self.ssim),
+            feature_distance=fmean(self.feature_distance) if self.feature_distance else None,
+            damaged_psnr=_pooled_psnr(self.damaged_error, num_damaged),
+            undamaged_psnr=_pooled_psnr(self.undamaged_error, num_known - num_damaged),
+            outside_hull=self.num_outside / num_known,
+        )
+
+
+def _no_counts() -> Float[Tensor, " bins"]:
+    return torch.zeros(CONFIDENCE_BINS, dtype=torch.float64)
+
+
+@dataclass
+class _SourceTally:
+    """Everything counted over the pairs of one source."""
+
+    input: _PictureTally = field(default_factory=_PictureTally)
+    warp_mean: _PictureTally = field(default_factory=_PictureTally)
+    painted: _PictureTally = field(default_factory=_PictureTally)
+    num_known: int = 0
+    num_damaged: int = 0
+    num_right: Tensor = field(default_factory=_no_counts)
+    num_wrong: Tensor = field(default_factory=_no_counts)
+    cpu_s: list[float] = field(default_factory=list)
+
+    def add_confidence(self, painting: Painting, pair: PaintingPair) -> None:
+        known = pair.target_valid
+        bins = (painting.confidence.clamp(0, 1) * (CONFIDENCE_BINS - 1)).round().long()[known]
+        wrong = _absolute_error(painting.rgb, pair.target_rgb)[known] > WRONG_ERROR
+        self.num_right += torch.bincount(bins[~wrong], minlength=CONFIDENCE_BINS)
+        self.num_wrong += torch.bincount(bins[wrong], minlength=CONFIDENCE_BINS)
+
+    def scores(self) -> SourceScores:
+        counts = (self.num_known, self.num_damaged)
+        return SourceScores(
+            num_pairs=len(self.cpu_s),
+            damaged_share=self.num_damaged / self.num_known,
+            input=self.input.figures(*counts),
+            warp_mean=self.warp_mean.figures(*counts),
+            painted=self.painted.figures(*counts),
+            confidence_auc=confidence_auc(self.num_right, self.num_wrong),
+            cpu_ms_per_frame=1000 * median(self.cpu_s),
+        )
+
+
+def _pairs_of(source: PairSource) -> Iterator[PaintingPair]:
+    for index in range(len(source)):
+        yield source.read(index)
+
+
+def _score_pair(
+    painter: Painter,
+    pair: PaintingPair,
+    tally: _SourceTally,
+    feature_distance: PictureDistance | None,
+) -> None:
+    """Paint one pair and count it; one whose target is known nowhere does not count."""
+    if not bool(pair.target_valid.any()):
+        return
+    conditions = pair.conditions
+    started = time.process_time()
+    painting = painter.paint(conditions)
+    tally.cpu_s.append(time.process_time() - started)
+    damaged = _absolute_error(conditions.render_rgb, pair.target_rgb) > DAMAGED_ERROR
+    tally.num_known += int(pair.target_valid.sum())
+    tally.num_damaged += int((damaged & pair.target_valid).sum())
+    tally.add_confidence(painting, pair)
+    pictures = (
+        (tally.input, UnpaintedPainter().paint(conditions).rgb),
+        (tally.warp_mean, WarpPainter().paint(conditions).rgb),
+        (tally.painted, painting.rgb),
+    )
+    for one, picture in pictures:
+        one.add(picture, pair, damaged, feature_distance)
+
+
+def _joined(tallies: Sequence[_SourceTally]) -> _SourceTally:
+    """One tally over the pairs of several sources."""
+    return _SourceTally(
+        input=_joined_pictures([tally.input for tally in tallies]),
+        warp_mean=_joined_pictures([tally.warp_mean for tally in tallies]),
+        painted=_joined_pictures([tally.painted for tally in tallies]),
+        num_known=sum(tally.num_known for tally in tallies),
+        num_damaged=sum(tally.num_damaged for tally in tallies),
+        num_right=torch.stack([tally.num_right for tally in tallies]).sum(dim=0),
+        num_wrong=torch.stack([tally.num_wrong for tally in tallies]).sum(dim=0),
+        cpu_s=[seconds for tally in tallies for seconds in tally.cpu_s],
+    )
+
+
+def _joined_pictures(tallies: Sequence[_PictureTally]) -> _PictureTally:
+    return _PictureTally(
+        psnr=[value for tally in tallies for value in tally.psnr],
+        ssim=[value for tally in tallies for value in tally.ssim],
+        feature_distance=[value for tally in tallies for value in tally.feature_distance],
+        damaged_error=sum(tally.damaged_error for tally in tallies),
+        undamaged_error=sum(tally.undamaged_error for tally in tallies),
+        num_outside=sum(tally.num_outside for tally in tallies),
+    )
+
+
+def _absolute_error(
+    picture: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]
+) -> Float[Tensor, "height width"]:
+    return (picture.clamp(0, 1) - truth).abs().mean(dim=-1)
+
+
+def _pooled_psnr(error_sum: float, num_pixels: int) -> float | None:
+    return psnr_from_error(error_sum / num_pixels) if num_pixels else None
