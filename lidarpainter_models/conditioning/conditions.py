@@ -87,17 +87,15 @@ class ConditionBuilder:
         if key not in self._sources:
             view, camera = self._views[key], self._cameras[key]
             render = self.scene.render(camera, view.timestamp_ns)
-            # the sky mask knows better than the render where there is sky; what is neither sky
-            # nor rendered is a hole of the render, which shows nothing for certain
-            is_hole = (render.alpha < self.config.warp.sky_alpha) & ~view.sky_mask
-            alpha = torch.where(view.sky_mask, 0.0, torch.where(is_hole, 1.0, render.alpha))
+            # the sky mask knows better than the render where there is sky; what else is clear in
+            # the render is drawn by the sky too, so it stands at infinity in both views
             self._sources[key] = SourcePicture(
                 key=key,
                 camera=camera,
                 timestamp_ns=view.timestamp_ns,
                 rgb=self._without_exposure(view.rgb, key[1]),
-                depth_m=torch.where(view.sky_mask | is_hole, 0.0, render.depth_m),
-                alpha=alpha,
+                depth_m=torch.where(view.sky_mask, 0.0, render.depth_m),
+                alpha=torch.where(view.sky_mask, 0.0, render.alpha),
             )
         return self._sources[key]
 
