@@ -73,6 +73,33 @@ def insert_samples(
 
 
 @numba.njit(cache=True, parallel=True)
+def steps_inside(
+    cells_uv: np.ndarray,
+    depth_m: np.ndarray,
+    inner_m: np.ndarray,
+    reach: int,
+    tolerance: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """For points on a rim, the step (columns, rows) to the nearest inner cell of their surface.
+
+    Where none lies within reach the step is zero and the flag false.
+    """
+    steps = np.zeros((depth_m.shape[0], 2), dtype=np.float32)
+    is_found = np.zeros(depth_m.shape[0], dtype=np.bool_)
+    for i in numba.prange(depth_m.shape[0]):
+        column, row, z = cells_uv[i, 0], cells_uv[i, 1], depth_m[i]
+        best = reach * reach + 1
+        for r in range(max(row - reach, 0), min(row + reach + 1, inner_m.shape[0])):
+            for c in range(max(column - reach, 0), min(column + reach + 1, inner_m.shape[1])):
+                distance = (r - row) * (r - row) + (c - column) * (c - column)
+                if distance < best and abs(inner_m[r, c] - z) <= tolerance * z:
+                    best = distance
+                    steps[i, 0], steps[i, 1] = c - column, r - row
+                    is_found[i] = True
+    return steps, is_found
+
+
+@numba.njit(cache=True, parallel=True)
 def sample_levels(
     pixels_uv: np.ndarray,
     level: np.ndarray,

@@ -24,11 +24,13 @@ from lidarpainter_models.scenes.colour_sampling import (
     insert_samples,
     project_inside,
     sample_levels,
+    steps_inside,
 )
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.exposure_matching import match_exposure
 from lidarpainter_models.scenes.map_points import MapPoints
 from lidarpainter_models.scenes.point_visibility import (
+    Neighbourhood,
     Visibility,
     box_far_ends,
     surface_visibility,
@@ -36,6 +38,9 @@ from lidarpainter_models.scenes.point_visibility import (
 )
 from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.scenes.tracks import ActorTrack
+
+_FINE_ENOUGH_PX = 2.0
+"""A picture with more pixels than this across a point's footprint is no better for it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,14 +63,22 @@ class ColouringConfig:
     """Gaps between scan lines up to this angle are closed to the background."""
     hidden_tolerance: float = 0.05
     """A point is behind a surface when further by this share of its depth."""
-    edge_rad: float = 0.005
-    """Depth edges nearer than this angle spoil a sample: errors of pose and calibration."""
+    edge_rad: float = 0.004
+    """Nearer surface within this angle spoils a sample: errors of pose and calibration."""
+    rim_rad: float = 0.008
+    """A surface that ends within this angle may show what is beyond it."""
     edge_tolerance: float = 0.15
     """A neighbour nearer or further by this share of the depth makes an edge."""
-    behind_edge_weight: float = 0.02
+    behind_edge_weight: float = 0.2
     """Weight of a sample beside a nearer surface."""
-    before_edge_weight: float = 0.1
+    rim_weight: float = 0.4
     """Weight of a sample on the rim of a surface."""
+    foreign_likeness: float = 30.0
+    """A rim's colour is foreign when nearer than this (RGB distance of 255) to that beyond..."""
+    foreign_contrast: float = 60.0
+    """... and further than this from that inside."""
+    inner_reach: int = 6
+    """How many cells away the inner part of a surface is looked for from its rim."""
     standing_box_share: float = 0.85
     """Share of each side of a standing actor's box that hides what is behind it."""
     near_m: float = 0.5
@@ -183,12 +196,14 @@ def _sample_view(
     visible = visible_points(cells_uv, seen.depth_m, visibility, tolerance=config.hidden_tolerance)
     kept = visible.nonzero()[:, 0]
     footprint_px = (seen.range_m * config.footprint_rad * camera.fx_px / seen.depth_m)[kept]
-    weight = _weight(seen, cells_uv, visibility, kept, config) * footprint_px.clamp(max=1.0)
-    level = (footprint_px >= 1.5).int() + (footprint_px >= 3.0).int()
-    levels = _pyramid(picture.numpy())
-    rgb = sample_levels(seen.pixels_uv[kept].numpy(), level.numpy(), *levels)
+    levels = _Levels(picture, footprint_px)
+    rgb, trust = _rim_samples(
+        levels, seen.pixels_uv[kept], cells_uv[kept], seen.depth_m[kept], visibility, scale, config
+    )
+    weight = trust / (1 + (seen.age_s[kept] / config.recency_s) ** 2)
+    weight *= footprint_px.clamp(max=_FINE_ENOUGH_PX) ** 2
     insert_samples(
-        *(seen.rows[kept].numpy(), weight.numpy(), rgb, number),
+        *(seen.rows[kept].numpy(), weight.numpy(), rgb.numpy(), number),
         *(samples.weight, samples.rgb, samples.view),
     )
 
@@ -243,25 +258,23 @@ def _visibility(
     """What stands before and around each cell when the picture was taken."""
     solid = (seen.is_actor | (seen.age_s <= config.surface_window_s)).nonzero()[:, 0]
     footprint_px = seen.range_m * config.beam_spacing_rad * grid.fx_px / seen.depth_m
-    hidden_from_m, nearest_m, furthest_m = surface_visibility(
-        cells_uv[solid],
-        seen.depth_m[solid],
-        (footprint_px[solid] / 2).round().long().clamp(max=2),
-        height_px=grid.height_px,
-        width_px=grid.width_px,
-        gap_px=max(1, round(config.gap_rad * grid.fx_px)),
-        edge_px=max(1, round(config.edge_rad * grid.fx_px)),
-    )
     boxes = [
         (track.pose_at(timestamp_ns), track.size_m * _solid_share(track, config))
         for track in tracks
         if track.is_present(timestamp_ns)
     ]
-    return Visibility(
-        hidden_from_m=hidden_from_m,
-        nearest_m=nearest_m,
-        furthest_m=furthest_m,
-        box_m=box_far_ends(boxes, grid),
+    return surface_visibility(
+        cells_uv[solid],
+        seen.depth_m[solid],
+        (footprint_px[solid] / 2).round().long().clamp(max=2),
+        grid,
+        Neighbourhood(
+            gap_px=max(1, round(config.gap_rad * grid.fx_px)),
+            edge_px=max(1, round(config.edge_rad * grid.fx_px)),
+            rim_px=max(1, round(config.rim_rad * grid.fx_px)),
+            edge_tolerance=config.edge_tolerance,
+        ),
+        box_far_ends(boxes, grid),
     )
 
 
@@ -270,21 +283,67 @@ def _solid_share(track: ActorTrack, config: ColouringConfig) -> float:
     return 1.0 if track.is_moving else config.standing_box_share
 
 
-def _weight(
-    seen: _InView,
-    cells_uv: Int[Tensor, "points 2"],
+def _rim_samples(
+    levels: "_Levels",
+    pixels_uv: Float[Tensor, "kept 2"],
+    cells_uv: Int[Tensor, "kept 2"],
+    depth_m: Float[Tensor, " kept"],
     visibility: Visibility,
-    kept: Int[Tensor, " kept"],
+    cells_per_pixel: Float[Tensor, "2"],
     config: ColouringConfig,
-) -> Float[Tensor, " kept"]:
-    """How far each visible sample is to be trusted."""
-    column, row = cells_uv[kept].unbind(-1)
-    depth_m = seen.depth_m[kept]
-    weight = 1 / (1 + (seen.age_s[kept] / config.recency_s) ** 2)
+) -> tuple[UInt8[Tensor, "kept 3"], Float[Tensor, " kept"]]:
+    """Colours of visible samples, and how far the place of each is to be trusted.
+
+    On the rim of a surface a small error of pose takes the colour of what is beside it. Where the
+    colour there is more like that beyond the rim than like that of the nearest inner cell, the
+    inner one is taken.
+    """
+    rgb = levels.sample(pixels_uv)
+    trust = torch.ones_like(depth_m)
+    column, row = cells_uv.unbind(-1)
     is_behind = visibility.nearest_m[row, column] < depth_m * (1 - config.edge_tolerance)
     is_before = visibility.furthest_m[row, column] > depth_m * (1 + config.edge_tolerance)
-    weight = torch.where(is_behind, weight * config.behind_edge_weight, weight)
-    return torch.where(is_before, weight * config.before_edge_weight, weight)
+    trust[is_behind] = config.behind_edge_weight
+    on_rim = is_before.nonzero()[:, 0]
+    trust[on_rim] *= config.rim_weight
+    steps, has_inner = map(
+        torch.from_numpy,
+        steps_inside(
+            *(cells_uv[on_rim].numpy(), depth_m[on_rim].numpy(), visibility.inner_m.numpy()),
+            *(config.inner_reach, config.edge_tolerance),
+        ),
+    )
+    moved, steps = on_rim[has_inner], steps[has_inner] / cells_per_pixel
+    own = rgb[moved].float()
+    inner = levels.sample(pixels_uv[moved] + steps, moved)
+    beyond = levels.sample(pixels_uv[moved] - steps, moved)
+    to_inner, to_beyond = (own - inner.float()).norm(dim=-1), (own - beyond.float()).norm(dim=-1)
+    is_foreign = (to_beyond < config.foreign_likeness) & (to_inner > config.foreign_contrast)
+    rgb[moved[is_foreign]] = inner[is_foreign]
+    return rgb, trust
+
+
+class _Levels:
+    """A picture at three sizes, and at which of them each point is sampled."""
+
+    def __init__(
+        self, picture: UInt8[Tensor, "height width 3"], footprint_px: Float[Tensor, " points"]
+    ) -> None:
+        height_px, width_px = picture.shape[:2]
+        self._pictures = [picture.numpy()]
+        for shrink in (2, 4):
+            size = (max(1, width_px // shrink), max(1, height_px // shrink))
+            self._pictures.append(cv2.resize(picture.numpy(), size, interpolation=cv2.INTER_AREA))
+        self._level = (footprint_px >= 1.5).int() + (footprint_px >= 3.0).int()
+
+    def sample(
+        self, pixels_uv: Float[Tensor, "rows 2"], rows: Int[Tensor, " rows"] | None = None
+    ) -> UInt8[Tensor, "rows 3"]:
+        """Colours at positions; `rows` says which points they belong to if not all."""
+        level = self._level if rows is None else self._level[rows]
+        return torch.from_numpy(
+            sample_levels(pixels_uv.contiguous().numpy(), level.numpy(), *self._pictures)
+        )
 
 
 def _shrunk(
@@ -295,12 +354,3 @@ def _shrunk(
         return rgb_u8
     size = (config.width_px, round(height_px * config.width_px / width_px))
     return torch.from_numpy(cv2.resize(rgb_u8.numpy(), size, interpolation=cv2.INTER_AREA))
-
-
-def _pyramid(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The picture, and area-averaged copies of half and a quarter of its size."""
-    height_px, width_px = picture.shape[:2]
-    sizes = [(max(1, width_px // 2), max(1, height_px // 2))]
-    sizes.append((max(1, width_px // 4), max(1, height_px // 4)))
-    middle, coarsest = (cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for size in sizes)
-    return picture, middle, coarsest

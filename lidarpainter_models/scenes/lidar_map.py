@@ -10,7 +10,6 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError, SceneError
@@ -39,6 +38,10 @@ class LidarMapConfig:
 
     min_range_m: float = 1.0
     """Nearer returns come from the LiDAR's own housing."""
+    ego_range_m: float = 2.6
+    """Returns nearer than this are the ego vehicle's own body..."""
+    ego_half_width_m: float = 1.2
+    """... when also less than this to the left or right of the LiDAR; a car beside it is not."""
     max_range_m: float = 300.0
     """Further returns are left out: there a beam is a metre wide."""
     separation: SeparationConfig = field(default_factory=SeparationConfig)
@@ -127,8 +130,11 @@ def _place_sweep(
 ) -> _PlacedSweep:
     """Read a sweep, drop what is out of range, and find what lies near actors."""
     read = scene.read_sweep(sweep)
-    range_m = _range(read.xyz_m, sweep)
-    used = (range_m >= config.min_range_m) & (range_m <= config.max_range_m)
+    away = read.xyz_m - sweep.world_from_lidar[:3, 3].to(read.xyz_m)
+    range_m = away.norm(dim=-1)
+    left = scene.world_from_ego[scene.frame_position(sweep.frame_index), :3, 1].to(away)
+    is_ego = (range_m < config.ego_range_m) & ((away @ left).abs() < config.ego_half_width_m)
+    used = (range_m >= config.min_range_m) & (range_m <= config.max_range_m) & ~is_ego
     timestamp_ns = sweep.timestamp_ns + read.time_offset_ns[used].to(torch.int64)
     points = MapPoints.uncoloured(
         xyz_m=read.xyz_m[used],
@@ -138,10 +144,6 @@ def _place_sweep(
     )
     near = near_actors(points.xyz_m, timestamp_ns, tracks, config.separation)
     return _PlacedSweep(points=points, near=near)
-
-
-def _range(xyz_m: Float[Tensor, "points 3"], sweep: Sweep) -> Float[Tensor, " points"]:
-    return (xyz_m - sweep.world_from_lidar[:3, 3].to(xyz_m)).norm(dim=-1)
 
 
 def _ground(street_parts: Sequence[MapPoints]) -> GroundHeights:

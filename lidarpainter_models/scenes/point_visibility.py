@@ -34,44 +34,69 @@ class Visibility:
     nearest_m: Float[Tensor, "rows columns"]
     """Nearest surface in the neighbourhood."""
     furthest_m: Float[Tensor, "rows columns"]
-    """Furthest surface in the neighbourhood, 0 where there is none."""
+    """Furthest surface in the neighbourhood, very far where part of it is open."""
     box_m: Float[Tensor, "rows columns"]
     """Far end of the nearest actor box that covers the cell."""
+    inner_m: Float[Tensor, "rows columns"]
+    """Depth of the surface where it goes on all around the cell, 0 at its rims and beyond."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Neighbourhood:
+    """How far around a cell surfaces are looked at, in cells."""
+
+    gap_px: int
+    """To each side, for nearer surface that hides a point."""
+    edge_px: int
+    """All around, for nearer surface that a point is just beside."""
+    rim_px: int
+    """All around, for the end of the surface that a point is on."""
+    edge_tolerance: float
+    """A neighbour nearer or further by this share of the depth makes an edge."""
 
 
 def surface_visibility(
     cells_uv: Int[Tensor, "points 2"],
     depth_m: Float[Tensor, " points"],
     radius_px: Int[Tensor, " points"],
-    *,
-    height_px: int,
-    width_px: int,
-    gap_px: int,
-    edge_px: int,
-) -> tuple[Float[Tensor, "rows columns"], ...]:
-    """`hidden_from_m`, `nearest_m` and `furthest_m` of a cloud of discs.
+    grid: Camera,
+    around: Neighbourhood,
+    box_m: Float[Tensor, "rows columns"],
+) -> Visibility:
+    """What a cloud of discs and boxes lets a camera see.
 
     Args:
         cells_uv: column and row of each point.
         depth_m: camera z.
         radius_px: radius of each point's disc.
-        height_px: rows of the grid.
-        width_px: columns of the grid.
-        gap_px: how far to each side nearer surface is looked for.
-        edge_px: how far around a cell the neighbourhood reaches.
+        grid: its pixels are the cells.
+        around: see there.
+        box_m: as `box_far_ends` gives it.
     """
-    seen = splat_points(
-        cells_uv, depth_m, height_px=height_px, width_px=width_px, radius_px=radius_px
-    )
-    is_surface = seen >= 0
-    depth = torch.where(is_surface, depth_m[seen.clamp(min=0)], _FAR_M).numpy()
-    sides = [_nearest_towards(depth, gap_px, *step) for step in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+    size = {"height_px": grid.height_px, "width_px": grid.width_px}
+    seen = splat_points(cells_uv, depth_m, radius_px=radius_px, **size)
+    is_surface = (seen >= 0).numpy()
+    depth = np.where(is_surface, depth_m.numpy()[seen.clamp(min=0).numpy()], np.float32(_FAR_M))
+    steps = ((1, 0), (-1, 0), (0, 1), (0, -1))
+    sides = [_nearest_towards(depth, around.gap_px, *step) for step in steps]
     hidden = np.minimum(np.maximum(sides[0], sides[1]), np.maximum(sides[2], sides[3]))
-    kernel = np.ones((2 * edge_px + 1, 2 * edge_px + 1), np.uint8)
-    nearest = cv2.erode(depth, kernel, borderType=cv2.BORDER_REPLICATE)
-    known = np.where(is_surface.numpy(), depth, np.float32(0))
-    furthest = cv2.dilate(known, kernel, borderType=cv2.BORDER_REPLICATE)
-    return torch.from_numpy(hidden), torch.from_numpy(nearest), torch.from_numpy(furthest)
+    square = np.ones((2 * around.edge_px + 1,) * 2, np.uint8)
+    nearest = cv2.erode(depth, square, borderType=cv2.BORDER_REPLICATE)
+    wide = np.ones((2 * around.rim_px + 1,) * 2, np.uint8)
+    known = np.where(is_surface, depth, np.float32(0))
+    furthest = cv2.dilate(known, wide, borderType=cv2.BORDER_REPLICATE)
+    gaps = np.ones((2 * around.gap_px + 1,) * 2, np.uint8)
+    closed = cv2.morphologyEx(is_surface.astype(np.uint8), cv2.MORPH_CLOSE, gaps)
+    is_closed = cv2.erode(closed, wide) > 0
+    is_inner = is_surface & is_closed & (nearest >= depth * (1 - around.edge_tolerance))
+    is_inner &= furthest <= depth * (1 + around.edge_tolerance)
+    return Visibility(
+        hidden_from_m=torch.from_numpy(hidden),
+        nearest_m=torch.from_numpy(nearest),
+        furthest_m=torch.from_numpy(np.where(is_closed, furthest, np.float32(_FAR_M))),
+        box_m=box_m,
+        inner_m=torch.from_numpy(np.where(is_inner, depth, np.float32(0))),
+    )
 
 
 def box_far_ends(

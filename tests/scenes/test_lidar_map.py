@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from toy_street import CAR_SIZE_M, CAR_X_M, WALL_X_M, ToyStreet
@@ -58,6 +60,17 @@ def test_ranges_out_of_bounds_are_left_out(street):
     config = LidarMapConfig(max_range_m=15.0)
     lidar_map = build_lidar_map(street, split_frames=(0,), colour_views=(), config=config)
     assert float(lidar_map.street.range_m.max()) <= 15
+
+
+def test_the_ego_vehicle_itself_leaves_no_points():
+    street = ToyStreet(num_frames=1)
+    bonnet, beside = [1.8, 0.3, 1.0], [0.2, 1.9, 1.0]
+    read = street.read_sweep(street.sweeps[0])
+    added = torch.cat([torch.tensor([bonnet, beside]), read.xyz_m[2:]])
+    street.read_sweep = lambda _: replace(read, xyz_m=added)
+    xyz_m = build_lidar_map(street, split_frames=(0,), colour_views=()).street.xyz_m
+    assert not (xyz_m == torch.tensor(bonnet)).all(-1).any()
+    assert (xyz_m == torch.tensor(beside)).all(-1).any()
 
 
 def test_no_points_is_an_error(street):
