@@ -6,7 +6,6 @@ searched so that a given number of voxels comes out. Metres; world or box frame 
 """
 
 from dataclasses import dataclass, fields
-from typing import Self
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -27,7 +26,7 @@ class VoxelPoints:
     num_points: Int[Tensor, " voxels"]
     """How many points lie inside."""
 
-    def keep(self, kept: Bool[Tensor, " voxels"]) -> Self:
+    def keep(self, kept: Bool[Tensor, " voxels"]) -> "VoxelPoints":
         """The marked voxels."""
         return type(self)(**{field.name: getattr(self, field.name)[kept] for field in fields(self)})
 

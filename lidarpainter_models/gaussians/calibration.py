@@ -9,7 +9,6 @@ motion in its box frame, linear in time between knots at the training times. Tan
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
 
 import torch
 from jaxtyping import Float, Int
@@ -40,7 +39,7 @@ class CameraCorrections:
         keys: Sequence[ViewKey],
         timestamps_ns: Int[Tensor, " views"],
         recorded_world_from_camera: Float[Tensor, "views 4 4"],
-    ) -> Self:
+    ) -> "CameraCorrections":
         """Nothing corrected yet."""
         names = tuple(sorted({name for _, name in keys}))
         return cls(
@@ -119,7 +118,7 @@ class ActorCorrections:
     tangent: Float[Tensor, "actors knots 6"]
 
     @classmethod
-    def none(cls, num_actors: int, knots_ns: Int[Tensor, " knots"]) -> Self:
+    def none(cls, num_actors: int, knots_ns: Int[Tensor, " knots"]) -> "ActorCorrections":
         """Nothing corrected yet; knots are sorted and unique."""
         knots = torch.unique(knots_ns)
         return cls(
@@ -150,7 +149,7 @@ class ExposureCorrections:
     matrix: Float[Tensor, "cameras 3 4"]
 
     @classmethod
-    def none(cls, camera_names: Sequence[str]) -> Self:
+    def none(cls, camera_names: Sequence[str]) -> "ExposureCorrections":
         """Colours as they are."""
         return cls(
             camera_names=tuple(camera_names),

@@ -1,7 +1,7 @@
 """All that a running fit is made of, and how it is kept and taken up again bit for bit."""
 
 from dataclasses import dataclass, field
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -38,7 +38,7 @@ class FitState:
     """Loss and squared error of the steps since the last entry of the history."""
 
     @classmethod
-    def begin(cls, scene: GaussianScene, config: FitConfig) -> Self:
+    def begin(cls, scene: GaussianScene, config: FitConfig) -> "FitState":
         """A fit before its first step; takes its own copy of the scene."""
         scene = _as_leaves(scene.copy())
         generator = torch.Generator()
@@ -94,7 +94,7 @@ class FitState:
         return tensors, numbers
 
     @classmethod
-    def resume(cls, tensors: dict[str, Tensor], numbers: dict[str, Any], config: FitConfig) -> Self:
+    def resume(cls, tensors: dict[str, Tensor], numbers: dict[str, Any], config: FitConfig) -> "FitState":
         """The state that `keep` described."""
         scene = GaussianScene.from_arrays(ungroup_tensors(tensors, "scene"), numbers["scene"])
         state = cls.begin(scene, config)

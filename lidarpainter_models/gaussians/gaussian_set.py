@@ -7,7 +7,6 @@ constant 0.5 added when rendered (Kerbl et al., 2023).
 """
 
 from dataclasses import dataclass, fields
-from typing import Self
 
 import torch
 from jaxtyping import Float, Int
@@ -80,11 +79,11 @@ class GaussianSet:
         """The columns that are optimised, by name."""
         return {name: getattr(self, name) for name in PARAMETERS}
 
-    def select(self, rows: Int[Tensor, " kept"]) -> Self:
+    def select(self, rows: Int[Tensor, " kept"]) -> "GaussianSet":
         """The given rows, detached."""
         return type(self)(**{name: value[rows] for name, value in self.columns().items()})
 
-    def append(self, other: Self) -> Self:
+    def append(self, other: "GaussianSet") -> "GaussianSet":
         """These rows followed by the other's, detached.
 
         Raises:
@@ -99,19 +98,19 @@ class GaussianSet:
             **{name: torch.cat([value, theirs[name]]) for name, value in self.columns().items()}
         )
 
-    def as_leaves(self) -> Self:
+    def as_leaves(self) -> "GaussianSet":
         """A copy whose parameters collect gradients."""
         columns = {name: value.clone() for name, value in self.columns().items()}
         for name in PARAMETERS:
             columns[name].requires_grad_(True)
         return type(self)(**columns)
 
-    def to(self, device: torch.device | str) -> Self:
+    def to(self, device: torch.device | str) -> "GaussianSet":
         """The same rows on another device, detached."""
         return type(self)(**{name: value.to(device) for name, value in self.columns().items()})
 
     @classmethod
-    def empty(cls, *, sh_degree: int = 1) -> Self:
+    def empty(cls, *, sh_degree: int = 1) -> "GaussianSet":
         """No rows."""
         return cls(
             means=torch.zeros(0, 3),

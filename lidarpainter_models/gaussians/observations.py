@@ -6,7 +6,7 @@ training frames enter. Frames: world (z up) and camera (x right, y down, z forwa
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, Self
+from typing import Any
 
 import cv2
 import torch
@@ -118,7 +118,7 @@ class SceneObservations:
         return arrays, metadata
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, Tensor], metadata: dict[str, Any]) -> Self:
+    def from_arrays(cls, arrays: dict[str, Tensor], metadata: dict[str, Any]) -> "SceneObservations":
         """Rebuild stored observations.
 
         Raises:

@@ -7,7 +7,7 @@ forward; world: z up; metres.
 """
 
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Self
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -216,7 +216,7 @@ class GaussianScene:
         return arrays, metadata
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, Tensor], metadata: dict[str, Any]) -> Self:
+    def from_arrays(cls, arrays: dict[str, Tensor], metadata: dict[str, Any]) -> "GaussianScene":
         """Rebuild a stored scene.
 
         Raises:
@@ -249,12 +249,12 @@ class GaussianScene:
         except (KeyError, TypeError) as error:
             raise SceneError(f"a stored Gaussian scene is incomplete: {error}") from error
 
-    def copy(self) -> Self:
+    def copy(self) -> "GaussianScene":
         """The same scene, sharing no memory and collecting no gradients."""
         arrays, metadata = self.to_arrays()
         return self.from_arrays({name: value.clone() for name, value in arrays.items()}, metadata)
 
-    def with_gaussians(self, gaussians: GaussianSet) -> Self:
+    def with_gaussians(self, gaussians: GaussianSet) -> "GaussianScene":
         """The same scene with other Gaussians."""
         return replace(self, gaussians=gaussians)
 

@@ -9,7 +9,6 @@ picture shows are filled in from their neighbours by push and pull (Gortler et a
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Self
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -61,7 +60,7 @@ class SkyTexture:
     visits: Int[Tensor, "rows columns"]
 
     @classmethod
-    def constant(cls, layout: SkyLayout, rgb: Float[Tensor, "3"]) -> Self:
+    def constant(cls, layout: SkyLayout, rgb: Float[Tensor, "3"]) -> "SkyTexture":
         """One colour everywhere, nothing seen yet."""
         size = (layout.rows, layout.columns)
         return cls(
@@ -101,12 +100,12 @@ class SkyTexture:
         else:
             adam_reference(self, texel_gradient, texel_weight, learning_rate)
 
-    def filled(self) -> Self:
+    def filled(self) -> "SkyTexture":
         """The same sky with every unseen texel filled in from seen ones."""
         known = self.weight.clamp(max=1.0)
         return replace(self, rgb=push_pull(self.rgb, known, wraps=self.layout.wraps))
 
-    def clone(self) -> Self:
+    def clone(self) -> "SkyTexture":
         """A copy that shares no memory."""
         return replace(self, **{name: value.clone() for name, value in self.tensors().items()})
 
