@@ -94,7 +94,9 @@ class FitState:
         return tensors, numbers
 
     @classmethod
-    def resume(cls, tensors: dict[str, Tensor], numbers: dict[str, Any], config: FitConfig) -> "FitState":
+    def resume(
+        cls, tensors: dict[str, Tensor], numbers: dict[str, Any], config: FitConfig
+    ) -> "FitState":
         """The state that `keep` described."""
         scene = GaussianScene.from_arrays(ungroup_tensors(tensors, "scene"), numbers["scene"])
         state = cls.begin(scene, config)

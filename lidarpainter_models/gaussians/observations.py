@@ -118,7 +118,9 @@ class SceneObservations:
         return arrays, metadata
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, Tensor], metadata: dict[str, Any]) -> "SceneObservations":
+    def from_arrays(
+        cls, arrays: dict[str, Tensor], metadata: dict[str, Any]
+    ) -> "SceneObservations":
         """Rebuild stored observations.
 
         Raises:
