@@ -8,7 +8,7 @@ from prefect import flow
 from flows.parameters import ReconstructParameters
 from flows.presets import preview
 from flows.reconstruct import reconstruct
-from lidarpainter_models.scenes.synthetic import SyntheticStreetConfig
+from lidarpainter_models.scenes.synthetic.config import SyntheticStreetConfig
 from tasks.ingest import ingest_street
 
 DEMO_SEED = 1

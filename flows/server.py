@@ -41,7 +41,11 @@ def prefect_server(log_path: Path) -> Iterator[None]:
     Raises:
         RuntimeError: the server does not start.
     """
-    from prefect.settings import PREFECT_API_URL, temporary_settings
+    from prefect.settings import (
+        PREFECT_API_URL,
+        PREFECT_LOGGING_TO_API_ENABLED,
+        temporary_settings,
+    )
 
     if PREFECT_API_URL.value():
         yield
@@ -52,7 +56,12 @@ def prefect_server(log_path: Path) -> Iterator[None]:
         process = _start(port, log.fileno())
     try:
         _wait_until_healthy(process, port, log_path)
-        with temporary_settings({PREFECT_API_URL: f"http://127.0.0.1:{port}/api"}):
+        # logs are sent in the background, perhaps after the server is gone
+        own = {
+            PREFECT_API_URL: f"http://127.0.0.1:{port}/api",
+            PREFECT_LOGGING_TO_API_ENABLED: False,
+        }
+        with temporary_settings(own):
             yield
     finally:
         _stop(process)

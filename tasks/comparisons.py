@@ -11,7 +11,7 @@ from lidarpainter_models.gaussians.scene_graph import GaussianScene
 from lidarpainter_models.geometry.trajectories import Shift
 from lidarpainter_models.painter.protocol import Painter
 from lidarpainter_models.scenes.records import RecordedView
-from lidarpainter_models.scenes.synthetic import SyntheticStreet
+from lidarpainter_models.scenes.synthetic.street import SyntheticStreet
 
 
 @dataclass(frozen=True, kw_only=True)

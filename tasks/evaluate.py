@@ -26,7 +26,7 @@ from lidarpainter_models.gaussians.observations import ObservationConfig
 from lidarpainter_models.gaussians.scene_graph import GaussianScene
 from lidarpainter_models.metrics.squeezenet import SqueezeNetDistance, load_squeezenet_distance
 from lidarpainter_models.painter import load_painter
-from lidarpainter_models.scenes.synthetic import SyntheticStreet
+from lidarpainter_models.scenes.synthetic.street import SyntheticStreet
 from tasks.painters import painter_digest
 from tasks.progress import listener
 from tasks.scenes import SplitSpec, open_split

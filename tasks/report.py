@@ -14,7 +14,7 @@ from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.export.report import Comparison, Plot, Report, Table, render_report
 from lidarpainter_models.painter import load_painter
-from lidarpainter_models.scenes.synthetic import SyntheticStreet
+from lidarpainter_models.scenes.synthetic.street import SyntheticStreet
 from tasks.comparisons import Subject, comparisons
 from tasks.evaluate import GENERATOR_ENTRY, JudgeSettings
 from tasks.painters import painter_digest

@@ -1,18 +1,29 @@
-"""A small stored scene, so that commands have something to work on."""
+"""The toy street in a store, and parameters so small that it is reconstructed in seconds."""
 
 from pathlib import Path
 
 import cv2
-import pytest
 import torch
 from toy_street import ToyStreet, world_from_car
 
-from catalog.store import STORE_ENVIRONMENT, open_store
+from flows.overrides import with_overrides
+from flows.parameters import ReconstructParameters
+from flows.presets import preview
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord
 from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
-from tasks.ingest import record_scene
 
 TOY_SCENE = "toy/street"
+SMALL = (
+    "observation.width_px=120",
+    "painter=warp",
+    "novel.every_nth=2",
+    "fit.steps=12",
+    "fit.log_every=5",
+    "fit.initialisation.num_gaussians=800",
+    "fit.densification.budget=1000",
+    "refine.steps=6",
+    "refine.densification.budget=1000",
+)
 IDENTITY = torch.eye(4, dtype=torch.float64)
 
 
@@ -47,10 +58,7 @@ def write_toy_scene(store_root: Path, num_frames: int = 4) -> Path:
     return writer.path
 
 
-@pytest.fixture
-def toy_store(tmp_path, monkeypatch):
-    """A store that holds the toy street, and is the one commands use."""
-    store = open_store(tmp_path / "store")
-    record_scene(store, write_toy_scene(store.root))
-    monkeypatch.setenv(STORE_ENVIRONMENT, str(store.root))
-    return store
+def small_parameters(**changes: object) -> ReconstructParameters:
+    """The preview preset, shrunk until it takes seconds."""
+    settings = [*SMALL, *(f"{name}={value}" for name, value in changes.items())]
+    return with_overrides(preview(TOY_SCENE), settings)

@@ -1,0 +1,220 @@
+"""The stages of a reconstruction, one after the other, without a server."""
+
+import json
+from pathlib import Path
+
+import pytest
+from toy_store import TOY_SCENE, small_parameters, write_toy_scene
+
+from catalog.errors import DamagedArtefactError
+from catalog.store import open_store
+from lidarpainter_models.errors import SceneError
+from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+from tasks.evaluate import evaluate
+from tasks.fit import fit, refine
+from tasks.ingest import record_scene
+from tasks.paint import paint
+from tasks.painted_views import load_guidance
+from tasks.prepare import prepare
+from tasks.publish import begin_run, complete_run, fail_run
+from tasks.render import RenderRequest, render
+from tasks.report import ReportInputs, report_path, write_report
+from tasks.runs import open_run
+from tasks.scores import load_scores
+from tasks.stored import FittedRef, load_history, load_scene
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    store = open_store(tmp_path_factory.mktemp("store"))
+    record_scene(store, write_toy_scene(store.root))
+    return store
+
+
+@pytest.fixture(scope="module")
+def parameters():
+    return small_parameters()
+
+
+@pytest.fixture(scope="module")
+def stages(store, parameters):
+    """Every stage's result by its name."""
+    root = store.root
+    seen = prepare.fn(root, parameters.split_spec, parameters.observation)
+    first = fit.fn(root, seen.ref, parameters.fit)
+    fitted = FittedRef(seen.ref, first.ref)
+    painted = paint.fn(root, "paint-1", TOY_SCENE, fitted, parameters.paint_settings, 0)
+    refined = refine.fn(root, "refine-1", seen.ref, first.ref, painted.ref, parameters.refine)
+    final = FittedRef(seen.ref, refined.ref)
+    split, settings = parameters.split_spec, parameters.judge_settings
+    return {
+        "prepare": seen,
+        "fit": first,
+        "paint-1": painted,
+        "refine-1": refined,
+        "evaluate-unpainted": evaluate.fn(root, "evaluate-unpainted", split, fitted, settings),
+        "evaluate": evaluate.fn(root, "evaluate", split, final, settings),
+        "evaluate-view-time": evaluate.fn(
+            root, "evaluate-view-time", split, final, settings, "warp"
+        ),
+    }
+
+
+@pytest.fixture(scope="module")
+def final(stages):
+    return FittedRef(stages["prepare"].ref, stages["refine-1"].ref)
+
+
+@pytest.fixture(scope="module")
+def run(store, parameters, stages, final):
+    """A complete run with its report."""
+    record = begin_run.fn(store.root, parameters, "cpu")
+    scores = {
+        "unpainted": load_scores(stages["evaluate-unpainted"].ref),
+        "painted": load_scores(stages["evaluate"].ref),
+    }
+    result = {
+        "run_id": record.run_id,
+        "scene": TOY_SCENE,
+        "preset": "preview",
+        "painter": "warp",
+        "split": "alternate",
+        "rounds": 1,
+        "seconds": {name: stage.seconds for name, stage in stages.items()},
+        "peak_memory_bytes": 1,
+        "num_gaussians": stages["refine-1"].summary["num_gaussians"],
+        **scores["painted"],
+        "unpainted": scores["unpainted"],
+        "guidance": {"paint-1": stages["paint-1"].summary},
+    }
+    report = write_report.fn(
+        store.root,
+        ReportInputs(
+            result=result,
+            split=parameters.split_spec,
+            settings=parameters.judge_settings,
+            painter="warp",
+            unpainted=FittedRef(stages["prepare"].ref, stages["fit"].ref),
+            final=final,
+            stages=stages,
+        ),
+    )
+    result["report"] = str(report_path(report.ref))
+    refs = tuple(stage.ref for stage in stages.values())
+    complete_run.fn(store.root, record, result, scores, refs)
+    return open_run(store, record.run_id)
+
+
+def test_every_stage_leaves_an_artefact_with_a_manifest(store, stages):
+    for stage in stages.values():
+        assert store.artefacts.verified(stage.ref).kind == stage.ref.kind
+    assert len(store.tables.rows("artefacts")) == len(stages)
+
+
+def test_a_stage_asked_again_is_not_computed_again(store, parameters, stages):
+    again = fit.fn(store.root, stages["prepare"].ref, parameters.fit)
+    assert not again.is_new
+    assert again.ref == stages["fit"].ref
+
+
+def test_a_fit_keeps_its_course_and_no_scratch(store, stages):
+    history = load_history(stages["fit"].ref)
+    assert [entry["step"] for entry in history] == [5, 10, 12]
+    assert list((store.root / "work").iterdir()) == []
+    scene = load_scene(store, stages["fit"].ref)
+    assert scene.num_gaussians == stages["fit"].summary["num_gaussians"]
+
+
+def test_painted_views_come_back_as_guidance(store, stages):
+    views = load_guidance(store, stages["paint-1"].ref)
+    assert len(views) == stages["paint-1"].summary["num_views"] > 0
+    for view in views:
+        assert view.rgb.shape == (view.camera.height_px, view.camera.width_px, 3)
+        assert 0 <= float(view.weight.min()) <= float(view.weight.max()) <= 1
+    pictures = stages["paint-1"].ref.folder / "pictures" / "left-2m"
+    assert {path.stem for path in pictures.iterdir()} >= {"render", "painted", "confidence"}
+
+
+def test_scores_say_why_a_number_is_missing(stages):
+    scores = load_scores(stages["evaluate"].ref)
+    assert scores["recorded"]["psnr"] > 10
+    assert scores["recorded"]["num_views"] == 2
+    left = scores["novel"]["left-2m"]
+    assert left["psnr"] is None
+    assert "nobody took pictures" in left["psnr_reason"]
+    assert 0 <= left["depth_within_5_percent"] <= 1
+
+
+def test_painting_at_view_time_is_judged_apart(stages):
+    assert stages["evaluate-view-time"].ref != stages["evaluate"].ref
+
+
+def test_a_report_stands_alone(run):
+    page = Path(run.result["report"]).read_text("utf-8")
+    assert page.startswith("<!doctype html>")
+    assert run.run_id in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    assert 'src="data:image/jpeg;base64,' in page
+
+
+def test_a_run_is_found_with_its_numbers(store, run):
+    assert run.final.gaussians.kind == "gaussians"
+    assert run.unpainted.gaussians != run.final.gaussians
+    row = store.run("latest")
+    assert row["run_id"] == run.run_id
+    metrics = store.tables.rows("metrics")
+    assert {metric["variant"] for metric in metrics} == {"unpainted", "painted"}
+    assert all(
+        (metric["value"] is None) == bool(metric["reason"])
+        for metric in metrics
+        if metric["name"] == "psnr"
+    )
+
+
+def test_a_failed_run_says_why(store, parameters):
+    other = parameters.model_copy(update={"preset": "balanced"})
+    record = begin_run.fn(store.root, other, "cpu")
+    assert store.tables.row("runs", record.run_id)["status"] == "running"
+    fail_run.fn(store.root, record, "SceneError: no picture")
+    assert store.tables.row("runs", record.run_id)["error"] == "SceneError: no picture"
+
+
+@pytest.mark.parametrize("painter", [None, "warp"])
+def test_a_run_is_rendered_where_nobody_drove(store, run, parameters, tmp_path, painter):
+    request = RenderRequest(
+        trajectory=parse_trajectory("lane-change:2+up:0.5"),
+        frames=slice(1, 3),
+        painter=painter,
+        observation=parameters.observation,
+        conditions=parameters.conditions,
+    )
+    made = render.fn(store.root, run, request, tmp_path)
+    assert made["num_pictures"] == 2
+    described = json.loads((tmp_path / "trajectory.json").read_text())
+    assert [row["file"] for row in described["pictures"]] == ["0001.png", "0002.png"]
+    first, last = (row["world_from_camera"] for row in described["pictures"])
+    assert last[7] - first[7] == pytest.approx(2.0, abs=0.2)  # y is to the left
+
+
+def test_an_unknown_camera_is_named_before_anything_is_drawn(store, run, parameters, tmp_path):
+    request = RenderRequest(
+        trajectory=parse_trajectory("recorded"),
+        camera="back",
+        observation=parameters.observation,
+        conditions=parameters.conditions,
+    )
+    with pytest.raises(SceneError, match="no camera 'back', it has front"):
+        render.fn(store.root, run, request, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_damaged_input_is_found_and_not_used(store, parameters, stages):
+    file = stages["prepare"].ref.folder / "observations.safetensors"
+    content = file.read_bytes()
+    file.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    try:
+        config = parameters.fit.__class__(steps=1)
+        with pytest.raises(DamagedArtefactError, match="is not what was written"):
+            fit.fn(store.root, stages["prepare"].ref, config)
+    finally:
+        file.write_bytes(content)
