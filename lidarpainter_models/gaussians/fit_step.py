@@ -48,7 +48,7 @@ def recorded_step(
     if not (refinement.cameras and is_refined):
         pose = pose.detach()
     camera = picture.camera.at(pose.detach())
-    bodies = scene.camera_from_body(pose, picture.timestamp_ns)
+    bodies = scene.camera_from_body(pose, *scene.world_from_actors(picture.timestamp_ns))
     with_actors = bool(scene.recorded_tracks) and state.step % config.losses.actors_every == 0
     screen_gradient = torch.zeros(scene.num_gaussians)
     image = scene.splat(
@@ -80,7 +80,8 @@ def add_guidance_gradients(state: FitState, view: GuidanceView, config: FitConfi
     if settings.freedom == "appearance":
         gaussians = _with_fixed_geometry(gaussians)
     with torch.no_grad():
-        bodies = scene.camera_from_body(view.camera.world_from_camera, view.timestamp_ns)
+        actors = scene.world_from_actors(view.timestamp_ns)
+        bodies = scene.camera_from_body(view.camera.world_from_camera, *actors)
     image = scene.splat(view.camera, bodies, gaussians=gaussians)
     sky_rgb = scene.sky.sample(scene.sky.rays(view.camera, image.alpha.detach() < OPAQUE))
     shown = image.rgb + (1 - image.alpha)[..., None] * sky_rgb

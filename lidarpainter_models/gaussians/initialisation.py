@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError
@@ -109,9 +109,17 @@ def _scene_around(
             timestamps_ns,
             torch.stack([camera.world_from_camera.double() for camera in cameras]),
         ),
-        actors=ActorCorrections.none(len(observations.tracks), timestamps_ns),
+        actors=ActorCorrections.none(len(observations.tracks), _frame_times(views)),
         exposure=ExposureCorrections.none(observations.camera_names),
     )
+
+
+def _frame_times(views: Sequence[TrainingView]) -> Int[Tensor, " frames"]:
+    """Mean exposure time of each training frame, over its cameras."""
+    of_frame: dict[int, list[int]] = {}
+    for view in views:
+        of_frame.setdefault(view.key[0], []).append(view.timestamp_ns)
+    return torch.tensor([sum(times) // len(times) for times in of_frame.values()])
 
 
 def pixel_footprint(

@@ -10,6 +10,7 @@ Tangents are (rotation vector in radians, translation in metres) in the body's o
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
@@ -17,9 +18,9 @@ from torch import Tensor
 
 from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_tangent
 
-# halving the gap divides the error of a cubic through smooth motion by 16, of a line by 4; real
-# motion is neither, and the variance is the square
-_CLOSER_NEIGHBOURS_VARIANCE = 1 / 16
+# halving the gap to the neighbours divides the error of a cubic through smooth motion by 16; on a
+# real road it is rough, and half the error (a quarter of the variance) is what is left
+_CLOSER_NEIGHBOURS_VARIANCE = 1 / 4
 _LEAST_VARIANCE = torch.tensor([1e-10] * 3 + [1e-8] * 3, dtype=torch.float64)
 
 
@@ -94,10 +95,11 @@ class RefinedTrack:
         corrected = self.with_neighbours_correction(query_s, recorded)
         if self.times_s.numel() < 2:
             return corrected
+        if not float(self.times_s[0]) < query_s < float(self.times_s[-1]):
+            return corrected
         moved = interpolate_smoothly(self.times_s, self.refined, query_s)
-        trust = self.trust_in_motion(query_s)
         difference = tangent_from_rigid(invert_rigid(corrected) @ moved)
-        return corrected @ rigid_from_tangent(trust * difference)
+        return corrected @ rigid_from_tangent(self.trust_in_motion * difference)
 
     def with_neighbours_correction(
         self, query_s: float, recorded: Float[Tensor, "4 4"]
@@ -110,15 +112,15 @@ class RefinedTrack:
         corrections = tangent_from_rigid(invert_rigid(self.recorded[rows]) @ self.refined[rows])
         return recorded @ rigid_from_tangent((weights[:, None] * corrections).sum(dim=0))
 
-    def trust_in_motion(self, query_s: float) -> Float[Tensor, "6"]:
-        """Weight of the interpolated motion, per tangent axis, in [0, 1].
+    @cached_property
+    def trust_in_motion(self) -> Float[Tensor, "6"]:
+        """Weight of the interpolated motion between refined times, per tangent axis, in [0, 1].
 
         Each inner refined time is left out and guessed both ways; its neighbours are then twice as
         far as those of a time between refined ones, for which the motion's error is scaled down.
         """
-        is_inside = float(self.times_s[0]) < query_s < float(self.times_s[-1])
         count = self.times_s.numel()
-        if count < 5 or not is_inside:
+        if count < 5:
             return torch.zeros(6, dtype=torch.float64)
         motion_error, correction_error = [], []
         for left_out in range(1, count - 1):

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
+from lidarpainter_models.gaussians.actor_motions import PRESENCE_MARGIN_NS, ActorMotions
 from lidarpainter_models.gaussians.calibration import (
     ActorCorrections,
     CameraCorrections,
@@ -30,8 +31,6 @@ from lidarpainter_models.kernels.backends import Backend
 from lidarpainter_models.kernels.gaussian_raster import SplatImage, render_gaussians
 from lidarpainter_models.scenes.driving_scene import ActorTrack
 
-PRESENCE_MARGIN_NS = 60_000_000
-"""An actor stays for half a 10 Hz frame (and a little) beyond its first and last box."""
 OPAQUE = 1 - 1e-4
 """From this opacity on nothing is seen of the sky: the rasteriser stops there too."""
 _FAR_BEHIND_M = -1e6
@@ -64,6 +63,7 @@ class GaussianScene:
     actors: ActorCorrections
     exposure: ExposureCorrections
     _recorded_poses: dict[int, tuple[Tensor, Tensor]] = field(default_factory=dict, repr=False)
+    _motions_made: ActorMotions | None = field(default=None, repr=False)
 
     @property
     def num_gaussians(self) -> int:
@@ -73,40 +73,68 @@ class GaussianScene:
     @property
     def tracks(self) -> tuple[ActorTrack, ...]:
         """The actors' tracks with refined poses."""
-        refined = []
-        for index, track in enumerate(self.recorded_tracks):
-            with torch.no_grad():
-                tangents = torch.stack(
-                    [self.actors.at(int(time_ns))[index] for time_ns in track.timestamps_ns]
-                )
-                poses = track.world_from_box.double() @ rigid_from_tangent(tangents)
-            refined.append(replace(track, world_from_box=poses))
-        return tuple(refined)
+        motions = self._motions()
+        return tuple(
+            replace(
+                track,
+                world_from_box=torch.stack(
+                    [motions.pose_at(index, int(time_ns)) for time_ns in track.timestamps_ns]
+                ),
+            )
+            for index, track in enumerate(self.recorded_tracks)
+        )
+
+    def actor_poses(
+        self, timestamp_ns: int
+    ) -> tuple[Float[Tensor, "actors 4 4"], Float[Tensor, " actors"]]:
+        """Most likely actor poses at any time, and 1 for each actor present then, else 0.
+
+        At training times these are the refined poses; in between see `pose_blending`.
+        """
+        motions, (recorded, present) = self._motions(), self._recorded_at(timestamp_ns)
+        poses = recorded.clone()
+        for index in present.nonzero()[:, 0].tolist():
+            poses[index] = motions.pose_at(index, timestamp_ns)
+        return poses, present
 
     def world_from_actors(
         self, timestamp_ns: int
     ) -> tuple[Float[Tensor, "actors 4 4"], Float[Tensor, " actors"]]:
-        """Refined actor poses at a time, and 1 for each actor that is present then, else 0."""
-        if timestamp_ns not in self._recorded_poses:
-            self._recorded_poses[timestamp_ns] = _poses_at(self.recorded_tracks, timestamp_ns)
-        recorded, present = self._recorded_poses[timestamp_ns]
+        """Corrected actor poses at a time, differentiable, and 1 for each actor present then."""
+        recorded, present = self._recorded_at(timestamp_ns)
         return recorded @ rigid_from_tangent(self.actors.at(timestamp_ns)), present
 
+    def _recorded_at(
+        self, timestamp_ns: int
+    ) -> tuple[Float[Tensor, "actors 4 4"], Float[Tensor, " actors"]]:
+        if timestamp_ns not in self._recorded_poses:
+            self._recorded_poses[timestamp_ns] = _poses_at(self.recorded_tracks, timestamp_ns)
+        return self._recorded_poses[timestamp_ns]
+
+    def _motions(self) -> ActorMotions:
+        """The actors' refined motions, made again when the corrections have changed."""
+        tangent = self.actors.tangent.detach()
+        if self._motions_made is None or not torch.equal(self._motions_made.tangent, tangent):
+            self._motions_made = ActorMotions.of(self.recorded_tracks, self.actors)
+        return self._motions_made
+
     def camera_from_body(
-        self, world_from_camera: Float[Tensor, "4 4"], timestamp_ns: int
+        self,
+        world_from_camera: Float[Tensor, "4 4"],
+        world_from_actors: Float[Tensor, "actors 4 4"],
+        present: Float[Tensor, " actors"],
     ) -> Float[Tensor, "bodies 4 4"]:
-        """Where every body stands in the camera; differentiable in both poses, float32.
+        """Where every body stands in the camera; differentiable in the poses, float32.
 
         Absent actors are put far behind the camera, where nothing is drawn.
         """
         camera_from_world = invert_rigid(world_from_camera.double())
         if not self.recorded_tracks:
             return camera_from_world[None].float()
-        world_from_actor, present = self.world_from_actors(timestamp_ns)
         absent = torch.eye(4, dtype=torch.float64)
         absent[2, 3] = _FAR_BEHIND_M
         is_present = present[:, None, None] > 0
-        camera_from_actor = torch.where(is_present, camera_from_world @ world_from_actor, absent)
+        camera_from_actor = torch.where(is_present, camera_from_world @ world_from_actors, absent)
         return torch.cat([camera_from_world[None], camera_from_actor]).float()
 
     def splat(
@@ -159,7 +187,9 @@ class GaussianScene:
         with torch.no_grad():
             if row is not None:
                 camera = camera.at(self.cameras.world_from_camera(row))
-            bodies = self.camera_from_body(camera.world_from_camera, timestamp_ns)
+            bodies = self.camera_from_body(
+                camera.world_from_camera, *self.actor_poses(timestamp_ns)
+            )
             image = self.splat(camera, bodies, with_actor_alpha=True, backend=backend)
             clear = (1 - image.alpha)[..., None]
             rgb = image.rgb + clear * self.sky.sample(self.sky.rays(camera, image.alpha < OPAQUE))

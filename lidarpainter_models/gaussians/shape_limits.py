@@ -66,7 +66,7 @@ def viewing_rays(scene: GaussianScene, camera_rows: Sequence[int] | None = None)
         for row in rows:
             timestamp_ns = int(scene.cameras.timestamps_ns[row])
             camera_from_body = scene.camera_from_body(
-                scene.cameras.world_from_camera(row), timestamp_ns
+                scene.cameras.world_from_camera(row), *scene.world_from_actors(timestamp_ns)
             )
             body_from_camera = invert_rigid(camera_from_body)
             offset = means - body_from_camera[body, :3, 3]
