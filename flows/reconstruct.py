@@ -10,7 +10,10 @@ from typing import Any
 from prefect import flow
 
 from catalog.records import RunRecord
+from catalog.store import open_store
+from flows.overrides import with_overrides
 from flows.parameters import ReconstructParameters
+from flows.presets import preset as preset_named
 from tasks.evaluate import evaluate
 from tasks.fit import fit, refine
 from tasks.paint import paint
@@ -44,6 +47,22 @@ def reconstruct(parameters: ReconstructParameters, store_path: Path) -> dict[str
     record = begin_run(store_path, parameters, DEVICE)
     with failure_recorded(store_path, record):
         return _run(parameters, store_path, record)
+
+
+@flow(name="reconstruct-scene")
+def reconstruct_scene(
+    scene: str, preset: str = "balanced", settings: tuple[str, ...] = (), store: str | None = None
+) -> dict[str, Any]:
+    """Reconstruct a scene by name, as a worker is asked to.
+
+    Args:
+        scene: `<dataset>/<sequence>` of the store.
+        preset: `preview`, `balanced` or `paper`.
+        settings: other settings, `key=value` as the command's `--set`.
+        store: folder of the store; by default what `LIDARPAINTER_STORE` says on the worker.
+    """
+    parameters = with_overrides(preset_named(preset, scene), settings)
+    return reconstruct.fn(parameters, open_store(store).root)
 
 
 def _run(parameters: ReconstructParameters, store_path: Path, record: RunRecord) -> dict[str, Any]:

@@ -18,24 +18,18 @@ from lidarpainter_models.evaluation.scene_scores import (
     ScoringConfig,
     painted_renderer,
     scene_renderer,
-    score_geometry,
-    score_recorded,
-    score_synthetic,
 )
 from lidarpainter_models.gaussians.observations import ObservationConfig
 from lidarpainter_models.gaussians.scene_graph import GaussianScene
 from lidarpainter_models.metrics.squeezenet import SqueezeNetDistance, load_squeezenet_distance
 from lidarpainter_models.painter import load_painter
-from lidarpainter_models.scenes.synthetic.street import SyntheticStreet
+from tasks.judging import Judgement
 from tasks.painters import painter_digest
 from tasks.progress import listener
 from tasks.scenes import SplitSpec, open_split
 from tasks.scores import SCORES_FILE
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
 from tasks.stored import FittedRef, load_observations, load_scene, write_json
-
-GENERATOR_ENTRY = "generator"
-"""Entry of a scene's manifest by which the synthetic street is built again."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,8 +68,15 @@ def evaluate(
     def build(place: Workplace) -> dict[str, Any]:
         scene = load_scene(store, fitted.gaussians)
         held_out = HeldOut(scene=recorded, test_views=views.test, observation=settings.observation)
-        render = _renderer(store, fitted, scene, settings.conditions, view_time_painter)
-        scores = _scores(held_out, scene, render, settings, stage)
+        judgement = Judgement(
+            held_out=held_out,
+            fitted=scene,
+            render_as=_renderer(store, fitted, scene, settings.conditions, view_time_painter),
+            shifts=settings.scoring.shifts,
+            feature_distance=_feature_distance(settings.feature_weights),
+            progress=lambda done, total: listener().advanced(stage, done, total, ""),
+        )
+        scores = judgement.scores()
         write_json(place.output / SCORES_FILE, scores)
         return {"psnr": scores["recorded"]["psnr"], "num_views": scores["recorded"]["num_views"]}
 
@@ -100,69 +101,14 @@ def _renderer(
     scene: GaussianScene,
     conditions: ConditionConfig,
     painter: str | None,
-) -> Callable[[str | None], Renderer]:
+) -> Callable[[str], Renderer]:
     """Renderers by the camera whose exposure they take."""
     if painter is None:
         return lambda camera_name: scene_renderer(scene, camera_name)
     seen = load_observations(store, fitted.observations)
     builder = ConditionBuilder(scene, seen.lidar_map, seen.views, config=conditions)
-    renderer = painted_renderer(builder, load_painter(painter))
-    return lambda _camera_name: renderer
-
-
-def _scores(
-    held_out: HeldOut,
-    scene: GaussianScene,
-    render: Callable[[str | None], Renderer],
-    settings: JudgeSettings,
-    stage: str,
-) -> dict[str, Any]:
-    shifts = settings.scoring.shifts
-    distance = _feature_distance(settings.feature_weights)
-    told = _Steps(stage, 3)
-    cameras = tuple(dict.fromkeys(view.camera_name for view in held_out.test_views))
-    only_camera = cameras[0] if len(cameras) == 1 else None
-    recorded = score_recorded(render(only_camera), held_out, scene, feature_distance=distance)
-    told.next()
-    num_views = len(held_out.test_views)
-    novel = {shift.name: _without_truth(num_views) for shift in shifts}
-    if GENERATOR_ENTRY in held_out.scene.manifest:
-        street = SyntheticStreet.from_manifest(held_out.scene.manifest)
-        novel = score_synthetic(
-            render(only_camera), held_out, scene, street, shifts, feature_distance=distance
-        )
-    told.next()
-    for name, fraction in score_geometry(held_out, scene, shifts).items():
-        place = novel.get(name, recorded)
-        place["depth_within_5_percent"] = fraction
-    told.next()
-    return {"recorded": recorded, "novel": novel}
-
-
-def _without_truth(num_views: int) -> dict[str, Any]:
-    """The figures of a place where nobody took a picture."""
-    missing = dict.fromkeys(("psnr", "ssim", "lpips", "fid", "kid"))
-    return {
-        **missing,
-        "psnr_reason": "nobody took pictures there",
-        "ssim_reason": "nobody took pictures there",
-        "lpips_reason": "nobody took pictures there",
-        "fid_reason": "Inception weights are user-supplied and none were given",
-        "kid_reason": "Inception weights are user-supplied and none were given",
-        "num_views": num_views,
-    }
-
-
-class _Steps:
-    """Tells the listener about steps of one stage."""
-
-    def __init__(self, stage: str, total: int) -> None:
-        self._stage, self._total, self._done = stage, total, 0
-
-    def next(self) -> None:
-        """One more step is done."""
-        self._done += 1
-        listener().advanced(self._stage, self._done, self._total, "")
+    loaded = load_painter(painter)
+    return lambda camera_name: painted_renderer(builder, loaded, camera_name)
 
 
 def _feature_distance(path: Path | None) -> SqueezeNetDistance | None:

@@ -16,7 +16,8 @@ from lidarpainter_models.export.report import Comparison, Plot, Report, Table, r
 from lidarpainter_models.painter import load_painter
 from lidarpainter_models.scenes.synthetic.street import SyntheticStreet
 from tasks.comparisons import Subject, comparisons
-from tasks.evaluate import GENERATOR_ENTRY, JudgeSettings
+from tasks.evaluate import JudgeSettings
+from tasks.judging import GENERATOR_ENTRY
 from tasks.painters import painter_digest
 from tasks.scenes import SplitSpec, open_split
 from tasks.scores import SCORE_COLUMNS, SCORE_NOTE, score_rows

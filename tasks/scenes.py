@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from catalog.store import Store
+from lidarpainter_models.errors import SceneError
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import ViewSplit, split_views
 
@@ -24,7 +25,16 @@ def open_scene(store: Store, scene_id: str) -> DrivingScene:
     Raises:
         SceneError: it is not there, or not complete.
     """
-    return DrivingScene.open(store.scene_folder(scene_id))
+    folder = store.scene_folder(scene_id)
+    if not folder.exists():
+        known = sorted(
+            f"{path.parent.name}/{path.name}" for path in store.root.glob("scenes/*/[!.]*")
+        )
+        raise SceneError(
+            f"no scene {scene_id} in {store.root}: ingest it first "
+            f"(there {'is' if len(known) == 1 else 'are'} {', '.join(known) or 'none'})"
+        )
+    return DrivingScene.open(folder)
 
 
 def open_split(store: Store, split: SplitSpec) -> tuple[DrivingScene, ViewSplit]:

@@ -48,11 +48,14 @@ def scene_renderer(fitted: GaussianScene, camera_name: str | None = None) -> Ren
     return render
 
 
-def painted_renderer(builder: ConditionBuilder, painter: Painter) -> Renderer:
+def painted_renderer(
+    builder: ConditionBuilder, painter: Painter, camera_name: str | None = None
+) -> Renderer:
     """The scene followed by a painter: painting at view time."""
 
     def render(camera: Camera, timestamp_ns: int) -> Float[Tensor, "height width 3"]:
-        return painter.paint(builder.conditions(camera, timestamp_ns)).rgb
+        conditions = builder.conditions(camera, timestamp_ns, camera_name=camera_name)
+        return painter.paint(conditions).rgb
 
     return render
 
