@@ -1,7 +1,7 @@
 """Change single settings of a preset by their dotted path: `fit.steps=500`."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar, get_type_hints
 
@@ -31,6 +31,20 @@ def with_overrides(parameters: Parameters, assignments: Sequence[str]) -> Parame
     return parameters
 
 
+def with_changes(parameters: Parameters, changes: Mapping[str, Any]) -> Parameters:
+    """The same parameters with whole fields replaced, checked as at the first time.
+
+    Raises:
+        ConfigError: a value does not fit its field.
+    """
+    values = {field: getattr(parameters, field) for field in type(parameters).model_fields}
+    try:
+        return type(parameters)(**{**values, **changes})
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ConfigError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+
+
 def _assigned(owner: Any, names: list[str], text: str, path: str) -> Any:  # noqa: ANN401
     """A copy of a model or dataclass with one setting below it changed."""
     known = _field_names(owner)
@@ -45,7 +59,7 @@ def _assigned(owner: Any, names: list[str], text: str, path: str) -> Any:  # noq
         value = _assigned(getattr(owner, name), names[1:], text, path)
     else:
         value = _parsed(get_type_hints(type(owner))[name], text, path)
-    return _replaced(owner, name, value, path)
+    return _replaced(owner, name, value)
 
 
 def _field_names(owner: Any) -> list[str]:  # noqa: ANN401 - a model, a dataclass or a plain value
@@ -56,14 +70,10 @@ def _field_names(owner: Any) -> list[str]:  # noqa: ANN401 - a model, a dataclas
     return []
 
 
-def _replaced(owner: Any, name: str, value: Any, path: str) -> Any:  # noqa: ANN401
+def _replaced(owner: Any, name: str, value: Any) -> Any:  # noqa: ANN401
     if not isinstance(owner, BaseModel):
         return replace(owner, **{name: value})
-    values = {field: getattr(owner, field) for field in type(owner).model_fields}
-    try:
-        return type(owner)(**{**values, name: value})
-    except ValidationError as error:
-        raise ConfigError(f"{path}: {error.errors()[0]['msg']}") from None
+    return with_changes(owner, {name: value})
 
 
 def _parsed(expected: Any, text: str, path: str) -> Any:  # noqa: ANN401 - any type of a setting

@@ -14,13 +14,17 @@ from catalog.store import open_store
 from flows.overrides import with_overrides
 from flows.parameters import ReconstructParameters
 from flows.presets import preset as preset_named
+from lidarpainter_models.metrics.squeezenet import load_squeezenet_distance
+from lidarpainter_models.painter import load_painter
 from tasks.evaluate import evaluate
 from tasks.fit import fit, refine
 from tasks.paint import paint
-from tasks.painters import NO_PAINTER, painter_digest
+from tasks.painters import NO_PAINTER
 from tasks.prepare import prepare
 from tasks.publish import begin_run, complete_run, fail_run
-from tasks.report import GUIDANCE_COLUMNS, ReportInputs, report_path, write_report
+from tasks.report import ReportInputs, report_path, write_report
+from tasks.report_figures import GUIDANCE_COLUMNS
+from tasks.scenes import open_split
 from tasks.scores import Scores, load_scores
 from tasks.stages import StageResult
 from tasks.stored import FittedRef
@@ -43,10 +47,24 @@ class Course:
 @flow(name="reconstruct")
 def reconstruct(parameters: ReconstructParameters, store_path: Path) -> dict[str, Any]:
     """Fit a scene, paint shifted views of it, go on fitting with them, judge and report."""
-    painter_digest(parameters.painter)  # a wrong painter is told before the fit, not after it
+    check_inputs(parameters, store_path)
     record = begin_run(store_path, parameters, DEVICE)
     with failure_recorded(store_path, record):
         return _run(parameters, store_path, record)
+
+
+def check_inputs(parameters: ReconstructParameters, store_path: Path) -> None:
+    """Find at once what would otherwise be found after minutes of fitting.
+
+    Raises:
+        SceneError: the scene is not there, or lacks a camera.
+        ConfigError: the split leaves nothing to train on.
+        WeightsError: the painter or the weights of the feature distance cannot be used.
+    """
+    open_split(open_store(store_path), parameters.split_spec)
+    load_painter(parameters.painter)
+    if parameters.feature_weights is not None:
+        load_squeezenet_distance(parameters.feature_weights)
 
 
 @flow(name="reconstruct-scene")

@@ -12,21 +12,19 @@ from catalog.artefacts import ArtefactRef, Workplace
 from catalog.store import Store, open_store
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.export.report import Comparison, Plot, Report, Table, render_report
+from lidarpainter_models.export.report import Comparison, Report, render_report
 from lidarpainter_models.painter import load_painter
 from lidarpainter_models.scenes.synthetic.street import SyntheticStreet
 from tasks.comparisons import Subject, comparisons
 from tasks.evaluate import JudgeSettings
 from tasks.judging import GENERATOR_ENTRY
 from tasks.painters import painter_digest
+from tasks.report_figures import plots, tables
 from tasks.scenes import SplitSpec, open_split
-from tasks.scores import SCORE_COLUMNS, SCORE_NOTE, score_rows
 from tasks.stages import STAGE_OPTIONS, StageResult, library_digest, run_stage
-from tasks.stored import FittedRef, load_history, load_observations, load_scene
+from tasks.stored import FittedRef, load_observations, load_scene
 
 REPORT_FILE = "report.html"
-MEGABYTE = 1e6
-GUIDANCE_COLUMNS = ("num_cameras", "num_without_room", "num_refused", "num_views", "mean_weight")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,8 +51,8 @@ def write_report(store_path: Path, inputs: ReportInputs) -> StageResult:
             title=f"LidarPainter: {inputs.result['scene']}",
             summary=_summary(inputs),
             comparisons=_comparisons(store, inputs),
-            tables=_tables(inputs),
-            plots=_plots(inputs.stages),
+            tables=tables(inputs.result, inputs.stages),
+            plots=plots(inputs.stages),
             provenance=_provenance(store, inputs),
         )
         (place.output / REPORT_FILE).write_text(render_report(report), "utf-8")
@@ -104,61 +102,6 @@ def _summary(inputs: ReportInputs) -> str:
         f"{result['num_gaussians']} Gaussians. Painted means: after {result['rounds']} rounds of "
         "painting shifted views and fitting on with them."
     )
-
-
-def _tables(inputs: ReportInputs) -> list[Table]:
-    stages = [
-        [
-            name,
-            stage.seconds,
-            stage.cpu_seconds,
-            stage.peak_memory_bytes / MEGABYTE,
-            stage.ref.digest,
-        ]
-        for name, stage in inputs.stages.items()
-    ]
-    guidance = [
-        [name, *(values[key] for key in GUIDANCE_COLUMNS)]
-        for name, values in inputs.result["guidance"].items()
-    ]
-    tables = [
-        Table(
-            title="Held-out views",
-            columns=SCORE_COLUMNS,
-            rows=score_rows(inputs.result),
-            note=SCORE_NOTE,
-        ),
-        Table(
-            title="Stages",
-            columns=["stage", "seconds", "CPU seconds", "peak memory, MB", "artefact"],
-            rows=stages,
-            note="As computed; a stage that was there already keeps the time it took then.",
-        ),
-    ]
-    if guidance:
-        tables.append(
-            Table(title="Painted views", columns=["round", *GUIDANCE_COLUMNS], rows=guidance)
-        )
-    return tables
-
-
-def _plots(stages: Mapping[str, StageResult]) -> list[Plot]:
-    histories = {
-        name: load_history(stage.ref)
-        for name, stage in stages.items()
-        if stage.ref.kind == "gaussians"
-    }
-
-    def lines(key: str) -> dict[str, list[tuple[float, float]]]:
-        return {
-            name: [(entry["step"], entry[key]) for entry in history]
-            for name, history in histories.items()
-        }
-
-    return [
-        Plot(title="Training views", x_label="step", y_label="PSNR, dB", series=lines("psnr")),
-        Plot(title="Size", x_label="step", y_label="Gaussians", series=lines("num_gaussians")),
-    ]
 
 
 def _provenance(store: Store, inputs: ReportInputs) -> dict[str, str]:

@@ -31,6 +31,7 @@ def evaluate(
 
     from catalog.store import open_store
     from flows.cli.progress import shown_progress
+    from flows.overrides import with_changes
     from flows.parameters import view_parameters
     from tasks.evaluate import evaluate as evaluate_task
     from tasks.runs import open_run
@@ -40,7 +41,7 @@ def evaluate(
     finished = open_run(store, run)
     parameters = view_parameters(finished)
     if feature_weights is not None:
-        parameters = parameters.model_copy(update={"feature_weights": feature_weights})
+        parameters = with_changes(parameters, {"feature_weights": feature_weights})
     variants: dict[str, tuple[Any, str | None]] = {
         "unpainted": (finished.unpainted, None),
         "painted": (finished.final, None),

@@ -36,7 +36,7 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     from catalog.store import open_store
     from flows.cli.ingest import parse_names
     from flows.cli.running import run_reconstruction
-    from flows.overrides import with_overrides
+    from flows.overrides import with_changes, with_overrides
     from flows.presets import preset as preset_named
 
     parameters = preset_named(preset, scene)
@@ -49,7 +49,7 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     changes = {name: value for name, value in changes.items() if value is not None}
     if shift is not None or up is not None:
         changes["novel"] = shifted(parameters.novel, shift, up)
-    parameters = with_overrides(parameters.model_copy(update=changes), settings or [])
+    parameters = with_overrides(with_changes(parameters, changes), settings or [])
     result = run_reconstruction(parameters, open_store())
     if as_json:
         print_json(result)

@@ -12,8 +12,9 @@ from flows.server import prefect_server
 
 def run_reconstruction(parameters: ReconstructParameters, store: Store) -> dict[str, Any]:
     """Reconstruct one scene of the store."""
-    from flows.reconstruct import reconstruct
+    from flows.reconstruct import check_inputs, reconstruct
 
+    check_inputs(parameters, store.root)  # before a server is started for nothing
     with _running(store):
         return reconstruct(parameters, store.root)
 

@@ -1,0 +1,152 @@
+"""The whole command: once, again, killed, twice at once, and with something wrong."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from toy_store import SMALL, TOY_SCENE, write_toy_scene
+
+from catalog.store import open_store
+from flows.cli.main import main
+
+ROOT = Path(__file__).resolve().parents[2]
+LONG_FIT = ("fit.steps=1500", "fit.half_resolution=0")
+# the command, with checkpoints as often as a short test needs them
+COMMAND = """
+import sys
+import tasks.fit
+from flows.cli.main import main
+tasks.fit.CHECKPOINT_EVERY_S = 0.5
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.fixture
+def store(tmp_path):
+    store = open_store(tmp_path / "store")
+    write_toy_scene(store.root)
+    return store
+
+
+def start(store, *settings):
+    assignments = [word for setting in (*SMALL, *settings) for word in ("--set", setting)]
+    command = ["--store", str(store.root), "reconstruct", TOY_SCENE, "--json", *assignments]
+    environment = {**os.environ, "PREFECT_HOME": str(store.root / "prefect")}
+    return subprocess.Popen(
+        [sys.executable, "-c", COMMAND, *command],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        env=environment,
+    )
+
+
+def finish(process):
+    out, errors = process.communicate(timeout=900)
+    assert process.returncode == 0, errors
+    return json.loads(out)
+
+
+def scene_bytes(result):
+    return (Path(result["artefacts"]["fit"]) / "scene.safetensors").read_bytes()
+
+
+def wait_for_checkpoint(store):
+    deadline = time.monotonic() + 600
+    while not list(store.root.glob("work/*/fit.safetensors")):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+@pytest.mark.slow
+def test_the_command_gives_numbers_a_report_and_a_catalog(store):
+    result = finish(start(store))
+    assert set(result["seconds"]) == {
+        "prepare",
+        "fit",
+        "paint-1",
+        "refine-1",
+        "evaluate-unpainted",
+        "evaluate",
+        "report",
+        "total",
+    }
+    assert result["recorded"]["num_views"] == 2
+    assert result["recorded"]["recorded_poses"]["psnr"] > 10
+    assert result["unpainted"]["recorded"]["psnr"] > 10
+    assert result["num_gaussians"] > 0
+    assert result["peak_memory_bytes"] > 1e8
+    assert Path(result["report"]).is_file()
+    assert store.run("latest")["run_id"] == result["run_id"]
+
+    again = finish(start(store))
+    assert again["run_id"] == result["run_id"]
+    assert not any(again["computed_now"].values())
+    assert again["recorded"] == result["recorded"]
+
+
+@pytest.mark.slow
+def test_a_fit_killed_in_its_middle_goes_on_to_the_same_scene_bit_for_bit(store, tmp_path):
+    killed = start(store, *LONG_FIT)
+    wait_for_checkpoint(store)
+    killed.send_signal(signal.SIGKILL)
+    killed.communicate()
+    assert list(store.root.glob("artefacts/gaussians/*")) == []
+    assert list(store.root.glob("work/*/fit.safetensors"))
+    resumed = finish(start(store, *LONG_FIT))
+
+    other = open_store(tmp_path / "undisturbed")
+    write_toy_scene(other.root)
+    undisturbed = finish(start(other, *LONG_FIT))
+    assert resumed["run_id"] == undisturbed["run_id"]
+    assert scene_bytes(resumed) == scene_bytes(undisturbed)
+    assert list(store.root.glob("work/*")) == list(store.root.glob("aside/*")) == []
+    assert [row["status"] for row in store.tables.rows("runs")] == ["complete"]
+
+
+@pytest.mark.slow
+def test_two_runs_at_once_share_every_computation(store):
+    both = [start(store, *LONG_FIT) for _ in range(2)]
+    first, second = (finish(process) for process in both)
+    assert first["artefacts"] == second["artefacts"]
+    assert first["recorded"] == second["recorded"]
+    for stage, computed in first["computed_now"].items():
+        assert computed != second["computed_now"][stage], stage
+    for row in store.tables.rows("artefacts"):
+        store.artefacts.verified(store.artefacts.ref(row["kind"], row["digest"]))
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["toy/nothing"], "no scene toy/nothing in"),
+        (["../toy"], "no scene id"),
+        (["toy/street/../../x"], "no scene id"),
+        ([TOY_SCENE, "--preset", "perfect"], "no preset 'perfect'"),
+        ([TOY_SCENE, "--shift", "2,x"], "expected positive metres"),
+        ([TOY_SCENE, "--up", "-1"], "expected positive metres"),
+        ([TOY_SCENE, "--set", "fit.stepz=5"], "no setting 'fit.stepz'"),
+        ([TOY_SCENE, "--set", "fit.steps=0"], "steps"),
+        ([TOY_SCENE, "--split", "sometimes"], "split 'sometimes' is not understood"),
+        ([TOY_SCENE, "--train-cameras", "back"], "no camera 'back'"),
+        ([TOY_SCENE, "--painter", "picasso"], "no painter 'picasso'"),
+        ([TOY_SCENE, "--painter", "missing.safetensors"], "no painter weights at"),
+        ([TOY_SCENE, "--rounds", "-1"], "rounds"),
+    ],
+)
+def test_what_cannot_be_reconstructed_is_one_line_and_nothing_is_started(
+    store, monkeypatch, capsys, words, expected
+):
+    monkeypatch.setattr("flows.cli.running.prefect_server", pytest.fail)
+    assert main(["--store", str(store.root), "reconstruct", *words]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert expected in captured.err
+    assert not (store.root / "artefacts").exists()
