@@ -17,27 +17,34 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Tensor
 
+from lidarpainter_models.conditioning.point_surfaces import (
+    DIRECTIONS,
+    curtain,
+    disc_surface,
+    spread,
+    surface_gaps,
+)
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.point_blend import blend_points
-from lidarpainter_models.kernels.point_splat import splat_points
 from lidarpainter_models.scenes.driving_scene import ActorTrack
 from lidarpainter_models.scenes.lidar_map import LidarMap
 from lidarpainter_models.scenes.map_points import MapPoints
-
-DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LidarImageConfig:
     """How LiDAR points become a picture. Angles make every length follow the resolution."""
 
-    window_s: float = 2.0
-    """Street points measured at most this long before or after the picture are used: the street
-    stands still, and views ahead of the log have only older points."""
+    window_s: float = 1.0
+    """Street points measured this long before or after the picture are drawn first; where no
+    sweep is so near in time, counted from the nearest."""
+    reach_s: float = 10.0
+    """Street points up to this much older or newer fill what the window leaves open: the street
+    stands still, but what moved through it unboxed does not."""
     recency_s: float = 0.4
     """A point this much older weighs e times less in the blend."""
     beam_spacing_rad: float = 0.004
@@ -65,7 +72,14 @@ class LidarImageConfig:
 
     def __post_init__(self) -> None:
         """Refuse settings that no picture can be made with."""
-        for name in ("window_s", "recency_s", "beam_spacing_rad", "max_radius_rad", "near_m"):
+        for name in (
+            "window_s",
+            "reach_s",
+            "recency_s",
+            "beam_spacing_rad",
+            "max_radius_rad",
+            "near_m",
+        ):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
         if self.min_radius_px < 0.71:
@@ -94,13 +108,15 @@ class ViewPoints(NamedTuple):
     positions_uv: Float[Tensor, "points 2"]
     depth_m: Float[Tensor, " points"]
     radius_px: Float[Tensor, " points"]
-    rgb: Float[Tensor, "points 3"]
+    rgb_u8: UInt8[Tensor, "points 3"]
     has_colour: Bool[Tensor, " points"]
     age_s: Float[Tensor, " points"]
+    is_recent: Bool[Tensor, " points"]
 
     def keep(self, kept: Bool[Tensor, " points"]) -> "ViewPoints":
         """The points that are marked."""
-        return ViewPoints(*(field[kept] for field in self))
+        rows = kept.nonzero()[:, 0]
+        return ViewPoints(*(field.index_select(0, rows) for field in self))
 
 
 def render_lidar(
@@ -126,8 +142,7 @@ def render_lidar(
         cy_px=camera.cy_px + margin_px,
     )
     points = view_points(lidar_map, tracks, wide, timestamp_ns, config)
-    hidden = _is_hidden(points, wide, margin_px, config)
-    picture = _blend(points.keep(~hidden), wide, config)
+    picture = _picture(points, wide, margin_px, config)
     picture = picture[margin_px:-margin_px, margin_px:-margin_px]
     hit = picture[..., 3] > 0
     return LidarImage(
@@ -138,6 +153,24 @@ def render_lidar(
     )
 
 
+def _picture(
+    points: ViewPoints, camera: Camera, reach_px: int, config: LidarImageConfig
+) -> Float[Tensor, "height width 6"]:
+    """Recent points first, older ones where those leave the picture open, then gaps closed."""
+    recent, older = points.keep(points.is_recent), points.keep(~points.is_recent)
+    surface = _surface(recent, camera, recent.radius_px.round())
+    recent = recent.keep(~_hidden(recent, surface, reach_px, config))
+    everywhere = torch.ones(camera.height_px, camera.width_px, dtype=torch.bool)
+    picture = _blend(recent, everywhere, camera, config)
+    is_open = picture[..., 4] == 0
+    older = older.keep(_at(spread(is_open, reach_px), older))
+    surface = torch.minimum(surface, _surface(older, camera, older.radius_px.round()))
+    older = older.keep(~_hidden(older, surface, reach_px, config))
+    picture = picture + _blend(older, is_open, camera, config)
+    seen = ViewPoints(*(torch.cat(pair) for pair in zip(recent, older, strict=True)))
+    return picture + _fill_gaps(picture[..., 4], seen, camera, config)
+
+
 def view_points(
     lidar_map: LidarMap,
     tracks: Sequence[ActorTrack],
@@ -145,12 +178,17 @@ def view_points(
     timestamp_ns: int,
     config: LidarImageConfig,
 ) -> ViewPoints:
-    """Every map point of the time that falls into the picture, hidden or not."""
-    window_ns = round(config.window_s * 1e9)
+    """Every map point within reach of the time that falls into the picture, hidden or not.
+
+    Recent are street points within the window of the newest sweep at that time, and all actors'.
+    """
     street = lidar_map.street
-    recent = (street.timestamp_ns - timestamp_ns).abs() <= window_ns
+    age_ns = (street.timestamp_ns - timestamp_ns).abs()
+    newest_ns = int(age_ns.min()) if len(age_ns) else 0
+    used = age_ns <= newest_ns + round(config.reach_s * 1e9)
     identity = torch.eye(4, dtype=torch.float64)
-    parts = [_project(street, recent, identity, camera, timestamp_ns, config)]
+    placed = _project(street, used, identity, camera, timestamp_ns, config)
+    parts = [placed._replace(is_recent=placed.age_s <= newest_ns * 1e-9 + config.window_s)]
     for track in tracks:
         points = lidar_map.actors.get(track.actor_id)
         if points is None or not track.is_present(timestamp_ns):
@@ -193,69 +231,35 @@ def _project(
         positions_uv=positions_uv,
         depth_m=depth_m,
         radius_px=(footprint_px / 2).clamp(config.min_radius_px, max_radius_px),
-        rgb=points.rgb_u8[chosen].to(torch.float32) / 255,
+        rgb_u8=points.rgb_u8.index_select(0, chosen),
         has_colour=points.has_colour[chosen],
         age_s=(points.timestamp_ns[chosen] - timestamp_ns).abs().to(torch.float32) * 1e-9,
+        is_recent=torch.ones_like(chosen, dtype=torch.bool),
     )
 
 
-def _surface(
-    points: ViewPoints, camera: Camera, radius_px: Int[Tensor, " points"] | int
-) -> Float[Tensor, "height width"]:
-    """Depth of the nearest disc in each pixel, infinity where there is none."""
-    nearest = splat_points(
-        points.positions_uv.floor().to(torch.int64),
-        points.depth_m,
-        height_px=camera.height_px,
-        width_px=camera.width_px,
-        radius_px=radius_px,
-    ).to(torch.int64)
-    beyond = points.depth_m.new_tensor([torch.inf])
-    return torch.cat([points.depth_m, beyond])[nearest]  # index -1 takes infinity
-
-
-def _is_hidden(
-    points: ViewPoints, camera: Camera, reach_px: int, config: LidarImageConfig
+def _hidden(
+    points: ViewPoints,
+    surface: Float[Tensor, "height width"],
+    reach_px: int,
+    config: LidarImageConfig,
 ) -> Bool[Tensor, " points"]:
-    """Whether nearer surface surrounds a point in most directions of its neighbourhood."""
-    surface = _surface(points, camera, points.radius_px.round().to(torch.int64))
-    curtain = _curtain(surface, reach_px, config.hidden_directions)
-    column, row = points.positions_uv.floor().long().unbind(-1)
-    return curtain[row, column] < points.depth_m * (1 - config.hidden_tolerance)
-
-
-def _curtain(
-    surface: Float[Tensor, "height width"], reach_px: int, num_directions: int
-) -> Float[Tensor, "height width"]:
-    """The depth beyond which `num_directions` of the 8 directions meet nearer surface.
-
-    A direction is a wedge, not a ray: beyond its first pixel it is three pixels wide, so that it
-    does not slip between the points of a sparse surface.
-    """
-    height_px, width_px = surface.shape
-    wide = -torch.nn.functional.max_pool2d(-surface[None], 3, 1, 1)[0]
-    narrow = torch.nn.functional.pad(surface, [reach_px] * 4, value=torch.inf)
-    wide = torch.nn.functional.pad(wide, [reach_px] * 4, value=torch.inf)
-    nearest = []
-    for step_v, step_u in DIRECTIONS:
-        best = torch.full_like(surface, torch.inf)
-        for step in range(1, reach_px + 1):
-            top, left = reach_px + step * step_v, reach_px + step * step_u
-            layer = narrow if step == 1 else wide
-            torch.minimum(best, layer[top : top + height_px, left : left + width_px], out=best)
-        nearest.append(best)
-    return torch.stack(nearest).kthvalue(num_directions, dim=0).values
+    """Whether nearer surface surrounds a point in its neighbourhood."""
+    behind = curtain(surface, reach_px, config.hidden_directions)
+    return _at(behind, points) < points.depth_m * (1 - config.hidden_tolerance)
 
 
 def _blend(
-    points: ViewPoints, camera: Camera, config: LidarImageConfig
+    points: ViewPoints,
+    wanted: Bool[Tensor, "height width"],
+    camera: Camera,
+    config: LidarImageConfig,
 ) -> Float[Tensor, "height width 6"]:
-    """Mean of the points on the surface of each pixel, near ones in time and place first."""
-    direct = _surface(points, camera, 0)
-    spread = _surface(points, camera, points.radius_px.ceil().to(torch.int64))
-    surface = torch.where(direct.isfinite(), direct, spread).nan_to_num(posinf=0.0)
-    picture = _blend_on(surface, points, config)
-    return picture + _fill_gaps(picture[..., 4], points, camera, config)
+    """Mean of the points on the surface of each wanted pixel: the columns of `_means_on`."""
+    direct = _surface(points, camera, torch.zeros_like(points.radius_px))
+    covered = _surface(points, camera, points.radius_px.ceil())
+    surface = torch.where(direct.isfinite(), direct, covered)
+    return _means_on(torch.where(wanted & surface.isfinite(), surface, 0), points, config)
 
 
 def _fill_gaps(
@@ -266,22 +270,38 @@ def _fill_gaps(
 ) -> Float[Tensor, "height width 6"]:
     """What wider discs give in the gaps of a surface; 0 elsewhere."""
     reach_px = math.ceil(config.gap_widening * config.max_radius_rad * camera.fx_px)
-    gap = _gaps(depth_m, reach_px, config)
-    beside = _spread(gap, reach_px)
-    column, row = points.positions_uv.floor().long().unbind(-1)
-    wide = points.keep(beside[row, column])
+    gaps = surface_gaps(
+        depth_m, reach_px, config.gap_directions, depth_range=config.gap_depth_range
+    )
+    wide = points.keep(_at(spread(gaps, reach_px), points))
     wide = wide._replace(radius_px=wide.radius_px * config.gap_widening)
-    surface = _surface(wide, camera, wide.radius_px.ceil().to(torch.int64))
-    return _blend_on(torch.where(gap & surface.isfinite(), surface, 0), wide, config)
+    surface = _surface(wide, camera, wide.radius_px.ceil())
+    return _means_on(torch.where(gaps & surface.isfinite(), surface, 0), wide, config)
 
 
-def _blend_on(
+def _surface(
+    points: ViewPoints, camera: Camera, radius_px: Float[Tensor, " points"]
+) -> Float[Tensor, "height width"]:
+    """Depth of the nearest disc in each pixel, infinity where there is none."""
+    size = {"height_px": camera.height_px, "width_px": camera.width_px}
+    return disc_surface(points.positions_uv, points.depth_m, radius_px.to(torch.int64), **size)
+
+
+def _at(picture: Shaped[Tensor, "height width"], points: ViewPoints) -> Shaped[Tensor, " points"]:
+    """The values of a picture in the pixels of the points."""
+    column, row = points.positions_uv.floor().long().unbind(-1)
+    return picture[row, column]
+
+
+def _means_on(
     surface_depth_m: Float[Tensor, "height width"], points: ViewPoints, config: LidarImageConfig
 ) -> Float[Tensor, "height width 6"]:
     """Means of coloured rgb, share of coloured points, depth and age on a surface; 0 off it."""
-    recent = torch.exp(-points.age_s / config.recency_s).clamp(min=1e-6)
+    newest_s = points.age_s.min() if len(points.age_s) else 0.0
+    recent = torch.exp(-(points.age_s - newest_s) / config.recency_s).clamp(min=1e-6)
     coloured = points.has_colour.to(torch.float32)[:, None]
-    columns = [points.rgb * coloured, coloured, points.depth_m[:, None], points.age_s[:, None]]
+    rgb = points.rgb_u8.to(torch.float32) / 255 * coloured
+    columns = [rgb, coloured, points.depth_m[:, None], points.age_s[:, None]]
     picture, _ = blend_points(
         points.positions_uv,
         points.depth_m,
@@ -292,33 +312,3 @@ def _blend_on(
         tolerance=config.surface_tolerance,
     )
     return picture
-
-
-def _gaps(
-    depth_m: Float[Tensor, "height width"], reach_px: int, config: LidarImageConfig
-) -> Bool[Tensor, "height width"]:
-    """Pixels without depth that one surface surrounds in most directions."""
-    row, column = ((depth_m == 0) & _spread(depth_m > 0, reach_px)).nonzero().unbind(-1)
-    padded = torch.nn.functional.pad(depth_m, [reach_px] * 4).reshape(-1)
-    row_px = depth_m.shape[1] + 2 * reach_px
-    place = (row + reach_px) * row_px + column + reach_px
-    met = []
-    for step_v, step_u in DIRECTIONS:
-        first = torch.zeros_like(depth_m[row, column])
-        for step in range(reach_px, 0, -1):
-            here = padded[place + step * (step_v * row_px + step_u)]
-            first = torch.where(here > 0, here, first)
-        met.append(first)
-    ascending = torch.stack(met).sort(dim=0).values
-    near, far = ascending[len(DIRECTIONS) - config.gap_directions], ascending[-1]
-    gaps = torch.zeros_like(depth_m, dtype=torch.bool)
-    gaps[row, column] = (near > 0) & (far <= near * (1 + config.gap_depth_range))
-    return gaps
-
-
-def _spread(mask: Bool[Tensor, "height width"], reach_px: int) -> Bool[Tensor, "height width"]:
-    """Pixels with a marked one in the square around them."""
-    pool = torch.nn.functional.max_pool2d
-    side_px = 2 * reach_px + 1
-    along_rows = pool(mask.float()[None], (1, side_px), 1, (0, reach_px))
-    return pool(along_rows, (side_px, 1), 1, (reach_px, 0))[0] > 0

@@ -94,11 +94,34 @@ def test_a_road_at_a_grazing_angle_is_not_culled(camera_at):
     assert ((image.depth_m[rows, 31] / expected_m - 1).abs() < 0.2).all()
 
 
-def test_only_points_near_in_time_are_drawn(camera_at):
-    lidar_map = street(points(whole_wall(10.0), timestamp_ns=3 * SECOND_NS))
-    assert not render_lidar(lidar_map, [], camera_at(), 0).hit.any()
-    image = render_lidar(lidar_map, [], camera_at(), 0, config=LidarImageConfig(window_s=4.0))
-    assert torch.allclose(image.age_s, torch.tensor(3.0))
+def half_wall(x_m):
+    return wall(x_m, left_m=x_m, right_m=0.0, bottom_m=-x_m, top_m=x_m, spacing_m=0.1)
+
+
+def test_older_points_fill_only_what_newer_ones_leave_open(camera_at):
+    new = points(half_wall(10.0))
+    old = points(whole_wall(8.0), BLUE, timestamp_ns=-3 * SECOND_NS)
+    image = render_lidar(street(new, old), [], camera_at(), 0)
+    # the older wall stands in front, but the newer one was seen through it
+    assert (image.rgb[:, :30, 0] == 1).all()
+    assert (image.rgb[:, 34:, 2] == 1).all()
+    assert torch.allclose(image.age_s[:, 34:], torch.tensor(3.0))
+
+
+def test_points_out_of_reach_in_time_are_not_drawn(camera_at):
+    new = points(half_wall(10.0))
+    old = points(whole_wall(8.0), BLUE, timestamp_ns=-3 * SECOND_NS)
+    config = LidarImageConfig(reach_s=2.0)
+    image = render_lidar(street(new, old), [], camera_at(), 0, config=config)
+    assert not image.hit[:, 34:].any()
+
+
+def test_ahead_of_the_log_the_newest_points_are_drawn(camera_at):
+    newest = points(whole_wall(10.0), timestamp_ns=-5 * SECOND_NS)
+    older = points(whole_wall(9.0), BLUE, timestamp_ns=-8 * SECOND_NS)
+    image = render_lidar(street(older, newest), [], camera_at(), 0)
+    assert (image.rgb[..., 0] == 1).all()
+    assert torch.allclose(image.age_s, torch.tensor(5.0))
 
 
 def test_newer_points_outweigh_older_ones(camera_at):
@@ -145,7 +168,8 @@ def test_a_gap_in_one_surface_is_closed_but_its_outside_is_not(camera_at):
 
 
 @pytest.mark.parametrize(
-    "change", [{"window_s": 0.0}, {"min_radius_px": 0.5}, {"hidden_directions": 9}]
+    "change",
+    [{"window_s": 0.0}, {"reach_s": -1.0}, {"min_radius_px": 0.5}, {"hidden_directions": 9}],
 )
 def test_impossible_settings_are_refused(change):
     with pytest.raises(ConfigError, match=next(iter(change))):
