@@ -8,7 +8,7 @@ are brought to one exposure and combined robustly.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -18,13 +18,12 @@ from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.scenes.actor_separation import poses_at
 from lidarpainter_models.scenes.colour_sampling import (
     SLOTS,
     combine_samples,
     insert_samples,
     project_inside,
-    sample_levels,
-    steps_inside,
 )
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.exposure_matching import match_exposure
@@ -37,6 +36,7 @@ from lidarpainter_models.scenes.point_visibility import (
     visible_points,
 )
 from lidarpainter_models.scenes.records import RecordedView
+from lidarpainter_models.scenes.rim_colours import PictureLevels, RimConfig, rim_samples
 from lidarpainter_models.scenes.tracks import ActorTrack
 
 _FINE_ENOUGH_PX = 2.0
@@ -67,18 +67,7 @@ class ColouringConfig:
     """Nearer surface within this angle spoils a sample: errors of pose and calibration."""
     rim_rad: float = 0.008
     """A surface that ends within this angle may show what is beyond it."""
-    edge_tolerance: float = 0.15
-    """A neighbour nearer or further by this share of the depth makes an edge."""
-    behind_edge_weight: float = 0.2
-    """Weight of a sample beside a nearer surface."""
-    rim_weight: float = 0.4
-    """Weight of a sample on the rim of a surface."""
-    foreign_likeness: float = 30.0
-    """A rim's colour is foreign when nearer than this (RGB distance of 255) to that beyond..."""
-    foreign_contrast: float = 60.0
-    """... and further than this from that inside."""
-    inner_reach: int = 6
-    """How many cells away the inner part of a surface is looked for from its rim."""
+    rims: RimConfig = field(default_factory=RimConfig)
     standing_box_share: float = 0.85
     """Share of each side of a standing actor's box that hides what is behind it."""
     near_m: float = 0.5
@@ -115,9 +104,11 @@ def colour_map(
     bodies = [_Body(None, street), *(_Body(tracks[name], actors[name]) for name in actors)]
     samples = _Samples(sum(len(body.points) for body in bodies))
     camera_names = list(dict.fromkeys(view.camera_name for view in views))
-    for number, view in enumerate(views):
+    for number, (view, actors_then) in enumerate(
+        zip(views, _actors_at(views, scene.tracks), strict=True)
+    ):
         picture = _shrunk(scene.read_image(view), config)
-        _sample_view(picture, view, number, bodies, scene.tracks, samples, config)
+        _sample_view(picture, view, number, bodies, actors_then, samples, config)
     if views:
         view_camera = np.array([camera_names.index(view.camera_name) for view in views])
         gains = match_exposure(samples.weight, samples.rgb, samples.view, view_camera)
@@ -136,6 +127,10 @@ def colour_map(
         )
         start = rows.stop
     return coloured[0], dict(zip(actors, coloured[1:], strict=True))
+
+
+_ActorsThen = dict[str, tuple[ActorTrack, Tensor]]
+"""Tracks by actor id, with `world_from_box` at one time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,14 +169,14 @@ def _sample_view(
     view: RecordedView,
     number: int,
     bodies: Sequence[_Body],
-    tracks: Sequence[ActorTrack],
+    actors_then: _ActorsThen,
     samples: _Samples,
     config: ColouringConfig,
 ) -> None:
     """Take one picture's samples into account."""
     height_px, width_px = picture.shape[:2]
     camera = view.camera.resized(width_px=width_px, height_px=height_px)
-    seen = _project(bodies, camera, view.timestamp_ns, config)
+    seen = _project(bodies, camera, view.timestamp_ns, actors_then, config)
     if len(seen.rows) == 0:
         return
     cell_px = max(1.0, config.grid_rad * camera.fx_px)
@@ -192,13 +187,19 @@ def _sample_view(
     cells_uv = (seen.pixels_uv * scale).long()
     cells_uv[:, 0].clamp_(max=grid.width_px - 1)
     cells_uv[:, 1].clamp_(max=grid.height_px - 1)
-    visibility = _visibility(seen, cells_uv, grid, view.timestamp_ns, tracks, config)
+    visibility = _visibility(seen, cells_uv, grid, actors_then, config)
     visible = visible_points(cells_uv, seen.depth_m, visibility, tolerance=config.hidden_tolerance)
     kept = visible.nonzero()[:, 0]
     footprint_px = (seen.range_m * config.footprint_rad * camera.fx_px / seen.depth_m)[kept]
-    levels = _Levels(picture, footprint_px)
-    rgb, trust = _rim_samples(
-        levels, seen.pixels_uv[kept], cells_uv[kept], seen.depth_m[kept], visibility, scale, config
+    levels = PictureLevels(picture, footprint_px)
+    rgb, trust = rim_samples(
+        levels,
+        seen.pixels_uv[kept],
+        cells_uv[kept],
+        seen.depth_m[kept],
+        visibility,
+        scale,
+        config.rims,
     )
     weight = trust / (1 + (seen.age_s[kept] / config.recency_s) ** 2)
     weight *= footprint_px.clamp(max=_FINE_ENOUGH_PX) ** 2
@@ -208,8 +209,25 @@ def _sample_view(
     )
 
 
+def _actors_at(views: Sequence[RecordedView], tracks: Sequence[ActorTrack]) -> list[_ActorsThen]:
+    """For each view the tracks present at its exposure, with `world_from_box` then."""
+    present: list[_ActorsThen] = [{} for _ in views]
+    if not views:
+        return present
+    times_ns = torch.tensor([view.timestamp_ns for view in views])
+    for track in tracks:
+        for number, pose in enumerate(poses_at(track, times_ns)):
+            if track.is_present(views[number].timestamp_ns):
+                present[number][track.actor_id] = (track, pose)
+    return present
+
+
 def _project(
-    bodies: Sequence[_Body], camera: Camera, timestamp_ns: int, config: ColouringConfig
+    bodies: Sequence[_Body],
+    camera: Camera,
+    timestamp_ns: int,
+    actors_then: _ActorsThen,
+    config: ColouringConfig,
 ) -> _InView:
     """Where the points of all bodies stand in a picture taken at a time."""
     lens = torch.tensor(
@@ -221,9 +239,10 @@ def _project(
         first, start = start, start + len(body.points)
         camera_from_points = camera.camera_from_world
         if body.track is not None:
-            if not body.track.is_present(timestamp_ns):
+            if body.track.actor_id not in actors_then:
                 continue
-            camera_from_points = camera_from_points @ body.track.pose_at(timestamp_ns)
+            _, world_from_box = actors_then[body.track.actor_id]
+            camera_from_points = camera_from_points @ world_from_box
         pixels_from_points = (lens @ camera_from_points[:3]).numpy()
         rows, pixels_uv, depth_m = map(
             torch.from_numpy,
@@ -251,17 +270,15 @@ def _visibility(
     seen: _InView,
     cells_uv: Int[Tensor, "points 2"],
     grid: Camera,
-    timestamp_ns: int,
-    tracks: Sequence[ActorTrack],
+    actors_then: _ActorsThen,
     config: ColouringConfig,
 ) -> Visibility:
     """What stands before and around each cell when the picture was taken."""
     solid = (seen.is_actor | (seen.age_s <= config.surface_window_s)).nonzero()[:, 0]
     footprint_px = seen.range_m * config.beam_spacing_rad * grid.fx_px / seen.depth_m
     boxes = [
-        (track.pose_at(timestamp_ns), track.size_m * _solid_share(track, config))
-        for track in tracks
-        if track.is_present(timestamp_ns)
+        (world_from_box, track.size_m * _solid_share(track, config))
+        for track, world_from_box in actors_then.values()
     ]
     return surface_visibility(
         cells_uv[solid],
@@ -272,7 +289,7 @@ def _visibility(
             gap_px=max(1, round(config.gap_rad * grid.fx_px)),
             edge_px=max(1, round(config.edge_rad * grid.fx_px)),
             rim_px=max(1, round(config.rim_rad * grid.fx_px)),
-            edge_tolerance=config.edge_tolerance,
+            edge_tolerance=config.rims.edge_tolerance,
         ),
         box_far_ends(boxes, grid),
     )
@@ -281,69 +298,6 @@ def _visibility(
 def _solid_share(track: ActorTrack, config: ColouringConfig) -> float:
     """A moving actor's whole box hides, as its colours must not reach the street."""
     return 1.0 if track.is_moving else config.standing_box_share
-
-
-def _rim_samples(
-    levels: "_Levels",
-    pixels_uv: Float[Tensor, "kept 2"],
-    cells_uv: Int[Tensor, "kept 2"],
-    depth_m: Float[Tensor, " kept"],
-    visibility: Visibility,
-    cells_per_pixel: Float[Tensor, "2"],
-    config: ColouringConfig,
-) -> tuple[UInt8[Tensor, "kept 3"], Float[Tensor, " kept"]]:
-    """Colours of visible samples, and how far the place of each is to be trusted.
-
-    On the rim of a surface a small error of pose takes the colour of what is beside it. Where the
-    colour there is more like that beyond the rim than like that of the nearest inner cell, the
-    inner one is taken.
-    """
-    rgb = levels.sample(pixels_uv)
-    trust = torch.ones_like(depth_m)
-    column, row = cells_uv.unbind(-1)
-    is_behind = visibility.nearest_m[row, column] < depth_m * (1 - config.edge_tolerance)
-    is_before = visibility.furthest_m[row, column] > depth_m * (1 + config.edge_tolerance)
-    trust[is_behind] = config.behind_edge_weight
-    on_rim = is_before.nonzero()[:, 0]
-    trust[on_rim] *= config.rim_weight
-    steps, has_inner = map(
-        torch.from_numpy,
-        steps_inside(
-            *(cells_uv[on_rim].numpy(), depth_m[on_rim].numpy(), visibility.inner_m.numpy()),
-            *(config.inner_reach, config.edge_tolerance),
-        ),
-    )
-    moved, steps = on_rim[has_inner], steps[has_inner] / cells_per_pixel
-    own = rgb[moved].float()
-    inner = levels.sample(pixels_uv[moved] + steps, moved)
-    beyond = levels.sample(pixels_uv[moved] - steps, moved)
-    to_inner, to_beyond = (own - inner.float()).norm(dim=-1), (own - beyond.float()).norm(dim=-1)
-    is_foreign = (to_beyond < config.foreign_likeness) & (to_inner > config.foreign_contrast)
-    rgb[moved[is_foreign]] = inner[is_foreign]
-    return rgb, trust
-
-
-class _Levels:
-    """A picture at three sizes, and at which of them each point is sampled."""
-
-    def __init__(
-        self, picture: UInt8[Tensor, "height width 3"], footprint_px: Float[Tensor, " points"]
-    ) -> None:
-        height_px, width_px = picture.shape[:2]
-        self._pictures = [picture.numpy()]
-        for shrink in (2, 4):
-            size = (max(1, width_px // shrink), max(1, height_px // shrink))
-            self._pictures.append(cv2.resize(picture.numpy(), size, interpolation=cv2.INTER_AREA))
-        self._level = (footprint_px >= 1.5).int() + (footprint_px >= 3.0).int()
-
-    def sample(
-        self, pixels_uv: Float[Tensor, "rows 2"], rows: Int[Tensor, " rows"] | None = None
-    ) -> UInt8[Tensor, "rows 3"]:
-        """Colours at positions; `rows` says which points they belong to if not all."""
-        level = self._level if rows is None else self._level[rows]
-        return torch.from_numpy(
-            sample_levels(pixels_uv.contiguous().numpy(), level.numpy(), *self._pictures)
-        )
 
 
 def _shrunk(

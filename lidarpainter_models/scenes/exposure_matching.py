@@ -14,7 +14,7 @@ LEAST_SHARED = 100
 SMALLEST_DEPARTURE = 0.03
 """A view that departs less (in log gain) from its camera's other views keeps its camera's gain."""
 _ROUNDS = 8
-_MOST_POINTS = 100_000
+_MOST_POINTS = 40_000
 
 
 def match_exposure(
