@@ -12,7 +12,7 @@ import lidarpainter_models
 from catalog.artefacts import ArtefactRef
 from catalog.digests import canonical_json, finite_or_none, plain
 from catalog.records import MetricRecord, RunRecord, metric_rows, run_id_of
-from catalog.store import open_store
+from catalog.store import Store, open_store
 from tasks.scenes import open_scene
 from tasks.scores import metric_values
 from tasks.stages import STAGE_OPTIONS, library_digest
@@ -85,10 +85,19 @@ def complete_run(
         result=canonical_json(stored),
         report=stored["report"],
     )
-    metrics = [
+    record_scores(store, record.run_id, record.scene_id, scores)
+    store.tables.merge("runs", [done.row()])
+    return stored
+
+
+def record_scores(
+    store: Store, run_id: str, scene_id: str, scores: Mapping[str, Mapping[str, Any]]
+) -> None:
+    """Enter every number of some evaluations, by variant (`unpainted`, `painted`, ...)."""
+    records = [
         MetricRecord(
-            run_id=record.run_id,
-            scene_id=record.scene_id,
+            run_id=run_id,
+            scene_id=scene_id,
             protocol=protocol,
             trajectory=trajectory,
             variant=variant,
@@ -99,6 +108,4 @@ def complete_run(
         for variant, found in scores.items()
         for protocol, trajectory, name, value, reason in metric_values(found)
     ]
-    store.tables.merge("metrics", metric_rows(metrics))
-    store.tables.merge("runs", [done.row()])
-    return stored
+    store.tables.merge("metrics", metric_rows(records))

@@ -33,7 +33,16 @@ def load_scores(ref: ArtefactRef) -> Scores:
 def metric_values(
     scores: Mapping[str, Any],
 ) -> list[tuple[str, str, str, float | None, str | None]]:
-    """Every number as (protocol, trajectory, name, value, reason why there is none)."""
+    """Every number as (protocol, trajectory, name, value, reason why there is none).
+
+    Scores of strips have neither recorded nor novel views, but judging cameras.
+    """
+    if "recorded" not in scores:
+        return [
+            ("cross-camera", camera, name, value, values.get(f"{name}_reason"))
+            for camera, values in scores.items()
+            for name, value in _numbers(values)
+        ]
     found = []
     for name, value in _numbers(scores["recorded"]):
         found.append(

@@ -32,6 +32,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "gaussians": (*BASE, "gaussians"),
     "guidance": (*BASE, "gaussians", "painter", "conditioning"),
     "evaluation": (*BASE, "gaussians", "painter", "conditioning", "metrics", "evaluation"),
+    "strips": (*BASE, "gaussians", "painter", "conditioning", "metrics", "evaluation"),
     "report": (*BASE, "gaussians", "painter", "conditioning", "metrics", "evaluation", "export"),
     "pairs": (*BASE, "gaussians", "painter", "conditioning"),
     "painter": (*BASE, "painter"),

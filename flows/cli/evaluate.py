@@ -8,12 +8,12 @@ import typer
 from flows.cli.output import print_json, print_table
 from lidarpainter_models.errors import ConfigError
 
-PROTOCOLS = ("paper", "truth")
+PROTOCOLS = ("paper", "truth", "cross-camera")
 
 
 def evaluate(
     run: Annotated[str, typer.Argument(help="A run id, a unique prefix of one, or latest.")],
-    protocol: Annotated[str, typer.Option(help=f"{' or '.join(PROTOCOLS)}.")] = "paper",
+    protocol: Annotated[str, typer.Option(help=f"{', '.join(PROTOCOLS)}.")] = "paper",
     postpaint: Annotated[
         bool, typer.Option("--postpaint", help="Judge what is painted at view time as well.")
     ] = False,
@@ -27,13 +27,15 @@ def evaluate(
 ) -> None:
     """Judge a finished run on views it never saw."""
     if protocol not in PROTOCOLS:
-        raise ConfigError(f"no protocol {protocol!r}, expected {' or '.join(PROTOCOLS)}")
+        raise ConfigError(f"no protocol {protocol!r}, expected {', '.join(PROTOCOLS)}")
 
     from catalog.store import open_store
     from flows.cli.progress import shown_progress
     from flows.overrides import with_changes
     from flows.parameters import view_parameters
+    from tasks.cross_camera import evaluate_strips
     from tasks.evaluate import evaluate as evaluate_task
+    from tasks.publish import record_scores
     from tasks.runs import open_run
     from tasks.scores import load_scores
 
@@ -48,23 +50,27 @@ def evaluate(
     }
     if postpaint or painter:
         variants["view-time"] = (finished.final, painter or parameters.painter)
+    judge = evaluate_strips if protocol == "cross-camera" else evaluate_task
     scores = {}
     with shown_progress():
         for name, (fitted, chosen) in variants.items():
-            judged = evaluate_task.fn(
+            judged = judge.fn(
                 store.root,
-                f"evaluate-{name}",
+                f"{protocol}-{name}",
                 parameters.split_spec,
                 fitted,
                 parameters.judge_settings,
                 chosen,
             )
             scores[name] = load_scores(judged.ref)
+    record_scores(store, finished.run_id, finished.scene_id, scores)
     if protocol == "truth":
         scores = {name: _with_truth(found, finished.scene_id) for name, found in scores.items()}
     result = {"run_id": finished.run_id, "scene": finished.scene_id, "protocol": protocol, **scores}
     if as_json:
         print_json(result)
+    elif protocol == "cross-camera":
+        _show_strips(result, list(variants))
     else:
         _show(result, list(variants))
 
@@ -97,3 +103,12 @@ def _show(result: dict[str, Any], variants: list[str]) -> None:
     ]
     title = f"{result['scene']}, run {result['run_id']}"
     print_table(title, ["truth", "view", "figure", *variants], rows, num_text_columns=3)
+
+
+def _show_strips(result: dict[str, Any], variants: list[str]) -> None:
+    rows = [
+        [name, *(result[variant][name]["psnr"] for variant in variants)]
+        for name in result[variants[0]]
+    ]
+    title = f"{result['scene']}, run {result['run_id']}: PSNR on strips seen by two cameras"
+    print_table(title, ["judging camera", *variants], rows)

@@ -83,6 +83,14 @@ def test_every_number_has_its_truth_and_a_missing_one_its_reason():
     assert ("depth", "left-2m", "depth_within_5_percent", 0.93, None) in values
 
 
+def test_strips_are_numbers_of_their_own_protocol():
+    strips = {"left": {"psnr": 25.0, "num_views": 14}, "back": {"psnr": None, "psnr_reason": "x"}}
+    assert metric_values(strips) == [
+        ("cross-camera", "left", "psnr", 25.0, None),
+        ("cross-camera", "back", "psnr", None, "x"),
+    ]
+
+
 def test_the_table_puts_unpainted_beside_painted():
     rows = score_rows({**SCORES, "unpainted": SCORES})
     assert rows[0] == ["recorded, interpolated poses", 29.5, 29.5, 0.9, 0.9, 0.98, 0.98, 14]

@@ -1,0 +1,56 @@
+"""The views by which cameras left out of a fit judge it: see `strips` for what they measure."""
+
+from collections.abc import Iterable, Sequence
+
+from lidarpainter_models.evaluation.held_out import HeldOut
+from lidarpainter_models.evaluation.strips import StripView
+from lidarpainter_models.gaussians.observations import fit_camera, shrink_picture
+from lidarpainter_models.gaussians.scene_graph import GaussianScene
+
+
+def judging_cameras(held_out: HeldOut, fitted_cameras: Sequence[str]) -> tuple[str, ...]:
+    """The scene's cameras that no fit has seen."""
+    return tuple(name for name in held_out.scene.camera_names if name not in fitted_cameras)
+
+
+def strip_views(
+    held_out: HeldOut,
+    fitted: GaussianScene,
+    *,
+    judging_camera: str,
+    fitted_camera: str,
+    frames: Iterable[int],
+) -> list[StripView]:
+    """One camera's pictures at some frames, beside the fitted camera of the same frames.
+
+    The judging camera stands where the log says, at fit size; the fitted one where the fit found
+    it: at its own pose in training frames, between its neighbours' in others. Frames that one of
+    the two lacks, or that have no sweep, are left out.
+    """
+    scene = held_out.scene
+    judging = {view.frame_index: view for view in scene.views_of(judging_camera)}
+    fitting = {view.frame_index: view for view in scene.views_of(fitted_camera)}
+    views = []
+    for frame in frames:
+        if frame not in judging or frame not in fitting or not scene.sweeps_of(frame):
+            continue
+        own, other = judging[frame], fitting[frame]
+        camera = fit_camera(own, held_out.observation)
+        picture = shrink_picture(
+            scene.read_image(own), width_px=camera.width_px, height_px=camera.height_px
+        )
+        views.append(
+            StripView(
+                camera=camera,
+                timestamp_ns=own.timestamp_ns,
+                truth_rgb=picture.float() / 255,
+                fitted_camera=fitted.corrected_camera(
+                    fit_camera(other, held_out.observation),
+                    timestamp_ns=other.timestamp_ns,
+                    camera_name=fitted_camera,
+                    key=other.key,
+                ),
+                points_world=held_out.points_at(own),
+            )
+        )
+    return views
