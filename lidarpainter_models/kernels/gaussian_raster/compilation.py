@@ -12,10 +12,13 @@ from typing import Any
 
 import numba
 
-EXACT = {"error_model": "numpy", "fastmath": {"contract"}, "forceinline": True}
+_ENTRY = {"error_model": "numpy", "fastmath": {"contract"}, "forceinline": True}
+_INNER = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # never called from Python
+
+EXACT = _ENTRY | _INNER
 """Code on single Gaussians: fused multiply-add, otherwise as written; divisions do not raise."""
 
-LANE_LOOP = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
+LANE_LOOP = _INNER | {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
 """Loops over pixels, with freedom to use vectors that leaves NaN and infinity alone."""
 
 
@@ -30,4 +33,4 @@ SOURCES = _sources_digest()
 def compiled_entry(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function with `prange` loops that Python calls; cache it for these sources."""
     function.__qualname__ = f"{function.__qualname__}_{SOURCES}"
-    return numba.njit(cache=True, parallel=True, **EXACT)(function)
+    return numba.njit(cache=True, parallel=True, **_ENTRY)(function)
