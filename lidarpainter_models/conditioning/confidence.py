@@ -5,10 +5,15 @@ Geometry says where a painter had something to go by:
     support = 1 - (1 - w_warp V) (1 - w_lidar L) (1 - w_surface A)
     confidence = painter confidence * support * seen
 
-V is 1 where a recorded picture could be warped here (its surface agrees in depth, sky with sky);
-L = exp(-d / reach) with d the distance to the nearest pixel a LiDAR point coloured; A rises
-smoothly from 0 to 1 with the opacity of the render; `seen` is 1 where the surface fell into any
-training picture, hidden or not, and 0 outside all of them: nothing is known there.
+V is how well recorded pictures vouch for a pixel: 0 where none could be warped here, a fixed share
+where a single one could, and exp(-excess / scale) where two could, with the excess of their
+difference over a slack. L = exp(-d / reach) with d the distance to the nearest pixel a LiDAR point
+coloured; A rises smoothly from 0 to 1 with the opacity of the render; `seen` is 1 where the
+surface fell into any training picture, hidden or not, and 0 outside all of them: nothing is known
+there. The weights follow errors measured at shifted views of a synthetic street: mean of render
+and warp 25.8 dB where two pictures are warped, 22.3 dB where one is; render 19 dB at LiDAR hits
+without warp, 18 to 15 dB without either, 13 dB in holes; from a difference of 0.16 between two
+warped pictures on, they are no better than the render.
 
 The gate compares: where recorded pixels are known (warped pictures first, LiDAR colours
 elsewhere), a painting that departs from them by more than the plain render did is weighed down,
@@ -34,7 +39,13 @@ class ConfidenceConfig:
     """What each kind of evidence is worth, and when painting counts as harm."""
 
     warp_weight: float = 0.9
-    """Support of a pixel that a recorded picture shows."""
+    """Support of a pixel that two recorded pictures show alike."""
+    single_warp_share: float = 0.7
+    """What a single recorded picture is worth, of two."""
+    warp_slack: float = 0.05
+    """Mean difference of two warped pictures that is put down to sampling."""
+    warp_scale: float = 0.1
+    """Further difference at which their worth has fallen to 1/e."""
     lidar_weight: float = 0.6
     """Support of a pixel with a coloured LiDAR point in it."""
     surface_weight: float = 0.3
@@ -56,15 +67,22 @@ class ConfidenceConfig:
 
     def __post_init__(self) -> None:
         """Refuse weights outside [0, 1] and empty ranges."""
-        for name in ("warp_weight", "lidar_weight", "surface_weight", "min_evidence"):
+        for name in (
+            "warp_weight",
+            "single_warp_share",
+            "lidar_weight",
+            "surface_weight",
+            "min_evidence",
+        ):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"{name} must be in [0, 1], got {getattr(self, name)}")
         if not 0 <= self.alpha_range[0] < self.alpha_range[1] <= 1:
             raise ConfigError(f"alpha_range must rise within [0, 1], got {self.alpha_range}")
         if self.gate_window_px < 1 or self.gate_window_px % 2 == 0:
             raise ConfigError(f"gate_window_px must be odd, got {self.gate_window_px}")
-        if min(self.lidar_reach_rad, self.gate_scale, self.refuse_excess) <= 0:
-            raise ConfigError("lidar_reach_rad, gate_scale and refuse_excess must be positive")
+        for name in ("lidar_reach_rad", "warp_scale", "gate_scale", "refuse_excess"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,7 +125,7 @@ def geometric_confidence(
 ) -> Float[Tensor, "height width"]:
     """`support * seen` of the module's formula, in [0, 1]."""
     config = config or ConfidenceConfig()
-    warp = conditions.warp_valid.any(dim=0).to(torch.float32)
+    warp = _vouched(conditions, config)
     distance_px = torch.full_like(conditions.render_alpha, torch.inf)
     if bool(conditions.lidar_hit.any()):
         distance = distance_transform_edt(~conditions.lidar_hit.cpu().numpy())
@@ -118,6 +136,20 @@ def geometric_confidence(
     surface = rise * rise * (3 - 2 * rise)
     doubt = (1 - config.warp_weight * warp) * (1 - config.lidar_weight * lidar)
     return (1 - doubt * (1 - config.surface_weight * surface)) * seen
+
+
+def _vouched(
+    conditions: PaintingConditions, config: ConfidenceConfig
+) -> Float[Tensor, "height width"]:
+    """V of the module's formula."""
+    num_valid = conditions.warp_valid.sum(dim=0)
+    vouched = config.single_warp_share * (num_valid == 1).to(torch.float32)
+    if len(conditions.warp_valid) < 2:
+        return vouched
+    first, second = conditions.warp_rgb[:2]
+    difference = _box_sum((first - second).abs().mean(dim=-1), 3) / 9
+    agreement = torch.exp(-(difference - config.warp_slack).clamp(min=0) / config.warp_scale)
+    return torch.where(num_valid >= 2, agreement, vouched)
 
 
 def guidance_gate(

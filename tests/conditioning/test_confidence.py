@@ -40,8 +40,8 @@ def conditions(**changes):
         "lidar_rgb": torch.zeros(HEIGHT, WIDTH, 3),
         "lidar_depth_m": torch.zeros(HEIGHT, WIDTH),
         "lidar_hit": torch.zeros(HEIGHT, WIDTH, dtype=torch.bool),
-        "warp_rgb": truth[None],
-        "warp_valid": torch.ones(1, HEIGHT, WIDTH, dtype=torch.bool),
+        "warp_rgb": torch.stack([truth, truth]),
+        "warp_valid": torch.ones(2, HEIGHT, WIDTH, dtype=torch.bool),
     }
     return PaintingConditions(**{**fields, **changes})
 
@@ -56,7 +56,7 @@ EVERYWHERE = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
 def test_confidence_follows_its_formula():
     hit = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     hit[10, 10] = True
-    given = conditions(lidar_hit=hit, warp_valid=torch.zeros(1, HEIGHT, WIDTH, dtype=torch.bool))
+    given = conditions(lidar_hit=hit, warp_valid=torch.zeros(2, HEIGHT, WIDTH, dtype=torch.bool))
     config = ConfidenceConfig(lidar_reach_rad=0.04)  # 2 px
     confidence = geometric_confidence(given, camera(), EVERYWHERE, config=config)
     expected = 1 - (1 - 0.6 * math.exp(-3 / 2)) * (1 - 0.3)
@@ -65,7 +65,7 @@ def test_confidence_follows_its_formula():
 
 
 def test_a_warped_pixel_is_trusted_more_than_a_bare_render_and_a_hole_not_at_all():
-    bare = torch.zeros(1, HEIGHT, WIDTH, dtype=torch.bool)
+    bare = torch.zeros(2, HEIGHT, WIDTH, dtype=torch.bool)
     warped = geometric_confidence(conditions(), camera(), EVERYWHERE)
     rendered = geometric_confidence(conditions(warp_valid=bare), camera(), EVERYWHERE)
     hole = geometric_confidence(
@@ -74,6 +74,19 @@ def test_a_warped_pixel_is_trusted_more_than_a_bare_render_and_a_hole_not_at_all
     assert (warped > 0.9).all()
     assert torch.allclose(rendered, torch.tensor(0.3))
     assert (hole == 0).all()
+
+
+def test_two_pictures_that_agree_count_more_than_one_or_two_that_differ():
+    truth = conditions().warp_rgb[0]
+    one = torch.stack([EVERYWHERE, ~EVERYWHERE])
+    agreeing = geometric_confidence(conditions(), camera(), EVERYWHERE)
+    single = geometric_confidence(conditions(warp_valid=one), camera(), EVERYWHERE)
+    differing = geometric_confidence(
+        conditions(warp_rgb=torch.stack([truth, 1 - truth])), camera(), EVERYWHERE
+    )
+    assert torch.allclose(agreeing, torch.tensor(1 - 0.1 * 0.7))
+    assert torch.allclose(single, torch.tensor(1 - (1 - 0.9 * 0.7) * 0.7))
+    assert (differing[2:-2, 2:-2] < single[2:-2, 2:-2]).all()
 
 
 def test_nothing_outside_every_recorded_picture_is_trusted():
@@ -116,7 +129,7 @@ def test_the_gate_refuses_a_view_made_worse_everywhere():
 
 
 def test_without_evidence_nothing_is_gated():
-    nothing = torch.zeros(1, HEIGHT, WIDTH, dtype=torch.bool)
+    nothing = torch.zeros(2, HEIGHT, WIDTH, dtype=torch.bool)
     gate = guidance_gate(painting(torch.zeros(HEIGHT, WIDTH, 3)), conditions(warp_valid=nothing))
     assert (gate.weight == 1).all()
     assert math.isnan(gate.painted_difference)
