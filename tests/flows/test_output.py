@@ -1,0 +1,94 @@
+"""Tables and progress say what is so, in either kind of place they are shown."""
+
+import json
+import math
+
+import pytest
+from rich.console import Console
+from rich.progress import Progress
+
+from flows.cli.output import format_bytes, format_cell, print_json, print_pairs, print_table
+from flows.cli.progress import Bars, Lines, shown_progress
+from tasks.progress import listener
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (None, "-"),
+        (True, "yes"),
+        (29.53449, "29.534"),
+        (7, "7"),
+        ("a[bold]", "a\\[bold]"),
+    ],
+)
+def test_cells_are_short_and_never_markup(value, expected):
+    assert format_cell(value) == expected
+
+
+@pytest.mark.parametrize(
+    ("num_bytes", "expected"), [(0, "0 B"), (999, "999 B"), (1500, "1.5 kB"), (2.5e9, "2.5 GB")]
+)
+def test_sizes_have_a_unit(num_bytes, expected):
+    assert format_bytes(num_bytes) == expected
+
+
+def test_json_stays_json_where_a_number_is_infinite(capsys):
+    print_json({"psnr": math.inf, "views": [1, math.nan]})
+    assert json.loads(capsys.readouterr().out) == {"psnr": None, "views": [1, None]}
+
+
+def test_a_table_shows_every_cell(capsys):
+    print_table("scores", ["view", "psnr"], [["left-2m", 24.5], ["[x]", None]], "in dB")
+    print_pairs("run", {"run": "abc"})
+    out = capsys.readouterr().out
+    assert all(word in out for word in ("scores", "left-2m", "24.500", "[x]", "in dB", "abc"))
+
+
+def test_lines_say_how_a_stage_ended(capsys):
+    lines = Lines()
+    lines.started("fit")
+    lines.advanced("fit", 1, 2, "30 dB")  # too soon to say anything
+    lines.waiting("fit", "42")
+    lines.finished("fit", 12.34, is_new=True)
+    lines.finished("paint", 12.34, is_new=False)
+    assert capsys.readouterr().err.splitlines() == [
+        "fit: waiting for process 42, which computes the same",
+        "fit: 12.3 s",
+        "paint: was there",
+    ]
+
+
+def test_a_stage_that_takes_long_says_so_now_and_then(capsys, monkeypatch):
+    monkeypatch.setattr("flows.cli.progress.LINE_EVERY_S", 0.0)
+    lines = Lines()
+    lines.started("fit")
+    lines.advanced("fit", 1, 4, "30 dB")
+    assert capsys.readouterr().err == "fit: 25 % 30 dB\n"
+
+
+def test_bars_follow_every_stage(capsys):
+    console = Console(force_terminal=True, width=80)
+    with Progress(
+        "{task.description} {task.percentage:.0f} {task.fields[note]}", console=console
+    ) as progress:
+        bars = Bars(progress)
+        bars.started("fit")
+        bars.advanced("fit", 1, 2, "30 dB")
+        bars.waiting("fit", "42")
+        bars.finished("fit", 3.0, is_new=True)
+        bars.started("paint")
+        bars.finished("paint", 3.0, is_new=False)
+    out = capsys.readouterr().out
+    assert "fit 100 3.0 s" in out
+    assert "paint 100 was there" in out
+
+
+def test_progress_is_heard_inside_the_block_only(capsys):
+    with shown_progress() as shown:
+        assert listener() is shown
+        listener().started("fit")
+        listener().finished("fit", 1.0, is_new=True)
+    assert listener() is not shown
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err) == ("", "fit: 1.0 s\n")
