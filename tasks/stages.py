@@ -1,10 +1,11 @@
 """What all stages share: their identity, their measurement, their retries.
 
-A stage's artefact is keyed on its inputs, its configuration and the source of the library packages
-it runs (`SOURCES`). Prefect's own cache is off: its key would see these thin tasks only, and what
-is done is written in the store.
+A stage's artefact is keyed on its inputs, its configuration, the source of the library packages it
+runs (`SOURCES`) and of the task module that writes it. Prefect's own cache is off: its key would
+see the thin task only, and what is done is written in the store.
 """
 
+import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -17,7 +18,7 @@ from prefect.client.schemas.objects import State, TaskRun
 
 import lidarpainter_models
 from catalog.artefacts import ArtefactRef, Recipe, Workplace
-from catalog.digests import digest_source
+from catalog.digests import digest_file, digest_source, digest_text
 from catalog.errors import CatalogError, ConflictError
 from catalog.records import artefact_row
 from catalog.store import Store
@@ -38,6 +39,9 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "painter": (*BASE, "painter"),
 }
 """Library packages by kind of artefact."""
+TASKS = Path(__file__).parent
+FILE_FORMATS = ("painted_views.py", "stored.py", "tensors.py")
+"""Task modules that decide what lies in an artefact's files."""
 
 RETRIES = 2
 RETRY_DELAY_S = 3
@@ -69,6 +73,12 @@ def library_digest(kind: str | None = None) -> str:
     return digest_source(LIBRARY, SOURCES[kind])
 
 
+def stage_digest(kind: str, build: Callable[..., Any]) -> str:
+    """Digest of all source behind an artefact: the library's, and how a task writes it."""
+    own = digest_file(Path(inspect.getfile(build)))
+    return digest_text(library_digest(kind) + own + digest_source(TASKS, FILE_FORMATS))
+
+
 def run_stage(
     store: Store,
     *,
@@ -83,7 +93,7 @@ def run_stage(
         kind=kind,
         inputs=inputs,
         config=config,
-        source_digest=library_digest(kind),
+        source_digest=stage_digest(kind, build),
         software_version=lidarpainter_models.__version__,
     )
 

@@ -33,6 +33,10 @@ def write_number(place):
     return {"num_gaussians": 3}
 
 
+def never(_place):
+    pytest.fail("computed although it was there")
+
+
 def run(store, build=write_number, **changes):
     values = {"stage": "fit", "kind": "gaussians", "inputs": {"a": "b"}, "config": {"steps": 1}}
     return stages.run_stage(store, **{**values, **changes}, build=build)
@@ -41,7 +45,7 @@ def run(store, build=write_number, **changes):
 def test_a_stage_is_computed_once_and_entered_into_the_catalog(tmp_path):
     store = open_store(tmp_path)
     first = run(store)
-    second = run(store, build=pytest.fail)
+    second = run(store, build=never)
     assert (first.is_new, second.is_new) == (True, False)
     assert first.summary["num_gaussians"] == second.summary["num_gaussians"] == 3
     assert first.peak_memory_bytes > 1e7
@@ -57,6 +61,19 @@ def test_a_changed_library_is_never_served_a_stale_result(tmp_path, monkeypatch)
     second = run(store)
     assert second.is_new
     assert second.ref != first.ref
+
+
+def test_a_changed_task_module_is_never_served_a_stale_result(tmp_path):
+    modules = []
+    for number in (1, 2):
+        path = tmp_path / f"writer_{number}.py"
+        path.write_text(f"def build(place):\n    return {{'version': {number}}}\n")
+        names = {}
+        exec(compile(path.read_text(), str(path), "exec"), names)  # noqa: S102 - our own text
+        modules.append(names["build"])
+    first, second = (stages.stage_digest("gaussians", build) for build in modules)
+    assert first != second
+    assert stages.stage_digest("gaussians", modules[0]) == first
 
 
 @pytest.mark.parametrize("kind", sorted(stages.SOURCES))
