@@ -12,12 +12,14 @@ from typing import Any
 from prefect import flow
 from pydantic import BaseModel, ConfigDict
 
+from catalog.store import split_scene_id
 from lidarpainter_models.conditioning.harvest import HarvestConfig
 from lidarpainter_models.conditioning.street_harvest import StreetPlan, default_street_plans
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.held_back import (
     FIRST_TRAINING_SEED,
     check_street_seed,
+    check_training_pairs,
     check_training_scene,
 )
 from lidarpainter_models.painter import OverlayPainter, UnpaintedPainter, WarpPainter
@@ -31,7 +33,12 @@ from tasks.harvest import (
     pair_set,
     street_id,
 )
-from tasks.judge_painter import judge_held_back, judge_painters, load_painting_scores
+from tasks.judge_painter import (
+    feature_distance_of,
+    judge_held_back,
+    judge_painters,
+    load_painting_scores,
+)
 from tasks.scenes import SplitSpec
 from tasks.stages import StageResult
 from tasks.train_painter import publish_painter, train, training_record, weights_path
@@ -146,13 +153,18 @@ def check_sources(parameters: TrainPainterParameters) -> None:
 
     Raises:
         ConfigError: no source of pairs, or a street whose seed is kept for judging.
+        DataError: a folder holds no pairs.
+        WeightsError: the weights for the feature distance cannot be used.
     """
+    feature_distance_of(parameters.feature_weights)
     if not (parameters.street_seeds or parameters.scenes or parameters.pair_folders):
         raise ConfigError("nothing to train on: expected street seeds, scenes or folders of pairs")
     for seed in parameters.street_seeds:
         check_street_seed(seed)
     for scene_id in parameters.scenes:
-        check_training_scene(*scene_id.split("/", 1))
+        check_training_scene(*split_scene_id(scene_id))
+    for one in named_sets(parameters.pair_folders):
+        check_training_pairs(one.open())
 
 
 def named_sets(folders: Iterable[Path]) -> tuple[PairSet, ...]:

@@ -11,7 +11,7 @@ from catalog.digests import DIGEST_LENGTH, digest_file
 from catalog.store import open_store
 from lidarpainter_models.conditioning.pairs import PairFolder
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.evaluation.held_back import TARGETS_KEY, hold_back, unseen_pairs
+from lidarpainter_models.evaluation.held_back import hold_back, trained_targets, unseen_pairs
 from lidarpainter_models.evaluation.painting import score_painter
 from lidarpainter_models.metrics.squeezenet import SqueezeNetDistance, load_squeezenet_distance
 from lidarpainter_models.painter import load_painter
@@ -64,8 +64,8 @@ def judge_painters(
     loaded = {label: load_painter(name) for label, name in painters.items()}
     distance = feature_distance_of(feature_weights)
     folders = open_sets(sets)
-    provenances = {label: provenance_of(painter) for label, painter in loaded.items()}
-    unseen = unseen_pairs(folders, list(provenances.values()))
+    known = {label: _trained_targets(painter) for label, painter in loaded.items()}
+    unseen = unseen_pairs(folders, [targets for targets in known.values() if targets is not None])
     pairs = {
         name: {
             "folder": str(folder.folder),
@@ -80,11 +80,7 @@ def judge_painters(
             for label, painter in loaded.items()
         },
         "pairs": pairs,
-        "training_unknown": [
-            label
-            for label, painter in loaded.items()
-            if isinstance(painter, NanoPainter) and TARGETS_KEY not in provenances[label]
-        ],
+        "training_unknown": [label for label, targets in known.items() if targets is None],
     }
 
 
@@ -155,9 +151,10 @@ def feature_distance_of(weights: Path | None) -> SqueezeNetDistance | None:
     return None if weights is None else load_squeezenet_distance(weights)
 
 
-def provenance_of(painter: Painter) -> dict[str, Any]:
-    """Where a painter's weights come from; nothing for one that has none."""
-    return painter.provenance if isinstance(painter, NanoPainter) else {}
+def _trained_targets(painter: Painter) -> frozenset[str] | None:
+    """What a painter was trained on; nothing for one that learns nothing, None if unknown."""
+    is_learned = isinstance(painter, NanoPainter)
+    return trained_targets(painter.provenance) if is_learned else frozenset()
 
 
 def painting_rows(

@@ -76,9 +76,9 @@ def with_length(
     if budget_s is not None and steps is not None:
         raise ConfigError("give --budget or --steps, not both")
     network = replace(training.network, inputs=inputs)
-    return replace(
-        training, network=network, max_cpu_s=budget_s, steps=steps if steps else training.steps
-    )
+    if steps is None:
+        steps = training.steps
+    return replace(training, network=network, max_cpu_s=budget_s, steps=steps)
 
 
 def write_painter(weights: Path, record: dict[str, Any], out: Path) -> dict[str, str]:

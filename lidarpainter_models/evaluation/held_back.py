@@ -9,7 +9,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from typing import Any
 
 from lidarpainter_models.conditioning.pairs import PairFolder
@@ -67,18 +67,38 @@ class PairSubset:
 
 
 def target_of(folder: PairFolder, index: int) -> str:
-    """The true picture of a pair: data set, sequence, and what was photographed from where.
+    """The true picture of a pair: data set, sequence, and what was photographed from where."""
+    return target_name(folder.name(index), folder.provenance(index))
 
-    A pair whose provenance says neither has a target of its own, shared with its damaged copies.
+
+def target_name(pair: str, provenance: Mapping[str, Any]) -> str:
+    """What a pair's true picture is called.
+
+    A pair whose provenance does not say what it shows has a target of its own, shared with its
+    damaged copies.
     """
-    provenance = folder.provenance(index)
     place = f"{provenance.get('dataset', 'unknown')}/{provenance.get('sequence', 'unknown')}"
     if "target" in provenance:
         return f"{place} {json.dumps(provenance['target'])}"
     if "frame" in provenance and "shift" in provenance:
         camera = provenance.get("cameras", [None])[0]
         return f"{place} {json.dumps([provenance['frame'], camera, provenance['shift']])}"
-    return f"{place} {_COPY.sub('', folder.name(index))}"
+    return f"{place} {_COPY.sub('', pair)}"
+
+
+def trained_targets(provenance: Mapping[str, Any]) -> frozenset[str] | None:
+    """The true pictures that weights were trained on, or None if they do not say.
+
+    Weights say it by a list of targets, or by describing every pair of their sources.
+    """
+    if TARGETS_KEY in provenance:
+        return frozenset(provenance[TARGETS_KEY])
+    described = [source.get("pairs") for source in provenance.get("sources", ())]
+    if not described or not all(isinstance(pairs, Mapping) for pairs in described):
+        return None
+    return frozenset(
+        target_name(pair, known) for pairs in described for pair, known in pairs.items()
+    )
 
 
 def check_street_seed(seed: int) -> None:
@@ -153,9 +173,7 @@ def hold_back(
     return learnt, judged
 
 
-def without_targets(
-    folders: Mapping[str, PairFolder], targets: frozenset[str] | set[str]
-) -> dict[str, PairSubset]:
+def without_targets(folders: Mapping[str, PairFolder], targets: Set[str]) -> dict[str, PairSubset]:
     """The pairs that aim at none of some targets; empty sets are left out."""
     kept = {
         name: PairSubset(
@@ -169,19 +187,18 @@ def without_targets(
 
 
 def unseen_pairs(
-    folders: Mapping[str, PairFolder], provenances: Sequence[Mapping[str, Any]]
+    folders: Mapping[str, PairFolder], known: Iterable[frozenset[str]]
 ) -> dict[str, PairSubset]:
     """The pairs that no painter was trained on, so that all of them are judged alike.
 
     Args:
         folders: pairs by name.
-        provenances: that of every painter; one that names no targets was trained on nothing.
+        known: the targets that each painter was trained on.
 
     Raises:
         DataError: every pair's target was trained on.
     """
-    seen = {target for provenance in provenances for target in provenance.get(TARGETS_KEY, ())}
-    unseen = without_targets(folders, seen)
+    unseen = without_targets(folders, frozenset().union(*known))
     if not unseen:
         raise DataError(
             f"no pair of {', '.join(folders) or 'no folder'} is left to judge by: a painter was "

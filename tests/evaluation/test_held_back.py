@@ -15,6 +15,7 @@ from lidarpainter_models.evaluation.held_back import (
     check_training_scene,
     hold_back,
     target_of,
+    trained_targets,
     unseen_pairs,
 )
 from lidarpainter_models.painter.examples import PairSource
@@ -106,12 +107,20 @@ def test_copies_of_a_view_share_its_target(tmp_path, make_flat_pair):
 
 def test_what_any_painter_knows_judges_none(make_folder):
     folder = make_folder("a", range(4))
-    knows = [{TARGETS_KEY: ['log/1 [0, "front"]']}, {}, {TARGETS_KEY: ['log/1 [2, "front"]']}]
-    unseen = unseen_pairs({"a": folder}, knows)
+    known = [frozenset({'log/1 [0, "front"]'}), frozenset(), frozenset({'log/1 [2, "front"]'})]
+    unseen = unseen_pairs({"a": folder}, known)
     assert unseen["a"].targets == {'log/1 [1, "front"]', 'log/1 [3, "front"]'}
-    everything = {TARGETS_KEY: sorted(unseen["a"].targets)}
     with pytest.raises(DataError, match="no pair of a is left"):
-        unseen_pairs({"a": folder}, [*knows, everything])
+        unseen_pairs({"a": folder}, [*known, unseen["a"].targets])
+
+
+def test_weights_say_what_they_know_by_targets_or_by_their_sources(make_folder):
+    folder = make_folder("a", range(2))
+    expected = {'log/1 [0, "front"]', 'log/1 [1, "front"]'}
+    assert trained_targets({TARGETS_KEY: sorted(expected)}) == expected
+    assert trained_targets({"sources": [folder.describe()]}) == expected
+    assert trained_targets({"steps": 5}) is None
+    assert trained_targets({"sources": [{"digest": "x"}]}) is None
 
 
 @pytest.mark.parametrize("seed", [0, 7, 99, 999])
