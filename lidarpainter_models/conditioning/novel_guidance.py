@@ -48,6 +48,8 @@ class NovelGuidanceConfig:
     """Where the recorded cameras are moved to; the paper's 2 and 3 m to both sides and 1.5 m up."""
     every_nth: int = 2
     """Of the training frames, every n-th is painted at every shift."""
+    camera_names: tuple[str, ...] | None = None
+    """Cameras that are moved; None moves every training camera."""
     room_m: float = 0.6
     """No surface may be nearer to a moved camera than this."""
     max_points_in_room: int = 10
@@ -115,10 +117,12 @@ def novel_cameras(
         start: Training frame counted from, so that another round may paint other frames.
 
     Raises:
-        ConfigError: a view's frame is not among `frame_indices`.
+        ConfigError: a view's frame is not among `frame_indices`, or a camera named in the config
+            has no training view.
     """
     config = config or NovelGuidanceConfig()
     directions = dict(zip(frame_indices, road_directions(world_from_ego), strict=True))
+    _check_names(config.camera_names, training_views)
     frames = sorted({view.key[0] for view in training_views})
     unknown = [frame for frame in frames if frame not in directions]
     if unknown:
@@ -136,7 +140,17 @@ def novel_cameras(
         for shift in config.shifts
         for view in training_views
         if view.key[0] in chosen
+        and (config.camera_names is None or view.key[1] in config.camera_names)
     ]
+
+
+def _check_names(names: tuple[str, ...] | None, views: Sequence[TrainingView]) -> None:
+    known = sorted({view.key[1] for view in views})
+    missing = sorted(set(names or ()) - set(known))
+    if missing:
+        raise ConfigError(
+            f"no training view has the camera {', '.join(missing)} (there are {', '.join(known)})"
+        )
 
 
 def has_room(

@@ -203,6 +203,12 @@ def test_a_frame_without_an_ego_pose_is_refused(views):
         novel_cameras(views, range(3), ego_path(3))
 
 
+def test_an_unknown_camera_is_refused(views):
+    config = NovelGuidanceConfig(camera_names=("rear",))
+    with pytest.raises(ConfigError, match="rear"):
+        novel_cameras(views, range(10), ego_path(), config=config)
+
+
 def test_painting_gives_guidance_that_trusts_what_was_recorded(builder, views, board, draw):
     config = NovelGuidanceConfig(shifts=(Shift(lateral_m=1),), every_nth=3)
     novel = novel_cameras(views, range(10), ego_path(), config=config)
