@@ -217,8 +217,9 @@ def _step(state: TrainingState, batch: TrainingBatch, config: NanoTrainingConfig
     norm = torch.nn.utils.clip_grad_norm_(state.network.parameters(), config.max_gradient_norm)
     if not bool(torch.isfinite(terms.total) & torch.isfinite(norm)):
         raise TrainingError(
-            f"loss {float(terms.total.detach())} with gradient norm {float(norm)} at step {state.step}: "
-            "the training stops, its last checkpoint is kept; try a lower learning_rate"
+            f"loss {float(terms.total.detach())} with gradient norm {float(norm)} at step "
+            f"{state.step}: the training stops, its last checkpoint is kept; try a lower "
+            "learning_rate"
         )
     state.optimiser.step()
     _average(state, config.average_decay)
