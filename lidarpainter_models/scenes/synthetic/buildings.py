@@ -1,6 +1,7 @@
 """Rows of buildings along the street, with gaps, corners and what hangs on their walls."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -61,7 +62,7 @@ def draw_lots(plan: StreetPlan, rng: np.random.Generator) -> list[Lot]:
             while edges[-1] < last - 22:
                 edges.append(edges[-1] + rng.uniform(8.5, 19))
             edges = [*edges, last]
-            for index, (low, high) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+            for index, (low, high) in enumerate(pairwise(edges)):
                 is_end = block == 0 and index == len(edges) - 2
                 is_start = block == 1 and index == 0
                 is_gap = not (is_end or is_start) and rng.random() < 0.16
@@ -213,7 +214,7 @@ def add_skyline(
         texture = surfaces.add_texture(_tower(size, rng))
         surface = surfaces.add(Surface(semantics=StreetClass.BUILDING, texture=texture, gloss=0.5))
         yaw = float(plan.line.heading_at(middle))
-        add_box(builder, place + [0, 0, size[2] / 2 - 1], size, surface, yaw_rad=yaw)
+        add_box(builder, place + np.array([0, 0, size[2] / 2 - 1]), size, surface, yaw_rad=yaw)
 
 
 def _tower(size: np.ndarray, rng: np.random.Generator) -> np.ndarray:

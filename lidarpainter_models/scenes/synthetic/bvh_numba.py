@@ -60,6 +60,13 @@ def _bin_costs(
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _bins(centres: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Bin of every centre along one axis."""
+    scale = NUM_BINS / (high - low)
+    return np.minimum(((centres - low) * scale).astype(np.int64), NUM_BINS - 1)
+
+
+@numba.njit(cache=True, error_model="numpy")
 def _partition(lower: np.ndarray, upper: np.ndarray, order: np.ndarray) -> int:
     """Reorder `order` in place; gives the size of its first part."""
     centres = np.empty((order.size, 3), np.float32)
@@ -68,12 +75,17 @@ def _partition(lower: np.ndarray, upper: np.ndarray, order: np.ndarray) -> int:
     low, high = np.empty(3, np.float32), np.empty(3, np.float32)
     for axis in range(3):
         low[axis], high[axis] = centres[:, axis].min(), centres[:, axis].max()
-    axis = int(np.argmax(high - low))
-    if high[axis] - low[axis] < 1e-6:
+    if (high - low).max() < 1e-6:
         return order.size // 2
-    scale = NUM_BINS / (high[axis] - low[axis])
-    bins = np.minimum(((centres[:, axis] - low[axis]) * scale).astype(np.int64), NUM_BINS - 1)
-    split = int(np.argmin(_bin_costs(lower, upper, order, bins)))
+    best_cost, best_axis, split = np.inf, 0, 0
+    for axis in range(3):
+        if high[axis] - low[axis] < 1e-6:
+            continue
+        costs = _bin_costs(lower, upper, order, _bins(centres[:, axis], low[axis], high[axis]))
+        place = int(np.argmin(costs))
+        if costs[place] < best_cost:
+            best_cost, best_axis, split = costs[place], axis, place
+    bins = _bins(centres[:, best_axis], low[best_axis], high[best_axis])
     first = order[bins <= split]
     second = order[bins > split]
     order[: first.size] = first
@@ -82,9 +94,7 @@ def _partition(lower: np.ndarray, upper: np.ndarray, order: np.ndarray) -> int:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def build_tree(
-    lower: np.ndarray, upper: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def build_tree(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Tree over boxes (float32 (items, 3) each); node 0 is the root.
 
     Returns:

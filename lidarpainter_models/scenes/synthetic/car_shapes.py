@@ -12,6 +12,8 @@ from lidarpainter_models.scenes.synthetic.meshes import Mesh, MeshBuilder
 from lidarpainter_models.scenes.synthetic.solids import add_box, add_tube
 
 LOWEST_M = 0.24
+BULGE = ((0.955, 0.05), (0.87, 0.082), (0.6, 0.1), (0.25, 0.105), (0.0, 0.105))
+"""How the ends are closed: rings shrunk to a share, pushed out by metres."""
 
 
 def build_car(shape: CarShape, atlas: CarAtlas, num_stations: int = 34) -> tuple[Mesh, np.ndarray]:
@@ -61,15 +63,27 @@ def _rings(shape: CarShape, stations: np.ndarray) -> np.ndarray:
     return np.stack([*left, *right], axis=1)
 
 
-def _add_shell(
-    builder: MeshBuilder, shape: CarShape, atlas: CarAtlas, num_stations: int
-) -> None:
+def _closed(rings: np.ndarray) -> np.ndarray:
+    """The rings with rounded ends, shrunk towards the middle of the floor."""
+    ends = []
+    for ring, out in ((rings[0], -1.0), (rings[-1], 1.0)):
+        centre = np.array([ring[0, 0], 0.0, LOWEST_M])
+        shrunk = [
+            centre + (ring - centre) * [1.0, share, share] + [out * push, 0.0, 0.0]
+            for share, push in BULGE
+        ]
+        ends.append(np.stack(shrunk))
+    return np.concatenate([ends[0][::-1], rings, ends[1]])
+
+
+def _add_shell(builder: MeshBuilder, shape: CarShape, atlas: CarAtlas, num_stations: int) -> None:
     """The body between the two ends, the ends, and the floor."""
-    half = shape.length_m / 2
+    half = shape.length_m / 2 - BULGE[-1][1]
     even = np.linspace(-half, half, num_stations)
-    stations = np.unique(np.concatenate([even, [x for x, _ in shape.roof], shape.glass]))
+    corners = [x for x, _ in shape.roof if abs(x) < half]
+    stations = np.unique(np.concatenate([even, corners, shape.glass]))
     keep = np.concatenate([[True], np.diff(stations) > 0.02])
-    rings = _rings(shape, stations[keep])
+    rings = _closed(_rings(shape, stations[keep]))
     normals = _smooth_normals(rings)
     quads = [rings[:-1, :-1], rings[1:, :-1], rings[1:, 1:], rings[:-1, 1:]]
     shades = [normals[:-1, :-1], normals[1:, :-1], normals[1:, 1:], normals[:-1, 1:]]
@@ -77,10 +91,6 @@ def _add_shell(
         corners = np.stack([quads[i] for i in order], axis=2).reshape(-1, 3, 3)
         smooth = np.stack([shades[i] for i in order], axis=2).reshape(-1, 3, 3)
         builder.primitives(corners, atlas.uv(corners), atlas.body, normals=smooth)
-    for ring in (rings[0], rings[-1]):
-        centre = np.array([ring[0, 0], 0.0, 0.5 * (LOWEST_M + ring[:, 2].max())])
-        fan = np.stack([np.repeat(centre[None], len(ring) - 1, 0), ring[:-1], ring[1:]], axis=1)
-        builder.primitives(fan, atlas.uv(fan), atlas.body)
     floor = np.stack([rings[:, 0], rings[:, -1]])
     builder.grid(floor, np.full((*floor.shape[:2], 2), 0.5), atlas.rubber)
 

@@ -5,6 +5,7 @@ share one view. The fourth channel is gloss.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -22,9 +23,9 @@ from lidarpainter_models.scenes.synthetic.surfaces import (
 
 PER_M = 96.0
 PAINTS = (
-    (226, 228, 230), (40, 42, 46), (132, 136, 142), (176, 178, 182), (148, 26, 28), (26, 48, 96),
-    (60, 66, 72), (98, 30, 34), (52, 78, 66), (196, 178, 140), (18, 18, 20), (202, 96, 30),
-    (60, 110, 150), (236, 236, 232), (92, 82, 74),
+    (206, 208, 210), (40, 42, 46), (122, 126, 132), (164, 166, 170), (138, 26, 28), (30, 48, 90),
+    (60, 66, 72), (96, 34, 38), (52, 74, 64), (172, 160, 132), (22, 22, 24), (176, 92, 40),
+    (62, 98, 132), (212, 212, 206), (92, 82, 74), (28, 29, 32), (146, 148, 150), (80, 84, 90),
 )  # fmt: skip
 GLASS = (26.0, 31.0, 36.0)
 PAINT_GLOSS, GLASS_GLOSS = 0.62, 1.0
@@ -91,9 +92,7 @@ class _Layout:
         return self._place(self.length_m / 2 - x, 2 * self.height_m + self.width_m / 2 - y)
 
 
-def add_car_surfaces(
-    surfaces: SurfaceSet, shape: CarShape, rng: np.random.Generator
-) -> CarAtlas:
+def add_car_surfaces(surfaces: SurfaceSet, shape: CarShape, rng: np.random.Generator) -> CarAtlas:
     """Paint a car: a random colour, plates of its own."""
     paint = PAINTS[int(rng.integers(len(PAINTS)))]
     size = shape.length_m, shape.width_m, shape.height_m
@@ -167,16 +166,17 @@ class _CarPainter:
         shape = self.shape
         half = shape.length_m / 2
         self._rect("side", (-half, half, 0.0, 0.33), (30, 30, 31), 0.1)
-        rear_base, rear_top, front_top, front_base = shape.glass
+        rear_base, _, _, front_base = shape.glass
         edges = [rear_base + 0.1, *shape.pillars, front_base - 0.1]
         is_van = shape.category == "van"
-        for index, (start, end) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+        for index, (start, end) in enumerate(pairwise(edges)):
             if is_van and index == 0:
                 continue  # the load bay has no windows
             xs = np.linspace(start + 0.04, end - 0.04, 12)
             low = [(x, self._belt(x) + 0.04) for x in xs]
             high = [(x, max(self._roof(x) - 0.13, self._belt(x) + 0.05)) for x in xs[::-1]]
             self._fill("side", np.array(low + high), GLASS, GLASS_GLOSS)
+            self._draw_inside(start, end)
             self._line([(start, self._belt(start)), (start + 0.02, 0.36)])
         self._line([(edges[-1] - 0.05, self._belt(edges[-1])), (edges[-1] - 0.02, 0.36)])
         self._line([(edges[0] + 0.3, 0.36), (edges[-1], 0.36)])
@@ -191,10 +191,29 @@ class _CarPainter:
         tail = self._belt(-half + 0.1)
         self._rect("side", (-half, -half + 0.3, tail - 0.2, tail + 0.02), (168, 18, 20), 0.9)
 
+    def _draw_inside(self, start: float, end: float) -> None:
+        """What is seen through a side window: the light of the other side, and a seat."""
+        if end - start < 0.5:
+            return
+        xs = np.linspace(start + 0.12, end - 0.12, 8)
+        low = [(x, self._belt(x) + 0.14) for x in xs]
+        high = [(x, max(self._roof(x) - 0.19, self._belt(x) + 0.15)) for x in xs[::-1]]
+        self._fill("side", np.array(low + high), (66, 74, 80), GLASS_GLOSS)
+        seat, belt = start + 0.45 * (end - start), self._belt(start)
+        angles = np.linspace(0, 2 * np.pi, 16)
+        head = np.stack([seat + 0.1 * np.cos(angles), belt + 0.2 + 0.12 * np.sin(angles)], 1)
+        self._fill("side", head, (20, 21, 23), GLASS_GLOSS)
+        self._rect("side", (seat - 0.19, seat + 0.12, belt + 0.04, belt + 0.14), (20, 21, 23), 1.0)
+
     def _draw_ends(self) -> None:
         shape = self.shape
         half, belt_front = shape.width_m / 2, self._belt(shape.length_m / 2 - 0.15)
         dark = (22, 22, 24)
+        shade = np.linspace(0.72, 1.0, max(round(0.4 * PER_M), 2))[::-1]  # less light from below
+        for foot in (self.shape.height_m, 2 * self.shape.height_m):
+            line = round((foot - 0.62) * PER_M)
+            area = self.colour[line : line + len(shade)]
+            area *= shade[: len(area), None, None]
         self._rect("front", (-half, half, 0.2, 0.34), (34, 34, 35), 0.1)
         self._rect("front", (-0.5, 0.5, 0.36, 0.56), dark, 0.3)
         for bar in np.linspace(0.38, 0.54, 4):
@@ -203,7 +222,15 @@ class _CarPainter:
             lamp = (side * (half - 0.08), side * (half - 0.46), belt_front - 0.13, belt_front)
             self._rect("front", lamp, (232, 236, 238), 1.0)
         rear_belt = self._belt(-shape.length_m / 2 + 0.15)
-        self._rect("rear", (-half, half, 0.2, 0.42), (34, 34, 35), 0.1)
+        self._rect("rear", (-half, half, 0.2, 0.4), (34, 34, 35), 0.1)
+        seam = tuple(self.paint * 0.4)
+        self._rect("rear", (-half, half, 0.5, 0.512), seam, 0.2)
+        self._rect("rear", (-half + 0.22, half - 0.22, rear_belt + 0.03, rear_belt + 0.042), seam)
+        for side in (-1, 1):
+            self._rect("rear", (side * 0.5, side * 0.62, 0.26, 0.32), (120, 120, 122), 0.6)
+            lamp = (side * (half - 0.12), side * (half - 0.3), 0.43, 0.47)
+            self._rect("rear", lamp, (150, 30, 28), 0.6)
+        self._rect("rear", (-0.07, 0.07, rear_belt - 0.12, rear_belt - 0.04), (170, 172, 176), 0.8)
         self._rect("rear", (-0.3, 0.3, 0.54, 0.72), tuple(self.paint * 0.6), 0.3)
         for side in (-1, 1):
             lamp = (side * (half - 0.02), side * (half - 0.36), rear_belt - 0.22, rear_belt + 0.02)

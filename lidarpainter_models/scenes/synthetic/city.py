@@ -46,7 +46,7 @@ class City:
     """float64 (moving actors)."""
 
 
-def build_city(seed: int, duration_s: float) -> City:
+def build_city(seed: int) -> City:
     """Draw a street; each part has its own stream of random numbers."""
     streams = np.random.SeedSequence([seed, 20_261]).spawn(9)
     plan_rng, ground_rng, house_rng, green_rng, thing_rng, car_rng, sky_rng, ego_rng, lot_rng = (
@@ -60,8 +60,8 @@ def build_city(seed: int, duration_s: float) -> City:
     add_skyline(builder, surfaces, plan, house_rng)
     _add_greenery(builder, surfaces, plan, lots, green_rng)
     StreetFurniture(builder, surfaces, plan, thing_rng).add_all()
-    ego = draw_ego_motion(plan.line, ego_rng, duration_s=duration_s)
-    actors = tuple(Traffic(plan, ego, surfaces, car_rng, duration_s).draw())
+    ego = draw_ego_motion(plan.line, ego_rng)
+    actors = tuple(Traffic(plan, ego, surfaces, car_rng).draw())
     light = draw_light(surfaces, plan, sky_rng)
     street, owner = _standing(builder.build(), plan, actors)
     moving = [
@@ -132,7 +132,7 @@ def _fill_gap(
             second = plan.line.place(high, front, KERB_HEIGHT_M)
             length = float(np.linalg.norm(second - first))
             uv = ((0, 0), (length / 1.2, 0), (0, 1.0))
-            top = first + [0, 0, 1.9]
+            top = first + np.array([0, 0, 1.9])
             builder.quad(top, second - first, [0, 0, -1.9], fence, uv=uv)
     else:
         first = plan.line.place(start, front + lot.side * 0.6, KERB_HEIGHT_M)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Self
+from typing import Any
 
 from lidarpainter_models.errors import ConfigError
 
@@ -127,7 +127,7 @@ class SyntheticStreetConfig:
         return values
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+    def from_dict(cls, values: Mapping[str, Any]) -> "SyntheticStreetConfig":
         """The inverse of `to_dict`.
 
         Raises:

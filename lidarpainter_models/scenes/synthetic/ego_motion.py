@@ -6,14 +6,38 @@ import numpy as np
 
 from lidarpainter_models.scenes.synthetic.street_line import StreetLine
 
+SETTLING_S = 2.5
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """Speed that goes from a first to a last value and settles there exponentially."""
+
+    first_mps: float
+    last_mps: float
+
+    def speed_mps(self, time_s: np.ndarray | float) -> np.ndarray:
+        """Speed at times after the start."""
+        left = np.exp(-np.asarray(time_s, float) / SETTLING_S)
+        return self.last_mps + (self.first_mps - self.last_mps) * left
+
+    def travelled_m(self, time_s: np.ndarray | float) -> np.ndarray:
+        """The integral of the speed."""
+        time_s = np.asarray(time_s, float)
+        settled = SETTLING_S * (1 - np.exp(-time_s / SETTLING_S))
+        return self.last_mps * time_s + (self.first_mps - self.last_mps) * settled
+
+    def times(self, factor: float) -> "Pace":
+        """The same course, faster or slower."""
+        return Pace(self.first_mps * factor, self.last_mps * factor)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EgoMotion:
     """Pose of the ego frame (on the ground below the LiDAR) over time; the identity at time 0."""
 
     line: StreetLine
-    speed_mps: float
-    acceleration_mps2: float
+    pace: Pace
     sway_m: float
     sway_hz: float
     wobble_rad: tuple[float, float]
@@ -23,16 +47,15 @@ class EgoMotion:
 
     def travelled_m(self, time_s: np.ndarray | float) -> np.ndarray:
         """Distance along the street."""
-        time_s = np.asarray(time_s, float)
-        return self.speed_mps * time_s + 0.5 * self.acceleration_mps2 * time_s**2
+        return self.pace.travelled_m(time_s)
 
     def world_from_ego(self, time_s: np.ndarray) -> np.ndarray:
         """(n, 4, 4)."""
         time_s = np.atleast_1d(np.asarray(time_s, float))
         swing = 2 * np.pi * self.sway_hz
         aside = self.sway_m * (1 - np.cos(swing * time_s))
-        speed = self.speed_mps + self.acceleration_mps2 * time_s
-        yaw = np.arctan2(self.sway_m * swing * np.sin(swing * time_s), np.maximum(speed, 0.5))
+        speed = np.maximum(self.pace.speed_mps(time_s), 0.5)
+        yaw = np.arctan2(self.sway_m * swing * np.sin(swing * time_s), speed)
         poses = self.line.poses(self.travelled_m(time_s), aside, yaw)
         for axis in (0, 1):
             angle = self._wobble(time_s, axis)
@@ -52,13 +75,11 @@ class EgoMotion:
         return self.wobble_rad[axis] * (0.6 * fast + 0.4 * slow)
 
 
-def draw_ego_motion(line: StreetLine, rng: np.random.Generator, *, duration_s: float) -> EgoMotion:
+def draw_ego_motion(line: StreetLine, rng: np.random.Generator) -> EgoMotion:
     """A drive between 4 and 9 m/s."""
-    first, last = rng.uniform(4.0, 8.0), rng.uniform(5.0, 9.0)
     return EgoMotion(
         line=line,
-        speed_mps=first,
-        acceleration_mps2=float(np.clip((last - first) / max(duration_s, 1.0), -1.5, 1.5)),
+        pace=Pace(rng.uniform(4.0, 8.0), rng.uniform(5.0, 9.0)),
         sway_m=rng.uniform(-0.08, 0.08),
         sway_hz=rng.uniform(0.1, 0.25),
         wobble_rad=(rng.uniform(0.0005, 0.0015), rng.uniform(0.0008, 0.002)),

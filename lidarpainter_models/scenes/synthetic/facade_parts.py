@@ -102,7 +102,11 @@ def _add_blade(
     faces = {"left": face, "right": face}
     add_box(builder, centre, (size[0], 0.12, size[1]), dark, yaw_rad=_yaw(place), faces=faces)
     add_tube(
-        builder, _on_wall(place, x, z + 0.2, 0), _on_wall(place, x, z + 0.2, 0.3), (0.03, 0.03), dark
+        builder,
+        _on_wall(place, x, z + 0.2, 0),
+        _on_wall(place, x, z + 0.2, 0.3),
+        (0.03, 0.03),
+        dark,
     )
 
 

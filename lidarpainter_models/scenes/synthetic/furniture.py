@@ -1,6 +1,7 @@
 """What stands on the sidewalks: lamps, signals, signs, poles with wires, meters, bins, shelters."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -41,9 +42,7 @@ class StreetFurniture:
     ) -> int:
         """A surface of one colour."""
         tint = tint_from_bytes(colour)
-        return self.surfaces.add(
-            Surface(semantics=kind, tint=tint, gloss=0.15, emission=emission)
-        )
+        return self.surfaces.add(Surface(semantics=kind, tint=tint, gloss=0.15, emission=emission))
 
     def foot(self, s_m: float, side: int, inset_m: float = EDGE_M) -> np.ndarray:
         """A place on the sidewalk; `inset_m` from the kerb."""
@@ -254,7 +253,12 @@ class StreetFurniture:
             for height, reach in ((10.4, 1.25), (9.3, 1.0)):
                 arm = foot + height * UP
                 add_tube(
-                    self.builder, arm - reach * inward, arm + reach * inward, (0.06, 0.06), wood, sides=6
+                    self.builder,
+                    arm - reach * inward,
+                    arm + reach * inward,
+                    (0.06, 0.06),
+                    wood,
+                    sides=6,
                 )
             if self.rng.random() < 0.5:
                 can = foot + 7.9 * UP + 0.35 * ahead
@@ -262,11 +266,11 @@ class StreetFurniture:
             spots = [10.5 * UP - 1.15 * inward, 10.5 * UP + 1.15 * inward, 9.4 * UP + 0.9 * inward]
             tops.append([foot + spot for spot in spots] + [foot + 7.4 * UP])
         share = np.linspace(0, 1, 9)
-        for first, second in zip(tops[:-1], tops[1:], strict=True):
+        for first, second in pairwise(tops):
             for start, end in zip(first, second, strict=True):
                 path = start + share[:, None] * (end - start)
                 path[:, 2] -= 3.2 * share * (1 - share)
-                for low, high in zip(path[:-1], path[1:], strict=True):
+                for low, high in pairwise(path):
                     radii = (WIRE_RADIUS_M, WIRE_RADIUS_M)
                     add_tube(self.builder, low, high, radii, black, sides=4)
 
@@ -293,9 +297,7 @@ class StreetFurniture:
         for end in (-2.0, 2.0):
             place = middle + end * ahead + 1.3 * UP
             faces = {"front": face, "back": face}
-            add_box(
-                self.builder, place, (0.08, 1.2, 1.8), metal, yaw_rad=heading, faces=faces
-            )
+            add_box(self.builder, place, (0.08, 1.2, 1.8), metal, yaw_rad=heading, faces=faces)
 
 
 def plan_clear(plan: StreetPlan, s_m: float) -> float:

@@ -26,9 +26,9 @@ from lidarpainter_models.scenes.synthetic.surfaces import (
 STEP_M = 4.0
 KERB_M = 0.16
 SIDEWALK_TEXTURE_M = (12.0, 6.0)
-NEAR_STRETCH_M = (-24.0, 84.0)
-NEAR_TEXELS_PER_M = 42.0
-FAR_TEXELS_PER_M = 16.0
+STRETCHES_M = ((-8.0, 60.0), (48.0, 26.0), (100.0, 14.0))
+"""Where a stretch of road texture begins, and its texels per metre."""
+BEHIND_TEXELS_PER_M = 14.0
 
 
 def add_ground(
@@ -57,7 +57,9 @@ def add_ground(
         detail_per_m=0.6,
         detail_strength=0.12,
     )
-    kerb = surfaces.add(Surface(semantics=StreetClass.SIDEWALK, tint=tint_from_bytes((150, 148, 142))))
+    kerb = surfaces.add(
+        Surface(semantics=StreetClass.SIDEWALK, tint=tint_from_bytes((150, 148, 142)))
+    )
     lot = surfaces.add(
         Surface(
             semantics=StreetClass.TERRAIN,
@@ -67,12 +69,14 @@ def add_ground(
     for start, end in plan.blocks:
         for near, far in _sides(plan):
             _add_block(builder, plan, (start, end), (near, far), (surfaces.add(slabs), kerb, lot))
-    plain = surfaces.add(Surface(semantics=StreetClass.TERRAIN, tint=tint_from_bytes((112, 112, 98))))
+    plain = surfaces.add(
+        Surface(semantics=StreetClass.TERRAIN, tint=tint_from_bytes((112, 112, 98)))
+    )
     builder.quad([-1500, -1500, -1.2], [3000, 0, 0], [0, 3000, 0], plain)
 
 
 def _sides(plan: StreetPlan) -> tuple[tuple[float, float], tuple[float, float]]:
-    """d of the kerb and of the far end of the blocks, right and left."""
+    """Kerb and far end (d) of the blocks, right and left."""
     return (
         (plan.right_kerb_m, plan.right_kerb_m - BLOCK_DEPTH_M),
         (plan.left_kerb_m, plan.left_kerb_m + BLOCK_DEPTH_M),
@@ -86,13 +90,10 @@ def _add_road(
     rng: np.random.Generator,
     detail: int,
 ) -> None:
-    """The road in three stretches, the nearest one in fine texels."""
-    near = NEAR_STRETCH_M
-    stretches = (
-        (plan.start_m, near[0], FAR_TEXELS_PER_M),
-        (*near, NEAR_TEXELS_PER_M),
-        (near[1], plan.end_m, FAR_TEXELS_PER_M),
-    )
+    """The road in stretches, those near the recorded path in fine texels."""
+    starts = [plan.start_m, *(start for start, _ in STRETCHES_M), plan.end_m]
+    texels = [BEHIND_TEXELS_PER_M, *(per_m for _, per_m in STRETCHES_M)]
+    stretches = zip(starts[:-1], starts[1:], texels, strict=True)
     for start, end, per_m in stretches:
         texture = surfaces.add_texture(paint_road(plan, rng, start, end, per_m))
         surface = surfaces.add(
@@ -161,15 +162,18 @@ def _add_block(
     _add_sheet(builder, plan, tuple(sorted((cut, lot_edge))), (inside, far), slabs, **tile)
     inner = tuple(sorted((lot_edge, other)))
     _add_sheet(builder, plan, inner, (inside, far), lot, uv_m=(16.0, 16.0), **top)
-    _add_kerb_face(builder, plan, (np.linspace(start, end, round((end - start) / STEP_M) + 1), near), kerb)
+    _add_kerb_face(
+        builder, plan, (np.linspace(start, end, round((end - start) / STEP_M) + 1), near), kerb
+    )
     _add_kerb_face(builder, plan, (corner, np.linspace(near, far, 8)), kerb)
 
 
 def _add_kerb_face(
-    builder: MeshBuilder, plan: StreetPlan, path: tuple[np.ndarray | float, np.ndarray | float], kerb: int
+    builder: MeshBuilder,
+    plan: StreetPlan,
+    path: tuple[np.ndarray | float, np.ndarray | float],
+    kerb: int,
 ) -> None:
     """The upright side of a kerb along a path of street coordinates."""
-    points = np.stack(
-        [plan.line.place(*path, KERB_HEIGHT_M), plan.line.place(*path, -0.05)]
-    )
+    points = np.stack([plan.line.place(*path, KERB_HEIGHT_M), plan.line.place(*path, -0.05)])
     builder.grid(points, np.full((*points.shape[:2], 2), 0.5), kerb)

@@ -13,6 +13,7 @@ from lidarpainter_models.scenes.synthetic.layout import LANE_M, PARKING_M, Stree
 from lidarpainter_models.scenes.synthetic.lettering import text_mask
 from lidarpainter_models.scenes.synthetic.noise import (
     as_rgba,
+    coarse_noise,
     fractal_noise,
     grain,
     value_noise,
@@ -21,7 +22,7 @@ from lidarpainter_models.scenes.synthetic.noise import (
 SUBPIXEL_BITS = 6
 WHITE = (214.0, 212.0, 204.0)
 YELLOW = (218.0, 172.0, 62.0)
-GREEN = (86.0, 138.0, 92.0)
+GREEN = (84.0, 122.0, 92.0)
 
 
 @dataclass(eq=False)
@@ -157,42 +158,49 @@ def lay_asphalt(canvas: GroundCanvas, rng: np.random.Generator, plan: StreetPlan
     rows, columns = canvas.paint.shape
     length_m, width_m = columns / canvas.per_m, rows / canvas.per_m
     cells = max(int(width_m / 4), 1), max(int(length_m / 7), 1)
-    age = fractal_noise(rng, (rows, columns), cells, octaves=5, persistence=0.6)
-    tone = 96 + 34 * (age - 0.5)
-    d = canvas.left_m - (np.arange(rows) + 0.5) / canvas.per_m
+    tone = 98 + 62 * (coarse_noise(rng, (rows, columns), cells, persistence=0.6) - 0.5)
+    d = (canvas.left_m - (np.arange(rows) + 0.5) / canvas.per_m).astype(np.float32)
     lanes = (0.0, LANE_M, *plan.oncoming_d_m)
     for lane in lanes:
-        tracks = sum(np.exp(-(((d - lane - side) / 0.33) ** 2)) for side in (-0.8, 0.8))
+        tracks = np.exp(-(((np.abs(d - lane) - 0.8) / 0.33) ** 2))
         oil = np.exp(-(((d - lane) / 0.28) ** 2))
         streak = value_noise(rng, (1, columns), (1, max(int(length_m / 9), 1)))
         tone += 6 * tracks[:, None] - 11 * oil[:, None] * (0.4 + 0.9 * streak)
     gutter = np.exp(-(d - plan.right_kerb_m) / 0.35) + np.exp((d - plan.left_kerb_m) / 0.35)
     tone -= 22 * gutter[:, None]
     tone += 2.2 * grain(rng, (rows, columns))
-    canvas.colour[:] = tone[..., None] * np.array([1.0, 0.985, 0.965], np.float32)
+    for channel, share in enumerate((1.0, 0.985, 0.965)):
+        canvas.colour[..., channel] = share * tone
 
 
 def lay_repairs(canvas: GroundCanvas, rng: np.random.Generator, plan: StreetPlan) -> None:
     """Patches with sealed edges, utility cuts, tar lines and cracks."""
     end_m = canvas.start_m + canvas.paint.shape[1] / canvas.per_m
     length = end_m - canvas.start_m
-    for _ in range(int(length / 6)):
+    lanes = (0.0, LANE_M, *plan.oncoming_d_m, plan.parking_d_m[0], plan.parking_d_m[1])
+    for _ in range(int(length / 14)):  # lanes resurfaced for a while
+        s, d = rng.uniform(canvas.start_m - 10, end_m), lanes[int(rng.integers(len(lanes)))]
+        part = strip(s, s + rng.uniform(8, 30), d + rng.normal(0, 0.3), rng.uniform(1.4, 3.6))
+        grey = rng.choice([rng.uniform(52, 76), rng.uniform(112, 140)])
+        part = part + rng.uniform(-0.15, 0.15, (4, 2))
+        canvas.fill(part, (grey, grey * 0.985, grey * 0.965), strength=rng.uniform(0.45, 0.85))
+    for _ in range(int(length / 5)):
         s, d = rng.uniform(canvas.start_m, end_m), rng.uniform(plan.right_kerb_m, plan.left_kerb_m)
         size = (rng.uniform(1, 9), rng.uniform(0.6, 2.6))
-        grey = rng.uniform(58, 122)
+        grey = rng.choice([rng.uniform(48, 74), rng.uniform(108, 136)])
         patch = strip(s, s + size[0], d, size[1]) + rng.uniform(-0.12, 0.12, (4, 2))
         canvas.fill(patch, (grey, grey * 0.985, grey * 0.97), strength=rng.uniform(0.5, 0.95))
-        canvas.stroke(np.vstack([patch, patch[:1]]), 0.06, (44, 43, 43), strength=0.75)
-    for _ in range(int(length / 2.6)):
+        canvas.stroke(np.vstack([patch, patch[:1]]), 0.035, (46, 45, 45), strength=0.7)
+    for _ in range(int(length / 1.1)):
         start = np.array(
             [rng.uniform(canvas.start_m, end_m), rng.uniform(plan.right_kerb_m, plan.left_kerb_m)]
         )
         angle = rng.choice([0.0, np.pi / 2, rng.uniform(0, np.pi)])
-        steps = rng.normal(0, 0.35, int(rng.integers(8, 40))).cumsum() * 0.5 + angle
-        walk = start + np.stack([np.cos(steps), np.sin(steps)], 1).cumsum(0) * 0.25
-        is_tar = rng.random() < 0.35
-        shade = (38, 38, 39) if is_tar else (58, 56, 54)
-        canvas.stroke(walk, 0.07 if is_tar else 0.022, shade, strength=0.85)
+        steps = rng.normal(0, 0.55, int(rng.integers(8, 50))).cumsum() * 0.45 + angle
+        walk = start + np.stack([np.cos(steps), np.sin(steps)], 1).cumsum(0) * 0.17
+        is_tar = rng.random() < 0.2
+        shade = (40, 40, 41) if is_tar else (52, 50, 48)
+        canvas.stroke(walk, 0.05 if is_tar else 0.014, shade, strength=0.85)
 
 
 def lay_ironwork(canvas: GroundCanvas, rng: np.random.Generator, plan: StreetPlan) -> None:
@@ -273,5 +281,5 @@ def stencil(
 
 
 def parking_edge(plan: StreetPlan) -> tuple[float, float]:
-    """d of the lines between traffic and parked cars, right and left."""
+    """Where (d) the lines between traffic and parked cars run, right and left."""
     return plan.right_kerb_m + PARKING_M, plan.left_kerb_m - PARKING_M

@@ -25,7 +25,7 @@ def draw_text(
         colour: one value per channel.
         weight: thickness of a stroke relative to the height of a capital.
     """
-    left, top, right, bottom = (int(round(edge)) for edge in box)
+    left, top, right, bottom = (round(edge) for edge in box)
     left, top = max(left, 0), max(top, 0)
     right, bottom = min(right, picture.shape[1]), min(bottom, picture.shape[0])
     if right - left < 3 or bottom - top < 3:
@@ -41,7 +41,7 @@ def draw_text(
 def text_mask(text: str, *, width_px: int, height_px: int, weight: float = 0.13) -> np.ndarray:
     """Coverage (height, width) in 0..1 of a line of text that fills as much as it can."""
     capital = 96
-    thickness = max(int(round(capital * weight)), 1)
+    thickness = max(round(capital * weight), 1)
     scale = cv2.getFontScaleFromHeight(FONT, capital, thickness)
     (width, height), below = cv2.getTextSize(text, FONT, scale, thickness)
     margin = thickness + 8

@@ -21,9 +21,9 @@ from lidarpainter_models.scenes.synthetic.shade_numba import (
     classify,
     hit_normal,
     paint_at,
-    sample_texture,
 )
-from lidarpainter_models.scenes.synthetic.trace_numba import INLINED, RAY, STACK_SIZE, trace_scene
+from lidarpainter_models.scenes.synthetic.texture_numba import sample_texture
+from lidarpainter_models.scenes.synthetic.trace_numba import INLINED, RAY, WORK_ROWS, trace_scene
 
 BEAM_WIDTH_RAD = 0.002
 
@@ -79,7 +79,7 @@ def cast_sweep(
     surface = np.zeros((columns, beams, 3), np.float32)
     label = np.full((columns, beams, 2), -1, np.int32)
     for column in numba.prange(columns):
-        stack = np.empty((STACK_SIZE, 2))
+        stack = np.full((WORK_ROWS, 2), -1.0)
         pose = world_from_lidar[column]
         origin = (pose[0, 3], pose[1, 3], pose[2, 3])
         for beam in range(beams):

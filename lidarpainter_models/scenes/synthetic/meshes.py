@@ -23,7 +23,7 @@ class Mesh:
     """Primitives as rows: a corner, two edges, what lies there."""
 
     geometry: np.ndarray
-    """float64 (primitives, GEOMETRY_COLUMNS), see scene_arrays.py; the cut-out flag is set later."""
+    """float64 (primitives, GEOMETRY_COLUMNS), see scene_arrays.py; cut-outs are marked later."""
     shading: np.ndarray
     """float64 (primitives, SHADING_COLUMNS)."""
     surface: np.ndarray

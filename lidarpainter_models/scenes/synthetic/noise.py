@@ -48,6 +48,20 @@ def fractal_noise(
     return total / weights
 
 
+def coarse_noise(
+    rng: np.random.Generator,
+    shape: tuple[int, int],
+    cells: tuple[int, int],
+    *,
+    persistence: float = 0.5,
+    shrink: int = 4,
+) -> np.ndarray:
+    """Four octaves of noise for large pictures: made `shrink` times smaller, then enlarged."""
+    small = max(shape[0] // shrink, 2), max(shape[1] // shrink, 2)
+    field = fractal_noise(rng, small, cells, octaves=4, persistence=persistence)
+    return cv2.resize(field, shape[::-1], interpolation=cv2.INTER_LINEAR)
+
+
 def grain(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
     """Independent values about 0 with unit deviation, float32."""
     return rng.standard_normal(shape, dtype=np.float32)

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarpainter_models.scenes.synthetic.noise import fractal_noise
 from lidarpainter_models.scenes.synthetic.wall_textures import Colour, WallCanvas
 
 GLASS_GLOSS = 1.0
@@ -48,10 +47,10 @@ def draw_glass(
     elif inside < 0.65:
         canvas.fill(rect, (214, 182, 122), gloss=0.6, strength=0.55)
     rows, columns = canvas.window(rect)
-    shape = rows.stop - rows.start, columns.stop - columns.start
-    if min(shape) > 2:
-        cloud = fractal_noise(rng, shape, (2, 2), octaves=3)
-        canvas.colour[rows, columns] *= (0.8 + 0.4 * cloud)[..., None]
+    height, width = rows.stop - rows.start, columns.stop - columns.start
+    slant = rng.uniform(-0.25, 0.25)
+    across, down = np.linspace(-slant, slant, width), np.linspace(0.16, -0.16, height)
+    canvas.colour[rows, columns] *= (1.0 + across[None, :] + down[:, None])[..., None]
 
 
 def draw_window(
@@ -130,7 +129,9 @@ def draw_shop_window(
     canvas.fill((x0, x1, z1 - 0.09, z1), frame)
     for _ in range(int(rng.integers(1, 4))):
         x, z = rng.uniform(x0 + 0.1, max(x1 - 0.9, x0 + 0.2)), rng.uniform(lower + 0.2, z1 - 0.8)
-        paper = rng.choice(np.array([[232, 228, 216], [222, 64, 48], [250, 214, 70], [46, 96, 168]]))
+        paper = rng.choice(
+            np.array([[232, 228, 216], [222, 64, 48], [250, 214, 70], [46, 96, 168]])
+        )
         ink = (30, 30, 34) if paper.sum() > 420 else (246, 244, 238)
         canvas.fill((x, x + 0.7, z, z + 0.42), paper)
         words = NOTICES[int(rng.integers(len(NOTICES)))]

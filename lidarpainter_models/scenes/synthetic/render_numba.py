@@ -19,9 +19,9 @@ from lidarpainter_models.scenes.synthetic.shade_numba import (
     classify,
     paint_at,
     shade,
-    sky_radiance,
 )
-from lidarpainter_models.scenes.synthetic.trace_numba import INLINED, RAY, STACK_SIZE, trace_scene
+from lidarpainter_models.scenes.synthetic.sky_numba import sky_radiance
+from lidarpainter_models.scenes.synthetic.trace_numba import INLINED, RAY, WORK_ROWS, trace_scene
 
 FAR_M = 5000.0
 SKY_CLASS = 0
@@ -149,7 +149,7 @@ def render_picture(
     semantics = np.empty((height_px, width_px), np.int32)
     actor_index = np.empty((height_px, width_px), np.int32)
     for line in numba.prange(height_px):
-        stack = np.empty((STACK_SIZE, 2))
+        stack = np.full((WORK_ROWS, 2), -1.0)
         for column in range(width_px):
             place = (float(column), float(line))
             pixel = _render_pixel(scene, instances, view, place, stack)

@@ -15,7 +15,7 @@ from lidarpainter_models.scenes.synthetic.ground_textures import (
     strip,
 )
 from lidarpainter_models.scenes.synthetic.layout import LANE_M, StreetPlan
-from lidarpainter_models.scenes.synthetic.noise import as_rgba, fractal_noise
+from lidarpainter_models.scenes.synthetic.noise import as_rgba, coarse_noise
 
 DASH_M = 3.0
 GAP_M = 6.0
@@ -44,7 +44,7 @@ def _wear(canvas: GroundCanvas, rng: np.random.Generator) -> np.ndarray:
     """How much paint is left, 0..1."""
     rows, columns = canvas.paint.shape
     cells = max(int(rows / canvas.per_m * 3), 1), max(int(columns / canvas.per_m * 3), 1)
-    noise = fractal_noise(rng, (rows, columns), cells, octaves=4, persistence=0.75)
+    noise = coarse_noise(rng, (rows, columns), cells, persistence=0.75)
     return np.clip((noise - 0.27) * 6.0, 0.12, 1.0)
 
 
@@ -70,6 +70,25 @@ def _paint_lines(
     for side in (-0.11, 0.11):
         line = strip(first, last, plan.centre_d_m + side, 0.1)
         canvas.fill(line, YELLOW, is_paint=True, wear=wear)
+    _paint_dashes(canvas, plan, first, last, wear)
+    right_edge, left_edge = parking_edge(plan)
+    if plan.right_side == "bike":
+        middle = (right_edge - LANE_M / 2) / 2
+        lane = strip(first, last, middle, plan.right_extra_m - 0.3)
+        canvas.fill(lane, GREEN, strength=0.5, wear=wear)
+    for d in (-LANE_M / 2, right_edge, left_edge):
+        canvas.fill(strip(first, last, d, LINE_M), WHITE, is_paint=True, wear=wear)
+    for s in np.arange(np.ceil(first / 6.0) * 6.0, last, 6.0):  # ticks between parking places
+        for edge, kerb in ((right_edge, plan.right_kerb_m), (left_edge, plan.left_kerb_m)):
+            middle = edge + np.sign(kerb) * 0.45
+            tick = strip(s - 0.05, s + 0.05, middle, 0.9)
+            canvas.fill(tick, WHITE, is_paint=True, wear=wear)
+
+
+def _paint_dashes(
+    canvas: GroundCanvas, plan: StreetPlan, first: float, last: float, wear: np.ndarray
+) -> None:
+    """Broken lines between lanes of one direction, and beside a turning lane."""
     is_turn = plan.left_side == "turn"
     for start, end in _dashes(first, last):
         dash = strip(start, end, LANE_M / 2, LINE_M)
@@ -79,23 +98,7 @@ def _paint_lines(
                 strip(start, end, lane + LANE_M / 2, LINE_M), WHITE, is_paint=True, wear=wear
             )
     if is_turn:
-        canvas.fill(
-            strip(first, last, LANE_M / 2 - 0.22, 0.1), YELLOW, is_paint=True, wear=wear
-        )
-    right_edge, left_edge = parking_edge(plan)
-    if plan.right_side == "bike":
-        middle = (right_edge - LANE_M / 2) / 2
-        canvas.fill(
-            strip(first, last, middle, plan.right_extra_m - 0.3), GREEN, strength=0.55, wear=wear
-        )
-    for d in (-LANE_M / 2, right_edge, left_edge):
-        canvas.fill(strip(first, last, d, LINE_M), WHITE, is_paint=True, wear=wear)
-    for s in np.arange(np.ceil(first / 6.0) * 6.0, last, 6.0):  # ticks between parking places
-        for edge, kerb in ((right_edge, plan.right_kerb_m), (left_edge, plan.left_kerb_m)):
-            tick = np.sign(kerb) * 0.9
-            canvas.fill(
-                strip(s - 0.05, s + 0.05, edge + tick / 2, 0.9), WHITE, is_paint=True, wear=wear
-            )
+        canvas.fill(strip(first, last, LANE_M / 2 - 0.22, 0.1), YELLOW, is_paint=True, wear=wear)
 
 
 def _paint_crossing(canvas: GroundCanvas, plan: StreetPlan, wear: np.ndarray) -> None:

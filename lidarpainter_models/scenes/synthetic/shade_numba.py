@@ -9,8 +9,6 @@ import numpy as np
 
 from lidarpainter_models.scenes.synthetic.scene_arrays import (
     ACTOR,
-    CLOUD_OFFSET,
-    CLOUD_TEXTURE,
     DETAIL_PER_M,
     DETAIL_STRENGTH,
     DETAIL_TEXTURE,
@@ -23,7 +21,6 @@ from lidarpainter_models.scenes.synthetic.scene_arrays import (
     KIND_CUT_OUT,
     KIND_GLOSS,
     KIND_ROAD,
-    LEVEL_OFFSET,
     SEMANTICS,
     SUN_DIRECTION,
     SUN_RGB,
@@ -38,136 +35,24 @@ from lidarpainter_models.scenes.synthetic.scene_arrays import (
     InstanceArrays,
     SceneArrays,
 )
+from lidarpainter_models.scenes.synthetic.sky_numba import mirrored_radiance
+from lidarpainter_models.scenes.synthetic.texture_numba import filtered_texture, sample_texture
 from lidarpainter_models.scenes.synthetic.trace_numba import INLINED, RAY, to_box, trace_scene
 
-MAX_TAPS = 8
 SHADOW_START_M = 0.004
 SHADOW_REACH_M = 120.0
-
-
-@numba.njit(**INLINED)
-def _neighbours(low: int, size: int, repeats: int) -> tuple[int, int]:
-    """Two texels next to each other, wrapped around or held at the edge."""
-    if repeats > 0:
-        return (low if low >= 0 else size - 1), (low + 1 if low + 1 < size else 0)
-    return min(max(low, 0), size - 1), min(max(low + 1, 0), size - 1)
-
-
-@numba.njit(**RAY)
-def sample_texture(
-    scene: SceneArrays, texture: int, place: tuple, level: int
-) -> tuple[float, float, float, float]:
-    """Linear colour and fourth channel (0..1) at (s, t), bilinear in one level."""
-    index = scene.texture_index[texture]
-    level = min(max(level, 0), index[3] - 1)
-    width, height = max(index[0] >> level, 1), max(index[1] >> level, 1)
-    s, t = place
-    if index[2] > 0:
-        s, t = s - np.floor(s), t - np.floor(t)
-    x, y = s * width - 0.5, t * height - 0.5
-    column, line = int(np.floor(x)), int(np.floor(y))
-    across, down = x - column, y - line
-    left, right = _neighbours(column, width, index[2])
-    top, bottom = _neighbours(line, height, index[2])
-    first = index[LEVEL_OFFSET + level]
-    red, green, blue, fourth = 0.0, 0.0, 0.0, 0.0
-    for corner in range(4):
-        i = right if corner & 1 else left
-        j = bottom if corner >> 1 else top
-        weight = across if corner & 1 else 1.0 - across
-        weight *= down if corner >> 1 else 1.0 - down
-        texel = first + j * width + i
-        red += weight * scene.to_linear[scene.texels[texel, 0]]
-        green += weight * scene.to_linear[scene.texels[texel, 1]]
-        blue += weight * scene.to_linear[scene.texels[texel, 2]]
-        fourth += weight * scene.texels[texel, 3]
-    return red, green, blue, fourth * (1.0 / 255.0)
-
-
-@numba.njit(**INLINED)
-def _filtered(
-    scene: SceneArrays, texture: int, place: tuple, first: tuple, second: tuple
-) -> tuple[float, float, float, float]:
-    """Average over the parallelogram spanned by two uv steps around a place."""
-    index = scene.texture_index[texture]
-    length_first = np.sqrt((first[0] * index[0]) ** 2 + (first[1] * index[1]) ** 2)
-    length_second = np.sqrt((second[0] * index[0]) ** 2 + (second[1] * index[1]) ** 2)
-    longer = first if length_first >= length_second else second
-    most, least = max(length_first, length_second), min(length_first, length_second)
-    width = max(least, most / MAX_TAPS, 1e-3)
-    level = int(np.floor(np.log2(width) + 0.4))
-    taps = min(max(int(np.ceil(most / (2.0 ** max(level, 0)) - 0.3)), 1), MAX_TAPS)
-    red, green, blue, fourth = 0.0, 0.0, 0.0, 0.0
-    for tap in range(taps):
-        along = (tap + 0.5) / taps - 0.5
-        at = (place[0] + along * longer[0], place[1] + along * longer[1])
-        sample = sample_texture(scene, texture, at, level)
-        red += sample[0]
-        green += sample[1]
-        blue += sample[2]
-        fourth += sample[3]
-    return red / taps, green / taps, blue / taps, fourth / taps
-
-
-@numba.njit(**RAY)
-def sky_radiance(scene: SceneArrays, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Sky in a unit direction: gradient, clouds on a plane above, glow and disc of the sun."""
-    light = scene.light
-    height = max(z, 0.0)
-    fade = (1.0 - height) ** 4
-    sun = x * light[SUN_DIRECTION] + y * light[SUN_DIRECTION + 1] + z * light[SUN_DIRECTION + 2]
-    glow = 0.25 * max(sun, 0.0) ** 12 + (30.0 if sun > 0.99985 else 0.0)
-    cover, bright = 0.0, 0.0
-    if height > 0.03:
-        scale = 0.09 / (height + 0.12)
-        at = (x * scale + light[CLOUD_OFFSET], y * scale + light[CLOUD_OFFSET + 1])
-        level = 1 if height > 0.25 else 2
-        cloud = sample_texture(scene, int(light[CLOUD_TEXTURE]), at, level)
-        cover = cloud[3] * min((height - 0.03) * 8.0, 1.0)
-        bright = cloud[0]
-    red, green, blue = 0.0, 0.0, 0.0
-    for channel in range(3):
-        clear = light[ZENITH_RGB + channel] * (1.0 - fade) + light[HORIZON_RGB + channel] * fade
-        clear += glow * light[SUN_RGB + channel] * 0.12
-        white = 0.55 * bright + 0.12 * clear + 0.10 * glow
-        value = clear * (1.0 - cover) + white * cover
-        if channel == 0:
-            red = value
-        elif channel == 1:
-            green = value
-        else:
-            blue = value
-    return red, green, blue
-
-
-@numba.njit(**INLINED)
-def _mirrored(scene: SceneArrays, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """What a glossy surface shows: sky, with a dark band of street below it."""
-    above = min(max((z - 0.12) * 4.0, 0.0), 1.0)
-    light = scene.light
-    low = (
-        0.5 * light[GROUND_RGB] + 0.05,
-        0.5 * light[GROUND_RGB + 1] + 0.05,
-        0.5 * light[GROUND_RGB + 2] + 0.05,
-    )
-    if above <= 0.0:
-        return low
-    sky = sky_radiance(scene, x, y, z)
-    return (
-        low[0] + above * (min(sky[0], 4.0) - low[0]),
-        low[1] + above * (min(sky[1], 4.0) - low[1]),
-        low[2] + above * (min(sky[2], 4.0) - low[2]),
-    )
 
 
 @numba.njit(**INLINED)
 def _contact_shade(instances: InstanceArrays, time_index: int, x: float, y: float) -> float:
     """How much sky light reaches the ground at a place near vehicles."""
     shade = 1.0
-    for row in instances.contact[time_index]:
-        east, north = x - row[0], y - row[1]
+    for index in range(instances.contact.shape[1]):
+        east = x - instances.contact[time_index, index, 0]
+        north = y - instances.contact[time_index, index, 1]
         if abs(east) > 4.5 or abs(north) > 4.5:
             continue
+        row = instances.contact[time_index, index]
         along = abs(row[2] * east + row[3] * north) - row[4]
         aside = abs(row[2] * north - row[3] * east) - row[5]
         outside = np.sqrt(max(along, 0.0) ** 2 + max(aside, 0.0) ** 2)
@@ -275,7 +160,7 @@ def _albedo(
     )
     steps = _steps_in_uv(scene, prim, direction, differentials, hit[0])
     index = scene.surface_index[surface]
-    colour = _filtered(scene, index[TEXTURE], place, steps[0], steps[1])
+    colour = filtered_texture(scene, index[TEXTURE], place, steps[0], steps[1])
     factor = 1.0
     if index[DETAIL_TEXTURE] >= 0:
         normal = shading
@@ -312,7 +197,7 @@ def _add_gloss(
         dy + 2.0 * facing * normal[1],
         dz + 2.0 * facing * normal[2],
     )
-    seen = _mirrored(scene, rx, ry, rz)
+    seen = mirrored_radiance(scene, rx, ry, rz)
     light = scene.light
     towards = rx * light[SUN_DIRECTION] + ry * light[SUN_DIRECTION + 1]
     towards += rz * light[SUN_DIRECTION + 2]

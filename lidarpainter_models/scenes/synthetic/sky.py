@@ -15,16 +15,16 @@ def draw_clouds(rng: np.random.Generator, *, cover: float) -> np.ndarray:
     wisps = fractal_noise(rng, (size, size), (3, 12), octaves=6, persistence=0.6)
     density = 0.7 * shape + 0.3 * wisps
     edge = np.quantile(density, 1 - cover)
-    opacity = np.clip((density - edge) * 7.0, 0, 1) ** 1.2
+    opacity = np.clip((density - edge) * 6.0, 0, 1)
     relief = np.roll(density, (9, 5), (0, 1)) - density
-    bright = np.clip(0.80 + 2.4 * relief - 0.18 * opacity, 0.35, 1.0)
+    bright = np.clip(0.92 + 2.0 * relief - 0.22 * opacity, 0.45, 1.0)
     colour = srgb_from_linear(bright)[..., None] * 255 * np.array([1.0, 1.0, 1.0])
     return as_rgba(colour, 0.92 * opacity)
 
 
 def draw_light(surfaces: SurfaceSet, plan: StreetPlan, rng: np.random.Generator) -> Light:
     """A day: how high the sun, how warm its light, how much cloud."""
-    clouds = surfaces.add_texture(draw_clouds(rng, cover=rng.uniform(0.2, 0.6)), repeats=True)
+    clouds = surfaces.add_texture(draw_clouds(rng, cover=rng.uniform(0.3, 0.75)), repeats=True)
     height = plan.sun_direction[2]
     warmth = 1.0 - height
     return Light(

@@ -56,7 +56,6 @@ def add_tube(
     *,
     sides: int = 10,
     has_caps: bool = False,
-    uv_repeats: tuple[float, float] = (1.0, 1.0),
 ) -> None:
     """A round tube (or cone) between two points, smooth around; texture v runs from its end."""
     start, end = np.asarray(start, float), np.asarray(end, float)
@@ -69,8 +68,8 @@ def add_tube(
     angles = np.linspace(0, 2 * np.pi, sides + 1)
     ring = np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * second
     low, high = start + radii[0] * ring, end + radii[1] * ring
-    turn = np.linspace(0, uv_repeats[0], sides + 1)
-    zeros, ones = np.zeros_like(turn), np.full_like(turn, uv_repeats[1])
+    turn = np.linspace(0, 1, sides + 1)
+    zeros, ones = np.zeros_like(turn), np.ones_like(turn)
     uv_low, uv_high = np.stack([turn, ones], -1), np.stack([turn, zeros], -1)
     sheets = (
         ((low[:-1], low[1:], high[:-1]), (ring[:-1], ring[1:], ring[:-1]), (0, 1, 2)),

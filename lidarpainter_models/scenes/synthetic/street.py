@@ -8,7 +8,7 @@ of its sweep.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -79,10 +79,10 @@ class SyntheticStreet:
 
     def __init__(self, config: SyntheticStreetConfig) -> None:
         self.config = config
-        self._city: City = build_city(config.seed, config.num_frames * config.frame_interval_s)
+        self._city: City = build_city(config.seed)
 
     @classmethod
-    def from_manifest(cls, manifest: Mapping[str, Any]) -> Self:
+    def from_manifest(cls, manifest: Mapping[str, Any]) -> "SyntheticStreet":
         """Rebuild the world a stored synthetic scene was recorded in.
 
         Raises:

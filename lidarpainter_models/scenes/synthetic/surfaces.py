@@ -125,6 +125,7 @@ class SurfaceSet:
 
 
 _TO_LINEAR = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
+_TO_BYTE = np.rint(srgb_from_linear(np.arange(4096) / 4095.0) * 255).astype(np.uint8)
 
 
 def _pyramid(rgba: np.ndarray) -> list[np.ndarray]:
@@ -135,7 +136,8 @@ def _pyramid(rgba: np.ndarray) -> list[np.ndarray]:
         level = len(levels)
         size = (max(rgba.shape[1] >> level, 1), max(rgba.shape[0] >> level, 1))
         linear = cv2.resize(linear, size, interpolation=cv2.INTER_AREA).reshape(size[1], size[0], 4)
-        picture = linear.copy()
-        picture[..., :3] = srgb_from_linear(linear[..., :3])
-        levels.append(np.clip(np.rint(picture * 255), 0, 255).astype(np.uint8))
+        picture = np.empty(linear.shape, np.uint8)
+        picture[..., :3] = _TO_BYTE[(linear[..., :3] * 4095 + 0.5).astype(np.uint16)]
+        picture[..., 3] = linear[..., 3] * 255 + 0.5
+        levels.append(picture)
     return levels

@@ -21,6 +21,9 @@ from lidarpainter_models.scenes.synthetic.scene_arrays import (
 )
 
 STACK_SIZE = 96
+NO_NODE = 1 << 30
+WORK_ROWS = STACK_SIZE + 2
+"""Rows of a working space: the stack, then the last hit of nearest-hit and of any-hit rays."""
 RAY = {
     "cache": True,
     "error_model": "numpy",
@@ -78,9 +81,7 @@ def _hit_prim(row: np.ndarray, origin: tuple, direction: tuple) -> tuple[float, 
 def is_cut_away(scene: SceneArrays, prim: int, u: float, v: float, width_m: float) -> bool:
     """Whether a cut-out texture is open where a ray of this width meets it."""
     shading = scene.prim_shading[prim]
-    texture = scene.texture_index[
-        scene.surface_index[scene.prim_index[prim, SURFACE], TEXTURE]
-    ]
+    texture = scene.texture_index[scene.surface_index[scene.prim_index[prim, SURFACE], TEXTURE]]
     s = shading[UV_CORNER] + u * shading[UV_FIRST] + v * shading[UV_SECOND]
     t = shading[UV_CORNER + 1] + u * shading[UV_FIRST + 1] + v * shading[UV_SECOND + 1]
     geometry = scene.prim_geometry[prim]
@@ -97,6 +98,71 @@ def is_cut_away(scene: SceneArrays, prim: int, u: float, v: float, width_m: floa
     return scene.texels[texel, 3] < CUT_OUT_THRESHOLD
 
 
+@numba.njit(**INLINED)
+def _hit_leaf(
+    scene: SceneArrays, leaf: int, origin: tuple, direction: tuple, limits: tuple, best: tuple
+) -> tuple[float, int, float, float]:
+    """The better of the best hit so far and those in a leaf."""
+    t_best, prim_best, u_best, v_best = best
+    first, count = (-leaf - 1) >> 3, (-leaf - 1) & 7
+    for prim in range(first, first + count):
+        row = scene.prim_geometry[prim]
+        t, u, v = _hit_prim(row, origin, direction)
+        if not (0.0 < t < t_best):
+            continue
+        if row[IS_CUT_OUT] > 0 and is_cut_away(scene, prim, u, v, t * limits[1]):
+            continue
+        t_best, prim_best, u_best, v_best = t, prim, u, v
+    return t_best, prim_best, u_best, v_best
+
+
+@numba.njit(**INLINED)
+def _try_hint(
+    scene: SceneArrays, hint: int, origin: tuple, direction: tuple, limit: float
+) -> tuple[float, int, float, float]:
+    """The hit to start from: that of one primitive, or none."""
+    best = (float(limit), -1, 0.0, 0.0)
+    if hint >= 0 and scene.prim_geometry[hint, IS_CUT_OUT] == 0:
+        t, u, v = _hit_prim(scene.prim_geometry[hint], origin, direction)
+        if 0.0 < t < limit:
+            best = (t, hint, u, v)
+    return best
+
+
+@numba.njit(**INLINED)
+def _descend(
+    scene: SceneArrays,
+    node: int,
+    start: tuple,
+    inverse: tuple,
+    limit: float,
+    stack: np.ndarray,
+    top: int,
+) -> tuple[int, int]:
+    """The nearer child that the ray enters (NO_NODE: none) and the stack with the farther one."""
+    bounds = scene.node_bounds[node]
+    left = _enter(bounds, 0, start, inverse, limit)
+    right = _enter(bounds, 6, start, inverse, limit)
+    far = 1 if left <= right else 0
+    if max(left, right) < BEYOND:
+        stack[top, 0] = scene.node_children[node, far]
+        stack[top, 1] = max(left, right)
+        top += 1
+    if min(left, right) < BEYOND:
+        return int(scene.node_children[node, 1 - far]), top
+    return NO_NODE, top
+
+
+@numba.njit(**INLINED)
+def _pop(stack: np.ndarray, top: int, limit: float) -> tuple[int, int]:
+    """The next waiting node that begins before `limit` (NO_NODE: none) and the rest."""
+    while top > 0:
+        top -= 1
+        if stack[top, 1] <= limit:
+            return int(stack[top, 0]), top
+    return NO_NODE, 0
+
+
 @numba.njit(**RAY)
 def trace(
     scene: SceneArrays,
@@ -104,6 +170,7 @@ def trace(
     origin: tuple,
     direction: tuple,
     limits: tuple,
+    hint: int,
     stack: np.ndarray,
 ) -> tuple[float, int, float, float]:
     """Nearest hit below `limits[0]` in the tree of one root.
@@ -114,47 +181,29 @@ def trace(
         origin: of the ray, in the frame of the tree.
         direction: of the ray.
         limits: greatest t, width of the ray per t in metres, 1.0 where any hit will do.
-        stack: float64 (STACK_SIZE, 2), working space.
+        hint: primitive that the ray probably hits (-1: none); tried first, it saves steps and
+            never changes the result.
+        stack: float64 (WORK_ROWS, 2), working space.
 
     Returns:
         t, primitive (-1: none) and the edge coordinates u, v of the hit.
     """
-    t_best, prim_best, u_best, v_best = limits[0], -1, 0.0, 0.0
+    best = _try_hint(scene, hint, origin, direction, limits[0])
+    takes_any = limits[2] > 0
     start = (np.float32(origin[0]), np.float32(origin[1]), np.float32(origin[2]))
     inverse = (_inverse(direction[0]), _inverse(direction[1]), _inverse(direction[2]))
-    node, entered, top = root, np.float32(0.0), 0
-    while True:
-        if entered > t_best:
-            pass
-        elif node >= 0:
-            bounds, limit = scene.node_bounds[node], np.float32(t_best)
-            left = _enter(bounds, 0, start, inverse, limit)
-            right = _enter(bounds, 6, start, inverse, limit)
-            far = 1 if left <= right else 0
-            if max(left, right) < BEYOND:
-                stack[top, 0] = scene.node_children[node, far]
-                stack[top, 1] = max(left, right)
-                top += 1
-            if min(left, right) < BEYOND:
-                node, entered = scene.node_children[node, 1 - far], min(left, right)
-                continue
+    node, top = root, 0
+    while not (takes_any and best[1] >= 0):
+        if node >= 0:
+            node, top = _descend(scene, node, start, inverse, np.float32(best[0]), stack, top)
         else:
-            first, count = (-node - 1) >> 3, (-node - 1) & 7
-            for prim in range(first, first + count):
-                row = scene.prim_geometry[prim]
-                t, u, v = _hit_prim(row, origin, direction)
-                if not (0.0 < t < t_best):
-                    continue
-                if row[IS_CUT_OUT] > 0 and is_cut_away(scene, prim, u, v, t * limits[1]):
-                    continue
-                t_best, prim_best, u_best, v_best = t, prim, u, v
-                if limits[2] > 0:
-                    return t_best, prim_best, u_best, v_best
-        if top == 0:
-            break
-        top -= 1
-        node, entered = int(stack[top, 0]), np.float32(stack[top, 1])
-    return t_best, prim_best, u_best, v_best
+            best = _hit_leaf(scene, node, origin, direction, limits, best)
+            node = NO_NODE
+        if node == NO_NODE:
+            node, top = _pop(stack, top, best[0])
+            if node == NO_NODE:
+                break
+    return best
 
 
 @numba.njit(**INLINED)
@@ -182,8 +231,11 @@ def trace_scene(
     Returns:
         t, primitive (-1: none), u, v and the instance that was hit (-1: the street).
     """
-    t, prim, u, v = trace(scene, 0, origin, direction, limits, stack)
+    kind = int(limits[2])
+    hint = int(stack[STACK_SIZE + kind, 0])
+    t, prim, u, v = trace(scene, 0, origin, direction, limits, hint, stack)
     instance = -1
+    stack[STACK_SIZE + kind, 0] = prim
     if limits[2] > 0 and prim >= 0:
         return t, prim, u, v, instance
     squared = direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2
@@ -198,7 +250,7 @@ def trace_scene(
         local_direction = to_box(pose, direction[0], direction[1], direction[2])
         new_limits = (t, limits[1], limits[2])
         new_t, new_prim, new_u, new_v = trace(
-            scene, instances.roots[index], local_origin, local_direction, new_limits, stack
+            scene, instances.roots[index], local_origin, local_direction, new_limits, -1, stack
         )
         if new_prim >= 0:
             t, prim, u, v, instance = new_t, new_prim, new_u, new_v, index

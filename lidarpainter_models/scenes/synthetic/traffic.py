@@ -11,7 +11,7 @@ import numpy as np
 from lidarpainter_models.scenes.synthetic.car_kinds import SHAPES
 from lidarpainter_models.scenes.synthetic.car_shapes import build_car
 from lidarpainter_models.scenes.synthetic.car_textures import CarAtlas, add_car_surfaces
-from lidarpainter_models.scenes.synthetic.ego_motion import EgoMotion
+from lidarpainter_models.scenes.synthetic.ego_motion import EgoMotion, Pace
 from lidarpainter_models.scenes.synthetic.layout import (
     KERB_HEIGHT_M,
     LANE_M,
@@ -41,9 +41,8 @@ class StreetActor:
     """In the box frame."""
     start_s_m: float
     d_m: float
-    speed_mps: float = 0.0
-    """Along +s; negative comes towards the ego car."""
-    acceleration_mps2: float = 0.0
+    pace: Pace | None = None
+    """Along +s, none for what stands; negative comes towards the ego car."""
     yaw_rad: float = 0.0
     """Relative to the street."""
     ground_m: float = 0.0
@@ -51,13 +50,13 @@ class StreetActor:
     @property
     def is_moving(self) -> bool:
         """Whether it ever leaves its place."""
-        return self.speed_mps != 0.0
+        return self.pace is not None
 
     def world_from_box(self, line: StreetLine, time_s: np.ndarray) -> np.ndarray:
         """(n, 4, 4) at times after the first frame."""
         time_s = np.atleast_1d(np.asarray(time_s, float))
-        along = self.speed_mps * time_s + 0.5 * self.acceleration_mps2 * time_s**2
-        poses = line.poses(self.start_s_m + along, self.d_m, self.yaw_rad)
+        along = 0.0 if self.pace is None else self.pace.travelled_m(time_s)
+        poses = line.poses(self.start_s_m + along + 0 * time_s, self.d_m, self.yaw_rad)
         lift = self.ground_m + self.size_m[2] / 2
         poses[:, :3, 3] += lift * poses[:, :3, 2]
         return poses
@@ -71,7 +70,6 @@ class Traffic:
     ego: EgoMotion
     surfaces: SurfaceSet
     rng: np.random.Generator
-    duration_s: float
     actors: list[StreetActor] = field(default_factory=list)
     _painted: list[tuple[str, CarAtlas]] = field(default_factory=list)
     _meshes: dict[tuple[int, bool], tuple[Mesh, np.ndarray]] = field(default_factory=dict)
@@ -90,41 +88,43 @@ class Traffic:
         self._add_waiting()
         return self.actors
 
-    def _add_car(self, kind: str, **way: float) -> None:
+    def _add_car(self, kind: str, pace: Pace, **way: float) -> None:
         """A moving car of its own paint."""
         atlas = add_car_surfaces(self.surfaces, SHAPES[kind], self.rng)
         mesh, size = build_car(SHAPES[kind], atlas)
         name = f"car-{len(self.actors):03d}"
         self.actors.append(
             StreetActor(
-                actor_id=name, category=SHAPES[kind].category, size_m=size, mesh=mesh, **way
+                actor_id=name,
+                category=SHAPES[kind].category,
+                size_m=size,
+                mesh=mesh,
+                pace=pace,
+                **way,
             )
         )
 
     def _add_same_direction(self) -> None:
         """Cars ahead in the ego lane and, where it is a lane, in the one to its left."""
         rng, ego = self.rng, self.ego
-        ahead = rng.uniform(12.5, 17.0)
-        for index in range(2):
-            speed = ego.speed_mps * rng.uniform(0.97, 1.12) + 0.25 * index
+        ahead, factors = rng.uniform(12.5, 17.0), np.sort(rng.uniform(1.0, 1.15, 2))
+        for factor in factors:  # the faster one is in front
             self._add_car(
                 KINDS[int(rng.integers(5))],
+                ego.pace.times(float(factor)),
                 start_s_m=ahead,
                 d_m=rng.uniform(-0.15, 0.15),
-                speed_mps=speed,
-                acceleration_mps2=max(ego.acceleration_mps2, -0.2) + rng.uniform(0.0, 0.2),
             )
             ahead += rng.uniform(11, 18)
         if self.plan.left_side == "turn":
             return
-        place = rng.uniform(9.5, 15.0)
-        for _ in range(2):
+        place, factors = rng.uniform(9.5, 15.0), np.sort(rng.uniform(1.02, 1.35, 2))
+        for factor in factors:
             self._add_car(
                 KINDS[int(rng.integers(len(KINDS)))],
+                ego.pace.times(float(factor)),
                 start_s_m=place,
                 d_m=LANE_M + rng.uniform(-0.15, 0.15),
-                speed_mps=ego.speed_mps * rng.uniform(1.02, 1.3),
-                acceleration_mps2=max(ego.acceleration_mps2, 0.0) + rng.uniform(0.0, 0.3),
             )
             place += rng.uniform(13, 22)
 
@@ -137,9 +137,9 @@ class Traffic:
             while place < 110:
                 self._add_car(
                     KINDS[int(rng.integers(len(KINDS)))],
+                    Pace(-speed, -speed),
                     start_s_m=place,
                     d_m=lane + rng.uniform(-0.15, 0.15),
-                    speed_mps=-speed,
                     yaw_rad=np.pi,
                 )
                 place += rng.uniform(17, 42) * (1.0 if place < 60 else 1.6)
@@ -160,7 +160,7 @@ class Traffic:
                     mesh=mesh,
                     start_s_m=rng.uniform(7, 44),
                     d_m=kerb + side * rng.uniform(1.1, SIDEWALK_M - 0.7),
-                    speed_mps=speed,
+                    pace=Pace(speed, speed),
                     yaw_rad=0.0 if speed > 0 else np.pi,
                     ground_m=KERB_HEIGHT_M,
                 )

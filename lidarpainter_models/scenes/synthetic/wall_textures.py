@@ -48,11 +48,10 @@ class WallCanvas:
         """Rows and columns of (x from, x to, z from, z to)."""
         x0, x1, z0, z1 = rect
         rows, columns = self.gloss.shape
-        top, bottom = round((self.height_m - z1) * self.per_m), round((self.height_m - z0) * self.per_m)
-        left, right = round(x0 * self.per_m), round(x1 * self.per_m)
+        top, bottom = ((self.height_m - z) * self.per_m for z in (z1, z0))
         return (
-            slice(int(np.clip(top, 0, rows)), int(np.clip(max(bottom, top + 1), 0, rows))),
-            slice(int(np.clip(left, 0, columns)), int(np.clip(max(right, left + 1), 0, columns))),
+            _within(round(top), round(bottom), rows),
+            _within(round(x0 * self.per_m), round(x1 * self.per_m), columns),
         )
 
     def fill(
@@ -80,6 +79,11 @@ class WallCanvas:
         return as_rgba(self.colour, self.gloss)
 
 
+def _within(first: int, last: int, size: int) -> slice:
+    """At least one line from `first` on, cut to the picture."""
+    return slice(min(max(first, 0), size), min(max(last, first + 1, 0), size))
+
+
 def draw_wall(canvas: WallCanvas, kind: WallKind, colour: Colour, rng: np.random.Generator) -> None:
     """Cover the canvas with a material, weathered."""
     rows, columns = canvas.gloss.shape
@@ -95,9 +99,7 @@ def draw_wall(canvas: WallCanvas, kind: WallKind, colour: Colour, rng: np.random
     canvas.colour *= shade[..., None]
 
 
-def _brick(
-    x: np.ndarray, z: np.ndarray, colour: Colour, rng: np.random.Generator
-) -> np.ndarray:
+def _brick(x: np.ndarray, z: np.ndarray, colour: Colour, rng: np.random.Generator) -> np.ndarray:
     """Courses of brick, each of its own shade, in pale mortar."""
     course = np.floor(z / 0.075).astype(int) + 2
     shifted = x[None, :] + 0.11 * (course % 2)[:, None]
@@ -111,9 +113,7 @@ def _brick(
     )
 
 
-def _stucco(
-    x: np.ndarray, z: np.ndarray, colour: Colour, rng: np.random.Generator
-) -> np.ndarray:
+def _stucco(x: np.ndarray, z: np.ndarray, colour: Colour, rng: np.random.Generator) -> np.ndarray:
     """Plain render with a soft grain and a few patched cracks."""
     tone = 1 + 0.015 * grain(rng, (z.size, x.size))
     picture = (tone[..., None] * np.array(colour)).astype(np.float32)
@@ -125,9 +125,7 @@ def _stucco(
     return picture
 
 
-def _boards(
-    x: np.ndarray, z: np.ndarray, colour: Colour, rng: np.random.Generator
-) -> np.ndarray:
+def _boards(x: np.ndarray, z: np.ndarray, colour: Colour, rng: np.random.Generator) -> np.ndarray:
     """Painted horizontal boards, each with a shadow line below it."""
     board = z / 0.16
     tones = rng.normal(1.0, 0.03, int(board.max()) + 1)[board.astype(int)]
@@ -135,9 +133,7 @@ def _boards(
     return (tones[:, None, None] * np.array(colour) * np.ones((1, x.size, 1))).astype(np.float32)
 
 
-def _panels(
-    x: np.ndarray, z: np.ndarray, colour: Colour, rng: np.random.Generator
-) -> np.ndarray:
+def _panels(x: np.ndarray, z: np.ndarray, colour: Colour, rng: np.random.Generator) -> np.ndarray:
     """Concrete panels with open joints and bolt holes."""
     across, down = x / 1.8, z / 1.2
     column, row = across.astype(int), down.astype(int)

@@ -20,13 +20,13 @@ class Light:
 
     sun_direction: tuple[float, float, float]
     sun_rgb: tuple[float, float, float] = (2.5, 2.3, 1.95)
-    zenith_rgb: tuple[float, float, float] = (0.30, 0.42, 0.66)
+    zenith_rgb: tuple[float, float, float] = (0.30, 0.45, 0.74)
     horizon_rgb: tuple[float, float, float] = (0.74, 0.80, 0.88)
     ground_rgb: tuple[float, float, float] = (0.26, 0.24, 0.21)
     haze_per_m: float = 1 / 1400
     cloud_texture: int = 0
     cloud_offset: tuple[float, float] = (0.0, 0.0)
-    exposure: float = 0.78
+    exposure: float = 0.86
 
 
 @dataclass(frozen=True, eq=False)
