@@ -119,7 +119,7 @@ def _advance(
 def _change_set(state: FitState, config: FitConfig) -> None:
     """Split and prune when it is time."""
     settings, fraction = config.densification, state.step / config.steps
-    if state.step % settings.every or fraction < settings.start:
+    if state.step % settings.every or fraction < settings.start or state.step == config.steps:
         return
     sizes = [track.size_m for track in state.scene.recorded_tracks]
     gaussians = state.scene.gaussians

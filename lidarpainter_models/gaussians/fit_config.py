@@ -1,6 +1,6 @@
 """Every setting of a fit, each with its reason."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from lidarpainter_models.errors import ConfigError
@@ -89,3 +89,23 @@ class FitConfig:
             raise ConfigError(
                 f"guidance.probability must be in [0, 1], got {self.guidance.probability}"
             )
+
+
+def continuation(
+    config: FitConfig, *, steps: int, guidance: GuidanceConfig | None = None
+) -> FitConfig:
+    """Settings for going on from a fitted scene, usually with painted views.
+
+    Full pictures and free poses from the first step; rates start at the geometric mean of the
+    first and last of the first fit, so that nothing fitted is shaken loose; no splitting, as the
+    budget is used up.
+    """
+    return replace(
+        config,
+        steps=steps,
+        half_resolution=0.0,
+        learning_rates=config.learning_rates.lowered(),
+        densification=replace(config.densification, start=0.0, stop=0.0),
+        refinement=replace(config.refinement, start_step=0),
+        guidance=guidance or config.guidance,
+    )

@@ -4,10 +4,11 @@ from dataclasses import dataclass
 
 import cv2
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarpainter_models.gaussians.observations import TrainingView, shrink_picture
+from lidarpainter_models.gaussians.pixel_terms import NOTHING, OPEN, SKY, SOLID, PixelFacts
 from lidarpainter_models.geometry.cameras import Camera
 
 
@@ -19,16 +20,12 @@ class FitPicture:
     """As recorded."""
     timestamp_ns: int
     camera_name: str
-    rgb_u8: UInt8[Tensor, "height width 3"]
-    sky_mask: Bool[Tensor, "height width"]
-    lidar_depth_m: Float[Tensor, "height width"]
-    solid_mask: Bool[Tensor, "height width"]
-    """Pixels on or beside a LiDAR return that are not sky."""
+    facts: PixelFacts
 
     @property
-    def rgb(self) -> Float[Tensor, "height width 3"]:
-        """The picture as floats."""
-        return self.rgb_u8.float() / 255
+    def is_open(self) -> Bool[Tensor, "height width"]:
+        """Pixels that may be sky without being in its mask."""
+        return self.facts.kind == OPEN
 
 
 def full_picture(view: TrainingView) -> FitPicture:
@@ -37,39 +34,30 @@ def full_picture(view: TrainingView) -> FitPicture:
         camera=view.camera,
         timestamp_ns=view.timestamp_ns,
         camera_name=view.key[1],
-        rgb_u8=view.rgb_u8,
-        sky_mask=view.sky_mask,
-        lidar_depth_m=view.lidar_depth_m,
-        solid_mask=solid_pixels(view.lidar_depth_m, view.sky_mask),
+        facts=_facts(view.camera, view.rgb, view.sky_mask, view.lidar_depth_m),
     )
 
 
 def half_picture(view: TrainingView) -> FitPicture:
     """The view at half size: area-averaged colours, mostly-sky mask, nearest depths."""
-    width_px = max(view.camera.width_px // 2, 1)
-    height_px = max(view.camera.height_px // 2, 1)
+    size = {
+        "width_px": max(view.camera.width_px // 2, 1),
+        "height_px": max(view.camera.height_px // 2, 1),
+    }
     mask = cv2.resize(
-        view.sky_mask.float().numpy(), (width_px, height_px), interpolation=cv2.INTER_AREA
+        view.sky_mask.float().numpy(),
+        (size["width_px"], size["height_px"]),
+        interpolation=cv2.INTER_AREA,
     )
-    depth_m = shrink_depth(view.lidar_depth_m, width_px=width_px, height_px=height_px)
-    sky_mask = torch.from_numpy(mask) > 0.5
+    camera = view.camera.resized(**size)
+    rgb = shrink_picture(view.rgb_u8, **size).float() / 255
+    depth_m = shrink_depth(view.lidar_depth_m, **size)
     return FitPicture(
-        camera=view.camera.resized(width_px=width_px, height_px=height_px),
+        camera=camera,
         timestamp_ns=view.timestamp_ns,
         camera_name=view.key[1],
-        rgb_u8=shrink_picture(view.rgb_u8, width_px=width_px, height_px=height_px),
-        sky_mask=sky_mask,
-        lidar_depth_m=depth_m,
-        solid_mask=solid_pixels(depth_m, sky_mask),
+        facts=_facts(camera, rgb, torch.from_numpy(mask) > 0.5, depth_m),
     )
-
-
-def solid_pixels(
-    lidar_depth_m: Float[Tensor, "height width"], sky_mask: Bool[Tensor, "height width"]
-) -> Bool[Tensor, "height width"]:
-    """Pixels at most one away from a LiDAR return, without the sky."""
-    beside = torch.nn.functional.max_pool2d((lidar_depth_m > 0).float()[None], 3, 1, 1)[0]
-    return (beside > 0) & ~sky_mask
 
 
 def shrink_depth(
@@ -83,3 +71,24 @@ def shrink_depth(
     nearest.scatter_reduce_(0, cells, depth_m[rows, columns], reduce="amin")
     nearest = torch.where(nearest.isfinite(), nearest, torch.zeros_like(nearest))
     return nearest.view(height_px, width_px)
+
+
+def above_horizon(camera: Camera) -> Bool[Tensor, "height width"]:
+    """Pixels whose rays rise, world z being up."""
+    up = camera.world_from_camera[2, :3].float()
+    return (camera.pixel_directions() @ up) > 0
+
+
+def _facts(
+    camera: Camera,
+    rgb: Float[Tensor, "height width 3"],
+    sky_mask: Bool[Tensor, "height width"],
+    lidar_depth_m: Float[Tensor, "height width"],
+) -> PixelFacts:
+    """Tell the pixels apart; solid ones are at most one pixel away from a LiDAR return."""
+    beside = torch.nn.functional.max_pool2d((lidar_depth_m > 0).float()[None], 3, 1, 1)[0] > 0
+    kind = torch.full(sky_mask.shape, NOTHING, dtype=torch.uint8)
+    kind[above_horizon(camera)] = OPEN
+    kind[beside] = SOLID
+    kind[sky_mask] = SKY
+    return PixelFacts(rgb=rgb.contiguous(), kind=kind, lidar_depth_m=lidar_depth_m.contiguous())

@@ -12,12 +12,11 @@ from lidarpainter_models.gaussians.fit_state import FitState
 from lidarpainter_models.gaussians.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.losses import (
     actor_boundary_loss,
-    clear_sky_loss,
-    depth_loss,
     pose_prior,
     project_boxes,
 )
 from lidarpainter_models.gaussians.observations import GuidanceView
+from lidarpainter_models.gaussians.pixel_terms import SKY, depth_loss, pixel_terms
 from lidarpainter_models.gaussians.scene_graph import OPAQUE
 from lidarpainter_models.gaussians.sky_sampling import SkyRays
 from lidarpainter_models.geometry.cameras import Camera
@@ -49,24 +48,34 @@ def recorded_step(
         pose = pose.detach()
     camera = picture.camera.at(pose.detach())
     bodies = scene.camera_from_body(pose, *scene.world_from_actors(picture.timestamp_ns))
-    with_actors = bool(scene.recorded_tracks) and state.step % config.losses.actors_every == 0
+    with_actors = _wants_actor_term(state, config)
     screen_gradient = torch.zeros(scene.num_gaussians)
     image = scene.splat(
         camera, bodies, with_actor_alpha=with_actors, screen_gradient_out=screen_gradient
     )
-    rays = scene.sky.rays(camera, image.alpha.detach() < OPAQUE)
+    rays = scene.sky.rays(camera, (image.alpha.detach() < OPAQUE) | picture.is_open)
     sky_rgb = scene.sky.sample(rays).requires_grad_(True)
-    shown = composed(image, sky_rgb, config.initialisation.sky.min_transmittance)
+    terms = pixel_terms(
+        image,
+        sky_rgb,
+        picture.facts,
+        sky_tolerance=config.losses.sky_tolerance,
+        depth_tolerance=config.losses.depth_tolerance,
+        least_clear=config.initialisation.sky.min_transmittance,
+    )
+    shown = terms.shown
     if _fits_exposure(state, config):
         shown = scene.exposure.apply(shown, picture.camera_name)
     loss = _picture_loss(shown, picture, config, perceptual)
-    loss = loss + _regularisers(state, image, picture, camera, config)
+    loss = loss + config.losses.sky * terms.sky + config.losses.depth * terms.depth
+    if with_actors:
+        loss = loss + config.losses.actors * _actor_term(state, image, picture, camera)
     loss = loss + _priors(state, tangent, picture.timestamp_ns, config)
     loss.backward()
     state.tally.add(screen_gradient, image.visible)
     _step_poses(state, config)
     _step_sky(state, sky_rgb, rays, image.alpha.detach(), config, picture)
-    squared_error = (shown.detach() - picture.rgb).square().mean()
+    squared_error = (shown.detach() - picture.facts.rgb).square().mean()
     return float(loss.detach()), float(squared_error)
 
 
@@ -95,15 +104,6 @@ def add_guidance_gradients(state: FitState, view: GuidanceView, config: FitConfi
     loss.backward()
 
 
-def composed(
-    image: SplatImage, sky_rgb: Float[Tensor, "height width 3"], min_transmittance: float
-) -> Float[Tensor, "height width 3"]:
-    """Gaussians over sky; the sky gets a gradient only where it is seen clearly enough."""
-    clear = (1 - image.alpha)[..., None]
-    gated = torch.where(clear.detach() > min_transmittance, sky_rgb, sky_rgb.detach())
-    return image.rgb + clear * gated
-
-
 def _with_fixed_geometry(gaussians: GaussianSet) -> GaussianSet:
     """The same Gaussians, of which only colour and opacity collect gradients."""
     return GaussianSet(
@@ -123,34 +123,22 @@ def _picture_loss(
     config: FitConfig,
     perceptual: Perceptual | None,
 ) -> Float[Tensor, ""]:
-    target = picture.rgb
+    target = picture.facts.rgb
     loss = l1_ssim_loss(shown, target, ssim_weight=config.losses.ssim)
     if perceptual is not None and config.losses.perceptual > 0:
         loss = loss + config.losses.perceptual * perceptual(shown, target)
     return loss
 
 
-def _regularisers(
-    state: FitState, image: SplatImage, picture: FitPicture, camera: Camera, config: FitConfig
+def _actor_term(
+    state: FitState, image: SplatImage, picture: FitPicture, camera: Camera
 ) -> Float[Tensor, ""]:
-    """L_g: clear sky, actors inside their boxes, LiDAR depth."""
-    weights, scene = config.losses, state.scene
-    total = image.alpha.new_zeros(())
-    if weights.sky > 0:
-        total = total + weights.sky * clear_sky_loss(
-            image.alpha, picture.sky_mask, picture.solid_mask
-        )
-    if weights.depth > 0:
-        total = total + weights.depth * depth_loss(
-            image.depth_m, image.alpha, picture.lidar_depth_m, tolerance=weights.depth_tolerance
-        )
-    if weights.actors > 0 and image.features.shape[-1] == 1:
-        with torch.no_grad():
-            world_from_actors, present = scene.world_from_actors(picture.timestamp_ns)
-            sizes = [track.size_m for track in scene.recorded_tracks]
-            in_boxes = project_boxes(camera, world_from_actors, sizes, present > 0)
-        total = total + weights.actors * actor_boundary_loss(image.features[..., 0], in_boxes)
-    return total
+    """Actors stay inside their projected boxes."""
+    with torch.no_grad():
+        world_from_actors, present = state.scene.world_from_actors(picture.timestamp_ns)
+        sizes = [track.size_m for track in state.scene.recorded_tracks]
+        in_boxes = project_boxes(camera, world_from_actors, sizes, present > 0)
+    return actor_boundary_loss(image.features[..., 0], in_boxes)
 
 
 def _priors(
@@ -210,6 +198,12 @@ def _step_poses(state: FitState, config: FitConfig) -> None:
         table.grad = None
 
 
+def _wants_actor_term(state: FitState, config: FitConfig) -> bool:
+    weights = config.losses
+    is_due = state.step % weights.actors_every == 0
+    return is_due and weights.actors > 0 and bool(state.scene.recorded_tracks)
+
+
 def _fits_exposure(state: FitState, config: FitConfig) -> bool:
     """One camera alone has no other to differ from."""
     return config.refinement.exposure or len(state.scene.exposure.camera_names) > 1
@@ -234,7 +228,7 @@ def _step_sky(
     clear = 1 - alpha
     learns = clear > settings.min_transmittance
     if config.sky_in_mask_only:
-        learns &= picture.sky_mask
+        learns &= picture.facts.kind == SKY
     ratio = settings.final_learning_rate / settings.learning_rate
     state.scene.sky.observe(
         sky_rgb.grad,

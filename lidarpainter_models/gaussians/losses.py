@@ -1,8 +1,6 @@
-"""What a fit minimises besides the picture difference.
+"""What a fit minimises besides the terms per pixel: actors in their boxes, small corrections.
 
-The regularisers are those that StreetCrafter (Yan et al., 2025) calls L_g, as the paper takes them
-over: the sky stays clear, actors stay in their boxes, LiDAR says how far things are. Depth is
-camera z in metres, alpha the opacity of the Gaussians in [0, 1].
+Sky and LiDAR depth are in `pixel_terms`. Lengths are metres, angles radians.
 """
 
 from collections.abc import Sequence
@@ -31,6 +29,9 @@ class LossWeights:
     """Of the perceptual distance, where one is given to the fit."""
     sky: float = 0.05
     """Of the clear-sky term."""
+    sky_tolerance: float = 0.06
+    """A pixel without LiDAR return this close to the sky's colour counts as sky: between wires
+    the fit would otherwise hang sky-coloured needles at any depth."""
     actors: float = 0.1
     """Of the term that keeps actors inside their boxes."""
     actors_every: int = 10
@@ -47,21 +48,6 @@ class LossWeights:
     """Of squared jumps between an actor's neighbouring corrections, likewise."""
 
 
-def clear_sky_loss(
-    alpha: Float[Tensor, "height width"],
-    sky_mask: Bool[Tensor, "height width"],
-    solid_mask: Bool[Tensor, "height width"],
-) -> Float[Tensor, ""]:
-    """Mean of -log(1 - alpha) in the sky and of -log(alpha) where LiDAR hit something.
-
-    StreetCrafter takes the entropy of alpha everywhere outside the sky; that also closes the gaps
-    between wires and branches, which are neither sky for certain nor solid. They are left alone.
-    """
-    inside = alpha.clamp(_EDGE, 1 - _EDGE)
-    wanted = torch.where(sky_mask, 1 - inside, inside)
-    return -torch.where(sky_mask | solid_mask, wanted.log(), torch.zeros_like(alpha)).mean()
-
-
 def actor_boundary_loss(
     actor_alpha: Float[Tensor, "height width"], in_boxes: Bool[Tensor, "height width"]
 ) -> Float[Tensor, ""]:
@@ -70,26 +56,6 @@ def actor_boundary_loss(
     log_clear = torch.log1p(-inside)
     entropy = -(inside * inside.log() + (1 - inside) * log_clear)
     return torch.where(in_boxes, entropy, -log_clear).mean()
-
-
-def depth_loss(
-    accumulated_m: Float[Tensor, "height width"],
-    alpha: Float[Tensor, "height width"],
-    lidar_depth_m: Float[Tensor, "height width"],
-    *,
-    tolerance: float,
-) -> Float[Tensor, ""]:
-    """Robust relative error of the expected depth where LiDAR hit, as a mean over those pixels.
-
-    With e the relative error, log(1 + e / tolerance): the pull weakens beyond the tolerance (an
-    occlusion more likely than a wrong surface) but never ends. Pixels that the Gaussians leave
-    clear do not count: their expected depth means nothing.
-    """
-    is_known = (lidar_depth_m > 0) & (alpha.detach() > 0.3)
-    safe_m = torch.where(is_known, lidar_depth_m, torch.ones_like(lidar_depth_m))
-    expected_m = accumulated_m / alpha.clamp(min=0.05)
-    error = torch.log1p((expected_m - safe_m).abs() / (safe_m * tolerance))
-    return (error * is_known).sum() / is_known.sum().clamp(min=1)
 
 
 def pose_prior(

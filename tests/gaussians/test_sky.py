@@ -4,7 +4,7 @@ import pytest
 import torch
 from gaussian_world import camera_at
 
-from lidarpainter_models.gaussians.fit_step import composed
+from lidarpainter_models.gaussians.pixel_terms import composed
 from lidarpainter_models.gaussians.sky import (
     SkyConfig,
     SkyTexture,

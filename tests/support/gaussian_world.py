@@ -1,6 +1,6 @@
 """A tiny world made of Gaussians, so that a fit can in principle be perfect.
 
-A speckled wall 8 m ahead, a speckled car in front of it that drives to the left, a plain sky above.
+A rough, speckled wall 8 m ahead, a speckled car in front of it that drives to the left, a plain sky above.
 """
 
 from dataclasses import dataclass
@@ -136,7 +136,9 @@ def build_world():
     """Four views of a wall and a car, 0.3 m apart."""
     generator = torch.Generator().manual_seed(7)
     y, z = torch.meshgrid(torch.linspace(-6, 6, 40), torch.linspace(-4, 3, 24), indexing="ij")
-    wall_m = torch.stack([torch.full_like(y, 8.0), y, z], dim=-1).flatten(0, 1)
+    # rough, because on a flat wall the drawing order would flip with the slightest turn
+    relief_m = 0.6 * torch.rand(y.shape, generator=generator)
+    wall_m = torch.stack([8.0 + relief_m, y, z], dim=-1).flatten(0, 1)
     wall_rgb = torch.rand(wall_m.shape[0], 3, generator=generator)
     car_m = (torch.rand(120, 3, generator=generator) - 0.5) * CAR_SIZE_M
     car_rgb = torch.rand(120, 3, generator=generator) * 0.5
