@@ -128,7 +128,7 @@ METRICS = TableSchema(
         Column("metric_id", "text", "digest of the run and the four columns that name the number"),
         Column("run_id", "text", "the run"),
         Column("scene_id", "text", "dataset/sequence"),
-        Column("protocol", "text", "which truth: recorded, recorded-poses, truth, depth, cross-camera"),
+        Column("protocol", "text", "recorded, recorded-poses, truth, depth or cross-camera"),
         Column("trajectory", "text", "where the camera was: recorded, left-2m, up-1.5m, ..."),
         Column("variant", "text", "unpainted, painted, or painted at view time"),
         Column("name", "text", "what was measured: psnr, ssim, ..."),

@@ -31,8 +31,8 @@ from lidarpainter_models.kernels.backends import Backend
 from lidarpainter_models.kernels.gaussian_raster import SplatImage, render_gaussians
 from lidarpainter_models.scenes.driving_scene import ActorTrack
 
-OPAQUE = 1 - 1e-4
-"""From this opacity on nothing is seen of the sky: the rasteriser stops there too."""
+OPAQUE = 1 - 1 / 512
+"""From this opacity on the sky is not looked up: it would change no byte by more than half."""
 _FAR_BEHIND_M = -1e6
 SCHEMA = 1
 

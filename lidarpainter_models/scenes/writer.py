@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -69,7 +69,7 @@ class SceneWriter:
         self._seen: set[tuple[str, int, str]] = set()
         self._provenance: Mapping[str, Any] = {}
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "SceneWriter":
         self._aside = AsideFolder(self.path)
         layouts = [
             layout

@@ -1,6 +1,7 @@
 """A tiny world made of Gaussians, so that a fit can in principle be perfect.
 
-A rough, speckled wall 8 m ahead, a speckled car in front of it that drives to the left, a plain sky above.
+A rough, speckled wall 8 m ahead, a speckled car in front of it that drives to the left, and a
+plain sky above.
 """
 
 from dataclasses import dataclass

@@ -27,7 +27,7 @@ from lidarpainter_models.scenes.synthetic.solids import add_box
 from lidarpainter_models.scenes.synthetic.surfaces import StreetClass, Surface, SurfaceSet
 from lidarpainter_models.scenes.synthetic.wall_textures import wall_tile
 
-TILE_M = 5.0
+TILE_M = 11.0
 NEAR_FROM_M, NEAR_TO_M = -22.0, 92.0
 
 
@@ -156,7 +156,7 @@ class _Building:
         """Sides, back and roof; a side on the cross street is a facade of its own."""
         width, depth, height = size
         inward = -np.cross(right, [0, 0, 1.0])
-        tile = wall_tile(style.wall, style.colour, self.rng, size_m=TILE_M, per_m=20.0)
+        tile = wall_tile(style.wall, style.colour, self.rng, size_m=TILE_M, per_m=16.0)
         wall = self.surfaces.add(
             Surface(
                 semantics=StreetClass.BUILDING,

@@ -201,7 +201,7 @@ def _add_gloss(
     light = scene.light
     towards = rx * light[SUN_DIRECTION] + ry * light[SUN_DIRECTION + 1]
     towards += rz * light[SUN_DIRECTION + 2]
-    flash = 3.0 * gloss * max(towards, 0.0) ** 160 if sun > 0 else 0.0
+    flash = 3.0 * gloss * max(towards, 0.0) ** 500 if sun > 0 else 0.0
     return (
         diffuse[0] + fresnel * (seen[0] - diffuse[0]) + flash * light[SUN_RGB],
         diffuse[1] + fresnel * (seen[1] - diffuse[1]) + flash * light[SUN_RGB + 1],

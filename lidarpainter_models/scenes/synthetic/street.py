@@ -33,7 +33,7 @@ from lidarpainter_models.scenes.synthetic.surfaces import StreetClass
 
 START_NS = 1_700_000_000_000_000_000
 GENERATOR = "lidarpainter synthetic street"
-WORLD_VERSION = 1
+WORLD_VERSION = 2
 """Raise it whenever equal settings would give another world."""
 
 
