@@ -73,8 +73,13 @@ def surface_visibility(
         around: see there.
         box_m: as `box_far_ends` gives it.
     """
-    size = {"height_px": grid.height_px, "width_px": grid.width_px}
-    seen = splat_points(cells_uv, depth_m, radius_px=radius_px, **size)
+    seen = splat_points(
+        cells_uv,
+        depth_m,
+        height_px=grid.height_px,
+        width_px=grid.width_px,
+        radius_px=radius_px,
+    )
     is_surface = (seen >= 0).numpy()
     depth = np.where(is_surface, depth_m.numpy()[seen.clamp(min=0).numpy()], np.float32(_FAR_M))
     steps = ((1, 0), (-1, 0), (0, 1), (0, -1))

@@ -132,8 +132,8 @@ def _grown(mask: np.ndarray, radius_px: int) -> np.ndarray:
 
 def _log_ratio(picture: np.ndarray, without: np.ndarray, with_returns: np.ndarray) -> np.ndarray:
     """Log of how many pixels of each pixel's colour have no return, over how many have one."""
-    lab = cv2.cvtColor(picture, cv2.COLOR_RGB2LAB)
-    bins = np.stack([lab[..., 0] >> 4, lab[..., 1] >> 2, lab[..., 2] >> 2], axis=-1).astype(int)
+    lab = cv2.cvtColor(picture, cv2.COLOR_RGB2LAB).astype(np.int64)
+    bins = np.stack([lab[..., 0] // 16, lab[..., 1] // 4, lab[..., 2] // 4], axis=-1)
     cells = (bins[..., 0] * 64 + bins[..., 1]) * 64 + bins[..., 2]
     counts = [
         _smoothed(np.bincount(cells[chosen], minlength=16 * 64 * 64).reshape(16, 64, 64) + 1.0)
