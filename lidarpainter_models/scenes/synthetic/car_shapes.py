@@ -109,7 +109,7 @@ def _add_wheels(builder: MeshBuilder, shape: CarShape, atlas: CarAtlas) -> None:
     """Four tyres with rims; their bottoms stand on z = 0."""
     radius = shape.wheel_radius_m
     for x in shape.wheel_x_m:
-        width = float(_half_width(shape, np.array(x)))
+        width = float(_half_width(shape, np.array([x]))[0])
         for side in (-1.0, 1.0):
             outer = np.array([x, side * (width + 0.012), radius])
             inner = np.array([x, side * (width - 0.22), radius])
@@ -123,7 +123,7 @@ def _add_trim(builder: MeshBuilder, shape: CarShape, atlas: CarAtlas) -> None:
     """Mirrors, door handles and licence plates."""
     x = shape.glass[3] - 0.22
     belt = float(np.interp(x, *zip(*shape.belt, strict=True)))
-    width = float(_half_width(shape, np.array(x)))
+    width = float(_half_width(shape, np.array([x]))[0])
     for side in (-1.0, 1.0):
         centre = (x, side * (width + 0.0), belt + 0.07)
         add_box(builder, centre, (0.1, 0.16, 0.13), atlas.paint)

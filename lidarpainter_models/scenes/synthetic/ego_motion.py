@@ -11,21 +11,22 @@ SETTLING_S = 2.5
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """Speed that goes from a first to a last value and settles there exponentially."""
+    """Speed that settles exponentially from a first to a last value; the first before time 0."""
 
     first_mps: float
     last_mps: float
 
     def speed_mps(self, time_s: np.ndarray | float) -> np.ndarray:
         """Speed at times after the start."""
-        left = np.exp(-np.asarray(time_s, float) / SETTLING_S)
-        return self.last_mps + (self.first_mps - self.last_mps) * left
+        left = np.exp(-np.maximum(time_s, 0.0) / SETTLING_S)
+        return np.asarray(self.last_mps + (self.first_mps - self.last_mps) * left)
 
     def travelled_m(self, time_s: np.ndarray | float) -> np.ndarray:
         """The integral of the speed."""
-        time_s = np.asarray(time_s, float)
-        settled = SETTLING_S * (1 - np.exp(-time_s / SETTLING_S))
-        return self.last_mps * time_s + (self.first_mps - self.last_mps) * settled
+        since, before = np.maximum(time_s, 0.0), np.minimum(time_s, 0.0)
+        settled = SETTLING_S * (1 - np.exp(-since / SETTLING_S))
+        change = (self.first_mps - self.last_mps) * settled
+        return np.asarray(self.first_mps * before + self.last_mps * since + change)
 
     def times(self, factor: float) -> "Pace":
         """The same course, faster or slower."""
@@ -49,9 +50,8 @@ class EgoMotion:
         """Distance along the street."""
         return self.pace.travelled_m(time_s)
 
-    def world_from_ego(self, time_s: np.ndarray) -> np.ndarray:
+    def world_from_ego(self, time_s: np.ndarray | float) -> np.ndarray:
         """(n, 4, 4)."""
-        time_s = np.atleast_1d(np.asarray(time_s, float))
         swing = 2 * np.pi * self.sway_hz
         aside = self.sway_m * (1 - np.cos(swing * time_s))
         speed = np.maximum(self.pace.speed_mps(time_s), 0.5)

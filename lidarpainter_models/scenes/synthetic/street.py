@@ -227,10 +227,9 @@ class SyntheticStreet:
             actor_index=torch.from_numpy(label[..., 1][is_kept]),
         )
 
-    def _instances(self, time_s: np.ndarray | float) -> InstanceArrays:
+    def _instances(self, time_s: np.ndarray) -> InstanceArrays:
         """Where everything that moves is at given times."""
         city = self._city
-        time_s = np.atleast_1d(np.asarray(time_s, float))
         moving = [actor for actor in city.actors if actor.is_moving]
         poses = np.stack([actor.world_from_box(city.plan.line, time_s) for actor in moving], 1)
         vehicles = [actor for actor in city.actors if actor.category != "pedestrian"]
@@ -271,9 +270,9 @@ def sample_offsets(samples_per_axis: int) -> np.ndarray:
     return np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
 
 
-def _seconds(timestamp_ns: int) -> float:
-    """Since the first frame."""
-    return (timestamp_ns - START_NS) / 1e9
+def _seconds(timestamp_ns: int) -> np.ndarray:
+    """Time since the first frame, (1)."""
+    return np.array([(timestamp_ns - START_NS) / 1e9])
 
 
 SEMANTIC_NAMES = {int(kind): kind.name.lower() for kind in StreetClass}

@@ -42,9 +42,9 @@ class StreetLine:
         z = rise_m * (1 - np.cos(2 * np.pi * s / 240.0))
         return cls(s, x - x[zero], y - y[zero], z, heading)
 
-    def heading_at(self, s_m: np.ndarray | float) -> np.ndarray:
+    def heading_at(self, s_m: np.ndarray | float) -> np.ndarray | np.floating:
         """Direction of the line about the up axis, radians."""
-        return np.interp(s_m, self.s_m, self.heading_rad)
+        return np.asarray(np.interp(s_m, self.s_m, self.heading_rad))
 
     def place(
         self, s_m: np.ndarray | float, d_m: np.ndarray | float, h_m: np.ndarray | float = 0.0

@@ -52,9 +52,8 @@ class StreetActor:
         """Whether it ever leaves its place."""
         return self.pace is not None
 
-    def world_from_box(self, line: StreetLine, time_s: np.ndarray) -> np.ndarray:
+    def world_from_box(self, line: StreetLine, time_s: np.ndarray | float) -> np.ndarray:
         """(n, 4, 4) at times after the first frame."""
-        time_s = np.atleast_1d(np.asarray(time_s, float))
         along = 0.0 if self.pace is None else self.pace.travelled_m(time_s)
         poses = line.poses(self.start_s_m + along + 0 * time_s, self.d_m, self.yaw_rad)
         lift = self.ground_m + self.size_m[2] / 2
