@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Int, Integer, Shaped
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError
@@ -116,7 +116,7 @@ class SweepPoints:
     """After the time of the sweep."""
     ring: Int[Tensor, " points"]
     """Laser of the sensor, -1 where unknown."""
-    return_index: Int[Tensor, " points"]
+    return_index: Integer[Tensor, " points"]
     lidar: Shaped[Tensor, " points"]
     """Position of the LiDAR's name in the scene's `lidar_names`."""
 
