@@ -62,7 +62,7 @@ def adaptive_voxels(
     least_m: float = 0.03,
     most_m: float = 2.0,
 ) -> VoxelPoints:
-    """At most about `budget` voxels with the finest detail per pixel that allows.
+    """At most `budget` voxels with the finest detail per pixel that allows.
 
     Args:
         xyz_m: the cloud.
@@ -73,18 +73,25 @@ def adaptive_voxels(
         least_m: smallest edge.
         most_m: largest edge.
     """
-    low, high = 0.25, 64.0
+    low, high = 0.25, 1024.0
     keys = voxel_keys(xyz_m, adaptive_sizes(footprint_m, low, least_m=least_m, most_m=most_m))
     best = low
     if torch.unique(keys).numel() > budget:
-        for _ in range(7):
+        for _ in range(9):
             middle = (low * high) ** 0.5
             sizes = adaptive_sizes(footprint_m, middle, least_m=least_m, most_m=most_m)
             is_few = torch.unique(voxel_keys(xyz_m, sizes)).numel() <= budget
             low, high = (low, middle) if is_few else (middle, high)
         best = high
     sizes = adaptive_sizes(footprint_m, best, least_m=least_m, most_m=most_m)
-    return mean_by_voxel(xyz_m, rgb, has_colour, sizes)
+    voxels = mean_by_voxel(xyz_m, rgb, has_colour, sizes)
+    count = voxels.size_m.numel()
+    if count <= budget:
+        return voxels
+    # even the largest voxels are too many: an even choice of them
+    chosen = torch.zeros(count, dtype=torch.bool)
+    chosen[(torch.arange(budget) * count) // budget] = True
+    return voxels.keep(chosen)
 
 
 def mean_by_voxel(

@@ -4,6 +4,7 @@ One safetensors file holds every tensor; its header carries the numbers, as JSON
 beside the old one and renamed over it, so that there is always one whole checkpoint or none.
 """
 
+import contextlib
 import json
 import os
 import time
@@ -64,7 +65,8 @@ class CheckpointFolder:
                 os.fsync(written.fileno())
             aside.replace(target)
         except (OSError, SafetensorError) as error:
-            aside.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                aside.unlink(missing_ok=True)
             raise StorageError(f"cannot write the checkpoint {target}: {error}") from error
         self._last_time = time.monotonic()
 

@@ -1,7 +1,8 @@
 """LiDAR depth of one sweep as a camera saw it: sparse, occlusion-checked, actors in place.
 
 Depth is camera z in metres, 0 where no point falls. The LiDAR stands higher than the camera and
-sees over roofs and behind posts; a point behind nearer returns around its pixel is dropped.
+sees over roofs and behind posts; a point with nearer returns above or beside its pixel is dropped.
+Nearer returns below it hide nothing: that is how a road looks.
 """
 
 from collections.abc import Sequence
@@ -26,7 +27,8 @@ class SparseDepthConfig:
     max_depth_m: float = 250.0
     """Beyond the reach of the sensors in use."""
     occlusion_window_px: int = 5
-    """Gaps between beams are a few pixels wide: look that far around for a nearer return."""
+    """Gaps between beams are a few pixels wide: look for nearer returns in the upper half of a
+    window of this width."""
     occlusion_margin: float = 0.05
     """A point further behind than this part of its depth is hidden ..."""
     occlusion_margin_m: float = 0.3
@@ -47,8 +49,9 @@ def sparse_lidar_depth(
     nearest = torch.full((camera.height_px * camera.width_px,), torch.inf)
     nearest.scatter_reduce_(0, row * camera.width_px + column, depth_m[inside], reduce="amin")
     nearest = nearest.view(camera.height_px, camera.width_px)
-    window = config.occlusion_window_px
-    front = -torch.nn.functional.max_pool2d(-nearest[None], window, 1, window // 2)[0]
+    reach = config.occlusion_window_px // 2
+    padded = torch.nn.functional.pad(-nearest[None], (reach, reach, reach, 0), value=-torch.inf)
+    front = -torch.nn.functional.max_pool2d(padded, (reach + 1, 2 * reach + 1), 1)[0]
     is_visible = nearest <= front * (1 + config.occlusion_margin) + config.occlusion_margin_m
     return torch.where(is_visible & nearest.isfinite(), nearest, torch.zeros_like(nearest))
 
