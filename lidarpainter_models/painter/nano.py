@@ -41,6 +41,9 @@ class NanoConfig:
     """Channels at 1/4, 1/8 and 1/16 of the resolution."""
     blocks: tuple[int, int, int] = (2, 2, 3)
     """Residual blocks per level; the upper two have as many again on the way up."""
+    normalise: bool = True
+    """Keep activations at one size. Without it a training at this learning rate can run away and
+    leave a network that says the same everywhere; off in weights made before."""
     num_sources: int = 2
     """Warped pictures it looks at; missing ones count as invalid, further ones are left out."""
     residual_limit: float = 0.25
@@ -80,7 +83,8 @@ class NanoConfig:
         """
         try:
             changed = {key: tuple(values[key]) for key in ("widths", "blocks", "prompts")}
-            return cls(**values | changed | {"inputs": frozenset(values["inputs"])})
+            inputs = frozenset(values["inputs"])
+            return cls(**{"normalise": False} | values | changed | {"inputs": inputs})
         except (KeyError, TypeError) as error:
             raise ConfigError(f"not the settings of a nano painter: {error}") from None
 
@@ -99,11 +103,29 @@ class NanoOutput:
     """Shares of the candidates; they sum to one."""
 
 
-class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions beside an identity; starts as the identity."""
+class PixelNorm(nn.Module):
+    """Scales the channels of every pixel to a root mean square of one (Zhang and Sennrich, 2019).
+
+    It looks at one pixel alone, so a window and a whole picture are treated alike.
+    """
 
     def __init__(self, width: int) -> None:
         super().__init__()
+        self.gain = nn.Parameter(torch.ones(width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Normalise and scale."""
+        mean_square = x.float().square().mean(dim=1, keepdim=True)
+        scale = torch.rsqrt(mean_square + 1e-4).to(x.dtype)
+        return x * scale * self.gain[:, None, None].to(x.dtype)
+
+
+class ResidualBlock(nn.Module):
+    """Two 3x3 convolutions beside an identity; starts as the identity."""
+
+    def __init__(self, width: int, *, normalise: bool) -> None:
+        super().__init__()
+        self.before = PixelNorm(width) if normalise else nn.SiLU()
         self.first = nn.Conv2d(width, width, 3, padding=1)
         self.second = nn.Conv2d(width, width, 3, padding=1)
         nn.init.zeros_(self.second.weight)
@@ -111,7 +133,7 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Add the block's change to its input."""
-        return x + self.second(F.silu(self.first(F.silu(x))))
+        return x + self.second(F.silu(self.first(self.before(x))))
 
 
 class NanoNetwork(nn.Module):
@@ -123,16 +145,17 @@ class NanoNetwork(nn.Module):
         fine, middle, coarse = config.widths
         in_channels = count_features(config.inputs, config.num_sources) * CELL_PX**2
         self.stem = nn.Conv2d(in_channels, fine, 3, padding=1)
-        self.encode_fine = _blocks(fine, config.blocks[0])
+        self.encode_fine = _blocks(fine, config.blocks[0], config)
         self.down_middle = nn.Conv2d(fine, middle, 2, stride=2)
-        self.encode_middle = _blocks(middle, config.blocks[1])
+        self.encode_middle = _blocks(middle, config.blocks[1], config)
         self.down_coarse = nn.Conv2d(middle, coarse, 2, stride=2)
-        self.encode_coarse = _blocks(coarse, config.blocks[2])
+        self.encode_coarse = _blocks(coarse, config.blocks[2], config)
         self.prompt = nn.Embedding(len(config.prompts), coarse)
         self.up_middle = nn.Conv2d(coarse, middle * 4, 1)
-        self.decode_middle = _blocks(middle, config.blocks[1])
+        self.decode_middle = _blocks(middle, config.blocks[1], config)
         self.up_fine = nn.Conv2d(middle, fine * 4, 1)
-        self.decode_fine = _blocks(fine, config.blocks[0])
+        self.decode_fine = _blocks(fine, config.blocks[0], config)
+        self.last = PixelNorm(fine) if config.normalise else nn.Identity()
         self.head = nn.Conv2d(fine, (len(config.candidates) + 4) * CELL_PX**2, 3, padding=1)
         self._start_as_base()
 
@@ -210,9 +233,10 @@ class NanoNetwork(nn.Module):
         coarse = self.encode_coarse(coarse)
         middle = self.decode_middle(middle + F.pixel_shuffle(self.up_middle(coarse), 2))
         fine = self.decode_fine(fine + F.pixel_shuffle(self.up_fine(middle), 2))
-        outputs = F.pixel_shuffle(self.head(F.silu(fine)), CELL_PX)
+        outputs = F.pixel_shuffle(self.head(F.silu(self.last(fine))), CELL_PX)
         return outputs[..., :height_px, :width_px]
 
 
-def _blocks(width: int, number: int) -> nn.Sequential:
-    return nn.Sequential(*[ResidualBlock(width) for _ in range(number)])
+def _blocks(width: int, number: int, config: NanoConfig) -> nn.Sequential:
+    blocks = [ResidualBlock(width, normalise=config.normalise) for _ in range(number)]
+    return nn.Sequential(*blocks)

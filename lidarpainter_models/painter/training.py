@@ -18,7 +18,7 @@ from torch import Tensor
 from lidarpainter_models.errors import ConfigError, DataError, TrainingError
 from lidarpainter_models.painter.augmentation import AugmentationConfig, TrainingBatch, draw_batch
 from lidarpainter_models.painter.examples import PairSource
-from lidarpainter_models.painter.losses import LossTerms, LossWeights, painting_loss
+from lidarpainter_models.painter.losses import LossWeights, painting_loss
 from lidarpainter_models.painter.nano import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.training_checkpoints import (
     TrainingState,
@@ -28,6 +28,10 @@ from lidarpainter_models.painter.training_checkpoints import (
 )
 
 CPU = torch.device("cpu")
+ALIVE_AFTER_STEPS = 1000
+"""From here on a network that says the same in every pixel counts as dead."""
+LEAST_SPREAD = 1e-3
+"""Deviation of the expected log error over pixels under which it says the same everywhere."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,7 +120,8 @@ def train_nano(
     Raises:
         DataError: no pairs, or a damaged pair.
         ConfigError: shares that do not fit the sources, or a checkpoint of another training.
-        TrainingError: the loss is no longer finite; the last checkpoint stays as it was.
+        TrainingError: the loss is no longer finite or the network has died; the last checkpoint
+            stays as it was.
     """
     shares = _source_shares(sources, config)
     digest = training_digest(config.to_dict(), [source.digest for source in sources])
@@ -128,10 +133,10 @@ def train_nano(
     while not _is_done(state, config):
         state.network.train()
         batch = _draw(sources, shares, state.step, config).to(device)
-        terms = _step(state, batch, config)
+        losses = _step(state, batch, config)
         state.step += 1
         state.cpu_s = clock.cpu_s()
-        _log(state, terms, config, progress)
+        _log(state, losses, config, progress)
         if path and clock.is_due(config.checkpoint_every_s):
             write_checkpoint(path, state, digest)
     if path:
@@ -205,8 +210,13 @@ def _learning_rate(state: TrainingState, config: NanoTrainingConfig) -> float:
     return config.learning_rate * rise * fall
 
 
-def _step(state: TrainingState, batch: TrainingBatch, config: NanoTrainingConfig) -> LossTerms:
-    """One optimiser step; refuses to take one that is not finite."""
+def _step(
+    state: TrainingState, batch: TrainingBatch, config: NanoTrainingConfig
+) -> dict[str, float]:
+    """One optimiser step; refuses to take one that is not finite.
+
+    Returns the losses, and as `spread` the deviation over pixels of the expected log error.
+    """
     for group in state.optimiser.param_groups:
         group["lr"] = _learning_rate(state, config)
         group["weight_decay"] = config.weight_decay
@@ -223,7 +233,7 @@ def _step(state: TrainingState, batch: TrainingBatch, config: NanoTrainingConfig
         )
     state.optimiser.step()
     _average(state, config.average_decay)
-    return terms
+    return terms.to_dict() | {"spread": float(output.log_error.detach().std())}
 
 
 @torch.no_grad()
@@ -236,21 +246,26 @@ def _average(state: TrainingState, decay: float) -> None:
 
 def _log(
     state: TrainingState,
-    terms: LossTerms,
+    losses: dict[str, float],
     config: NanoTrainingConfig,
     progress: Callable[[TrainingProgress], None] | None,
 ) -> None:
-    for name, value in terms.to_dict().items():
+    for name, value in losses.items():
         state.running[name] = state.running.get(name, 0.0) + value
     if state.step % config.log_every_steps:
         return
-    losses = {name: value / config.log_every_steps for name, value in state.running.items()}
+    means = {name: value / config.log_every_steps for name, value in state.running.items()}
     state.running.clear()
-    state.history.append({"step": state.step, "cpu_s": round(state.cpu_s, 1), **losses})
+    state.history.append({"step": state.step, "cpu_s": round(state.cpu_s, 1), **means})
+    if state.step > ALIVE_AFTER_STEPS and means["spread"] < LEAST_SPREAD:
+        raise TrainingError(
+            f"the network says the same in every pixel at step {state.step}: the training stops, "
+            "its last checkpoint is kept; start again with a lower learning_rate"
+        )
     if progress:
         done = min(_share_done(state, config), 1.0)
         progress(
-            TrainingProgress(step=state.step, share_done=done, cpu_s=state.cpu_s, losses=losses)
+            TrainingProgress(step=state.step, share_done=done, cpu_s=state.cpu_s, losses=means)
         )
 
 

@@ -15,7 +15,7 @@ from lidarpainter_models.painter.candidates import (
     fill_push_pull,
     masked_blur,
 )
-from lidarpainter_models.painter.nano import NanoConfig, NanoNetwork
+from lidarpainter_models.painter.nano import NanoConfig, NanoNetwork, PixelNorm
 from lidarpainter_models.painter.nano_painter import NanoPainter
 
 SMALL = {"widths": (8, 8, 8), "blocks": (1, 1, 1)}
@@ -120,6 +120,31 @@ def test_residual_is_bounded(make_conditions):
     low = candidates.pictures.amin(dim=1) - config.residual_limit
     high = candidates.pictures.amax(dim=1) + config.residual_limit
     assert bool(((output.rgb >= low - 1e-6) & (output.rgb <= high + 1e-6)).all())
+
+
+def test_pixel_norm_brings_every_pixel_to_one():
+    features = 1e4 * torch.randn(2, 8, 5, 7, generator=torch.Generator().manual_seed(0))
+    size = PixelNorm(8)(features).square().mean(dim=1)
+    torch.testing.assert_close(size, torch.ones(2, 5, 7))
+    assert float(PixelNorm(8)(torch.zeros(1, 8, 2, 2)).detach().abs().max()) == 0
+
+
+def test_large_weights_cannot_blow_up_the_answer(make_conditions):
+    network = scrambled(NanoConfig(**SMALL))
+    with torch.no_grad():
+        for name, parameter in network.named_parameters():
+            if "head" not in name and "gain" not in name:
+                parameter.mul_(1e3)
+        batch = stack_conditions([make_conditions()], num_sources=2)
+        output = network(batch, ["clear"], half_precision=True)
+    assert bool(output.rgb.isfinite().all())
+    assert float(output.log_error.std()) > 0
+
+
+def test_settings_from_before_normalisation_mean_none():
+    settings = NanoConfig(**SMALL).to_dict()
+    del settings["normalise"]
+    assert not NanoConfig.from_dict(settings).normalise
 
 
 def test_unknown_prompt_is_refused_in_one_line(make_conditions):

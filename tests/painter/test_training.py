@@ -128,6 +128,15 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_checkpoint(make_pair, memo
     )
 
 
+def test_a_network_that_says_the_same_everywhere_is_noticed(make_pair, memory_pairs, monkeypatch):
+    monkeypatch.setattr("lidarpainter_models.painter.training.ALIVE_AFTER_STEPS", 0)
+    # at this rate nothing moves, and the first network knows no difference between pixels
+    config = replace(SHORT, learning_rate=1e-12)
+    with pytest.raises(TrainingError, match="same in every pixel at step 2") as caught:
+        train_nano([memory_pairs([make_pair(32)])], config)
+    assert "\n" not in str(caught.value)
+
+
 def test_a_checkpoint_of_another_training_is_refused(make_pair, memory_pairs, tmp_path):
     pairs = [make_pair(32)]
     config = replace(SHORT, steps=1)
