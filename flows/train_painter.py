@@ -24,7 +24,7 @@ from lidarpainter_models.evaluation.held_back import (
 )
 from lidarpainter_models.painter import OverlayPainter, UnpaintedPainter, WarpPainter
 from lidarpainter_models.painter.training import NanoTrainingConfig
-from lidarpainter_models.scenes.synthetic.config import SyntheticStreetConfig
+from lidarpainter_models.scenes.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
 from tasks.harvest import (
     PairSet,
     harvest_recorded,
@@ -62,8 +62,10 @@ class HarvestParameters(BaseModel):
 
     street_seeds: tuple[int, ...] = ()
     """Synthetic streets to draw and to harvest."""
-    street: SyntheticStreetConfig = SyntheticStreetConfig(seed=FIRST_TRAINING_SEED)
-    """What the streets have in common; each has its own seed."""
+    street: SyntheticStreetConfig = SyntheticStreetConfig(
+        seed=FIRST_TRAINING_SEED, width_px=640, height_px=360, cameras=DEFAULT_CAMERAS[:1]
+    )
+    """What the streets have in common; each has its own seed. The plans fit the front camera."""
     street_plans: tuple[StreetPlan, ...] = default_street_plans()
     scenes: tuple[str, ...] = ()
     """Stored scenes to harvest, `<dataset>/<sequence>`."""
