@@ -91,9 +91,8 @@ class PixelTerms(torch.autograd.Function):
             tensor.detach().contiguous().numpy()
             for tensor in (rgb, depth_m, alpha, sky_rgb, target, kind, lidar_m)
         ]
-        shown, by_alpha, by_depth, sky_term, depth_term, count = _forward(
-            *arrays, np.array(tolerances, np.float64)
-        )
+        arrays.append(np.array(tolerances, np.float64))
+        shown, by_alpha, by_depth, sky_term, depth_term, count = _forward(*arrays)
         ctx.kept = (arrays[2], arrays[3], by_alpha, by_depth, count, least_clear)
         return (
             torch.from_numpy(shown),

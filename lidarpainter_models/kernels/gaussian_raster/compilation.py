@@ -12,8 +12,9 @@ from typing import Any
 
 import numba
 
-_ENTRY = {"error_model": "numpy", "fastmath": {"contract"}, "forceinline": True}
-_INNER = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # never called from Python
+_ENTRY: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}, "forceinline": True}
+# never called from Python
+_INNER: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 EXACT = _ENTRY | _INNER
 """Code on single Gaussians: fused multiply-add, otherwise as written; divisions do not raise."""

@@ -98,6 +98,11 @@ def _compiled_view(view: SplatView) -> View:
     )
 
 
+def _pictures(tensors: tuple[Tensor, ...], light: np.ndarray) -> Pictures:
+    rgb, depth, alpha, features = map(_array, tensors)
+    return Pictures(rgb, depth, alpha, features, light)
+
+
 class _DrawGaussians(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> DrawnPictures:  # noqa: ANN401
@@ -107,22 +112,22 @@ class _DrawGaussians(torch.autograd.Function):
             records = project(gaussians, compiled_view)
             lists = list_tiles(records, view.width_px, view.height_px)
             drawn = blend(records, gaussians.features, lists, view.width_px, view.height_px)
-        pictures = [torch.from_numpy(picture) for picture in drawn[:4]]
+        rgb, depth_m, alpha, features = (torch.from_numpy(picture) for picture in drawn[:4])
         visible = torch.from_numpy(records[:, IS_VISIBLE] > 0.0)
         radius_px = torch.from_numpy(3.0 * records[:, SIGMA])
-        ctx.save_for_backward(*tensors, *pictures)
+        ctx.save_for_backward(*tensors, rgb, depth_m, alpha, features)
         ctx.mark_non_differentiable(visible, radius_px)
         ctx.view, ctx.records, ctx.lists, ctx.light = compiled_view, records, lists, drawn.light
         ctx.screen_gradient_out = screen_gradient_out
-        return (*pictures, visible, radius_px)
+        return rgb, depth_m, alpha, features, visible, radius_px
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *output_gradients: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         tensors, pictures = ctx.saved_tensors[:-4], ctx.saved_tensors[-4:]
         gaussians = _gaussians(tensors)
-        drawn = Pictures(*(_array(picture) for picture in pictures), ctx.light)
-        gradients = Pictures(*(_array(gradient) for gradient in output_gradients[:4]), ctx.light)
+        drawn = _pictures(pictures, ctx.light)
+        gradients = _pictures(output_gradients[:4], ctx.light)
         with ONE_AT_A_TIME:
             sums, to_features = gaussian_sums(
                 ctx.records, gaussians.features, ctx.lists, drawn, gradients

@@ -104,7 +104,7 @@ def _report_screen_gradient(
     def report(gradient: Tensor) -> None:
         del gradient
         if watched:
-            absolute = watched.pop().absgrad[0]
+            absolute = watched.pop().absgrad[0]  # type: ignore[attr-defined]  # gsplat adds it
             out.zero_()
             out[index] = torch.linalg.vector_norm(absolute, dim=1).to(out.dtype)
 

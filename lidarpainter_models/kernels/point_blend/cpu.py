@@ -43,6 +43,10 @@ def _divide(sums, totals):
                     sums[row, col, channel] /= total
 
 
+def _array(tensor: Tensor) -> np.ndarray:
+    return np.ascontiguousarray(tensor.detach().numpy(), np.float32)
+
+
 def blend_points(
     positions_uv: Tensor,
     depth_m: Tensor,
@@ -56,10 +60,16 @@ def blend_points(
     height_px, width_px = surface_depth_m.shape
     sums = np.zeros((height_px, width_px, attributes.shape[1]), np.float32)
     totals = np.zeros((height_px, width_px), np.float32)
-    arrays = [
-        np.ascontiguousarray(tensor.detach().numpy(), np.float32)
-        for tensor in (positions_uv, depth_m, attributes, surface_depth_m, weight, radius_px)
-    ]
-    _scatter(*arrays, np.float32(tolerance), sums, totals)
+    _scatter(
+        _array(positions_uv),
+        _array(depth_m),
+        _array(attributes),
+        _array(surface_depth_m),
+        _array(weight),
+        _array(radius_px),
+        np.float32(tolerance),
+        sums,
+        totals,
+    )
     _divide(sums, totals)
     return torch.from_numpy(sums), torch.from_numpy(totals)

@@ -4,6 +4,8 @@ Intersection after Moeller and Trumbore (1997), with the second barycentric boun
 parallelograms. Rays need no unit length: a hit at t is at origin + t * direction.
 """
 
+from typing import Any
+
 import numba
 import numpy as np
 
@@ -24,7 +26,7 @@ STACK_SIZE = 96
 NO_NODE = 1 << 30
 WORK_ROWS = STACK_SIZE + 2
 """Rows of a working space: the stack, then the last hit of nearest-hit and of any-hit rays."""
-RAY = {
+RAY: dict[str, Any] = {
     "cache": True,
     "error_model": "numpy",
     "fastmath": {"nsz", "arcp", "contract", "afn", "reassoc"},  # infinities keep their meaning
@@ -39,13 +41,15 @@ EDGE = 1e-6  # neighbours overlap by this much, so no ray slips between them
 
 
 @numba.njit(**INLINED)
-def _inverse(step: float) -> float:
+def _inverse(step: float) -> np.float32:
     """1 / step without infinities, which would meet zeros in `_enter`."""
     return np.float32(1.0 / step if abs(step) > 1e-12 else 1e12)
 
 
 @numba.njit(**INLINED)
-def _enter(bounds: np.ndarray, side: int, origin: tuple, inverse: tuple, limit: float) -> float:
+def _enter(
+    bounds: np.ndarray, side: int, origin: tuple, inverse: tuple, limit: np.float32
+) -> np.float32:
     """Where the ray enters a child's box, or `BEYOND`."""
     x1 = (bounds[side] - origin[0]) * inverse[0]
     x2 = (bounds[side + 3] - origin[0]) * inverse[0]
