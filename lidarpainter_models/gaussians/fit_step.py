@@ -178,7 +178,8 @@ def _step_poses(state: FitState, config: FitConfig) -> None:
         rate = _tangent_rate(
             rates.at("camera_rotation_rad", fraction), rates.at("camera_translation_m", fraction)
         )
-        state.camera_adam.step(scene.cameras.view_tangent, scene.cameras.view_tangent.grad, rate)
+        table = scene.cameras.view_tangent
+        state.camera_adam.step(table, _gradient(table), rate)
         scene.cameras.recentre(keep_mean=refinement.extrinsics)
     if refinement.actors and is_refined and scene.recorded_tracks:
         rate = _tangent_rate(
@@ -186,11 +187,11 @@ def _step_poses(state: FitState, config: FitConfig) -> None:
         )
         with torch.no_grad():
             table = scene.actors.tangent.view(-1, 6)
-            state.actor_adam.step(table, scene.actors.tangent.grad.view(-1, 6), rate)
+            state.actor_adam.step(table, _gradient(scene.actors.tangent).view(-1, 6), rate)
     if _fits_exposure(state, config):
         with torch.no_grad():
             rate = torch.full((12,), rates.at("exposure", fraction))
-            gradient = scene.exposure.matrix.grad.flatten(1)
+            gradient = _gradient(scene.exposure.matrix).flatten(1)
             if len(scene.exposure.camera_names) > 1:
                 gradient[0] = 0  # the reference: all cameras together would be free to drift
             state.exposure_adam.step(scene.exposure.matrix.view(-1, 12), gradient, rate)
@@ -202,6 +203,17 @@ def _wants_actor_term(state: FitState, config: FitConfig) -> bool:
     weights = config.losses
     is_due = state.step % weights.actors_every == 0
     return is_due and weights.actors > 0 and bool(state.scene.recorded_tracks)
+
+
+def _gradient(table: Tensor) -> Tensor:
+    """What the backward pass left.
+
+    Raises:
+        RuntimeError: it never reached this table.
+    """
+    if table.grad is None:
+        raise RuntimeError(f"no gradient reached a table of shape {tuple(table.shape)}")
+    return table.grad
 
 
 def _fits_exposure(state: FitState, config: FitConfig) -> bool:

@@ -117,19 +117,20 @@ class GaussianAdam:
             longer = log_scale.sum(dim=1, keepdim=True) - log_scale.amin(dim=1, keepdim=True)
             sigma_m = (longer / 2).exp()
             for name, parameter in gaussians.parameters().items():
-                if parameter.grad is None:
+                gradient = parameter.grad
+                if gradient is None:
                     continue
                 rate = self.rates.at(name, fraction)
                 if name == "means":
-                    self._step_scaled(parameter, rate, sigma_m)
+                    self._step_scaled(parameter, gradient, rate, sigma_m)
                 else:
-                    self._step_fused(name, parameter, rate)
+                    self._step_fused(name, parameter, gradient, rate)
                 parameter.grad = None
 
-    def _step_fused(self, name: str, parameter: Tensor, rate: float) -> None:
+    def _step_fused(self, name: str, parameter: Tensor, gradient: Tensor, rate: float) -> None:
         adam(
             [parameter],
-            [parameter.grad],
+            [gradient],
             [self.first[name]],
             [self.second[name]],
             [],
@@ -145,13 +146,17 @@ class GaussianAdam:
         )
 
     def _step_scaled(
-        self, means: Tensor, rate: float, sigma_m: Float[Tensor, "gaussians 1"]
+        self,
+        means: Tensor,
+        gradient: Tensor,
+        rate: float,
+        sigma_m: Float[Tensor, "gaussians 1"],
     ) -> None:
         self.steps["means"] += 1
         count = float(self.steps["means"])
         first, second = self.first["means"], self.second["means"]
-        first.lerp_(means.grad, 0.1)
-        second.mul_(0.99).addcmul_(means.grad, means.grad, value=0.01)
+        first.lerp_(gradient, 0.1)
+        second.mul_(0.99).addcmul_(gradient, gradient, value=0.01)
         spread = (second / (1 - 0.99**count)).sqrt_().add_(1e-15)
         means.addcdiv_(first * sigma_m, spread, value=-rate / (1 - 0.9**count))
 

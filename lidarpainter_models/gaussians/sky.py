@@ -92,7 +92,10 @@ class SkyTexture:
         self.weight += texel_weight
         if self.rgb.device.type == "cpu":
             sky_kernels.adam(
-                *(self._moments()[name].numpy() for name in ("rgb", "first", "second", "visits")),
+                self.rgb.numpy(),
+                self.first_moment.numpy(),
+                self.second_moment.numpy(),
+                self.visits.numpy(),
                 texel_gradient.numpy(),
                 texel_weight.numpy(),
                 learning_rate,
@@ -107,20 +110,13 @@ class SkyTexture:
 
     def clone(self) -> "SkyTexture":
         """A copy that shares no memory."""
-        return replace(self, **{name: value.clone() for name, value in self.tensors().items()})
+        tensors = {name: value.clone() for name, value in self.tensors().items()}
+        return SkyTexture(layout=self.layout, **tensors)
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything a checkpoint must keep besides the layout."""
         names = ("rgb", "weight", "first_moment", "second_moment", "visits")
         return {name: getattr(self, name) for name in names}
-
-    def _moments(self) -> dict[str, Tensor]:
-        return {
-            "rgb": self.rgb,
-            "first": self.first_moment,
-            "second": self.second_moment,
-            "visits": self.visits,
-        }
 
 
 def adam_reference(
