@@ -38,8 +38,8 @@ def _half_width(shape: CarShape, x: np.ndarray) -> np.ndarray:
 
 def _rings(shape: CarShape, stations: np.ndarray) -> np.ndarray:
     """Points (stations, ring, 3) from the left sill over the roof to the right sill."""
-    top = np.interp(stations, *zip(*shape.roof, strict=True))
-    belt = np.minimum(np.interp(stations, *zip(*shape.belt, strict=True)), top - 0.02)
+    top = np.interp(stations, *np.transpose(shape.roof))
+    belt = np.minimum(np.interp(stations, *np.transpose(shape.belt)), top - 0.02)
     width = _half_width(shape, stations)
     cabin = np.clip((top - belt - 0.1) / 0.35, 0, 1)
     roof_width = width * (0.93 - 0.2 * cabin)
@@ -80,8 +80,8 @@ def _add_shell(builder: MeshBuilder, shape: CarShape, atlas: CarAtlas, num_stati
     """The body between the two ends, the ends, and the floor."""
     half = shape.length_m / 2 - BULGE[-1][1]
     even = np.linspace(-half, half, num_stations)
-    corners = [x for x, _ in shape.roof if abs(x) < half]
-    stations = np.unique(np.concatenate([even, corners, shape.glass]))
+    bends = [x for x, _ in shape.roof if abs(x) < half]
+    stations = np.unique(np.concatenate([even, bends, shape.glass]))
     keep = np.concatenate([[True], np.diff(stations) > 0.02])
     rings = _closed(_rings(shape, stations[keep]))
     normals = _smooth_normals(rings)
@@ -122,13 +122,13 @@ def _add_wheels(builder: MeshBuilder, shape: CarShape, atlas: CarAtlas) -> None:
 def _add_trim(builder: MeshBuilder, shape: CarShape, atlas: CarAtlas) -> None:
     """Mirrors, door handles and licence plates."""
     x = shape.glass[3] - 0.22
-    belt = float(np.interp(x, *zip(*shape.belt, strict=True)))
+    belt = float(np.interp(x, *np.transpose(shape.belt)))
     width = float(_half_width(shape, np.array([x]))[0])
     for side in (-1.0, 1.0):
         centre = (x, side * (width + 0.0), belt + 0.07)
         add_box(builder, centre, (0.1, 0.16, 0.13), atlas.paint)
         for handle in shape.pillars[-2:]:
-            height = float(np.interp(handle, *zip(*shape.belt, strict=True))) - 0.13
+            height = float(np.interp(handle, *np.transpose(shape.belt))) - 0.13
             add_box(builder, (handle + 0.2, side * width, height), (0.2, 0.05, 0.03), atlas.chrome)
     half = shape.length_m / 2
     for end, face in ((-half - 0.012, "back"), (half + 0.012, "front")):

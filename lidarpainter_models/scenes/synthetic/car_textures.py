@@ -150,17 +150,17 @@ class _CarPainter:
 
     def _line(self, places: list[tuple[float, float]]) -> None:
         """A seam on the side."""
-        places = np.asarray(places, float)
-        uv = self.layout.side(places[:, 0], places[:, 1])
+        x, z = np.asarray(places, float).T
+        uv = self.layout.side(x, z)
         pixels = np.rint((uv * [self.columns, self.rows] - 0.5) * 16).astype(np.int32)
         shade = tuple(float(c) for c in self.paint * 0.35)
         cv2.polylines(self.colour, [pixels], False, shade, 1, cv2.LINE_AA, 4)
 
     def _roof(self, x: float) -> float:
-        return float(np.interp(x, *zip(*self.shape.roof, strict=True)))
+        return float(np.interp(x, *np.transpose(self.shape.roof)))
 
     def _belt(self, x: float) -> float:
-        return float(np.interp(x, *zip(*self.shape.belt, strict=True)))
+        return float(np.interp(x, *np.transpose(self.shape.belt)))
 
     def _draw_side(self) -> None:
         shape = self.shape

@@ -50,7 +50,7 @@ class EgoMotion:
         """Distance along the street."""
         return self.pace.travelled_m(time_s)
 
-    def world_from_ego(self, time_s: np.ndarray | float) -> np.ndarray:
+    def world_from_ego(self, time_s: np.ndarray) -> np.ndarray:
         """(n, 4, 4)."""
         swing = 2 * np.pi * self.sway_hz
         aside = self.sway_m * (1 - np.cos(swing * time_s))

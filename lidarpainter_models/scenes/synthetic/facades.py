@@ -52,7 +52,7 @@ def draw_style(rng: np.random.Generator) -> FacadeStyle:
     """A random building."""
     wall = WALL_KINDS[int(rng.integers(len(WALL_KINDS)))]
     colours = BRICK_COLOURS if wall == "brick" else STUCCO_COLOURS
-    colour = tuple(float(c) for c in np.array(colours[int(rng.integers(len(colours)))]) * 1.0)
+    colour = _colour(np.array(colours[int(rng.integers(len(colours)))]) * 1.0)
     ground: tuple[GroundFloor, ...] = ("shop", "shop", "shop", "gate", "homes")
     is_industrial = wall in ("brick", "panels") and rng.random() < 0.5
     window_width_m = rng.uniform(1.9, 2.8) if is_industrial else rng.uniform(0.95, 1.5)
@@ -60,7 +60,7 @@ def draw_style(rng: np.random.Generator) -> FacadeStyle:
         wall=wall,
         colour=colour,
         frame=FRAMES[int(rng.integers(len(FRAMES)))],
-        trim=tuple(float(c) for c in np.array([206, 200, 186]) * rng.uniform(0.35, 1.05)),
+        trim=_colour(np.array([206, 200, 186]) * rng.uniform(0.35, 1.05)),
         ground_floor=ground[int(rng.integers(len(ground)))],
         window_width_m=window_width_m,
         window_height_m=rng.uniform(1.6, 2.2),
@@ -68,6 +68,11 @@ def draw_style(rng: np.random.Generator) -> FacadeStyle:
         panes=(4, 4) if is_industrial else (2, int(rng.integers(1, 3))),
         is_glazed=bool(rng.random() < 0.14),
     )
+
+
+def _colour(values: np.ndarray) -> Colour:
+    red, green, blue = values.tolist()
+    return red, green, blue
 
 
 @dataclass(frozen=True, eq=False)

@@ -209,10 +209,8 @@ class StreetFurniture:
         lamps = {"red": (236, 44, 36), "yellow": (240, 180, 40), "green": (60, 232, 150)}
         for row, (name, colour) in enumerate(lamps.items()):
             lit = name == shows
-            dim = tuple(int(c * 0.28) for c in colour)
-            surface = self.plain(
-                colour if lit else dim, StreetClass.SIGN, emission=2.6 if lit else 0.0
-            )
+            red, green, blue = (c if lit else int(c * 0.28) for c in colour)
+            surface = self.plain((red, green, blue), StreetClass.SIGN, emission=2.6 if lit else 0.0)
             place = centre + 0.14 * front + (0.33 - 0.33 * row) * UP
             add_ball(self.builder, place, (0.05, 0.05, 0.12), surface, rows=8)
             add_tube(

@@ -1,5 +1,7 @@
 """The ground: road in painted stretches, kerbs, raised blocks with sidewalks, the cross street."""
 
+from functools import partial
+
 import numpy as np
 
 from lidarpainter_models.scenes.synthetic.ground_textures import (
@@ -146,7 +148,7 @@ def _add_block(
     start, end = stretch
     near, far = sides
     out = np.sign(near)
-    top = {"height_m": KERB_HEIGHT_M}
+    sheet = partial(_add_sheet, builder, plan, height_m=KERB_HEIGHT_M)
     inner_near = near + out * KERB_M
     inside = near + out * SIDEWALK_M
     meets_cross_at_end = end <= plan.cross_start_m
@@ -155,17 +157,19 @@ def _add_block(
     cut = corner + inward * KERB_M
     lot_edge = corner + inward * SIDEWALK_M
     other = start if meets_cross_at_end else end
-    _add_sheet(builder, plan, (start, end), (near, inner_near), kerb, **top)
-    _add_sheet(builder, plan, tuple(sorted((corner, cut))), (inner_near, far), kerb, **top)
-    tile = {"uv_m": SIDEWALK_TEXTURE_M, **top}
-    _add_sheet(builder, plan, tuple(sorted((cut, other))), (inner_near, inside), slabs, **tile)
-    _add_sheet(builder, plan, tuple(sorted((cut, lot_edge))), (inside, far), slabs, **tile)
-    inner = tuple(sorted((lot_edge, other)))
-    _add_sheet(builder, plan, inner, (inside, far), lot, uv_m=(16.0, 16.0), **top)
+    sheet((start, end), (near, inner_near), kerb)
+    sheet(_between(corner, cut), (inner_near, far), kerb)
+    sheet(_between(cut, other), (inner_near, inside), slabs, uv_m=SIDEWALK_TEXTURE_M)
+    sheet(_between(cut, lot_edge), (inside, far), slabs, uv_m=SIDEWALK_TEXTURE_M)
+    sheet(_between(lot_edge, other), (inside, far), lot, uv_m=(16.0, 16.0))
     _add_kerb_face(
         builder, plan, (np.linspace(start, end, round((end - start) / STEP_M) + 1), near), kerb
     )
     _add_kerb_face(builder, plan, (corner, np.linspace(near, far, 8)), kerb)
+
+
+def _between(one_m: float, other_m: float) -> tuple[float, float]:
+    return min(one_m, other_m), max(one_m, other_m)
 
 
 def _add_kerb_face(

@@ -136,7 +136,7 @@ class MeshBuilder:
         """A sheet through points (rows, columns, 3) with uv (rows, columns, 2), as triangles."""
         quads = [points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]]
         uvs = [uv[:-1, :-1], uv[:-1, 1:], uv[1:, 1:], uv[1:, :-1]]
-        normals = [None] * 4
+        normals = None
         if is_smooth:
             along = np.cross(np.gradient(points, axis=0), np.gradient(points, axis=1))
             along /= np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-12)
@@ -145,6 +145,6 @@ class MeshBuilder:
             corners = np.stack([quads[i] for i in order], axis=2).reshape(-1, 3, 3)
             place = np.stack([uvs[i] for i in order], axis=2).reshape(-1, 3, 2)
             chosen = None
-            if is_smooth:
+            if normals is not None:
                 chosen = np.stack([normals[i] for i in order], axis=2).reshape(-1, 3, 3)
             self.primitives(corners, place, surface, normals=chosen)

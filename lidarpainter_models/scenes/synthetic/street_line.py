@@ -62,7 +62,10 @@ class StreetLine:
         )
 
     def poses(
-        self, s_m: np.ndarray, d_m: np.ndarray | float, yaw_rad: np.ndarray | float = 0.0
+        self,
+        s_m: np.ndarray | float,
+        d_m: np.ndarray | float,
+        yaw_rad: np.ndarray | float = 0.0,
     ) -> np.ndarray:
         """world_from_body (n, 4, 4) of things that stand on the street and follow its slope.
 

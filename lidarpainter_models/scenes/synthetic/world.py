@@ -67,8 +67,13 @@ def pack_scene(
         roots.append(num_nodes)
         num_nodes += tree[0].shape[0]
         num_prims += tree[2].shape[0]
+    bounds, children, geometry, shading, owner = map(np.concatenate, zip(*trees, strict=True))
     arrays = layout.SceneArrays(
-        *(np.concatenate(parts) for parts in zip(*trees, strict=True)),
+        node_bounds=bounds,
+        node_children=children,
+        prim_geometry=geometry,
+        prim_shading=shading,
+        prim_index=owner,
         surface_value=value,
         surface_index=index,
         texels=texels,
