@@ -1,7 +1,7 @@
 """Rows of the catalog and their deterministic ids."""
 
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, Literal
@@ -115,6 +115,6 @@ def artefact_row(ref: ArtefactRef, manifest: Manifest) -> dict[str, Any]:
     }
 
 
-def metric_rows(records: Iterable[MetricRecord]) -> list[Mapping[str, Any]]:
+def metric_rows(records: Iterable[MetricRecord]) -> list[dict[str, Any]]:
     """Rows of many metrics."""
     return [record.row() for record in records]

@@ -153,8 +153,9 @@ def feature_distance_of(weights: Path | None) -> SqueezeNetDistance | None:
 
 def _trained_targets(painter: Painter) -> frozenset[str] | None:
     """What a painter was trained on; nothing for one that learns nothing, None if unknown."""
-    is_learned = isinstance(painter, NanoPainter)
-    return trained_targets(painter.provenance) if is_learned else frozenset()
+    if isinstance(painter, NanoPainter):
+        return trained_targets(painter.provenance)
+    return frozenset()
 
 
 def painting_rows(

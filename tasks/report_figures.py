@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from lidarpainter_models.export.report import Plot, Table
+from lidarpainter_models.export.report import Cell, Plot, Table
 from tasks.scores import SCORE_COLUMNS, SCORE_NOTE, score_rows
 from tasks.stages import StageResult
 from tasks.stored import load_history
@@ -14,7 +14,7 @@ GUIDANCE_COLUMNS = ("num_cameras", "num_without_room", "num_refused", "num_views
 
 def tables(result: Mapping[str, Any], stages: Mapping[str, StageResult]) -> list[Table]:
     """Scores, stages and painted views of a run."""
-    costs = [
+    costs: list[list[Cell]] = [
         [
             name,
             stage.seconds,

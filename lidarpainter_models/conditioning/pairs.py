@@ -119,14 +119,15 @@ class PairWriter:
             raise DataError(f"pair name {name!r} is taken or not letters, digits and ._+-")
         content = _encode(pair, provenance)
         height_px, width_px = pair.conditions.height_width_px
+        file_name = f"{name}.safetensors"
         entry = {
-            "file": f"{name}.safetensors",
+            "file": file_name,
             "height_px": height_px,
             "width_px": width_px,
             "sha256": hashlib.sha256(content).hexdigest(),
             "provenance": provenance,
         }
-        path = self.folder / entry["file"]
+        path = self.folder / file_name
         write_whole(path, content)
         index = {"format": PAIR_FORMAT, "pairs": [*self._pairs, entry]}
         write_whole(self.folder / INDEX_NAME, json.dumps(index, indent=1).encode())

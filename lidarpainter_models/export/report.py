@@ -18,6 +18,8 @@ PLOT_WIDTH, PLOT_HEIGHT = 460, 240
 PLOT_MARGIN = 46
 SERIES_COLOURS = ("#0b6e99", "#d1495b", "#5c8001", "#8f5db7")
 
+Cell = str | float | int | None
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Comparison:
@@ -38,7 +40,7 @@ class Table:
 
     title: str
     columns: Sequence[str]
-    rows: Sequence[Sequence[str | float | int | None]]
+    rows: Sequence[Sequence[Cell]]
     note: str = ""
 
 

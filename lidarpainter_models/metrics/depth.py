@@ -5,6 +5,7 @@ the points themselves (grown by a few pixels, since points are sparse) hides wha
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -41,9 +42,11 @@ def visible_points(
     pixels_uv, depth_m = camera.project(points_world.to(torch.float32))
     inside = camera.contains(pixels_uv, depth_m)
     pixels, depth_m = pixels_uv[inside].floor().to(torch.int32), depth_m[inside].contiguous()
-    size = {"height_px": camera.height_px, "width_px": camera.width_px}
-    nearest = splat_points(pixels, depth_m, **size, radius_px=0).reshape(-1)
-    front = splat_points(pixels, depth_m, **size, radius_px=OCCLUDER_RADIUS_PX).reshape(-1)
+    splat = partial(
+        splat_points, pixels, depth_m, height_px=camera.height_px, width_px=camera.width_px
+    )
+    nearest = splat(radius_px=0).reshape(-1)
+    front = splat(radius_px=OCCLUDER_RADIUS_PX).reshape(-1)
     hit = nearest >= 0
     own_m = depth_m[nearest[hit].long()]
     front_m = depth_m[front[hit].long()]
