@@ -48,8 +48,9 @@ class NanoConfig:
     """Warped pictures it looks at; missing ones count as invalid, further ones are left out."""
     residual_limit: float = 0.25
     """Largest change beyond the mix, in units of rgb: enough for a glint, too little to paint."""
-    base_logit: float = 9.0
-    """First logit of the base candidate: the others then move it by less than half a byte."""
+    base_logit: float = 2.5
+    """First logit of the base candidate: high enough to begin near it, low enough for the other
+    candidates to be learnt from (at 9 they hardly were)."""
     confidence_error: float = 0.05
     """Mean absolute error at which the confidence has fallen to 1/e."""
     prompts: tuple[str, ...] = (DEFAULT_PROMPT,)
