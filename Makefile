@@ -10,7 +10,7 @@ SYSTEM := $(VENV)/.system-libraries
 export OMP_WAIT_POLICY := passive
 export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba-cache
 
-.PHONY: demo test lint types slow bench clean
+.PHONY: demo test lint slow bench clean
 
 demo: $(INSTALLED) $(SYSTEM)
 	$(BIN)/lidarpainter demo --out demo
@@ -25,8 +25,6 @@ lint: $(INSTALLED) $(SYSTEM)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
-
-types: $(INSTALLED)
 	$(BIN)/mypy
 
 bench: $(INSTALLED)

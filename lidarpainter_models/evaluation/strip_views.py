@@ -6,6 +6,7 @@ from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.strips import StripView
 from lidarpainter_models.gaussians.observations import fit_camera, shrink_picture
 from lidarpainter_models.gaussians.scene_graph import GaussianScene
+from lidarpainter_models.geometry.transforms import invert_rigid
 
 
 def judging_cameras(held_out: HeldOut, fitted_cameras: Sequence[str]) -> tuple[str, ...]:
@@ -23,9 +24,10 @@ def strip_views(
 ) -> list[StripView]:
     """One camera's pictures at some frames, beside the fitted camera of the same frames.
 
-    The judging camera stands where the log says, at fit size; the fitted one where the fit found
-    it: at its own pose in training frames, between its neighbours' in others. Frames that one of
-    the two lacks, or that have no sweep, are left out.
+    The fitted camera stands where the fit found it: at its own pose in training frames, between
+    its neighbours' in others. The judging camera, at fit size, rides on the same rig: it stands
+    where the log says, moved as the fit moved the other camera, for the jitter of logged poses is
+    the rig's. Frames that one of the two lacks, or that have no sweep, are left out.
     """
     scene = held_out.scene
     judging = {view.frame_index: view for view in scene.views_of(judging_camera)}
@@ -35,7 +37,13 @@ def strip_views(
         if frame not in judging or frame not in fitting or not scene.sweeps_of(frame):
             continue
         own, other = judging[frame], fitting[frame]
+        logged = fit_camera(other, held_out.observation)
+        found = fitted.corrected_camera(
+            logged, timestamp_ns=other.timestamp_ns, camera_name=fitted_camera, key=other.key
+        )
+        found_from_logged = found.world_from_camera @ invert_rigid(logged.world_from_camera)
         camera = fit_camera(own, held_out.observation)
+        camera = camera.at(found_from_logged @ camera.world_from_camera)
         picture = shrink_picture(
             scene.read_image(own), width_px=camera.width_px, height_px=camera.height_px
         )
@@ -44,12 +52,7 @@ def strip_views(
                 camera=camera,
                 timestamp_ns=own.timestamp_ns,
                 truth_rgb=picture.float() / 255,
-                fitted_camera=fitted.corrected_camera(
-                    fit_camera(other, held_out.observation),
-                    timestamp_ns=other.timestamp_ns,
-                    camera_name=fitted_camera,
-                    key=other.key,
-                ),
+                fitted_camera=found,
                 points_world=held_out.points_at(own),
             )
         )

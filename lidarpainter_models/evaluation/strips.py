@@ -175,8 +175,9 @@ def calibrate_strip(
             f"no rotation under {MAX_ROTATION_RAD} rad explains the judging camera, got {best.x}"
         )
     affine = fit_affine_colour(turned_pixels(best.x), truth)
+    about_x, about_y, about_z = best.x.tolist()
     return StripCalibration(
-        rotation_rad=tuple(float(angle) for angle in best.x),
+        rotation_rad=(about_x, about_y, about_z),
         affine=tuple(tuple(float(value) for value in row) for row in affine),
     )
 

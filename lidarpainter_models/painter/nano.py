@@ -129,8 +129,8 @@ class ResidualBlock(nn.Module):
         self.before = PixelNorm(width) if normalise else nn.SiLU()
         self.first = nn.Conv2d(width, width, 3, padding=1)
         self.second = nn.Conv2d(width, width, 3, padding=1)
-        nn.init.zeros_(self.second.weight)
-        nn.init.zeros_(self.second.bias)
+        for parameter in self.second.parameters():
+            nn.init.zeros_(parameter)
 
     def forward(self, x: Tensor) -> Tensor:
         """Add the block's change to its input."""
@@ -163,9 +163,9 @@ class NanoNetwork(nn.Module):
     @torch.no_grad()
     def _start_as_base(self) -> None:
         """Zero the head; its biases choose the base candidate and expect an error of 0.03."""
-        for parameter in (self.head.weight, self.head.bias, self.prompt.weight):
+        for parameter in (*self.head.parameters(), self.prompt.weight):
             nn.init.zeros_(parameter)
-        bias = self.head.bias.view(-1, CELL_PX**2)
+        bias = self.head.get_parameter("bias").view(-1, CELL_PX**2)
         base = self.config.candidates.index(base_candidate(self.config.inputs))
         bias[base] = self.config.base_logit
         bias[-1] = -3.5

@@ -36,7 +36,9 @@ class NanoPainter:
             provenance: where its weights come from, as stored beside them.
             half_precision: run the convolutions in bfloat16.
         """
-        self.network = network.eval().requires_grad_(False).to(memory_format=torch.channels_last)
+        frozen = network.eval().requires_grad_(False)
+        # torch's stub lacks memory_format
+        self.network = frozen.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.provenance = provenance or {}
         self.half_precision = half_precision
 

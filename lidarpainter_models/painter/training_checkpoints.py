@@ -40,7 +40,8 @@ class TrainingState:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             network = NanoNetwork(config)
-        network = network.to(device=device, memory_format=torch.channels_last)
+        # torch's stub lacks memory_format
+        network = network.to(device=device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         averaged = deepcopy(network).requires_grad_(False)
         # the learning rate is set at every step
         optimiser = torch.optim.AdamW(network.parameters(), lr=0.0, betas=(0.9, 0.99))

@@ -93,6 +93,18 @@ def scene_of(gaussians, cameras, tracks=(), *, sky_rgb=SKY_RGB, timestamps_ns=No
     )
 
 
+def scene_trained_on(views):
+    """One Gaussian ahead of the given recorded views, which are the scene's training views."""
+    ahead = round_gaussians(torch.tensor([[8.0, 0.0, 1.0]]), torch.full((1, 3), 0.5), sigma_m=0.5)
+    scene = scene_of(ahead, [view.camera for view in views])
+    scene.cameras = CameraCorrections.none(
+        [view.key for view in views],
+        torch.tensor([view.timestamp_ns for view in views]),
+        torch.stack([view.camera.world_from_camera for view in views]),
+    )
+    return scene
+
+
 def map_points(xyz_m, rgb):
     """Coloured points of frame 0."""
     count = xyz_m.shape[0]

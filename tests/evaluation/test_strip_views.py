@@ -1,0 +1,57 @@
+"""Where the judging cameras stand."""
+
+import pytest
+import torch
+from gaussian_world import scene_trained_on
+from toy_street import ToyStreet
+
+from lidarpainter_models.evaluation.held_out import HeldOut
+from lidarpainter_models.evaluation.strip_views import judging_cameras, strip_views
+from lidarpainter_models.gaussians.observations import ObservationConfig
+from lidarpainter_models.geometry.transforms import rigid_from_tangent
+
+SIDE = ("front", 1.0), ("side", 0.8)
+MOTION = torch.tensor([0.0, 0.02, 0.01, 0.1, 0.0, 0.05], dtype=torch.float64)
+
+
+@pytest.fixture
+def street():
+    return ToyStreet(num_frames=3, camera_gains=SIDE)
+
+
+def held_out(street):
+    tests = tuple(view for view in street.views if view.frame_index == 1)
+    return HeldOut(scene=street, test_views=tests, observation=ObservationConfig(width_px=240))
+
+
+def fitted_to(street):
+    """A scene whose training views are the front camera's, at frames 0 and 2."""
+    views = [view for view in street.views if view.camera_name == "front" and view.frame_index != 1]
+    return scene_trained_on(views)
+
+
+def side_poses(street, fitted, frames):
+    views = strip_views(
+        held_out(street), fitted, judging_camera="side", fitted_camera="front", frames=frames
+    )
+    return [view.camera.world_from_camera for view in views]
+
+
+def test_only_cameras_that_no_fit_saw_judge(street):
+    assert judging_cameras(held_out(street), ("front",)) == ("side",)
+
+
+def test_uncorrected_fit_leaves_the_judging_camera_where_the_log_says(street):
+    poses = side_poses(street, fitted_to(street), (0, 1, 2))
+    recorded = [view.camera.world_from_camera for view in street.views_of("side")]
+    assert torch.allclose(torch.stack(poses), torch.stack(recorded), atol=1e-9)
+
+
+def test_judging_camera_rides_on_the_rig_that_the_fit_moved(street):
+    fitted = fitted_to(street)
+    fitted.cameras.view_tangent[:] = MOTION  # frames 0 and 2, so frame 1 between them as well
+    front, side = street.views_of("front")[1], street.views_of("side")[1]
+    moved = front.camera.world_from_camera @ rigid_from_tangent(MOTION)
+    world_motion = moved @ torch.linalg.inv(front.camera.world_from_camera)
+    for pose in side_poses(street, fitted, (0, 1, 2)):
+        assert torch.allclose(pose, world_motion @ side.camera.world_from_camera, atol=1e-6)
