@@ -14,6 +14,15 @@ from torch.optim.adam import adam
 
 from lidarpainter_models.gaussians.gaussian_set import PARAMETERS, GaussianSet
 
+LEAST_COLOUR_GRADIENT = 1e-7
+"""Adam's epsilon for colours. The loss is a mean over the picture, so a colour's gradient is the
+share of the picture that its Gaussian fills. One that the recorded views barely show gets less than
+a whole step: Adam's normalisation would drive its colour by noise, and from the next lane it is in
+full view. Shapes do not need it; there it costs sharpness.
+"""
+LEAST_SHAPE_GRADIENT = 1e-15
+COLOURS = ("sh_dc", "sh_rest")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LearningRates:
@@ -141,7 +150,7 @@ class GaussianAdam:
             beta2=0.99,
             lr=rate,
             weight_decay=0.0,
-            eps=1e-15,
+            eps=LEAST_COLOUR_GRADIENT if name in COLOURS else LEAST_SHAPE_GRADIENT,
             maximize=False,
         )
 
@@ -157,7 +166,7 @@ class GaussianAdam:
         first, second = self.first["means"], self.second["means"]
         first.lerp_(gradient, 0.1)
         second.mul_(0.99).addcmul_(gradient, gradient, value=0.01)
-        spread = (second / (1 - 0.99**count)).sqrt_().add_(1e-15)
+        spread = (second / (1 - 0.99**count)).sqrt_().add_(LEAST_SHAPE_GRADIENT)
         means.addcdiv_(first * sigma_m, spread, value=-rate / (1 - 0.9**count))
 
     def rebuild(self, kept: Int[Tensor, " kept"], num_added: int) -> None:

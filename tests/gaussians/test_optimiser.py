@@ -1,7 +1,12 @@
 import torch
 from gaussian_world import round_gaussians
 
-from lidarpainter_models.gaussians.optimiser import GaussianAdam, LearningRates, RowAdam
+from lidarpainter_models.gaussians.optimiser import (
+    LEAST_COLOUR_GRADIENT,
+    GaussianAdam,
+    LearningRates,
+    RowAdam,
+)
 
 
 def two_gaussians():
@@ -70,3 +75,13 @@ def test_rows_without_gradient_do_not_drift():
     assert torch.allclose(table[1], torch.tensor([-0.1, 0.2]).double())
     assert float(table[[0, 2]].abs().max()) == 0
     assert adam.count.tolist() == [0, 1, 0]
+
+
+def test_colour_that_is_hardly_seen_moves_less_than_one_that_is():
+    gaussians = two_gaussians()
+    before = gaussians.sh_dc.detach().clone()
+    gradient = torch.tensor([LEAST_COLOUR_GRADIENT / 10, LEAST_COLOUR_GRADIENT * 100])
+    gaussians.sh_dc.grad = gradient[:, None, None].expand(-1, 1, 3).clone()
+    GaussianAdam(gaussians, LearningRates(sh_dc=(0.01, 0.01))).step(gaussians, 0.0)
+    moved = (before - gaussians.sh_dc.detach())[:, 0, 0]
+    assert torch.allclose(moved, torch.tensor([0.01 / 11, 0.01 * 100 / 101]), rtol=1e-3)
