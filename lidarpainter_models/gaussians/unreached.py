@@ -18,6 +18,7 @@ from lidarpainter_models.gaussians.observations import TrainingView
 from lidarpainter_models.gaussians.plane_sweep import choose_depth, sweep_cost, sweep_depths
 from lidarpainter_models.gaussians.scene_graph import GaussianScene
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation
+from lidarpainter_models.scenes.ground_heights import GroundHeights
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,6 +37,8 @@ class UnreachedConfig:
     """Nearer things are within every LiDAR's reach."""
     farthest_m: float = 800.0
     """Beyond it a lane's width moves nothing by a pixel."""
+    most_below_ground_m: float = 1.0
+    """Deeper ones are dropped; roads fall away further than the LiDAR sees them."""
     num_depths: int = 24
     """Depths tried."""
     prior: float = 0.03
@@ -53,6 +56,8 @@ def unreached_gaussians(
 ) -> GaussianSet:
     """Gaussians that close the clear places of the training views which are not sky."""
     found = GaussianSet.empty(sh_degree=scene.gaussians.sh_degree)
+    street = scene.gaussians.means[scene.gaussians.body_index == 0].detach()
+    ground = GroundHeights(street, least_points=2)
     cameras = sorted({view.key[1] for view in views})
     chosen = [
         (view, of_camera)
@@ -65,7 +70,7 @@ def unreached_gaussians(
         share = rest // (len(chosen) - done)
         grown = scene.with_gaussians(scene.gaussians.append(found))
         seeds = _seeds_of_view(grown, view, of_camera, config, budget=share)
-        found = found.append(seeds)
+        found = found.append(_above_ground(seeds, ground, config))
     return found
 
 
@@ -96,6 +101,15 @@ def _seeds_of_view(
     grid = torch.zeros_like(is_open)
     grid[stride // 2 :: stride, stride // 2 :: stride] = True
     return _facing_discs(view, depth_m, is_open & grid, stride, config, scene.gaussians)
+
+
+def _above_ground(
+    seeds: GaussianSet, ground: GroundHeights, config: UnreachedConfig
+) -> GaussianSet:
+    """Without those that a gap in the road let through to the underworld."""
+    height_m = ground.around(seeds.means[:, :2])
+    is_below = seeds.means[:, 2] < height_m - config.most_below_ground_m
+    return seeds.select((~is_below).nonzero()[:, 0])
 
 
 def depth_from_below(

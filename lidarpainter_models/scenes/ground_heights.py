@@ -6,8 +6,12 @@ in glass and water).
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 from torch import Tensor
+
+NEIGHBOURS = 24
+OUTLIER_M = 0.2
 
 
 class GroundHeights:
@@ -39,6 +43,28 @@ class GroundHeights:
         found = torch.searchsorted(self._cells, keys).clamp(max=self._cells.numel() - 1)
         is_known = self._cells[found] == keys
         return torch.where(is_known, self._height_m[found].to(xy_m), torch.nan)
+
+    def around(self, xy_m: Float[Tensor, "points 2"]) -> Float[Tensor, " points"]:
+        """Ground z interpolated from the nearest known cells; NaN only if none is known.
+
+        Of these, cells that rise over their lower quartile hold no ground (a car's bumper).
+        """
+        has_height = ~self._height_m.isnan()
+        known_m = self._height_m[has_height].float()
+        if known_m.numel() == 0 or xy_m.shape[0] == 0:
+            return torch.full_like(xy_m[:, 0], torch.nan)
+        tree = cKDTree(self._centres(self._cells[has_height]).numpy())
+        count = min(NEIGHBOURS, known_m.numel())
+        distance_m, nearest = tree.query(xy_m.numpy(), k=[*range(1, count + 1)])
+        z = known_m[torch.from_numpy(nearest)]
+        is_ground = z <= z.quantile(0.25, dim=1, keepdim=True) + OUTLIER_M
+        weight = is_ground / (torch.from_numpy(distance_m).float() + 0.1 * self._cell_m) ** 2
+        return (weight * z).sum(dim=1) / weight.sum(dim=1)
+
+    def _centres(self, cells: Int[Tensor, " cells"]) -> Float[Tensor, "cells 2"]:
+        row = (cells + (1 << 30)) % (1 << 31) - (1 << 30)
+        column = (cells - row) // (1 << 31)
+        return (torch.stack([column, row], dim=1).float() + 0.5) * self._cell_m
 
     def _keys(self, xy_m: Float[Tensor, "points 2"]) -> Tensor:
         column, row = (xy_m / self._cell_m).floor().long().unbind(-1)

@@ -101,3 +101,38 @@ def test_sky_and_covered_places_ask_for_nothing():
     wall = round_gaussians(wall_m, torch.rand(2400, 3), sigma_m=0.3)
     covered = scene_of(wall, cameras)
     assert len(unreached_gaussians(covered, views, UnreachedConfig(), budget=100)) == 0
+
+
+def test_nothing_is_put_under_the_ground():
+    """A gap in the road is clear and no sky; what is seen through it would be far below."""
+    camera = camera_at(0.0, width_px=96, height_px=64)
+    x, y = torch.meshgrid(torch.arange(2.0, 40, 0.5), torch.arange(-12.0, 12, 0.5), indexing="ij")
+    road = torch.stack([x, y, torch.zeros_like(x)], dim=-1).reshape(-1, 3)
+    road = road[(road[:, 0] < 3) | (road[:, 0] > 12)]  # the gap
+    gaussians = round_gaussians(road, torch.full_like(road, 0.4), sigma_m=0.3)
+    cameras = [camera.at(pose) for pose in _poses_ahead(camera, 3)]
+    pictures = [torch.full((64, 96, 3), 0.4) for _ in cameras]
+    views = [
+        TrainingView(
+            key=(index, "front"),
+            camera=one,
+            timestamp_ns=index * FRAME_NS,
+            rgb_u8=(picture * 255).to(torch.uint8),
+            sky_mask=torch.arange(64)[:, None].expand(64, 96) < 34,
+            lidar_depth_m=torch.zeros(64, 96),
+        )
+        for index, (one, picture) in enumerate(zip(cameras, pictures, strict=True))
+    ]
+    scene = scene_of(gaussians, cameras)
+    put = unreached_gaussians(scene, views, UnreachedConfig(), budget=500)
+    all_put = unreached_gaussians(
+        scene, views, UnreachedConfig(most_below_ground_m=1e6), budget=500
+    )
+    assert float(all_put.means[:, 2].min()) < -1.5
+    assert len(put) == 0 or float(put.means[:, 2].min()) > -1.2
+
+
+def _poses_ahead(camera, count):
+    poses = camera.world_from_camera.repeat(count, 1, 1)
+    poses[:, 0, 3] += 0.3 * torch.arange(count)
+    return poses
