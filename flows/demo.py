@@ -1,6 +1,5 @@
 """The built-in synthetic street through the whole pipeline."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,6 @@ DEMO_SEED = 1
 """Kept apart from the seeds that painters are trained and tested on."""
 DEMO_CAMERAS = DEFAULT_CAMERAS[:1]
 """The front camera alone: minutes on a CPU."""
-DEMO_STEPS = 1500
-"""A street without noise in its poses is fitted sooner than a real log."""
 
 
 def demo_street() -> SyntheticStreetConfig:
@@ -28,8 +25,7 @@ def demo_street() -> SyntheticStreetConfig:
 
 def demo_parameters() -> ReconstructParameters:
     """The preview preset on that street."""
-    chosen = preview(f"synthetic/street-{DEMO_SEED:04d}")
-    return chosen.model_copy(update={"fit": replace(chosen.fit, steps=DEMO_STEPS)})
+    return preview(f"synthetic/street-{DEMO_SEED:04d}")
 
 
 @flow(name="demo")

@@ -8,7 +8,7 @@ from lidarpainter_models.conditioning.conditions import ConditionConfig
 from lidarpainter_models.conditioning.novel_guidance import NovelGuidanceConfig
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.scene_scores import ScoringConfig
-from lidarpainter_models.gaussians.fit_config import FitConfig, GuidanceConfig
+from lidarpainter_models.gaussians.fit_config import FitConfig, GuidanceConfig, continuation
 from lidarpainter_models.gaussians.observations import ObservationConfig
 
 SHORT_REFINE_STEPS = 500
@@ -27,7 +27,7 @@ def preview(scene: str) -> ReconstructParameters:
         novel=NovelGuidanceConfig(),
         conditions=ConditionConfig(),
         rounds=1,
-        refine=continued(fit, steps=SHORT_REFINE_STEPS, guidance=GuidanceConfig()),
+        refine=continuation(fit, steps=SHORT_REFINE_STEPS, guidance=GuidanceConfig()),
         scoring=ScoringConfig(),
     )
 
@@ -45,7 +45,7 @@ def balanced(scene: str) -> ReconstructParameters:
         novel=NovelGuidanceConfig(),
         conditions=ConditionConfig(),
         rounds=2,
-        refine=continued(fit, steps=3_000, guidance=GuidanceConfig()),
+        refine=continuation(fit, steps=3_000, guidance=GuidanceConfig()),
         scoring=ScoringConfig(),
     )
 
@@ -63,7 +63,7 @@ def paper(scene: str) -> ReconstructParameters:
         novel=NovelGuidanceConfig(every_nth=1),
         conditions=ConditionConfig(),
         rounds=1,
-        refine=continued(fit, steps=23_000, guidance=guidance),
+        refine=continuation(fit, steps=23_000, guidance=guidance),
         scoring=ScoringConfig(),
     )
 
@@ -85,14 +85,3 @@ def preset(name: str, scene: str) -> ReconstructParameters:
         return PRESETS[name](scene)
     except KeyError:
         raise ConfigError(f"no preset {name!r}, expected one of {', '.join(PRESETS)}") from None
-
-
-def continued(fit: FitConfig, *, steps: int, guidance: GuidanceConfig) -> FitConfig:
-    """Settings that go on where a fit ended: full pictures, poses free from the first step."""
-    return replace(
-        fit,
-        steps=steps,
-        half_resolution=0.0,
-        guidance=guidance,
-        refinement=replace(fit.refinement, start_step=0),
-    )

@@ -5,7 +5,7 @@ far tower. Pose corrections step only when their view is drawn (a dense Adam wou
 on momentum for the dozen steps in between). Rates fall exponentially over the fit.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
@@ -55,13 +55,6 @@ class LearningRates:
         """The rate of one kind after a fraction of the fit."""
         first, last = getattr(self, name)
         return first * (last / first) ** min(max(fraction, 0.0), 1.0)
-
-    def lowered(self) -> "LearningRates":
-        """Rates for going on: from the geometric mean of first and last to the last."""
-        pairs = {field.name: getattr(self, field.name) for field in fields(self)}
-        return LearningRates(
-            **{name: ((first * last) ** 0.5, last) for name, (first, last) in pairs.items()}
-        )
 
 
 class RowAdam:
