@@ -10,7 +10,7 @@ from flows.parameters import ReconstructParameters
 from flows.presets import preview
 from flows.reconstruct import reconstruct
 from lidarpainter_models.scenes.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
-from tasks.harvest import keep_street
+from tasks.harvest import keep_street, street_id
 
 DEMO_SEED = 1
 """Kept apart from the seeds that painters are trained and tested on."""
@@ -18,14 +18,14 @@ DEMO_CAMERAS = DEFAULT_CAMERAS[:1]
 """The front camera alone: minutes on a CPU."""
 
 
-def demo_street() -> SyntheticStreetConfig:
-    """The street of the demo."""
-    return SyntheticStreetConfig(seed=DEMO_SEED, width_px=640, height_px=360, cameras=DEMO_CAMERAS)
+def demo_street(seed: int = DEMO_SEED) -> SyntheticStreetConfig:
+    """The street of the demo, or another one of its kind."""
+    return SyntheticStreetConfig(seed=seed, width_px=640, height_px=360, cameras=DEMO_CAMERAS)
 
 
-def demo_parameters() -> ReconstructParameters:
+def demo_parameters(seed: int = DEMO_SEED) -> ReconstructParameters:
     """The preview preset on that street."""
-    return preview(f"synthetic/street-{DEMO_SEED:04d}")
+    return preview(street_id(seed))
 
 
 @flow(name="demo")

@@ -13,6 +13,13 @@ REPORT_NAME = "report.html"
 
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the report and the store.")] = Path("demo"),
+    seed: Annotated[
+        int, typer.Option(min=0, max=999, help="Which street; painters train on other seeds.")
+    ] = 1,
+    painter: Annotated[
+        str | None,
+        typer.Option(help="none, overlay, warp, nano, or weights; the preset's if absent."),
+    ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="Any setting: fit.steps=500. May be repeated."),
@@ -25,10 +32,13 @@ def demo(
     from flows.cli.reconstruct import show
     from flows.cli.running import run_demo
     from flows.demo import demo_parameters
-    from flows.overrides import with_overrides
+    from flows.overrides import with_changes, with_overrides
 
-    parameters = with_overrides(demo_parameters(), settings or [])
-    result = run_demo(parameters, open_store(out / "store"))
+    parameters = demo_parameters(seed)
+    if painter is not None:
+        parameters = with_changes(parameters, {"painter": painter})
+    parameters = with_overrides(parameters, settings or [])
+    result = run_demo(parameters, seed, open_store(out / "store"))
     report = out.absolute() / REPORT_NAME
     with storage_errors(f"cannot write {report}"):
         shutil.copyfile(result["report"], report)

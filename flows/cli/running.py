@@ -19,12 +19,12 @@ def run_reconstruction(parameters: ReconstructParameters, store: Store) -> dict[
         return reconstruct(parameters, store.root)
 
 
-def run_demo(parameters: ReconstructParameters, store: Store) -> dict[str, Any]:
-    """Make the demo's street in the store and reconstruct it."""
+def run_demo(parameters: ReconstructParameters, seed: int, store: Store) -> dict[str, Any]:
+    """Make the street of a seed in the store and reconstruct it."""
     from flows.demo import demo, demo_street
 
     with _running(store):
-        return demo(demo_street(), parameters, store.root)
+        return demo(demo_street(seed), parameters, store.root)
 
 
 @contextmanager
