@@ -8,10 +8,14 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED_ENVIRONMENT = "LIDARPAINTER_SHARED"
+
+settings.register_profile("shared machine", deadline=None)  # time says nothing on a busy core
+settings.load_profile("shared machine")
 
 
 def checked_modules() -> list[str]:
