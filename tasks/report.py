@@ -97,9 +97,10 @@ def _comparisons(store: Store, inputs: ReportInputs) -> list[Comparison]:
 
 def _summary(inputs: ReportInputs) -> str:
     result = inputs.result
+    rounds = "1 round" if result["rounds"] == 1 else f"{result['rounds']} rounds"
     return (
         f"Preset {result['preset']}, painter {result['painter']}, split {result['split']}, "
-        f"{result['num_gaussians']} Gaussians. Painted means: after {result['rounds']} rounds of "
+        f"{result['num_gaussians']} Gaussians. Painted means: after {rounds} of "
         "painting shifted views and fitting on with them."
     )
 
