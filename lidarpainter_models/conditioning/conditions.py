@@ -12,14 +12,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.conditioning.lidar_images import LidarImageConfig, render_lidar
+from lidarpainter_models.conditioning.lidar_images import (
+    LidarImage,
+    LidarImageConfig,
+    render_lidar,
+)
 from lidarpainter_models.conditioning.moving_boxes import MovingBoxes
 from lidarpainter_models.conditioning.references import WarpTarget, warped_references
+from lidarpainter_models.conditioning.surface_depth import SurfaceDepthConfig, surface_depth
 from lidarpainter_models.conditioning.warping import SourcePicture, WarpConfig, source_cost_m
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.calibration import ViewKey
 from lidarpainter_models.gaussians.observations import TrainingView
-from lidarpainter_models.gaussians.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.scene_graph import GaussianScene, SceneRender
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT, PaintingConditions
 from lidarpainter_models.scenes.lidar_map import LidarMap
@@ -34,6 +39,7 @@ class ConditionConfig:
     num_sources: int = 6
     """Recorded pictures they are patched together from: the nearest, then ever sparser ones."""
     lidar: LidarImageConfig = field(default_factory=LidarImageConfig)
+    surface: SurfaceDepthConfig = field(default_factory=SurfaceDepthConfig)
     warp: WarpConfig = field(default_factory=WarpConfig)
 
     def __post_init__(self) -> None:
@@ -87,6 +93,7 @@ class ConditionBuilder:
         if key not in self._sources:
             view, camera = self._views[key], self._cameras[key]
             render = self.scene.render(camera, view.timestamp_ns)
+            lidar = self._lidar(camera, view.timestamp_ns)
             # the sky mask knows better than the render where there is sky; what else is clear in
             # the render is drawn by the sky too, so it stands at infinity in both views
             self._sources[key] = SourcePicture(
@@ -94,7 +101,7 @@ class ConditionBuilder:
                 camera=camera,
                 timestamp_ns=view.timestamp_ns,
                 rgb=self._without_exposure(view.rgb, key[1]),
-                depth_m=torch.where(view.sky_mask, 0.0, render.depth_m),
+                depth_m=torch.where(view.sky_mask, 0.0, self._surface_m(render, lidar, camera)),
                 alpha=torch.where(view.sky_mask, 0.0, render.alpha),
             )
         return self._sources[key]
@@ -142,12 +149,15 @@ class ConditionBuilder:
             prompt: Passed on to the painter.
         """
         render = self.scene.render(camera, timestamp_ns)
-        lidar = render_lidar(
-            self.lidar_map, self.tracks, camera, timestamp_ns, config=self.config.lidar
-        )
+        lidar = self._lidar(camera, timestamp_ns)
         is_sky = (render.alpha < self.config.warp.sky_alpha) & (lidar.depth_m == 0)
         references = warped_references(
-            WarpTarget(camera, timestamp_ns, [render.depth_m, lidar.depth_m], is_sky),
+            WarpTarget(
+                camera,
+                timestamp_ns,
+                [self._surface_m(render, lidar, camera), lidar.depth_m],
+                is_sky,
+            ),
             self.sources_for(camera, timestamp_ns, exclude=exclude),
             self._boxes,
             count=self.config.num_references,
@@ -166,6 +176,19 @@ class ConditionBuilder:
             warp_valid=references.valid,
             prompt=prompt,
         )
+
+    def _lidar(self, camera: Camera, timestamp_ns: int) -> LidarImage:
+        """What the LiDAR knows of a view."""
+        return render_lidar(
+            self.lidar_map, self.tracks, camera, timestamp_ns, config=self.config.lidar
+        )
+
+    def _surface_m(
+        self, render: SceneRender, lidar: LidarImage, camera: Camera
+    ) -> Float[Tensor, "height width"]:
+        """The best known depth of a view."""
+        focal_px = (camera.fx_px + camera.fy_px) / 2
+        return surface_depth(render.depth_m, lidar.depth_m, focal_px, self.config.surface)
 
     def _without_exposure(
         self, rgb: Float[Tensor, "height width 3"], camera_name: str

@@ -80,7 +80,7 @@ def default_street_plans() -> tuple[StreetPlan, ...]:
     """A fit stopped early, one nearly done, and one that has to look ahead of what it saw."""
     return (
         StreetPlan(fit=weak_fit(300), num_views=14),
-        StreetPlan(fit=weak_fit(1200, budget=80_000)),
+        StreetPlan(fit=weak_fit(1200, budget=80_000), num_views=36),
         StreetPlan(fit=weak_fit(700, budget=70_000), split="forward:17:8", num_views=16),
     )
 
