@@ -41,7 +41,13 @@ from tasks.judge_painter import (
 )
 from tasks.scenes import SplitSpec
 from tasks.stages import StageResult
-from tasks.train_painter import publish_painter, train, training_record, weights_path
+from tasks.train_painter import (
+    first_weights,
+    publish_painter,
+    train,
+    training_record,
+    weights_path,
+)
 
 SYNTHETIC = "synthetic/"
 UNLEARNED = (UnpaintedPainter.name, OverlayPainter.name, WarpPainter.name)
@@ -81,6 +87,8 @@ class TrainPainterParameters(HarvestParameters):
 
     pair_folders: tuple[Path, ...] = ()
     """Pairs that were harvested before."""
+    start: Path | None = None
+    """Weights to go on from, a name or a file; None starts from nothing."""
     training: NanoTrainingConfig = NanoTrainingConfig()
     held_back: float = 0.1
     """Share of the true pictures that are kept from training, to judge by."""
@@ -111,7 +119,9 @@ def train_painter(parameters: TrainPainterParameters, store_path: Path) -> dict[
     check_sources(parameters)
     harvested = _harvested(parameters, store_path)
     sets = (*(made for made, _ in harvested), *named_sets(parameters.pair_folders))
-    trained = train(store_path, "train", sets, parameters.training, parameters.held_back)
+    trained = train(
+        store_path, "train", sets, parameters.training, parameters.held_back, parameters.start
+    )
     scores = None
     if parameters.held_back > 0:
         weights = weights_path(trained.ref)
@@ -154,11 +164,14 @@ def check_sources(parameters: TrainPainterParameters) -> None:
     """Refuse to train on nothing, or on what judges painters.
 
     Raises:
-        ConfigError: no source of pairs, or a street whose seed is kept for judging.
+        ConfigError: no source of pairs, a street whose seed is kept for judging, or first weights
+            that do not say what they have learnt.
         DataError: a folder holds no pairs.
-        WeightsError: the weights for the feature distance cannot be used.
+        WeightsError: the first weights, or those for the feature distance, cannot be used.
     """
     feature_distance_of(parameters.feature_weights)
+    if parameters.start is not None:
+        first_weights(parameters.start)
     if not (parameters.street_seeds or parameters.scenes or parameters.pair_folders):
         raise ConfigError("nothing to train on: expected street seeds, scenes or folders of pairs")
     for seed in parameters.street_seeds:

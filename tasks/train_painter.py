@@ -4,7 +4,7 @@ Training is a stage like any other: keyed on the pairs and every setting, resume
 checkpoint when it was killed.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,18 @@ from catalog.artefacts import ArtefactRef, Workplace
 from catalog.digests import DIGEST_LENGTH, canonical_json, digest_file, finite_or_none
 from catalog.store import open_store
 from lidarpainter_models.conditioning.pairs import PairFolder
+from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.held_back import (
     TARGETS_KEY,
     PairSubset,
     check_training_pairs,
     hold_back,
+    trained_targets,
 )
+from lidarpainter_models.painter import load_painter
+from lidarpainter_models.painter.nano_painter import NanoPainter
 from lidarpainter_models.painter.training import NanoTrainingConfig, TrainingProgress, train_nano
+from lidarpainter_models.painter.training_checkpoints import training_digest
 from lidarpainter_models.painter.weights import save_weights
 from lidarpainter_models.scenes.readers.pandaset import LICENCE as PANDASET_LICENCE
 from tasks.harvest import PairSet
@@ -49,16 +54,30 @@ def train(
     sets: Sequence[PairSet],
     config: NanoTrainingConfig,
     held_back: float,
+    start: Path | None = None,
 ) -> StageResult:
     """Train on all pairs but those held back.
 
+    Args:
+        store_path: the store.
+        stage: its name for the listener.
+        sets: pairs to learn from and to judge by.
+        config: the recipe.
+        held_back: share of the true pictures kept to judge by.
+        start: weights to go on from, a name or a file; None starts from nothing.
+
     Raises:
-        ConfigError: pairs of a street that is kept for judging, or nothing left to learn from.
+        ConfigError: pairs of a street that is kept for judging, nothing left to learn from, or
+            first weights that have learnt what is held back.
+        WeightsError: the first weights cannot be used.
     """
     folders = open_sets(sets)
     for folder in folders.values():
         check_training_pairs(folder)
     learnt, judged = hold_back(folders, held_back)
+    first = None if start is None else first_weights(start)
+    if first is not None:
+        _check_unknown(first, judged)
 
     def told(progress: TrainingProgress) -> None:
         loss = progress.losses.get("total")
@@ -69,7 +88,11 @@ def train(
         for folder in folders.values():
             folder.verify()
         result = train_nano(
-            list(learnt.values()), config, checkpoint_folder=place.scratch, progress=told
+            list(learnt.values()),
+            config,
+            start=None if first is None else first.network,
+            checkpoint_folder=place.scratch,
+            progress=told,
         )
         licence, attribution = _terms(folders.values())
         record = {
@@ -80,17 +103,25 @@ def train(
             **result.record,
         }
         provenance = _provenance(record, learnt.values())
+        if first is not None:
+            record["started_from"] = provenance["started_from"] = _origin(first)
+            provenance[TARGETS_KEY] = sorted(
+                {*provenance[TARGETS_KEY], *(trained_targets(first.provenance) or ())}
+            )
         save_weights(
             result.network, place.output / WEIGHTS_FILE, licence=licence, provenance=provenance
         )
         write_json(place.output / RECORD_FILE, record)
         return {key: record[key] for key in ("num_pairs", "steps", "cpu_s")}
 
+    inputs = {f"pairs {name}": subset.digest for name, subset in learnt.items()}
+    if first is not None:
+        inputs["first weights"] = training_digest({}, [], first.network)[:DIGEST_LENGTH]
     return run_stage(
         open_store(store_path),
         stage=stage,
         kind="painter",
-        inputs={f"pairs {name}": subset.digest for name, subset in learnt.items()},
+        inputs=inputs,
         config={"training": config.to_dict(), "held_back": held_back},
         build=build,
     )
@@ -132,6 +163,35 @@ def training_record(trained: ArtefactRef, scores: dict[str, Any] | None) -> dict
     """How a painter was trained and what it reached on the pairs held back."""
     record = read_json(trained.folder / RECORD_FILE)
     return finite_or_none(record | {"held_back_scores": scores})
+
+
+def first_weights(start: Path) -> NanoPainter:
+    """The painter that a training goes on from.
+
+    Raises:
+        ConfigError: it learns nothing, or does not say what it has learnt.
+        WeightsError: there is no such painter, or its file cannot be used.
+    """
+    painter = load_painter(start)
+    if not isinstance(painter, NanoPainter) or trained_targets(painter.provenance) is None:
+        raise ConfigError(f"{start}: expected a trained painter that says what it has learnt")
+    return painter
+
+
+def _check_unknown(first: NanoPainter, judged: Mapping[str, PairSubset]) -> None:
+    """What judges a training must be new to the weights it goes on from."""
+    known = trained_targets(first.provenance) or frozenset()
+    seen = sorted(known & frozenset().union(*(subset.targets for subset in judged.values())))
+    if seen:
+        raise ConfigError(
+            f"the first weights have learnt {len(seen)} of the targets held back ({seen[0]})"
+        )
+
+
+def _origin(first: NanoPainter) -> dict[str, Any]:
+    """Which weights a training went on from."""
+    kept = ("training_digest", "num_pairs", "steps", "cpu_s", "pairs", "licence", "started_from")
+    return {key: first.provenance[key] for key in kept if key in first.provenance}
 
 
 def _provenance(record: dict[str, Any], learnt: Iterable[PairSubset]) -> dict[str, Any]:

@@ -71,6 +71,9 @@ def train(  # noqa: PLR0913 - the options of a command
     ] = None,
     budget: Budget = None,
     steps: Steps = None,
+    start: Annotated[
+        Path | None, typer.Option(help="Go on from these weights: nano, or a .safetensors file.")
+    ] = None,
     inputs: Annotated[
         str, typer.Option(help="What the painter may see, with commas between.")
     ] = "render,lidar,warp",
@@ -90,10 +93,14 @@ def train(  # noqa: PLR0913 - the options of a command
     from flows.overrides import with_overrides
 
     parameters = train_parameters(
-        parse_seeds(seeds), scenes, split, cameras, parse_paths(pairs, "--pairs")
+        parse_seeds(seeds), scenes, split, cameras, parse_paths(pairs, "--pairs"), start
     )
     training = with_length(parameters.training, parse_inputs(inputs), budget, steps)
-    changes = {"training": training, "held_back": held_back, "feature_weights": feature_weights}
+    changes = {
+        "training": training,
+        "held_back": held_back,
+        "feature_weights": feature_weights,
+    }
     parameters = with_overrides(parameters.model_copy(update=changes), settings or [])
     result = run_training(parameters)
     if out is not None:

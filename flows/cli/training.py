@@ -48,12 +48,14 @@ def train_parameters(
     split: str,
     cameras: str | None,
     pair_folders: tuple[Path, ...],
+    start: Path | None = None,
 ) -> TrainPainterParameters:
     """What to train on; refused before any work begins.
 
     Raises:
         ConfigError: nothing, or what judges painters.
         DataError: a folder holds no pairs.
+        WeightsError: the first weights cannot be used.
     """
     parameters = TrainPainterParameters(
         street_seeds=seeds,
@@ -61,6 +63,7 @@ def train_parameters(
         split=split,
         cameras=parse_names(cameras),
         pair_folders=pair_folders,
+        start=start,
     )
     check_sources(parameters)
     return parameters

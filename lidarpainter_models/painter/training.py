@@ -104,6 +104,7 @@ def train_nano(
     sources: Sequence[PairSource],
     config: NanoTrainingConfig,
     *,
+    start: NanoNetwork | None = None,
     checkpoint_folder: Path | None = None,
     progress: Callable[[TrainingProgress], None] | None = None,
     device: torch.device = CPU,
@@ -113,19 +114,21 @@ def train_nano(
     Args:
         sources: sets of pairs; at least one pair in all.
         config: the whole recipe.
+        start: weights to go on from; None starts from nothing.
         checkpoint_folder: where checkpoints are kept; None keeps none.
         progress: called at every entry of the history.
         device: where the network runs.
 
     Raises:
         DataError: no pairs, or a damaged pair.
-        ConfigError: shares that do not fit the sources, or a checkpoint of another training.
+        ConfigError: shares that do not fit the sources, first weights of another network, or a
+            checkpoint of another training.
         TrainingError: the loss is no longer finite or the network has died; the last checkpoint
             stays as it was.
     """
     shares = _source_shares(sources, config)
-    digest = training_digest(config.to_dict(), [source.digest for source in sources])
-    state = TrainingState.start(config.network, config.seed, device)
+    digest = training_digest(config.to_dict(), [source.digest for source in sources], start)
+    state = TrainingState.start(config.network, config.seed, device, start)
     path = checkpoint_folder / "training.pt" if checkpoint_folder else None
     if path and path.exists():
         read_checkpoint(path, state, digest)

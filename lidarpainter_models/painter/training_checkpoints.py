@@ -35,11 +35,24 @@ class TrainingState:
     history: list[dict[str, float]] = field(default_factory=list)
 
     @classmethod
-    def start(cls, config: NanoConfig, seed: int, device: torch.device) -> "TrainingState":
-        """First weights; they follow from the seed and leave the global generator as it was."""
+    def start(
+        cls, config: NanoConfig, seed: int, device: torch.device, weights: NanoNetwork | None = None
+    ) -> "TrainingState":
+        """First weights: those given, or such as follow from the seed alone.
+
+        Raises:
+            ConfigError: the weights given belong to another network.
+        """
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             network = NanoNetwork(config)
+        if weights is not None:
+            if weights.config != config:
+                raise ConfigError(
+                    f"cannot start a network {config.to_dict()} from the weights of "
+                    f"{weights.config.to_dict()}"
+                )
+            network.load_state_dict(weights.state_dict())
         # torch's stub lacks memory_format
         network = network.to(device=device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         averaged = deepcopy(network).requires_grad_(False)
@@ -48,11 +61,17 @@ class TrainingState:
         return cls(network=network, averaged=averaged, optimiser=optimiser)
 
 
-def training_digest(config: dict[str, Any], pair_digests: Sequence[str]) -> str:
-    """SHA-256 of the settings that shape the weights, and of the pairs."""
+def training_digest(
+    config: dict[str, Any], pair_digests: Sequence[str], start: NanoNetwork | None = None
+) -> str:
+    """SHA-256 of the settings that shape the weights, of the pairs, and of the first weights."""
     shaping = {key: value for key, value in config.items() if key != "checkpoint_every_s"}
     text = json.dumps([shaping, list(pair_digests)], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
+    digest = hashlib.sha256(text.encode())
+    if start is not None:
+        for tensor in start.state_dict().values():
+            digest.update(tensor.cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def write_checkpoint(path: Path, state: TrainingState, digest: str) -> None:

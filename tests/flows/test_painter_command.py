@@ -71,6 +71,8 @@ def test_seeds_may_be_listed_and_ranged():
         (["train", "--seeds", "1000", "--inputs", "radar"], "inputs must be of"),
         (["train", "--seeds", "1000", "--inputs", "warp"], "warps the render"),
         (["train", "--pairs", "/nowhere"], "no training pairs in /nowhere"),
+        (["train", "--pairs", "/nowhere", "--start", "warp"], "expected a trained painter"),
+        (["train", "--seeds", "1000", "--start", "gone.safetensors"], "no painter weights at"),
         (["harvest"], "nothing to harvest"),
         (["harvest", "--scene", "toy/street", "--set", "harvest.wrong=1"], "no setting"),
         (["info", "--painter", "picasso"], "no painter 'picasso'"),

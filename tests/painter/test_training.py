@@ -12,7 +12,7 @@ from lidarpainter_models.painter.augmentation import (
     batch_pairs,
     draw_batch,
 )
-from lidarpainter_models.painter.nano import NanoConfig
+from lidarpainter_models.painter.nano import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.nano_painter import NanoPainter
 from lidarpainter_models.painter.render_damage import damage_render, random_blobs
 from lidarpainter_models.painter.training import NanoTrainingConfig, train_nano
@@ -150,6 +150,24 @@ def test_a_damaged_checkpoint_is_one_clear_line(make_pair, memory_pairs, tmp_pat
     with pytest.raises(DataError, match="not a readable training checkpoint") as caught:
         train_nano([memory_pairs([make_pair(32)])], SHORT, checkpoint_folder=tmp_path)
     assert "\n" not in str(caught.value)
+
+
+def test_a_training_may_go_on_from_weights(make_pair, memory_pairs):
+    source = memory_pairs([make_pair(32, seed) for seed in range(4)])
+    first = train_nano([source], SHORT)
+    still = train_nano([source], replace(SHORT, learning_rate=1e-12), start=first.network)
+    for name, tensor in still.network.state_dict().items():
+        torch.testing.assert_close(tensor, first.network.state_dict()[name])
+    digests = {first.record["training_digest"], still.record["training_digest"]}
+    from_nothing = train_nano([source], replace(SHORT, learning_rate=1e-12))
+    assert from_nothing.record["training_digest"] not in digests
+
+
+def test_weights_of_another_network_are_no_start(make_pair, memory_pairs):
+    source = memory_pairs([make_pair(32)])
+    other = NanoNetwork(replace(SHORT.network, residual_limit=0.5))
+    with pytest.raises(ConfigError, match="cannot start a network"):
+        train_nano([source], SHORT, start=other)
 
 
 def test_shares_must_fit_the_sources(make_pair, memory_pairs):
