@@ -99,7 +99,8 @@ def judge_held_back(
         ConfigError: none were held back.
     """
     folders = open_sets(sets)
-    _, judged = hold_back(folders, held_back)
+    known = _trained_targets(load_painter(weights)) or frozenset()
+    _, judged = hold_back(folders, held_back, known=known)
     if not judged:
         raise ConfigError("no pairs were held back, so there is nothing to judge by")
     inputs = {"painter": digest_file(weights)[:DIGEST_LENGTH]}

@@ -4,7 +4,7 @@ Training is a stage like any other: keyed on the pairs and every setting, resume
 checkpoint when it was killed.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -68,16 +68,14 @@ def train(
 
     Raises:
         ConfigError: pairs of a street that is kept for judging, nothing left to learn from, or
-            first weights that have learnt what is held back.
+            first weights that do not say what they have learnt.
         WeightsError: the first weights cannot be used.
     """
     folders = open_sets(sets)
     for folder in folders.values():
         check_training_pairs(folder)
-    learnt, judged = hold_back(folders, held_back)
     first = None if start is None else first_weights(start)
-    if first is not None:
-        _check_unknown(first, judged)
+    learnt, judged = hold_back(folders, held_back, known=_learnt_by(first))
 
     def told(progress: TrainingProgress) -> None:
         loss = progress.losses.get("total")
@@ -105,9 +103,7 @@ def train(
         provenance = _provenance(record, learnt.values())
         if first is not None:
             record["started_from"] = provenance["started_from"] = _origin(first)
-            provenance[TARGETS_KEY] = sorted(
-                {*provenance[TARGETS_KEY], *(trained_targets(first.provenance) or ())}
-            )
+            provenance[TARGETS_KEY] = sorted({*provenance[TARGETS_KEY], *_learnt_by(first)})
         save_weights(
             result.network, place.output / WEIGHTS_FILE, licence=licence, provenance=provenance
         )
@@ -178,14 +174,10 @@ def first_weights(start: Path) -> NanoPainter:
     return painter
 
 
-def _check_unknown(first: NanoPainter, judged: Mapping[str, PairSubset]) -> None:
-    """What judges a training must be new to the weights it goes on from."""
-    known = trained_targets(first.provenance) or frozenset()
-    seen = sorted(known & frozenset().union(*(subset.targets for subset in judged.values())))
-    if seen:
-        raise ConfigError(
-            f"the first weights have learnt {len(seen)} of the targets held back ({seen[0]})"
-        )
+def _learnt_by(first: NanoPainter | None) -> frozenset[str]:
+    """The targets that the first weights know."""
+    known = None if first is None else trained_targets(first.provenance)
+    return known or frozenset()
 
 
 def _origin(first: NanoPainter) -> dict[str, Any]:

@@ -138,7 +138,7 @@ def check_training_pairs(folder: PairFolder) -> None:
 
 
 def hold_back(
-    folders: Mapping[str, PairFolder], share: float
+    folders: Mapping[str, PairFolder], share: float, *, known: Set[str] = frozenset()
 ) -> tuple[dict[str, PairSubset], dict[str, PairSubset]]:
     """Part the pairs into those to learn from and those to judge by; no target is in both.
 
@@ -148,6 +148,7 @@ def hold_back(
     Args:
         folders: pairs by name.
         share: part of the targets to hold back, in [0, 1).
+        known: targets learnt before: of those held back they judge nothing.
 
     Returns:
         Pairs to learn from and pairs to judge by, by name; empty sets are left out.
@@ -165,7 +166,8 @@ def hold_back(
     learnt = without_targets(folders, held)
     judged = {}
     for name, folder in folders.items():
-        indices = [index for index in range(len(folder)) if target_of(folder, index) in held]
+        judges = held - known
+        indices = [index for index in range(len(folder)) if target_of(folder, index) in judges]
         if indices:
             judged[name] = PairSubset(folder, name, indices)
     if folders and not learnt:

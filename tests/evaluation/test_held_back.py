@@ -143,3 +143,12 @@ def test_pairs_of_a_street_that_judges_never_train(make_folder):
     bad = make_folder("bad", [1], dataset="synthetic", sequence="street-0007")
     with pytest.raises(ConfigError, match="street seed 7 is kept"):
         check_training_pairs(bad)
+
+
+def test_what_was_learnt_before_judges_nothing_and_is_still_not_learnt(make_folder):
+    folders = {"log": make_folder("log", range(10))}
+    learnt, judged = hold_back(folders, 0.3)
+    known = sorted(judged["log"].targets)[0]
+    again, rest = hold_back(folders, 0.3, known={known})
+    assert again["log"].targets == learnt["log"].targets
+    assert rest["log"].targets == judged["log"].targets - {known}

@@ -197,3 +197,15 @@ def test_ablate_puts_all_variants_beside_the_rules(make_pairs):
     assert {one["total"]["num_pairs"] for one in found["painters"].values()} == {2}
     lidar_only = load_weights(Path(found["weights"]["lidar"]))
     assert lidar_only.network.config.inputs == {"lidar"}
+
+
+def test_a_painter_is_trained_on_from_its_weights(make_pairs, tmp_path, capsys):
+    first, then = tmp_path / "first.safetensors", tmp_path / "then.safetensors"
+    words = ["painter", "train", "--steps", "2", "--held-back", "0.25", "--json", *SMALL_TRAINING]
+    assert main([*words, "--pairs", make_pairs("a", range(4)), "--out", str(first)]) == 0
+    words += ["--pairs", make_pairs("b", range(4, 8)), "--start", str(first)]
+    assert main([*words, "--out", str(then)]) == 0
+    record = json.loads(then.with_suffix(".json").read_text("utf-8"))
+    assert record["started_from"]["steps"] == 2
+    learnt = [load_weights(path).provenance["trained_targets"] for path in (first, then)]
+    assert set(learnt[0]) < set(learnt[1])
