@@ -12,9 +12,10 @@ a comparison gives a mask for `choose`.
 import operator
 from typing import Any
 
+import numba
 import numpy as np
 from llvmlite import ir
-from numba import extending, njit, types
+from numba import extending, types
 from numba.core import cgutils
 from numba.extending import models, overload, register_model
 
@@ -305,7 +306,7 @@ def prefetch(typingctx, array, first):
     return types.void(array, first), generate
 
 
-@njit(**EXACT)
+@numba.njit(**EXACT)
 def lane_array(size: int) -> np.ndarray:
     """Room for float32 that begins where a cache line does: other lanes take twice as long."""
     room = np.empty(size + LANES, np.float32)
