@@ -108,14 +108,12 @@ def raster_figures(machine, size, repeats):
             value=forward_ms,
             unit="ms",
             floor=forward_floor,
-            limit=4.0,
         ),
         Figure(
             name="gaussian_raster.backward",
             value=step_ms - forward_ms,
             unit="ms",
             floor=backward_floor,
-            limit=4.0,
         ),
         Figure(
             name="gaussian_raster.lanes_per_blend",

@@ -63,20 +63,18 @@ def _starts(counts: np.ndarray) -> np.ndarray:
 
 @numba.njit(cache=True)
 def _splat_band(
-    points: np.ndarray,
-    pixels_uv: np.ndarray,
+    discs: np.ndarray,
     depth_m: np.ndarray,
-    radius_px: np.ndarray,
     rows: tuple[int, int],
     nearest_m: np.ndarray,
     winner: np.ndarray,
 ) -> None:
     """Draw the points of a band into its rows."""
     width_px = winner.shape[1]
-    for point in points:
-        z = depth_m[point]
-        u, v, r = pixels_uv[point, 0], pixels_uv[point, 1], radius_px[point]
-        limit = r * (r + 1)
+    for place in range(len(depth_m)):
+        z = depth_m[place]
+        point, u, v, r = discs[place, 0], discs[place, 1], discs[place, 2], discs[place, 3]
+        limit = np.int64(r) * (np.int64(r) + 1)
         for row in range(max(v - r, rows[0]), min(v + r + 1, rows[1])):
             rest = limit - (row - v) * (row - v)
             for column in range(max(u - r, 0), min(u + r + 1, width_px)):
@@ -103,17 +101,24 @@ def _splat(
             for band in range(first, end):
                 counts[run, band] += 1
     band_first = _starts(counts)
-    listed = np.empty(band_first[-1], np.int32)
+    # what a band needs lies side by side, or each band would drag all points through the cache
+    discs, depths_m = (
+        np.empty((band_first[-1], 4), np.int32),
+        np.empty(band_first[-1], depth_m.dtype),
+    )
     for run in numba.prange(RUNS):
         for point in range(run * count // RUNS, (run + 1) * count // RUNS):
             u, v, r = pixels_uv[point, 0], pixels_uv[point, 1], radius_px[point]
             first, end = _bands_of(v, r, u, depth_m[point], height_px, width_px)
             for band in range(first, end):
-                listed[counts[run, band]] = point
+                place = counts[run, band]
                 counts[run, band] += 1
+                discs[place, 0], discs[place, 1], discs[place, 2] = point, u, v
+                discs[place, 3] = r
+                depths_m[place] = depth_m[point]
     for band in numba.prange(bands):
         rows = (band * BAND_ROWS, min((band + 1) * BAND_ROWS, height_px))
         nearest_m = np.full((rows[1] - rows[0], width_px), np.inf, dtype=depth_m.dtype)
-        points = listed[band_first[band] : band_first[band + 1]]
-        _splat_band(points, pixels_uv, depth_m, radius_px, rows, nearest_m, winner)
+        first, end = band_first[band], band_first[band + 1]
+        _splat_band(discs[first:end], depths_m[first:end], rows, nearest_m, winner)
     return winner
