@@ -28,7 +28,7 @@ lint: $(INSTALLED) $(SYSTEM)
 	$(BIN)/mypy
 
 bench: $(INSTALLED)
-	$(BIN)/python tests/benchmarks/bench_gaussian_raster.py
+	$(BIN)/python tests/benchmarks/suite.py
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

@@ -3,7 +3,10 @@
 What the user has set stays as it is.
 """
 
+import math
 import os
+import tempfile
+from pathlib import Path
 
 PREFECT = {
     "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "120",
@@ -21,7 +24,50 @@ QUIET = {"PREFECT_LOGGING_LEVEL": "CRITICAL"}
 """Errors reach the user as one line of ours, not as Prefect's traceback."""
 
 
-def prepare_environment(*, is_quiet: bool) -> None:
-    """Set what Prefect, OpenMP and numba read at import."""
-    for name, value in {**PREFECT, **THREADS, **(QUIET if is_quiet else {})}.items():
+CPU_LIMIT = Path("/sys/fs/cgroup/cpu.max")
+"""Quota and period in microseconds, where a container has one."""
+
+
+def prepare_environment(*, is_quiet: bool, sequences_at_once: int = 1) -> None:
+    """Set what Prefect, OpenMP and numba read at import.
+
+    Args:
+        is_quiet: whether Prefect keeps its log lines to itself.
+        sequences_at_once: processes like this one that share the machine; each gets its share of
+            the cores, so that together they run no more threads than there are.
+    """
+    threads = str(max(usable_cores() // sequences_at_once, 1))
+    counts = {"NUMBA_NUM_THREADS": threads, "OMP_NUM_THREADS": threads}
+    for name, value in {**PREFECT, **THREADS, **counts, **(QUIET if is_quiet else {})}.items():
         os.environ.setdefault(name, value)
+    if not _has_cache_folder():
+        # a fresh private folder: compiled code is unpickled, nobody else may put it there
+        os.environ.setdefault("NUMBA_CACHE_DIR", tempfile.mkdtemp(prefix="lidarpainter-numba-"))
+
+
+def usable_cores(cpu_limit: Path = CPU_LIMIT) -> int:
+    """Cores that this process may run on: its affinity, and a container's quota rounded up."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    try:
+        quota, period = cpu_limit.read_text("ascii").split()
+    except (OSError, ValueError):
+        quota, period = "max", "1"
+    if quota != "max":
+        cores = min(cores or 1, math.ceil(int(quota) / int(period)))
+    return max(cores or 1, 1)
+
+
+def _has_cache_folder() -> bool:
+    """Whether numba can keep compiled code beside the sources or in the user's cache."""
+    package = Path(__file__).resolve().parents[1] / "lidarpainter_models" / "kernels"
+    user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "numba"
+    return _can_write(package / "__pycache__") or _can_write(user)
+
+
+def _can_write(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False

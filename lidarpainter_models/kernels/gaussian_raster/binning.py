@@ -1,11 +1,11 @@
 """Sort visible Gaussians by depth and list, for every screen tile, those that reach it.
 
 A Gaussian is listed in a tile only if its ellipse alpha >= 1/255 crosses the tile's pixel centres
-row band by row band ("AccuTile" of Hanson et al. 2025, "Speedy-Splat"). The lists are filled in
-depth order by counting, so they need no sort of their own. Compiled code.
+row band by row band ("AccuTile" of Hanson et al. 2025, "Speedy-Splat"), and with the rows that the
+ellipse reaches inside the tile's columns. The lists are filled in depth order by counting, so they
+need no sort of their own. Compiled code.
 """
 
-import math
 from typing import NamedTuple
 
 import numba
@@ -13,26 +13,20 @@ import numpy as np
 
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import TILE_PX
 from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry
-from lidarpainter_models.kernels.gaussian_raster.projection import (
-    ACROSS,
-    ALONG,
-    DEPTH,
-    HALF_HEIGHT,
-    HALF_WIDTH,
-    IS_VISIBLE,
-    MEAN_X,
-    MEAN_X_FRACTION,
-    MEAN_Y,
-    MEAN_Y_FRACTION,
-    SHEAR,
+from lidarpainter_models.kernels.gaussian_raster.projection import CHUNKS, DEPTH, IS_VISIBLE
+from lidarpainter_models.kernels.gaussian_raster.screen_ellipses import (
+    ellipse_of,
+    rows_in_tile,
+    tile_box,
+    tile_columns,
 )
 from lidarpainter_models.kernels.gaussian_raster.work_sharing import jump_of
 
 RUNS = 16
 """The depth order is cut into this many runs that are listed independently of each other."""
 RADIX_BITS = 11
-ROUNDING_PX = 1e-3
-"""Slack of the ellipse test; what it lets in too much fails the exact test of the pixel."""
+REACHES = TILE_PX * TILE_PX
+"""A tile and the reach inside it are found as one number, tile times this plus reach."""
 
 
 class TileLists(NamedTuple):
@@ -44,20 +38,44 @@ class TileLists(NamedTuple):
     """(tiles + 1): entries of tile t are `tile_first[t] : tile_first[t + 1]`, nearest first."""
     gaussian: np.ndarray
     """(entries): index of the Gaussian."""
-    order: np.ndarray
-    """(visible): indices of the visible Gaussians, nearest first."""
-    entry_first: np.ndarray
-    """(visible + 1): where the entries of the Gaussian at a place in `order` begin in `entry`."""
+    reach: np.ndarray
+    """(entries): rows of the tile that it reaches, see `first_row_of` and `end_row_of`."""
+    own: np.ndarray
+    """(gaussians, 2): where a Gaussian's entries begin and end in `entry`."""
     entry: np.ndarray
-    """(entries): numbers of the entries, Gaussian by Gaussian, tiles in reading order."""
+    """Numbers of the entries, Gaussian by Gaussian with gaps, tiles in reading order."""
 
 
 @numba.njit(**EXACT)
-def depth_order(records: np.ndarray) -> np.ndarray:
+def first_row_of(reach: int) -> int:
+    """First row of a tile in an entry's reach."""
+    return reach // TILE_PX
+
+
+@numba.njit(**EXACT)
+def end_row_of(reach: int) -> int:
+    """One past the last row of a tile in an entry's reach."""
+    return reach % TILE_PX + 1
+
+
+@numba.njit(**EXACT)
+def _count_boxes(
+    records: np.ndarray, first: int, end: int, grid: tuple[int, int], own: np.ndarray
+) -> int:
+    """Tiles that each Gaussian's bounding box touches; returns how many Gaussians are visible."""
+    visible = 0
+    for index in range(first, end):
+        own[index, 1] = 0
+        if records[index, IS_VISIBLE] > 0.0:
+            box = tile_box(records[index], grid[0], grid[1])
+            own[index, 1] = max(box[1] - box[0], 0) * max(box[3] - box[2], 0)
+            visible += 1
+    return visible
+
+
+@numba.njit(**EXACT)
+def _depth_order(records: np.ndarray, count: int) -> np.ndarray:
     """Indices of the visible Gaussians by depth; equal depths keep the order of their index."""
-    count = 0
-    for index in range(len(records)):
-        count += records[index, IS_VISIBLE] > 0.0
     order = np.empty(count, np.int32)
     depth = np.empty(count, np.float32)
     place = 0
@@ -93,104 +111,58 @@ def _radix_sorted(keys: np.ndarray, order: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(**EXACT)
-def _tile_span(low_px: float, high_px: float, tiles: int) -> tuple[int, int]:
-    """First and one past the last tile whose pixel centres lie between two positions."""
-    first = math.ceil(max(low_px - ROUNDING_PX, 0.0) - 0.5)
-    last = math.floor(min(high_px + ROUNDING_PX, tiles * TILE_PX + 0.0) - 0.5)
-    return int(first) // TILE_PX, min(int(last) // TILE_PX + 1, tiles)
-
-
-@numba.njit(**EXACT)
-def _reach_across(record: np.ndarray, y_low: float, y_high: float) -> tuple[float, float]:
-    """Leftmost and rightmost offset from the centre of the ellipse between two row offsets."""
-    half_height = np.float64(record[HALF_HEIGHT])
-    half_width = np.float64(record[HALF_WIDTH])
-    across, along = np.float64(record[ACROSS]), np.float64(record[ALONG])
-    shear = np.float64(record[SHEAR])
-    y_low, y_high = max(y_low, -half_height), min(y_high, half_height)
-    reach = along * half_height * half_height
-    # the row offset of the rightmost point; the leftmost lies opposite
-    tip = -shear * half_height * half_height / half_width
-    y = min(max(tip, y_low), y_high)
-    right = -shear * y + math.sqrt(max(reach - along * y * y, 0.0) / across)
-    y = min(max(-tip, y_low), y_high)
-    left = -shear * y - math.sqrt(max(reach - along * y * y, 0.0) / across)
-    return left, right
-
-
-@numba.njit(**EXACT)
-def _centre_of(record: np.ndarray) -> tuple[float, float]:
-    x = np.float64(record[MEAN_X]) + record[MEAN_X_FRACTION]
-    return x, np.float64(record[MEAN_Y]) + record[MEAN_Y_FRACTION]
-
-
-@numba.njit(**EXACT)
-def _tile_box(record: np.ndarray, columns: int, rows: int) -> tuple[int, int, int, int]:
-    """Tile columns and rows (first, end, first, end) that a Gaussian's bounding box covers."""
-    x, y = _centre_of(record)
-    first_column, end_column = _tile_span(x - record[HALF_WIDTH], x + record[HALF_WIDTH], columns)
-    first_row, end_row = _tile_span(y - record[HALF_HEIGHT], y + record[HALF_HEIGHT], rows)
-    return first_column, end_column, first_row, end_row
-
-
-@numba.njit(**EXACT)
-def _tile_columns(
-    record: np.ndarray, row: int, columns: int, box: tuple[int, int, int, int]
-) -> tuple[int, int]:
-    """First and one past the last tile column a Gaussian reaches in a tile row."""
-    if box[1] - box[0] <= 1 or box[3] - box[2] <= 1:
-        return box[0], box[1]  # the box is as tight as the ellipse
-    x, y = _centre_of(record)
-    top = row * TILE_PX + 0.5 - y
-    left, right = _reach_across(record, top, top + TILE_PX - 1.0)
-    return _tile_span(x + left, x + right, columns)
+def _find_run(
+    records: np.ndarray,
+    first: int,
+    end: int,
+    grid: tuple[int, int],
+    own: np.ndarray,
+    found: np.ndarray,
+) -> None:
+    """Write the tiles of each Gaussian and its reach in them where its entries will stand."""
+    for index in range(first, end):
+        if records[index, IS_VISIBLE] > 0.0:
+            record = records[index]
+            position = own[index, 0]
+            box = tile_box(record, grid[0], grid[1])
+            ellipse = ellipse_of(record)
+            for row in range(box[2], box[3]):
+                columns = tile_columns(ellipse, row, grid[0], box)
+                for column in range(columns[0], columns[1]):
+                    first_row, end_row = rows_in_tile(ellipse, row, column, box)
+                    if first_row < end_row:
+                        reach = first_row * TILE_PX + end_row - 1
+                        found[position] = (row * grid[0] + column) * REACHES + reach
+                        position += 1
+            own[index, 1] = position
 
 
 @numba.njit(**EXACT)
 def _count_run(
-    records: np.ndarray,
-    order: np.ndarray,
-    span: tuple[int, int],
-    grid: tuple[int, int],
-    entry_count: np.ndarray,
-    tile_count: np.ndarray,
+    order: np.ndarray, own: np.ndarray, found: np.ndarray, tile_count: np.ndarray
 ) -> None:
-    columns, rows = grid
-    for place in range(span[0], span[1]):
-        record = records[order[place]]
-        box = _tile_box(record, columns, rows)
-        total = 0
-        for row in range(box[2], box[3]):
-            first_column, end_column = _tile_columns(record, row, columns, box)
-            for column in range(first_column, end_column):
-                tile_count[row * columns + column] += 1
-            total += max(end_column - first_column, 0)
-        entry_count[place] = total
+    """Count the entries of each tile."""
+    for index in order:
+        for position in range(own[index, 0], own[index, 1]):
+            tile_count[found[position] // REACHES] += 1
 
 
 @numba.njit(**EXACT)
-def _list_run(
-    records: np.ndarray, lists: TileLists, span: tuple[int, int], cursor: np.ndarray
-) -> None:
-    for place in range(span[0], span[1]):
-        index = lists.order[place]
-        record = records[index]
-        position = lists.entry_first[place]
-        box = _tile_box(record, lists.columns, lists.rows)
-        for row in range(box[2], box[3]):
-            first_column, end_column = _tile_columns(record, row, lists.columns, box)
-            for column in range(first_column, end_column):
-                tile = row * lists.columns + column
-                entry = cursor[tile]
-                cursor[tile] += 1
-                lists.gaussian[entry] = index
-                lists.entry[position] = entry
-                position += 1
+def _list_run(order: np.ndarray, lists: TileLists, cursor: np.ndarray) -> None:
+    """Turn the tiles of each Gaussian into entries of these tiles' lists."""
+    for index in order:
+        for position in range(lists.own[index, 0], lists.own[index, 1]):
+            tile, reach = lists.entry[position] // REACHES, lists.entry[position] % REACHES
+            entry = cursor[tile]
+            cursor[tile] += 1
+            lists.gaussian[entry] = index
+            lists.reach[entry] = reach
+            lists.entry[position] = entry
 
 
 @numba.njit(**EXACT)
-def _starts(tile_count: np.ndarray, entry_count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Turn counts into first places; `tile_count` becomes each run's first entry in each tile."""
+def _tile_starts(tile_count: np.ndarray) -> np.ndarray:
+    """First entry of every tile; `tile_count` becomes each run's first entry in each tile."""
     runs, tiles = tile_count.shape
     tile_first = np.empty(tiles + 1, np.int64)
     total = 0
@@ -201,34 +173,46 @@ def _starts(tile_count: np.ndarray, entry_count: np.ndarray) -> tuple[np.ndarray
             tile_count[run, tile] = total
             total += count
     tile_first[tiles] = total
-    entry_first = np.empty(len(entry_count) + 1, np.int64)
+    return tile_first
+
+
+@numba.njit(**EXACT)
+def _entry_starts(own: np.ndarray) -> int:
+    """Turn the sizes of the boxes into first places; returns the room for all."""
     total = 0
-    for place in range(len(entry_count)):
-        entry_first[place] = total
-        total += entry_count[place]
-    entry_first[len(entry_count)] = total
-    return tile_first, entry_first
+    for index in range(len(own)):
+        room = own[index, 1]
+        own[index, 0] = own[index, 1] = total
+        total += room
+    return total
 
 
 @compiled_entry
 def list_tiles(records: np.ndarray, width: int, height: int) -> TileLists:
     """The tile lists of projected Gaussians; the same for any number of threads."""
     columns, rows = (width + TILE_PX - 1) // TILE_PX, (height + TILE_PX - 1) // TILE_PX
-    order = depth_order(records)
-    count = len(order)
-    entry_count = np.empty(count, np.int64)
+    count, grid = len(records), (columns, rows)
+    own = np.empty((count, 2), np.int32)
+    visible = 0
+    jump = jump_of(CHUNKS)
+    for place in numba.prange(CHUNKS):
+        run = place * jump % CHUNKS
+        first, end = run * count // CHUNKS, (run + 1) * count // CHUNKS
+        visible += _count_boxes(records, first, end, grid, own)
+    found = np.empty(_entry_starts(own), np.int32)
+    for place in numba.prange(CHUNKS):
+        run = place * jump % CHUNKS
+        first, end = run * count // CHUNKS, (run + 1) * count // CHUNKS
+        _find_run(records, first, end, grid, own, found)
+    order = _depth_order(records, visible)
     tile_count = np.zeros((RUNS, columns * rows), np.int64)
-    jump = jump_of(RUNS)
-    for place in numba.prange(RUNS):
-        run = place * jump % RUNS
-        span = (run * count // RUNS, (run + 1) * count // RUNS)
-        _count_run(records, order, span, (columns, rows), entry_count, tile_count[run])
-    tile_first, entry_first = _starts(tile_count, entry_count)
-    gaussian = np.empty(tile_first[-1], np.int32)
-    entry = np.empty(tile_first[-1], np.int32)
-    lists = TileLists(columns, rows, tile_first, gaussian, order, entry_first, entry)
-    for place in numba.prange(RUNS):
-        run = place * jump % RUNS
-        span = (run * count // RUNS, (run + 1) * count // RUNS)
-        _list_run(records, lists, span, tile_count[run])
+    for run in numba.prange(RUNS):
+        part = order[run * visible // RUNS : (run + 1) * visible // RUNS]
+        _count_run(part, own, found, tile_count[run])
+    tile_first = _tile_starts(tile_count)
+    gaussian, reach = np.empty(tile_first[-1], np.int32), np.empty(tile_first[-1], np.uint8)
+    lists = TileLists(columns, rows, tile_first, gaussian, reach, own, found)
+    for run in numba.prange(RUNS):
+        part = order[run * visible // RUNS : (run + 1) * visible // RUNS]
+        _list_run(part, lists, tile_count[run])
     return lists

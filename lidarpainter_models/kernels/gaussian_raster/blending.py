@@ -1,56 +1,67 @@
 """Blend the Gaussians of each screen tile front to back: compiled code, float32 lanes.
 
-A tile's pixels lie in one flat work array, quantity after quantity, row after row, so that the
-loop over pixels has no branch and no call and becomes vector instructions.
+A tile's pixels lie in one flat work array, quantity after quantity, row after row; a row of sixteen
+is one value (`lanes`). What a row shares is computed once for it.
 """
 
-import math
 from typing import NamedTuple
 
 import numba
 import numpy as np
 
-from lidarpainter_models.kernels.gaussian_raster.binning import TileLists
+from lidarpainter_models.kernels.gaussian_raster.binning import TileLists, end_row_of, first_row_of
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
     ALPHA_CUT,
     MAX_ALPHA,
     MIN_TRANSMITTANCE,
     TILE_PX,
 )
-from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, LANE_LOOP, compiled_entry
+from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry
 from lidarpainter_models.kernels.gaussian_raster.lane_exponential import lane_exp
+from lidarpainter_models.kernels.gaussian_raster.lanes import (
+    choose,
+    lane_array,
+    lane_centres,
+    largest,
+    load,
+    magnitude,
+    prefetch,
+    smallest,
+    spread,
+    store,
+    store_triples,
+    widest,
+)
 from lidarpainter_models.kernels.gaussian_raster.projection import (
     ACROSS,
     ALONG,
     BLUE,
     DEPTH,
     GREEN,
-    HALF_HEIGHT,
     LOG_OPACITY,
     MEAN_X,
     MEAN_X_FRACTION,
     MEAN_Y,
     MEAN_Y_FRACTION,
+    RECORD_FLOATS,
     RED,
     SHEAR,
 )
 from lidarpainter_models.kernels.gaussian_raster.work_sharing import jump_of
 
 PIXELS = TILE_PX * TILE_PX
-CHECK_EVERY = 16
-"""Gaussians between two looks at whether the whole tile has stopped."""
+BATCH = 16
+"""Gaussians whose records are fetched together, while those before are blended; before each batch
+the tile is left if it has stopped."""
 
-# Where each quantity of a tile begins in its work array; unsigned, because a signed index could
-# be negative and its wrap-around keeps loops scalar.
-LIGHT, LANE_RED, LANE_GREEN, LANE_BLUE, LANE_DEPTH, WEIGHT, PIXEL_X, PIXEL_Y = (
-    np.uint64(k * PIXELS) for k in range(8)
-)
-LANES = 8 * PIXELS
-FEATURES = 8 * PIXELS
+# Where each quantity of a tile begins in its work array.
+LIGHT, LANE_RED, LANE_GREEN, LANE_BLUE, LANE_DEPTH, WEIGHT = (k * PIXELS for k in range(6))
+FEATURES = 6 * PIXELS
 
 CUT = np.float32(ALPHA_CUT)
 TOP = np.float32(MAX_ALPHA)
 STOP = np.float32(MIN_TRANSMITTANCE)
+HALF = np.float32(0.5)
 ZERO = np.float32(0.0)
 ONE = np.float32(1.0)
 FAR = np.float32(-5.7)
@@ -69,6 +80,18 @@ class Pictures(NamedTuple):
 
 
 @numba.njit(**EXACT)
+def flat_pictures(pictures: Pictures) -> Pictures:
+    """The same pictures, one number after the other."""
+    return Pictures(
+        pictures.rgb.reshape(-1),
+        pictures.depth.reshape(-1),
+        pictures.alpha.reshape(-1),
+        pictures.features.reshape(-1),
+        pictures.light.reshape(-1),
+    )
+
+
+@numba.njit(**EXACT)
 def local_centre(record: np.ndarray, tile_x: int, tile_y: int) -> tuple[float, float]:
     """Centre of a Gaussian from the corner of a tile, pixels; exact to float32."""
     return (
@@ -78,65 +101,76 @@ def local_centre(record: np.ndarray, tile_x: int, tile_y: int) -> tuple[float, f
 
 
 @numba.njit(**EXACT)
-def tile_rows_of(y: float, half_height: float) -> tuple[int, int]:
-    """First and one past the last row of a tile that a Gaussian can reach."""
-    first = math.ceil(max(y - half_height - 0.5, 0.0))
-    end = math.floor(min(y + half_height + 0.5, TILE_PX + 0.0))
-    return int(min(first, TILE_PX)), int(max(end, 0.0))
+def fetch_records(
+    records: np.ndarray, gaussian: np.ndarray, first: int, end: int, batch: np.ndarray
+) -> int:
+    """Copy a batch of records from an entry on side by side, and ask for the next one.
 
-
-@numba.njit(**EXACT)
-def place_pixels(lanes: np.ndarray) -> None:
-    """Write the pixel centres of a tile, from its corner, into its work array."""
-    for row in range(TILE_PX):
-        for column in range(TILE_PX):
-            pixel = np.uint64(row * TILE_PX + column)
-            lanes[PIXEL_X + pixel] = column + 0.5
-            lanes[PIXEL_Y + pixel] = row + 0.5
+    Returns one past the last entry of the batch.
+    """
+    flat = records.reshape(-1)
+    last = min(first + BATCH, end)
+    for entry in range(first, last):
+        source = np.int64(gaussian[entry]) * RECORD_FLOATS
+        store(batch, (entry - first) * RECORD_FLOATS, load(flat, source))
+    for entry in range(last, min(last + BATCH, end)):
+        prefetch(flat, np.int64(gaussian[entry]) * RECORD_FLOATS)
+    return last
 
 
 @numba.njit(**EXACT)
 def has_light(lanes: np.ndarray) -> bool:
     """Whether any pixel of a tile still takes Gaussians."""
-    brightest = lanes[LIGHT]
-    for pixel in range(np.uint64(1), np.uint64(PIXELS)):
-        brightest = max(brightest, lanes[LIGHT + pixel])
-    return brightest > ZERO
+    brightest = load(lanes, LIGHT)
+    for row in range(1, TILE_PX):
+        brightest = largest(brightest, load(lanes, LIGHT + row * TILE_PX))
+    return widest(brightest) > ZERO
 
 
-@numba.njit(**LANE_LOOP)
+@numba.njit(**EXACT)
 def _blend(
-    lanes: np.ndarray, first_row: int, end_row: int, x: float, y: float, record: np.ndarray
+    lanes: np.ndarray,
+    first_row: int,
+    end_row: int,
+    centre: tuple[float, float],
+    record: np.ndarray,
+    keeps_weight: bool,
 ) -> None:
     """Blend one Gaussian into rows of a tile. A stopped pixel has its light negated."""
-    across, shear, along = record[ACROSS], record[SHEAR], record[ALONG]
-    log_opacity = record[LOG_OPACITY]
-    red, green, blue, depth = record[RED], record[GREEN], record[BLUE], record[DEPTH]
-    for pixel in range(np.uint64(first_row * TILE_PX), np.uint64(end_row * TILE_PX)):
-        dy = lanes[PIXEL_Y + pixel] - y
-        u = lanes[PIXEL_X + pixel] - x + shear * dy
-        alpha = lane_exp(max(log_opacity - along * dy * dy - across * u * u, FAR))
-        alpha = min(alpha, TOP) if alpha >= CUT else ZERO
-        light = lanes[LIGHT + pixel]
+    shear, along, log_opacity = record[SHEAR], record[ALONG], record[LOG_OPACITY]
+    across = spread(record[ACROSS])
+    red, green, blue = spread(record[RED]), spread(record[GREEN]), spread(record[BLUE])
+    depth = spread(record[DEPTH])
+    offset = lane_centres() - centre[0]
+    for row in range(first_row, end_row):
+        pixel = row * TILE_PX
+        dy = np.float32(row) + HALF - centre[1]
+        u = offset + shear * dy
+        exponent = log_opacity - along * dy * dy - across * u * u
+        alpha = lane_exp(largest(exponent, FAR))
+        alpha = choose(alpha >= CUT, smallest(alpha, TOP), ZERO)
+        light = load(lanes, LIGHT + pixel)
         weight = light * alpha
         left = light - weight
         goes_on = left >= STOP
-        weight = weight if goes_on else ZERO
-        lanes[LIGHT + pixel] = left if goes_on else -abs(light)
-        lanes[WEIGHT + pixel] = weight
-        lanes[LANE_RED + pixel] += weight * red
-        lanes[LANE_GREEN + pixel] += weight * green
-        lanes[LANE_BLUE + pixel] += weight * blue
-        lanes[LANE_DEPTH + pixel] += weight * depth
+        weight = choose(goes_on, weight, ZERO)
+        store(lanes, LIGHT + pixel, choose(goes_on, left, ZERO - magnitude(light)))
+        store(lanes, LANE_RED + pixel, load(lanes, LANE_RED + pixel) + weight * red)
+        store(lanes, LANE_GREEN + pixel, load(lanes, LANE_GREEN + pixel) + weight * green)
+        store(lanes, LANE_BLUE + pixel, load(lanes, LANE_BLUE + pixel) + weight * blue)
+        store(lanes, LANE_DEPTH + pixel, load(lanes, LANE_DEPTH + pixel) + weight * depth)
+        if keeps_weight:
+            store(lanes, WEIGHT + pixel, weight)
 
 
-@numba.njit(**LANE_LOOP)
+@numba.njit(**EXACT)
 def _blend_features(lanes: np.ndarray, first_row: int, end_row: int, features: np.ndarray) -> None:
     for channel in range(len(features)):
-        value = features[channel]
-        start = np.uint64(FEATURES + channel * PIXELS)
-        for pixel in range(np.uint64(first_row * TILE_PX), np.uint64(end_row * TILE_PX)):
-            lanes[start + pixel] += lanes[WEIGHT + pixel] * value
+        value = spread(features[channel])
+        start = FEATURES + channel * PIXELS
+        for pixel in range(first_row * TILE_PX, end_row * TILE_PX, TILE_PX):
+            blended = load(lanes, start + pixel) + load(lanes, WEIGHT + pixel) * value
+            store(lanes, start + pixel, blended)
 
 
 @numba.njit(**EXACT)
@@ -145,21 +179,24 @@ def _blend_tile(
     features: np.ndarray,
     lists: TileLists,
     tile: int,
-    tile_x: int,
-    tile_y: int,
+    corner: tuple[int, int],
     lanes: np.ndarray,
 ) -> None:
-    first, end = lists.tile_first[tile], lists.tile_first[tile + 1]
-    for entry in range(first, end):
-        if (entry - first) % CHECK_EVERY == CHECK_EVERY - 1 and not has_light(lanes):
+    batch = lane_array(BATCH * RECORD_FLOATS)
+    has_features = features.shape[1] > 0
+    end = lists.tile_first[tile + 1]
+    for first in range(lists.tile_first[tile], end, BATCH):
+        if not has_light(lanes):
             break
-        index = lists.gaussian[entry]
-        record = records[index]
-        x, y = local_centre(record, tile_x, tile_y)
-        first_row, end_row = tile_rows_of(y, record[HALF_HEIGHT])
-        _blend(lanes, first_row, end_row, x, y, record)
-        if features.shape[1]:
-            _blend_features(lanes, first_row, end_row, features[index])
+        last = fetch_records(records, lists.gaussian, first, end, batch)
+        for entry in range(first, last):
+            place = (entry - first) * RECORD_FLOATS
+            record = batch[place : place + RECORD_FLOATS]
+            first_row, end_row = first_row_of(lists.reach[entry]), end_row_of(lists.reach[entry])
+            centre = local_centre(record, corner[0], corner[1])
+            _blend(lanes, first_row, end_row, centre, record, has_features)
+            if has_features:
+                _blend_features(lanes, first_row, end_row, features[lists.gaussian[entry]])
 
 
 @numba.njit(**EXACT)
@@ -170,33 +207,61 @@ def _light_pixels(lanes: np.ndarray, rows: int, columns: int) -> None:
 
 
 @numba.njit(**EXACT)
-def _store_tile(lanes: np.ndarray, tile_x: int, tile_y: int, pictures: Pictures) -> None:
+def _store_row(lanes: np.ndarray, row: int, place: int, flat: Pictures) -> None:
+    """Write a whole tile row to pixels from a place on."""
+    pixel = row * TILE_PX
+    left = magnitude(load(lanes, LIGHT + pixel))
+    store(flat.light, place, left)
+    store(flat.alpha, place, ONE - left)
+    store(flat.depth, place, load(lanes, LANE_DEPTH + pixel))
+    red, green = load(lanes, LANE_RED + pixel), load(lanes, LANE_GREEN + pixel)
+    store_triples(flat.rgb, 3 * place, red, green, load(lanes, LANE_BLUE + pixel))
+
+
+@numba.njit(**EXACT)
+def _store_tile(lanes: np.ndarray, corner: tuple[int, int], pictures: Pictures) -> None:
     height, width, channels = pictures.features.shape
-    for row in range(min(TILE_PX, height - tile_y)):
-        for column in range(min(TILE_PX, width - tile_x)):
-            pixel = row * TILE_PX + column
-            y, x = tile_y + row, tile_x + column
-            light = abs(lanes[pixel])
-            pictures.light[y, x] = light
-            pictures.alpha[y, x] = ONE - light
-            for channel in range(3):
-                pictures.rgb[y, x, channel] = lanes[(1 + channel) * PIXELS + pixel]
-            pictures.depth[y, x] = lanes[4 * PIXELS + pixel]
-            for channel in range(channels):
-                pictures.features[y, x, channel] = lanes[FEATURES + channel * PIXELS + pixel]
+    flat = flat_pictures(pictures)
+    columns = min(TILE_PX, width - corner[0])
+    for row in range(min(TILE_PX, height - corner[1])):
+        place = (corner[1] + row) * width + corner[0]
+        if columns == TILE_PX:
+            _store_row(lanes, row, place, flat)
+        else:
+            _store_part_of_row(lanes, row, place, columns, flat)
+        features = pictures.features[corner[1] + row]
+        for channel in range(channels):
+            start = FEATURES + channel * PIXELS + row * TILE_PX
+            for column in range(columns):
+                features[corner[0] + column, channel] = lanes[start + column]
+
+
+@numba.njit(**EXACT)
+def _store_part_of_row(
+    lanes: np.ndarray, row: int, place: int, columns: int, flat: Pictures
+) -> None:
+    """Write the first pixels of a tile row that the picture's edge cuts."""
+    for column in range(columns):
+        pixel = row * TILE_PX + column
+        left = abs(lanes[LIGHT + pixel])
+        flat.light[place + column] = left
+        flat.alpha[place + column] = ONE - left
+        flat.depth[place + column] = lanes[LANE_DEPTH + pixel]
+        for channel in range(3):
+            flat.rgb[3 * (place + column) + channel] = lanes[LANE_RED + channel * PIXELS + pixel]
 
 
 @numba.njit(**EXACT)
 def _draw_tile(
     records: np.ndarray, features: np.ndarray, lists: TileLists, tile: int, pictures: Pictures
 ) -> None:
-    tile_x, tile_y = tile % lists.columns * TILE_PX, tile // lists.columns * TILE_PX
+    corner = (tile % lists.columns * TILE_PX, tile // lists.columns * TILE_PX)
     height, width = pictures.depth.shape
-    lanes = np.zeros(LANES + features.shape[1] * PIXELS, np.float32)
-    _light_pixels(lanes, min(TILE_PX, height - tile_y), min(TILE_PX, width - tile_x))
-    place_pixels(lanes)
-    _blend_tile(records, features, lists, tile, tile_x, tile_y, lanes)
-    _store_tile(lanes, tile_x, tile_y, pictures)
+    lanes = lane_array(FEATURES + features.shape[1] * PIXELS)
+    lanes[:] = ZERO
+    _light_pixels(lanes, min(TILE_PX, height - corner[1]), min(TILE_PX, width - corner[0]))
+    _blend_tile(records, features, lists, tile, corner, lanes)
+    _store_tile(lanes, corner, pictures)
 
 
 @compiled_entry

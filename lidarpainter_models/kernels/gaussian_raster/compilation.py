@@ -19,9 +19,6 @@ _INNER: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 EXACT = _ENTRY | _INNER
 """Code on single Gaussians: fused multiply-add, otherwise as written; divisions do not raise."""
 
-LANE_LOOP = _INNER | {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
-"""Loops over pixels, with freedom to use vectors that leaves NaN and infinity alone."""
-
 
 def _sources_digest() -> str:
     sources = sorted(Path(__file__).parent.glob("*.py"))

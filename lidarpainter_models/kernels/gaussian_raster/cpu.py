@@ -14,7 +14,7 @@ from torch import Tensor
 from lidarpainter_models.errors import BackendError
 from lidarpainter_models.kernels.gaussian_raster.binning import list_tiles
 from lidarpainter_models.kernels.gaussian_raster.blending import Pictures, blend
-from lidarpainter_models.kernels.gaussian_raster.blending_gradients import gaussian_sums
+from lidarpainter_models.kernels.gaussian_raster.blending_gradients import entry_sums
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import TANGENT_MARGIN
 from lidarpainter_models.kernels.gaussian_raster.projection import (
     IS_VISIBLE,
@@ -129,18 +129,14 @@ class _DrawGaussians(torch.autograd.Function):
         drawn = _pictures(pictures, ctx.light)
         gradients = _pictures(output_gradients[:4], ctx.light)
         with ONE_AT_A_TIME:
-            sums, to_features = gaussian_sums(
-                ctx.records, gaussians.features, ctx.lists, drawn, gradients
-            )
-            found = unproject(gaussians, ctx.view, ctx.records, sums)
+            slots = entry_sums(ctx.records, gaussians.features, ctx.lists, drawn, gradients)
+            found = unproject(gaussians, ctx.view, ctx.records, ctx.lists, slots)
         if ctx.screen_gradient_out is not None:
             ctx.screen_gradient_out.copy_(torch.from_numpy(found.absolute))
-        return (*_tensor_gradients(found, to_features, tensors), None, None, None)
+        return (*_tensor_gradients(found, tensors), None, None, None)
 
 
-def _tensor_gradients(
-    found: Gradients, to_features: np.ndarray, tensors: tuple[Tensor, ...]
-) -> list[Tensor]:
+def _tensor_gradients(found: Gradients, tensors: tuple[Tensor, ...]) -> list[Tensor]:
     """Gradients in the order and kinds of the float tensors that were given."""
     to_transforms = np.zeros((found.camera_from_body.shape[1], 4, 4))
     for run in found.camera_from_body:
@@ -151,7 +147,7 @@ def _tensor_gradients(
         found.scale_m,
         found.opacity,
         found.sh,
-        to_features,
+        found.features,
         found.screen_offset,
         to_transforms,
     )

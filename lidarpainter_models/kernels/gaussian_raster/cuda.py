@@ -4,9 +4,11 @@ Projection, bodies and colour are those of the reference, in torch on the GPU, s
 with respect to the transforms are exact; binning and blending are gsplat's kernels (Ye et al.
 2024, "gsplat: An Open-Source Library for Gaussian Splatting"). gsplat 1.5 clamps alpha at 0.999
 where the others clamp at 0.99, and its atomic sums make gradients differ in the last bits from run
-to run.
+to run. Only what can reach the picture is handed over, so memory follows the visible Gaussians, as
+in gsplat's packed mode; antialiasing is in the opacity, depth is one of the blended values.
 """
 
+from importlib import import_module
 from types import ModuleType
 
 import torch
@@ -14,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import BackendError
+from lidarpainter_models.kernels.gaussian_raster import reference
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import TILE_PX
 from lidarpainter_models.kernels.gaussian_raster.reference import (
     ScreenGaussians,
@@ -33,14 +36,16 @@ def draw_gaussians(
     """Picture as `SplatImage` lists it: rgb, depth, alpha, features, visible, radius.
 
     Raises:
-        BackendError: gsplat is missing, or the tensors are not on a CUDA device.
+        BackendError: gsplat or its kernels are missing, or the tensors are not on a CUDA device.
     """
-    gsplat = _import_gsplat()
+    gsplat = import_gsplat()
     if inputs.means.device.type != "cuda":
         raise BackendError(
             f"the cuda backend needs tensors on a CUDA device, got {inputs.means.device}"
         )
     screen = project_gaussians(inputs, view)
+    if len(screen.index) == 0:  # gsplat expects at least one
+        return reference.draw_gaussians(inputs, view, screen_gradient_out)
     centre_px = screen.centre_px[None].contiguous()
     if screen_gradient_out is not None and centre_px.requires_grad:
         _report_screen_gradient(centre_px, screen.index, screen_gradient_out)
@@ -63,14 +68,29 @@ def draw_gaussians(
     return picture[..., :3], picture[..., 3], alpha[0, ..., 0], picture[..., 4:], visible, radius_px
 
 
-def _import_gsplat() -> ModuleType:
+def import_gsplat() -> ModuleType:
+    """Gsplat with kernels that can run; it compiles them here if no wheel brought them.
+
+    Raises:
+        BackendError: it is not installed, or there are no kernels and no compiler for them.
+    """
     try:
-        import gsplat  # an optional dependency; compiled at its first use
+        gsplat = import_module("gsplat")
     except ImportError as error:
         raise BackendError(
             f"the cuda backend needs gsplat ({error}); install the extra: "
             "pip install 'lidarpainter[cuda]'"
         ) from error
+    try:
+        kernels = import_module("gsplat.cuda._backend")._C
+    except (ImportError, OSError, RuntimeError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise BackendError(f"gsplat could not load or compile its kernels: {reason}") from error
+    if kernels is None:
+        raise BackendError(
+            f"gsplat has no compiled kernels and finds no nvcc; install its wheel for torch "
+            f"{torch.__version__} or a CUDA toolkit (CUDA_HOME)"
+        )
     return gsplat
 
 

@@ -79,6 +79,7 @@ class Footprint(NamedTuple):
     """One Gaussian between body frame and screen; vectors are tuples (`small_vectors`)."""
 
     point: Vector
+    inverse_z: float
     rotation: Matrix
     translation: Vector
     unit_wxyz: Quaternion
@@ -148,6 +149,7 @@ def footprint_of(
     row_y = v3.scaled(row_y, view.fy * inverse_z)
     return Footprint(
         point,
+        inverse_z,
         rotation,
         translation,
         unit,
@@ -240,7 +242,8 @@ def _write_place(
 ) -> bool:
     """Write where a Gaussian lies and how far it reaches; return whether that is in the picture."""
     x, y, z = footprint.point
-    x, y = view.fx * x / z + view.cx, view.fy * y / z + view.cy
+    x = view.fx * x * footprint.inverse_z + view.cx
+    y = view.fy * y * footprint.inverse_z + view.cy
     if len(gaussians.screen_offset):
         x += gaussians.screen_offset[index, 0]
         y += gaussians.screen_offset[index, 1]

@@ -1,8 +1,9 @@
 """Carry screen gradients back through the projection: compiled code, one Gaussian at a time.
 
-The projection is computed again rather than kept. Everything is float64; the gradient of
-`camera_from_body` is summed over fixed runs of Gaussians and then over runs, in order, so it does
-not depend on the number of threads.
+Each Gaussian first adds up the sums of its entries, tiles in reading order. The projection is
+computed again rather than kept. Everything is float64; the gradient of `camera_from_body` is summed
+over fixed runs of Gaussians and then over runs, in order, so it does not depend on the number of
+threads.
 """
 
 import math
@@ -13,6 +14,7 @@ import numpy as np
 
 from lidarpainter_models.kernels.gaussian_raster import small_vectors as v3
 from lidarpainter_models.kernels.gaussian_raster import spherical_harmonics
+from lidarpainter_models.kernels.gaussian_raster.binning import TileLists
 from lidarpainter_models.kernels.gaussian_raster.blending_gradients import (
     SUM_ABS_X,
     SUM_ABS_Y,
@@ -24,9 +26,11 @@ from lidarpainter_models.kernels.gaussian_raster.blending_gradients import (
     SUM_GY,
     SUM_GYY,
     SUM_RED,
+    SUMS,
 )
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import MIN_COMPENSATION
 from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry
+from lidarpainter_models.kernels.gaussian_raster.lanes import prefetch
 from lidarpainter_models.kernels.gaussian_raster.projection import (
     ACROSS,
     ALONG,
@@ -46,6 +50,9 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
 from lidarpainter_models.kernels.gaussian_raster.small_vectors import Matrix, Vector
 from lidarpainter_models.kernels.gaussian_raster.work_sharing import jump_of
 
+AHEAD = 8
+"""Gaussians between asking for sums and adding them up: some hundred nanoseconds each."""
+
 
 class Gradients(NamedTuple):
     """Gradients of the arrays in `projection.Gaussians`; transforms per run in float64."""
@@ -55,6 +62,7 @@ class Gradients(NamedTuple):
     scale_m: np.ndarray
     opacity: np.ndarray
     sh: np.ndarray
+    features: np.ndarray
     screen_offset: np.ndarray
     absolute: np.ndarray
     camera_from_body: np.ndarray
@@ -71,18 +79,17 @@ def _screen_gradient(sums: np.ndarray, record: np.ndarray) -> tuple[float, float
 @numba.njit(**EXACT)
 def _covariance_gradient(sums: np.ndarray, footprint: Footprint) -> Vector:
     """Gradient with respect to the blurred screen covariance's xx, xy and yy."""
-    yy = footprint.yy
-    slope = footprint.xy / yy
-    remaining = footprint.xx - slope * footprint.xy
-    across = 0.5 / remaining
+    by_yy = 1.0 / footprint.yy
+    slope = footprint.xy * by_yy
+    by_remaining = 1.0 / (footprint.xx - slope * footprint.xy)
     # exponent = -u^2 / (2 remaining) - dy^2 / (2 yy), u = dx - slope dy
-    to_remaining = 0.5 * sums[SUM_GUU] / (remaining * remaining)
-    to_slope = 2.0 * across * sums[SUM_GUY]
-    to_yy = 0.5 * sums[SUM_GYY] / (yy * yy)
+    to_remaining = 0.5 * sums[SUM_GUU] * by_remaining * by_remaining
+    to_slope = by_remaining * sums[SUM_GUY] * by_yy
+    to_yy = 0.5 * sums[SUM_GYY] * by_yy * by_yy
     return (
         to_remaining,
-        -2.0 * slope * to_remaining + to_slope / yy,
-        slope * slope * to_remaining - slope / yy * to_slope + to_yy,
+        to_slope - 2.0 * slope * to_remaining,
+        slope * slope * to_remaining - slope * to_slope + to_yy,
     )
 
 
@@ -113,32 +120,34 @@ def _axes_gradient(
     """Gradients of the Gaussian's axes in the camera frame and of its centre there."""
     to_xx, to_xy, to_yy = covariance_gradient
     row_x, row_y, axes = footprint.row_x, footprint.row_y, footprint.axes_in_camera
-    x, y, z = footprint.point
+    x, y, _ = footprint.point
+    by_z = footprint.inverse_z
     to_row_x = v3.add(v3.scaled(row_x, 2.0 * to_xx), v3.scaled(row_y, to_xy))
     to_row_y = v3.add(v3.scaled(row_y, 2.0 * to_yy), v3.scaled(row_x, to_xy))
-    to_axis_x = v3.scaled(to_row_x, view.fx / z)
-    to_axis_y = v3.scaled(to_row_y, view.fy / z)
+    to_axis_x = v3.scaled(to_row_x, view.fx * by_z)
+    to_axis_y = v3.scaled(to_row_y, view.fy * by_z)
     to_axis_z = v3.add(
         v3.scaled(to_axis_x, -footprint.tangent_x), v3.scaled(to_axis_y, -footprint.tangent_y)
     )
-    to_z = -(v3.dot(to_row_x, row_x) + v3.dot(to_row_y, row_y)) / z
+    to_z = -(v3.dot(to_row_x, row_x) + v3.dot(to_row_y, row_y)) * by_z
     to_x, to_y = 0.0, 0.0
-    if view.lowest_x <= x / z <= view.highest_x:
-        to_x = -v3.dot(to_axis_x, axes[2]) / z
-    if view.lowest_y <= y / z <= view.highest_y:
-        to_y = -v3.dot(to_axis_y, axes[2]) / z
-    to_point = (to_x, to_y, to_z - (to_x * x + to_y * y) / z)
+    if view.lowest_x <= x * by_z <= view.highest_x:
+        to_x = -v3.dot(to_axis_x, axes[2]) * by_z
+    if view.lowest_y <= y * by_z <= view.highest_y:
+        to_y = -v3.dot(to_axis_y, axes[2]) * by_z
+    to_point = (to_x, to_y, to_z - (to_x * x + to_y * y) * by_z)
     return (to_axis_x, to_axis_y, to_axis_z), to_point
 
 
 @numba.njit(**EXACT)
 def _centre_gradient(
-    point: Vector, to_screen: tuple[float, float], to_depth: float, view: View
+    footprint: Footprint, to_screen: tuple[float, float], to_depth: float, view: View
 ) -> Vector:
     """Gradient of the centre in the camera frame through its pixel position and depth."""
-    x, y, z = point
-    to_x, to_y = to_screen[0] * view.fx / z, to_screen[1] * view.fy / z
-    return (to_x, to_y, to_depth - (to_x * x + to_y * y) / z)
+    x, y, _ = footprint.point
+    by_z = footprint.inverse_z
+    to_x, to_y = to_screen[0] * view.fx * by_z, to_screen[1] * view.fy * by_z
+    return (to_x, to_y, to_depth - (to_x * x + to_y * y) * by_z)
 
 
 @numba.njit(**EXACT)
@@ -164,8 +173,9 @@ def _store_shape(
     to_unit = v3.rotation_gradient(unit, to_turned)
     along = to_unit[0] * unit[0] + to_unit[1] * unit[1] + to_unit[2] * unit[2]
     along += to_unit[3] * unit[3]
+    by_length = 1.0 / footprint.wxyz_length
     for k in range(4):
-        gradients.rotation_wxyz[index, k] = (to_unit[k] - along * unit[k]) / footprint.wxyz_length
+        gradients.rotation_wxyz[index, k] = (to_unit[k] - along * unit[k]) * by_length
     return v3.product(to_axes, v3.transposed(footprint.from_axes))
 
 
@@ -224,13 +234,15 @@ def _unproject_one(  # noqa: PLR0913 - a compiled loop body
     footprint = footprint_of(gaussians, index, point, rotation, translation, view)
     to_screen = _screen_gradient(sums, record)
     gradients.screen_offset[index, 0], gradients.screen_offset[index, 1] = to_screen
-    gradients.absolute[index] = 2.0 * math.hypot(record[ACROSS] * sums[SUM_ABS_X], sums[SUM_ABS_Y])
+    absolute_x, absolute_y = record[ACROSS] * sums[SUM_ABS_X], sums[SUM_ABS_Y]
+    absolute = math.sqrt(absolute_x * absolute_x + absolute_y * absolute_y)
+    gradients.absolute[index] = 2.0 * absolute
     gradients.opacity[index] = sums[SUM_G] / gaussians.opacity[index]
     to_covariance = _covariance_gradient(sums, footprint)
     if view.antialias:
         to_covariance = _add_compensation_gradient(footprint, view.blur, sums[SUM_G], to_covariance)
     to_axes, to_point = _axes_gradient(footprint, to_covariance, view)
-    to_centre = _centre_gradient(point, to_screen, sums[SUM_DEPTH], view)
+    to_centre = _centre_gradient(footprint, to_screen, sums[SUM_DEPTH], view)
     to_point = v3.add(to_point, to_centre)
     to_rotation = _store_shape(gaussians, index, footprint, to_axes, gradients)
     to_direction = _store_colour(gaussians, index, footprint, record, sums, weights, gradients)
@@ -246,25 +258,76 @@ def _unproject_one(  # noqa: PLR0913 - a compiled loop body
 
 
 @numba.njit(**EXACT)
+def _prefetch_entries(lists: TileLists, index: int, records: np.ndarray, slots: np.ndarray) -> None:
+    """Ask for the sums that a later Gaussian will add up: they lie all over the memory."""
+    if records[index, IS_VISIBLE] > 0.0:
+        for position in range(lists.own[index, 0], lists.own[index, 1]):
+            prefetch(slots, np.int64(lists.entry[position]) * SUMS)
+
+
+@numba.njit(**EXACT)
+def _add_entries(
+    lists: TileLists,
+    index: int,
+    slots: np.ndarray,
+    feature_slots: np.ndarray,
+    sums: np.ndarray,
+    feature_sums: np.ndarray,
+) -> None:
+    """Sums of a Gaussian over its entries."""
+    for k in range(SUMS):
+        sums[k] = 0.0
+    for k in range(len(feature_sums)):
+        feature_sums[k] = 0.0
+    for position in range(lists.own[index, 0], lists.own[index, 1]):
+        entry = lists.entry[position]
+        slot = np.int64(entry) * SUMS
+        for k in range(SUMS):
+            sums[k] += slots[slot + k]
+        for k in range(len(feature_sums)):
+            feature_sums[k] += feature_slots[entry, k]
+
+
+@numba.njit(**EXACT)
 def _unproject_run(
     gaussians: Gaussians,
     view: View,
     records: np.ndarray,
-    sums: np.ndarray,
+    lists: TileLists,
+    slots: tuple[np.ndarray, np.ndarray],
     gradients: Gradients,
     run: int,
 ) -> None:
-    weights = np.empty(16)
+    weights, sums = np.empty(16), np.empty(SUMS)
+    feature_sums = np.empty(slots[1].shape[1])
     count = len(records)
-    for index in range(run * count // CHUNKS, (run + 1) * count // CHUNKS):
+    first, end = run * count // CHUNKS, (run + 1) * count // CHUNKS
+    for index in range(first, end):
+        _prefetch_entries(lists, min(index + AHEAD, end - 1), records, slots[0])
         if records[index, IS_VISIBLE] > 0.0:
-            record, own_sums = records[index], sums[index]
-            _unproject_one(gaussians, index, view, record, own_sums, weights, gradients, run)
+            _add_entries(lists, index, slots[0], slots[1], sums, feature_sums)
+            for k in range(len(feature_sums)):
+                gradients.features[index, k] = feature_sums[k]
+            _unproject_one(gaussians, index, view, records[index], sums, weights, gradients, run)
 
 
 @compiled_entry
-def unproject(gaussians: Gaussians, view: View, records: np.ndarray, sums: np.ndarray) -> Gradients:
-    """Gradients of everything `project` read; zero where a Gaussian was not visible."""
+def unproject(
+    gaussians: Gaussians,
+    view: View,
+    records: np.ndarray,
+    lists: TileLists,
+    slots: tuple[np.ndarray, np.ndarray],
+) -> Gradients:
+    """Gradients of everything `project` read; zero where a Gaussian was not visible.
+
+    Args:
+        gaussians: as they were drawn.
+        view: as they were drawn.
+        records: from `projection.project`.
+        lists: from `binning.list_tiles`.
+        slots: from `blending_gradients.entry_sums`.
+    """
     count, coefficients, _ = gaussians.sh.shape
     bodies = len(gaussians.camera_from_body)
     gradients = Gradients(
@@ -273,11 +336,12 @@ def unproject(gaussians: Gaussians, view: View, records: np.ndarray, sums: np.nd
         np.zeros((count, 3), np.float32),
         np.zeros(count, np.float32),
         np.zeros((count, coefficients, 3), np.float32),
+        np.zeros(gaussians.features.shape, np.float32),
         np.zeros((count, 2), np.float32),
         np.zeros(count, np.float32),
         np.zeros((CHUNKS, bodies, 3, 4)),
     )
     jump = jump_of(CHUNKS)
     for place in numba.prange(CHUNKS):
-        _unproject_run(gaussians, view, records, sums, gradients, place * jump % CHUNKS)
+        _unproject_run(gaussians, view, records, lists, slots, gradients, place * jump % CHUNKS)
     return gradients

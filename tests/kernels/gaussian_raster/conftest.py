@@ -98,13 +98,13 @@ def draw_and_go_back(splats, *, backend, dtype, **settings):
     splats = dict(splats)
     for name in DIFFERENTIABLE:
         splats[name] = splats[name].to(dtype, copy=True).requires_grad_()
-    absolute = torch.zeros(len(splats["means"]), dtype=dtype)
+    absolute = splats["means"].new_zeros(len(splats["means"]), dtype=dtype)
     image = render_gaussians(**splats, **settings, backend=backend, screen_gradient_out=absolute)
     generator = torch.Generator().manual_seed(99)
     loss = image.rgb.new_zeros(())
     for picture in (image.rgb, 0.05 * image.depth_m, image.alpha, image.features):
         weight = torch.randn(picture.shape, generator=generator, dtype=torch.float64)
-        loss = loss + (picture * weight.to(dtype)).sum()
+        loss = loss + (picture * weight.to(picture)).sum()
     loss.backward()
     gradients = {name: splats[name].grad.double() for name in DIFFERENTIABLE}
     return DrawnSplats(image=image, gradients=gradients, absolute_gradient=absolute.double())

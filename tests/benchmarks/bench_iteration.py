@@ -1,0 +1,256 @@
+"""A step of the fit: against its kernels, on a scene four times as long, and what memory it takes.
+
+Run as a program it prints the peak memory of one step with a million Gaussians: that needs a
+process of its own.
+"""
+
+import json
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import torch
+from bench_machine import best_cpu_s
+from bench_raster import STAGES, Stages
+from bench_records import Figure
+from bench_scenes import street_like_splats
+from bench_work import ADAM_BYTES, SSIM_BYTES_PER_VALUE, SSIM_FLOP_PER_VALUE
+
+from lidarpainter_models.gaussians.calibration import (
+    ActorCorrections,
+    CameraCorrections,
+    ExposureCorrections,
+)
+from lidarpainter_models.gaussians.fit_config import FitConfig
+from lidarpainter_models.gaussians.fit_pictures import full_picture
+from lidarpainter_models.gaussians.fit_state import FitState
+from lidarpainter_models.gaussians.fit_step import recorded_step
+from lidarpainter_models.gaussians.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.observations import TrainingView
+from lidarpainter_models.gaussians.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.sky import SkyConfig, SkyTexture, sky_layout
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.transforms import rigid_from_rotation
+from lidarpainter_models.kernels.gaussian_raster import render_gaussians
+from lidarpainter_models.kernels.ssim import l1_ssim_loss
+
+SIZE = (30_000, 480, 320)
+BLOCK_M = 1000.0
+"""Blocks of a long street lie this far behind each other, out of each other's view."""
+FLOATS_PER_GAUSSIAN = 59
+
+
+def street_scene(count, width_px, height_px, *, blocks=1):
+    """`count` Gaussians before a camera in each block, the cameras being the training views."""
+    splats = street_like_splats(count, width_px, height_px)
+    look_forward = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    cameras, sets = [], []
+    for block in range(blocks):
+        # each block looks away from the one before
+        turn = torch.diag(torch.tensor([1.0, 1.0, 1.0]) if block % 2 == 0 else _BACKWARDS)
+        rotation = turn @ look_forward
+        place = torch.tensor([0.0, BLOCK_M * block, 1.0])
+        camera = {name: splats[name] for name in ("fx_px", "fy_px", "cx_px", "cy_px")}
+        cameras.append(
+            Camera(
+                world_from_camera=rigid_from_rotation(rotation, place).double(),
+                width_px=width_px,
+                height_px=height_px,
+                **camera,
+            )
+        )
+        sets.append(_placed(splats, rotation, place))
+    gaussians = GaussianSet(
+        **{name: torch.cat([s[name] for s in sets]) for name in sets[0]},
+    )
+    return _scene(gaussians, cameras), cameras
+
+
+_BACKWARDS = torch.tensor([-1.0, -1.0, 1.0])
+
+
+def _placed(splats, rotation, place):
+    values = {name: value.detach() for name, value in splats.items() if torch.is_tensor(value)}
+    return {
+        "means": values["means"] @ rotation.T + place,
+        "rotation_wxyz": values["rotation_wxyz"],
+        "log_scale": values["scale_m"].log(),
+        "opacity_logit": torch.logit(values["opacity"]),
+        "sh_dc": values["sh"][:, :1].contiguous(),
+        "sh_rest": values["sh"][:, 1:].contiguous(),
+        "body_index": values["body_index"],
+    }
+
+
+def _scene(gaussians, cameras):
+    times = torch.arange(len(cameras)) * 100_000_000
+    return GaussianScene(
+        gaussians=gaussians,
+        recorded_tracks=(),
+        sky=SkyTexture.constant(sky_layout(cameras, SkyConfig()), torch.tensor([0.6, 0.7, 0.9])),
+        cameras=CameraCorrections.none(
+            [(frame, "front") for frame in range(len(cameras))],
+            times,
+            torch.stack([camera.world_from_camera for camera in cameras]),
+        ),
+        actors=ActorCorrections.none(0, times),
+        exposure=ExposureCorrections.none(["front"]),
+    )
+
+
+def training_pictures(cameras):
+    """A grey picture with LiDAR depth in a tenth of the pixels for every camera."""
+    generator = torch.Generator().manual_seed(1)
+    pictures = []
+    for frame, camera in enumerate(cameras):
+        shape = (camera.height_px, camera.width_px)
+        is_hit = torch.rand(shape, generator=generator) < 0.1
+        depth_m = 3.0 + 57.0 * torch.rand(shape, generator=generator)
+        view = TrainingView(
+            key=(frame, "front"),
+            camera=camera,
+            timestamp_ns=frame * 100_000_000,
+            rgb_u8=torch.randint(0, 255, (*shape, 3), generator=generator, dtype=torch.uint8),
+            sky_mask=torch.zeros(shape, dtype=torch.bool),
+            lidar_depth_m=torch.where(is_hit, depth_m, 0.0),
+        )
+        pictures.append(full_picture(view))
+    return pictures
+
+
+class Fit:
+    """A running fit whose steps can be timed."""
+
+    def __init__(self, count, width_px, height_px, *, blocks=1):
+        scene, cameras = street_scene(count, width_px, height_px, blocks=blocks)
+        self.config = FitConfig(steps=10_000)
+        self.state = FitState.begin(scene, self.config)
+        self.pictures = training_pictures(cameras)
+        self.view = 0
+
+    def step(self):
+        """What every step of a fit does, on one recorded view after the other."""
+        recorded_step(self.state, self.pictures[self.view], self.view, self.config, None)
+        self.state.gaussian_adam.step(self.state.scene.gaussians, 0.5)
+        self.state.step += 1
+        self.view = (self.view + 1) % len(self.pictures)
+
+
+def iteration_figures(machine, repeats):
+    """A whole step, its render and loss against their kernels, and its fixed cost."""
+    count, width, height = SIZE
+    splats = street_like_splats(*SIZE)
+    stages = Stages(splats)
+    target = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(2))
+    kernels_ms = sum(1e3 * best_cpu_s(getattr(stages, name), repeats) for name in STAGES)
+    loss_ms = 1e3 * best_cpu_s(lambda: _loss(target, splats=None), repeats)
+    whole_ms = 1e3 * best_cpu_s(lambda: _loss(target, splats=splats), repeats)
+    values = 3 * width * height
+    ssim_floor = max(
+        values * SSIM_FLOP_PER_VALUE / machine.flops,
+        values * SSIM_BYTES_PER_VALUE / machine.bandwidth,
+    )
+    fit, idle = Fit(*SIZE), Fit(1, 16, 16)
+    iteration_ms = 1e3 * best_cpu_s(fit.step, repeats)
+    idle_ms = 1e3 * best_cpu_s(idle.step, repeats)
+    adam_ms = 1e3 * best_cpu_s(lambda: _adam(fit), repeats)
+    numbers = count * FLOATS_PER_GAUSSIAN
+    return [
+        Figure(
+            name="ssim.forward_backward",
+            value=loss_ms,
+            unit="ms",
+            floor=1e3 * ssim_floor,
+        ),
+        Figure(
+            name="adam.step",
+            value=adam_ms,
+            unit="ms",
+            floor=1e3 * numbers * ADAM_BYTES / machine.bandwidth,
+        ),
+        Figure(name="iteration", value=iteration_ms, unit="ms", floor=kernels_ms + loss_ms),
+        Figure(
+            name="iteration.render_and_loss",
+            value=whole_ms,
+            unit="ms",
+            floor=kernels_ms + loss_ms,
+            limit=1.3,
+            tolerance=0.15,
+        ),
+        Figure(
+            name="iteration.python_share",
+            value=idle_ms / iteration_ms,
+            unit="x",
+            limit=0.05,
+        ),
+    ]
+
+
+def _loss(target, *, splats):
+    """The picture loss and its gradient, of a drawn picture or of a given one."""
+    if splats is None:
+        rgb = (target * 0.9).requires_grad_()
+    else:
+        rgb = render_gaussians(**splats, backend="cpu").rgb
+    l1_ssim_loss(rgb, target).backward()
+
+
+def _adam(fit):
+    gaussians = fit.state.scene.gaussians
+    for parameter in gaussians.parameters().values():
+        parameter.grad = parameter.detach()
+    fit.state.gaussian_adam.step(gaussians, 0.5)
+
+
+def frame_growth_figures(repeats):
+    """A street of four blocks against one of them: what is out of view is not to be paid for."""
+    taken = {}
+    for blocks in (1, 4):
+        fit = Fit(*SIZE, blocks=blocks)
+        taken[blocks] = 1e3 * best_cpu_s(fit.step, repeats * blocks)
+    return [
+        Figure(name="growth.frames.1", value=taken[1], unit="ms"),
+        Figure(name="growth.frames.4", value=taken[4], unit="ms"),
+        Figure(name="growth.frames.four_times", value=taken[4] / taken[1], unit="x", limit=1.15),
+    ]
+
+
+def memory_figures():
+    """Peak memory of a step with a million Gaussians beyond parameters and Adam's moments."""
+    told = subprocess.run(
+        [sys.executable, __file__, "1000000", "960", "640"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    extra = json.loads(told.stdout)["extra_bytes"]
+    return [Figure(name="memory.training_step", value=extra / 1e9, unit="GB", limit=1.5)]
+
+
+def _measure_memory(count, width_px, height_px):
+    small = Fit(100, width_px, height_px)
+    small.step()  # compiles and allocates what does not depend on the number of Gaussians
+    del small
+    before = _resident_bytes()
+    fit = Fit(count, width_px, height_px)
+    # forget the peak of building the scene; what it left unreturned counts against the step
+    Path("/proc/self/clear_refs").write_text("5", "ascii")
+    fit.step()
+    kept_bytes = count * FLOATS_PER_GAUSSIAN * 4 * 3  # parameters and two moments
+    sys.stdout.write(json.dumps({"extra_bytes": _peak_bytes() - before - kept_bytes}))
+
+
+def _resident_bytes():
+    return int(Path("/proc/self/statm").read_text("ascii").split()[1]) * resource.getpagesize()
+
+
+def _peak_bytes():
+    lines = Path("/proc/self/status").read_text("ascii").splitlines()
+    peak = next(line for line in lines if line.startswith("VmHWM"))
+    return int(peak.split()[1]) * 1024
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    _measure_memory(*(int(argument) for argument in sys.argv[1:]))

@@ -1,0 +1,195 @@
+"""The rasteriser stage by stage: each against its floor, then the whole, two threads and growth."""
+
+from itertools import pairwise
+
+import numba
+import numpy as np
+import torch
+from bench_machine import best_cpu_s, best_wall_s
+from bench_records import Figure
+from bench_scenes import street_like_splats
+from bench_work import BACKWARD_LANE_FLOP, FORWARD_LANE_FLOP, count_lanes, raster_bytes
+
+from lidarpainter_models.kernels.gaussian_raster import cpu, render_gaussians
+from lidarpainter_models.kernels.gaussian_raster.binning import list_tiles
+from lidarpainter_models.kernels.gaussian_raster.blending import Pictures, blend
+from lidarpainter_models.kernels.gaussian_raster.blending_gradients import entry_sums
+from lidarpainter_models.kernels.gaussian_raster.projection import IS_VISIBLE, project
+from lidarpainter_models.kernels.gaussian_raster.projection_gradients import unproject
+from lidarpainter_models.kernels.gaussian_raster.splat_inputs import SplatView
+
+GAUSSIAN_GROWTH = (20_000, 40_000, 80_000, 160_000, 320_000, 640_000, 1_000_000)
+PIXEL_GROWTH = ((400, 250), (560, 360), (800, 500), (1120, 720), (1600, 1000), (2000, 1000))
+
+
+class Stages:
+    """The compiled stages of one scene, each callable alone on what the one before made."""
+
+    def __init__(self, splats):
+        count = len(splats["means"])
+        names = ("means", "rotation_wxyz", "scale_m", "opacity", "sh")
+        tensors = tuple(splats[name] for name in names)
+        tensors += (torch.zeros(count, 0), torch.zeros(count, 2))
+        tensors += (splats["camera_from_body"], splats["body_index"])
+        camera = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
+        self.gaussians = cpu._gaussians(tensors)
+        self.view = cpu._compiled_view(SplatView(**{name: splats[name] for name in camera}))
+        self.records = self.project()
+        self.lists = self.list_tiles()
+        self.drawn = self.blend()
+        generator = np.random.default_rng(0)
+        self.to_drawn = Pictures(
+            *(generator.standard_normal(p.shape).astype(np.float32) for p in self.drawn)
+        )
+        self.slots = self.blend_gradients()
+
+    def project(self):
+        return project(self.gaussians, self.view)
+
+    def list_tiles(self):
+        return list_tiles(self.records, self.view.width, self.view.height)
+
+    def blend(self):
+        features = self.gaussians.features
+        return blend(self.records, features, self.lists, self.view.width, self.view.height)
+
+    def blend_gradients(self):
+        features = self.gaussians.features
+        return entry_sums(self.records, features, self.lists, self.drawn, self.to_drawn)
+
+    def unproject(self):
+        return unproject(self.gaussians, self.view, self.records, self.lists, self.slots)
+
+
+STAGES = ("project", "list_tiles", "blend", "blend_gradients", "unproject")
+
+
+def forward(splats):
+    """One picture, without what a backward pass needs."""
+    with torch.no_grad():
+        return render_gaussians(**splats, backend="cpu")
+
+
+def step(splats):
+    """One picture and all gradients."""
+    image = render_gaussians(**splats, backend="cpu")
+    loss = image.rgb.square().sum() + 0.01 * image.depth_m.sum() + image.alpha.sum()
+    loss.backward()
+
+
+def raster_figures(machine, size, repeats):
+    """Every stage and the whole of one scene on one thread; times in milliseconds."""
+    numba.set_num_threads(1)
+    splats = street_like_splats(*size)
+    stages = Stages(splats)
+    lanes = count_lanes(stages.records, stages.lists, stages.view.height, stages.view.width)
+    floors = _stage_floors(stages, lanes, machine)
+    figures = []
+    for name in STAGES:
+        taken = 1e3 * best_cpu_s(getattr(stages, name), repeats)
+        # the lane loops are held to multiply-adds alone, the other stages to memory
+        limit = 4.0 if name in ("blend", "blend_gradients") else None
+        figures.append(
+            Figure(
+                name=f"gaussian_raster.{name}",
+                value=taken,
+                unit="ms",
+                floor=floors[name],
+                limit=limit,
+            )
+        )
+    forward_ms = 1e3 * best_cpu_s(lambda: forward(splats), repeats)
+    step_ms = 1e3 * best_cpu_s(lambda: step(splats), repeats)
+    forward_floor = sum(floors[name] for name in STAGES[:3])
+    backward_floor = sum(floors[name] for name in STAGES[3:])
+    return [
+        Figure(
+            name="gaussian_raster.forward",
+            value=forward_ms,
+            unit="ms",
+            floor=forward_floor,
+        ),
+        Figure(
+            name="gaussian_raster.backward",
+            value=step_ms - forward_ms,
+            unit="ms",
+            floor=backward_floor,
+        ),
+        Figure(
+            name="gaussian_raster.lanes_per_blend",
+            value=lanes.evaluated / lanes.blended,
+            unit="x",
+            limit=2.6,
+            tolerance=0.02,
+        ),
+        *figures,
+    ]
+
+
+def _stage_floors(stages, lanes, machine):
+    """Milliseconds: multiply-adds of the lanes for the lane loops, bytes for the other stages."""
+    count, visible = len(stages.records), int((stages.records[:, IS_VISIBLE] > 0).sum())
+    pixels = stages.view.width * stages.view.height
+    moved = raster_bytes(count, visible, len(stages.lists.gaussian), pixels)
+    floors = {name: 1e3 * moved[name] / machine.bandwidth for name in STAGES}
+    floors["blend"] = 1e3 * lanes.evaluated * FORWARD_LANE_FLOP / machine.flops
+    floors["blend_gradients"] = 1e3 * lanes.evaluated * BACKWARD_LANE_FLOP / machine.flops
+    return floors
+
+
+def thread_figures(size, repeats):
+    """Wall time of one thread over that of two, taken in turns so that a busy spell hits both."""
+    if numba.config.NUMBA_NUM_THREADS < 2:
+        return []
+    splats = street_like_splats(*size)
+    walls = {1: float("inf"), 2: float("inf")}
+    for _ in range(repeats):
+        for threads in walls:
+            numba.set_num_threads(threads)
+            walls[threads] = min(walls[threads], best_wall_s(lambda: step(splats), 1))
+    numba.set_num_threads(1)
+    speedup = walls[1] / walls[2]
+    return [
+        Figure(
+            name="gaussian_raster.thread_speedup",
+            value=speedup,
+            unit="x",
+            threads=2,
+            better="higher",
+            limit=1.7,
+        )
+    ]
+
+
+def growth_figures(repeats, *, gaussians=GAUSSIAN_GROWTH, sizes=PIXEL_GROWTH):
+    """Time of a step at growing sizes; each as the growth per doubling of what grew."""
+    by_count = {count: 1e3 * best_cpu_s(_step_of(count, 960, 640), repeats) for count in gaussians}
+    by_pixels = {
+        width * height: 1e3 * best_cpu_s(_step_of(100_000, width, height), repeats)
+        for width, height in sizes
+    }
+    figures = doublings("growth.gaussians", by_count, "Gaussians")
+    return figures + doublings("growth.pixels", by_pixels, "px")
+
+
+def _step_of(count, width, height):
+    splats = street_like_splats(count, width, height)
+    return lambda: step(splats)
+
+
+def doublings(name, taken_ms, unit):
+    """The times, and for each pair of neighbours how much a doubling would have cost."""
+    figures = [
+        Figure(name=f"{name}.{amount}", value=ms, unit="ms") for amount, ms in taken_ms.items()
+    ]
+    for (few, fast), (many, slow) in pairwise(taken_ms.items()):
+        per_doubling = (slow / fast) ** (np.log(2.0) / np.log(many / few))
+        figures.append(
+            Figure(
+                name=f"{name}.doubling.{few}-{many}_{unit}",
+                value=float(per_doubling),
+                unit="x",
+                limit=2.2,
+            )
+        )
+    return figures
