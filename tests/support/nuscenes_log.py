@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from lidarpainter_models.geometry.transforms import (
+    interpolate_rigid,
     interpolate_rigid_track,
     invert_rigid,
     quaternion_from_rotation,
@@ -304,20 +305,24 @@ def written_pose(target_from_source):
 
 
 def _when_seen(track, scene):
-    """A track whose boxes stand where and when the LiDAR, turning clockwise, looked at them."""
+    """A track whose boxes stand where and when the LiDAR, turning clockwise, looked at them.
+
+    The actor goes from its first to its last place at one speed: boxes of key frames say no more
+    about the time between them.
+    """
     times_ns, poses = [], []
     for frame_index in track.frame_indices.tolist():
         ends_ns = 1000 * (end_us(scene, scene.frame_indices.index(frame_index)) - START_US)
         lidar_from_global = invert_rigid(ego_at(scene, ends_ns) @ EGO_FROM_LIDAR)
-        time_ns = ends_ns
-        for _ in range(12):
-            pose = _continued(track, time_ns)
+        time_ns, pose = ends_ns, _uniformly(track, ends_ns)
+        for _ in range(6 if track.is_moving else 1):
             x, y, _z, _one = lidar_from_global @ scene.global_from_world @ pose[:, 3]
             from_left_clockwise = (np.pi - np.arctan2(float(y), float(x))) % (2 * np.pi)
             turned = from_left_clockwise / (2 * np.pi)
             time_ns = ends_ns - round((1 - turned) * 2 * HALF_TURN_US * 1000)
+            pose = _uniformly(track, time_ns)
         times_ns.append(time_ns)
-        poses.append(_continued(track, time_ns))
+        poses.append(pose)
     return replace(
         track,
         timestamps_ns=torch.tensor(times_ns) + 1000 * START_US,
@@ -325,12 +330,7 @@ def _when_seen(track, scene):
     )
 
 
-def _continued(track, time_ns):
-    """A track's pose; before its first and after its last box the motion there goes on."""
+def _uniformly(track, time_ns):
     first_ns, last_ns = int(track.timestamps_ns[0]), int(track.timestamps_ns[-1])
-    end = 0 if time_ns < first_ns else -1
-    if first_ns <= time_ns <= last_ns:
-        return track.pose_at(time_ns)
-    pose = track.world_from_box[end]
-    mirrored = track.pose_at(2 * (first_ns if end == 0 else last_ns) - time_ns)
-    return pose @ invert_rigid(mirrored) @ pose
+    share = torch.tensor((time_ns - first_ns) / (last_ns - first_ns), dtype=torch.float64)
+    return interpolate_rigid(track.world_from_box[0], track.world_from_box[-1], share)
