@@ -7,6 +7,7 @@ The nuScenes devkit opens the result.
     write_nuscenes_log(scene, root, key_every=3)  # root/v1.0-mini, root/samples, root/sweeps
 """
 
+import copy
 import hashlib
 import json
 from dataclasses import replace
@@ -83,6 +84,32 @@ def street_like_nuscenes(store, *, global_from_world=FAR_AWAY, **settings):
     scene.manifest["global_from_world"] = global_from_world.reshape(16).tolist()
     scene.tracks = tuple(_when_seen(track, scene) for track in scene.tracks)
     return scene
+
+
+def reduced(scene, *, num_frames, cameras, num_actors):
+    """The first frames of a scene, some cameras, and the actors with the most points."""
+    small = copy.copy(scene)
+    small.frame_indices = scene.frame_indices[:num_frames]
+    small.frame_timestamps_ns = scene.frame_timestamps_ns[:num_frames]
+    small.world_from_ego = scene.world_from_ego[:num_frames]
+    small.views = tuple(
+        view
+        for view in scene.views
+        if view.camera_name in cameras and view.frame_index in small.frame_indices
+    )
+    small.sweeps = tuple(s for s in scene.sweeps if s.frame_index in small.frame_indices)
+    ranked = sorted(scene.tracks, key=lambda track: -int(track.num_points[:num_frames].min()))
+    small.tracks = tuple(
+        replace(
+            track,
+            frame_indices=track.frame_indices[:num_frames],
+            timestamps_ns=track.timestamps_ns[:num_frames],
+            world_from_box=track.world_from_box[:num_frames],
+            num_points=track.num_points[:num_frames],
+        )
+        for track in ranked[:num_actors]
+    )
+    return small
 
 
 def write_nuscenes_log(scene, root, *, key_every=3, version="v1.0-mini", name=SCENE_NAME):
