@@ -34,7 +34,6 @@ from lidarpainter_models.scenes.synthetic import (
     write_street,
 )
 
-START_US = 1_532_402_927_000_000
 HALF_TURN_US = 25_000
 SCENE_NAME = "scene-0061"
 LOG_NAME = "n015-2018-07-24-11-22-45+0800"
@@ -183,11 +182,11 @@ class _Log:
             if view.frame_index == frame_index:
                 pose = scene.global_from_world @ view.camera.world_from_camera
                 global_from_ego = pose @ invert_rigid(self.ego_from_sensor[view.camera_name])
-                time_us = START_US + view.timestamp_ns // 1000
+                time_us = view.timestamp_ns // 1000
                 row = self._data_row(view.camera_name, position, time_us, global_from_ego)
                 row |= {"width": view.camera.width_px, "height": view.camera.height_px}
                 self._write(row["filename"], scene.read_jpeg(view))
-        global_from_ego = ego_at(scene, 1000 * (self.ends_us[position] - START_US))
+        global_from_ego = ego_at(scene, 1000 * self.ends_us[position])
         row = self._data_row("LIDAR_TOP", position, self.ends_us[position], global_from_ego)
         self._write(row["filename"], self._cloud(frame_index, global_from_ego))
         if is_key:
@@ -310,7 +309,7 @@ class _Log:
 def end_us(scene, position):
     """When the turn of a frame's sweep ends; the street states its middle."""
     sweep = scene.sweeps_of(scene.frame_indices[position])[0]
-    return START_US + sweep.timestamp_ns // 1000 + HALF_TURN_US
+    return sweep.timestamp_ns // 1000 + HALF_TURN_US
 
 
 def ego_at(scene, timestamp_ns):
@@ -339,7 +338,7 @@ def _when_seen(track, scene):
     """
     times_ns, poses = [], []
     for frame_index in track.frame_indices.tolist():
-        ends_ns = 1000 * (end_us(scene, scene.frame_indices.index(frame_index)) - START_US)
+        ends_ns = 1000 * end_us(scene, scene.frame_indices.index(frame_index))
         lidar_from_global = invert_rigid(ego_at(scene, ends_ns) @ EGO_FROM_LIDAR)
         time_ns, pose = ends_ns, _uniformly(track, ends_ns)
         for _ in range(6 if track.is_moving else 1):
@@ -352,7 +351,7 @@ def _when_seen(track, scene):
         poses.append(pose)
     return replace(
         track,
-        timestamps_ns=torch.tensor(times_ns) + 1000 * START_US,
+        timestamps_ns=torch.tensor(times_ns),
         world_from_box=torch.stack(poses),
     )
 
