@@ -3,12 +3,17 @@
 The pickle has matrices instead of the tables; its transforms from the LiDAR to each camera hold
 the car's motion between their times, so that the ego pose of every picture follows from them. The
 pickle is read as inert data with an allow-list.
+
+    python tests/support/nuscenes_key_frame.py FOLDER PICTURE.jpg  # docs/pictures/overlay_nuscenes
 """
 
 import json
 import shutil
+import sys
+import tempfile
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from nuscenes_log import token_of, written_pose
@@ -18,6 +23,9 @@ from lidarpainter_models.geometry.transforms import (
     rigid_from_rotation,
     rotation_from_vector,
 )
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.overlay import draw_overlay
+from lidarpainter_models.scenes.readers import ingest_scene
 from lidarpainter_models.scenes.readers.pickle_tree import Made, Named, read_pickle_tree
 
 SCENE_NAME = "scene-0061"
@@ -136,3 +144,16 @@ class _Tables:
 
 def _matrix(rows):
     return torch.tensor(rows, dtype=torch.float64)
+
+
+def draw_key_frame(folder, camera_name="CAM_FRONT"):
+    """The overlay of one camera of a key frame, BGR bytes, made through tables and reader."""
+    with tempfile.TemporaryDirectory() as place:
+        write_key_frame(folder, Path(place) / "log")
+        path = ingest_scene("nuscenes", Path(place) / "log", SCENE_NAME, Path(place) / "store")
+        picture = draw_overlay(DrivingScene.open(path), 0, camera_name).numpy()
+    return cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+
+
+if __name__ == "__main__":
+    cv2.imwrite(sys.argv[2], draw_key_frame(sys.argv[1]), [cv2.IMWRITE_JPEG_QUALITY, 80])

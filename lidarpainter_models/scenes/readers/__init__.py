@@ -11,8 +11,8 @@ Progress = Callable[[int, int], None]
 """Told frames done and frames in all."""
 
 _READERS = {
-    "nuscenes": (list_nuscenes_scenes, read_nuscenes),
     "pandaset": (list_pandaset_sequences, read_pandaset),
+    "nuscenes": (list_nuscenes_scenes, read_nuscenes),
 }
 
 

@@ -28,7 +28,6 @@ from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.transforms import (
     interpolate_rigid,
     invert_rigid,
-    transform_points,
 )
 from lidarpainter_models.scenes.readers.nuscenes_dataset import NuscenesTables, Sample
 from lidarpainter_models.scenes.readers.nuscenes_recordings import LIDAR_NAME, Recording
@@ -94,11 +93,22 @@ class Annotations:
         first, second = self._boxes[before], self._boxes[before + 1]
         elapsed_ns = sweep.timestamp_ns - self._key_ns[before]
         share = elapsed_ns / (self._key_ns[before + 1] - self._key_ns[before])
-        return [
-            _between(box, second[actor_id], share, sweep)
-            for actor_id, box in first.items()
-            if actor_id in second
-        ]
+        pairs = [(box, second[name]) for name, box in first.items() if name in second]
+        return _between(pairs, share, _Turn(sweep)) if pairs else []
+
+
+class _Turn:
+    """The turn of the LiDAR that ended with a sweep."""
+
+    def __init__(self, sweep: Recording) -> None:
+        self._end_ns = sweep.timestamp_ns
+        self._lidar_from_global = invert_rigid(sweep.global_from_sensor).numpy()
+
+    def seen_ns(self, place_global_m: np.ndarray) -> int:
+        """When the LiDAR looked at a place."""
+        rotation, translation_m = self._lidar_from_global[:2, :3], self._lidar_from_global[:2, 3]
+        place_m = rotation @ place_global_m + translation_m
+        return self._end_ns + int(turn_offset_ns(place_m[:1], place_m[1:])[0])
 
 
 class PointsByPlace:
@@ -106,6 +116,7 @@ class PointsByPlace:
 
     def __init__(self, xyz_m: Float[Tensor, "points 3"]) -> None:
         self._xyz_m = xyz_m[torch.argsort(xyz_m[:, 0])]
+        self._x_m = self._xyz_m[:, 0].contiguous()
 
     def count_inside(
         self, target_from_box: Float[Tensor, "4 4"], size_m: tuple[float, float, float]
@@ -114,7 +125,7 @@ class PointsByPlace:
         reach_m = float(np.linalg.norm(size_m)) / 2
         centre_x_m = float(target_from_box[0, 3])
         ends_m = torch.tensor([centre_x_m - reach_m, centre_x_m + reach_m]).to(self._xyz_m)
-        first, last = torch.searchsorted(self._xyz_m[:, 0].contiguous(), ends_m).tolist()
+        first, last = torch.searchsorted(self._x_m, ends_m).tolist()
         near_m = self._xyz_m[first:last]
         return int(is_inside_box(near_m, target_from_box, torch.tensor(size_m)).sum())
 
@@ -123,6 +134,7 @@ def _read_boxes(
     tables: NuscenesTables, sample: Sample, sweep: Recording, categories: dict[str, str]
 ) -> dict[str, AnnotatedBox]:
     """The boxes of one key frame by instance; `categories` remembers what instances are."""
+    turn = _Turn(sweep)
     boxes: dict[str, AnnotatedBox] = {}
     for row in tables["sample_annotation"].rows_with(sample.token):
         instance = row.text("instance_token")
@@ -130,7 +142,7 @@ def _read_boxes(
             raise DataError(f"{row.where}: the sample has another box of instance {instance}")
         if instance not in categories:
             categories[instance] = _read_category(tables, instance, row.where)
-        boxes[instance] = _read_box(row, categories[instance], sweep)
+        boxes[instance] = _read_box(row, categories[instance], turn)
     return boxes
 
 
@@ -143,7 +155,7 @@ def _read_category(tables: NuscenesTables, instance: str, asked_by: str) -> str:
     return tables["category"].row(row.text("category_token"), row.where).text("name")
 
 
-def _read_box(row: TableRow, category: str, sweep: Recording) -> AnnotatedBox:
+def _read_box(row: TableRow, category: str, turn: _Turn) -> AnnotatedBox:
     width_m, length_m, height_m = row.numbers("size", 3)
     size_m = (length_m, width_m, height_m)
     require_size(size_m, row.where)
@@ -152,37 +164,44 @@ def _read_box(row: TableRow, category: str, sweep: Recording) -> AnnotatedBox:
         actor_id=row.text("instance_token"),
         category=category,
         size_m=size_m,
-        timestamp_ns=_seen_ns(global_from_box[:3, 3], sweep),
+        timestamp_ns=turn.seen_ns(global_from_box[:3, 3].numpy()),
         global_from_box=global_from_box,
     )
 
 
 def _between(
-    first: AnnotatedBox, second: AnnotatedBox, share: float, sweep: Recording
-) -> AnnotatedBox:
-    """A box at the moment a sweep between two key frames, `share` of the way, looked at it.
+    pairs: list[tuple[AnnotatedBox, AnnotatedBox]], share: float, turn: _Turn
+) -> list[AnnotatedBox]:
+    """The boxes of a sweep that is `share` of the way from one key frame to the next."""
+    moments_ns, shares = zip(*[_moment(*pair, share, turn) for pair in pairs], strict=True)
+    poses = interpolate_rigid(
+        torch.stack([first.global_from_box for first, _ in pairs]),
+        torch.stack([second.global_from_box for _, second in pairs]),
+        torch.tensor(shares, dtype=torch.float64),
+    )
+    return [
+        replace(first, timestamp_ns=moment_ns, global_from_box=pose)
+        for (first, _), moment_ns, pose in zip(pairs, moments_ns, poses, strict=True)
+    ]
 
-    Where the box stands and when the sweep looked there depend on each other; each round makes the
-    error smaller by the box's speed over that of the beam at the box, less than a tenth.
+
+def _moment(
+    first: AnnotatedBox, second: AnnotatedBox, share: float, turn: _Turn
+) -> tuple[int, float]:
+    """When a turn looks at a box on its way from one place to another, and how far it is then.
+
+    Where the box stands and when it is looked at depend on each other; each round makes the error
+    smaller by the box's speed over that of the beam at the box, less than a tenth.
     """
-    start_m, end_m = first.global_from_box[:3, 3], second.global_from_box[:3, 3]
+    start_m = first.global_from_box[:3, 3].numpy()
+    end_m = second.global_from_box[:3, 3].numpy()
     seen_ns, last_ns = first.timestamp_ns, second.timestamp_ns
     for _ in range(_ROUNDS):
-        seen_ns = _seen_ns(torch.lerp(start_m, end_m, share), sweep)
+        seen_ns = turn.seen_ns(start_m + share * (end_m - start_m))
         seen_ns = min(max(seen_ns, first.timestamp_ns), last_ns)
         if first.timestamp_ns < last_ns:
             share = (seen_ns - first.timestamp_ns) / (last_ns - first.timestamp_ns)
-    pose = interpolate_rigid(
-        first.global_from_box, second.global_from_box, torch.tensor(share, dtype=torch.float64)
-    )
-    return replace(first, timestamp_ns=seen_ns, global_from_box=pose)
-
-
-def _seen_ns(place_global_m: Float[Tensor, "3"], sweep: Recording) -> int:
-    """When the LiDAR looked at a place in the turn that ended with a sweep."""
-    lidar_from_global = invert_rigid(sweep.global_from_sensor)
-    x_m, y_m, _ = transform_points(lidar_from_global, place_global_m[None])[0].numpy()
-    return sweep.timestamp_ns + int(turn_offset_ns(np.array([x_m]), np.array([y_m]))[0])
+    return seen_ns, share
 
 
 def _moving(frames: list[dict[str, AnnotatedBox]]) -> frozenset[str]:

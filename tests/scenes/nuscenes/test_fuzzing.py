@@ -6,6 +6,7 @@ import shutil
 from collections import Counter
 from itertools import count
 
+import mutations
 import numpy as np
 import pytest
 from mutations import damaged_bytes, damaged_json, judge
@@ -14,6 +15,23 @@ NUM_CASES = 10_000
 MAX_MEMORY_BYTES = 2 * 1024**3
 PLACES = (".json", ".jpg", ".pcd.bin", "scene-0061")
 _ticks = count(1)
+
+
+@pytest.fixture(autouse=True)
+def doctor_asked_once(monkeypatch):
+    """Most damage that is not refused leaves the scene as it was: equal digest, equal findings."""
+    monkeypatch.setattr(mutations, "check_scene", remembered(mutations.check_scene))
+
+
+def remembered(check):
+    found = {}
+
+    def checked(scene):
+        if scene.content_digest not in found:
+            found[scene.content_digest] = check(scene)
+        return found[scene.content_digest]
+
+    return checked
 
 
 def damaged_file(log, rng):
