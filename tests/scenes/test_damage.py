@@ -1,8 +1,10 @@
 """The damage that readers are tried with is real, seeded, and judged strictly."""
 
 import json
+import time
 from collections import Counter
 
+import mutations
 import numpy as np
 import pytest
 from mutations import damaged_bytes, damaged_json, judge
@@ -79,5 +81,20 @@ def test_other_ends_are_not_good(tmp_path):
         (write_elsewhere, "outside the store"),
         (leave_a_file, "a refused log left"),
     ):
+        with pytest.raises(AssertionError, match=complaint):
+            judged(ingest, tmp_path)
+
+
+def test_ingest_without_end_is_stopped(tmp_path, monkeypatch):
+    monkeypatch.setattr(mutations, "MAX_SECONDS", 0.1)
+
+    def spin():
+        while True:
+            pass
+
+    def wait():
+        time.sleep(60)
+
+    for ingest, complaint in ((spin, "s of CPU time"), (wait, "s of waiting")):
         with pytest.raises(AssertionError, match=complaint):
             judged(ingest, tmp_path)
