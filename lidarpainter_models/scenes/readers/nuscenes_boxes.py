@@ -4,8 +4,8 @@ What the dataset does and what is made of it here:
 
 - `size` is width, length, height; the canonical order is length, width, height. The box's own axes
   (x along the length, y left, z up) are the canonical ones; `rotation` is w, x, y, z.
-- A box is drawn around the points of its key sweep. The sweep took 50 ms, so the box holds when
-  the LiDAR looked at its centre, which the centre's azimuth tells; at 10 m/s half a metre would be
+- A box is drawn around the points of its key sweep, which took 50 ms: it is taken to hold when
+  the LiDAR looked at its centre, as the centre's azimuth tells; at 10 m/s half a metre would be
   at stake. That moment is the box's time, and the one at which it is interpolated.
 - Between two neighbouring key frames that both have an instance, it has a box in every sweep, at
   the moment this sweep looked at it: slerp and a straight line between the two. Before the first,

@@ -72,14 +72,14 @@ def outcomes_of(log, seeds, folder):
 
 @pytest.mark.parametrize("part", range(4))
 def test_damaged_logs_end_well(log, tmp_path, part):
-    outcomes = outcomes_of(log, range(40 * part, 40 * (part + 1)), tmp_path)
-    assert outcomes["refused"] >= 10
+    outcomes = outcomes_of(log, range(25 * part, 25 * (part + 1)), tmp_path)
+    assert outcomes["refused"] >= 5
     assert outcomes["accepted"] >= 2
 
 
 @pytest.mark.slow
 def test_ten_thousand_damaged_logs_end_well(log, tmp_path, record_property):
-    """Half an hour; `-o junit_family=xunit1 --junit-xml=FILE` keeps the counts."""
+    """Long; `-o junit_family=xunit1 --junit-xml=FILE` keeps the counts."""
     outcomes = outcomes_of(log, range(NUM_CASES), tmp_path)
     for outcome, number in outcomes.items():
         record_property(outcome, number)
