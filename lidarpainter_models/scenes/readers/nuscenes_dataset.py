@@ -5,6 +5,7 @@ tables, beside `samples/` and `sweeps/`. A scene of several versions (mini is a 
 taken from the first of them in the order above; other versions follow by name.
 """
 
+import stat
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -46,10 +47,13 @@ class NuscenesTables:
     def __getitem__(self, name: str) -> NuscenesTable:
         path = self.folder / f"{name}.json"
         try:
-            stat = path.stat()
+            status = path.stat()
         except OSError:
             raise DataError(f"{path}: the table is missing") from None
-        return _read_table(path, _KEYS[name], _Stamp(stat.st_size, stat.st_mtime_ns, stat.st_ino))
+        if not stat.S_ISREG(status.st_mode):  # a pipe would be waited for without end
+            raise DataError(f"{path}: not a file")
+        stamp = _Stamp(status.st_size, status.st_mtime_ns, status.st_ino)
+        return _read_table(path, _KEYS[name], stamp)
 
     def digests(self) -> dict[str, str]:
         """SHA-256 of every table."""

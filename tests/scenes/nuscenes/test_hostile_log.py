@@ -1,5 +1,7 @@
 """A bad nuScenes log gets one clear line with file and row, and leaves nothing behind."""
 
+import os
+
 import numpy as np
 import pytest
 
@@ -67,7 +69,7 @@ CASES = [
     ("sample_data", set_in("filename", "a\x00b"), "expected a path below the root"),
     ("sample_data", set_in("filename", "\ud800"), "expected a path below the root"),
     ("sample_data", set_in("filename", "x" * 5000), "cannot be read (File name too long)"),
-    ("sample_data", set_in("filename", "samples"), "cannot be read (Is a directory)"),
+    ("sample_data", set_in("filename", "samples"), "/log/samples: "),
     ("sample_data", set_in("filename", "samples/none.jpg"), "none.jpg: the file is missing"),
     ("sample_data", set_in("is_key_frame", "yes"), "is_key_frame is 'yes', expected true or"),
     ("sample_data", set_in("width", 97), "the picture is 96 x 54 px, expected 97 x 54"),
@@ -117,6 +119,13 @@ def test_two_key_sweeps_of_one_sample(log, store):
 def test_missing_table(log, store, table):
     (log.folder / f"{table}.json").unlink()
     assert refusal(log, store).endswith(f"{table}.json: the table is missing")
+
+
+def test_table_that_never_ends(log, store):
+    path = log.folder / "category.json"
+    path.unlink()
+    os.mkfifo(path)
+    assert refusal(log, store).endswith("category.json: not a file")
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
