@@ -4,12 +4,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 from lidarpainter_models.errors import DataError
+from lidarpainter_models.scenes.readers.nuscenes import list_nuscenes_scenes, read_nuscenes
 from lidarpainter_models.scenes.readers.pandaset import list_pandaset_sequences, read_pandaset
 
 Progress = Callable[[int, int], None]
 """Told frames done and frames in all."""
 
-_READERS = {"pandaset": (list_pandaset_sequences, read_pandaset)}
+_READERS = {
+    "pandaset": (list_pandaset_sequences, read_pandaset),
+    "nuscenes": (list_nuscenes_scenes, read_nuscenes),
+}
 
 
 def known_datasets() -> tuple[str, ...]:
