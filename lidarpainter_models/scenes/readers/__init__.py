@@ -5,11 +5,15 @@ from pathlib import Path
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.scenes.readers.pandaset import list_pandaset_sequences, read_pandaset
+from lidarpainter_models.scenes.readers.waymo import list_waymo_segments, read_waymo
 
 Progress = Callable[[int, int], None]
 """Told frames done and frames in all."""
 
-_READERS = {"pandaset": (list_pandaset_sequences, read_pandaset)}
+_READERS = {
+    "pandaset": (list_pandaset_sequences, read_pandaset),
+    "waymo": (list_waymo_segments, read_waymo),
+}
 
 
 def known_datasets() -> tuple[str, ...]:

@@ -1,0 +1,320 @@
+"""A scene as Waymo's car could have recorded it, made from a synthetic street.
+
+The truth is what the formats can express, so that a reader must give it back as it is:
+
+- Points of TOP are those of the street: each has a pixel of its own (beam and firing) and the
+  pose of the car at that moment. A second echo stands half a metre behind every fourth.
+- Points of the other LiDARs are the street's points near the car, moved to the centre of the pixel
+  they fall into, at most two a pixel; `num_lost` counts the others, which are in no truth.
+- Boxes stand upright in the vehicle frame (the street's follow its slope by a degree or so).
+- Every camera takes its picture at its own moment, with the car's velocity carried that far, and
+  through a distorted lens. The pixels of the pictures are the street's, which nobody looks at.
+"""
+
+from collections import defaultdict
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from lidarpainter_models.geometry.boxes import is_inside_box
+from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.records import (
+    BoxRecord,
+    Distortion,
+    ImageRecord,
+    RollingShutter,
+    SweepPoints,
+)
+from lidarpainter_models.scenes.synthetic import (
+    RigCamera,
+    RigLidar,
+    SyntheticStreet,
+    SyntheticStreetConfig,
+    write_street,
+)
+from lidarpainter_models.scenes.synthetic.lidar import beam_inclinations_rad
+from lidarpainter_models.scenes.synthetic.street import ego_from_camera
+from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
+
+LENS_TERMS = (0.04, -0.03, 0.001, -0.0015, 0.002)
+NEAR_M = 15.0
+SECOND_ECHO_M = 0.5
+TURN_S = 0.1
+
+
+@dataclass(frozen=True)
+class CameraSetup:
+    """Where a camera looks and when it takes its picture."""
+
+    yaw_deg: float
+    exposure_ms: float
+    """Middle of the exposure, after the frame's pose."""
+    readout: str
+    position_m: tuple[float, float, float]
+
+
+CAMERAS = {
+    "FRONT": CameraSetup(0.0, -2.0, "right", (1.54, -0.02, 2.1)),
+    "FRONT_LEFT": CameraSetup(45.0, -14.0, "left", (1.49, 0.09, 2.1)),
+    "FRONT_RIGHT": CameraSetup(-45.0, 11.0, "right", (1.49, -0.09, 2.1)),
+    "SIDE_LEFT": CameraSetup(90.0, -26.0, "down", (1.43, 0.11, 2.1)),
+    "SIDE_RIGHT": CameraSetup(-90.0, 24.0, "up", (1.43, -0.11, 2.1)),
+}
+# yaw, pitch, roll in degrees and position on the vehicle
+NEAR_LIDARS = {
+    "FRONT": ((0.0, 1.2, 0.3), (4.07, 0.0, 0.69)),
+    "SIDE_LEFT": ((89.0, -0.4, 1.3), (3.24, 1.02, 0.98)),
+    "SIDE_RIGHT": ((-92.0, 0.3, -1.4), (3.24, -1.02, 0.98)),
+    "REAR": ((-178.4, 1.6, 0.5), (-1.15, 0.0, 0.46)),
+}
+NEAR_LIMITS_RAD = (-np.pi / 2, np.pi / 6)
+TOP_YAW_DEG = 148.0
+
+
+def far_away():
+    """A rigid global_from_world, some kilometres from the origin and turned about every axis."""
+    pose = torch.eye(4, dtype=torch.float64)
+    turn = Rotation.from_euler("zyx", [131.0, 0.4, -0.7], degrees=True).as_matrix()
+    pose[:3, :3] = torch.from_numpy(turn)
+    pose[:3, 3] = torch.tensor([-2311.0, 1804.5, -160.25], dtype=torch.float64)
+    return pose
+
+
+@dataclass
+class LidarSetup:
+    """What is calibrated of a LiDAR, and the size of its image."""
+
+    vehicle_from_lidar: np.ndarray
+    beams_rad: np.ndarray | None
+    """Rows from the top; None where they are uniform between `NEAR_LIMITS_RAD`."""
+    num_rows: int
+    num_columns: int
+
+
+@dataclass
+class WaymoTruth:
+    """A canonical scene and what the formats hold beside it."""
+
+    scene: DrivingScene
+    street: SyntheticStreet
+    lidars: dict[str, LidarSetup]
+    vehicle_from_camera: dict[str, torch.Tensor]
+    velocities: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    """Per frame: m/s in the global frame, rad/s in the vehicle's."""
+    num_lost: int = 0
+    """Points near the car that found both echoes of their pixel taken."""
+
+    def global_from_ego(self, timestamp_ns):
+        return self.scene.global_from_world @ self.street.world_from_ego(timestamp_ns)
+
+
+def street_config(**changes):
+    """A small street with Waymo's cameras."""
+    cameras = tuple(
+        RigCamera(
+            name=name,
+            focal_per_width=1.0,
+            yaw_rad=float(np.radians(setup.yaw_deg)),
+            forward_m=setup.position_m[0],
+            left_m=setup.position_m[1],
+            up_m=setup.position_m[2],
+        )
+        for name, setup in CAMERAS.items()
+    )
+    settings = {
+        "seed": 5,
+        "num_frames": 3,
+        "width_px": 96,
+        "height_px": 64,
+        "samples_per_axis": 1,
+        "cameras": cameras,
+        "lidar": RigLidar(name="TOP", beams=32, columns=450, up_m=2.18),
+    }
+    return SyntheticStreetConfig(**{**settings, **changes})
+
+
+def write_truth(config, folder, *, near_rows=24, near_columns=90):
+    """Record a street and store it as Waymo's car would have seen it."""
+    street_scene = DrivingScene.open(write_street(config, folder / "street"))
+    street = SyntheticStreet.from_manifest(street_scene.manifest)
+    truth = WaymoTruth(
+        scene=street_scene,
+        street=street,
+        lidars=_lidars(config, near_rows, near_columns),
+        vehicle_from_camera={rig.name: ego_from_camera(rig) for rig in config.cameras},
+    )
+    header = SceneHeader(licence="drawn", global_from_world=far_away())
+    with SceneWriter(folder / "truth", "truth", "waymo", header) as writer:
+        for frame_index in street_scene.frame_indices:
+            _write_frame(truth, street_scene, frame_index, writer)
+    truth.scene = DrivingScene.open(writer.path)
+    return truth
+
+
+def moved(pose, velocity, turn, seconds):
+    """A pose a moment later."""
+    later = pose.clone()
+    spin = Rotation.from_rotvec(np.asarray(turn) * seconds).as_matrix()
+    later[:3, :3] = pose[:3, :3] @ torch.from_numpy(spin)
+    later[:3, 3] += torch.from_numpy(np.asarray(velocity) * seconds)
+    return later
+
+
+def top_column(time_offset_ns, num_columns):
+    """Which firing of the turn a point of TOP belongs to."""
+    share = np.asarray(time_offset_ns) / 1e9 / TURN_S + 0.5
+    return np.rint(share * num_columns - 0.5).astype(int)
+
+
+def _lidars(config, near_rows, near_columns):
+    top = np.eye(4)
+    top[:3, :3] = Rotation.from_euler("z", TOP_YAW_DEG, degrees=True).as_matrix()
+    top[2, 3] = config.lidar.up_m
+    beams_rad = beam_inclinations_rad(config.lidar.beams)
+    lidars = {"TOP": LidarSetup(top, beams_rad, config.lidar.beams, config.lidar.columns)}
+    for name, (angles_deg, position_m) in NEAR_LIDARS.items():
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_euler("ZYX", angles_deg, degrees=True).as_matrix()
+        pose[:3, 3] = position_m
+        lidars[name] = LidarSetup(pose, None, near_rows, near_columns)
+    return lidars
+
+
+def _write_frame(truth, street_scene, frame_index, writer):
+    position = street_scene.frame_position(frame_index)
+    timestamp_ns = int(street_scene.frame_timestamps_ns[position])
+    world_from_ego = street_scene.world_from_ego[position]
+    writer.add_frame(frame_index, timestamp_ns=timestamp_ns, world_from_ego=world_from_ego)
+    step_ns = 1_000_000
+    ahead = truth.street.world_from_ego(timestamp_ns + step_ns)
+    velocity = ((ahead - world_from_ego)[:3, 3] / (step_ns / 1e9)).numpy()
+    between = (world_from_ego[:3, :3].T @ ahead[:3, :3]).numpy()
+    turn = Rotation.from_matrix(between).as_rotvec() / (step_ns / 1e9)
+    truth.velocities[frame_index] = far_away()[:3, :3].numpy() @ velocity, turn
+    for view in street_scene.views:
+        if view.frame_index == frame_index:
+            _write_image(truth, street_scene, view, world_from_ego, velocity, turn, writer)
+    points = street_scene.read_points(frame_index)
+    parts = [_write_top(truth, frame_index, timestamp_ns, points, writer)]
+    for name in NEAR_LIDARS:
+        parts.append(_write_near(truth, name, timestamp_ns, world_from_ego, points, writer))
+    _write_boxes(street_scene, frame_index, world_from_ego, torch.cat(parts), writer)
+
+
+def _write_image(truth, street_scene, view, world_from_ego, velocity, turn, writer):
+    setup = CAMERAS[view.camera_name]
+    pose = moved(world_from_ego, velocity, turn, setup.exposure_ms / 1e3)
+    camera = replace(
+        view.camera,
+        world_from_camera=pose @ truth.vehicle_from_camera[view.camera_name],
+        fx_px=view.camera.fx_px + 0.25,
+        cx_px=view.camera.cx_px - 1.375,
+        cy_px=view.camera.cy_px + 0.8125,
+    )
+    record = ImageRecord(
+        camera_name=view.camera_name,
+        timestamp_ns=view.timestamp_ns + round(setup.exposure_ms * 1e6),
+        camera=camera,
+        distortion=Distortion("brown", LENS_TERMS),
+        rolling_shutter=RollingShutter(duration_s=0.044, direction=setup.readout),
+    )
+    writer.add_image(record, street_scene.read_jpeg(view))
+
+
+def _write_top(truth, frame_index, timestamp_ns, points, writer):
+    """The street's own points and, behind every fourth, a second echo."""
+    setup = truth.lidars["TOP"]
+    column = top_column(points.time_offset_ns.numpy(), setup.num_columns)
+    origin = np.zeros((points.num_points, 3))
+    for place in np.unique(column):
+        offset_ns = ((place + 0.5) / setup.num_columns - 0.5) * TURN_S * 1e9
+        pose = truth.street.world_from_ego(timestamp_ns + round(offset_ns)).numpy()
+        origin[column == place] = (pose @ setup.vehicle_from_lidar)[:3, 3]
+    ray = points.xyz_m.numpy() - origin
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    behind = points.xyz_m[::4].double() + SECOND_ECHO_M * torch.from_numpy(ray[::4])
+    world_from_lidar = _world_from_ego(truth, timestamp_ns) @ torch.from_numpy(
+        setup.vehicle_from_lidar
+    )
+    second = replace(
+        points,
+        **{
+            name: getattr(points, name)[::4]
+            for name in ("intensity", "time_offset_ns", "ring", "lidar")
+        },
+        xyz_m=behind.float(),
+        return_index=torch.ones(len(behind), dtype=torch.int32),
+    )
+    both = SweepPoints.concatenate([points, second])
+    writer.add_sweep("TOP", both, timestamp_ns=timestamp_ns, world_from_lidar=world_from_lidar)
+    return both.xyz_m
+
+
+def _write_near(truth, name, timestamp_ns, world_from_ego, points, writer):
+    """Points near the car, on the centres of the pixels of a virtual range image."""
+    setup = truth.lidars[name]
+    world_from_lidar = world_from_ego @ torch.from_numpy(setup.vehicle_from_lidar)
+    xyz_m = transform_points(invert_rigid(world_from_lidar), points.xyz_m.double()).numpy()
+    range_m = np.linalg.norm(xyz_m, axis=1)
+    inclination = np.arcsin(xyz_m[:, 2] / range_m)
+    low, high = NEAR_LIMITS_RAD
+    heading = np.arctan2(setup.vehicle_from_lidar[1, 0], setup.vehicle_from_lidar[0, 0])
+    azimuth = np.arctan2(xyz_m[:, 1], xyz_m[:, 0]) + heading
+    share = ((np.pi - azimuth) / (2 * np.pi)) % 1.0
+    column = np.minimum((share * setup.num_columns).astype(int), setup.num_columns - 1)
+    row = ((high - inclination) / (high - low) * setup.num_rows).astype(int)
+    pixels = defaultdict(list)
+    for index in np.flatnonzero((range_m < NEAR_M) & (range_m > 1.0) & (inclination < high)):
+        pixels[row[index], column[index]].append(float(range_m[index]))
+    kept = [
+        (*pixel, echo, reach)
+        for pixel, reaches in sorted(pixels.items())
+        for echo, reach in enumerate(sorted(reaches)[:2])
+    ]
+    truth.num_lost += sum(max(len(reaches) - 2, 0) for reaches in pixels.values())
+    row, column, echo = (np.array([entry[axis] for entry in kept]) for axis in range(3))
+    reach = np.array([entry[3] for entry in kept], dtype=np.float32).astype(float)
+    inclination = high - (row + 0.5) / setup.num_rows * (high - low)
+    azimuth = np.pi - 2 * np.pi * (column + 0.5) / setup.num_columns - heading
+    level = reach * np.cos(inclination)
+    centres = np.stack(
+        [level * np.cos(azimuth), level * np.sin(azimuth), reach * np.sin(inclination)], axis=1
+    )
+    found = SweepPoints(
+        xyz_m=transform_points(world_from_lidar, torch.from_numpy(centres)).float(),
+        intensity=torch.full((len(kept),), 0.5),
+        time_offset_ns=torch.zeros(len(kept), dtype=torch.int64),
+        ring=torch.from_numpy(row.astype(np.int32)),
+        return_index=torch.from_numpy(echo.astype(np.int32)),
+        lidar=torch.zeros(len(kept), dtype=torch.uint8),
+    )
+    writer.add_sweep(name, found, timestamp_ns=timestamp_ns, world_from_lidar=world_from_lidar)
+    return found.xyz_m
+
+
+def _write_boxes(street_scene, frame_index, world_from_ego, xyz_m, writer):
+    for track in street_scene.tracks:
+        for row in np.flatnonzero(track.frame_indices.numpy() == frame_index):
+            ego_from_box = invert_rigid(world_from_ego) @ track.world_from_box[row]
+            heading = float(torch.atan2(ego_from_box[1, 0], ego_from_box[0, 0]))
+            upright = Rotation.from_euler("z", heading).as_matrix()
+            ego_from_box[:3, :3] = torch.from_numpy(upright)
+            pose = world_from_ego @ ego_from_box
+            writer.add_box(
+                BoxRecord(
+                    actor_id=track.actor_id,
+                    category="pedestrian" if track.category == "pedestrian" else "vehicle",
+                    timestamp_ns=int(track.timestamps_ns[row]),
+                    world_from_box=pose,
+                    size_m=tuple(track.size_m.double().tolist()),
+                    is_moving=track.is_moving,
+                    num_points=int(is_inside_box(xyz_m, pose, track.size_m).sum()),
+                )
+            )
+
+
+def _world_from_ego(truth, timestamp_ns):
+    return truth.street.world_from_ego(timestamp_ns)
