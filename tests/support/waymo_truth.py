@@ -7,13 +7,16 @@ The truth is what the formats can express, so that a reader must give it back as
 - Points of the other LiDARs are the street's points near the car, moved to the centre of the pixel
   they fall into, at most two a pixel; `num_lost` counts the others, which are in no truth.
 - Boxes stand upright in the vehicle frame (the street's follow its slope by a degree or so).
+- No point lies within a millimetre of a box's faces, where float32 could not tell its side.
 - Every camera takes its picture at its own moment, with the car's velocity carried that far, and
   through a distorted lens. The pixels of the pictures are the street's, which nobody looks at.
 """
 
+import copy
 from collections import defaultdict
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
@@ -33,7 +36,6 @@ from lidarpainter_models.scenes.synthetic import (
     RigLidar,
     SyntheticStreet,
     SyntheticStreetConfig,
-    write_street,
 )
 from lidarpainter_models.scenes.synthetic.lidar import beam_inclinations_rad
 from lidarpainter_models.scenes.synthetic.street import ego_from_camera
@@ -42,6 +44,7 @@ from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
 LENS_TERMS = (0.04, -0.03, 0.001, -0.0015, 0.002)
 NEAR_M = 15.0
 SECOND_ECHO_M = 0.5
+CLEARANCE_M = 0.001
 TURN_S = 0.1
 
 
@@ -98,10 +101,10 @@ class LidarSetup:
 class WaymoTruth:
     """A canonical scene and what the formats hold beside it."""
 
-    scene: DrivingScene
     street: SyntheticStreet
     lidars: dict[str, LidarSetup]
     vehicle_from_camera: dict[str, torch.Tensor]
+    scene: DrivingScene | None = None
     velocities: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
     """Per frame: m/s in the global frame, rad/s in the vehicle's."""
     num_lost: int = 0
@@ -136,20 +139,25 @@ def street_config(**changes):
     return SyntheticStreetConfig(**{**settings, **changes})
 
 
-def write_truth(config, folder, *, near_rows=24, near_columns=90):
-    """Record a street and store it as Waymo's car would have seen it."""
-    street_scene = DrivingScene.open(write_street(config, folder / "street"))
-    street = SyntheticStreet.from_manifest(street_scene.manifest)
+def seen_with(street, config):
+    """The same street through other sensors, without drawing it again."""
+    other = copy.copy(street)
+    vars(other).pop("timestamps_ns", None)
+    other.config = config
+    return other
+
+
+def write_truth(street, folder, *, near_rows=24, near_columns=90):
+    """Drive through a street and store what Waymo's car would have seen."""
     truth = WaymoTruth(
-        scene=street_scene,
         street=street,
-        lidars=_lidars(config, near_rows, near_columns),
-        vehicle_from_camera={rig.name: ego_from_camera(rig) for rig in config.cameras},
+        lidars=_lidars(street.config, near_rows, near_columns),
+        vehicle_from_camera={rig.name: ego_from_camera(rig) for rig in street.config.cameras},
     )
     header = SceneHeader(licence="drawn", global_from_world=far_away())
-    with SceneWriter(folder / "truth", "truth", "waymo", header) as writer:
-        for frame_index in street_scene.frame_indices:
-            _write_frame(truth, street_scene, frame_index, writer)
+    with SceneWriter(folder, "truth", "waymo", header) as writer:
+        for frame_index in range(street.config.num_frames):
+            _write_frame(truth, frame_index, writer)
     truth.scene = DrivingScene.open(writer.path)
     return truth
 
@@ -183,48 +191,66 @@ def _lidars(config, near_rows, near_columns):
     return lidars
 
 
-def _write_frame(truth, street_scene, frame_index, writer):
-    position = street_scene.frame_position(frame_index)
-    timestamp_ns = int(street_scene.frame_timestamps_ns[position])
-    world_from_ego = street_scene.world_from_ego[position]
+def _write_frame(truth, frame_index, writer):
+    street = truth.street
+    timestamp_ns = street.timestamps_ns[frame_index]
+    world_from_ego = street.world_from_ego(timestamp_ns)
     writer.add_frame(frame_index, timestamp_ns=timestamp_ns, world_from_ego=world_from_ego)
     step_ns = 1_000_000
-    ahead = truth.street.world_from_ego(timestamp_ns + step_ns)
+    ahead = street.world_from_ego(timestamp_ns + step_ns)
     velocity = ((ahead - world_from_ego)[:3, 3] / (step_ns / 1e9)).numpy()
     between = (world_from_ego[:3, :3].T @ ahead[:3, :3]).numpy()
     turn = Rotation.from_matrix(between).as_rotvec() / (step_ns / 1e9)
     truth.velocities[frame_index] = far_away()[:3, :3].numpy() @ velocity, turn
-    for view in street_scene.views:
-        if view.frame_index == frame_index:
-            _write_image(truth, street_scene, view, world_from_ego, velocity, turn, writer)
-    points = street_scene.read_points(frame_index)
-    parts = [_write_top(truth, frame_index, timestamp_ns, points, writer)]
-    for name in NEAR_LIDARS:
-        parts.append(_write_near(truth, name, timestamp_ns, world_from_ego, points, writer))
-    _write_boxes(street_scene, frame_index, world_from_ego, torch.cat(parts), writer)
+    for rig in street.config.cameras:
+        pose = moved(world_from_ego, velocity, turn, CAMERAS[rig.name].exposure_ms / 1e3)
+        _write_image(truth, rig.name, timestamp_ns, pose, writer)
+    boxes = _upright_boxes(street.actors(timestamp_ns), world_from_ego)
+    points = _without(street.sweep(frame_index).points, boxes)
+    parts = [_write_top(truth, timestamp_ns, points, boxes, writer)]
+    parts += [_write_near(truth, name, timestamp_ns, points, boxes, writer) for name in NEAR_LIDARS]
+    _write_boxes(boxes, timestamp_ns, torch.cat(parts), writer)
 
 
-def _write_image(truth, street_scene, view, world_from_ego, velocity, turn, writer):
-    setup = CAMERAS[view.camera_name]
-    pose = moved(world_from_ego, velocity, turn, setup.exposure_ms / 1e3)
-    camera = replace(
-        view.camera,
-        world_from_camera=pose @ truth.vehicle_from_camera[view.camera_name],
-        fx_px=view.camera.fx_px + 0.25,
-        cx_px=view.camera.cx_px - 1.375,
-        cy_px=view.camera.cy_px + 0.8125,
+def _write_image(truth, name, timestamp_ns, world_from_vehicle, writer):
+    """The picture is taken with the frame, but stored where the camera is at its exposure."""
+    setup, street = CAMERAS[name], truth.street
+    camera = street.camera(name, timestamp_ns)
+    rgb = street.render(camera, timestamp_ns).rgb.numpy()
+    bgr = np.round(np.clip(rgb[..., ::-1], 0, 1) * 255).astype(np.uint8)
+    stored = replace(
+        camera,
+        world_from_camera=world_from_vehicle @ truth.vehicle_from_camera[name],
+        fx_px=camera.fx_px + 0.25,
+        cx_px=camera.cx_px - 1.375,
+        cy_px=camera.cy_px + 0.8125,
     )
     record = ImageRecord(
-        camera_name=view.camera_name,
-        timestamp_ns=view.timestamp_ns + round(setup.exposure_ms * 1e6),
-        camera=camera,
+        camera_name=name,
+        timestamp_ns=timestamp_ns + round(setup.exposure_ms * 1e6),
+        camera=stored,
         distortion=Distortion("brown", LENS_TERMS),
         rolling_shutter=RollingShutter(duration_s=0.044, direction=setup.readout),
     )
-    writer.add_image(record, street_scene.read_jpeg(view))
+    writer.add_image(record, cv2.imencode(".jpg", bgr)[1].tobytes())
 
 
-def _write_top(truth, frame_index, timestamp_ns, points, writer):
+def _without(points, boxes):
+    """The points that are clearly inside or outside of each box."""
+    is_clear = torch.ones(points.num_points, dtype=torch.bool)
+    for actor, pose in boxes:
+        size_m = torch.tensor(actor.size_m)
+        inner, outer = (
+            is_inside_box(points.xyz_m, pose, size_m, margin_m=margin_m)
+            for margin_m in (-CLEARANCE_M, CLEARANCE_M)
+        )
+        is_clear &= inner == outer
+    return SweepPoints(
+        **{name: getattr(points, name)[is_clear] for name in SweepPoints.__dataclass_fields__}
+    )
+
+
+def _write_top(truth, timestamp_ns, points, boxes, writer):
     """The street's own points and, behind every fourth, a second echo."""
     setup = truth.lidars["TOP"]
     column = top_column(points.time_offset_ns.numpy(), setup.num_columns)
@@ -236,11 +262,7 @@ def _write_top(truth, frame_index, timestamp_ns, points, writer):
     ray = points.xyz_m.numpy() - origin
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     behind = points.xyz_m[::4].double() + SECOND_ECHO_M * torch.from_numpy(ray[::4])
-    world_from_lidar = _world_from_ego(truth, timestamp_ns) @ torch.from_numpy(
-        setup.vehicle_from_lidar
-    )
-    second = replace(
-        points,
+    second = SweepPoints(
         **{
             name: getattr(points, name)[::4]
             for name in ("intensity", "time_offset_ns", "ring", "lidar")
@@ -248,15 +270,20 @@ def _write_top(truth, frame_index, timestamp_ns, points, writer):
         xyz_m=behind.float(),
         return_index=torch.ones(len(behind), dtype=torch.int32),
     )
-    both = SweepPoints.concatenate([points, second])
+    both = SweepPoints.concatenate([points, _without(second, boxes)])
+    world_from_lidar = truth.street.world_from_ego(timestamp_ns) @ torch.from_numpy(
+        setup.vehicle_from_lidar
+    )
     writer.add_sweep("TOP", both, timestamp_ns=timestamp_ns, world_from_lidar=world_from_lidar)
     return both.xyz_m
 
 
-def _write_near(truth, name, timestamp_ns, world_from_ego, points, writer):
+def _write_near(truth, name, timestamp_ns, points, boxes, writer):
     """Points near the car, on the centres of the pixels of a virtual range image."""
     setup = truth.lidars[name]
-    world_from_lidar = world_from_ego @ torch.from_numpy(setup.vehicle_from_lidar)
+    world_from_lidar = truth.street.world_from_ego(timestamp_ns) @ torch.from_numpy(
+        setup.vehicle_from_lidar
+    )
     xyz_m = transform_points(invert_rigid(world_from_lidar), points.xyz_m.double()).numpy()
     range_m = np.linalg.norm(xyz_m, axis=1)
     inclination = np.arcsin(xyz_m[:, 2] / range_m)
@@ -291,30 +318,34 @@ def _write_near(truth, name, timestamp_ns, world_from_ego, points, writer):
         return_index=torch.from_numpy(echo.astype(np.int32)),
         lidar=torch.zeros(len(kept), dtype=torch.uint8),
     )
+    found = _without(found, boxes)
     writer.add_sweep(name, found, timestamp_ns=timestamp_ns, world_from_lidar=world_from_lidar)
     return found.xyz_m
 
 
-def _write_boxes(street_scene, frame_index, world_from_ego, xyz_m, writer):
-    for track in street_scene.tracks:
-        for row in np.flatnonzero(track.frame_indices.numpy() == frame_index):
-            ego_from_box = invert_rigid(world_from_ego) @ track.world_from_box[row]
-            heading = float(torch.atan2(ego_from_box[1, 0], ego_from_box[0, 0]))
-            upright = Rotation.from_euler("z", heading).as_matrix()
-            ego_from_box[:3, :3] = torch.from_numpy(upright)
-            pose = world_from_ego @ ego_from_box
-            writer.add_box(
-                BoxRecord(
-                    actor_id=track.actor_id,
-                    category="pedestrian" if track.category == "pedestrian" else "vehicle",
-                    timestamp_ns=int(track.timestamps_ns[row]),
-                    world_from_box=pose,
-                    size_m=tuple(track.size_m.double().tolist()),
-                    is_moving=track.is_moving,
-                    num_points=int(is_inside_box(xyz_m, pose, track.size_m).sum()),
-                )
+def _upright_boxes(actors, world_from_ego):
+    """The actors with their poses, turned upright in the vehicle frame."""
+    boxes = []
+    for actor in actors:
+        ego_from_box = invert_rigid(world_from_ego) @ actor.world_from_box
+        heading = float(torch.atan2(ego_from_box[1, 0], ego_from_box[0, 0]))
+        upright = Rotation.from_euler("z", heading).as_matrix()
+        ego_from_box[:3, :3] = torch.from_numpy(upright)
+        boxes.append((actor, world_from_ego @ ego_from_box))
+    return boxes
+
+
+def _write_boxes(boxes, timestamp_ns, xyz_m, writer):
+    for actor, pose in boxes:
+        num_points = int(is_inside_box(xyz_m, pose, torch.tensor(actor.size_m)).sum())
+        writer.add_box(
+            BoxRecord(
+                actor_id=actor.actor_id,
+                category="pedestrian" if actor.category == "pedestrian" else "vehicle",
+                timestamp_ns=timestamp_ns,
+                world_from_box=pose,
+                size_m=actor.size_m,
+                is_moving=actor.is_moving,
+                num_points=num_points,
             )
-
-
-def _world_from_ego(truth, timestamp_ns):
-    return truth.street.world_from_ego(timestamp_ns)
+        )

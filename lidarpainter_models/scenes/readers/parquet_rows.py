@@ -130,6 +130,8 @@ class ParquetRows:
                 f"{self.path}: {self.num_rows} rows of {num_bytes} bytes, expected at most "
                 f"{MAX_SMALL_ROWS} rows and {MAX_SMALL_BYTES} bytes"
             )
+        with self.path.open("rb") as file:
+            self._digest = hashlib.file_digest(file, "sha256")
         return list(self._rows(batch_rows=1024))
 
     def stream(self) -> Iterator[ParquetRow]:

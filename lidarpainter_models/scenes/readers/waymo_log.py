@@ -7,7 +7,7 @@ seconds since the epoch (float64 holds them to 0.2 us) unless named otherwise.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -119,6 +119,7 @@ class WaymoSensors:
     sweeps: tuple[WaymoSweep, ...]
 
 
+@runtime_checkable
 class WaymoSegment(Protocol):
     """One segment in either release."""
 

@@ -95,6 +95,7 @@ class WaymoRecordSegment:
         sweeps = (
             _sweep(content, f"{place}, lasers[{position}]")
             for position, content in enumerate(frame.lasers)
+            if content  # derived files keep the place of a LiDAR that they have emptied
         )
         return WaymoSensors(
             images=tuple(
