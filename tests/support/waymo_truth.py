@@ -104,6 +104,7 @@ class WaymoTruth:
     street: SyntheticStreet
     lidars: dict[str, LidarSetup]
     vehicle_from_camera: dict[str, torch.Tensor]
+    reach_m: float
     scene: DrivingScene | None = None
     velocities: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
     """Per frame: m/s in the global frame, rad/s in the vehicle's."""
@@ -147,12 +148,23 @@ def seen_with(street, config):
     return other
 
 
-def write_truth(street, folder, *, near_rows=24, near_columns=90):
-    """Drive through a street and store what Waymo's car would have seen."""
+def write_truth(
+    street, folder, *, near_lidars=tuple(NEAR_LIDARS), near_size=(24, 90), reach_m=1000.0
+):
+    """Drive through a street and store what Waymo's car would have seen.
+
+    Args:
+        street: what there is, and the cameras and the LiDAR that see it.
+        folder: where the scene is stored.
+        near_lidars: which of the other four LiDARs there are.
+        near_size: rows and columns of their range images.
+        reach_m: how far actors are labelled.
+    """
     truth = WaymoTruth(
         street=street,
-        lidars=_lidars(street.config, near_rows, near_columns),
+        lidars=_lidars(street.config, near_lidars, near_size),
         vehicle_from_camera={rig.name: ego_from_camera(rig) for rig in street.config.cameras},
+        reach_m=reach_m,
     )
     header = SceneHeader(licence="drawn", global_from_world=far_away())
     with SceneWriter(folder, "truth", "waymo", header) as writer:
@@ -177,17 +189,18 @@ def top_column(time_offset_ns, num_columns):
     return np.rint(share * num_columns - 0.5).astype(int)
 
 
-def _lidars(config, near_rows, near_columns):
+def _lidars(config, near_lidars, near_size):
     top = np.eye(4)
     top[:3, :3] = Rotation.from_euler("z", TOP_YAW_DEG, degrees=True).as_matrix()
     top[2, 3] = config.lidar.up_m
     beams_rad = beam_inclinations_rad(config.lidar.beams)
     lidars = {"TOP": LidarSetup(top, beams_rad, config.lidar.beams, config.lidar.columns)}
-    for name, (angles_deg, position_m) in NEAR_LIDARS.items():
+    for name in near_lidars:
+        angles_deg, position_m = NEAR_LIDARS[name]
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_euler("ZYX", angles_deg, degrees=True).as_matrix()
         pose[:3, 3] = position_m
-        lidars[name] = LidarSetup(pose, None, near_rows, near_columns)
+        lidars[name] = LidarSetup(pose, None, *near_size)
     return lidars
 
 
@@ -205,10 +218,14 @@ def _write_frame(truth, frame_index, writer):
     for rig in street.config.cameras:
         pose = moved(world_from_ego, velocity, turn, CAMERAS[rig.name].exposure_ms / 1e3)
         _write_image(truth, rig.name, timestamp_ns, pose, writer)
-    boxes = _upright_boxes(street.actors(timestamp_ns), world_from_ego)
+    boxes = _upright_boxes(street.actors(timestamp_ns), world_from_ego, truth.reach_m)
     points = _without(street.sweep(frame_index).points, boxes)
     parts = [_write_top(truth, timestamp_ns, points, boxes, writer)]
-    parts += [_write_near(truth, name, timestamp_ns, points, boxes, writer) for name in NEAR_LIDARS]
+    parts += [
+        _write_near(truth, name, timestamp_ns, points, boxes, writer)
+        for name in truth.lidars
+        if name != "TOP"
+    ]
     _write_boxes(boxes, timestamp_ns, torch.cat(parts), writer)
 
 
@@ -323,11 +340,13 @@ def _write_near(truth, name, timestamp_ns, points, boxes, writer):
     return found.xyz_m
 
 
-def _upright_boxes(actors, world_from_ego):
-    """The actors with their poses, turned upright in the vehicle frame."""
+def _upright_boxes(actors, world_from_ego, reach_m):
+    """The actors within reach with their poses, turned upright in the vehicle frame."""
     boxes = []
     for actor in actors:
         ego_from_box = invert_rigid(world_from_ego) @ actor.world_from_box
+        if ego_from_box[:2, 3].norm() > reach_m:
+            continue
         heading = float(torch.atan2(ego_from_box[1, 0], ego_from_box[0, 0]))
         upright = Rotation.from_euler("z", heading).as_matrix()
         ego_from_box[:3, :3] = torch.from_numpy(upright)

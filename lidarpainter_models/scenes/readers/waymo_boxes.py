@@ -28,7 +28,7 @@ from lidarpainter_models.scenes.readers.pandaset_boxes import (
 )
 from lidarpainter_models.scenes.readers.pandaset_calibration import nanoseconds, turned_about_up
 from lidarpainter_models.scenes.readers.waymo_calibration import CameraCalibration
-from lidarpainter_models.scenes.readers.waymo_cameras import capture_s
+from lidarpainter_models.scenes.readers.waymo_cameras import PictureClock
 from lidarpainter_models.scenes.readers.waymo_log import (
     UprightBox,
     WaymoFrame,
@@ -89,9 +89,14 @@ def box_records(
     if not frame.labels:
         return []
     times = points.times()
+    clocks = {
+        name: PictureClock(image, cameras[name])
+        for name, image in images.items()
+        if name in cameras
+    }
     records = []
     for label in frame.labels:
-        found = _synced(label, frame, images, cameras)
+        found = _synced(label, frame, clocks)
         box = _source_box(label, label.box if found is None else found[0])
         rows = times.inside(box)
         time_s = points.time_s + times.time_of(box, rows) if found is None else found[1]
@@ -111,20 +116,13 @@ def box_records(
 
 
 def _synced(
-    label: WaymoLabel,
-    frame: WaymoFrame,
-    images: dict[str, WaymoImage],
-    cameras: dict[str, CameraCalibration],
+    label: WaymoLabel, frame: WaymoFrame, clocks: dict[str, PictureClock]
 ) -> tuple[UprightBox, float] | None:
     """The camera-synced box and its time; None where the frame does not have both."""
-    if label.synced is None:
-        return None
-    image = images.get(label.synced.camera_name)
-    calibration = cameras.get(label.synced.camera_name)
-    if image is None or calibration is None:
+    if label.synced is None or label.synced.camera_name not in clocks:
         return None
     box, pose = label.synced.box, frame.global_from_vehicle.numpy()
-    time_s = capture_s(image, calibration, pose[:3, :3] @ box.centre_m + pose[:3, 3])
+    time_s = clocks[label.synced.camera_name].time_of(pose[:3, :3] @ box.centre_m + pose[:3, 3])
     return None if time_s is None else (box, time_s)
 
 

@@ -21,7 +21,6 @@ from lidarpainter_models.geometry.transforms import (
     invert_rigid,
     rigid_from_rotation,
     rotation_from_vector,
-    transform_points,
 )
 from lidarpainter_models.scenes.readers.pandaset_calibration import nanoseconds
 from lidarpainter_models.scenes.readers.waymo_calibration import CameraCalibration
@@ -29,8 +28,7 @@ from lidarpainter_models.scenes.readers.waymo_log import WaymoImage
 from lidarpainter_models.scenes.records import ImageRecord, RollingShutter
 
 _NEAR_PLANE_M = 0.1
-_CAPTURE_STEPS = 4
-"""Each step shrinks the error by the picture's motion per readout: 0.1 us are left."""
+_SHARES = np.array([0.0, 0.5, 1.0])
 
 
 def exposure_s(image: WaymoImage) -> float:
@@ -73,32 +71,43 @@ def image_record(
     )
 
 
-def capture_s(
-    image: WaymoImage, calibration: CameraCalibration, point_global_m: np.ndarray
-) -> float | None:
-    """When a camera read the row or column that shows a point; None if it is behind the camera.
+class PictureClock:
+    """Tells when a camera read the row or column that shows a point.
 
+    Where the point is in the picture depends on when it is looked at, as the vehicle moves
+    meanwhile: its place is taken at the beginning, middle and end of the readout and put between.
     The distortion of the lens moves a column by some pixels, which are some 0.1 ms: left out.
     """
-    time_s = exposure_s(image)
-    point = torch.from_numpy(point_global_m)[None]
-    for _ in range(_CAPTURE_STEPS):
-        global_from_camera = (
-            global_from_vehicle_at(image, time_s) @ calibration.lens.world_from_camera
+
+    def __init__(self, image: WaymoImage, calibration: CameraCalibration) -> None:
+        self._lens, self._readout = calibration.lens, calibration.readout
+        self._begin_s = exposure_s(image) - readout_s(image) / 2
+        self._duration_s = readout_s(image)
+        self._camera_from_global = np.stack(
+            [
+                invert_rigid(
+                    global_from_vehicle_at(image, self._begin_s + share * self._duration_s)
+                    @ calibration.lens.world_from_camera
+                ).numpy()
+                for share in _SHARES
+            ]
         )
-        x_m, y_m, z_m = transform_points(invert_rigid(global_from_camera), point)[0].tolist()
-        if z_m < _NEAR_PLANE_M:
+
+    def time_of(self, point_global_m: np.ndarray) -> float | None:
+        """When the point was read; beside the picture its edge's time, None behind the camera."""
+        rotation = self._camera_from_global[:, :3, :3]
+        x_m, y_m, z_m = (rotation @ point_global_m + self._camera_from_global[:, :3, 3]).T
+        if z_m.min() < _NEAR_PLANE_M:
             return None
-        time_s = exposure_s(image) + readout_s(image) * (
-            _read_share(calibration, x_m / z_m, y_m / z_m) - 0.5
-        )
-    return time_s
+        share = self._share_read(x_m / z_m, y_m / z_m)
+        # where the share of the picture that has been read is the one that shows the point
+        found = float(np.interp(0.0, _SHARES - share, _SHARES))
+        return self._begin_s + found * self._duration_s
 
-
-def _read_share(calibration: CameraCalibration, across: float, down: float) -> float:
-    """How much of the picture has been read when a direction (x/z, y/z) comes, 0 to 1."""
-    lens = calibration.lens
-    column = min(max((across * lens.fx_px + lens.cx_px) / lens.width_px, 0.0), 1.0)
-    row = min(max((down * lens.fy_px + lens.cy_px) / lens.height_px, 0.0), 1.0)
-    shares = {"right": column, "left": 1 - column, "down": row, "up": 1 - row}
-    return shares.get(calibration.readout or "", 0.5)
+    def _share_read(self, across: np.ndarray, down: np.ndarray) -> np.ndarray:
+        """How much of the picture has been read when a direction (x/z, y/z) comes, 0 to 1."""
+        lens = self._lens
+        column = np.clip((across * lens.fx_px + lens.cx_px) / lens.width_px, 0.0, 1.0)
+        row = np.clip((down * lens.fy_px + lens.cy_px) / lens.height_px, 0.0, 1.0)
+        shares = {"right": column, "left": 1 - column, "down": row, "up": 1 - row}
+        return shares.get(self._readout or "", np.full_like(column, 0.5))

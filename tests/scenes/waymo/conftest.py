@@ -43,10 +43,11 @@ def tiny_truth(street, tmp_path_factory) -> WaymoTruth:
         width_px=32,
         height_px=24,
         cameras=tuple(rig for rig in street.config.cameras if rig.name in ("FRONT", "SIDE_LEFT")),
-        lidar=RigLidar(name="TOP", beams=24, columns=150, up_m=2.18),
+        lidar=RigLidar(name="TOP", beams=32, columns=360, up_m=2.18),
     )
     folder = tmp_path_factory.mktemp("tiny-truth")
-    return write_truth(seen_with(street, config), folder, near_rows=6, near_columns=20)
+    other = seen_with(street, config)
+    return write_truth(other, folder, near_lidars=("REAR",), near_size=(6, 20), reach_m=22.0)
 
 
 @pytest.fixture(scope="session")
