@@ -212,6 +212,11 @@ def context_message(truth, segment=SEGMENT):
     """Name and calibrations, which every frame repeats."""
     cameras = [camera_numbers(truth, name) for name in truth.scene.camera_names]
     lidars = [lidar_numbers(truth, name) for name in truth.scene.lidar_names]
+    return context_of(cameras, lidars, segment)
+
+
+def context_of(cameras, lidars, segment=SEGMENT):
+    """The context of calibrations in plain numbers."""
     return b"".join(
         [
             text(1, segment),
@@ -368,16 +373,20 @@ def write_v2(truth, folder, segment=SEGMENT, *, rows_per_group=5):
 def component_tables(truth, segment=SEGMENT):
     """The components that the reader joins, as Arrow tables."""
     frames = [frame_numbers(truth, index) for index in truth.scene.frame_indices]
-    scene = truth.scene
+    cameras = [camera_numbers(truth, name) for name in truth.scene.camera_names]
+    lidars = [lidar_numbers(truth, name) for name in truth.scene.lidar_names]
+    return component_tables_of(frames, cameras, lidars, segment)
+
+
+def component_tables_of(frames, cameras, lidars, segment):
+    """The components of frames and calibrations in plain numbers."""
     rows = {
         "vehicle_pose": [
             {**_key(frame), "[VehiclePoseComponent].world_from_vehicle.transform": frame.pose}
             for frame in frames
         ],
-        "camera_calibration": [
-            _camera_row(camera_numbers(truth, name)) for name in scene.camera_names
-        ],
-        "lidar_calibration": [_lidar_row(lidar_numbers(truth, name)) for name in scene.lidar_names],
+        "camera_calibration": [_camera_row(camera) for camera in cameras],
+        "lidar_calibration": [_lidar_row(lidar) for lidar in lidars],
         "camera_image": [
             _image_row(_key(frame), image) for frame in frames for image in frame.images
         ],
