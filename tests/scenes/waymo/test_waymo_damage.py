@@ -12,7 +12,7 @@ from waymo_log import SEGMENT, frame_messages, write_v2
 
 from lidarpainter_models.scenes.readers import ingest_scene
 
-FAST_CASES = 40
+FAST_CASES = 25
 ALL_CASES = 10_000
 MAX_BYTES = 2 << 30
 
