@@ -21,6 +21,8 @@ MAX_ROWS = 1_000_000
 MAX_SMALL_BYTES = 256 << 20
 MAX_ROW_BYTES = 64 << 20
 """Of one row when unpacked, on the average of its row group; a range image takes 4 MB."""
+MAX_ROWS_PER_FRAME = 64
+"""No component that is streamed has more than eight sensors."""
 _BATCH_ROWS = 2
 _BUFFER_BYTES = 1 << 20
 """Read from a column at a time, so that a row group is never in memory whole."""
@@ -169,7 +171,7 @@ class ParquetRows:
             try:
                 batch = next(batches, None)
                 rows = [] if batch is None else _values(batch)
-            except (pa.ArrowException, OSError, ValueError, KeyError) as error:
+            except (pa.ArrowException, OSError, ValueError, KeyError, OverflowError) as error:
                 raise self._damaged(error) from None
             if batch is None:
                 return
@@ -195,7 +197,7 @@ class FrameStream:
         """The rows of one frame; frames are asked for in ascending order.
 
         Raises:
-            DataError: the rows are not in the order of time.
+            DataError: the rows are not in the order of time, or too many for a frame.
         """
         found = []
         row = self._ahead or next(self._rows, None)
@@ -208,6 +210,10 @@ class FrameStream:
                 break
             if row_us == time_us:
                 found.append(row)
+            if len(found) > MAX_ROWS_PER_FRAME:
+                raise DataError(
+                    f"{row.place}: one row too many, expected {MAX_ROWS_PER_FRAME} a frame at most"
+                )
             row = next(self._rows, None)
         self._ahead = row
         return found

@@ -519,3 +519,13 @@ def test_file_that_is_no_parquet(components, tmp_path):
     path.write_bytes(path.read_bytes()[:-3])
     line = refused_line(components, tmp_path / "store", str(path))
     assert "cannot be read as Parquet" in line
+
+
+def test_frame_of_countless_rows(components, tmp_path):
+    line = component_refusal(
+        components,
+        tmp_path / "store",
+        "camera_image",
+        lambda table: table.take(pa.array([0] * 100 + [1, 2, 3])),
+    )
+    assert "row 64: one row too many, expected 64 a frame at most" in line
