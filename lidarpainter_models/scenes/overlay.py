@@ -30,10 +30,17 @@ def draw_overlay(
     view = scene.view(frame_index, camera_name)
     picture = np.ascontiguousarray(scene.read_image(view).numpy())
     _draw_points(picture, view.camera, scene.read_points(frame_index).xyz_m)
-    for track in scene.tracks:
-        if track.is_present(view.timestamp_ns):
-            _draw_box(picture, view.camera, track, view.timestamp_ns)
+    draw_boxes(picture, view.camera, scene.tracks, view.timestamp_ns)
     return torch.from_numpy(picture)
+
+
+def draw_boxes(
+    picture: np.ndarray, camera: Camera, tracks: tuple[ActorTrack, ...], timestamp_ns: int
+) -> None:
+    """Draw the actors that are there at a time over a picture (height, width, 3; bytes)."""
+    for track in tracks:
+        if track.is_present(timestamp_ns):
+            _draw_box(picture, camera, track, timestamp_ns)
 
 
 def _draw_points(picture: np.ndarray, camera: Camera, xyz_m: Tensor) -> None:

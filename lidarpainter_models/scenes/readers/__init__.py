@@ -6,6 +6,7 @@ from pathlib import Path
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.scenes.readers.nuscenes import list_nuscenes_scenes, read_nuscenes
 from lidarpainter_models.scenes.readers.pandaset import list_pandaset_sequences, read_pandaset
+from lidarpainter_models.scenes.readers.waymo import list_waymo_segments, read_waymo
 
 Progress = Callable[[int, int], None]
 """Told frames done and frames in all."""
@@ -13,6 +14,7 @@ Progress = Callable[[int, int], None]
 _READERS = {
     "pandaset": (list_pandaset_sequences, read_pandaset),
     "nuscenes": (list_nuscenes_scenes, read_nuscenes),
+    "waymo": (list_waymo_segments, read_waymo),
 }
 
 

@@ -1,0 +1,230 @@
+"""Rows of Parquet files as downloaded: small tables whole, large ones streamed frame by frame.
+
+Every column that is asked for must be there and every value is checked when it is taken, with the
+file, row and column in the error. Nothing is read before the footer has said how much it is.
+"""
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from lidarpainter_models.errors import DataError
+
+MAX_SMALL_ROWS = 200_000
+MAX_ROWS = 1_000_000
+MAX_SMALL_BYTES = 256 << 20
+MAX_ROW_BYTES = 64 << 20
+"""Of one row when unpacked, on the average of its row group; a range image takes 4 MB."""
+MAX_ROWS_PER_FRAME = 64
+"""No component that is streamed has more than eight sensors."""
+_BATCH_ROWS = 2
+_BUFFER_BYTES = 1 << 20
+"""Read from a column at a time, so that a row group is never in memory whole."""
+
+
+@dataclass(frozen=True, eq=False)
+class ParquetRow:
+    """One row and its place."""
+
+    values: dict[str, Any]
+    """Python values, Arrow scalars for lists."""
+    place: str
+
+    def number(self, column: str) -> float:
+        """A number; a truth value is none."""
+        value = self._value(column)
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            return float(value)
+        raise DataError(f"{self.place}, {column}: {value!r}, expected a number")
+
+    def whole_number(self, column: str) -> int:
+        """A whole number."""
+        value = self._value(column)
+        if isinstance(value, int) and not isinstance(value, bool):
+            return value
+        raise DataError(f"{self.place}, {column}: {value!r}, expected a whole number")
+
+    def text(self, column: str) -> str:
+        """A text."""
+        value = self._value(column)
+        if isinstance(value, str):
+            return value
+        raise DataError(f"{self.place}, {column}: {value!r}, expected a text")
+
+    def content(self, column: str) -> bytes:
+        """A file's bytes."""
+        value = self._value(column)
+        if isinstance(value, bytes):
+            return value
+        raise DataError(f"{self.place}, {column}: {type(value).__name__}, expected bytes")
+
+    def numbers(self, column: str) -> np.ndarray:
+        """A list of numbers; empty where the list is absent."""
+        value = self.values[column]
+        if value is None:
+            return np.empty(0)
+        if not isinstance(value, pa.Array) or not (
+            pa.types.is_floating(value.type) or pa.types.is_integer(value.type)
+        ):
+            raise DataError(f"{self.place}, {column}: expected a list of numbers")
+        if value.null_count:
+            raise DataError(f"{self.place}, {column}: a number of the list is absent")
+        return value.to_numpy(zero_copy_only=False)
+
+    def _value(self, column: str) -> Any:  # noqa: ANN401
+        value = self.values[column]
+        if value is None:
+            raise DataError(f"{self.place}, {column}: is empty")
+        return value
+
+
+class ParquetRows:
+    """The rows of one file, of which some columns are read."""
+
+    def __init__(
+        self, path: Path, columns: tuple[str, ...], optional: tuple[str, ...] = ()
+    ) -> None:
+        """Open the file and check that it has the columns; optional ones are None without.
+
+        Raises:
+            DataError: the file is missing, damaged, or lacks a column.
+        """
+        self.path = Path(path)
+        self._digest = hashlib.sha256()
+        if not self.path.is_file():
+            raise DataError(f"{self.path}: the file is missing")
+        try:
+            self._file = pq.ParquetFile(
+                self.path, buffer_size=_BUFFER_BYTES, page_checksum_verification=True
+            )
+            names = set(self._file.schema_arrow.names)
+        except (pa.ArrowException, OSError, ValueError) as error:
+            raise self._damaged(error) from None
+        missing = [column for column in columns if column not in names]
+        if missing:
+            raise DataError(f"{self.path}: no column {', '.join(missing)}")
+        self._columns = [*columns, *(name for name in optional if name in names)]
+        self._absent = dict.fromkeys(name for name in optional if name not in names)
+
+    @property
+    def num_rows(self) -> int:
+        """How many rows the file states."""
+        return self._file.metadata.num_rows
+
+    def small_table(self) -> list[ParquetRow]:
+        """All rows at once.
+
+        Raises:
+            DataError: there are more than a small table has, or they cannot be read.
+        """
+        metadata = self._file.metadata
+        num_bytes = sum(
+            metadata.row_group(group).total_byte_size for group in range(metadata.num_row_groups)
+        )
+        if self.num_rows > MAX_SMALL_ROWS or num_bytes > MAX_SMALL_BYTES:
+            raise DataError(
+                f"{self.path}: {self.num_rows} rows of {num_bytes} bytes, expected at most "
+                f"{MAX_SMALL_ROWS} rows and {MAX_SMALL_BYTES} bytes"
+            )
+        with self.path.open("rb") as file:
+            self._digest = hashlib.file_digest(file, "sha256")
+        return list(self._rows(batch_rows=1024))
+
+    def stream(self) -> Iterator[ParquetRow]:
+        """Row by row; no more than a few are in memory.
+
+        Raises:
+            DataError: the file states too many or too large rows, or they cannot be read.
+        """
+        metadata = self._file.metadata
+        if self.num_rows > MAX_ROWS:
+            raise DataError(f"{self.path}: {self.num_rows} rows, expected {MAX_ROWS} at most")
+        for number in range(metadata.num_row_groups):
+            group = metadata.row_group(number)
+            if group.total_byte_size > MAX_ROW_BYTES * max(group.num_rows, 1):
+                raise DataError(
+                    f"{self.path}, row group {number}: {group.num_rows} rows of "
+                    f"{group.total_byte_size} bytes, expected {MAX_ROW_BYTES} a row at most"
+                )
+        yield from self._rows(batch_rows=_BATCH_ROWS)
+
+    def take_digest(self, content: bytes | memoryview) -> None:
+        """Note what was used of a row."""
+        self._digest.update(content)
+
+    def provenance(self) -> dict[str, object]:
+        """How much there is, and one digest over what was used."""
+        return {"num_rows": self.num_rows, "sha256": self._digest.hexdigest()}
+
+    def _rows(self, *, batch_rows: int) -> Iterator[ParquetRow]:
+        number = 0
+        batches = self._file.iter_batches(
+            batch_size=batch_rows, columns=self._columns, use_threads=False
+        )
+        while True:
+            try:
+                batch = next(batches, None)
+                rows = [] if batch is None else _values(batch)
+            except (pa.ArrowException, OSError, ValueError, KeyError, OverflowError) as error:
+                raise self._damaged(error) from None
+            if batch is None:
+                return
+            for values in rows:
+                yield ParquetRow({**values, **self._absent}, f"{self.path}, row {number}")
+                number += 1
+
+    def _damaged(self, error: Exception) -> DataError:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        return DataError(f"{self.path}: cannot be read as Parquet ({reason})")
+
+
+class FrameStream:
+    """The rows of a large file that is in the order of time, frame by frame."""
+
+    def __init__(self, rows: ParquetRows, time_column: str) -> None:
+        self._rows = rows.stream()
+        self._time_column = time_column
+        self._ahead: ParquetRow | None = None
+        self._last_us = -1
+
+    def rows_at(self, time_us: int) -> list[ParquetRow]:
+        """The rows of one frame; frames are asked for in ascending order.
+
+        Raises:
+            DataError: the rows are not in the order of time, or too many for a frame.
+        """
+        found = []
+        row = self._ahead or next(self._rows, None)
+        while row is not None:
+            row_us = row.whole_number(self._time_column)
+            if row_us < self._last_us:
+                raise DataError(f"{row.place}, {self._time_column}: not in the order of time")
+            self._last_us = row_us
+            if row_us > time_us:
+                break
+            if row_us == time_us:
+                found.append(row)
+            if len(found) > MAX_ROWS_PER_FRAME:
+                raise DataError(
+                    f"{row.place}: one row too many, expected {MAX_ROWS_PER_FRAME} a frame at most"
+                )
+            row = next(self._rows, None)
+        self._ahead = row
+        return found
+
+
+def _values(batch: pa.RecordBatch) -> list[dict[str, Any]]:
+    """The rows of a batch; lists stay Arrow arrays, a range image would take seconds as a list."""
+    columns = {}
+    for name, column in zip(batch.schema.names, batch.columns, strict=True):
+        is_list = pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type)
+        columns[name] = [scalar.values for scalar in column] if is_list else column.to_pylist()
+    return [
+        dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)
+    ]

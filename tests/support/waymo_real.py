@@ -1,0 +1,143 @@
+"""A real frame without range images, which is no scene, decoded and drawn all the same.
+
+    PYTHONPATH=.:tests/support python tests/support/waymo_real.py FRAME.tfrecord PICTURE.jpg
+
+draws the labels of the frame over its FRONT picture: that is how docs/pictures/overlay_waymo.jpg
+was made. The messages are also read here without the reader's schema, to check the one against
+the other.
+"""
+
+import struct
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from lidarpainter_models.geometry.transforms import invert_rigid
+from lidarpainter_models.scenes.overlay import draw_boxes
+from lidarpainter_models.scenes.readers.waymo_boxes import FramePoints, box_records
+from lidarpainter_models.scenes.readers.waymo_cameras import exposure_s, image_record
+from lidarpainter_models.scenes.readers.waymo_log import WaymoFrame, WaymoImage
+from lidarpainter_models.scenes.readers.waymo_v1 import WaymoRecordSegment
+from lidarpainter_models.scenes.tracks import ActorTrack, tracks_from_boxes
+from lidarpainter_models.scenes.undistortion import pinhole_of, undistort
+
+JPEG_QUALITY = 80
+
+
+@dataclass
+class RealFrame:
+    """One frame of a file, with the world at the vehicle."""
+
+    segment: WaymoRecordSegment
+    frame: WaymoFrame
+    images: dict[str, WaymoImage]
+
+    @classmethod
+    def read(cls, path):
+        segment = WaymoRecordSegment(path)
+        frame = segment.read_frame(0)
+        sensors = segment.read_sensors(0)
+        return cls(segment, frame, {image.camera_name: image for image in sensors.images})
+
+    def tracks(self) -> tuple[ActorTrack, ...]:
+        """One box per label, at the time of the FRONT picture: there are no points to ask."""
+        points = FramePoints(exposure_s(self.images["FRONT"]), np.zeros(3))
+        points.add(np.zeros((1, 3)), np.zeros(1), is_top=True)
+        records = box_records(
+            self.frame,
+            points,
+            self.images,
+            self.segment.cameras,
+            torch.eye(4, dtype=torch.float64),
+            {label.actor_id for label in self.frame.labels if label.speed_mps > 0.5},
+        )
+        columns = {
+            name: [getattr(record, name) for record in records]
+            for name in ("actor_id", "category", "timestamp_ns", "is_moving", "num_points")
+        }
+        sizes = zip(*[record.size_m for record in records], strict=True)
+        columns |= dict(zip(("length_m", "width_m", "height_m"), sizes, strict=True))
+        columns["frame_index"] = [0] * len(records)
+        return tracks_from_boxes(columns, torch.stack([box.world_from_box for box in records]))
+
+    def record(self, camera_name):
+        """The picture's record, in the vehicle frame of the frame's pose."""
+        return image_record(
+            self.images[camera_name],
+            self.segment.cameras[camera_name],
+            invert_rigid(self.frame.global_from_vehicle),
+        )
+
+    def overlay(self, camera_name) -> np.ndarray:
+        """The picture, undistorted, with the boxes over it."""
+        record = self.record(camera_name)
+        jpeg = np.frombuffer(self.images[camera_name].jpeg, np.uint8)
+        rgb = cv2.cvtColor(cv2.imdecode(jpeg, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+        pinhole = pinhole_of(record.camera, record.distortion)
+        picture = np.ascontiguousarray(undistort(rgb, record.camera, record.distortion, pinhole))
+        draw_boxes(picture, pinhole, self.tracks(), record.timestamp_ns)
+        return picture
+
+
+def write_overlay(frame_path, picture_path, *, width_px=1280):
+    """Draw the FRONT picture of a frame into a JPEG file."""
+    picture = RealFrame.read(frame_path).overlay("FRONT")
+    height_px = round(picture.shape[0] * width_px / picture.shape[1])
+    small = cv2.resize(picture, (width_px, height_px), interpolation=cv2.INTER_AREA)
+    quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    jpeg = cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), quality)[1]
+    picture_path.write_bytes(jpeg.tobytes())
+
+
+def record_content(path, index=0):
+    """The content of a record, found by the lengths alone."""
+    content, position = path.read_bytes(), 0
+    for _ in range(index + 1):
+        (num_bytes,) = struct.unpack_from("<Q", content, position)
+        start = position + 12
+        position = start + num_bytes + 4
+    return content[start : start + num_bytes]
+
+
+def fields(content):
+    """The fields of a protobuf message: a list of (number, value); messages stay bytes."""
+    found, position = [], 0
+    while position < len(content):
+        key, position = _varint(content, position)
+        number, kind = key >> 3, key & 7
+        if kind == 0:
+            value, position = _varint(content, position)
+        elif kind in (1, 5):
+            size = 8 if kind == 1 else 4
+            (value,) = struct.unpack_from("<d" if kind == 1 else "<f", content, position)
+            position += size
+        else:
+            size, position = _varint(content, position)
+            value = content[position : position + size]
+            position += size
+        found.append((number, value))
+    return found
+
+
+def all_of(content, number):
+    """The values of a repeated field."""
+    return [value for found, value in fields(content) if found == number]
+
+
+def _varint(content, position):
+    value = shift = 0
+    while True:
+        byte = content[position]
+        position += 1
+        value |= (byte & 0x7F) << shift
+        shift += 7
+        if byte < 0x80:
+            return value, position
+
+
+if __name__ == "__main__":
+    write_overlay(Path(sys.argv[1]), Path(sys.argv[2]))
