@@ -12,9 +12,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.errors import DataError
+from lidarpainter_models.errors import ConfigError, DataError
+from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import is_rigid
+from lidarpainter_models.scenes.records import Distortion, RollingShutter
 from lidarpainter_models.scenes.schema import is_safe_name
+from lidarpainter_models.scenes.undistortion import pinhole_of
 
 _JPEG_START = b"\xff\xd8"
 _JPEG_END = b"\xff\xd9"
@@ -28,6 +31,11 @@ MAX_PICTURE_PIXELS = 64_000_000
 A progressive JPEG keeps six bytes per pixel while it is decoded.
 """
 MAX_LABEL_LENGTH = 200
+MAX_PLACE_M = 1e8
+"""The Earth's radius is 6.4e6 m; frames of datasets are often centred far away."""
+MAX_LENS_NUMBER = 1e7
+MAX_SHUTTER_S = 10.0
+SHUTTER_DIRECTIONS = ("down", "up", "left", "right")
 _MAX_TIMESTAMP_NS = 2**62
 
 
@@ -64,7 +72,34 @@ def require_pose(target_from_source: Float[Tensor, "4 4"], where: str) -> Float[
         raise DataError(f"{where}: the pose is not finite")
     if not bool(is_rigid(target_from_source)):
         raise DataError(f"{where}: the pose is not a rotation and a translation")
+    if float(target_from_source[:3, 3].abs().max()) > MAX_PLACE_M:
+        raise DataError(f"{where}: the pose lies farther away than the Earth is wide")
     return target_from_source
+
+
+def require_lens(camera: Camera, distortion: Distortion, where: str) -> None:
+    """Refuse a lens whose numbers are no lens, or whose distortion cannot be undone."""
+    numbers = (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, *distortion.terms)
+    if not all(abs(number) <= MAX_LENS_NUMBER for number in numbers):
+        raise DataError(f"{where}: the lens has a number beyond {MAX_LENS_NUMBER:g}")
+    try:
+        pinhole_of(camera, distortion)
+    except (cv2.error, ConfigError, OverflowError):
+        raise DataError(
+            f"{where}: the {distortion.model} distortion {distortion.terms} cannot be undone"
+        ) from None
+
+
+def require_shutter(shutter: RollingShutter | None, where: str) -> None:
+    """Refuse a shutter that takes no time, too long, or reads in no direction."""
+    if shutter is None:
+        return
+    if not 0 <= shutter.duration_s <= MAX_SHUTTER_S or shutter.direction not in SHUTTER_DIRECTIONS:
+        raise DataError(
+            f"{where}: the rolling shutter reads {shutter.direction!r:.20} for "
+            f"{shutter.duration_s} s, expected {', '.join(SHUTTER_DIRECTIONS)} and at most "
+            f"{MAX_SHUTTER_S} s"
+        )
 
 
 def require_points(xyz_m: np.ndarray, where: str) -> None:

@@ -31,9 +31,11 @@ from lidarpainter_models.scenes.stored import content_digest, stored_digest
 from lidarpainter_models.scenes.validation import (
     require_jpeg,
     require_label,
+    require_lens,
     require_name,
     require_points,
     require_pose,
+    require_shutter,
     require_size,
     require_time,
 )
@@ -151,6 +153,8 @@ class SceneWriter:
         require_jpeg(jpeg, **size_px, where=source or where)
         require_pose(camera.world_from_camera, where)
         require_time(record.timestamp_ns, where)
+        require_lens(camera, record.distortion, where)
+        require_shutter(record.rolling_shutter, where)
         with storage_errors(self.path):
             offset = self._arrays["image_bytes"].append(np.frombuffer(jpeg, np.uint8))
         if record.camera_name not in self._camera_names:
