@@ -110,7 +110,12 @@ class StoredScene:
             )
         try:
             if self._group is None:
-                self._group = zarr.open_group(self.path / schema.ARRAYS_NAME, mode="r")
+                self._group = zarr.open_group(
+                    self.path / schema.ARRAYS_NAME,
+                    mode="r",
+                    zarr_format=3,  # version 2 has codecs that unpickle
+                    use_consolidated=False,
+                )
             rows = self._group[name][offset : offset + num_rows]  # type: ignore[index]
         except (OSError, ValueError, KeyError, RuntimeError) as error:
             raise SceneError(

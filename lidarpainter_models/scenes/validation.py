@@ -5,6 +5,7 @@ raises a one-line `DataError` that says what is wrong there and what was expecte
 """
 
 import math
+from collections.abc import Mapping
 
 import cv2
 import numpy as np
@@ -49,7 +50,7 @@ def require_name(name: str, kind: str) -> str:
     return name
 
 
-def require_label(label: str, where: str) -> str:
+def require_label(label: object, where: str) -> str:
     """Refuse a category that is not a short printable text."""
     if not (isinstance(label, str) and label.isprintable() and 0 < len(label) <= MAX_LABEL_LENGTH):
         raise DataError(
@@ -57,6 +58,16 @@ def require_label(label: str, where: str) -> str:
             f"{MAX_LABEL_LENGTH} letters"
         )
     return label
+
+
+def require_classes(classes: Mapping[str, object], where: str) -> dict[int, str]:
+    """Names of point classes by number, from texts as JSON has them; refuse other things."""
+    names = {}
+    for number, name in classes.items():
+        if not (number.isascii() and number.isdecimal() and len(number) <= 3 and int(number) < 256):
+            raise DataError(f"{where}: {number!r:.20} is no class number from 0 to 255")
+        names[int(number)] = require_label(name, f"{where}, class {number}")
+    return names
 
 
 def require_time(timestamp_ns: int, where: str) -> int:

@@ -127,8 +127,9 @@ def test_frames_are_read_only_a_little_ahead():
         read.append(frame_index)
         return frame_index
 
-    for frame_index in read_ahead(note, range(20), num_threads=2):
-        assert max(read) <= frame_index + 2
+    with read_ahead(note, range(20), num_threads=2) as frames:
+        for frame_index in frames:
+            assert max(read) <= frame_index + 2
     assert read == list(range(20))
 
 
@@ -138,10 +139,10 @@ def test_error_in_a_frame_is_raised_when_the_frame_is_due():
             raise DataError("frame 1")
         return frame_index
 
-    frames = read_ahead(refuse, range(4), num_threads=2)
-    assert next(frames) == 0
-    with pytest.raises(DataError, match="frame 1"):
-        next(frames)
+    with read_ahead(refuse, range(4), num_threads=2) as frames:
+        assert next(frames) == 0
+        with pytest.raises(DataError, match="frame 1"):
+            next(frames)
 
 
 def test_progress_counts_frames(sound_pandaset, tmp_path):

@@ -4,12 +4,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 from lidarpainter_models.errors import DataError
+from lidarpainter_models.scenes.readers.canonical import list_canonical_scenes, read_canonical
 from lidarpainter_models.scenes.readers.pandaset import list_pandaset_sequences, read_pandaset
 
 Progress = Callable[[int, int], None]
 """Told frames done and frames in all."""
 
-_READERS = {"pandaset": (list_pandaset_sequences, read_pandaset)}
+_READERS = {
+    "pandaset": (list_pandaset_sequences, read_pandaset),
+    "canonical": (list_canonical_scenes, read_canonical),
+}
 
 
 def known_datasets() -> tuple[str, ...]:

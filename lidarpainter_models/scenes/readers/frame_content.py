@@ -8,6 +8,7 @@ number of threads, and never more than `num_threads` + 1 frames are in memory.
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -75,24 +76,34 @@ class FrameContent:
         writer.add_boxes(self.boxes)
 
 
+@contextmanager
 def read_ahead(
     read: Callable[[int], Content], frame_indices: Sequence[int], *, num_threads: int
-) -> Iterator[Content]:
+) -> Iterator[Iterator[Content]]:
     """What `read` gives for each frame, in order; an error is raised when its frame is due.
 
-    With zero threads each frame is read when it is asked for.
+    With zero threads each frame is read when it is asked for. Leaving the block ends the threads.
     """
     if num_threads == 0:
-        yield from map(read, frame_indices)
+        yield map(read, frame_indices)
         return
-    with ThreadPoolExecutor(num_threads, thread_name_prefix="frame") as pool:
-        waiting: deque[Future[Content]] = deque()
-        try:
-            for frame_index in frame_indices:
-                waiting.append(pool.submit(read, frame_index))
-                if len(waiting) > num_threads:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            pool.shutdown(cancel_futures=True)
+    pool = ThreadPoolExecutor(num_threads, thread_name_prefix="frame")
+    try:
+        yield _in_order(pool, read, frame_indices, num_threads)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _in_order(
+    pool: ThreadPoolExecutor,
+    read: Callable[[int], Content],
+    frame_indices: Sequence[int],
+    num_ahead: int,
+) -> Iterator[Content]:
+    waiting: deque[Future[Content]] = deque()
+    for frame_index in frame_indices:
+        waiting.append(pool.submit(read, frame_index))
+        if len(waiting) > num_ahead:
+            yield waiting.popleft().result()
+    while waiting:
+        yield waiting.popleft().result()

@@ -57,7 +57,7 @@ from lidarpainter_models.scenes.readers.source_folder import SourceFolder
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord
 from lidarpainter_models.scenes.validation import (
     jpeg_header_size,
-    require_label,
+    require_classes,
     require_name,
 )
 from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
@@ -117,10 +117,12 @@ def read_pandaset(
         global_from_world=log.global_from_world,
         semantic_classes=log.semantic_classes,
     )
-    with SceneWriter(store, DATASET, sequence, header) as writer:
-        frames_read = read_ahead(log.read_frame, log.frame_indices, num_threads=num_threads)
-        for done, frame in enumerate(frames_read, start=1):
-            frame.write(writer)
+    with (
+        SceneWriter(store, DATASET, sequence, header) as writer,
+        read_ahead(log.read_frame, log.frame_indices, num_threads=num_threads) as contents,
+    ):
+        for done, content in enumerate(contents, start=1):
+            content.write(writer)
             if progress is not None:
                 progress(done, len(log.frame_indices))
         writer.set_provenance({"root": str(root), **log.source.provenance()})
@@ -242,15 +244,9 @@ def _semantic_classes(source: SourceFolder) -> dict[int, str]:
         return {}
     file = "annotations/semseg/classes.json"
     classes = source.read_json(file, dict)
-    if not classes or not all(
-        number.isascii() and number.isdecimal() and len(number) <= 3 and int(number) < 256
-        for number in classes
-    ):
+    if not classes:
         raise DataError(f"{source.root / file}: expected names by class number")
-    return {
-        int(number): require_label(name, f"{source.root / file}, class {number}")
-        for number, name in classes.items()
-    }
+    return require_classes(classes, str(source.root / file))
 
 
 def _selected(num_frames: int, frames: slice | None, folder: Path) -> list[int]:
