@@ -35,7 +35,7 @@ class Made:
     state: Any = field(default=None)
 
 
-MAX_OPCODES = 500_000
+MAX_OPCODES = 100_000
 """A pickle with more is refused; those of PandaSet have a few thousand."""
 
 _MARK = object()
