@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
@@ -217,3 +218,14 @@ def test_zarr_metadata_of_the_writer_is_that_of_the_format(small_scene):
         expected = schema.zarr_metadata(layout, found["shape"][0])
         found["codecs"][1] = {"name": found["codecs"][1]["name"]}
         assert {key: found[key] for key in expected} == expected
+
+
+def test_every_column_and_array_stands_in_the_specification():
+    text = (Path(__file__).resolve().parents[2] / "docs/canonical-format.md").read_text("utf-8")
+    for columns in schema.TABLES.values():
+        for column in columns:
+            assert f"| {column.name} |" in text
+            assert column.description in text
+    for layout in schema.ARRAYS.values():
+        assert f"| {layout.name} | {layout.dtype.name} |" in text
+        assert f"| {layout.chunk_rows} |" in text
