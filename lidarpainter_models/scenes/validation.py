@@ -40,6 +40,12 @@ SHUTTER_DIRECTIONS = ("down", "up", "left", "right")
 _MAX_TIMESTAMP_NS = 2**62
 
 
+def shown(text: str, max_length: int = 200) -> str:
+    """A text of unknown origin as one line of bounded length."""
+    line = text[:max_length].encode("unicode_escape").decode("ascii")
+    return line if len(text) <= max_length else f"{line}..."
+
+
 def require_name(name: str, kind: str) -> str:
     """Refuse names that would not be one plain folder, `../x` above all."""
     if not is_safe_name(name):

@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.scenes import schema
-from lidarpainter_models.scenes.validation import require_classes, require_name
+from lidarpainter_models.scenes.validation import require_classes, require_name, shown
 
 MAX_MANIFEST_BYTES = 16_000_000
 MAX_FILES = 100_000
@@ -68,7 +68,7 @@ def read_small_json(file: Path, max_bytes: int) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         if isinstance(error, DataError):
             raise
-        reason = getattr(error, "strerror", None) or f"no JSON: {error!s:.100}"
+        reason = getattr(error, "strerror", None) or f"no JSON: {shown(str(error))}"
         raise DataError(f"{file}: cannot be read ({reason})") from None
     if not isinstance(value, dict):
         raise DataError(f"{file}: holds no JSON object")
@@ -152,7 +152,7 @@ def _require_table(file: Path) -> None:
             group.column(index).num_values for group in groups for index in range(group.num_columns)
         ]
     except (OSError, ValueError, IndexError, pa.ArrowException) as error:
-        raise DataError(f"{file}: no Parquet file ({error!s:.100})") from None
+        raise DataError(f"{file}: no Parquet file ({shown(str(error))})") from None
     if not 0 <= footer.num_rows <= MAX_TABLE_ROWS:
         raise DataError(f"{file}: {footer.num_rows} rows, expected at most {MAX_TABLE_ROWS}")
     if any(not 0 <= count <= footer.num_rows * MAX_LIST_LENGTH for count in values):
@@ -161,7 +161,7 @@ def _require_table(file: Path) -> None:
         table = pq.read_table(file)
         table.validate(full=True)
     except (OSError, ValueError, MemoryError, pa.ArrowException) as error:
-        raise DataError(f"{file}: cannot be read ({error!s:.100})") from None
+        raise DataError(f"{file}: cannot be read ({shown(str(error))})") from None
     name = file.stem
     if not table.schema.equals(schema.arrow_schema(name)):
         raise DataError(f"{file}: the columns or their types are not those of the format")

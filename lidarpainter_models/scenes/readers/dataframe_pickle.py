@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from lidarpainter_models.errors import DataError, UnsafePickleError
-from lidarpainter_models.scenes.readers.pickle_tree import Made, Named, read_pickle_tree, shown
+from lidarpainter_models.scenes.readers.pickle_tree import Made, Named, read_pickle_tree
+from lidarpainter_models.scenes.validation import shown
 
 MAX_TABLE_BYTES = 64 * 1024 * 1024
 """A table that unpacks to more is refused; the largest of PandaSet has 9 MB."""

@@ -24,10 +24,9 @@ import numpy as np
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.scenes.readers.dataframe_pickle import Table
-from lidarpainter_models.scenes.readers.pickle_tree import shown
 from lidarpainter_models.scenes.readers.source_folder import SourceFolder
 from lidarpainter_models.scenes.schema import is_safe_name
-from lidarpainter_models.scenes.validation import require_label, require_size
+from lidarpainter_models.scenes.validation import require_label, require_size, shown
 
 SPINNING, FORWARD = 0, 1
 """Values of `cuboids.sensor_id` and of a point's `d`; -1 is a box outside the overlap."""

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from lidarpainter_models.errors import DataError, UnsafePickleError
+from lidarpainter_models.scenes.validation import shown
 
 
 class Named(NamedTuple):
@@ -149,12 +150,6 @@ def _pairs(items: list[Any]) -> dict[Any, Any]:
     if not all(isinstance(key, str | int) for key in items[::2]):
         raise DataError("the pickle is damaged: a key is neither a text nor a number")
     return dict(zip(items[::2], items[1::2], strict=True))
-
-
-def shown(text: str, max_length: int = 200) -> str:
-    """A text of unknown origin as one line of bounded length."""
-    line = text[:max_length].encode("unicode_escape").decode("ascii")
-    return line if len(text) <= max_length else f"{line}..."
 
 
 def read_pickle_tree(content: bytes, allowed: Iterable[Named]) -> Any:  # noqa: ANN401

@@ -15,7 +15,7 @@ from lidarpainter_models.scenes.readers.dataframe_pickle import (
     Table,
     read_table_bytes,
 )
-from lidarpainter_models.scenes.readers.pickle_tree import shown
+from lidarpainter_models.scenes.validation import shown
 
 MAX_FILE_BYTES = 256 * 1024 * 1024
 """A file that is read whole may be no larger; the largest of PandaSet has 4 MB."""
