@@ -120,7 +120,8 @@ class StoredScene:
             rows = self._group[name][offset : offset + num_rows]  # type: ignore[index]
         except (OSError, ValueError, KeyError, RuntimeError) as error:
             raise SceneError(
-                f"{self.path}: array {name} cannot be read ({shown(str(error))}); ingest the scene again"
+                f"{self.path}: array {name} cannot be read ({shown(str(error))}); "
+                "ingest the scene again"
             ) from None
         return np.asarray(rows)
 
