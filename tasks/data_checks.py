@@ -1,6 +1,8 @@
 """Whether a stored scene makes sense, and whether a dataset on disk can be read."""
 
+import json
 import tempfile
+from dataclasses import asdict
 from pathlib import Path
 
 from catalog.errors import CatalogError
@@ -13,42 +15,60 @@ from lidarpainter_models.scenes.readers import ingest_scene, list_sequences
 from tasks.health import Finding
 from tasks.scenes import open_scene
 
-TRIAL_FRAMES = slice(0, 2)
-"""A dataset is tried on this much of each sequence: enough to meet every kind of file."""
+TRIAL_FRAMES = slice(0, 6)
+"""A dataset is tried on this much of each sequence: enough to tell how its cameras are turned."""
 
 
 def check_stored_scene(store: Store, scene_id: str, out: Path | None) -> list[Finding]:
-    """Check a scene of the store and draw points and boxes over one of its pictures.
+    """Check a scene of the store; writes an overlay picture and all findings as JSON.
 
     Args:
         store: where the scene is.
         scene_id: `<dataset>/<sequence>`.
-        out: file or folder of the overlay picture; by default in the store's folder `doctor`.
+        out: file or folder of the overlay picture; by default in the store's folder `doctor`. The
+            JSON lies beside it under the same name.
     """
     scene = open_scene(store, scene_id)
     path = out or store.root / "doctor" / scene.dataset / f"{scene.sequence}.png"
     if path.suffix != ".png":
         path = path / "overlay.png"
-    return [*_findings(scene), Finding("overlay", "ok", str(_write_overlay(scene, path)))]
+    return _examined(scene, path)
 
 
-def check_dataset(dataset: str, root: Path) -> list[Finding]:
-    """Read the first frames of every sequence of a dataset into a folder that is then removed."""
+def check_dataset(store: Store, dataset: str, root: Path, out: Path | None) -> list[Finding]:
+    """Check the first frames of every sequence of a dataset, read into a folder then removed.
+
+    Args:
+        store: the overlay pictures and JSON files go to its folder `doctor`.
+        dataset: name of the reader.
+        root: the dataset's folder, as downloaded.
+        out: another folder for them.
+    """
     findings = []
     for sequence in list_sequences(dataset, root):
         with tempfile.TemporaryDirectory(prefix="lidarpainter-doctor-") as trial:
             try:
                 path = ingest_scene(dataset, root, sequence, Path(trial), frames=TRIAL_FRAMES)
-                failed = [
-                    found for found in _findings(DrivingScene.open(path)) if found.verdict == "fail"
-                ]
+                picture = (out or store.root / "doctor" / dataset) / f"{sequence}.png"
+                found = _examined(DrivingScene.open(path), picture)
             except (LidarPainterError, CatalogError) as error:
-                failed = [Finding("reading", "fail", str(error))]
-        if failed:
-            findings += [Finding(f"{sequence}: {f.name}", f.verdict, f.detail) for f in failed]
-        else:
-            findings.append(Finding(sequence, "ok", "its first frames can be read"))
+                found = [Finding("reading", "fail", str(error))]
+        findings += [Finding(f"{sequence}: {f.name}", f.verdict, f.detail) for f in found]
     return findings
+
+
+def _examined(scene: DrivingScene, picture: Path) -> list[Finding]:
+    """All findings about a scene, after writing its overlay picture and the JSON beside it."""
+    findings = [*_findings(scene), Finding("overlay", "ok", str(_write_overlay(scene, picture)))]
+    report = {
+        "scene": f"{scene.dataset}/{scene.sequence}",
+        "content_digest": scene.content_digest,
+        "is_fit": all(finding.verdict != "fail" for finding in findings),
+        "findings": [asdict(finding) for finding in findings],
+    }
+    file = picture.with_suffix(".json")
+    file.write_text(json.dumps(report, indent=2) + "\n", "utf-8")
+    return [*findings, Finding("report", "ok", str(file))]
 
 
 def _findings(scene: DrivingScene) -> list[Finding]:

@@ -31,7 +31,7 @@ def doctor(
     if subject is None:
         findings = health.check_environment(store.root)
     elif root is not None:
-        findings = data_checks.check_dataset(subject, root)
+        findings = data_checks.check_dataset(store, subject, root, out)
     else:
         findings = data_checks.check_stored_scene(store, subject, out)
     is_fit = all(finding.verdict != "fail" for finding in findings)

@@ -7,13 +7,13 @@ from typing import Annotated
 import typer
 
 from flows.cli.output import complain, format_bytes, print_json, print_table
-from lidarpainter_models.errors import ConfigError, LidarPainterError
+from lidarpainter_models.errors import ConfigError
 
 SOME_FAILED = 2
 RANGE = re.compile(r"(\d*):(\d*)")
 
 
-def ingest(
+def ingest(  # noqa: PLR0913 - one per option
     dataset: Annotated[str, typer.Argument(help="pandaset, ...")],
     root: Annotated[Path, typer.Argument(help="The dataset's folder, as downloaded.")],
     sequences: Annotated[
@@ -25,34 +25,29 @@ def ingest(
     cameras: Annotated[
         str | None, typer.Option(help="Cameras to take, with commas between; all if absent.")
     ] = None,
+    jobs: Annotated[
+        int, typer.Option(min=1, help="Sequences read at once, each in a process of its own.")
+    ] = 1,
+    again: Annotated[
+        bool, typer.Option("--again", help="Read sequences anew that are in the store unchanged.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Bring sequences of a dataset into the store."""
     chosen_frames = parse_frames(frames)
     chosen_cameras = parse_names(cameras)
 
-    from catalog.errors import CatalogError
     from catalog.store import open_store
     from flows.cli.progress import shown_progress
     from lidarpainter_models.scenes.readers import list_sequences
-    from tasks.ingest import ingest_sequence
+    from tasks.ingest_jobs import IngestRequest, ingest_sequences
 
     store = open_store()
-    names = sequences or list_sequences(dataset, root)
-    rows, failures = [], []
+    names = list(dict.fromkeys(sequences or list_sequences(dataset, root)))
+    request = IngestRequest(store.root, dataset, root, chosen_frames, chosen_cameras)
     with shown_progress():
-        for name in names:
-            try:
-                rows.append(
-                    ingest_sequence.fn(
-                        store.root, dataset, root, name, chosen_frames, chosen_cameras
-                    )
-                )
-            except (LidarPainterError, CatalogError) as error:
-                if len(names) == 1:
-                    raise
-                failures.append({"sequence": name, "error": str(error)})
-                complain(str(error))
+        done = ingest_sequences(request, names, jobs=jobs, again=again, on_failure=complain)
+    rows, failures = done.rows, done.failures
     if as_json:
         print_json({"store": str(store.root), "scenes": rows, "failures": failures})
     else:

@@ -5,6 +5,7 @@ point projects to u = fx x / z + cx with cx measured from the picture's left edg
 """
 
 from dataclasses import dataclass, replace
+from math import isfinite
 
 import torch
 from jaxtyping import Bool, Float
@@ -30,6 +31,9 @@ class Camera:
         """Refuse poses and focal lengths that cannot project."""
         if not bool(is_rigid(self.world_from_camera)):
             raise ConfigError("a camera needs a finite rigid world_from_camera")
+        lens = (self.fx_px, self.fy_px, self.cx_px, self.cy_px)
+        if not all(isfinite(number) for number in lens):
+            raise ConfigError(f"a camera needs a finite lens, got fx, fy, cx, cy = {lens}")
         if min(self.fx_px, self.fy_px) <= 0 or min(self.width_px, self.height_px) <= 0:
             raise ConfigError(
                 f"a camera needs positive focal lengths and size, got fx {self.fx_px}, "

@@ -1,10 +1,13 @@
 """Append rows to the arrays of a scene, chunk by chunk, and take their digest on the way.
 
 Rows are held back until a chunk is full, so a chunk is written once and never read again, and no
-more than one chunk of each array is in memory. One writer per array: two would lose data silently.
+more than two chunks of each array are in memory: one that fills up and one that is compressed and
+written by the one thread that writes. One writer per array: two would lose data silently.
 """
 
 import hashlib
+from collections.abc import Sequence
+from concurrent.futures import Executor, Future
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +23,12 @@ _ZSTD_LEVEL = 1
 class ArrayAppender:
     """One growing array."""
 
-    def __init__(self, group: zarr.Group, layout: ArrayLayout) -> None:
+    def __init__(self, group: zarr.Group, layout: ArrayLayout, writing: Executor) -> None:
         self.layout = layout
         self.num_rows = 0
+        """Rows handed to the thread that writes."""
+        self._writing = writing
+        self._last_write: Future[None] | None = None
         self._digest = hashlib.sha256()
         self._pending: list[np.ndarray] = []
         self._num_pending = 0
@@ -59,6 +65,7 @@ class ArrayAppender:
         """Write what is left; gives the array's entry in the manifest."""
         if self._num_pending:
             self._flush(self._num_pending)
+        self._settle()
         return {
             "dtype": self.layout.dtype.name,
             "shape": [self.num_rows, *self.layout.row_shape],
@@ -66,16 +73,29 @@ class ArrayAppender:
         }
 
     def _flush(self, num_rows: int) -> None:
+        """Hand rows to the thread that writes, once it is done with the last ones."""
         rows = np.concatenate(self._pending)
-        end = self.num_rows + num_rows
-        self._array.resize((end, *self.layout.row_shape))
-        self._array[self.num_rows : end] = rows[:num_rows]
-        self.num_rows = end
-        self._pending = [rows[num_rows:]]
+        self._settle()
+        self._last_write = self._writing.submit(self._write, self.num_rows, rows[:num_rows])
+        self.num_rows += num_rows
+        self._pending = [rows[num_rows:].copy()]
         self._num_pending = len(rows) - num_rows
 
+    def _settle(self) -> None:
+        """Wait for the last write; an error in it is raised here."""
+        if self._last_write is not None:
+            last, self._last_write = self._last_write, None
+            last.result()
 
-def create_arrays(folder: Path, layouts: list[ArrayLayout]) -> dict[str, ArrayAppender]:
-    """A new Zarr group with one empty array per layout."""
+    def _write(self, start: int, rows: np.ndarray) -> None:
+        end = start + len(rows)
+        self._array.resize((end, *self.layout.row_shape))
+        self._array[start:end] = rows
+
+
+def create_arrays(
+    folder: Path, layouts: Sequence[ArrayLayout], writing: Executor
+) -> dict[str, ArrayAppender]:
+    """A new Zarr group with one empty array per layout; `writing` has one thread."""
     group = zarr.create_group(folder, zarr_format=3)
-    return {layout.name: ArrayAppender(group, layout) for layout in layouts}
+    return {layout.name: ArrayAppender(group, layout, writing) for layout in layouts}

@@ -28,6 +28,7 @@ from lidarpainter_models.scenes.actor_checks import (
     check_box_points,
     check_duplicate_tracks,
 )
+from lidarpainter_models.scenes.calibration_checks import check_calibration
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.overlay import draw_overlay
 from lidarpainter_models.scenes.records import RecordedView
@@ -46,6 +47,7 @@ MIN_COVERAGE = 0.15
 MAX_SWEEP_GAP_M = 0.15
 """Median distance between two sweeps' points on the same surfaces."""
 MAX_GROUND_SLOPE_RAD = 0.15
+_NON_COMMERCIAL = ("non-commercial", "noncommercial", "-nc-", " nc ", "-nc ")
 _COVERAGE_CELLS = (9, 16)
 _NEIGHBOURHOOD_M = 25.0
 """Around the car, where two sweeps are dense enough to be compared."""
@@ -68,6 +70,7 @@ def check_scene(scene: DrivingScene) -> list[Check]:
     """Run every check; the order is that in which a reader would debug a new dataset."""
     checks: tuple[tuple[str, Callable[[DrivingScene], tuple[Verdict, str]]], ...] = (
         ("stored content", check_content),
+        ("licence", check_licence),
         ("ego poses", check_ego_poses),
         ("timestamps", check_timestamps),
         ("camera sync", check_camera_sync),
@@ -75,6 +78,7 @@ def check_scene(scene: DrivingScene) -> list[Check]:
         ("ground", check_ground),
         ("sweeps agree", check_sweeps_agree),
         ("points in pictures", check_coverage),
+        ("camera calibration", check_calibration),
         ("boxes hold points", check_box_points),
         ("boxes point ahead", check_box_axes),
         ("duplicate tracks", check_duplicate_tracks),
@@ -97,6 +101,16 @@ def check_content(scene: DrivingScene) -> tuple[Verdict, str]:
     scene.verify_content()
     counts = scene.manifest["counts"]
     return "ok", ", ".join(f"{count} {name}" for name, count in counts.items())
+
+
+def check_licence(scene: DrivingScene) -> tuple[Verdict, str]:
+    """Whether it is said what may be done with the data."""
+    licence = scene.manifest["licence"].strip()
+    if not licence:
+        return "fail", "the manifest names no licence: what may be done with the data is unknown"
+    if any(word in licence.lower() for word in _NON_COMMERCIAL):
+        return "ok", f"{licence} (no commercial use)"
+    return "ok", licence
 
 
 def check_ego_poses(scene: DrivingScene) -> tuple[Verdict, str]:

@@ -23,6 +23,8 @@ from lidarpainter_models.scenes.undistortion import pinhole_of, undistort
 
 __all__ = ["ActorTrack", "DrivingScene", "RecordedView", "Sweep", "SweepPoints", "scene_path"]
 
+# the lens belongs to the pixels as they lie in the file, whatever way up a viewer should show them
+_AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 _POINT_COLUMNS = {
     "xyz_m": "point_xyz_m",
     "intensity": "point_intensity",
@@ -108,7 +110,7 @@ class DrivingScene:
     def read_image(self, view: RecordedView) -> UInt8[Tensor, "height width 3"]:
         """The recorded picture as RGB bytes; a distorted lens is undone."""
         jpeg = self.read_jpeg(view)
-        picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+        picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), _AS_STORED)
         if picture is None:
             raise SceneError(f"{self.path}: the picture {view.key} cannot be decoded")
         picture = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)

@@ -11,12 +11,14 @@ import os
 import secrets
 import shutil
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
 from lidarpainter_models.errors import LidarPainterError, StorageError
 
 _LOCK_NAME = ".writing"
+_NUM_SYNC_THREADS = 8
 
 
 @contextmanager
@@ -85,10 +87,10 @@ def _clear_abandoned(final: Path) -> None:
 
 
 def _sync_tree(folder: Path) -> None:
-    for current, _folders, files in os.walk(folder, topdown=False):
-        for name in files:
-            _sync(Path(current, name))
-        _sync(Path(current))
+    paths = [folder, *folder.rglob("*")]
+    with ThreadPoolExecutor(_NUM_SYNC_THREADS) as pool:  # the disk takes many requests at once
+        for _ in pool.map(_sync, paths):
+            pass
 
 
 def _sync(path: Path) -> None:

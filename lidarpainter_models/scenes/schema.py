@@ -6,6 +6,7 @@ and units from here. Every `a_from_b` is a row-major 4x4 rigid transform in floa
 
 import re
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -148,6 +149,27 @@ def arrow_schema(table: str) -> pa.Schema:
             for column in TABLES[table]
         ]
     )
+
+
+def zarr_metadata(layout: ArrayLayout, num_rows: int) -> dict[str, Any]:
+    """What the `zarr.json` of an array must say; zstd may have any level (left out here)."""
+    encoding: dict[str, Any] = {"name": "bytes"}
+    if layout.dtype.itemsize > 1:
+        encoding["configuration"] = {"endian": "little"}
+    return {
+        "zarr_format": 3,
+        "node_type": "array",
+        "shape": [num_rows, *layout.row_shape],
+        "data_type": layout.dtype.name,
+        "chunk_grid": {
+            "name": "regular",
+            "configuration": {"chunk_shape": [layout.chunk_rows, *layout.row_shape]},
+        },
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+        "fill_value": 0,
+        "codecs": [encoding, {"name": "zstd"}, {"name": "crc32c"}],
+        "storage_transformers": [],
+    }
 
 
 def is_safe_name(name: str) -> bool:

@@ -17,6 +17,7 @@ import zarr
 
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.scenes import schema
+from lidarpainter_models.scenes.validation import shown
 
 _VERIFY_ROWS = 1 << 20
 
@@ -46,7 +47,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise SceneError(f"{path}: no scene here (no {schema.MANIFEST_NAME})") from None
     except (OSError, ValueError) as error:
-        raise SceneError(f"{file}: cannot be read ({error})") from None
+        raise SceneError(f"{file}: cannot be read ({shown(str(error))})") from None
     if not isinstance(manifest, dict) or manifest.get("is_complete") is not True:
         raise SceneError(f"{path}: the scene is not complete; ingest it again")
     if manifest.get("schema_version") != schema.SCHEMA_VERSION:
@@ -84,7 +85,7 @@ class StoredScene:
         try:
             table = pq.read_table(file)
         except (OSError, pa.ArrowException) as error:
-            raise SceneError(f"{file}: cannot be read ({error})") from None
+            raise SceneError(f"{file}: cannot be read ({shown(str(error))})") from None
         expected = schema.arrow_schema(name)
         if not table.schema.equals(expected):
             raise SceneError(
@@ -110,11 +111,17 @@ class StoredScene:
             )
         try:
             if self._group is None:
-                self._group = zarr.open_group(self.path / schema.ARRAYS_NAME, mode="r")
+                self._group = zarr.open_group(
+                    self.path / schema.ARRAYS_NAME,
+                    mode="r",
+                    zarr_format=3,  # version 2 has codecs that unpickle
+                    use_consolidated=False,
+                )
             rows = self._group[name][offset : offset + num_rows]  # type: ignore[index]
         except (OSError, ValueError, KeyError, RuntimeError) as error:
             raise SceneError(
-                f"{self.path}: array {name} cannot be read ({error}); ingest the scene again"
+                f"{self.path}: array {name} cannot be read ({shown(str(error))}); "
+                "ingest the scene again"
             ) from None
         return np.asarray(rows)
 

@@ -25,7 +25,11 @@ def _matrix(camera: Camera) -> np.ndarray:
 
 
 def pinhole_of(lens: Camera, distortion: Distortion) -> Camera:
-    """The pinhole camera of the undistorted picture: same size, no empty border."""
+    """The pinhole camera of the undistorted picture: same size, no empty border.
+
+    Raises:
+        ConfigError: no such camera exists.
+    """
     if distortion.model == "none":
         return lens
     size_px = (lens.width_px, lens.height_px)

@@ -5,6 +5,7 @@ raises a one-line `DataError` that says what is wrong there and what was expecte
 """
 
 import math
+from collections.abc import Mapping
 
 import cv2
 import numpy as np
@@ -12,9 +13,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.errors import DataError
+from lidarpainter_models.errors import ConfigError, DataError
+from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import is_rigid
+from lidarpainter_models.scenes.records import Distortion, RollingShutter
 from lidarpainter_models.scenes.schema import is_safe_name
+from lidarpainter_models.scenes.undistortion import pinhole_of
 
 _JPEG_START = b"\xff\xd8"
 _JPEG_END = b"\xff\xd9"
@@ -22,6 +26,24 @@ _JPEG_END = b"\xff\xd9"
 _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 MAX_COORDINATE_M = 100_000.0
 """Farther from the first ego pose than this, float32 is no longer exact to a centimetre."""
+MAX_PICTURE_PIXELS = 64_000_000
+"""A header that states more is refused before anything is decoded; cameras have up to 12 million.
+
+A progressive JPEG keeps six bytes per pixel while it is decoded.
+"""
+MAX_LABEL_LENGTH = 200
+MAX_PLACE_M = 1e8
+"""The Earth's radius is 6.4e6 m; frames of datasets are often centred far away."""
+MAX_LENS_NUMBER = 1e7
+MAX_SHUTTER_S = 10.0
+SHUTTER_DIRECTIONS = ("down", "up", "left", "right")
+_MAX_TIMESTAMP_NS = 2**62
+
+
+def shown(text: str, max_length: int = 200) -> str:
+    """A text of unknown origin as one line of bounded length."""
+    line = text[:max_length].encode("unicode_escape").decode("ascii")
+    return line if len(text) <= max_length else f"{line}..."
 
 
 def require_name(name: str, kind: str) -> str:
@@ -34,13 +56,67 @@ def require_name(name: str, kind: str) -> str:
     return name
 
 
+def require_label(label: object, where: str) -> str:
+    """Refuse a category that is not a short printable text."""
+    if not (isinstance(label, str) and label.isprintable() and 0 < len(label) <= MAX_LABEL_LENGTH):
+        raise DataError(
+            f"{where}: the category is {label!r:.50}, expected a printable text of at most "
+            f"{MAX_LABEL_LENGTH} letters"
+        )
+    return label
+
+
+def require_classes(classes: Mapping[str, object], where: str) -> dict[int, str]:
+    """Names of point classes by number, from texts as JSON has them; refuse other things."""
+    names = {}
+    for number, name in classes.items():
+        if not (number.isascii() and number.isdecimal() and len(number) <= 3 and int(number) < 256):
+            raise DataError(f"{where}: {number!r:.20} is no class number from 0 to 255")
+        names[int(number)] = require_label(name, f"{where}, class {number}")
+    return names
+
+
+def require_time(timestamp_ns: int, where: str) -> int:
+    """Refuse a time that 64 bits of nanoseconds cannot hold with room to spare."""
+    if not -_MAX_TIMESTAMP_NS < timestamp_ns < _MAX_TIMESTAMP_NS:
+        raise DataError(f"{where}: the time {float(timestamp_ns) / 1e9:g} s is no date of a log")
+    return timestamp_ns
+
+
 def require_pose(target_from_source: Float[Tensor, "4 4"], where: str) -> Float[Tensor, "4 4"]:
     """Refuse a pose that is not a finite rigid transform."""
     if not bool(torch.isfinite(target_from_source).all()):
         raise DataError(f"{where}: the pose is not finite")
     if not bool(is_rigid(target_from_source)):
         raise DataError(f"{where}: the pose is not a rotation and a translation")
+    if float(target_from_source[:3, 3].abs().max()) > MAX_PLACE_M:
+        raise DataError(f"{where}: the pose lies farther away than the Earth is wide")
     return target_from_source
+
+
+def require_lens(camera: Camera, distortion: Distortion, where: str) -> None:
+    """Refuse a lens whose numbers are no lens, or whose distortion cannot be undone."""
+    numbers = (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, *distortion.terms)
+    if not all(abs(number) <= MAX_LENS_NUMBER for number in numbers):
+        raise DataError(f"{where}: the lens has a number beyond {MAX_LENS_NUMBER:g}")
+    try:
+        pinhole_of(camera, distortion)
+    except (cv2.error, ConfigError, OverflowError):
+        raise DataError(
+            f"{where}: the {distortion.model} distortion {distortion.terms} cannot be undone"
+        ) from None
+
+
+def require_shutter(shutter: RollingShutter | None, where: str) -> None:
+    """Refuse a shutter that takes no time, too long, or reads in no direction."""
+    if shutter is None:
+        return
+    if not 0 <= shutter.duration_s <= MAX_SHUTTER_S or shutter.direction not in SHUTTER_DIRECTIONS:
+        raise DataError(
+            f"{where}: the rolling shutter reads {shutter.direction!r:.20} for "
+            f"{shutter.duration_s} s, expected {', '.join(SHUTTER_DIRECTIONS)} and at most "
+            f"{MAX_SHUTTER_S} s"
+        )
 
 
 def require_points(xyz_m: np.ndarray, where: str) -> None:
@@ -66,29 +142,22 @@ def require_size(size_m: tuple[float, float, float], where: str) -> None:
 
 
 def require_jpeg(jpeg: bytes, *, width_px: int, height_px: int, where: str) -> None:
-    """Refuse bytes that are no complete JPEG picture of the stated size."""
-    found_px = _decoded_size(jpeg, where)
+    """Refuse bytes that are no complete JPEG picture of the stated size.
+
+    A decoder fills a cut-off picture with grey and says nothing, so the end-of-image marker is
+    looked for as well.
+    """
+    found_px = jpeg_header_size(jpeg, where)
     if found_px != (width_px, height_px):
         raise DataError(
             f"{where}: the picture is {found_px[0]} x {found_px[1]} px, "
             f"expected {width_px} x {height_px}"
         )
-
-
-def _decoded_size(jpeg: bytes, where: str) -> tuple[int, int]:
-    """Width and height of a JPEG that is complete and decodes.
-
-    A decoder fills a cut-off picture with grey and says nothing, so the end-of-image marker is
-    looked for as well.
-    """
-    if not jpeg.startswith(_JPEG_START):
-        raise DataError(f"{where}: not a JPEG picture")
     if not jpeg.rstrip(b"\x00").endswith(_JPEG_END):
         raise DataError(f"{where}: the JPEG picture is cut off ({len(jpeg)} bytes, no end marker)")
-    picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-    if picture is None:
+    # an eighth of the size: all entropy-coded data is read, the rest of the work is spared
+    if cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_8) is None:
         raise DataError(f"{where}: the JPEG picture cannot be decoded")
-    return picture.shape[1], picture.shape[0]
 
 
 def jpeg_header_size(jpeg: bytes, where: str) -> tuple[int, int]:
@@ -97,12 +166,19 @@ def jpeg_header_size(jpeg: bytes, where: str) -> tuple[int, int]:
     Segments follow each other as marker, big-endian length, content (ITU-T T.81, annex B); the
     size stands in the start-of-frame segment.
     """
+    if not jpeg.startswith(_JPEG_START):
+        raise DataError(f"{where}: not a JPEG picture")
     position = len(_JPEG_START)
-    while jpeg.startswith(_JPEG_START) and position + 9 <= len(jpeg) and jpeg[position] == 0xFF:
+    while position + 9 <= len(jpeg) and jpeg[position] == 0xFF:
         marker = jpeg[position + 1]
         if marker in _START_OF_FRAME:
             height_px = int.from_bytes(jpeg[position + 5 : position + 7], "big")
             width_px = int.from_bytes(jpeg[position + 7 : position + 9], "big")
+            if not 0 < width_px * height_px <= MAX_PICTURE_PIXELS:
+                raise DataError(
+                    f"{where}: the JPEG picture states {width_px} x {height_px} px, expected at "
+                    f"most {MAX_PICTURE_PIXELS // 1_000_000} million"
+                )
             return width_px, height_px
         if marker == 0xFF:  # padding before a marker
             position += 1

@@ -6,7 +6,8 @@ no more than a chunk of each array in memory, and puts the scene in place only w
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -21,6 +22,7 @@ from jaxtyping import Float, Integer
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError, SceneError
+from lidarpainter_models.geometry.transforms import is_rigid
 from lidarpainter_models.scenes import schema
 from lidarpainter_models.scenes.array_writer import create_arrays
 from lidarpainter_models.scenes.publishing import AsideFolder, storage_errors
@@ -28,10 +30,14 @@ from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, SweepPoin
 from lidarpainter_models.scenes.stored import content_digest, stored_digest
 from lidarpainter_models.scenes.validation import (
     require_jpeg,
+    require_label,
+    require_lens,
     require_name,
     require_points,
     require_pose,
+    require_shutter,
     require_size,
+    require_time,
 )
 
 
@@ -76,11 +82,14 @@ class SceneWriter:
             for layout in schema.ARRAYS.values()
             if not layout.is_optional or self._header.semantic_classes
         ]
+        self._writing = ThreadPoolExecutor(1, thread_name_prefix="writing")
         try:
             with storage_errors(self.path):
-                self._arrays = create_arrays(self._aside.path / schema.ARRAYS_NAME, layouts)
+                self._arrays = create_arrays(
+                    self._aside.path / schema.ARRAYS_NAME, layouts, self._writing
+                )
         except BaseException:
-            self._aside.discard()
+            self._discard()
             raise
         return self
 
@@ -91,19 +100,24 @@ class SceneWriter:
         trace: TracebackType | None,
     ) -> None:
         if kind is not None:
-            self._aside.discard()
+            self._discard()
             return
         try:
             self._require_complete()
             with storage_errors(self.path):
                 digest = self._write_manifest()
+                self._writing.shutdown()
                 if digest == stored_digest(self.path):
                     self._aside.discard()  # whoever reads the equal scene there reads on
                 else:
                     self._aside.publish()
         except BaseException:
-            self._aside.discard()
+            self._discard()
             raise
+
+    def _discard(self) -> None:
+        self._writing.shutdown(cancel_futures=True)  # it must not write into what is removed
+        self._aside.discard()
 
     def add_frame(
         self, frame_index: int, *, timestamp_ns: int, world_from_ego: Float[Tensor, "4 4"]
@@ -111,6 +125,7 @@ class SceneWriter:
         """Begin a frame: everything added next belongs to it."""
         where = f"{self._name}, frame {frame_index}"
         require_pose(world_from_ego, f"{where}, ego")
+        require_time(timestamp_ns, where)
         frames = self._rows["frames"]
         if frames and (
             frame_index <= frames[-1]["frame_index"] or timestamp_ns <= frames[-1]["timestamp_ns"]
@@ -137,6 +152,9 @@ class SceneWriter:
         size_px = {"width_px": camera.width_px, "height_px": camera.height_px}
         require_jpeg(jpeg, **size_px, where=source or where)
         require_pose(camera.world_from_camera, where)
+        require_time(record.timestamp_ns, where)
+        require_lens(camera, record.distortion, where)
+        require_shutter(record.rolling_shutter, where)
         with storage_errors(self.path):
             offset = self._arrays["image_bytes"].append(np.frombuffer(jpeg, np.uint8))
         if record.camera_name not in self._camera_names:
@@ -168,11 +186,16 @@ class SceneWriter:
         timestamp_ns: int,
         world_from_lidar: Float[Tensor, "4 4"],
         semantics: Integer[Tensor, " points"] | None = None,
+        source: str | None = None,
     ) -> None:
-        """Store one LiDAR sweep of the current frame; `points.lidar` is set by its name."""
+        """Store one LiDAR sweep of the current frame; `points.lidar` is set by its name.
+
+        Errors in the points name `source`, the file they came from, if it is given.
+        """
         frame_index, where = self._place(lidar_name, "lidar")
         require_pose(world_from_lidar, where)
-        require_points(points.xyz_m.numpy(), where)
+        require_time(timestamp_ns, where)
+        require_points(points.xyz_m.numpy(), source or where)
         if (semantics is not None) != bool(self._header.semantic_classes):
             raise DataError(f"{where}: point classes and their names must come together")
         if lidar_name not in self._lidar_names:
@@ -206,24 +229,35 @@ class SceneWriter:
 
     def add_box(self, box: BoxRecord) -> None:
         """Store one box of the current frame."""
-        frame_index, where = self._place(box.actor_id, "actor")
-        require_pose(box.world_from_box, where)
-        require_size(box.size_m, where)
-        length_m, width_m, height_m = box.size_m
-        self._rows["boxes"].append(
-            {
-                "frame_index": frame_index,
-                "actor_id": box.actor_id,
-                "category": box.category,
-                "timestamp_ns": box.timestamp_ns,
-                "world_from_box": _flat(box.world_from_box),
-                "length_m": length_m,
-                "width_m": width_m,
-                "height_m": height_m,
-                "is_moving": box.is_moving,
-                "num_points": box.num_points,
-            }
-        )
+        self.add_boxes([box])
+
+    def add_boxes(self, boxes: Sequence[BoxRecord]) -> None:
+        """Store boxes of the current frame; many at once are checked faster than one by one."""
+        if not boxes:
+            return
+        are_rigid = is_rigid(torch.stack([box.world_from_box for box in boxes])).tolist()
+        for box, is_sound in zip(boxes, are_rigid, strict=True):
+            frame_index, where = self._place(box.actor_id, "actor")
+            if not is_sound:
+                require_pose(box.world_from_box, where)
+            require_size(box.size_m, where)
+            require_label(box.category, where)
+            require_time(box.timestamp_ns, where)
+            length_m, width_m, height_m = box.size_m
+            self._rows["boxes"].append(
+                {
+                    "frame_index": frame_index,
+                    "actor_id": box.actor_id,
+                    "category": box.category,
+                    "timestamp_ns": box.timestamp_ns,
+                    "world_from_box": _flat(box.world_from_box),
+                    "length_m": length_m,
+                    "width_m": width_m,
+                    "height_m": height_m,
+                    "is_moving": box.is_moving,
+                    "num_points": box.num_points,
+                }
+            )
 
     def set_provenance(self, provenance: Mapping[str, Any]) -> None:
         """Note in the manifest what the scene was made from (JSON-able; no part of its digest)."""

@@ -13,6 +13,9 @@ from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.readers import ingest_scene, list_sequences
 from lidarpainter_models.scenes.readers.dataframe_pickle import read_table_bytes
+from lidarpainter_models.scenes.readers.frame_content import read_ahead
+from lidarpainter_models.scenes.readers.pandaset import read_pandaset
+from lidarpainter_models.scenes.stored import stored_digest
 
 
 def test_world_begins_at_the_first_ego_pose_and_looks_along_the_road(small_scene):
@@ -104,6 +107,42 @@ def test_frames_and_cameras_can_be_chosen(sound_pandaset, tmp_path):
     assert scene.camera_names == ("back_camera",)
     assert [view.key for view in scene.views] == [(1, "back_camera"), (2, "back_camera")]
     assert torch.allclose(scene.world_from_ego[0], torch.eye(4, dtype=torch.float64), atol=1e-9)
+
+
+@pytest.mark.parametrize("num_threads", [1, 3])
+def test_frames_read_ahead_give_the_same_scene(sound_pandaset, tmp_path, num_threads):
+    serial, ahead = (
+        read_pandaset(sound_pandaset.root, "002", tmp_path / str(count), num_threads=count)
+        for count in (0, num_threads)
+    )
+    assert stored_digest(serial) == stored_digest(ahead)
+    files = [path.relative_to(serial) for path in serial.rglob("*") if path.is_file()]
+    assert all((serial / file).read_bytes() == (ahead / file).read_bytes() for file in files)
+
+
+def test_frames_are_read_only_a_little_ahead():
+    read = []
+
+    def note(frame_index):
+        read.append(frame_index)
+        return frame_index
+
+    with read_ahead(note, range(20), num_threads=2) as frames:
+        for frame_index in frames:
+            assert max(read) <= frame_index + 2
+    assert read == list(range(20))
+
+
+def test_error_in_a_frame_is_raised_when_the_frame_is_due():
+    def refuse(frame_index):
+        if frame_index == 1:
+            raise DataError("frame 1")
+        return frame_index
+
+    with read_ahead(refuse, range(4), num_threads=2) as frames:
+        assert next(frames) == 0
+        with pytest.raises(DataError, match="frame 1"):
+            next(frames)
 
 
 def test_progress_counts_frames(sound_pandaset, tmp_path):

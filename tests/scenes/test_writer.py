@@ -2,6 +2,7 @@
 
 import errno
 import fcntl
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -96,10 +97,11 @@ def test_what_is_written_is_what_is_read(tmp_path):
 
 def test_rows_that_fill_many_chunks_keep_their_order(tmp_path):
     layout = schema.ArrayLayout("rows", np.dtype("int16"), (2,), 7, "1", "counted")
-    arrays = array_writer.create_arrays(tmp_path / "a.zarr", [layout])
-    expected = np.arange(100).reshape(50, 2).astype(np.int16)
-    offsets = [arrays["rows"].append(part) for part in np.split(expected, [0, 1, 8, 29, 30])]
-    entry = arrays["rows"].finish()
+    with ThreadPoolExecutor(1) as writing:
+        arrays = array_writer.create_arrays(tmp_path / "a.zarr", [layout], writing)
+        expected = np.arange(100).reshape(50, 2).astype(np.int16)
+        offsets = [arrays["rows"].append(part) for part in np.split(expected, [0, 1, 8, 29, 30])]
+        entry = arrays["rows"].finish()
     assert offsets == [0, 0, 1, 8, 29, 30]
     assert entry["shape"] == [50, 2]
     group = array_writer.zarr.open_group(tmp_path / "a.zarr", mode="r")
@@ -135,6 +137,61 @@ def test_full_disk_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, good_wr
         add_frame(writer)
     assert "\n" not in str(raised.value)
     assert files_below(tmp_path) == []
+
+
+def add_full_frames(writer, num_frames=3):
+    for frame_index in range(num_frames):
+        add_frame(writer, frame_index, num_points=schema.ARRAYS["point_xyz_m"].chunk_rows)
+
+
+def add_frame_with_boxes(writer, boxes):
+    add_frame(writer)
+    writer.add_boxes(boxes)
+
+
+def test_error_in_the_thread_that_writes_is_raised_and_leaves_nothing(tmp_path, monkeypatch):
+    def refuse(_array, _start, _rows):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(array_writer.ArrayAppender, "_write", refuse)
+    with (
+        pytest.raises(StorageError, match="cannot be written: No space left"),
+        SceneWriter(tmp_path, "rig", "a", HEADER) as writer,
+    ):
+        add_full_frames(writer)
+    assert files_below(tmp_path) == []
+
+
+def test_many_boxes_at_once_are_those_given_one_by_one(tmp_path):
+    boxes = [some_box(actor_id=f"car-{number}") for number in range(5)]
+    digests = []
+    for name, adds in (("a", [boxes]), ("b", [[box] for box in boxes])):
+        with SceneWriter(tmp_path / name, "rig", "a", HEADER) as writer:
+            add_frame(writer)
+            for some in adds:
+                writer.add_boxes(some)
+        digests.append(DrivingScene.open(writer.path).content_digest)
+    assert digests[0] == digests[1]
+
+
+@pytest.mark.parametrize("position", [0, 3])
+def test_one_senseless_box_among_many_is_named(tmp_path, position):
+    boxes = [some_box(actor_id=f"car-{number}") for number in range(5)]
+    boxes[position] = replace(boxes[position], world_from_box=2 * IDENTITY)
+    with (
+        pytest.raises(DataError, match=f"actor car-{position}: the pose is not a rotation"),
+        SceneWriter(tmp_path, "rig", "a", HEADER) as writer,
+    ):
+        add_frame_with_boxes(writer, boxes)
+
+
+@pytest.mark.parametrize("category", ["", "a\nb", "\ud800", "x" * 201])
+def test_category_that_is_no_printable_text_is_refused(tmp_path, category):
+    with (
+        pytest.raises(DataError, match="expected a printable text"),
+        SceneWriter(tmp_path, "rig", "a", HEADER) as writer,
+    ):
+        add_frame_with_boxes(writer, [some_box(category=category)])
 
 
 def test_full_disk_while_publishing_leaves_the_old_scene(tmp_path, monkeypatch):

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.scenes.readers.nuscenes import list_nuscenes_scenes, read_nuscenes
+from lidarpainter_models.scenes.readers.canonical import list_canonical_scenes, read_canonical
 from lidarpainter_models.scenes.readers.pandaset import list_pandaset_sequences, read_pandaset
 from lidarpainter_models.scenes.readers.waymo import list_waymo_segments, read_waymo
 
@@ -15,6 +16,7 @@ _READERS = {
     "pandaset": (list_pandaset_sequences, read_pandaset),
     "nuscenes": (list_nuscenes_scenes, read_nuscenes),
     "waymo": (list_waymo_segments, read_waymo),
+    "canonical": (list_canonical_scenes, read_canonical),
 }
 
 

@@ -6,8 +6,8 @@ and two indexes, the first of which has the column names. Understood are the sta
 pandas 0.25 to 2 (and 3 where texts are plain objects); contents are flags, numbers and texts.
 """
 
-import gzip
-import io
+import operator
+import re
 import zlib
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,14 @@ import numpy as np
 
 from lidarpainter_models.errors import DataError, UnsafePickleError
 from lidarpainter_models.scenes.readers.pickle_tree import Made, Named, read_pickle_tree
+from lidarpainter_models.scenes.validation import shown
 
-MAX_TABLE_BYTES = 512 * 1024 * 1024
+MAX_TABLE_BYTES = 64 * 1024 * 1024
 """A table that unpacks to more is refused; the largest of PandaSet has 9 MB."""
+MAX_TABLE_ROWS = 1_000_000
+"""A frame of PandaSet has 170,000 points."""
+_GZIP_WINDOW_BITS = 31
+"""For zlib: a gzip header, its checksum and the largest window."""
 
 Table = dict[str, np.ndarray]
 """Columns by name, all of one length."""
@@ -59,10 +64,17 @@ ALLOWED_NAMES = frozenset(
     {*_FRAMES, *_MANAGERS, *_INDEX_KINDS, *_BLOCKS, *_SLICES, *_RECONSTRUCT, *_FROM_BUFFER}
     | {_NEW_INDEX, _ENCODE, _DTYPE, Named("numpy", "ndarray")}
 )
-_NUMBER_KINDS = frozenset("biuf")
+_NUMBER_CODE = re.compile(r"b1|[iu][1248]|f[248]")
+_BYTE_ORDERS = ("<", ">", "=", "|")
 
 
-def read_table_bytes(content: bytes, path: Path, *, max_bytes: int = MAX_TABLE_BYTES) -> Table:
+def read_table_bytes(
+    content: bytes,
+    path: Path,
+    *,
+    max_bytes: int = MAX_TABLE_BYTES,
+    max_rows: int = MAX_TABLE_ROWS,
+) -> Table:
     """The columns of one pickled pandas table, gzipped if the name of its `path` says so.
 
     Raises:
@@ -72,7 +84,7 @@ def read_table_bytes(content: bytes, path: Path, *, max_bytes: int = MAX_TABLE_B
     try:
         if path.suffix == ".gz":
             content = _unzip(content, max_bytes)
-        return _table(read_pickle_tree(content, ALLOWED_NAMES))
+        return _table(read_pickle_tree(content, ALLOWED_NAMES), max_rows)
     except UnsafePickleError as error:
         raise UnsafePickleError(f"{path}: {error}") from None
     except DataError as error:
@@ -80,17 +92,24 @@ def read_table_bytes(content: bytes, path: Path, *, max_bytes: int = MAX_TABLE_B
 
 
 def _unzip(content: bytes, max_bytes: int) -> bytes:
-    try:
-        with gzip.open(io.BytesIO(content)) as file:
-            unzipped = file.read(max_bytes + 1)
-    except (EOFError, OSError, zlib.error) as error:
-        raise DataError(f"the gzip file is cut off or damaged ({error})") from None
-    if len(unzipped) > max_bytes:
-        raise DataError(f"unpacks to more than {max_bytes} bytes, expected a table")
-    return unzipped
+    """The content of a gzip file, which may have several members; no more than `max_bytes`."""
+    parts, left = [], max_bytes + 1
+    while content:
+        member = zlib.decompressobj(_GZIP_WINDOW_BITS)
+        try:
+            parts.append(member.decompress(content, left))
+        except zlib.error as error:
+            raise DataError(f"the gzip file is cut off or damaged ({error})") from None
+        left -= len(parts[-1])
+        if left <= 0:
+            raise DataError(f"unpacks to more than {max_bytes} bytes, expected a table")
+        if not member.eof:
+            raise DataError("the gzip file is cut off or damaged (it has no end)")
+        content = member.unused_data.lstrip(b"\x00")
+    return b"".join(parts)
 
 
-def _table(tree: object) -> Table:
+def _table(tree: object, max_rows: int) -> Table:
     if not (isinstance(tree, Made) and tree.by in _FRAMES and isinstance(tree.state, dict)):
         raise DataError("the pickle holds no pandas table")
     manager = tree.state.get("_mgr", tree.state.get("_data"))
@@ -105,11 +124,18 @@ def _table(tree: object) -> Table:
     except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
         if isinstance(error, DataError):
             raise
-        raise DataError(f"the pandas table is damaged ({error})") from None
-    lengths = {-1 if column is None else len(column) for column in columns}
-    if len(lengths) != 1 or -1 in lengths:
+        raise DataError(f"the pandas table is damaged ({shown(str(error))})") from None
+    return dict(zip(names, _of_one_length(columns, max_rows), strict=True))
+
+
+def _of_one_length(columns: list[np.ndarray | None], max_rows: int) -> list[np.ndarray]:
+    found = [column for column in columns if column is not None]
+    lengths = {len(column) for column in found}
+    if len(found) != len(columns) or len(lengths) != 1:
         raise DataError("the pandas table is damaged (columns are missing or differ in length)")
-    return dict(zip(names, columns, strict=True))  # type: ignore[arg-type]
+    if max(lengths) > max_rows:
+        raise DataError(f"the table has {max(lengths)} rows, expected at most {max_rows}")
+    return found
 
 
 def _blocks(manager: Made) -> tuple[list[str], list[tuple[np.ndarray, list[int]]]]:
@@ -154,7 +180,10 @@ def _array(made: Made) -> np.ndarray:
         raise DataError(f"an array is made by {made.by}, which is not understood")
     if isinstance(content, Made) and content.by == _ENCODE:
         content = content.arguments[0]
-    return _flat_array(content, _dtype(dtype)).reshape(shape, order="F" if order == "F" else "C")
+    sizes = tuple(operator.index(size) for size in shape)
+    if not 1 <= len(sizes) <= 2 or min(sizes) < 0:
+        raise DataError("an array is neither a column nor a block of columns")
+    return _flat_array(content, _dtype(dtype)).reshape(sizes, order="F" if order == "F" else "C")
 
 
 def _flat_array(content: object, kind: np.dtype) -> np.ndarray:
@@ -171,13 +200,14 @@ def _flat_array(content: object, kind: np.dtype) -> np.ndarray:
 
 
 def _dtype(dtype: Made) -> np.dtype:
-    code = str(dtype.arguments[0]).lstrip("<>|=")
-    if dtype.by != _DTYPE or (code[:1] != "O" and code[:1] not in _NUMBER_KINDS):
-        raise DataError(f"column type {code!r} is not a number, a flag or a text")
+    text = dtype.arguments[0]
+    code = text.lstrip("<>|=") if isinstance(text, str) else ""
+    if dtype.by != _DTYPE or (code[:1] != "O" and not _NUMBER_CODE.fullmatch(code)):
+        raise DataError(f"column type {code!r:.50} is not a number, a flag or a text")
     if code[:1] == "O":
         return np.dtype(object)
     byte_order = dtype.state[1] if dtype.state else "="
-    return np.dtype(byte_order + code)
+    return np.dtype((byte_order if byte_order in _BYTE_ORDERS else "=") + code)
 
 
 def _plain_value(item: object) -> object:

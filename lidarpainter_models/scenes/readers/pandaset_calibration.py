@@ -20,8 +20,12 @@ from lidarpainter_models.geometry.transforms import (
     rotation_from_quaternion,
 )
 from lidarpainter_models.scenes.readers.source_folder import SourceFolder
+from lidarpainter_models.scenes.validation import require_time
 
 NS_PER_S = 1_000_000_000
+_LARGEST = 1e8
+"""Of a coordinate in metres (the Earth's radius is 6.4e6) or a number of pixels."""
+_LARGEST_INTEGER = 2**1000
 CAMERA_NAMES = (
     *("front_camera", "front_left_camera", "front_right_camera"),
     *("left_camera", "right_camera", "back_camera"),
@@ -67,7 +71,11 @@ def read_timestamps(source: SourceFolder, folder: str, num_frames: int | None = 
     values = source.read_json(file, list)
     if not values or not all(_is_number(value) for value in values):
         raise DataError(f"{where}: expected a list of times in seconds")
-    return _one_per_frame([nanoseconds(value) for value in values], num_frames, where)
+    times_ns = [
+        require_time(nanoseconds(value), f"{where}, frame {index}")
+        for index, value in enumerate(values)
+    ]
+    return _one_per_frame(times_ns, num_frames, where)
 
 
 def read_poses(source: SourceFolder, folder: str, num_frames: int) -> Float[Tensor, "frames 4 4"]:
@@ -137,10 +145,14 @@ def _one_per_frame(values: list, num_frames: int | None, where: str) -> list:
 
 def _number(values: dict[str, Any], key: str, where: str) -> float:
     value = values.get(key)
-    if not _is_number(value):
-        raise DataError(f"{where}: {key} is {value!r}, expected a finite number")
+    if not _is_number(value) or abs(value) > _LARGEST:  # type: ignore[arg-type]
+        found = f"{value!r:.50}" if isinstance(value, int | float | str) else type(value).__name__
+        raise DataError(f"{where}: {key} is {found}, expected a finite number")
     return float(value)  # type: ignore[arg-type]
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    """Whether JSON holds a number that a float can be; its integers have no end."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return math.isfinite(value) if isinstance(value, float) else abs(value) < _LARGEST_INTEGER

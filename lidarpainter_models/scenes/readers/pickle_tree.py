@@ -4,7 +4,8 @@ A pickle is a program for a small stack machine whose REDUCE and NEWOBJ opcodes 
 file names. This reader steps through the same opcodes but never imports, calls or builds anything:
 a name becomes `Named`, a call becomes `Made`, both inert. Names outside the caller's allow-list are
 refused. The opcodes are those of the standard library's `pickletools`; the ones left out
-(persistent ids, the extension registry, old class instances, sets) no table uses.
+(persistent ids, the extension registry, old class instances, sets) no table uses. Keys of dicts
+are texts and numbers: hashing a tuple nested a million deep would overflow the C stack.
 """
 
 import pickletools
@@ -13,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from lidarpainter_models.errors import DataError, UnsafePickleError
+from lidarpainter_models.scenes.validation import shown
 
 
 class Named(NamedTuple):
@@ -34,6 +36,9 @@ class Made:
     state: Any = field(default=None)
 
 
+MAX_OPCODES = 100_000
+"""A pickle with more is refused; those of PandaSet have a few thousand."""
+
 _MARK = object()
 _CONSTANTS: dict[str, Callable[[], Any]] = {
     "NONE": lambda: None,
@@ -42,7 +47,6 @@ _CONSTANTS: dict[str, Callable[[], Any]] = {
     "EMPTY_TUPLE": tuple,
     "EMPTY_LIST": list,
     "EMPTY_DICT": dict,
-    "MARK": lambda: _MARK,
 }
 _LITERALS = (
     *("INT", "LONG", "FLOAT", "BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT"),
@@ -59,11 +63,13 @@ class _Machine:
     def __init__(self, allowed: frozenset[Named]) -> None:
         self.allowed = allowed
         self.stack: list[Any] = []
+        self.marks: list[int] = []
         self.memo: dict[int, Any] = {}
         self.actions: dict[str, Callable[[Any], object]] = {
             **dict.fromkeys(_LITERALS, self.stack.append),
             **{name: self._push_constant(make) for name, make in _CONSTANTS.items()},
             **{name: self._push_tuple(size) for name, size in _TUPLE_SIZES.items()},
+            "MARK": lambda _: self._mark(),
             **dict.fromkeys(("BINGET", "LONG_BINGET", "GET"), self._get),
             **dict.fromkeys(("BINPUT", "LONG_BINPUT", "PUT"), self._put),
             **dict.fromkeys(("REDUCE", "NEWOBJ"), self._make),
@@ -94,8 +100,14 @@ class _Machine:
 
         return push
 
+    def _mark(self) -> None:
+        self.marks.append(len(self.stack))
+        self.stack.append(_MARK)
+
     def _pop_to_mark(self) -> list[Any]:
-        position = len(self.stack) - 1 - self.stack[::-1].index(_MARK)
+        position = self.marks.pop()
+        if self.stack[position] is not _MARK:
+            raise DataError("the pickle is damaged: a mark is gone")
         items = self.stack[position + 1 :]
         del self.stack[position:]
         return items
@@ -116,7 +128,7 @@ class _Machine:
         named = Named(_expect(module, str), _expect(name, str))
         if named not in self.allowed:
             raise UnsafePickleError(
-                f"the pickle names {named}, which no table needs; nothing of it was run"
+                f"the pickle names {shown(str(named))}, which no table needs; nothing of it was run"
             )
         self.stack.append(named)
 
@@ -135,6 +147,8 @@ def _expect(value: Any, kind: type) -> Any:  # noqa: ANN401
 
 
 def _pairs(items: list[Any]) -> dict[Any, Any]:
+    if not all(isinstance(key, str | int) for key in items[::2]):
+        raise DataError("the pickle is damaged: a key is neither a text nor a number")
     return dict(zip(items[::2], items[1::2], strict=True))
 
 
@@ -148,7 +162,9 @@ def read_pickle_tree(content: bytes, allowed: Iterable[Named]) -> Any:  # noqa: 
     """
     machine = _Machine(frozenset(allowed))
     try:
-        for opcode, argument, _position in pickletools.genops(content):
+        for step, (opcode, argument, _position) in enumerate(pickletools.genops(content)):
+            if step >= MAX_OPCODES:
+                raise DataError(f"the pickle has more than {MAX_OPCODES} opcodes")
             if opcode.name == "STOP":
                 return machine.stack.pop()
             if opcode.name in _IGNORED:
@@ -162,5 +178,5 @@ def read_pickle_tree(content: bytes, allowed: Iterable[Named]) -> Any:  # noqa: 
     except (IndexError, KeyError, TypeError, ValueError, OverflowError) as error:
         if isinstance(error, DataError):
             raise
-        raise DataError(f"the pickle is damaged: {error}") from None
+        raise DataError(f"the pickle is damaged: {shown(str(error))}") from None
     raise DataError("the pickle is damaged: it has no end")

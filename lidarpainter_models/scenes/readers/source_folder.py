@@ -2,13 +2,23 @@
 
 import hashlib
 import json
+import os
+import stat
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.scenes.readers.dataframe_pickle import Table, read_table_bytes
+from lidarpainter_models.scenes.readers.dataframe_pickle import (
+    MAX_TABLE_ROWS,
+    Table,
+    read_table_bytes,
+)
+from lidarpainter_models.scenes.validation import shown
+
+MAX_FILE_BYTES = 256 * 1024 * 1024
+"""A file that is read whole may be no larger; the largest of PandaSet has 4 MB."""
 
 
 class SourceFolder:
@@ -22,11 +32,11 @@ class SourceFolder:
         """The content of one file.
 
         Raises:
-            DataError: the file is missing or cannot be read.
+            DataError: the file is missing, too large, or cannot be read.
         """
         path = self.root / name
         try:
-            content = path.read_bytes()
+            content = _content(path)
         except (FileNotFoundError, NotADirectoryError):
             raise DataError(f"{path}: the file is missing") from None
         except OSError as error:
@@ -47,17 +57,23 @@ class SourceFolder:
         return value
 
     def read_table(
-        self, name: str, numbers: tuple[str, ...], *, texts: tuple[str, ...] = ()
+        self,
+        name: str,
+        numbers: tuple[str, ...],
+        *,
+        texts: tuple[str, ...] = (),
+        max_rows: int = MAX_TABLE_ROWS,
     ) -> Table:
         """The named columns of a pickled pandas table; nothing of it is run.
 
         Columns of numbers and flags come as float64 or int64, columns of texts as they are.
         """
         path = self.root / name
-        table = read_table_bytes(self.read_bytes(name), path)
+        table = read_table_bytes(self.read_bytes(name), path, max_rows=max_rows)
         missing = [column for column in (*numbers, *texts) if column not in table]
         if missing:
-            raise DataError(f"{path}: no column {', '.join(missing)}; it has {', '.join(table)}")
+            found = shown(", ".join(table))
+            raise DataError(f"{path}: no column {', '.join(missing)}; it has {found}")
         return {
             **{column: _numbers(table[column], f"{path}, column {column}") for column in numbers},
             **{column: table[column] for column in texts},
@@ -72,9 +88,21 @@ class SourceFolder:
         }
 
 
+def _content(path: Path) -> bytes:
+    """All of a regular file; a pipe or a device would never end."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    with os.fdopen(descriptor, "rb") as file:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise DataError(f"{path}: not a file")
+        if status.st_size > MAX_FILE_BYTES:
+            raise DataError(f"{path}: {status.st_size} bytes, expected at most {MAX_FILE_BYTES}")
+        return file.read()
+
+
 def _numbers(column: np.ndarray, where: str) -> np.ndarray:
     kind = np.int64 if column.dtype.kind in "biu" else np.float64
     try:
-        return column.astype(kind)
-    except (TypeError, ValueError):
+        return column.astype(kind, copy=False)
+    except (TypeError, ValueError, OverflowError):
         raise DataError(f"{where}: holds something other than numbers") from None
