@@ -93,7 +93,7 @@ def write(date_folder: Path, drive: str, store: Path) -> Path:
     velodyne = [global_from_imu(line, scale) @ invert_rigid(velo_from_imu) for line in packets]
     world_from_global = invert_rigid(velodyne[0])
     poses = [world_from_global @ pose for pose in velodyne]
-    times_ns = [nanoseconds(t) for t in (folder / "oxts/timestamps.txt").open()]
+    times_ns = [nanoseconds(t) for t in (folder / "oxts/timestamps.txt").read_text().splitlines()]
     lens = {
         "fx_px": projection[0, 0],
         "fy_px": projection[1, 1],
