@@ -29,7 +29,7 @@ from lidarpainter_models.painter.nano_painter import NanoPainter
 from lidarpainter_models.painter.training import NanoTrainingConfig, TrainingProgress, train_nano
 from lidarpainter_models.painter.training_checkpoints import training_digest
 from lidarpainter_models.painter.weights import save_weights
-from lidarpainter_models.scenes.readers.pandaset import LICENCE as PANDASET_LICENCE
+from lidarpainter_models.scenes.readers.pandaset.reader import LICENCE as PANDASET_LICENCE
 from tasks.harvest import PairSet
 from tasks.judge_painter import open_sets
 from tasks.progress import listener

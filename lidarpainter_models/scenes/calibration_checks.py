@@ -49,7 +49,8 @@ _PEAK_WIDTH_DEG = 0.6
 """Turns this near to the best one score well because of it."""
 _MAX_WIDTH_PX = 960
 """Larger pictures are halved or more first: a degree stays at least eight pixels."""
-_MIN_PX_PER_DEG = 1.5
+_MIN_PX_PER_DEG = 2.2
+"""In coarser pictures blurred edges of a street move the best turn by a degree."""
 _BLUR_DEG, _SURROUNDINGS_DEG = 0.15, 2.0
 _CELL_DEG = (0.35, 0.25)
 """Elevation and azimuth of a cell of the range image; beams lie 0.2 to 1.3 degrees apart."""

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.readers.frame_content import NUM_READING_THREADS
-from lidarpainter_models.scenes.readers.pandaset import read_pandaset
+from lidarpainter_models.scenes.readers.pandaset.reader import read_pandaset
 from tasks.measuring import measured
 
 

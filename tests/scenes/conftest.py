@@ -16,7 +16,7 @@ from pickled_tables import pickled_table
 
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.readers import ingest_scene
-from lidarpainter_models.scenes.readers.dataframe_pickle import read_table_bytes
+from lidarpainter_models.scenes.readers.pandaset.dataframe_pickle import read_table_bytes
 
 CAMERAS = ("front", "front_left", "front_right", "left", "right", "back")
 CAMERA_YAW_DEG = dict(zip(CAMERAS, (0.0, 57.0, -58.0, 90.0, -90.0, 180.0), strict=True))

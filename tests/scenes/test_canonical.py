@@ -11,7 +11,7 @@ from lidarpainter_models.errors import DataError, LidarPainterError
 from lidarpainter_models.scenes import schema
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.readers import ingest_scene, list_sequences
-from lidarpainter_models.scenes.readers.canonical_checks import zstd_content_size
+from lidarpainter_models.scenes.readers.canonical.checks import zstd_content_size
 from lidarpainter_models.scenes.stored import content_digest
 
 

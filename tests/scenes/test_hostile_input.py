@@ -11,8 +11,9 @@ import pytest
 
 from lidarpainter_models.errors import DataError, LidarPainterError, StorageError, UnsafePickleError
 from lidarpainter_models.scenes import array_writer
-from lidarpainter_models.scenes.readers import dataframe_pickle, ingest_scene
-from lidarpainter_models.scenes.readers.dataframe_pickle import read_table_bytes
+from lidarpainter_models.scenes.readers import ingest_scene
+from lidarpainter_models.scenes.readers.pandaset import dataframe_pickle
+from lidarpainter_models.scenes.readers.pandaset.dataframe_pickle import read_table_bytes
 
 
 def refusal(log, store, **options):

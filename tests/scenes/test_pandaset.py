@@ -12,9 +12,9 @@ from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.readers import ingest_scene, list_sequences
-from lidarpainter_models.scenes.readers.dataframe_pickle import read_table_bytes
 from lidarpainter_models.scenes.readers.frame_content import read_ahead
-from lidarpainter_models.scenes.readers.pandaset import read_pandaset
+from lidarpainter_models.scenes.readers.pandaset.dataframe_pickle import read_table_bytes
+from lidarpainter_models.scenes.readers.pandaset.reader import read_pandaset
 from lidarpainter_models.scenes.stored import stored_digest
 
 

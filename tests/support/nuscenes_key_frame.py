@@ -26,7 +26,7 @@ from lidarpainter_models.geometry.transforms import (
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.overlay import draw_overlay
 from lidarpainter_models.scenes.readers import ingest_scene
-from lidarpainter_models.scenes.readers.pickle_tree import Made, Named, read_pickle_tree
+from lidarpainter_models.scenes.readers.pandaset.pickle_tree import Made, Named, read_pickle_tree
 
 SCENE_NAME = "scene-0061"
 ALLOWED = (

@@ -18,10 +18,10 @@ import torch
 
 from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.scenes.overlay import draw_boxes
-from lidarpainter_models.scenes.readers.waymo_boxes import FramePoints, box_records
-from lidarpainter_models.scenes.readers.waymo_cameras import exposure_s, image_record
-from lidarpainter_models.scenes.readers.waymo_log import WaymoFrame, WaymoImage
-from lidarpainter_models.scenes.readers.waymo_v1 import WaymoRecordSegment
+from lidarpainter_models.scenes.readers.waymo.boxes import FramePoints, box_records
+from lidarpainter_models.scenes.readers.waymo.cameras import exposure_s, image_record
+from lidarpainter_models.scenes.readers.waymo.log import WaymoFrame, WaymoImage
+from lidarpainter_models.scenes.readers.waymo.v1 import WaymoRecordSegment
 from lidarpainter_models.scenes.tracks import ActorTrack, tracks_from_boxes
 from lidarpainter_models.scenes.undistortion import pinhole_of, undistort
 

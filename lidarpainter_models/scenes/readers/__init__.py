@@ -4,10 +4,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.scenes.readers.canonical import list_canonical_scenes, read_canonical
-from lidarpainter_models.scenes.readers.nuscenes import list_nuscenes_scenes, read_nuscenes
-from lidarpainter_models.scenes.readers.pandaset import list_pandaset_sequences, read_pandaset
-from lidarpainter_models.scenes.readers.waymo import list_waymo_segments, read_waymo
+from lidarpainter_models.scenes.readers.canonical.reader import (
+    list_canonical_scenes,
+    read_canonical,
+)
+from lidarpainter_models.scenes.readers.nuscenes.reader import list_nuscenes_scenes, read_nuscenes
+from lidarpainter_models.scenes.readers.pandaset.reader import (
+    list_pandaset_sequences,
+    read_pandaset,
+)
+from lidarpainter_models.scenes.readers.waymo.reader import list_waymo_segments, read_waymo
 
 Progress = Callable[[int, int], None]
 """Told frames done and frames in all."""

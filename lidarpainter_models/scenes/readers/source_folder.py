@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.scenes.readers.dataframe_pickle import (
+from lidarpainter_models.scenes.readers.pandaset.dataframe_pickle import (
     MAX_TABLE_ROWS,
     Table,
     read_table_bytes,

@@ -7,7 +7,7 @@ import pytest
 
 from lidarpainter_models.errors import DataError, LidarPainterError
 from lidarpainter_models.scenes.readers import ingest_scene
-from lidarpainter_models.scenes.readers.nuscenes_tables import MAX_ROW_BYTES, NuscenesTable
+from lidarpainter_models.scenes.readers.nuscenes.tables import MAX_ROW_BYTES, NuscenesTable
 
 
 def refusal(log, store, **options):
@@ -221,7 +221,7 @@ def test_rows_are_found_wherever_chunks_end(tmp_path, monkeypatch, blank):
     assert [row["x"][1] for row in whole] == list(range(0x20, 0x40))
     for chunk_bytes in (1, 2, 3, 7, 64):
         monkeypatch.setattr(
-            "lidarpainter_models.scenes.readers.nuscenes_tables._CHUNK_BYTES", chunk_bytes
+            "lidarpainter_models.scenes.readers.nuscenes.tables._CHUNK_BYTES", chunk_bytes
         )
         table = NuscenesTable(path)
         assert [row.values for row in table.rows()] == whole

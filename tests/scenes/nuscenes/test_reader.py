@@ -11,8 +11,9 @@ from nuscenes_log import SCENE_NAME, write_nuscenes_log
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.readers import ingest_scene, list_sequences, nuscenes_dataset
-from lidarpainter_models.scenes.readers.nuscenes_sweeps import (
+from lidarpainter_models.scenes.readers import ingest_scene, list_sequences
+from lidarpainter_models.scenes.readers.nuscenes import dataset as nuscenes_dataset
+from lidarpainter_models.scenes.readers.nuscenes.sweeps import (
     TURN_NS,
     read_lidar_points,
     turn_offset_ns,

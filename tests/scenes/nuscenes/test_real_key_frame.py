@@ -17,7 +17,7 @@ from nuscenes_key_frame import (
 from lidarpainter_models.scenes.doctor import check_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.readers import ingest_scene
-from lidarpainter_models.scenes.readers.nuscenes_sweeps import TURN_NS, read_lidar_points
+from lidarpainter_models.scenes.readers.nuscenes.sweeps import TURN_NS, read_lidar_points
 from lidarpainter_models.scenes.readers.source_folder import SourceFolder
 
 SPEED_MPS = 9.28

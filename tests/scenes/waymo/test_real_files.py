@@ -14,10 +14,10 @@ from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.boxes import box_corners
 from lidarpainter_models.geometry.transforms import invert_rigid, is_rigid, transform_points
 from lidarpainter_models.scenes.readers import ingest_scene, list_sequences
-from lidarpainter_models.scenes.readers.parquet_rows import ParquetRows
-from lidarpainter_models.scenes.readers.waymo_calibration import CAMERA_NAMES, TOP
-from lidarpainter_models.scenes.readers.waymo_cameras import exposure_s, readout_s
-from lidarpainter_models.scenes.readers.waymo_log import actor_name
+from lidarpainter_models.scenes.readers.waymo.calibration import CAMERA_NAMES, TOP
+from lidarpainter_models.scenes.readers.waymo.cameras import exposure_s, readout_s
+from lidarpainter_models.scenes.readers.waymo.log import actor_name
+from lidarpainter_models.scenes.readers.waymo.parquet_rows import ParquetRows
 
 FRAME, LABELS_ONLY = "pvps_data_one_frame", "mmdet3d_val"
 SEGMENT = "10023947602400723454_1120_000_1140_000"

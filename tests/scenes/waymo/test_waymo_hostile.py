@@ -13,8 +13,8 @@ from waymo_log import SEGMENT, double, frame_messages, matrix, message, text, tf
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.scenes.readers import ingest_scene
-from lidarpainter_models.scenes.readers.range_images import MAX_PIXELS, unpack_matrix
-from lidarpainter_models.scenes.readers.tfrecord import (
+from lidarpainter_models.scenes.readers.waymo.range_images import MAX_PIXELS, unpack_matrix
+from lidarpainter_models.scenes.readers.waymo.tfrecord import (
     MAX_RECORD_BYTES,
     TfrecordFile,
     masked_checksum,

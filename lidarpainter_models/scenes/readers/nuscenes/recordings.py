@@ -16,9 +16,9 @@ from torch import Tensor
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.transforms import invert_rigid
-from lidarpainter_models.scenes.readers.nuscenes_dataset import NuscenesTables, Sample
-from lidarpainter_models.scenes.readers.nuscenes_rows import TableRow
-from lidarpainter_models.scenes.readers.nuscenes_sweeps import TURN_NS, turn_offset_ns
+from lidarpainter_models.scenes.readers.nuscenes.dataset import NuscenesTables, Sample
+from lidarpainter_models.scenes.readers.nuscenes.rows import TableRow
+from lidarpainter_models.scenes.readers.nuscenes.sweeps import TURN_NS, turn_offset_ns
 
 LIDAR_NAME = "LIDAR_TOP"
 CAMERA_NAMES = (

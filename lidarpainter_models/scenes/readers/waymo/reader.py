@@ -30,25 +30,25 @@ import torch
 
 from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
-from lidarpainter_models.scenes.readers.pandaset_calibration import level_frame, nanoseconds
-from lidarpainter_models.scenes.readers.range_images import range_points
-from lidarpainter_models.scenes.readers.waymo_boxes import FramePoints, box_records, moving_ids
-from lidarpainter_models.scenes.readers.waymo_calibration import CAMERA_NAMES, TOP
-from lidarpainter_models.scenes.readers.waymo_cameras import exposure_s, image_record
-from lidarpainter_models.scenes.readers.waymo_checks import (
+from lidarpainter_models.scenes.readers.drive_poses import level_frame, nanoseconds
+from lidarpainter_models.scenes.readers.waymo.boxes import FramePoints, box_records, moving_ids
+from lidarpainter_models.scenes.readers.waymo.calibration import CAMERA_NAMES, TOP
+from lidarpainter_models.scenes.readers.waymo.cameras import exposure_s, image_record
+from lidarpainter_models.scenes.readers.waymo.checks import (
     require_agreement,
     require_drive,
     require_timely,
 )
-from lidarpainter_models.scenes.readers.waymo_log import (
+from lidarpainter_models.scenes.readers.waymo.log import (
     MAX_LAG_S,
     WaymoFrame,
     WaymoImage,
     WaymoSegment,
     WaymoSweep,
 )
-from lidarpainter_models.scenes.readers.waymo_v1 import WaymoRecordSegment
-from lidarpainter_models.scenes.readers.waymo_v2 import WaymoParquetSegment
+from lidarpainter_models.scenes.readers.waymo.range_images import range_points
+from lidarpainter_models.scenes.readers.waymo.v1 import WaymoRecordSegment
+from lidarpainter_models.scenes.readers.waymo.v2 import WaymoParquetSegment
 from lidarpainter_models.scenes.records import SweepPoints
 from lidarpainter_models.scenes.validation import jpeg_header_size, require_name
 from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter

@@ -1,8 +1,8 @@
 """Read nuScenes (Motional, CC BY-NC-SA 4.0): the tables of v1.0 and the files they name.
 
-Every sweep of LIDAR_TOP is a frame, key frames and those in between; `nuscenes_recordings.py` says
-which pictures it gets, `nuscenes_sweeps.py` what the points are and when they were measured,
-`nuscenes_boxes.py` where the boxes stand between key frames, `nuscenes_dataset.py` how versions
+Every sweep of LIDAR_TOP is a frame, key frames and those in between; `recordings.py` says
+which pictures it gets, `sweeps.py` what the points are and when they were measured,
+`boxes.py` where the boxes stand between key frames, `dataset.py` how versions
 and tables are found. The sequence is named as the scene (`scene-0061`).
 
 Frames. Ego (`ego_pose`) is on the ground below the rear axle, x forward, y left, z up; every
@@ -23,13 +23,14 @@ from torch import Tensor
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
-from lidarpainter_models.scenes.readers.nuscenes_boxes import Annotations, PointsByPlace
-from lidarpainter_models.scenes.readers.nuscenes_dataset import (
+from lidarpainter_models.scenes.readers.drive_poses import level_frame, pose_at
+from lidarpainter_models.scenes.readers.nuscenes.boxes import Annotations, PointsByPlace
+from lidarpainter_models.scenes.readers.nuscenes.dataset import (
     find_scene,
     open_versions,
     read_samples,
 )
-from lidarpainter_models.scenes.readers.nuscenes_recordings import (
+from lidarpainter_models.scenes.readers.nuscenes.recordings import (
     CAMERA_NAMES,
     LIDAR_NAME,
     RecordedFrame,
@@ -37,12 +38,11 @@ from lidarpainter_models.scenes.readers.nuscenes_recordings import (
     form_frames,
     read_recordings,
 )
-from lidarpainter_models.scenes.readers.nuscenes_sweeps import (
+from lidarpainter_models.scenes.readers.nuscenes.sweeps import (
     TURN_NS,
     LidarPoints,
     read_lidar_points,
 )
-from lidarpainter_models.scenes.readers.pandaset_calibration import level_frame, pose_at
 from lidarpainter_models.scenes.readers.source_folder import SourceFolder
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, SweepPoints
 from lidarpainter_models.scenes.validation import require_name

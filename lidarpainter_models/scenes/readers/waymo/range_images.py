@@ -18,9 +18,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.scenes.readers.waymo_calibration import MAX_ROWS, LidarCalibration
-from lidarpainter_models.scenes.readers.waymo_log import MAX_REACH_M, WaymoSweep
-from lidarpainter_models.scenes.readers.waymo_messages import parse_message
+from lidarpainter_models.scenes.readers.waymo.calibration import MAX_ROWS, LidarCalibration
+from lidarpainter_models.scenes.readers.waymo.log import MAX_REACH_M, WaymoSweep
+from lidarpainter_models.scenes.readers.waymo.messages import parse_message
 
 MAX_COLUMNS = 8192
 MAX_PIXELS = 1 << 19

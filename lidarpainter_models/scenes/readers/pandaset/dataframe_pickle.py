@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lidarpainter_models.errors import DataError, UnsafePickleError
-from lidarpainter_models.scenes.readers.pickle_tree import Made, Named, read_pickle_tree
+from lidarpainter_models.scenes.readers.pandaset.pickle_tree import Made, Named, read_pickle_tree
 from lidarpainter_models.scenes.validation import shown
 
 MAX_TABLE_BYTES = 64 * 1024 * 1024

@@ -8,21 +8,19 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.transforms import (
-    interpolate_rigid,
     rigid_from_rotation,
     rotation_from_quaternion,
 )
+from lidarpainter_models.scenes.readers.drive_poses import nanoseconds
 from lidarpainter_models.scenes.readers.source_folder import SourceFolder
 from lidarpainter_models.scenes.validation import require_time
 
-NS_PER_S = 1_000_000_000
 _LARGEST = 1e8
 """Of a coordinate in metres (the Earth's radius is 6.4e6) or a number of pixels."""
 _LARGEST_INTEGER = 2**1000
@@ -86,40 +84,6 @@ def read_poses(source: SourceFolder, folder: str, num_frames: int) -> Float[Tens
     return torch.stack(
         [_pose(entry, f"{where}, frame {index}") for index, entry in enumerate(entries)]
     )
-
-
-def pose_at(
-    global_from_body: Float[Tensor, "frames 4 4"], timestamps_ns: list[int], timestamp_ns: int
-) -> Float[Tensor, "4 4"]:
-    """A pose between the recorded ones; before the first and after the last the motion goes on."""
-    if len(timestamps_ns) == 1:
-        return global_from_body[0]
-    after = int(np.clip(np.searchsorted(timestamps_ns, timestamp_ns), 1, len(timestamps_ns) - 1))
-    start_ns, end_ns = timestamps_ns[after - 1], timestamps_ns[after]
-    fraction = (timestamp_ns - start_ns) / (end_ns - start_ns)
-    return interpolate_rigid(
-        global_from_body[after - 1],
-        global_from_body[after],
-        torch.tensor(fraction, dtype=torch.float64),
-    )
-
-
-def level_frame(global_from_ego: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    """A frame at the ego's place whose x is its heading in the level plane and z is up."""
-    heading_rad = torch.atan2(global_from_ego[1, 0], global_from_ego[0, 0])
-    return turned_about_up(float(heading_rad), global_from_ego[:3, 3])
-
-
-def turned_about_up(angle_rad: float, translation_m: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
-    """A frame at a place, turned counter-clockwise about the vertical."""
-    cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
-    rotation = [[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]
-    return rigid_from_rotation(torch.tensor(rotation, dtype=torch.float64), translation_m)
-
-
-def nanoseconds(time_s: float) -> int:
-    """Seconds since the epoch as whole nanoseconds (a float64 holds them to 0.2 us)."""
-    return round(time_s * NS_PER_S)
 
 
 def _pose(entry: Any, where: str) -> Float[Tensor, "4 4"]:  # noqa: ANN401

@@ -23,6 +23,13 @@ from torch import Tensor
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
+from lidarpainter_models.scenes.readers.drive_poses import (
+    NS_PER_S,
+    level_frame,
+    nanoseconds,
+    pose_at,
+    turned_about_up,
+)
 from lidarpainter_models.scenes.readers.frame_content import (
     NUM_READING_THREADS,
     FrameContent,
@@ -30,30 +37,21 @@ from lidarpainter_models.scenes.readers.frame_content import (
     SourceSweep,
     read_ahead,
 )
-from lidarpainter_models.scenes.readers.pandaset_boxes import (
-    SweepTimes,
-    merge_boxes,
-    moving_actors,
-    read_boxes,
-)
-from lidarpainter_models.scenes.readers.pandaset_calibration import (
+from lidarpainter_models.scenes.readers.pandaset.boxes import merge_boxes, read_boxes
+from lidarpainter_models.scenes.readers.pandaset.calibration import (
     CAMERA_NAMES,
-    NS_PER_S,
-    level_frame,
-    nanoseconds,
-    pose_at,
     read_camera,
     read_poses,
     read_timestamps,
-    turned_about_up,
 )
-from lidarpainter_models.scenes.readers.pandaset_points import (
+from lidarpainter_models.scenes.readers.pandaset.points import (
     LIDAR_NAMES,
     PandasetPoints,
     read_classes,
     read_points,
 )
 from lidarpainter_models.scenes.readers.source_folder import SourceFolder
+from lidarpainter_models.scenes.readers.swept_boxes import SweepTimes, moving_actors
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord
 from lidarpainter_models.scenes.validation import (
     jpeg_header_size,

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.scenes.readers.nuscenes_rows import TableRow, shown
-from lidarpainter_models.scenes.readers.nuscenes_tables import NuscenesTable
+from lidarpainter_models.scenes.readers.nuscenes.rows import TableRow, shown
+from lidarpainter_models.scenes.readers.nuscenes.tables import NuscenesTable
 
 _FIRST_VERSIONS = ("v1.0-trainval", "v1.0-test", "v1.0-mini")
 _KEYS = {

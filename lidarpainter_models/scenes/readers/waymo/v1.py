@@ -12,9 +12,7 @@ from typing import Any
 import numpy as np
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.scenes.readers.range_images import unpack_matrix
-from lidarpainter_models.scenes.readers.tfrecord import TfrecordFile
-from lidarpainter_models.scenes.readers.waymo_calibration import (
+from lidarpainter_models.scenes.readers.waymo.calibration import (
     CAMERA_NAMES,
     LIDAR_NAMES,
     CameraCalibration,
@@ -23,7 +21,7 @@ from lidarpainter_models.scenes.readers.waymo_calibration import (
     lidar_calibration,
     sensor_name,
 )
-from lidarpainter_models.scenes.readers.waymo_log import (
+from lidarpainter_models.scenes.readers.waymo.log import (
     MAX_LABELS,
     SyncedBox,
     WaymoFrame,
@@ -37,7 +35,9 @@ from lidarpainter_models.scenes.readers.waymo_log import (
     checked_frame,
     checked_image,
 )
-from lidarpainter_models.scenes.readers.waymo_messages import parse_message
+from lidarpainter_models.scenes.readers.waymo.messages import parse_message
+from lidarpainter_models.scenes.readers.waymo.range_images import unpack_matrix
+from lidarpainter_models.scenes.readers.waymo.tfrecord import TfrecordFile
 
 RANGE_CHANNELS, POSE_CHANNELS = 4, 6
 _VELOCITY = ("v_x", "v_y", "v_z", "w_x", "w_y", "w_z")

@@ -15,9 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.scenes.readers.parquet_rows import FrameStream, ParquetRow, ParquetRows
-from lidarpainter_models.scenes.readers.range_images import shaped_matrix
-from lidarpainter_models.scenes.readers.waymo_calibration import (
+from lidarpainter_models.scenes.readers.waymo.calibration import (
     CAMERA_NAMES,
     LIDAR_NAMES,
     CameraCalibration,
@@ -26,7 +24,7 @@ from lidarpainter_models.scenes.readers.waymo_calibration import (
     lidar_calibration,
     sensor_name,
 )
-from lidarpainter_models.scenes.readers.waymo_log import (
+from lidarpainter_models.scenes.readers.waymo.log import (
     MAX_LABELS,
     SyncedBox,
     WaymoFrame,
@@ -40,6 +38,12 @@ from lidarpainter_models.scenes.readers.waymo_log import (
     checked_frame,
     checked_image,
 )
+from lidarpainter_models.scenes.readers.waymo.parquet_rows import (
+    FrameStream,
+    ParquetRow,
+    ParquetRows,
+)
+from lidarpainter_models.scenes.readers.waymo.range_images import shaped_matrix
 
 RANGE_CHANNELS, POSE_CHANNELS = 4, 6
 SEGMENT, TIME = "key.segment_context_name", "key.frame_timestamp_micros"

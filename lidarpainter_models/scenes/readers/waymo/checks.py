@@ -11,8 +11,8 @@ from torch import Tensor
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation
-from lidarpainter_models.scenes.readers.waymo_cameras import exposure_s, global_from_vehicle_at
-from lidarpainter_models.scenes.readers.waymo_log import MAX_LAG_S, WaymoFrame, WaymoImage
+from lidarpainter_models.scenes.readers.waymo.cameras import exposure_s, global_from_vehicle_at
+from lidarpainter_models.scenes.readers.waymo.log import MAX_LAG_S, WaymoFrame, WaymoImage
 
 MAX_SPEED_MPS = 60.0
 MAX_TURN_RADPS = 2.0

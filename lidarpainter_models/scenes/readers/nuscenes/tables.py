@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.scenes.readers.nuscenes_rows import TableRow, shown
+from lidarpainter_models.scenes.readers.nuscenes.rows import TableRow, shown
 
 MAX_ROW_BYTES = 1 << 20
 """A longer row is refused; those of nuScenes have a few hundred bytes."""

@@ -1,7 +1,7 @@
 """What both releases of the Waymo Open Dataset say about a segment, checked, in plain numbers.
 
 Version 1 (TFRecord) and version 2 (Parquet) hold the same under other names; their readers give
-what is defined here and `waymo.py` makes a scene of it. Lengths are metres, angles radians, times
+what is defined here and `reader.py` makes a scene of it. Lengths are metres, angles radians, times
 seconds since the epoch (float64 holds them to 0.2 us) unless named otherwise.
 """
 
@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.scenes.readers.waymo_calibration import (
+from lidarpainter_models.scenes.readers.waymo.calibration import (
     CameraCalibration,
     LidarCalibration,
     finite_numbers,

@@ -22,9 +22,9 @@ from lidarpainter_models.geometry.transforms import (
     rigid_from_rotation,
     rotation_from_vector,
 )
-from lidarpainter_models.scenes.readers.pandaset_calibration import nanoseconds
-from lidarpainter_models.scenes.readers.waymo_calibration import CameraCalibration
-from lidarpainter_models.scenes.readers.waymo_log import WaymoImage
+from lidarpainter_models.scenes.readers.drive_poses import nanoseconds
+from lidarpainter_models.scenes.readers.waymo.calibration import CameraCalibration
+from lidarpainter_models.scenes.readers.waymo.log import WaymoImage
 from lidarpainter_models.scenes.records import ImageRecord, RollingShutter
 
 _NEAR_PLANE_M = 0.1

@@ -18,7 +18,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.scenes.readers.pandaset_boxes import (
+from lidarpainter_models.scenes.readers.drive_poses import nanoseconds, turned_about_up
+from lidarpainter_models.scenes.readers.swept_boxes import (
     FORWARD,
     MOVING_MPS,
     SPINNING,
@@ -26,10 +27,9 @@ from lidarpainter_models.scenes.readers.pandaset_boxes import (
     SweepTimes,
     moving_actors,
 )
-from lidarpainter_models.scenes.readers.pandaset_calibration import nanoseconds, turned_about_up
-from lidarpainter_models.scenes.readers.waymo_calibration import CameraCalibration
-from lidarpainter_models.scenes.readers.waymo_cameras import PictureClock
-from lidarpainter_models.scenes.readers.waymo_log import (
+from lidarpainter_models.scenes.readers.waymo.calibration import CameraCalibration
+from lidarpainter_models.scenes.readers.waymo.cameras import PictureClock
+from lidarpainter_models.scenes.readers.waymo.log import (
     UprightBox,
     WaymoFrame,
     WaymoImage,

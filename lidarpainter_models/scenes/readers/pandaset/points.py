@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.scenes.readers.pandaset_calibration import NS_PER_S
+from lidarpainter_models.scenes.readers.drive_poses import NS_PER_S
 from lidarpainter_models.scenes.readers.source_folder import SourceFolder
 from lidarpainter_models.scenes.records import SweepPoints
 

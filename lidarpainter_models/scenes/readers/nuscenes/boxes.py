@@ -29,10 +29,10 @@ from lidarpainter_models.geometry.transforms import (
     interpolate_rigid,
     invert_rigid,
 )
-from lidarpainter_models.scenes.readers.nuscenes_dataset import NuscenesTables, Sample
-from lidarpainter_models.scenes.readers.nuscenes_recordings import LIDAR_NAME, Recording
-from lidarpainter_models.scenes.readers.nuscenes_rows import TableRow
-from lidarpainter_models.scenes.readers.nuscenes_sweeps import turn_offset_ns
+from lidarpainter_models.scenes.readers.nuscenes.dataset import NuscenesTables, Sample
+from lidarpainter_models.scenes.readers.nuscenes.recordings import LIDAR_NAME, Recording
+from lidarpainter_models.scenes.readers.nuscenes.rows import TableRow
+from lidarpainter_models.scenes.readers.nuscenes.sweeps import turn_offset_ns
 from lidarpainter_models.scenes.validation import require_name, require_size
 
 MOVING_M = 1.0

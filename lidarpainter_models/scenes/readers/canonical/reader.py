@@ -16,7 +16,7 @@ import torch
 from lidarpainter_models.errors import DataError, LidarPainterError, StorageError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.scenes import schema
-from lidarpainter_models.scenes.readers.canonical_checks import read_foreign_manifest
+from lidarpainter_models.scenes.readers.canonical.checks import read_foreign_manifest
 from lidarpainter_models.scenes.readers.frame_content import (
     NUM_READING_THREADS,
     FrameContent,

@@ -1,0 +1,1 @@
+"""Scene folders in the canonical form, written elsewhere."""

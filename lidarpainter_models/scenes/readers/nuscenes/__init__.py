@@ -1,0 +1,1 @@
+"""nuScenes v1.0, from its JSON tables."""

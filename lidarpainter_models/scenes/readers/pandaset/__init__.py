@@ -1,0 +1,1 @@
+"""PandaSet, from its pickled tables."""

@@ -1,0 +1,1 @@
+"""Waymo Open Dataset, v1 (TFRecord) and v2 (Parquet)."""
