@@ -26,7 +26,7 @@ def preview(scene: str) -> ReconstructParameters:
         painter="nano",
         novel=NovelGuidanceConfig(),
         conditions=ConditionConfig(),
-        rounds=1,
+        rounds=2,
         refine=continuation(fit, steps=SHORT_REFINE_STEPS, guidance=GuidanceConfig()),
         scoring=ScoringConfig(),
     )
