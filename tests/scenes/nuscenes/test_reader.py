@@ -142,7 +142,7 @@ def test_frames_and_cameras_can_be_chosen(log, store):
     assert scene.world_from_ego[0, :3, 3].norm() < 1e-9
     with pytest.raises(DataError, match=r"no camera 'CAM_ROOF', expected some of CAM_FRONT, "):
         log.ingest(store, cameras=("CAM_ROOF",))
-    with pytest.raises(DataError, match="select none of its 4 sweeps"):
+    with pytest.raises(DataError, match="select none of its 4 frames"):
         log.ingest(store, frames=slice(9, 12))
 
 

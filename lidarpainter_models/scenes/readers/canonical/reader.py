@@ -24,6 +24,7 @@ from lidarpainter_models.scenes.readers.frame_content import (
     SourceSweep,
     read_ahead,
 )
+from lidarpainter_models.scenes.readers.selection import chosen_cameras, chosen_frames
 from lidarpainter_models.scenes.records import (
     BoxRecord,
     Distortion,
@@ -130,23 +131,15 @@ class _ForeignScene:
         self.manifest = read_foreign_manifest(folder)
         self.stored = StoredScene(folder)
         self.stored.verify_content()
-        names = self.manifest["camera_names"]
-        for name in cameras or ():
-            if name not in names:
-                raise DataError(f"{folder}: no camera {name!r}, it has {', '.join(names)}")
+        used = chosen_cameras(cameras, self.manifest["camera_names"], folder)
         all_frames = self.stored.table("frames").to_pylist()
         known = {row["frame_index"] for row in all_frames}
         self._rows = {name: self._by_frame(name, known) for name in ("cameras", "sweeps", "boxes")}
-        if cameras is not None:
-            self._rows["cameras"] = {
-                frame: [row for row in rows if row["camera"] in cameras]
-                for frame, rows in self._rows["cameras"].items()
-            }
-        self.frames = all_frames[frames or slice(None)]
-        if not self.frames:
-            raise DataError(
-                f"{folder}: the frames asked for select none of its {len(all_frames)} frames"
-            )
+        self._rows["cameras"] = {
+            frame: [row for row in rows if row["camera"] in used]
+            for frame, rows in self._rows["cameras"].items()
+        }
+        self.frames = [all_frames[i] for i in chosen_frames(len(all_frames), frames, folder)]
         self.header = SceneHeader(
             licence=self.manifest["licence"],
             global_from_world=require_pose(

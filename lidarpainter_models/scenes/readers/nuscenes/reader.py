@@ -20,7 +20,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.scenes.readers.drive_poses import level_frame, pose_at
@@ -43,6 +42,7 @@ from lidarpainter_models.scenes.readers.nuscenes.sweeps import (
     LidarPoints,
     read_lidar_points,
 )
+from lidarpainter_models.scenes.readers.selection import chosen_cameras, chosen_frames
 from lidarpainter_models.scenes.readers.source_folder import SourceFolder
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, SweepPoints
 from lidarpainter_models.scenes.validation import require_name
@@ -107,16 +107,12 @@ class _NuscenesLog:
         self.source = SourceFolder(root)
         self._tables, scene = find_scene(root, sequence)
         samples = read_samples(self._tables, scene)
-        channels = _cameras(cameras, scene.where)
+        channels = chosen_cameras(cameras, CAMERA_NAMES, scene.where)
         recordings = read_recordings(self._tables, samples, (LIDAR_NAME, *channels))
         self._sweeps = recordings.pop(LIDAR_NAME)
         self.annotations = Annotations(self._tables, samples, self._sweeps)
         self._frames = form_frames(self._sweeps, recordings)
-        self.frame_indices = list(range(len(self._frames)))[frames or slice(None)]
-        if not self.frame_indices:
-            raise DataError(
-                f"{scene.where}: the frames asked for select none of its {len(self._frames)} sweeps"
-            )
+        self.frame_indices = chosen_frames(len(self._frames), frames, scene.where)
         first = self._frames[self.frame_indices[0]]
         self.global_from_world = level_frame(first.sweep.global_from_ego)
         self._world_from_global = invert_rigid(self.global_from_world)
@@ -204,12 +200,3 @@ class _NuscenesLog:
                     num_points=points.count_inside(world_from_box, box.size_m),
                 )
             )
-
-
-def _cameras(wanted: tuple[str, ...] | None, where: str) -> tuple[str, ...]:
-    for name in wanted or ():
-        if name not in CAMERA_NAMES:
-            raise DataError(
-                f"{where}: no camera {name!r}, expected some of {', '.join(CAMERA_NAMES)}"
-            )
-    return CAMERA_NAMES if wanted is None else tuple(dict.fromkeys(wanted))

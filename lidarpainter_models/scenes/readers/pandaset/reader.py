@@ -50,6 +50,7 @@ from lidarpainter_models.scenes.readers.pandaset.points import (
     read_classes,
     read_points,
 )
+from lidarpainter_models.scenes.readers.selection import chosen_cameras, chosen_frames
 from lidarpainter_models.scenes.readers.source_folder import SourceFolder
 from lidarpainter_models.scenes.readers.swept_boxes import SweepTimes, moving_actors
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord
@@ -138,12 +139,13 @@ class _PandasetLog:
         num_frames = len(self.timestamps_ns)
         if any(later <= earlier for earlier, later in pairwise(self.timestamps_ns)):
             raise DataError(f"{folder / 'lidar/timestamps.json'}: the times do not ascend")
-        self.frame_indices = _selected(num_frames, frames, folder)
+        self.frame_indices = chosen_frames(num_frames, frames, folder)
         self.global_from_ego = read_poses(self.source, "lidar", num_frames) @ _VEHICLE_FROM_EGO
         self.global_from_world = level_frame(self.global_from_ego[self.frame_indices[0]])
         self.world_from_global = invert_rigid(self.global_from_world)
         self.cameras = {
-            name: read_camera(self.source, name, num_frames) for name in _cameras(cameras, folder)
+            name: read_camera(self.source, name, num_frames)
+            for name in chosen_cameras(cameras, CAMERA_NAMES, folder)
         }
         self.semantic_classes = _semantic_classes(self.source)
         boxes = {index: read_boxes(self.source, index) for index in self.frame_indices}
@@ -245,19 +247,3 @@ def _semantic_classes(source: SourceFolder) -> dict[int, str]:
     if not classes:
         raise DataError(f"{source.root / file}: expected names by class number")
     return require_classes(classes, str(source.root / file))
-
-
-def _selected(num_frames: int, frames: slice | None, folder: Path) -> list[int]:
-    chosen = list(range(num_frames))[frames or slice(None)]
-    if not chosen:
-        raise DataError(f"{folder}: the frames asked for select none of its {num_frames} frames")
-    return chosen
-
-
-def _cameras(wanted: tuple[str, ...] | None, folder: Path) -> tuple[str, ...]:
-    for name in wanted or ():
-        if name not in CAMERA_NAMES:
-            raise DataError(
-                f"{folder}: no camera {name!r}, expected some of {', '.join(CAMERA_NAMES)}"
-            )
-    return CAMERA_NAMES if wanted is None else tuple(dict.fromkeys(wanted))

@@ -31,6 +31,7 @@ import torch
 from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.scenes.readers.drive_poses import level_frame, nanoseconds
+from lidarpainter_models.scenes.readers.selection import chosen_cameras, chosen_frames
 from lidarpainter_models.scenes.readers.waymo.boxes import FramePoints, box_records, moving_ids
 from lidarpainter_models.scenes.readers.waymo.calibration import CAMERA_NAMES, TOP
 from lidarpainter_models.scenes.readers.waymo.cameras import exposure_s, image_record
@@ -116,14 +117,9 @@ class _WaymoLog:
         self, segment: WaymoSegment, frames: slice | None, cameras: tuple[str, ...] | None
     ) -> None:
         self.segment = segment
-        chosen = list(range(segment.num_frames))[frames or slice(None)]
-        if not chosen:
-            raise DataError(
-                f"{segment.place}: the frames asked for select none of its "
-                f"{segment.num_frames} frames"
-            )
+        chosen = chosen_frames(segment.num_frames, frames, segment.place)
         self.frames = {index: segment.read_frame(index) for index in chosen}
-        self.cameras = _cameras(cameras, segment)
+        self.cameras = chosen_cameras(cameras, CAMERA_NAMES.values(), segment.place)
         require_drive(list(self.frames.values()))
         self.turn_s = _turn_s(self.frames)
         self.global_from_world = level_frame(self.frames[chosen[0]].global_from_vehicle)
@@ -254,16 +250,6 @@ def _open_segment(root: Path, sequence: str) -> WaymoSegment:
     if found[0].suffix == ".tfrecord":
         return WaymoRecordSegment(found[0])
     return WaymoParquetSegment(found[0].parent.parent, sequence)
-
-
-def _cameras(wanted: tuple[str, ...] | None, segment: WaymoSegment) -> tuple[str, ...]:
-    for name in wanted or ():
-        if name not in CAMERA_NAMES.values():
-            raise DataError(
-                f"{segment.place}: no camera {name!r}, expected some of "
-                f"{', '.join(CAMERA_NAMES.values())}"
-            )
-    return tuple(CAMERA_NAMES.values()) if wanted is None else wanted
 
 
 def _turn_s(frames: dict[int, WaymoFrame]) -> float:
