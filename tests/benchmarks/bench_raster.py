@@ -64,15 +64,19 @@ class Stages:
 STAGES = ("project", "list_tiles", "blend", "blend_gradients", "unproject")
 
 
+REFERENCE_SCENE = (20_000, 480, 320)
+LEAST_TIMES_REFERENCE = 25.0
+
+
 def forward(splats):
     """One picture, without what a backward pass needs."""
     with torch.no_grad():
         return render_gaussians(**splats, backend="cpu")
 
 
-def step(splats):
+def step(splats, backend="cpu"):
     """One picture and all gradients."""
-    image = render_gaussians(**splats, backend="cpu")
+    image = render_gaussians(**splats, backend=backend)
     loss = image.rgb.square().sum() + 0.01 * image.depth_m.sum() + image.alpha.sum()
     loss.backward()
 
@@ -135,6 +139,24 @@ def _stage_floors(stages, lanes, machine):
     floors["blend"] = 1e3 * lanes.evaluated * FORWARD_LANE_FLOP / machine.flops
     floors["blend_gradients"] = 1e3 * lanes.evaluated * BACKWARD_LANE_FLOP / machine.flops
     return floors
+
+
+def reference_figures(size, repeats):
+    """How many times faster a picture with its gradients is than by the plain reference."""
+    numba.set_num_threads(1)
+    splats = street_like_splats(*size)
+    ours_s = best_cpu_s(lambda: step(splats), repeats)
+    reference_s = best_cpu_s(lambda: step(splats, "reference"), 1)
+    return [
+        Figure(name="gaussian_raster.step_small", value=1e3 * ours_s, unit="ms"),
+        Figure(
+            name="gaussian_raster.times_reference",
+            value=reference_s / ours_s,
+            unit="x",
+            better="higher",
+            limit=LEAST_TIMES_REFERENCE,
+        ),
+    ]
 
 
 def thread_figures(size, repeats):

@@ -22,7 +22,13 @@ import torch
 from bench_iteration import frame_growth_figures, iteration_figures, memory_figures
 from bench_machine import copy_bandwidth, fma_peak_flops
 from bench_points import point_figures
-from bench_raster import growth_figures, raster_figures, thread_figures
+from bench_raster import (
+    REFERENCE_SCENE,
+    growth_figures,
+    raster_figures,
+    reference_figures,
+    thread_figures,
+)
 from bench_records import Figure, baseline_of, kept_to, table, write_figures
 from rich.console import Console
 
@@ -58,11 +64,11 @@ def measure(*, quick):
     torch.set_num_threads(1)
     machine = Machine(fma_peak_flops(5 if quick else 20), copy_bandwidth(2 if quick else 10))
     if quick:
-        figures = raster_figures(machine, QUICK_SCENE, 1)
+        figures = raster_figures(machine, QUICK_SCENE, 1) + reference_figures(QUICK_SCENE, 1)
         figures += growth_figures(1, gaussians=(1000, 2000), sizes=((80, 48), (160, 96)))
         return machine.figures() + figures + point_figures(machine, 1, counts=(1000, 2000))
     figures = raster_figures(machine, SCENE, 7)
-    figures += thread_figures(SCENE, 7)
+    figures += thread_figures(SCENE, 7) + reference_figures(REFERENCE_SCENE, 7)
     figures += iteration_figures(machine, 15)
     figures += point_figures(machine, 5)
     figures += growth_figures(3) + frame_growth_figures(8) + memory_figures()
