@@ -199,6 +199,7 @@ def test_ablate_puts_all_variants_beside_the_rules(make_pairs):
     assert lidar_only.network.config.inputs == {"lidar"}
 
 
+@pytest.mark.slow
 def test_a_painter_is_trained_on_from_its_weights(make_pairs, tmp_path):
     first, then = tmp_path / "first.safetensors", tmp_path / "then.safetensors"
     words = ["painter", "train", "--steps", "2", "--held-back", "0.25", "--json", *SMALL_TRAINING]
