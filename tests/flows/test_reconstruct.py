@@ -72,6 +72,8 @@ def test_the_command_gives_numbers_a_report_and_a_catalog(store):
         "fit",
         "paint-1",
         "refine-1",
+        "paint-2",
+        "refine-2",
         "evaluate-unpainted",
         "evaluate",
         "report",
