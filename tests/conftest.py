@@ -11,6 +11,11 @@ import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
+from flows.environment import THREADS
+
+for _name, _value in THREADS.items():
+    os.environ.setdefault(_name, _value)  # read when a test first imports numba
+
 ROOT = Path(__file__).resolve().parents[1]
 SHARED_ENVIRONMENT = "LIDARPAINTER_SHARED"
 
