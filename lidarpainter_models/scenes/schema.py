@@ -15,7 +15,9 @@ SCHEMA_VERSION = 1
 """Raised when a reader of the last version could misread the new one."""
 MANIFEST_NAME = "manifest.json"
 ARRAYS_NAME = "scene.zarr"
-NAME_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+MAX_NAME_LENGTH = 128
+"""File systems allow a folder 255 bytes, and names are parts of longer ones."""
+NAME_PATTERN = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_NAME_LENGTH - 1}}}")
 """Datasets, sequences, cameras and LiDARs are named so: safe as a folder of their own."""
 
 POSE_TYPE = pa.list_(pa.float64(), 16)

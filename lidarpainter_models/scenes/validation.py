@@ -17,7 +17,7 @@ from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import is_rigid
 from lidarpainter_models.scenes.records import Distortion, RollingShutter
-from lidarpainter_models.scenes.schema import is_safe_name
+from lidarpainter_models.scenes.schema import MAX_NAME_LENGTH, is_safe_name
 from lidarpainter_models.scenes.undistortion import pinhole_of
 
 _JPEG_START = b"\xff\xd8"
@@ -50,8 +50,8 @@ def require_name(name: str, kind: str) -> str:
     """Refuse names that would not be one plain folder, `../x` above all."""
     if not is_safe_name(name):
         raise DataError(
-            f"{kind} name {name!r} cannot be used: expected letters, digits, '.', '_' or '-', "
-            "starting with a letter or digit"
+            f"{kind} name {name!r:.60} cannot be used: expected at most {MAX_NAME_LENGTH} letters, "
+            "digits, '.', '_' or '-', starting with a letter or digit"
         )
     return name
 

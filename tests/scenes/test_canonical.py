@@ -97,6 +97,7 @@ def test_lens_and_shutter_survive(foreign, tmp_path):
         (lambda m: m.update(is_complete=False), "is_complete is not true"),
         (lambda m: m.update(schema_version=2), "schema_version is 2, expected 1"),
         (lambda m: m.update(sequence="../x"), "name '../x' cannot be used"),
+        (lambda m: m.update(dataset="x" * 129), "cannot be used: expected at most 128"),
         (lambda m: m.update(camera_names=["a/b"]), "name 'a/b' cannot be used"),
         (lambda m: m.update(global_from_world=[1.0] * 15), "no list of 16 numbers"),
         (lambda m: m.update(global_from_world=[float("nan")] * 16), "no list of 16 numbers"),

@@ -15,6 +15,8 @@ from pickled_tables import pickled_table
 from lidarpainter_models.scenes.readers import ingest_scene
 
 NUM_FAST, NUM_ALL = 8, 10_000
+# Python's own unpickling of texts warns of what a damaged one holds
+pytestmark = pytest.mark.filterwarnings("ignore:invalid escape sequence:DeprecationWarning")
 FEW = {"frames": slice(0, 2), "cameras": ("front_camera", "back_camera")}
 
 

@@ -264,7 +264,7 @@ def test_what_a_killed_writer_left_is_cleared_away(tmp_path):
 def test_name_that_is_no_plain_folder_is_refused(tmp_path, name, position):
     names = ["rig", "a"]
     names[position] = name
-    with pytest.raises(DataError, match="cannot be used: expected letters"):
+    with pytest.raises(DataError, match="cannot be used: expected at most 128 letters"):
         SceneWriter(tmp_path, *names, HEADER)
     assert files_below(tmp_path) == []
 
