@@ -12,6 +12,7 @@ import pytest
 from mutations import damaged_bytes, damaged_json, judge
 from pickled_tables import pickled_table
 
+from lidarpainter_models.errors import DataError
 from lidarpainter_models.scenes.readers import ingest_scene
 
 NUM_FAST, NUM_ALL = 8, 10_000
@@ -139,4 +140,10 @@ def test_pipe_in_the_place_of_a_file_is_refused(pandaset, tmp_path):
     file.unlink()
     os.mkfifo(file)
     with pytest.raises(ValueError, match="not a file"):
+        pandaset.ingest(tmp_path / "store")
+
+
+def test_time_beyond_all_nanoseconds_is_refused(pandaset, tmp_path):
+    pandaset.write("lidar/timestamps.json", b"[1e308, 1.0, 2.0]")
+    with pytest.raises(DataError, match=r"timestamps.json: expected a list of times in seconds"):
         pandaset.ingest(tmp_path / "store")

@@ -24,6 +24,8 @@ from lidarpainter_models.scenes.validation import require_time
 _LARGEST = 1e8
 """Of a coordinate in metres (the Earth's radius is 6.4e6) or a number of pixels."""
 _LARGEST_INTEGER = 2**1000
+_LARGEST_TIME_S = 1e10
+"""After the epoch: three centuries; more cannot be told in nanoseconds."""
 CAMERA_NAMES = (
     *("front_camera", "front_left_camera", "front_right_camera"),
     *("left_camera", "right_camera", "back_camera"),
@@ -67,7 +69,7 @@ def read_timestamps(source: SourceFolder, folder: str, num_frames: int | None = 
     file = f"{folder}/timestamps.json"
     where = str(source.root / file)
     values = source.read_json(file, list)
-    if not values or not all(_is_number(value) for value in values):
+    if not values or not all(_is_number(v) and abs(v) < _LARGEST_TIME_S for v in values):
         raise DataError(f"{where}: expected a list of times in seconds")
     times_ns = [
         require_time(nanoseconds(value), f"{where}, frame {index}")
