@@ -23,7 +23,7 @@ from lidarpainter_models.evaluation.held_back import (
     check_training_scene,
 )
 from lidarpainter_models.painter import OverlayPainter, UnpaintedPainter, WarpPainter
-from lidarpainter_models.painter.training import NanoTrainingConfig
+from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.scenes.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
 from tasks.harvest import (
     PairSet,

@@ -16,7 +16,7 @@ from lidarpainter_models.evaluation.painting import score_painter
 from lidarpainter_models.metrics.squeezenet import SqueezeNetDistance, load_squeezenet_distance
 from lidarpainter_models.painter import load_painter
 from lidarpainter_models.painter.examples import PairSource
-from lidarpainter_models.painter.nano_painter import NanoPainter
+from lidarpainter_models.painter.nano.painter import NanoPainter
 from lidarpainter_models.painter.protocol import Painter
 from tasks.harvest import PairSet
 from tasks.measuring import measured

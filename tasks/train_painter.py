@@ -25,10 +25,14 @@ from lidarpainter_models.evaluation.held_back import (
     trained_targets,
 )
 from lidarpainter_models.painter import load_painter
-from lidarpainter_models.painter.nano_painter import NanoPainter
-from lidarpainter_models.painter.training import NanoTrainingConfig, TrainingProgress, train_nano
-from lidarpainter_models.painter.training_checkpoints import training_digest
-from lidarpainter_models.painter.weights import save_weights
+from lidarpainter_models.painter.nano.painter import NanoPainter
+from lidarpainter_models.painter.nano.training import (
+    NanoTrainingConfig,
+    TrainingProgress,
+    train_nano,
+)
+from lidarpainter_models.painter.nano.training_checkpoints import training_digest
+from lidarpainter_models.painter.nano.weights import save_weights
 from lidarpainter_models.scenes.readers.pandaset.reader import LICENCE as PANDASET_LICENCE
 from tasks.harvest import PairSet
 from tasks.judge_painter import open_sets

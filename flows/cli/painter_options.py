@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from lidarpainter_models.errors import ConfigError
 
 if TYPE_CHECKING:
-    from lidarpainter_models.painter.training import NanoTrainingConfig
+    from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 
 WEIGHTS_SUFFIX = ".safetensors"
 _SEEDS = re.compile(r"(\d+)(?::(\d+))?")
@@ -45,7 +45,7 @@ def parse_inputs(text: str) -> frozenset[str]:
     Raises:
         ConfigError: the network cannot be built from them.
     """
-    from lidarpainter_models.painter.candidates import check_inputs
+    from lidarpainter_models.painter.nano.candidates import check_inputs
 
     return check_inputs(part.strip() for part in text.split(","))
 

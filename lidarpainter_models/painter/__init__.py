@@ -4,13 +4,13 @@ from pathlib import Path
 
 from lidarpainter_models.errors import WeightsError
 from lidarpainter_models.painter.baselines import OverlayPainter, UnpaintedPainter, WarpPainter
+from lidarpainter_models.painter.nano.weights import load_weights
 from lidarpainter_models.painter.protocol import (
     DEFAULT_PROMPT,
     Painter,
     Painting,
     PaintingConditions,
 )
-from lidarpainter_models.painter.weights import load_weights
 
 __all__ = [
     "BUNDLED_NANO",

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from lidarpainter_models.painter.nano_painter import NanoPainter
+from lidarpainter_models.painter.nano.painter import NanoPainter
 from lidarpainter_models.painter.protocol import Painter
 
 NO_LICENCE = "Apache-2.0, a rule of the package"

@@ -10,7 +10,7 @@ import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
-from lidarpainter_models.painter.candidates import blur
+from lidarpainter_models.painter.filters import blur
 
 LARGEST_SLIDE_PX = 12
 MOST_NEEDLES = 10

@@ -12,9 +12,9 @@ from random_pairs import write_pairs
 from catalog.store import STORE_ENVIRONMENT, open_store
 from flows.cli.main import main
 from flows.cli.painter_options import parse_seeds, with_length
-from lidarpainter_models.painter.nano import NanoConfig, NanoNetwork
-from lidarpainter_models.painter.training import NanoTrainingConfig
-from lidarpainter_models.painter.weights import load_weights, save_weights
+from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
+from lidarpainter_models.painter.nano.training import NanoTrainingConfig
+from lidarpainter_models.painter.nano.weights import load_weights, save_weights
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = NanoConfig(widths=(8, 8, 8), blocks=(1, 1, 1))

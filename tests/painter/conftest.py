@@ -5,8 +5,8 @@ import hashlib
 import pytest
 import torch
 
-from lidarpainter_models.painter.candidates import blur
 from lidarpainter_models.painter.examples import PaintingPair
+from lidarpainter_models.painter.filters import blur
 from lidarpainter_models.painter.protocol import PaintingConditions
 
 

@@ -10,9 +10,9 @@ from random_pairs import write_pairs
 from catalog.store import open_store
 from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.painter.augmentation import AugmentationConfig
-from lidarpainter_models.painter.nano import NanoConfig
-from lidarpainter_models.painter.training import NanoTrainingConfig
-from lidarpainter_models.painter.weights import load_weights
+from lidarpainter_models.painter.nano.network import NanoConfig
+from lidarpainter_models.painter.nano.training import NanoTrainingConfig
+from lidarpainter_models.painter.nano.weights import load_weights
 from tasks.harvest import PairSet
 from tasks.judge_painter import (
     judge_held_back,

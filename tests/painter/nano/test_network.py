@@ -8,15 +8,10 @@ import torch
 from lidarpainter_models.errors import ConfigError, ShapeError
 from lidarpainter_models.painter import load_painter
 from lidarpainter_models.painter.batches import stack_conditions
-from lidarpainter_models.painter.candidates import (
-    blur,
-    build_candidates,
-    candidate_names,
-    fill_push_pull,
-    masked_blur,
-)
-from lidarpainter_models.painter.nano import NanoConfig, NanoNetwork, PixelNorm
-from lidarpainter_models.painter.nano_painter import NanoPainter
+from lidarpainter_models.painter.filters import blur, fill_push_pull, masked_blur
+from lidarpainter_models.painter.nano.candidates import build_candidates, candidate_names
+from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork, PixelNorm
+from lidarpainter_models.painter.nano.painter import NanoPainter
 
 SMALL = {"widths": (8, 8, 8), "blocks": (1, 1, 1)}
 

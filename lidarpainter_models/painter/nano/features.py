@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.painter.batches import ConditionBatch
-from lidarpainter_models.painter.candidates import blur, fill_push_pull
+from lidarpainter_models.painter.filters import blur, fill_push_pull
 
 REFERENCE_DEPTH_M = 10.0  # log depth is centred here, mid-range of a street
 

@@ -14,8 +14,8 @@ from safetensors.torch import save
 from torch import Tensor
 
 from lidarpainter_models.errors import WeightsError
-from lidarpainter_models.painter.nano import NanoConfig, NanoNetwork
-from lidarpainter_models.painter.nano_painter import NanoPainter
+from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
+from lidarpainter_models.painter.nano.painter import NanoPainter
 from lidarpainter_models.painter.whole_files import write_whole
 
 WEIGHTS_FORMAT = "lidarpainter-nano/1"

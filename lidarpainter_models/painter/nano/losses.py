@@ -13,7 +13,7 @@ from torch import Tensor
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.kernels.ssim import ssim_map
 from lidarpainter_models.painter.batches import ConditionBatch
-from lidarpainter_models.painter.nano import NanoOutput
+from lidarpainter_models.painter.nano.network import NanoOutput
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from lidarpainter_models.painter.batches import stack_conditions
-from lidarpainter_models.painter.nano import NanoNetwork
+from lidarpainter_models.painter.nano.network import NanoNetwork
 from lidarpainter_models.painter.protocol import Painting, PaintingConditions
 
 

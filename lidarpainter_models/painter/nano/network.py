@@ -17,14 +17,14 @@ from torch import Tensor, nn
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.batches import ConditionBatch
-from lidarpainter_models.painter.candidates import (
+from lidarpainter_models.painter.nano.candidates import (
     PAINTING_INPUTS,
     base_candidate,
     build_candidates,
     candidate_names,
     check_inputs,
 )
-from lidarpainter_models.painter.features import count_features, painting_features
+from lidarpainter_models.painter.nano.features import count_features, painting_features
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
 
 CELL_PX = 4

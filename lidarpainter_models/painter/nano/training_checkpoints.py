@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from lidarpainter_models.errors import ConfigError, DataError
-from lidarpainter_models.painter.nano import NanoConfig, NanoNetwork
+from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.whole_files import write_whole
 
 

@@ -7,7 +7,7 @@ import torch
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.batches import stack_conditions
-from lidarpainter_models.painter.losses import (
+from lidarpainter_models.painter.nano.losses import (
     LossWeights,
     absolute_loss,
     agreement_mask,
@@ -17,7 +17,7 @@ from lidarpainter_models.painter.losses import (
     squared_loss,
     structure_loss,
 )
-from lidarpainter_models.painter.nano import NanoOutput
+from lidarpainter_models.painter.nano.network import NanoOutput
 
 TERMS = (absolute_loss, squared_loss, structure_loss, gradient_loss)
 

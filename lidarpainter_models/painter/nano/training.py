@@ -18,9 +18,9 @@ from torch import Tensor
 from lidarpainter_models.errors import ConfigError, DataError, TrainingError
 from lidarpainter_models.painter.augmentation import AugmentationConfig, TrainingBatch, draw_batch
 from lidarpainter_models.painter.examples import PairSource
-from lidarpainter_models.painter.losses import LossWeights, painting_loss
-from lidarpainter_models.painter.nano import NanoConfig, NanoNetwork
-from lidarpainter_models.painter.training_checkpoints import (
+from lidarpainter_models.painter.nano.losses import LossWeights, painting_loss
+from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
+from lidarpainter_models.painter.nano.training_checkpoints import (
     TrainingState,
     read_checkpoint,
     training_digest,

@@ -12,10 +12,10 @@ from lidarpainter_models.painter.augmentation import (
     batch_pairs,
     draw_batch,
 )
-from lidarpainter_models.painter.nano import NanoConfig, NanoNetwork
-from lidarpainter_models.painter.nano_painter import NanoPainter
+from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
+from lidarpainter_models.painter.nano.painter import NanoPainter
+from lidarpainter_models.painter.nano.training import NanoTrainingConfig, train_nano
 from lidarpainter_models.painter.render_damage import damage_render, random_blobs
-from lidarpainter_models.painter.training import NanoTrainingConfig, train_nano
 
 NETWORK = NanoConfig(widths=(16, 16, 16), blocks=(1, 1, 1))
 QUIET = AugmentationConfig(
@@ -129,7 +129,7 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_checkpoint(make_pair, memo
 
 
 def test_a_network_that_says_the_same_everywhere_is_noticed(make_pair, memory_pairs, monkeypatch):
-    monkeypatch.setattr("lidarpainter_models.painter.training.ALIVE_AFTER_STEPS", 0)
+    monkeypatch.setattr("lidarpainter_models.painter.nano.training.ALIVE_AFTER_STEPS", 0)
     # at this rate nothing moves, and the first network knows no difference between pixels
     config = replace(SHORT, learning_rate=1e-12)
     with pytest.raises(TrainingError, match="same in every pixel at step 2") as caught:

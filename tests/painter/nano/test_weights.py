@@ -9,8 +9,8 @@ from safetensors.torch import save_file
 
 from lidarpainter_models.errors import StorageError, WeightsError
 from lidarpainter_models.painter import load_painter
-from lidarpainter_models.painter.nano import NanoConfig, NanoNetwork
-from lidarpainter_models.painter.weights import load_weights, save_weights
+from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
+from lidarpainter_models.painter.nano.weights import load_weights, save_weights
 
 SMALL = NanoConfig(widths=(8, 8, 8), blocks=(1, 1, 1))
 

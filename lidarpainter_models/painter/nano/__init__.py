@@ -1,0 +1,1 @@
+"""The small painter that comes with the package: its network, training and weights."""
