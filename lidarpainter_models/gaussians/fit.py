@@ -27,6 +27,7 @@ from lidarpainter_models.gaussians.initialisation import initialise_scene
 from lidarpainter_models.gaussians.observations import GuidanceView, SceneObservations
 from lidarpainter_models.gaussians.scene_graph import GaussianScene
 from lidarpainter_models.gaussians.shape_limits import limit_shapes, viewing_rays
+from lidarpainter_models.gaussians.sky import seen_as_sky
 
 Progress = Callable[[int, int, dict[str, float]], None]
 """Told the steps done, the steps in all and the newest entry of the history."""
@@ -77,8 +78,7 @@ def fit_gaussians(  # noqa: PLR0913 - the one door to the fit
         scene = initialise_scene(observations, config.initialisation) if start is None else start
         state = FitState.begin(scene, config)
     cpu_before_s -= state.cpu_s
-    full = [full_picture(view) for view in observations.views]
-    half = [half_picture(view) for view in observations.views] if config.half_resolution else []
+    full, half = _pictures(observations, state.scene, config)
     while state.step < config.steps:
         is_half = state.step < config.half_resolution * config.steps
         _advance(state, half if is_half else full, guidance, config, perceptual)
@@ -92,6 +92,17 @@ def fit_gaussians(  # noqa: PLR0913 - the one door to the fit
         if is_out_of_time:
             break
     return FitResult(scene=_finished(state, config), history=state.history)
+
+
+def _pictures(
+    observations: SceneObservations, scene: GaussianScene, config: FitConfig
+) -> tuple[list[FitPicture], list[FitPicture]]:
+    """The training pictures, and those at half size if they are wanted."""
+    views = observations.views
+    cameras, masks = [view.camera for view in views], [view.sky_mask for view in views]
+    pairs = list(zip(views, seen_as_sky(scene.sky.layout, cameras, masks), strict=True))
+    full = [full_picture(view, may_be_sky) for view, may_be_sky in pairs]
+    return full, [half_picture(*pair) for pair in pairs] if config.half_resolution else []
 
 
 def _advance(

@@ -28,35 +28,36 @@ class FitPicture:
         return self.facts.kind == OPEN
 
 
-def full_picture(view: TrainingView) -> FitPicture:
-    """The view as it is."""
+def full_picture(
+    view: TrainingView, may_be_sky: Bool[Tensor, "height width"] | None = None
+) -> FitPicture:
+    """The view as it is; only pixels that may be sky can be OPEN, by default all."""
     return FitPicture(
         camera=view.camera,
         timestamp_ns=view.timestamp_ns,
         camera_name=view.key[1],
-        facts=_facts(view.camera, view.rgb, view.sky_mask, view.lidar_depth_m),
+        facts=_facts(view.camera, view.rgb, view.sky_mask, view.lidar_depth_m, may_be_sky),
     )
 
 
-def half_picture(view: TrainingView) -> FitPicture:
-    """The view at half size: area-averaged colours, mostly-sky mask, nearest depths."""
+def half_picture(
+    view: TrainingView, may_be_sky: Bool[Tensor, "height width"] | None = None
+) -> FitPicture:
+    """The view at half size: area-averaged colours, mostly-sky masks, nearest depths."""
     size = {
         "width_px": max(view.camera.width_px // 2, 1),
         "height_px": max(view.camera.height_px // 2, 1),
     }
-    mask = cv2.resize(
-        view.sky_mask.float().numpy(),
-        (size["width_px"], size["height_px"]),
-        interpolation=cv2.INTER_AREA,
-    )
     camera = view.camera.resized(**size)
     rgb = shrink_picture(view.rgb_u8, **size).float() / 255
     depth_m = shrink_depth(view.lidar_depth_m, **size)
+    sky_mask = _shrink_mask(view.sky_mask, **size)
+    may_be_sky = None if may_be_sky is None else _shrink_mask(may_be_sky, **size)
     return FitPicture(
         camera=camera,
         timestamp_ns=view.timestamp_ns,
         camera_name=view.key[1],
-        facts=_facts(camera, rgb, torch.from_numpy(mask) > 0.5, depth_m),
+        facts=_facts(camera, rgb, sky_mask, depth_m, may_be_sky),
     )
 
 
@@ -79,16 +80,26 @@ def above_horizon(camera: Camera) -> Bool[Tensor, "height width"]:
     return (camera.pixel_directions() @ up) > 0
 
 
+def _shrink_mask(
+    mask: Bool[Tensor, "height width"], *, width_px: int, height_px: int
+) -> Bool[Tensor, "rows columns"]:
+    """True where most of a cell of the coarser grid is."""
+    share = cv2.resize(mask.float().numpy(), (width_px, height_px), interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(share) > 0.5
+
+
 def _facts(
     camera: Camera,
     rgb: Float[Tensor, "height width 3"],
     sky_mask: Bool[Tensor, "height width"],
     lidar_depth_m: Float[Tensor, "height width"],
+    may_be_sky: Bool[Tensor, "height width"] | None,
 ) -> PixelFacts:
     """Tell the pixels apart; solid ones are at most one pixel away from a LiDAR return."""
     beside = torch.nn.functional.max_pool2d((lidar_depth_m > 0).float()[None], 3, 1, 1)[0] > 0
     kind = torch.full(sky_mask.shape, NOTHING, dtype=torch.uint8)
-    kind[above_horizon(camera)] = OPEN
+    is_above = above_horizon(camera)
+    kind[is_above if may_be_sky is None else is_above & may_be_sky] = OPEN
     kind[beside] = SOLID
     kind[sky_mask] = SKY
     return PixelFacts(rgb=rgb.contiguous(), kind=kind, lidar_depth_m=lidar_depth_m.contiguous())

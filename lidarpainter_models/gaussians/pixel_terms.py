@@ -23,7 +23,7 @@ class PixelFacts:
 
     rgb: Float[Tensor, "height width 3"]
     kind: UInt8[Tensor, "height width"]
-    """SKY by its mask; SOLID beside a LiDAR return; OPEN above the horizon without one."""
+    """SKY by its mask; SOLID beside a LiDAR return; OPEN without one, where some view has sky."""
     lidar_depth_m: Float[Tensor, "height width"]
     """0 where no point falls."""
 
@@ -135,7 +135,11 @@ def looks_like_sky(
     *,
     tolerance: float,
 ) -> Bool[Tensor, "height width"]:
-    """Open pixels that show the colour which the sky has in their direction."""
+    """Open pixels that show the colour which the sky has in their direction.
+
+    Where no view has sky its colour is a continuation of what lies around, far towers included;
+    such pixels must not be OPEN, or the towers would be given to the sky.
+    """
     return ((rgb - sky_rgb).abs().amax(dim=-1) < tolerance) & open_mask
 
 

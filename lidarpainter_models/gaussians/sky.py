@@ -183,6 +183,21 @@ def sky_from_pictures(
     return replace(sky, rgb=push_pull(mean, weight.clamp(max=1.0), wraps=layout.wraps))
 
 
+def seen_as_sky(
+    layout: SkyLayout,
+    cameras: Sequence[Camera],
+    masks: Sequence[Bool[Tensor, "height width"]],
+) -> list[Bool[Tensor, "height width"]]:
+    """Each camera's pixels whose direction lies in the mask of any of the cameras."""
+    weight = torch.zeros(layout.rows, layout.columns)
+    for camera, mask in zip(cameras, masks, strict=True):
+        nothing = torch.zeros(*mask.shape, 3)
+        rays = sky_rays(camera, layout, mask)
+        weight += scatter_gradient(nothing, mask.float(), rays, layout)[1]
+    seen = (weight > 0).float()[..., None].expand(-1, -1, 3).contiguous()
+    return [sample_sky(seen, sky_rays(camera, layout), layout)[..., 0] > 0.5 for camera in cameras]
+
+
 def push_pull(
     rgb: Float[Tensor, "rows columns 3"],
     known: Float[Tensor, "rows columns"],

@@ -4,7 +4,9 @@ The sky returns no beam, lies above the horizon, and looks like nothing that ret
 second half matters: the upper floors of a house return none either (they are above the topmost
 beam), but their colours are those of the floors below. So colours are compared by how often they
 occur where beams return and where none does; what is frequent only without returns, and smooth, is
-sure sky. From there the mask grows to pixels that have the colour of the sure sky around them.
+sure sky, if it is one piece or its other pieces look like the largest: a tower too far for any beam
+is smooth and without returns too. From there the mask grows to pixels that have the colour of the
+sure sky around them.
 Doubt is settled as not sky: wires, foliage, far towers, and overcast skies behind white walls.
 """
 
@@ -36,9 +38,11 @@ class SkyConfig:
     least_log_ratio: float = 1.5
     """Sure sky has a colour that is e to this times more frequent without returns than with."""
     most_texture: float = 6.0
-    """Largest standard deviation of brightness in a neighbourhood of sure sky."""
+    """Largest standard deviation of a colour channel in a neighbourhood of sure sky."""
     least_area: float = 0.002
     """Smallest connected piece of sure sky, as a share of the picture."""
+    piece_tolerance: float = 25.0
+    """A piece of sure sky may differ so much from the largest one, in any channel."""
     colour_tolerance: float = 10.0
     """A pixel may differ so much from the sure sky around it, in any channel."""
     around_rad: float = 0.06
@@ -105,12 +109,14 @@ def sky_from_returns(
     surface = _grown(returns, 2) > 0
     sure = open_sky & (_log_ratio(picture, open_sky, surface) > config.least_log_ratio)
     sure &= _texture(picture) < config.most_texture
-    sky = _large_pieces(sure, config.least_area * sure.size)
+    around_px = config.around_rad * camera.fx_px
+    pieces = _large_pieces(sure, config.least_area * sure.size)
+    sky = _like_the_largest(picture, pieces, around_px, config.piece_tolerance)
     candidates = above & (_grown(returns, 1) == 0)
     for _ in range(_GROWTH_ROUNDS):
         if not sky.any():
             break
-        differs = _differs(picture, sky, config.around_rad * camera.fx_px)
+        differs = _differs(picture, sky, around_px)
         like_sky = sky | (candidates & (differs < config.colour_tolerance))
         # small pieces between wires and branches count once the large ones say what sky looks like
         seeds = _large_pieces(like_sky & (sure | sky), _SMALL_PIECE_PX)
@@ -151,10 +157,10 @@ def _smoothed(counts: np.ndarray) -> np.ndarray:
 
 
 def _texture(picture: np.ndarray) -> np.ndarray:
-    """Standard deviation of brightness in 5 x 5 pixels."""
-    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    mean, square = cv2.blur(grey, (5, 5)), cv2.blur(grey * grey, (5, 5))
-    return np.sqrt(np.maximum(square - mean * mean, 0))
+    """Largest standard deviation of a colour channel in 5 x 5 pixels."""
+    rgb = picture.astype(np.float32)
+    mean, square = cv2.blur(rgb, (5, 5)), cv2.blur(rgb * rgb, (5, 5))
+    return np.sqrt(np.maximum(square - mean * mean, 0)).max(axis=-1)
 
 
 def _large_pieces(mask: np.ndarray, least_px: float) -> np.ndarray:
@@ -162,6 +168,20 @@ def _large_pieces(mask: np.ndarray, least_px: float) -> np.ndarray:
     is_large = stats[:, cv2.CC_STAT_AREA] >= max(least_px, 1)
     is_large[0] = False
     return is_large[labels] if count > 1 else np.zeros_like(mask)
+
+
+def _like_the_largest(
+    picture: np.ndarray, pieces: np.ndarray, sigma_px: float, tolerance: float
+) -> np.ndarray:
+    """The largest connected piece, and those whose median colour continues it."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(pieces.astype(np.uint8))
+    if count <= 2:
+        return pieces
+    largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
+    differs = _differs(picture, labels == largest, sigma_px)
+    alike = [np.median(differs[labels == label]) < tolerance for label in range(1, count)]
+    alike[largest - 1] = True
+    return np.array([False, *alike])[labels]
 
 
 def _differs(picture: np.ndarray, sky: np.ndarray, sigma_px: float) -> np.ndarray:

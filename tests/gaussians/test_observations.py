@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from gaussian_world import camera_at, car_track
@@ -97,3 +99,13 @@ def test_pixels_are_told_apart(world):
         assert kind.shape == (picture.camera.height_px, picture.camera.width_px)
         assert {int(value) for value in kind.unique()} <= {0, SKY, SOLID, OPEN}
     assert bool((full_picture(view).facts.kind[view.sky_mask] == SKY).all())
+
+
+def test_only_where_some_view_has_sky_can_a_pixel_be_open(world):
+    nowhere = torch.zeros_like(world.observations.views[0].sky_mask)
+    view = replace(world.observations.views[0], sky_mask=nowhere)
+    for make in (full_picture, half_picture):
+        kind, kind_without = make(view).facts.kind, make(view, nowhere).facts.kind
+        assert bool((kind == OPEN).any())
+        assert not bool((kind_without == OPEN).any())
+        assert torch.equal(kind[kind != OPEN], kind_without[kind != OPEN])

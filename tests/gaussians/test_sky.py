@@ -10,6 +10,7 @@ from lidarpainter_models.gaussians.sky import (
     SkyTexture,
     adam_reference,
     push_pull,
+    seen_as_sky,
     sky_from_pictures,
     sky_layout,
 )
@@ -166,3 +167,18 @@ def test_camera_below_the_horizon_gets_a_small_texture():
     layout = sky_layout([camera], SkyConfig())
     assert layout.rows >= 2
     assert layout.columns >= 2
+
+
+def test_a_direction_is_sky_for_all_views_if_it_is_for_one():
+    ahead, turned = turned_camera(0.0), turned_camera(0.2)
+    layout = sky_layout([ahead, turned], SkyConfig())
+    mask = torch.zeros(ahead.height_px, ahead.width_px, dtype=torch.bool)
+    mask[:20] = True
+    nothing = torch.zeros_like(mask)
+    own, other = seen_as_sky(layout, [ahead, turned], [mask, nothing])
+    assert bool(own[mask].all())
+    assert not bool(own[22:].any())
+    # turned to the left, the view shares its right part with the other's left part
+    assert bool(other[:18, ahead.width_px // 2 :].all())
+    assert not bool(other[:, 0].any())
+    assert not bool(other[30:].any())

@@ -81,6 +81,23 @@ def test_wires_and_far_towers_without_returns_are_not_sky(camera):
     assert float(sky[35:75, 90:].float().mean()) > 0.97  # below the wire
 
 
+@pytest.mark.parametrize("colour", [(120.0, 135.0, 120.0), (225.0, 205.0, 165.0)])
+def test_a_smooth_tower_too_far_for_any_beam_is_not_sky(camera, colour):
+    tower = (slice(20, HORIZON), slice(60, 90))
+    picture = picture_of([(*tower, colour, 2.0)])
+    sky = sky_from_returns(picture, returns_in(), camera)
+    assert not sky[tower].any()
+    assert float(sky[:70, 100:].float().mean()) > 0.97
+
+
+def test_sky_cut_in_two_by_a_building_is_sky_on_both_sides(camera):
+    wall = (slice(0, HORIZON), slice(130, 150))
+    picture = picture_of([(*wall, (150.0, 140.0, 125.0), 8.0)])
+    sky = sky_from_returns(picture, returns_in((slice(45, HORIZON), wall[1])), camera)
+    assert float(sky[:70, :125].float().mean()) > 0.97
+    assert float(sky[:70, 155:].float().mean()) > 0.97
+
+
 def test_foliage_is_not_sky_and_gaps_in_it_may_be(camera):
     tree = (slice(20, HORIZON), slice(20, 80))
     picture = picture_of([(*tree, (60.0, 90.0, 40.0), 20.0)])
