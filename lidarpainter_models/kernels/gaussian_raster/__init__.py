@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.kernels.backends import Backend, implementation
+from lidarpainter_models.kernels.gaussian_raster.blending_limits import BLUR_PX2, NEAR_M
 from lidarpainter_models.kernels.gaussian_raster.splat_inputs import SplatInputs, SplatView
 
 __all__ = ["SplatImage", "accumulate_pixel_error", "render_gaussians"]
@@ -57,8 +58,8 @@ def render_gaussians(  # noqa: PLR0913 - the one door to the kernel; the scalars
     width_px: int,
     height_px: int,
     features: Float[Tensor, "gaussians features"] | None = None,
-    near_m: float = 0.1,
-    blur_px2: float = 0.3,
+    near_m: float = NEAR_M,
+    blur_px2: float = BLUR_PX2,
     antialias: bool = False,
     screen_offset: Float[Tensor, "gaussians 2"] | None = None,
     screen_gradient_out: Float[Tensor, " gaussians"] | None = None,

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError, ShapeError
+from lidarpainter_models.kernels.gaussian_raster.blending_limits import BLUR_PX2, NEAR_M
 
 DrawnPictures = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 """What a backend returns: rgb, depth, alpha, features, visible and radius, as in `SplatImage`."""
@@ -93,8 +94,8 @@ class SplatView:
     cy_px: float
     width_px: int
     height_px: int
-    near_m: float = 0.1
-    blur_px2: float = 0.3
+    near_m: float = NEAR_M
+    blur_px2: float = BLUR_PX2
     antialias: bool = False
 
     def __post_init__(self) -> None:
