@@ -34,11 +34,11 @@ CHUNKS = 64
 _VECTORS: dict[str, Any] = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy"}
 """A division that may raise cannot be part of a vector loop."""
 
-MOST_UNITS = (
-    (1 - BETA1) / math.sqrt((1 - BETA2) * (1 - BETA1**2 / BETA2)) / (math.sqrt(BETA2) / BETA1 - 1)
-)
-"""The farthest that a row still moves without a gradient, in learning rates: |m| <= 2.35 sqrt(v) by
-Cauchy and Schwarz, and the steps shrink by BETA1 / sqrt(BETA2) each."""
+MOST_STEP = (1 - BETA1) / math.sqrt((1 - BETA2) * (1 - BETA1**2 / BETA2))
+"""The largest step of Adam in learning rates: |m| <= 2.35 sqrt(v) by Cauchy and Schwarz."""
+MOST_UNITS = MOST_STEP / (math.sqrt(BETA2) / BETA1 - 1)
+"""The farthest that a row still moves without a gradient, in learning rates: the steps shrink by
+BETA1 / sqrt(BETA2) each."""
 
 
 class Parameters(NamedTuple):

@@ -4,6 +4,7 @@ Gaussians out of view lag behind (`gaussian_adam`). They are kept as they lag, t
 blocks: catching up for a checkpoint would split their way differently from an undisturbed run's.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lidarpainter_models.gaussians.adam_kernels import MOST_STEP
 from lidarpainter_models.gaussians.checkpoint import (
     generator_from,
     group_tensors,
@@ -75,8 +77,14 @@ class FitState:
         return float(torch.rand((), generator=self.generator))
 
     def seen(self, views: Sequence[View]) -> SeenGaussians:
-        """All Gaussians that any of these views can show, as leaves for one step."""
-        return self.gaussian_adam.seen(self.scene.gaussians, self.blocks.rows_in_view(views))
+        """All Gaussians that any of these views can show, as leaves for one step.
+
+        Views after the first are drawn when the actors' poses have been stepped.
+        """
+        rates, most = self.gaussian_adam.rates, math.sqrt(3.0) * MOST_STEP
+        slack = (most * max(rates.actor_translation_m), most * max(rates.actor_rotation_rad))
+        rows = self.blocks.rows_in_view(views, actor_slack=slack if len(views) > 1 else (0.0, 0.0))
+        return self.gaussian_adam.seen(self.scene.gaussians, rows)
 
     def step_gaussians(self, seen: SeenGaussians, fraction: float) -> None:
         """Move the Gaussians that collected gradients, after a fraction of the fit."""

@@ -53,11 +53,11 @@ def fit_step(
     bodies = scene.camera_from_body(pose, *scene.world_from_actors(picture.timestamp_ns))
     views = [(recorded, bodies)]
     if guidance is not None:
-        views.append((guidance.camera, guidance_bodies(state, guidance)))
+        views.append((guidance.camera, _guidance_bodies(state, guidance)))
     seen = state.seen(views)
     told = _recorded_step(state, seen, picture, row, views[0], config, perceptual)
     if guidance is not None:
-        add_guidance_gradients(state, seen, guidance, views[1][1], config)
+        add_guidance_gradients(state, seen, guidance, config)
     state.step_gaussians(seen, state.step / config.steps)
     return told
 
@@ -108,7 +108,7 @@ def _recorded_step(
     return float(loss.detach()), float(squared_error)
 
 
-def guidance_bodies(state: FitState, view: GuidanceView) -> Float[Tensor, "bodies 4 4"]:
+def _guidance_bodies(state: FitState, view: GuidanceView) -> Float[Tensor, "bodies 4 4"]:
     """Where a painted view has the bodies; no gradient."""
     with torch.no_grad():
         actors = state.scene.world_from_actors(view.timestamp_ns)
@@ -119,7 +119,6 @@ def add_guidance_gradients(
     state: FitState,
     seen: SeenGaussians,
     view: GuidanceView,
-    bodies: Float[Tensor, "bodies 4 4"],
     config: FitConfig,
 ) -> None:
     """Add one painted view's gradients to the Gaussians; nothing else is changed by it.
@@ -129,7 +128,7 @@ def add_guidance_gradients(
     scene, settings = state.scene, config.guidance
     if settings.freedom == "appearance":
         seen = seen.with_fixed_geometry()
-    image = scene.splat(view.camera, bodies, gaussians=seen)
+    image = scene.splat(view.camera, _guidance_bodies(state, view), gaussians=seen)
     sky_rgb = scene.sky.sample(scene.sky.rays(view.camera, image.alpha.detach() < OPAQUE))
     shown = image.rgb + (1 - image.alpha)[..., None] * sky_rgb
     loss = settings.weight * l1_ssim_loss(

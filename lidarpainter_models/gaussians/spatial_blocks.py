@@ -91,12 +91,17 @@ class SpatialBlocks:
             self.bounds,
         )
 
-    def rows_in_view(self, views: Sequence[View]) -> Int[Tensor, " seen"]:
-        """Rows, in order, of all Gaussians that any of the views can show, and some more."""
+    def rows_in_view(
+        self, views: Sequence[View], *, actor_slack: tuple[float, float] = (0.0, 0.0)
+    ) -> Int[Tensor, " seen"]:
+        """Rows, in order, of all Gaussians that any of the views can show, and some more.
+
+        `actor_slack` is how far actors may still move (metres, radians) before they are drawn.
+        """
         is_seen = np.zeros(len(self.order), np.bool_)
         for camera, camera_from_body in views:
             bodies = camera_from_body.detach().double().numpy()
-            frustum = _frustum(camera)
+            frustum = _frustum(camera, actor_slack)
             mark_seen(self.order, self.first, self.body, self.bounds, bodies, frustum, is_seen)
         return torch.from_numpy(np.flatnonzero(is_seen))
 
@@ -120,7 +125,7 @@ def _cell_keys(gaussians: GaussianSet, reach_sigmas: float) -> Int[np.ndarray, "
     return np.column_stack([body, cells])
 
 
-def _frustum(camera: Camera) -> Frustum:
+def _frustum(camera: Camera, actor_slack: tuple[float, float]) -> Frustum:
     """What a camera can show, the blur of footprints included."""
     blur_px = MOST_SIGMAS * math.sqrt(BLUR_PX2)
     left, right = camera.cx_px + blur_px, camera.width_px - camera.cx_px + blur_px
@@ -132,4 +137,5 @@ def _frustum(camera: Camera) -> Frustum:
         highest=(right / camera.fx_px, bottom / camera.fy_px),
         stretch=(math.hypot(1.0, widest_x), math.hypot(1.0, widest_y)),
         near_m=NEAR_M,
+        actor_slack=actor_slack,
     )

@@ -15,7 +15,7 @@ from lidarpainter_models.gaussians.fit_config import (
     continuation,
 )
 from lidarpainter_models.gaussians.fit_state import FitState
-from lidarpainter_models.gaussians.fit_step import add_guidance_gradients, guidance_bodies
+from lidarpainter_models.gaussians.fit_step import add_guidance_gradients
 from lidarpainter_models.gaussians.initialisation import InitialisationConfig, initialise_scene
 from lidarpainter_models.gaussians.observations import GuidanceView
 from lidarpainter_models.gaussians.optimiser import LearningRates
@@ -163,9 +163,10 @@ def test_pose_refinement_recovers_a_known_rotation(world):
 def with_guidance_gradients(world, view, config):
     """A state and its leaves after the gradients of one painted view."""
     state = FitState.begin(world.scene, config)
-    bodies = guidance_bodies(state, view)
+    poses = state.scene.world_from_actors(view.timestamp_ns)
+    bodies = state.scene.camera_from_body(view.camera.world_from_camera, *poses)
     seen = state.seen([(view.camera, bodies)])
-    add_guidance_gradients(state, seen, view, bodies, config)
+    add_guidance_gradients(state, seen, view, config)
     return state, seen
 
 

@@ -42,7 +42,7 @@ def test_what_is_out_of_view_changes_nothing_beyond_rounding(monkeypatch):
     monkeypatch.setattr(
         type(everything.state.blocks),
         "rows_in_view",
-        lambda blocks, _views: torch.arange(len(blocks.order)),
+        lambda blocks, _views, **_slack: torch.arange(len(blocks.order)),
     )
     steps_of(everything, BLOCKS * PASSES)
     truth = parameters_of(everything)

@@ -118,3 +118,16 @@ def test_absent_actor_is_out_of_view():
     bodies = scene.camera_from_body(camera.world_from_camera, poses, torch.zeros_like(present))
     rows = SpatialBlocks.of(scene.gaussians, RATES).rows_in_view([(camera, bodies)])
     assert bool((scene.gaussians.body_index[rows] == 0).all())
+
+
+def test_slack_takes_in_an_actor_that_may_move_into_view():
+    scene = scene_of(scattered(500, 7), [camera_at(0.0)], [car_track(2)])
+    blocks, camera = SpatialBlocks.of(scene.gaussians, RATES), camera_at(0.0)
+    poses, present = scene.actor_poses(0)
+    poses[0, 1, 3] = 40.0  # far to the left
+    view = (camera, scene.camera_from_body(camera.world_from_camera, poses, present))
+    of_actor = [
+        int((scene.gaussians.body_index[blocks.rows_in_view([view], actor_slack=slack)] > 0).sum())
+        for slack in ((0.0, 0.0), (40.0, 0.0))
+    ]
+    assert of_actor == [0, 50]
