@@ -18,7 +18,7 @@ SH_COEFFICIENTS = (1, 4, 9, 16)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SplatInputs:
-    """The tensors of one picture; `render_gaussians` says what each means and its shape.
+    """The tensors of some pictures; `render_views` says what each means and its shape.
 
     Raises:
         ShapeError: sizes or kinds of numbers do not belong together.
@@ -39,7 +39,7 @@ class SplatInputs:
         count = self.means.shape[0] if self.means.ndim else 0
         coefficients = self.sh.shape[1] if self.sh.ndim == 3 else 0
         channels = self.features.shape[1] if self.features.ndim == 2 else 0
-        bodies = self.camera_from_body.shape[0] if self.camera_from_body.ndim else 0
+        views, bodies = (*self.camera_from_body.shape, 0, 0)[:2]
         expected = {
             "means": (count, 3),
             "rotation_wxyz": (count, 4),
@@ -47,9 +47,9 @@ class SplatInputs:
             "opacity": (count,),
             "sh": (count, coefficients, 3),
             "body_index": (count,),
-            "camera_from_body": (bodies, 4, 4),
+            "camera_from_body": (views, bodies, 4, 4),
             "features": (count, channels),
-            "screen_offset": (count, 2),
+            "screen_offset": (views, count, 2),
         }
         for field in fields(self):
             _check_tensor(field.name, getattr(self, field.name), expected[field.name], self.means)
