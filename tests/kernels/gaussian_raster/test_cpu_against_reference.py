@@ -16,11 +16,13 @@ from lidarpainter_models.kernels.gaussian_raster import render_gaussians
 PICTURE_ERROR = 1e-6
 GRADIENT_ERROR = 3e-6
 OPAQUE_GRADIENT_ERROR = 6e-6
-"""Where alphas come near their clamp, 0.99. What lies behind a Gaussian is the picture minus what was
-passed, and counts by alpha / (1 - alpha), a hundredfold: 5.2e-6 in the rotations. Put into float64
-one by one, the running sums of the drawn picture make 5.6e-6 of it in opacity, those of what was
-passed 3.3e-6, the exponential 7e-7, rounding of the finished picture 7e-7. Summing both with
-compensation would cost a quarter of drawing and a tenth of going back (there alone: 4.9e-6)."""
+"""Where alphas come near their clamp, 0.99. What lies behind a Gaussian is the picture minus what
+was passed, and counts by alpha / (1 - alpha), a hundredfold: 5.2e-6 in the rotations. Put into
+float64 one by one, the running sums of the drawn picture make 5.6e-6 of it in opacity, those of
+what was passed 3.3e-6, the exponential 7e-7, rounding of the finished picture 7e-7. Compensated
+sums of what was passed gave 4.9e-6 for a tenth of the time of going back; of the picture they would
+take four more sums a lane in drawing.
+"""
 
 
 def picture_errors(actual, expected):
