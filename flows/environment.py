@@ -28,15 +28,13 @@ CPU_LIMIT = Path("/sys/fs/cgroup/cpu.max")
 """Quota and period in microseconds, where a container has one."""
 
 
-def prepare_environment(*, is_quiet: bool, sequences_at_once: int = 1) -> None:
+def prepare_environment(*, is_quiet: bool) -> None:
     """Set what Prefect, OpenMP and numba read at import.
 
     Args:
         is_quiet: whether Prefect keeps its log lines to itself.
-        sequences_at_once: processes like this one that share the machine; each gets its share of
-            the cores, so that together they run no more threads than there are.
     """
-    threads = str(max(usable_cores() // sequences_at_once, 1))
+    threads = str(usable_cores())
     counts = {"NUMBA_NUM_THREADS": threads, "OMP_NUM_THREADS": threads}
     for name, value in {**PREFECT, **THREADS, **counts, **(QUIET if is_quiet else {})}.items():
         os.environ.setdefault(name, value)

@@ -60,11 +60,14 @@ class GradientTally:
         return cls(total=torch.zeros(count), visits=torch.zeros(count))
 
     def add(
-        self, gradient: Float[Tensor, " gaussians"], visible: Bool[Tensor, " gaussians"]
+        self,
+        rows: Int[Tensor, " seen"],
+        gradient: Float[Tensor, " seen"],
+        visible: Bool[Tensor, " seen"],
     ) -> None:
-        """Collect one view's gradients, in place."""
-        self.total += torch.where(visible, gradient, torch.zeros_like(gradient))
-        self.visits += visible.float()
+        """Collect one view's gradients of some rows, in place."""
+        self.total[rows] += torch.where(visible, gradient, torch.zeros_like(gradient))
+        self.visits[rows] += visible.float()
 
     @property
     def mean(self) -> Float[Tensor, " gaussians"]:

@@ -18,11 +18,7 @@ from lidarpainter_models.gaussians.densification import densify, prune
 from lidarpainter_models.gaussians.fit_config import FitConfig
 from lidarpainter_models.gaussians.fit_pictures import FitPicture, full_picture, half_picture
 from lidarpainter_models.gaussians.fit_state import FitState
-from lidarpainter_models.gaussians.fit_step import (
-    Perceptual,
-    add_guidance_gradients,
-    recorded_step,
-)
+from lidarpainter_models.gaussians.fit_step import Perceptual, fit_step
 from lidarpainter_models.gaussians.initialisation import initialise_scene
 from lidarpainter_models.gaussians.observations import GuidanceView, SceneObservations
 from lidarpainter_models.gaussians.scene_graph import GaussianScene
@@ -113,18 +109,18 @@ def _advance(
     perceptual: Perceptual | None,
 ) -> None:
     """One step: gradients, optimisers, and at their times the rounds that change the set."""
-    fraction = state.step / config.steps
     row = state.next_view(len(pictures))
-    loss, squared_error = recorded_step(state, pictures[row], row, config, perceptual)
+    painted = None
     if guidance and state.random() < config.guidance.probability:
-        chosen = int(torch.randint(len(guidance), (), generator=state.generator))
-        add_guidance_gradients(state, guidance[chosen], config)
-    state.gaussian_adam.step(state.scene.gaussians, fraction)
+        painted = guidance[int(torch.randint(len(guidance), (), generator=state.generator))]
+    told = fit_step(state, pictures[row], row, painted, config, perceptual)
     state.step += 1
-    state.recent.append((loss, squared_error))
+    state.recent.append(told)
     _change_set(state, config)
     if state.step % config.shapes.every == 0:
-        limit_shapes(state.scene.gaussians, viewing_rays(state.scene), config.shapes)
+        scene = state.caught_up()
+        limit_shapes(scene.gaussians, viewing_rays(scene), config.shapes)
+        state.blocks.refresh(scene.gaussians)
 
 
 def _change_set(state: FitState, config: FitConfig) -> None:
@@ -133,7 +129,7 @@ def _change_set(state: FitState, config: FitConfig) -> None:
     if state.step % settings.every or fraction < settings.start or state.step == config.steps:
         return
     sizes = [track.size_m for track in state.scene.recorded_tracks]
-    gaussians = state.scene.gaussians
+    gaussians = state.caught_up().gaussians
     if fraction > settings.stop:
         state.apply(prune(gaussians, sizes, settings))
         return
@@ -163,7 +159,7 @@ def _log(state: FitState, config: FitConfig, progress: Progress | None) -> None:
 
 def _finished(state: FitState, config: FitConfig) -> GaussianScene:
     """The scene without gradients, useless Gaussians or unseen sky."""
-    scene = state.scene.copy()
+    scene = state.caught_up().copy()
     sizes = [track.size_m for track in scene.recorded_tracks]
     change = prune(scene.gaussians, sizes, config.densification)
     return replace(scene, gaussians=change.gaussians, sky=scene.sky.filled())

@@ -1,11 +1,18 @@
-"""All that a running fit is made of, and how it is kept and taken up again bit for bit."""
+"""All that a running fit is made of, and how it is kept and taken up again bit for bit.
 
+Gaussians out of view lag behind (`gaussian_adam`). They are kept as they lag, together with their
+blocks: catching up for a checkpoint would split their way differently from an undisturbed run's.
+"""
+
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from lidarpainter_models.gaussians.adam_kernels import MOST_STEP
 from lidarpainter_models.gaussians.checkpoint import (
     generator_from,
     group_tensors,
@@ -13,8 +20,11 @@ from lidarpainter_models.gaussians.checkpoint import (
 )
 from lidarpainter_models.gaussians.densification import GradientTally, SetChange
 from lidarpainter_models.gaussians.fit_config import FitConfig
-from lidarpainter_models.gaussians.optimiser import GaussianAdam, RowAdam
+from lidarpainter_models.gaussians.gaussian_adam import GaussianAdam
+from lidarpainter_models.gaussians.optimiser import RowAdam
 from lidarpainter_models.gaussians.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.seen_gaussians import SeenGaussians
+from lidarpainter_models.gaussians.spatial_blocks import SpatialBlocks, View
 
 
 @dataclass(eq=False, kw_only=True)
@@ -22,7 +32,9 @@ class FitState:
     """The scene with its optimisers, tallies, random state and history."""
 
     scene: GaussianScene
+    """Its Gaussians out of view lag behind until `caught_up`."""
     gaussian_adam: GaussianAdam
+    blocks: SpatialBlocks
     camera_adam: RowAdam
     actor_adam: RowAdam
     exposure_adam: RowAdam
@@ -46,6 +58,7 @@ class FitState:
         return cls(
             scene=scene,
             gaussian_adam=GaussianAdam(scene.gaussians, config.learning_rates),
+            blocks=SpatialBlocks.of(scene.gaussians, config.learning_rates),
             camera_adam=RowAdam(scene.cameras.view_tangent),
             actor_adam=RowAdam(scene.actors.tangent.flatten(0, 1)),
             exposure_adam=RowAdam(scene.exposure.matrix.flatten(1)),
@@ -63,10 +76,31 @@ class FitState:
         """A uniform number in [0, 1)."""
         return float(torch.rand((), generator=self.generator))
 
+    def seen(self, views: Sequence[View]) -> SeenGaussians:
+        """All Gaussians that any of these views can show, as leaves for one step.
+
+        Views after the first are drawn when the actors' poses have been stepped.
+        """
+        rates, most = self.gaussian_adam.rates, math.sqrt(3.0) * MOST_STEP
+        slack = (most * max(rates.actor_translation_m), most * max(rates.actor_rotation_rad))
+        rows = self.blocks.rows_in_view(views, actor_slack=slack if len(views) > 1 else (0.0, 0.0))
+        return self.gaussian_adam.seen(self.scene.gaussians, rows)
+
+    def step_gaussians(self, seen: SeenGaussians, fraction: float) -> None:
+        """Move the Gaussians that collected gradients, after a fraction of the fit."""
+        self.gaussian_adam.step(self.scene.gaussians, seen, fraction)
+        self.blocks.refresh(self.scene.gaussians, seen.rows)
+
+    def caught_up(self) -> GaussianScene:
+        """The scene with every Gaussian where the steps so far put it."""
+        self.gaussian_adam.catch_up(self.scene.gaussians)
+        return self.scene
+
     def apply(self, change: SetChange) -> None:
-        """Take over a changed set of Gaussians; tallies start again."""
+        """Take over a changed set of Gaussians, made from `caught_up`; tallies start again."""
         self.scene = self.scene.with_gaussians(change.gaussians.as_leaves())
         self.gaussian_adam.rebuild(change.kept, change.num_added)
+        self.blocks = SpatialBlocks.of(self.scene.gaussians, self.gaussian_adam.rates)
         self.tally = GradientTally.zeros(len(change.gaussians))
 
     def keep(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -76,6 +110,7 @@ class FitState:
             {
                 "scene": scene_arrays,
                 "gaussian_adam": self.gaussian_adam.tensors(),
+                "blocks": {"block_of_row": self.blocks.block_of_row},
                 "camera_adam": self.camera_adam.tensors(),
                 "actor_adam": self.actor_adam.tensors(),
                 "exposure_adam": self.exposure_adam.tensors(),
@@ -102,6 +137,9 @@ class FitState:
         state = cls.begin(scene, config)
         for name in ("gaussian_adam", "camera_adam", "actor_adam", "exposure_adam"):
             getattr(state, name).load(ungroup_tensors(tensors, name))
+        state.blocks = SpatialBlocks.with_rows_in(
+            tensors["blocks/block_of_row"], state.scene.gaussians, config.learning_rates
+        )
         state.tally = GradientTally(**ungroup_tensors(tensors, "tally"))
         state.generator = generator_from(tensors["random/state"])
         state.waiting = list(numbers["waiting"])

@@ -1,4 +1,7 @@
-"""Gradients of one recorded or painted view, and the steps of everything but the Gaussians."""
+"""One step of a fit: gradients of a recorded view and perhaps a painted one, and the optimisers.
+
+Only the Gaussians that these views can show take part (`seen_gaussians`).
+"""
 
 from collections.abc import Callable
 
@@ -9,7 +12,6 @@ from torch import Tensor
 from lidarpainter_models.gaussians.fit_config import FitConfig
 from lidarpainter_models.gaussians.fit_pictures import FitPicture
 from lidarpainter_models.gaussians.fit_state import FitState
-from lidarpainter_models.gaussians.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.losses import (
     actor_boundary_loss,
     pose_prior,
@@ -18,7 +20,9 @@ from lidarpainter_models.gaussians.losses import (
 from lidarpainter_models.gaussians.observations import GuidanceView
 from lidarpainter_models.gaussians.pixel_terms import SKY, depth_loss, pixel_terms
 from lidarpainter_models.gaussians.scene_graph import OPAQUE
+from lidarpainter_models.gaussians.seen_gaussians import SeenGaussians
 from lidarpainter_models.gaussians.sky_sampling import SkyRays
+from lidarpainter_models.gaussians.spatial_blocks import View
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
 from lidarpainter_models.kernels.ssim import l1_ssim_loss
@@ -29,29 +33,54 @@ Perceptual = Callable[
 """Distance of a rendered and a true picture, differentiable in the first."""
 
 
-def recorded_step(
+def fit_step(
     state: FitState,
     picture: FitPicture,
     row: int,
+    guidance: GuidanceView | None,
     config: FitConfig,
     perceptual: Perceptual | None,
 ) -> tuple[float, float]:
-    """Collect the Gaussians' gradients from one recorded view; step poses, exposure and sky.
+    """Step everything by one recorded view, the `row`-th, and the painted one if it is given.
 
-    Returns the loss and the mean squared error of the picture.
+    Returns the loss and the mean squared error of the recorded picture.
     """
     scene, refinement = state.scene, config.refinement
-    is_refined = state.step >= refinement.start_step
-    tangent = scene.cameras.tangent(row)
     pose = scene.cameras.world_from_camera(row)
-    if not (refinement.cameras and is_refined):
+    if not (refinement.cameras and state.step >= refinement.start_step):
         pose = pose.detach()
-    camera = picture.camera.at(pose.detach())
+    recorded = picture.camera.at(pose.detach())
     bodies = scene.camera_from_body(pose, *scene.world_from_actors(picture.timestamp_ns))
+    views = [(recorded, bodies)]
+    if guidance is not None:
+        views.append((guidance.camera, _guidance_bodies(state, guidance)))
+    seen = state.seen(views)
+    told = _recorded_step(state, seen, picture, row, views[0], config, perceptual)
+    if guidance is not None:
+        add_guidance_gradients(state, seen, guidance, config)
+    state.step_gaussians(seen, state.step / config.steps)
+    return told
+
+
+def _recorded_step(
+    state: FitState,
+    seen: SeenGaussians,
+    picture: FitPicture,
+    row: int,
+    view: View,
+    config: FitConfig,
+    perceptual: Perceptual | None,
+) -> tuple[float, float]:
+    """Collect the Gaussians' gradients from a recorded view; step poses, exposure and sky."""
+    scene, (camera, bodies) = state.scene, view
     with_actors = _wants_actor_term(state, config)
-    screen_gradient = torch.zeros(scene.num_gaussians)
+    screen_gradient = torch.zeros(len(seen))
     image = scene.splat(
-        camera, bodies, with_actor_alpha=with_actors, screen_gradient_out=screen_gradient
+        camera,
+        bodies,
+        gaussians=seen,
+        with_actor_alpha=with_actors,
+        screen_gradient_out=screen_gradient,
     )
     rays = scene.sky.rays(camera, (image.alpha.detach() < OPAQUE) | picture.is_open)
     sky_rgb = scene.sky.sample(rays).requires_grad_(True)
@@ -70,28 +99,36 @@ def recorded_step(
     loss = loss + config.losses.sky * terms.sky + config.losses.depth * terms.depth
     if with_actors:
         loss = loss + config.losses.actors * _actor_term(state, image, picture, camera)
-    loss = loss + _priors(state, tangent, picture.timestamp_ns, config)
+    loss = loss + _priors(state, scene.cameras.tangent(row), picture.timestamp_ns, config)
     loss.backward()
-    state.tally.add(screen_gradient, image.visible)
+    state.tally.add(seen.rows, screen_gradient, image.visible)
     _step_poses(state, config)
     _step_sky(state, sky_rgb, rays, image.alpha.detach(), config, picture)
     squared_error = (shown.detach() - picture.facts.rgb).square().mean()
     return float(loss.detach()), float(squared_error)
 
 
-def add_guidance_gradients(state: FitState, view: GuidanceView, config: FitConfig) -> None:
+def _guidance_bodies(state: FitState, view: GuidanceView) -> Float[Tensor, "bodies 4 4"]:
+    """Where a painted view has the bodies; no gradient."""
+    with torch.no_grad():
+        actors = state.scene.world_from_actors(view.timestamp_ns)
+        return state.scene.camera_from_body(view.camera.world_from_camera, *actors)
+
+
+def add_guidance_gradients(
+    state: FitState,
+    seen: SeenGaussians,
+    view: GuidanceView,
+    config: FitConfig,
+) -> None:
     """Add one painted view's gradients to the Gaussians; nothing else is changed by it.
 
     With the freedom `appearance` only colour and opacity receive any.
     """
     scene, settings = state.scene, config.guidance
-    gaussians = scene.gaussians
     if settings.freedom == "appearance":
-        gaussians = _with_fixed_geometry(gaussians)
-    with torch.no_grad():
-        actors = scene.world_from_actors(view.timestamp_ns)
-        bodies = scene.camera_from_body(view.camera.world_from_camera, *actors)
-    image = scene.splat(view.camera, bodies, gaussians=gaussians)
+        seen = seen.with_fixed_geometry()
+    image = scene.splat(view.camera, _guidance_bodies(state, view), gaussians=seen)
     sky_rgb = scene.sky.sample(scene.sky.rays(view.camera, image.alpha.detach() < OPAQUE))
     shown = image.rgb + (1 - image.alpha)[..., None] * sky_rgb
     loss = settings.weight * l1_ssim_loss(
@@ -102,19 +139,6 @@ def add_guidance_gradients(state: FitState, view: GuidanceView, config: FitConfi
             image.depth_m, image.alpha, view.lidar_depth_m, tolerance=config.losses.depth_tolerance
         )
     loss.backward()
-
-
-def _with_fixed_geometry(gaussians: GaussianSet) -> GaussianSet:
-    """The same Gaussians, of which only colour and opacity collect gradients."""
-    return GaussianSet(
-        means=gaussians.means.detach(),
-        rotation_wxyz=gaussians.rotation_wxyz.detach(),
-        log_scale=gaussians.log_scale.detach(),
-        opacity_logit=gaussians.opacity_logit,
-        sh_dc=gaussians.sh_dc,
-        sh_rest=gaussians.sh_rest,
-        body_index=gaussians.body_index,
-    )
 
 
 def _picture_loss(

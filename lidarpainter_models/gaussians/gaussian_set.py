@@ -100,7 +100,10 @@ class GaussianSet:
 
     def as_leaves(self) -> "GaussianSet":
         """A copy whose parameters collect gradients."""
-        columns = {name: value.clone() for name, value in self.columns().items()}
+        columns = {
+            name: value.clone(memory_format=torch.contiguous_format)
+            for name, value in self.columns().items()
+        }
         for name in PARAMETERS:
             columns[name].requires_grad_(True)
         return type(self)(**columns)

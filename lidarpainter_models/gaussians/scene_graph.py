@@ -22,6 +22,7 @@ from lidarpainter_models.gaussians.calibration import (
     ViewKey,
 )
 from lidarpainter_models.gaussians.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.seen_gaussians import SeenGaussians
 from lidarpainter_models.gaussians.sky import SkyTexture
 from lidarpainter_models.gaussians.sky_sampling import SkyLayout
 from lidarpainter_models.gaussians.stored_tracks import tracks_from_arrays, tracks_to_arrays
@@ -142,7 +143,7 @@ class GaussianScene:
         camera: Camera,
         camera_from_body: Float[Tensor, "bodies 4 4"],
         *,
-        gaussians: GaussianSet | None = None,
+        gaussians: GaussianSet | SeenGaussians | None = None,
         with_actor_alpha: bool = False,
         screen_gradient_out: Float[Tensor, " gaussians"] | None = None,
         backend: Backend = "auto",

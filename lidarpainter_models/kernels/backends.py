@@ -29,19 +29,25 @@ def available_backends(kernel: str) -> tuple[str, ...]:
     return tuple(found)
 
 
+def chosen_backend(backend: Backend, device: torch.device) -> str:
+    """The backend by name; `auto` takes cuda for GPU tensors and cpu for others."""
+    if backend == "auto":
+        return "cuda" if device.type == "cuda" else "cpu"
+    return backend
+
+
 def implementation(
     kernel: str, function: str, backend: Backend, device: torch.device
 ) -> Callable[..., Any]:
-    """The function of a kernel's backend; `auto` takes cuda for GPU tensors and cpu for others.
+    """The function of a kernel's backend, see `chosen_backend`.
 
     Raises:
         BackendError: the backend does not exist for this kernel or cannot run here.
     """
-    if backend == "auto":
-        backend = "cuda" if device.type == "cuda" else "cpu"
-    if backend not in available_backends(kernel):
+    chosen = chosen_backend(backend, device)
+    if chosen not in available_backends(kernel):
         raise BackendError(
-            f"kernel {kernel!r} has no {backend!r} backend here "
+            f"kernel {kernel!r} has no {chosen!r} backend here "
             f"(available: {', '.join(available_backends(kernel))})"
         )
-    return getattr(import_module(f"lidarpainter_models.kernels.{kernel}.{backend}"), function)
+    return getattr(import_module(f"lidarpainter_models.kernels.{kernel}.{chosen}"), function)

@@ -58,7 +58,9 @@ class Stages:
         return entry_sums(self.records, features, self.lists, self.drawn, self.to_drawn)
 
     def unproject(self):
-        return unproject(self.gaussians, self.view, self.records, self.lists, self.slots)
+        one_view = self.gaussians._replace(camera_from_body=self.gaussians.camera_from_body[None])
+        room = cpu._gradients_of_view(cpu._no_gradients(one_view), 0)
+        unproject(self.gaussians, self.view, self.records, self.lists, self.slots, room, False)
 
 
 STAGES = ("project", "list_tiles", "blend", "blend_gradients", "unproject")

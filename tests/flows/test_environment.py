@@ -15,18 +15,15 @@ def bare_environment(monkeypatch):
 
 
 @pytest.mark.usefixtures("bare_environment")
-@pytest.mark.parametrize("at_once", [1, 2, 1000])
-def test_sequences_that_run_at_once_share_the_cores(at_once):
-    prepare_environment(is_quiet=True, sequences_at_once=at_once)
-    threads = int(os.environ["NUMBA_NUM_THREADS"])
-    assert os.environ["OMP_NUM_THREADS"] == str(threads)
-    assert threads == max(usable_cores() // at_once, 1)
+def test_threads_follow_the_usable_cores():
+    prepare_environment(is_quiet=True)
+    assert os.environ["NUMBA_NUM_THREADS"] == os.environ["OMP_NUM_THREADS"] == str(usable_cores())
 
 
 @pytest.mark.usefixtures("bare_environment")
 def test_thread_count_of_the_user_stays():
     os.environ["NUMBA_NUM_THREADS"] = "7"
-    prepare_environment(is_quiet=True, sequences_at_once=2)
+    prepare_environment(is_quiet=True)
     assert os.environ["NUMBA_NUM_THREADS"] == "7"
 
 

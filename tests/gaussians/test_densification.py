@@ -20,7 +20,9 @@ def ten(*, body=0):
 
 def tally_of(*scores):
     tally = GradientTally.zeros(len(scores))
-    tally.add(torch.tensor(scores), torch.ones(len(scores), dtype=torch.bool))
+    tally.add(
+        torch.arange(len(scores)), torch.tensor(scores), torch.ones(len(scores), dtype=torch.bool)
+    )
     return tally
 
 
@@ -41,8 +43,8 @@ def test_nothing_is_split_without_gradient():
 
 def test_gradients_count_only_where_visible():
     tally = GradientTally.zeros(2)
-    tally.add(torch.tensor([2.0, 3.0]), torch.tensor([True, False]))
-    tally.add(torch.tensor([4.0, 5.0]), torch.tensor([True, True]))
+    tally.add(torch.tensor([0, 1]), torch.tensor([2.0, 3.0]), torch.tensor([True, False]))
+    tally.add(torch.tensor([0, 1]), torch.tensor([4.0, 5.0]), torch.tensor([True, True]))
     assert tally.mean.tolist() == [3.0, 5.0]
 
 

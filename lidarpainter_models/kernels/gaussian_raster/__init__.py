@@ -5,7 +5,9 @@ box frames; `camera_from_body` places each. The camera frame is x right, y down,
 are metres; the top-left pixel has its centre at (0.5, 0.5).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -13,10 +15,17 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.errors import ShapeError
-from lidarpainter_models.kernels.backends import Backend, implementation
+from lidarpainter_models.kernels.backends import Backend, chosen_backend, implementation
+from lidarpainter_models.kernels.gaussian_raster.blending_limits import BLUR_PX2, NEAR_M
 from lidarpainter_models.kernels.gaussian_raster.splat_inputs import SplatInputs, SplatView
 
-__all__ = ["SplatImage", "accumulate_pixel_error", "render_gaussians"]
+__all__ = [
+    "SplatImage",
+    "SplatView",
+    "accumulate_pixel_error",
+    "render_gaussians",
+    "render_views",
+]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,8 +66,8 @@ def render_gaussians(  # noqa: PLR0913 - the one door to the kernel; the scalars
     width_px: int,
     height_px: int,
     features: Float[Tensor, "gaussians features"] | None = None,
-    near_m: float = 0.1,
-    blur_px2: float = 0.3,
+    near_m: float = NEAR_M,
+    blur_px2: float = BLUR_PX2,
     antialias: bool = False,
     screen_offset: Float[Tensor, "gaussians 2"] | None = None,
     screen_gradient_out: Float[Tensor, " gaussians"] | None = None,
@@ -101,22 +110,6 @@ def render_gaussians(  # noqa: PLR0913 - the one door to the kernel; the scalars
         ConfigError: the camera or a setting makes no sense.
         BackendError: the backend cannot run here.
     """
-    count = means.shape[0]
-    if features is None:
-        features = means.new_zeros((count, 0))
-    if screen_offset is None:
-        screen_offset = means.new_zeros((count, 2))
-    inputs = SplatInputs(
-        means=means,
-        rotation_wxyz=rotation_wxyz,
-        scale_m=scale_m,
-        opacity=opacity,
-        sh=sh,
-        body_index=body_index,
-        camera_from_body=camera_from_body,
-        features=features,
-        screen_offset=screen_offset,
-    )
     view = SplatView(
         fx_px=float(fx_px),
         fy_px=float(fy_px),
@@ -128,20 +121,111 @@ def render_gaussians(  # noqa: PLR0913 - the one door to the kernel; the scalars
         blur_px2=float(blur_px2),
         antialias=bool(antialias),
     )
-    if screen_gradient_out is not None and screen_gradient_out.shape != (count,):
+    if screen_gradient_out is not None and screen_gradient_out.shape != means.shape[:1]:
         raise ShapeError(
-            f"screen_gradient_out needs shape ({count},), got {tuple(screen_gradient_out.shape)}"
+            f"screen_gradient_out needs shape {tuple(means.shape[:1])}, got "
+            f"{tuple(screen_gradient_out.shape)}"
         )
-    draw = implementation("gaussian_raster", "draw_gaussians", backend, means.device)
-    rgb, depth_m, alpha, feature_image, visible, radius_px = draw(inputs, view, screen_gradient_out)
-    return SplatImage(
-        rgb=rgb,
-        depth_m=depth_m,
-        alpha=alpha,
-        features=feature_image,
-        visible=visible,
-        radius_px=radius_px,
+    (image,) = render_views(
+        means,
+        rotation_wxyz,
+        scale_m,
+        opacity,
+        sh,
+        body_index,
+        camera_from_body[None],
+        [view],
+        features=features,
+        screen_offsets=None if screen_offset is None else screen_offset[None],
+        screen_gradients_out=None if screen_gradient_out is None else screen_gradient_out[None],
+        backend=backend,
     )
+    return image
+
+
+def render_views(  # noqa: PLR0913 - the Gaussians, and what differs from view to view
+    means: Float[Tensor, "gaussians 3"],
+    rotation_wxyz: Float[Tensor, "gaussians 4"],
+    scale_m: Float[Tensor, "gaussians 3"],
+    opacity: Float[Tensor, " gaussians"],
+    sh: Float[Tensor, "gaussians coefficients 3"],
+    body_index: Int[Tensor, " gaussians"],
+    camera_from_body: Float[Tensor, "views bodies 4 4"],
+    views: Sequence[SplatView],
+    *,
+    features: Float[Tensor, "gaussians features"] | None = None,
+    screen_offsets: Float[Tensor, "views gaussians 2"] | None = None,
+    screen_gradients_out: Float[Tensor, "views gaussians"] | None = None,
+    backend: Backend = "auto",
+    packed: bool = True,
+) -> list[SplatImage]:
+    """`render_gaussians` for several cameras in one call; pictures may differ in size.
+
+    Each picture is that of a call of its own bit for bit (on a CPU), and a gradient is the sum over
+    the views in their order. The Gaussians are checked once and gradients gathered in place.
+
+    Args:
+        means: with the next five as in `render_gaussians`.
+        rotation_wxyz: see `means`.
+        scale_m: see `means`.
+        opacity: see `means`.
+        sh: see `means`.
+        body_index: see `means`.
+        camera_from_body: rigid transforms of each view.
+        views: the cameras.
+        features: as in `render_gaussians`.
+        screen_offsets: as there, per view.
+        screen_gradients_out: as there, per view.
+        backend: as there.
+        packed: on CUDA, hand all views of one size to gsplat in one call, as the list of what is
+            visible in each; otherwise view by view. Nothing else depends on it.
+
+    Raises:
+        ShapeError: the tensors do not belong together.
+        ConfigError: a camera or a setting makes no sense.
+        BackendError: the backend cannot run here.
+    """
+    count, num_views = means.shape[0], (*camera_from_body.shape, 0)[0]
+    inputs = SplatInputs(
+        means=means,
+        rotation_wxyz=rotation_wxyz,
+        scale_m=scale_m,
+        opacity=opacity,
+        sh=sh,
+        body_index=body_index,
+        camera_from_body=camera_from_body,
+        features=means.new_zeros((count, 0)) if features is None else features,
+        screen_offset=(
+            means.new_zeros((num_views, count, 2)) if screen_offsets is None else screen_offsets
+        ),
+    )
+    if len(views) != num_views:
+        raise ShapeError(
+            f"camera_from_body holds {num_views} views, but {len(views)} cameras are given"
+        )
+    out = screen_gradients_out
+    if out is not None and out.shape != (num_views, count):
+        raise ShapeError(
+            f"screen_gradients_out needs shape ({num_views}, {count}), got {tuple(out.shape)}"
+        )
+    if not views:
+        return []
+    draw = implementation("gaussian_raster", "draw_views", backend, means.device)
+    if chosen_backend(backend, means.device) == "cuda":
+        draw = partial(draw, packed=packed)
+    return [
+        SplatImage(
+            rgb=rgb,
+            depth_m=depth_m,
+            alpha=alpha,
+            features=feature_image,
+            visible=visible,
+            radius_px=radius_px,
+        )
+        for rgb, depth_m, alpha, feature_image, visible, radius_px in draw(
+            inputs, tuple(views), screen_gradients_out
+        )
+    ]
 
 
 def accumulate_pixel_error(

@@ -25,3 +25,9 @@ MIN_COMPENSATION = 1e-12
 
 COLOUR_OFFSET = 0.5
 """Grey that spherical harmonics of zero stand for."""
+
+NEAR_M = 0.1
+"""By default, Gaussians with a smaller camera z are not drawn."""
+
+BLUR_PX2 = 0.3
+"""By default added to the variance of every footprint, so that none is thinner than a pixel."""

@@ -1,10 +1,12 @@
-"""The rasteriser on the CPU: numba kernels behind one autograd function.
+"""The rasteriser on the CPU: numba kernels behind one autograd function for any number of views.
 
 Pictures and gradients are bitwise the same for any number of threads (numba's setting,
 `numba.set_num_threads`). Input is read as float32 (transforms as float64) and must lie on the CPU.
 """
 
 import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,11 +14,12 @@ import torch
 from torch import Tensor
 
 from lidarpainter_models.errors import BackendError
-from lidarpainter_models.kernels.gaussian_raster.binning import list_tiles
+from lidarpainter_models.kernels.gaussian_raster.binning import TileLists, list_tiles
 from lidarpainter_models.kernels.gaussian_raster.blending import Pictures, blend
 from lidarpainter_models.kernels.gaussian_raster.blending_gradients import entry_sums
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import TANGENT_MARGIN
 from lidarpainter_models.kernels.gaussian_raster.projection import (
+    CHUNKS,
     IS_VISIBLE,
     SIGMA,
     Gaussians,
@@ -30,21 +33,23 @@ from lidarpainter_models.kernels.gaussian_raster.splat_inputs import (
     SplatView,
 )
 
+PICTURES = 6
+"""Tensors that a view gives: four pictures, visible and radius."""
 ONE_AT_A_TIME = threading.Lock()
 """numba's thread pools may not be entered by two Python threads at once."""
 
 
-def draw_gaussians(
-    inputs: SplatInputs, view: SplatView, screen_gradient_out: Tensor | None
-) -> DrawnPictures:
-    """Picture as `SplatImage` lists it: rgb, depth, alpha, features, visible, radius.
+def draw_views(
+    inputs: SplatInputs, views: Sequence[SplatView], screen_gradients_out: Tensor | None
+) -> list[DrawnPictures]:
+    """Pictures as `SplatImage` lists them: rgb, depth, alpha, features, visible, radius.
 
     Raises:
         BackendError: the tensors are not on the CPU.
     """
     if inputs.means.device.type != "cpu":
         raise BackendError(f"the cpu backend needs tensors on the CPU, got {inputs.means.device}")
-    return _DrawGaussians.apply(
+    drawn = _DrawViews.apply(
         inputs.means,
         inputs.rotation_wxyz,
         inputs.scale_m,
@@ -54,9 +59,10 @@ def draw_gaussians(
         inputs.screen_offset,
         inputs.camera_from_body,
         inputs.body_index,
-        view,
-        screen_gradient_out,
+        views,
+        screen_gradients_out,
     )
+    return [drawn[first : first + PICTURES] for first in range(0, len(drawn), PICTURES)]
 
 
 def _array(tensor: Tensor, dtype: torch.dtype = torch.float32) -> np.ndarray:
@@ -103,44 +109,105 @@ def _pictures(tensors: tuple[Tensor, ...], light: np.ndarray) -> Pictures:
     return Pictures(rgb, depth, alpha, features, light)
 
 
-class _DrawGaussians(torch.autograd.Function):
+def _of_view(gaussians: Gaussians, place: int) -> Gaussians:
+    """The Gaussians with the offsets and transforms of one view."""
+    return gaussians._replace(
+        screen_offset=gaussians.screen_offset[place],
+        camera_from_body=gaussians.camera_from_body[place],
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _DrawnView:
+    """What a backward pass needs to know of one view."""
+
+    view: View
+    records: np.ndarray
+    lists: TileLists
+    light: np.ndarray
+
+
+class _DrawViews(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *arguments: Any) -> DrawnPictures:  # noqa: ANN401
-        *tensors, view, screen_gradient_out = arguments
-        gaussians, compiled_view = _gaussians(tuple(tensors)), _compiled_view(view)
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:  # noqa: ANN401
+        *tensors, views, screen_gradients_out = arguments
+        gaussians = _gaussians(tuple(tensors))
+        drawn: list[Tensor] = []
+        ctx.views = []
         with ONE_AT_A_TIME:
-            records = project(gaussians, compiled_view)
-            lists = list_tiles(records, view.width_px, view.height_px)
-            drawn = blend(records, gaussians.features, lists, view.width_px, view.height_px)
-        rgb, depth_m, alpha, features = (torch.from_numpy(picture) for picture in drawn[:4])
-        visible = torch.from_numpy(records[:, IS_VISIBLE] > 0.0)
-        radius_px = torch.from_numpy(3.0 * records[:, SIGMA])
-        ctx.save_for_backward(*tensors, rgb, depth_m, alpha, features)
-        ctx.mark_non_differentiable(visible, radius_px)
-        ctx.view, ctx.records, ctx.lists, ctx.light = compiled_view, records, lists, drawn.light
-        ctx.screen_gradient_out = screen_gradient_out
-        return rgb, depth_m, alpha, features, visible, radius_px
+            for place, view in enumerate(views):
+                compiled = _compiled_view(view)
+                records = project(_of_view(gaussians, place), compiled)
+                lists = list_tiles(records, view.width_px, view.height_px)
+                pictures = blend(records, gaussians.features, lists, view.width_px, view.height_px)
+                ctx.views.append(
+                    _DrawnView(view=compiled, records=records, lists=lists, light=pictures.light)
+                )
+                drawn += [torch.from_numpy(picture) for picture in pictures[:4]]
+                drawn.append(torch.from_numpy(records[:, IS_VISIBLE] > 0.0))
+                drawn.append(torch.from_numpy(3.0 * records[:, SIGMA]))
+        floats = [drawn[k] for k in range(len(drawn)) if k % PICTURES < 4]
+        ctx.save_for_backward(*tensors, *floats)
+        ctx.mark_non_differentiable(*(drawn[k] for k in range(len(drawn)) if k % PICTURES >= 4))
+        ctx.screen_gradients_out = screen_gradients_out
+        return tuple(drawn)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *output_gradients: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
-        tensors, pictures = ctx.saved_tensors[:-4], ctx.saved_tensors[-4:]
+        count = len(ctx.saved_tensors) - 4 * len(ctx.views)
+        tensors, pictures = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
         gaussians = _gaussians(tensors)
-        drawn = _pictures(pictures, ctx.light)
-        gradients = _pictures(output_gradients[:4], ctx.light)
+        found = _no_gradients(gaussians)
         with ONE_AT_A_TIME:
-            slots = entry_sums(ctx.records, gaussians.features, ctx.lists, drawn, gradients)
-            found = unproject(gaussians, ctx.view, ctx.records, ctx.lists, slots)
-        if ctx.screen_gradient_out is not None:
-            ctx.screen_gradient_out.copy_(torch.from_numpy(found.absolute))
+            for place, drawn in enumerate(ctx.views):
+                given = output_gradients[PICTURES * place : PICTURES * place + 4]
+                slots = entry_sums(
+                    drawn.records,
+                    gaussians.features,
+                    drawn.lists,
+                    _pictures(pictures[4 * place : 4 * place + 4], drawn.light),
+                    _pictures(given, drawn.light),
+                )
+                own = _gradients_of_view(found, place)
+                of_view = _of_view(gaussians, place)
+                unproject(of_view, drawn.view, drawn.records, drawn.lists, slots, own, place > 0)
+        if ctx.screen_gradients_out is not None:
+            ctx.screen_gradients_out.copy_(torch.from_numpy(found.absolute))
         return (*_tensor_gradients(found, tensors), None, None, None)
+
+
+def _no_gradients(gaussians: Gaussians) -> Gradients:
+    """Zeros for every view; the last three arrays have a row per view."""
+    count, (views, bodies) = len(gaussians.means), gaussians.camera_from_body.shape[:2]
+    return Gradients(
+        means=np.zeros((count, 3), np.float32),
+        rotation_wxyz=np.zeros((count, 4), np.float32),
+        scale_m=np.zeros((count, 3), np.float32),
+        opacity=np.zeros(count, np.float32),
+        sh=np.zeros(gaussians.sh.shape, np.float32),
+        features=np.zeros(gaussians.features.shape, np.float32),
+        screen_offset=np.zeros((views, count, 2), np.float32),
+        absolute=np.zeros((views, count), np.float32),
+        camera_from_body=np.zeros((views, CHUNKS, bodies, 3, 4)),
+    )
+
+
+def _gradients_of_view(found: Gradients, place: int) -> Gradients:
+    """The sums that views share, and the arrays of one view."""
+    return found._replace(
+        screen_offset=found.screen_offset[place],
+        absolute=found.absolute[place],
+        camera_from_body=found.camera_from_body[place],
+    )
 
 
 def _tensor_gradients(found: Gradients, tensors: tuple[Tensor, ...]) -> list[Tensor]:
     """Gradients in the order and kinds of the float tensors that were given."""
-    to_transforms = np.zeros((found.camera_from_body.shape[1], 4, 4))
-    for run in found.camera_from_body:
-        to_transforms[:, :3] += run
+    views, _, bodies = found.camera_from_body.shape[:3]
+    to_transforms = np.zeros((views, bodies, 4, 4))
+    for run in range(CHUNKS):
+        to_transforms[:, :, :3] += found.camera_from_body[:, run]
     arrays = (
         found.means,
         found.rotation_wxyz,

@@ -4,19 +4,21 @@ Projection, bodies and colour are those of the reference, in torch on the GPU, s
 with respect to the transforms are exact; binning and blending are gsplat's kernels (Ye et al.
 2024, "gsplat: An Open-Source Library for Gaussian Splatting"). gsplat 1.5 clamps alpha at 0.999
 where the others clamp at 0.99, and its atomic sums make gradients differ in the last bits from run
-to run. Only what can reach the picture is handed over, so memory follows the visible Gaussians, as
-in gsplat's packed mode; antialiasing is in the opacity, depth is one of the blended values.
+to run. Only what can reach a picture is handed over, so memory follows the visible Gaussians, and
+views of one size go in one call in gsplat's packed form; antialiasing is in the opacity, depth is
+one of the blended values.
 """
 
+from collections.abc import Sequence
 from importlib import import_module
 from types import ModuleType
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import BackendError
-from lidarpainter_models.kernels.gaussian_raster import reference
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import TILE_PX
 from lidarpainter_models.kernels.gaussian_raster.reference import (
     ScreenGaussians,
@@ -30,10 +32,14 @@ from lidarpainter_models.kernels.gaussian_raster.splat_inputs import (
 )
 
 
-def draw_gaussians(
-    inputs: SplatInputs, view: SplatView, screen_gradient_out: Tensor | None
-) -> DrawnPictures:
-    """Picture as `SplatImage` lists it: rgb, depth, alpha, features, visible, radius.
+def draw_views(
+    inputs: SplatInputs,
+    views: Sequence[SplatView],
+    screen_gradients_out: Tensor | None,
+    *,
+    packed: bool,
+) -> list[DrawnPictures]:
+    """Pictures as `SplatImage` lists them: rgb, depth, alpha, features, visible, radius.
 
     Raises:
         BackendError: gsplat or its kernels are missing, or the tensors are not on a CUDA device.
@@ -43,29 +49,83 @@ def draw_gaussians(
         raise BackendError(
             f"the cuda backend needs tensors on a CUDA device, got {inputs.means.device}"
         )
-    screen = project_gaussians(inputs, view)
-    if len(screen.index) == 0:  # gsplat expects at least one
-        return reference.draw_gaussians(inputs, view, screen_gradient_out)
-    centre_px = screen.centre_px[None].contiguous()
-    if screen_gradient_out is not None and centre_px.requires_grad:
-        _report_screen_gradient(centre_px, screen.index, screen_gradient_out)
-    tile_first, gaussian = _tile_lists(gsplat, screen, centre_px.detach(), view)
-    precision = torch.linalg.inv(screen.covariance_px2)
-    values, alpha = gsplat.rasterize_to_pixels(
+    return draw_with(gsplat, inputs, views, screen_gradients_out, packed=packed)
+
+
+def draw_with(
+    gsplat: ModuleType,
+    inputs: SplatInputs,
+    views: Sequence[SplatView],
+    screen_gradients_out: Tensor | None,
+    *,
+    packed: bool,
+) -> list[DrawnPictures]:
+    """Draw with gsplat's functions on any device that they take."""
+    if screen_gradients_out is not None:
+        screen_gradients_out.zero_()
+    groups: dict[tuple[int, ...], list[int]] = {}
+    for place, view in enumerate(views):
+        key = (view.width_px, view.height_px) if packed else (place,)
+        groups.setdefault(key, []).append(place)
+    drawn: dict[int, DrawnPictures] = {}
+    for places in groups.values():
+        screens = [project_gaussians(inputs, place, views[place]) for place in places]
+        pictures = _rasterised(
+            gsplat, screens, views[places[0]], places, screen_gradients_out, packed=packed
+        )
+        for place, screen, (values, alpha) in zip(places, screens, pictures, strict=True):
+            seen = screen_radii(screen, len(inputs.means))
+            drawn[place] = (values[..., :3], values[..., 3], alpha, values[..., 4:], *seen)
+    return [drawn[place] for place in range(len(views))]
+
+
+def _rasterised(
+    gsplat: ModuleType,
+    screens: list[ScreenGaussians],
+    view: SplatView,
+    places: list[int],
+    screen_gradients_out: Tensor | None,
+    *,
+    packed: bool,
+) -> list[tuple[Float[Tensor, "height width channels"], Float[Tensor, "height width"]]]:
+    """Values and alpha of views of one size.
+
+    Packed, gsplat gets the visible Gaussians of all views in one list and the view of each;
+    otherwise those of the one view, with a dimension for views in front.
+    """
+    values = torch.cat([screen.values for screen in screens])
+    size = (view.height_px, view.width_px)
+    precision = torch.linalg.inv(torch.cat([screen.covariance_px2 for screen in screens]))
+    conics = torch.stack([precision[:, 0, 0], precision[:, 0, 1], precision[:, 1, 1]], dim=1)
+    opacity = torch.cat([screen.opacity for screen in screens])
+    centre_px = torch.cat([screen.centre_px for screen in screens])
+    if len(values) == 0:  # gsplat expects at least one
+        nothing = sum(tensor.sum() for tensor in (values, conics, opacity, centre_px))
+        blank = nothing + values.new_zeros((len(screens), *size, values.shape[1]))
+        return [(picture, picture[..., 0]) for picture in blank]
+    if not packed:
+        centre_px, conics, values, opacity = (
+            tensor[None] for tensor in (centre_px, conics, values, opacity)
+        )
+    centre_px = centre_px.contiguous()
+    is_watched = screen_gradients_out is not None and centre_px.requires_grad
+    if screen_gradients_out is not None and is_watched:
+        _report_screen_gradient(centre_px, screens, places, screen_gradients_out)
+    tile_first, gaussian = _tile_lists(gsplat, screens, centre_px.detach(), view, packed=packed)
+    pictures, alpha = gsplat.rasterize_to_pixels(
         centre_px,
-        torch.stack([precision[:, 0, 0], precision[:, 0, 1], precision[:, 1, 1]], dim=1)[None],
-        screen.values[None],
-        screen.opacity[None],
+        conics,
+        values,
+        opacity,
         view.width_px,
         view.height_px,
         TILE_PX,
         tile_first,
         gaussian,
-        absgrad=screen_gradient_out is not None,
+        packed=packed,
+        absgrad=is_watched,
     )
-    visible, radius_px = screen_radii(screen, len(inputs.means))
-    picture = values[0]
-    return picture[..., :3], picture[..., 3], alpha[0, ..., 0], picture[..., 4:], visible, radius_px
+    return list(zip(pictures, alpha[..., 0], strict=True))
 
 
 def import_gsplat() -> ModuleType:
@@ -96,36 +156,54 @@ def import_gsplat() -> ModuleType:
 
 def _tile_lists(
     gsplat: ModuleType,
-    screen: ScreenGaussians,
-    centre_px: Float[Tensor, "1 visible 2"],
+    screens: list[ScreenGaussians],
+    centre_px: Tensor,
     view: SplatView,
+    *,
+    packed: bool,
 ) -> tuple[Tensor, Tensor]:
     """The first entry of each tile, as gsplat wants it, and the entries, nearest first."""
     columns = (view.width_px + TILE_PX - 1) // TILE_PX
     rows = (view.height_px + TILE_PX - 1) // TILE_PX
-    radii_px = torch.ceil(screen.half_size_px.clamp_max(2.0**30)).to(torch.int32)
+    half_size_px = torch.cat([screen.half_size_px for screen in screens])
+    radii_px = torch.ceil(half_size_px.clamp_max(2.0**30)).to(torch.int32)
+    depth_m = torch.cat([screen.values[:, 3] for screen in screens]).detach().contiguous()
+    if packed:
+        counts = torch.tensor([len(screen.index) for screen in screens], device=depth_m.device)
+        in_pack: dict[str, Any] = {
+            "packed": True,
+            "n_images": len(screens),
+            "image_ids": torch.repeat_interleave(
+                torch.arange(len(screens), device=depth_m.device), counts
+            ),
+            "gaussian_ids": torch.cat([screen.index for screen in screens]),
+        }
+    else:
+        in_pack, radii_px, depth_m = {}, radii_px[None], depth_m[None]
     _, tile_depth_keys, gaussian = gsplat.isect_tiles(
-        centre_px,
-        radii_px[None],
-        screen.values[None, :, 3].detach().contiguous(),
-        TILE_PX,
-        columns,
-        rows,
+        centre_px, radii_px, depth_m, TILE_PX, columns, rows, **in_pack
     )
-    return gsplat.isect_offset_encode(tile_depth_keys, 1, columns, rows), gaussian
+    return gsplat.isect_offset_encode(tile_depth_keys, len(screens), columns, rows), gaussian
 
 
 def _report_screen_gradient(
-    centre_px: Float[Tensor, "1 visible 2"], index: Tensor, out: Float[Tensor, " gaussians"]
+    centre_px: Tensor,
+    screens: list[ScreenGaussians],
+    places: list[int],
+    out: Float[Tensor, "views gaussians"],
 ) -> None:
-    """Copy gsplat's absolute gradient to `out` once the backward pass has found it."""
+    """Copy gsplat's absolute gradients to the views' rows once a backward pass has found them."""
     watched = [centre_px]  # emptied by the first pass: a tensor held by its own hook never dies
 
     def report(gradient: Tensor) -> None:
         del gradient
-        if watched:
-            absolute = watched.pop().absgrad[0]  # type: ignore[attr-defined]  # gsplat adds it
-            out.zero_()
-            out[index] = torch.linalg.vector_norm(absolute, dim=1).to(out.dtype)
+        if not watched:
+            return
+        absolute = watched.pop().absgrad.reshape(-1, 2)  # type: ignore[attr-defined]  # gsplat adds it
+        lengths = torch.linalg.vector_norm(absolute, dim=1).to(out.dtype)
+        parts = lengths.split([len(screen.index) for screen in screens])
+        for place, screen, part in zip(places, screens, parts, strict=True):
+            out[place] = 0
+            out[place, screen.index] = part
 
     centre_px.register_hook(report)

@@ -55,7 +55,10 @@ AHEAD = 8
 
 
 class Gradients(NamedTuple):
-    """Gradients of the arrays in `projection.Gaussians`; transforms per run in float64."""
+    """Gradients of the arrays in `projection.Gaussians`; transforms per run in float64.
+
+    Those that several views share hold sums; the last three belong to one view.
+    """
 
     means: np.ndarray
     rotation_wxyz: np.ndarray
@@ -66,6 +69,12 @@ class Gradients(NamedTuple):
     screen_offset: np.ndarray
     absolute: np.ndarray
     camera_from_body: np.ndarray
+
+
+@numba.njit(**EXACT)
+def _put(array: np.ndarray, place: tuple[int, ...], value: float, adds: bool) -> None:
+    """Write a number, or add it in float32 as if it had been written and added then."""
+    array[place] = array[place] + np.float32(value) if adds else np.float32(value)
 
 
 @numba.njit(**EXACT)
@@ -152,16 +161,26 @@ def _centre_gradient(
 
 @numba.njit(**EXACT)
 def _store_shape(
-    gaussians: Gaussians, index: int, footprint: Footprint, to_axes: Matrix, gradients: Gradients
+    gaussians: Gaussians,
+    index: int,
+    footprint: Footprint,
+    to_axes: Matrix,
+    gradients: Gradients,
+    adds: bool,
 ) -> Matrix:
     """Store gradients of scale and rotation; return that of the transform's rotation."""
     to_from_axes = v3.product(v3.transposed(footprint.rotation), to_axes)
     turned = v3.rotation_matrix(footprint.unit_wxyz)
     scale = vector_of(gaussians.scale_m, index)
     by_axis, turned_axes = v3.transposed(to_from_axes), v3.transposed(turned)
-    gradients.scale_m[index, 0] = v3.dot(by_axis[0], turned_axes[0])
-    gradients.scale_m[index, 1] = v3.dot(by_axis[1], turned_axes[1])
-    gradients.scale_m[index, 2] = v3.dot(by_axis[2], turned_axes[2])
+    for k, gradient in enumerate(
+        (
+            v3.dot(by_axis[0], turned_axes[0]),
+            v3.dot(by_axis[1], turned_axes[1]),
+            v3.dot(by_axis[2], turned_axes[2]),
+        )
+    ):
+        _put(gradients.scale_m, (index, k), gradient, adds)
     to_turned = v3.transposed(
         (
             v3.scaled(by_axis[0], scale[0]),
@@ -175,12 +194,12 @@ def _store_shape(
     along += to_unit[3] * unit[3]
     by_length = 1.0 / footprint.wxyz_length
     for k in range(4):
-        gradients.rotation_wxyz[index, k] = (to_unit[k] - along * unit[k]) * by_length
+        _put(gradients.rotation_wxyz, (index, k), (to_unit[k] - along * unit[k]) * by_length, adds)
     return v3.product(to_axes, v3.transposed(footprint.from_axes))
 
 
 @numba.njit(**EXACT)
-def _store_colour(
+def _store_colour(  # noqa: PLR0913 - a compiled loop body
     gaussians: Gaussians,
     index: int,
     footprint: Footprint,
@@ -188,6 +207,7 @@ def _store_colour(
     sums: np.ndarray,
     weights: np.ndarray,
     gradients: Gradients,
+    adds: bool,
 ) -> Vector:
     """Store the gradient of the coefficients; return that of the view direction, metres."""
     mean = vector_of(gaussians.means, index)
@@ -203,7 +223,7 @@ def _store_colour(
     for k in range(coefficients):
         weight = weights[k]
         for channel in range(3):
-            gradients.sh[index, k, channel] = weight * to_colour[channel]
+            _put(gradients.sh, (index, k, channel), weight * to_colour[channel], adds)
         weights[k] = v3.dot(vector_of(gaussians.sh[index], k), to_colour)
     to_direction = spherical_harmonics.direction_gradient(coefficients, direction, weights)
     return v3.direction_of_gradient(direction, length, to_direction)
@@ -227,6 +247,7 @@ def _unproject_one(  # noqa: PLR0913 - a compiled loop body
     weights: np.ndarray,
     gradients: Gradients,
     run: int,
+    adds: bool,
 ) -> None:
     rotation, translation = transform_of(gaussians, index)
     mean = vector_of(gaussians.means, index)
@@ -237,18 +258,20 @@ def _unproject_one(  # noqa: PLR0913 - a compiled loop body
     absolute_x, absolute_y = record[ACROSS] * sums[SUM_ABS_X], sums[SUM_ABS_Y]
     absolute = math.sqrt(absolute_x * absolute_x + absolute_y * absolute_y)
     gradients.absolute[index] = 2.0 * absolute
-    gradients.opacity[index] = sums[SUM_G] / gaussians.opacity[index]
+    _put(gradients.opacity, (index,), sums[SUM_G] / gaussians.opacity[index], adds)
     to_covariance = _covariance_gradient(sums, footprint)
     if view.antialias:
         to_covariance = _add_compensation_gradient(footprint, view.blur, sums[SUM_G], to_covariance)
     to_axes, to_point = _axes_gradient(footprint, to_covariance, view)
     to_centre = _centre_gradient(footprint, to_screen, sums[SUM_DEPTH], view)
     to_point = v3.add(to_point, to_centre)
-    to_rotation = _store_shape(gaussians, index, footprint, to_axes, gradients)
-    to_direction = _store_colour(gaussians, index, footprint, record, sums, weights, gradients)
+    to_rotation = _store_shape(gaussians, index, footprint, to_axes, gradients, adds)
+    to_direction = _store_colour(
+        gaussians, index, footprint, record, sums, weights, gradients, adds
+    )
     to_mean = v3.add(v3.apply(v3.transposed(rotation), to_point), to_direction)
     for axis in range(3):
-        gradients.means[index, axis] = to_mean[axis]
+        _put(gradients.means, (index, axis), to_mean[axis], adds)
     # the direction is mean + rotation^T translation
     to_rotation = v3.added(to_rotation, v3.outer(to_point, mean))
     to_rotation = v3.added(to_rotation, v3.outer(translation, to_direction))
@@ -289,7 +312,7 @@ def _add_entries(
 
 
 @numba.njit(**EXACT)
-def _unproject_run(
+def _unproject_run(  # noqa: PLR0913 - a compiled loop body
     gaussians: Gaussians,
     view: View,
     records: np.ndarray,
@@ -297,6 +320,7 @@ def _unproject_run(
     slots: tuple[np.ndarray, np.ndarray],
     gradients: Gradients,
     run: int,
+    adds: bool,
 ) -> None:
     weights, sums = np.empty(16), np.empty(SUMS)
     feature_sums = np.empty(slots[1].shape[1])
@@ -307,8 +331,10 @@ def _unproject_run(
         if records[index, IS_VISIBLE] > 0.0:
             _add_entries(lists, index, slots[0], slots[1], sums, feature_sums)
             for k in range(len(feature_sums)):
-                gradients.features[index, k] = feature_sums[k]
-            _unproject_one(gaussians, index, view, records[index], sums, weights, gradients, run)
+                _put(gradients.features, (index, k), feature_sums[k], adds)
+            _unproject_one(
+                gaussians, index, view, records[index], sums, weights, gradients, run, adds
+            )
 
 
 @compiled_entry
@@ -318,8 +344,10 @@ def unproject(
     records: np.ndarray,
     lists: TileLists,
     slots: tuple[np.ndarray, np.ndarray],
-) -> Gradients:
-    """Gradients of everything `project` read; zero where a Gaussian was not visible.
+    gradients: Gradients,
+    adds: bool,
+) -> None:
+    """Write, or add to what other views gave, the gradients of everything `project` read.
 
     Args:
         gaussians: as they were drawn.
@@ -327,21 +355,11 @@ def unproject(
         records: from `projection.project`.
         lists: from `binning.list_tiles`.
         slots: from `blending_gradients.entry_sums`.
+        gradients: zeros, or the sums so far; the view's own arrays are always zeros. What was not
+            visible is left as it is.
+        adds: whether other views came before.
     """
-    count, coefficients, _ = gaussians.sh.shape
-    bodies = len(gaussians.camera_from_body)
-    gradients = Gradients(
-        np.zeros((count, 3), np.float32),
-        np.zeros((count, 4), np.float32),
-        np.zeros((count, 3), np.float32),
-        np.zeros(count, np.float32),
-        np.zeros((count, coefficients, 3), np.float32),
-        np.zeros(gaussians.features.shape, np.float32),
-        np.zeros((count, 2), np.float32),
-        np.zeros(count, np.float32),
-        np.zeros((CHUNKS, bodies, 3, 4)),
-    )
     jump = jump_of(CHUNKS)
     for place in numba.prange(CHUNKS):
-        _unproject_run(gaussians, view, records, lists, slots, gradients, place * jump % CHUNKS)
-    return gradients
+        run = place * jump % CHUNKS
+        _unproject_run(gaussians, view, records, lists, slots, gradients, run, adds)

@@ -6,6 +6,7 @@ constants. Gaussians that cannot reach a tile are left out of it, which changes 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -44,11 +45,26 @@ class ScreenGaussians:
     """Half width and height of the region where alpha reaches `ALPHA_CUT`; no gradient."""
 
 
-def draw_gaussians(
-    inputs: SplatInputs, view: SplatView, screen_gradient_out: Tensor | None
+def draw_views(
+    inputs: SplatInputs, views: Sequence[SplatView], screen_gradients_out: Tensor | None
+) -> list[DrawnPictures]:
+    """Pictures as `SplatImage` lists them: rgb, depth, alpha, features, visible, radius."""
+    return [
+        draw_view(
+            inputs,
+            place,
+            view,
+            None if screen_gradients_out is None else screen_gradients_out[place],
+        )
+        for place, view in enumerate(views)
+    ]
+
+
+def draw_view(
+    inputs: SplatInputs, place: int, view: SplatView, screen_gradient_out: Tensor | None
 ) -> DrawnPictures:
-    """Picture as `SplatImage` lists it: rgb, depth, alpha, features, visible, radius."""
-    screen = project_gaussians(inputs, view)
+    """The pictures of one view, whose transforms and offsets lie at a place of the inputs."""
+    screen = project_gaussians(inputs, place, view)
     watch = None
     if screen_gradient_out is not None:
         watch = ScreenGradientWatch(screen.index, screen_gradient_out)
@@ -66,9 +82,10 @@ def draw_gaussians(
     return values[..., :3], values[..., 3], alpha, values[..., 4:], visible, radius_px
 
 
-def project_gaussians(inputs: SplatInputs, view: SplatView) -> ScreenGaussians:
-    """Project, drop what no pixel can see, and sort by depth."""
-    camera_from_body = inputs.camera_from_body.to(inputs.means)[inputs.body_index.long()]
+def project_gaussians(inputs: SplatInputs, place: int, view: SplatView) -> ScreenGaussians:
+    """Project into the view at a place, drop what no pixel can see, and sort by depth."""
+    transforms = inputs.camera_from_body[place].to(inputs.means)
+    camera_from_body = transforms[inputs.body_index.long()]
     rotation, translation = camera_from_body[:, :3, :3], camera_from_body[:, :3, 3]
     point = torch.einsum("gij,gj->gi", rotation, inputs.means) + translation
     kept = torch.nonzero((point[:, 2] >= view.near_m) & (inputs.opacity >= ALPHA_CUT))[:, 0]
@@ -83,7 +100,7 @@ def project_gaussians(inputs: SplatInputs, view: SplatView) -> ScreenGaussians:
         opacity = opacity * ratio.clamp_min(MIN_COMPENSATION).sqrt()
     focal = point.new_tensor([view.fx_px, view.fy_px])
     principal = point.new_tensor([view.cx_px, view.cy_px])
-    centre = focal * point[:, :2] / point[:, 2:] + principal + inputs.screen_offset[kept]
+    centre = focal * point[:, :2] / point[:, 2:] + principal + inputs.screen_offset[place, kept]
     colour = _colour(inputs, kept, rotation, translation)
     values = torch.cat([colour, point[:, 2:], inputs.features[kept]], dim=1)
     return _seen(

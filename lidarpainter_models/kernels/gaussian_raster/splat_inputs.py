@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError, ShapeError
+from lidarpainter_models.kernels.gaussian_raster.blending_limits import BLUR_PX2, NEAR_M
 
 DrawnPictures = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 """What a backend returns: rgb, depth, alpha, features, visible and radius, as in `SplatImage`."""
@@ -17,7 +18,7 @@ SH_COEFFICIENTS = (1, 4, 9, 16)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SplatInputs:
-    """The tensors of one picture; `render_gaussians` says what each means and its shape.
+    """The tensors of some pictures; `render_views` says what each means and its shape.
 
     Raises:
         ShapeError: sizes or kinds of numbers do not belong together.
@@ -38,7 +39,7 @@ class SplatInputs:
         count = self.means.shape[0] if self.means.ndim else 0
         coefficients = self.sh.shape[1] if self.sh.ndim == 3 else 0
         channels = self.features.shape[1] if self.features.ndim == 2 else 0
-        bodies = self.camera_from_body.shape[0] if self.camera_from_body.ndim else 0
+        views, bodies = (*self.camera_from_body.shape, 0, 0)[:2]
         expected = {
             "means": (count, 3),
             "rotation_wxyz": (count, 4),
@@ -46,9 +47,9 @@ class SplatInputs:
             "opacity": (count,),
             "sh": (count, coefficients, 3),
             "body_index": (count,),
-            "camera_from_body": (bodies, 4, 4),
+            "camera_from_body": (views, bodies, 4, 4),
             "features": (count, channels),
-            "screen_offset": (count, 2),
+            "screen_offset": (views, count, 2),
         }
         for field in fields(self):
             _check_tensor(field.name, getattr(self, field.name), expected[field.name], self.means)
@@ -93,8 +94,8 @@ class SplatView:
     cy_px: float
     width_px: int
     height_px: int
-    near_m: float = 0.1
-    blur_px2: float = 0.3
+    near_m: float = NEAR_M
+    blur_px2: float = BLUR_PX2
     antialias: bool = False
 
     def __post_init__(self) -> None:

@@ -2,7 +2,8 @@
 
 Points of a band are visited in ascending order and only a strictly nearer one replaces another, so
 ties go to the lower index and the number of threads changes nothing. A point is looked at once to
-be sorted and once for each band its disc reaches, however many threads there are.
+be sorted and once for each band its disc reaches, however many threads there are. Points are taken
+piece by piece: room for millions at once would be new pages from the system at every call.
 """
 
 import numba
@@ -12,8 +13,10 @@ from torch import Tensor
 
 BAND_ROWS = 32
 """Rows of a band: its z-buffer stays in the cache, and there are more bands than cores."""
+PIECE = 1 << 20
+"""Points taken at once: their sorted copies stay under the 32 MiB that allocators keep."""
 RUNS = 16
-"""Points are sorted in this many runs, whatever the number of threads."""
+"""Points of a piece are sorted in this many runs, whatever the number of threads."""
 
 
 def splat_points(
@@ -84,18 +87,21 @@ def _splat_band(
 
 
 @numba.njit(cache=True, parallel=True)
-def _splat(
+def _splat_piece(
     pixels_uv: np.ndarray,
     depth_m: np.ndarray,
     radius_px: np.ndarray,
-    height_px: int,
-    width_px: int,
-) -> np.ndarray:
-    winner = np.full((height_px, width_px), -1, dtype=np.int64)
-    count, bands = len(depth_m), (height_px + BAND_ROWS - 1) // BAND_ROWS
+    piece: tuple[int, int],
+    nearest_m: np.ndarray,
+    winner: np.ndarray,
+) -> None:
+    """Draw the points of one piece, given by its first and the one past its last."""
+    height_px, width_px = winner.shape
+    start, count = piece[0], piece[1] - piece[0]
+    bands = (height_px + BAND_ROWS - 1) // BAND_ROWS
     counts = np.zeros((RUNS, bands), np.int64)
     for run in numba.prange(RUNS):
-        for point in range(run * count // RUNS, (run + 1) * count // RUNS):
+        for point in range(start + run * count // RUNS, start + (run + 1) * count // RUNS):
             u, v, r = pixels_uv[point, 0], pixels_uv[point, 1], radius_px[point]
             first, end = _bands_of(v, r, u, depth_m[point], height_px, width_px)
             for band in range(first, end):
@@ -107,7 +113,7 @@ def _splat(
         np.empty(band_first[-1], depth_m.dtype),
     )
     for run in numba.prange(RUNS):
-        for point in range(run * count // RUNS, (run + 1) * count // RUNS):
+        for point in range(start + run * count // RUNS, start + (run + 1) * count // RUNS):
             u, v, r = pixels_uv[point, 0], pixels_uv[point, 1], radius_px[point]
             first, end = _bands_of(v, r, u, depth_m[point], height_px, width_px)
             for band in range(first, end):
@@ -118,7 +124,22 @@ def _splat(
                 depths_m[place] = depth_m[point]
     for band in numba.prange(bands):
         rows = (band * BAND_ROWS, min((band + 1) * BAND_ROWS, height_px))
-        nearest_m = np.full((rows[1] - rows[0], width_px), np.inf, dtype=depth_m.dtype)
         first, end = band_first[band], band_first[band + 1]
-        _splat_band(discs[first:end], depths_m[first:end], rows, nearest_m, winner)
+        own_m = nearest_m[rows[0] : rows[1]]
+        _splat_band(discs[first:end], depths_m[first:end], rows, own_m, winner)
+
+
+@numba.njit(cache=True)
+def _splat(
+    pixels_uv: np.ndarray,
+    depth_m: np.ndarray,
+    radius_px: np.ndarray,
+    height_px: int,
+    width_px: int,
+) -> np.ndarray:
+    winner = np.full((height_px, width_px), -1, dtype=np.int64)
+    nearest_m = np.full((height_px, width_px), np.inf, dtype=depth_m.dtype)
+    for first in range(0, len(depth_m), PIECE):
+        piece = (first, min(first + PIECE, len(depth_m)))
+        _splat_piece(pixels_uv, depth_m, radius_px, piece, nearest_m, winner)
     return winner

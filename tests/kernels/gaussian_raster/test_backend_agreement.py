@@ -1,17 +1,25 @@
 """Every fast backend draws what the reference draws: one suite for the CPU and for CUDA.
 
+The CUDA backend is tried twice: on a GPU where there is one, and without gsplat's kernels, with a
+stand-in for the functions that it calls (`documented_gsplat`).
+
 Backends are compared by mean error: a pixel that sits on the alpha cut may fall on either side.
 gsplat clamps alpha at 0.999 and not at 0.99, so no Gaussian here is that opaque.
 """
 
 import sys
+from functools import partial
 from types import ModuleType, SimpleNamespace
 
+import documented_gsplat
 import pytest
 import torch
 
 from lidarpainter_models.errors import BackendError
+from lidarpainter_models.kernels import backends
+from lidarpainter_models.kernels.gaussian_raster import SplatView, cuda, render_views
 from lidarpainter_models.kernels.gaussian_raster.cuda import import_gsplat
+from lidarpainter_models.kernels.gaussian_raster.splat_inputs import SplatInputs
 
 ON_CUDA = pytest.param(
     "cuda",
@@ -20,10 +28,26 @@ ON_CUDA = pytest.param(
         pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device"),
     ],
 )
-FAST = ["cpu", ON_CUDA]
+FAST = ["cpu", "stand-in", ON_CUDA]
 MEAN_ERROR = {"rgb": 1e-5, "depth_m": 1e-4, "alpha": 1e-5, "features": 1e-5}
-GRADIENT_ERROR = {"cpu": 1e-5, "cuda": 1e-3}
+GRADIENT_ERROR = {"cpu": 1e-5, "stand-in": 1e-5, "cuda": 1e-3}
 """Relative; gsplat's exponential is the GPU's fast one and its sums are atomic."""
+
+
+@pytest.fixture(autouse=True)
+def stand_in(request, monkeypatch):
+    """Let the backend of tests called `stand-in` be the CUDA backend's own code on the CPU."""
+    if "stand-in" not in request.node.name:
+        return
+    module = ModuleType(cuda.__name__)
+    module.draw_views = partial(cuda.draw_with, documented_gsplat)
+    monkeypatch.setitem(sys.modules, cuda.__name__, module)
+    monkeypatch.setattr(backends, "available_backends", lambda _kernel: ("cuda", "reference"))
+
+
+def named(backend):
+    """The name that the door takes."""
+    return "cuda" if backend == "stand-in" else backend
 
 
 def agreeing(splats, draw, backend, *, settings=None, **build):
@@ -33,7 +57,7 @@ def agreeing(splats, draw, backend, *, settings=None, **build):
     expected = draw(inputs, backend="reference", dtype=torch.float64, **settings or {})
     if backend == "cuda":
         inputs = {k: v.cuda() if torch.is_tensor(v) else v for k, v in inputs.items()}
-    return draw(inputs, backend=backend, dtype=torch.float32, **settings or {}), expected
+    return draw(inputs, backend=named(backend), dtype=torch.float32, **settings or {}), expected
 
 
 @pytest.mark.parametrize("backend", FAST)
@@ -68,6 +92,77 @@ def test_no_gaussian_draws_nothing(splats, draw, backend):
     actual, _ = agreeing(splats, draw, backend, count=0, features=1)
     assert float(actual.image.alpha.detach().abs().max()) == 0
     assert float(actual.gradients["camera_from_body"].abs().max()) == 0
+
+
+CAMERA = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
+
+
+def three_views(splats, device):
+    """Two views of one size, apart, and a smaller one that looks at nothing."""
+    scene = splats(200, features=2)
+    scene["opacity"] = scene["opacity"].clamp(max=0.98)
+    tensors = {
+        name: value.to(device, torch.float32 if value.is_floating_point() else value.dtype)
+        for name, value in scene.items()
+        if torch.is_tensor(value) and name != "screen_offset"
+    }
+    transforms = tensors.pop("camera_from_body").repeat(3, 1, 1, 1)
+    transforms[1, :, 0, 3] += 0.5
+    transforms[2, :, 2, 3] -= 1e3
+    camera = {name: scene[name] for name in CAMERA}
+    views = [SplatView(**camera), SplatView(**camera), SplatView(**camera | {"width_px": 31})]
+    return tensors, transforms.requires_grad_(), views
+
+
+def loss_of(images):
+    return sum((image.rgb.square().sum() + image.alpha.sum()) for image in images)
+
+
+@pytest.mark.parametrize("packed", [True, False])
+@pytest.mark.parametrize("backend", ["stand-in", ON_CUDA])
+def test_packed_views_are_those_drawn_one_by_one(splats, backend, packed):
+    device = "cuda" if backend == "cuda" else "cpu"
+    tensors, transforms, views = three_views(splats, device)
+    expected = render_views(
+        **tensors, camera_from_body=transforms, views=views, backend="reference"
+    )
+    loss_of(expected).backward()
+    truth, transforms.grad = transforms.grad, None
+    out = torch.full((3, 200), 7.0, device=device)
+    images = render_views(
+        **tensors,
+        camera_from_body=transforms,
+        views=views,
+        screen_gradients_out=out,
+        backend=named(backend),
+        packed=packed,
+    )
+    loss_of(images).backward()
+    for image, law in zip(images, expected, strict=True):
+        assert float((image.rgb - law.rgb).detach().abs().mean()) < 1e-5
+        assert torch.equal(image.visible, law.visible)
+    assert float((transforms.grad - truth).norm()) < GRADIENT_ERROR["cuda"] * float(truth.norm())
+    assert bool((out[:2] > 0).any(dim=1).all())
+    assert float(out[2].abs().max()) == 0
+
+
+def test_one_packed_call_holds_all_views_of_one_size(splats, monkeypatch):
+    tensors, transforms, views = three_views(splats, "cpu")
+    transforms.data[2] = transforms.data[0]
+    calls, isect_tiles = [], documented_gsplat.isect_tiles
+
+    def counted(*arguments, **options):
+        calls.append(options.get("n_images"))
+        return isect_tiles(*arguments, **options)
+
+    monkeypatch.setattr(documented_gsplat, "isect_tiles", counted)
+    inputs = SplatInputs(
+        **tensors, camera_from_body=transforms, screen_offset=torch.zeros(3, 200, 2)
+    )
+    cuda.draw_with(documented_gsplat, inputs, views, None, packed=True)
+    assert calls == [2, 1]
+    cuda.draw_with(documented_gsplat, inputs, views, None, packed=False)
+    assert calls == [2, 1, None, None, None]
 
 
 def pretend_gsplat(monkeypatch, backend):

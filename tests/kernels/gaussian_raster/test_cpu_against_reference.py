@@ -14,7 +14,15 @@ from lidarpainter_models.kernels.gaussian_raster import render_gaussians
 # below hold no Gaussian that one side just cuts and the other just keeps: one such pixel in twenty
 # scenes moves a gradient by 1e-4.
 PICTURE_ERROR = 1e-6
-GRADIENT_ERROR = 6e-6
+GRADIENT_ERROR = 3e-6
+OPAQUE_GRADIENT_ERROR = 6e-6
+"""Where alphas come near their clamp, 0.99. What lies behind a Gaussian is the picture minus what
+was passed, and counts by alpha / (1 - alpha), a hundredfold: 5.2e-6 in the rotations. Put into
+float64 one by one, the running sums of the drawn picture make 5.6e-6 of it in opacity, those of
+what was passed 3.3e-6, the exponential 7e-7, rounding of the finished picture 7e-7. Compensated
+sums of what was passed gave 4.9e-6 for a tenth of the time of going back; of the picture they would
+take four more sums a lane in drawing.
+"""
 
 
 def picture_errors(actual, expected):
@@ -62,7 +70,8 @@ def test_picture_and_gradients_match_float64_autograd(splats, draw, case):
     assert torch.allclose(actual.image.radius_px.double(), expected.image.radius_px, rtol=1e-5)
     assert max(picture_errors(actual.image, expected.image).values()) < PICTURE_ERROR
     errors = relative_errors(actual.gradients, expected.gradients)
-    assert max(errors.values()) < GRADIENT_ERROR, errors
+    most = OPAQUE_GRADIENT_ERROR if case == "large and opaque" else GRADIENT_ERROR
+    assert max(errors.values()) < most, errors
     absolute, truth = actual.absolute_gradient, expected.absolute_gradient
     assert (absolute - truth).norm() < GRADIENT_ERROR * truth.norm()
     assert torch.equal(absolute == 0, truth == 0)
