@@ -18,15 +18,25 @@ def painter_digest(name_or_path: str) -> str:
     Raises:
         WeightsError: no such painter, or its weights are missing.
     """
-    if name_or_path == "nano":
-        return _weights_digest(BUNDLED_NANO)
     if is_one_step(name_or_path):
         _, preset = split_preset(name_or_path)
-        parts = [_large_digest(path) for path in painter_files(name_or_path)]
+        parts = [_large_digest(path) for path in files_of_painter(name_or_path)]
         return digest_text("\n".join([preset, *parts]))
-    if name_or_path in PAINTER_NAMES:
-        return name_or_path
-    return _weights_digest(Path(name_or_path))
+    files = files_of_painter(name_or_path)
+    return _weights_digest(files[0]) if files else name_or_path
+
+
+def files_of_painter(name_or_path: str) -> list[Path]:
+    """The files that a painter is made of; none for one that learns nothing.
+
+    Raises:
+        WeightsError: a model is not there.
+    """
+    if name_or_path == "nano":
+        return [BUNDLED_NANO]
+    if is_one_step(name_or_path):
+        return painter_files(name_or_path)
+    return [] if name_or_path in PAINTER_NAMES else [Path(name_or_path)]
 
 
 def _large_digest(path: Path) -> str:

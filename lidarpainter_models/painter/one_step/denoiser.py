@@ -26,7 +26,10 @@ class Float32Layer(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Run the layer on its input in float32."""
-        with torch.autocast(features.device.type, enabled=False):
+        device = features.device.type
+        if not torch.amp.is_autocast_available(device):  # the meta device
+            return self.layer(features.float())
+        with torch.autocast(device, enabled=False):
             return self.layer(features.float())
 
 

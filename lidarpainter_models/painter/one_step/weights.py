@@ -1,8 +1,8 @@
 """Weights files of the one-step painter: what training changed, and which model it stands on.
 
 One safetensors file under 20 MB at full size: adapters and skips in bfloat16, the U-Net's first
-and last layer and the fusion in float32, and the encoded prompts. The model itself is not in it; the header
-names it, with a few of its biases by which another model is found out.
+and last layer and the fusion in float32, and the encoded prompts. The model itself is not in it;
+the header names it, with a few of its biases by which another model is found out.
 """
 
 import json
@@ -95,8 +95,12 @@ def save_trained(
 
 
 def _stored(name: str, tensor: Tensor) -> Tensor:
-    dtype = torch.float32 if name.startswith(IN_FLOAT32) else torch.bfloat16
-    return tensor.detach().cpu().to(dtype).contiguous()
+    return tensor.detach().cpu().to(stored_type(name)).contiguous()
+
+
+def stored_type(name: str) -> torch.dtype:
+    """The type in which a weight is stored."""
+    return torch.float32 if name.startswith(IN_FLOAT32) else torch.bfloat16
 
 
 def read_trained(path: Path) -> TrainedFile:
