@@ -25,6 +25,7 @@ from lidarpainter_models.painter.one_step.lora import (
     merge_lora,
 )
 from lidarpainter_models.painter.one_step.network import OneStepNetwork
+from lidarpainter_models.painter.one_step.upsampling import phase_upsamplings
 
 FIRST_LAYER = "denoiser.unet.conv_in."
 LAST_LAYER = "denoiser.unet.conv_out."
@@ -74,9 +75,10 @@ def _autoencoder_parts(
     return SkipAutoencoder(autoencoder, has_skips=has_skips, skip_bias=config.skip_bias)
 
 
-def merged(network: OneStepNetwork) -> OneStepNetwork:
-    """The same network with its adapters merged, in place."""
+def made_lean(network: OneStepNetwork) -> OneStepNetwork:
+    """The same network for use alone, in place: adapters merged, doublings by phases."""
     merge_lora(network)
+    phase_upsamplings(network)
     return network
 
 

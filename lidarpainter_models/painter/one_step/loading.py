@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from lidarpainter_models.errors import WeightsError
-from lidarpainter_models.painter.one_step.assembly import assemble, merged
+from lidarpainter_models.painter.one_step.assembly import assemble, made_lean
 from lidarpainter_models.painter.one_step.base_models import (
     SD_TURBO,
     BaseModel,
@@ -46,7 +46,7 @@ def load_one_step(
     Args:
         name: see the module.
         dtype: type of the weights; the step, the fusion and the U-Net's last layer stay float32.
-        merges: merge trained adapters into the model; without, they can be trained on.
+        merges: merge adapters into the model and make it lean; without, it can be trained on.
         may_download: fetch a model of the hub that is not in the user's cache.
 
     Raises:
@@ -62,6 +62,8 @@ def load_one_step(
     prompts = _open_prompts(base, {})
     parts = load_parts(base, config, dtype=dtype)
     network = assemble(config, parts.unet, parts.autoencoder, has_adapters=not merges)
+    if merges:
+        made_lean(network)
     return OneStepPainter(network, prompts, _origin(base, parts) | {"trained_targets": []})
 
 
@@ -81,7 +83,7 @@ def load_trained(
     network = assemble(file.config, parts.unet, parts.autoencoder, has_adapters=True)
     apply_trained(network, file)
     if merges:
-        merged(network)
+        made_lean(network)
     origin = _origin(base, parts) | {"licence": file.licence}
     return OneStepPainter(network, prompts, file.provenance | origin)
 

@@ -2,9 +2,9 @@
 
 `plain` is the paper's network as one would first write it: two encodings, adapters beside their
 layers, the text encoder run for every view, weights built in float32 and then rounded. `lean` is
-how `OneStepPainter` runs: one batch through the encoder, adapters merged, the text encoded before,
-channels last, weights built in bfloat16. `taesd` is `lean` with the tiny autoencoder. All three
-have the same random weights.
+how `OneStepPainter` runs: one batch through the encoder, adapters merged, doublings by phases
+(`upsampling.py`), the text encoded before, channels last, weights built in bfloat16. `taesd` is
+`lean` with the tiny autoencoder. All three have the same random weights.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ from lidarpainter_models.painter.one_step.architectures import (
 )
 from lidarpainter_models.painter.one_step.assembly import (
     fill_randomly,
-    merged,
+    made_lean,
     random_network,
 )
 from lidarpainter_models.painter.one_step.presets import fast, paper
@@ -44,7 +44,7 @@ def build_wiring(wiring: Wiring, architecture: Architecture = SD_TURBO) -> Paint
         return _plain(architecture)
     # the tiny autoencoder has no adapters; time and fusion are those of `paper` in all three
     config = paper() if wiring == "lean" else replace(fast(), timestep=paper().timestep)
-    network = merged(
+    network = made_lean(
         random_network(config, architecture=architecture, seed=_SEED, has_adapters=True)
     )
     # torch's stub lacks memory_format

@@ -6,11 +6,10 @@ import pytest
 import torch
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.painter.one_step.assembly import merged
 from lidarpainter_models.painter.one_step.config import OneStepConfig
 from lidarpainter_models.painter.one_step.denoiser import widen_first_layer
 from lidarpainter_models.painter.one_step.latent_fusion import FusionConfig, LatentFusion
-from lidarpainter_models.painter.one_step.lora import is_adapted
+from lidarpainter_models.painter.one_step.lora import is_adapted, merge_lora
 from lidarpainter_models.painter.one_step.presets import PRESETS, paper, with_reference
 
 SKIPS = ("skip_conv_1", "skip_conv_2", "skip_conv_3", "skip_conv_4")
@@ -102,7 +101,7 @@ def test_merged_adapters_do_the_same_in_fewer_layers(make_network, make_inputs):
     plain = make_network(paper())(pictures, text)
     assert not torch.allclose(expected.rgb, plain.rgb, atol=1e-2)  # they do something
     num_layers = len(list(network.modules()))
-    network = merged(network)
+    merge_lora(network)
     actual = network(pictures, text)
     assert not any(is_adapted(module) for module in network.modules())
     assert len(list(network.modules())) < num_layers / 2
