@@ -1,6 +1,7 @@
 """Putting the parts of a one-step network together, with trained, random or no weights."""
 
 import math
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -112,9 +113,10 @@ def random_network(
         nn.Module.to(part, dtype).to_empty(device="cpu")
         fill_randomly(part, seed=seed)
     network = assemble(config, unet, autoencoder, has_adapters=has_adapters, seed=seed)
+    pool = _pool(seed)
     for name, parameter in network.named_parameters():
         if ADAPTER_MARK in name:
-            _fill(parameter, _pool(seed), scale=0.02)
+            _fill(parameter, pool, scale=0.02)
     return network.requires_grad_(False)
 
 
@@ -139,14 +141,15 @@ def fill_randomly(module: nn.Module, *, seed: int) -> None:
             parameter.fill_(1.0 if name.endswith("weight") else 0.0)
 
 
+@lru_cache(maxsize=2)
 def _pool(seed: int) -> Tensor:
     return torch.randn(_POOL, generator=torch.Generator().manual_seed(seed))
 
 
 @torch.no_grad()
 def _fill(parameter: Tensor, pool: Tensor, *, scale: float) -> None:
-    scaled = (pool * scale).to(parameter.dtype)
     flat = parameter.view(-1)
+    scaled = (pool[: flat.numel()] * scale).to(parameter.dtype)
     for first in range(0, flat.numel(), _POOL):
         part = flat[first : first + _POOL]
         part.copy_(scaled[: part.numel()])

@@ -25,25 +25,35 @@ def own_model(model_folder, tmp_path):
     return shutil.copytree(model_folder, tmp_path / "small-turbo")
 
 
-@pytest.fixture
-def trained(own_model, tmp_path):
+@pytest.fixture(scope="module")
+def training(model_folder, tmp_path_factory):
     """A weights file whose every weight was changed, and the painter it was saved from."""
-    painter = load_one_step(f"{own_model}:paper", merges=False)
+    painter = load_one_step(f"{model_folder}:paper", merges=False)
     generator = torch.Generator().manual_seed(0)
     state = dict(painter.network.named_parameters())
     with torch.no_grad():
         for name in trained_names(painter.network):
             state[name].add_(0.02 * torch.randn(state[name].shape, generator=generator))
-    path = tmp_path / "trained.safetensors"
+    path = tmp_path_factory.mktemp("trained") / "trained.safetensors"
     save_trained(
         painter.network,
         path,
         prompts=painter.prompts.encoded,
-        base=str(own_model),
+        base=str(model_folder),
         mark=painter.provenance["mark"],
         licence="see the model",
         provenance={"steps": 3, "trained_targets": ["a"]},
     )
+    return painter, path
+
+
+@pytest.fixture
+def trained(training, own_model, tmp_path):
+    """A copy of the weights file beside a copy of its model, and the painter."""
+    painter, original = training
+    path = tmp_path / original.name
+    shutil.copy(original, path)
+    respell(path, lambda header, _: header.update(base=str(own_model)))
     return painter, path
 
 
