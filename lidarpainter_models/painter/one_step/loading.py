@@ -30,6 +30,7 @@ from lidarpainter_models.painter.one_step.weights import TrainedFile, apply_trai
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
 
 SUFFIX = ".safetensors"
+UNTRAINED = "none for repairing renders: the model as it comes"
 MARK_TOLERANCE = 1e-2
 """Biases of one model agree to this share in float32, float16 and bfloat16."""
 
@@ -64,7 +65,8 @@ def load_one_step(
     network = assemble(config, parts.unet, parts.autoencoder, has_adapters=not merges)
     if merges:
         made_lean(network)
-    return OneStepPainter(network, prompts, _origin(base, parts) | {"trained_targets": []})
+    untrained = {"training": UNTRAINED, "trained_targets": []}
+    return OneStepPainter(network, prompts, _origin(base, parts) | untrained)
 
 
 def load_trained(

@@ -1,9 +1,10 @@
 """Reading safetensors straight into a network: checked by name and shape, one tensor at a time.
 
-A file is mapped into memory while it is read; opening it anew for every few tensors lets those
-pages go, so a float32 file never lies beside the bfloat16 weights that it becomes.
+A file is mapped into memory while it is read; opening it anew after every 128 MB lets those pages
+go, so a float32 file never lies beside the bfloat16 weights that it becomes.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +16,8 @@ from torch import Tensor, nn
 
 from lidarpainter_models.errors import WeightsError
 
-TENSORS_AT_ONCE = 32
+PORTION_NUMBERS = 1 << 25
+"""Numbers that are read before the file is opened anew: 128 MB of float32."""
 
 Adapt = Callable[[str, Tensor], Tensor]
 """Makes a stored tensor fit the network: its name in the network, the tensor."""
@@ -46,17 +48,30 @@ def fill_from_file(
     expected = {name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
     stored = {renamed(name): (name, shape) for name, shape in stored_shapes(path).items()}
     check_shapes(path, {name: shape for name, (_, shape) in stored.items()}, expected, widened)
-    names = list(stored)
-    for first in range(0, len(names), TENSORS_AT_ONCE):
+    for names in _portions({name: shape for name, (_, shape) in stored.items()}):
         part: dict[str, Tensor] = {}
         with open_tensors(path) as file:
-            for name in names[first : first + TENSORS_AT_ONCE]:
+            for name in names:
                 tensor = file.get_tensor(stored[name][0])
                 check_finite(path, name, tensor)
                 tensor = adapt(name, tensor) if adapt else tensor
                 part[name] = torch.empty(tensor.shape, dtype=dtype).copy_(tensor)
                 del tensor
         module.load_state_dict(part, strict=False, assign=True)
+
+
+def _portions(shapes: Mapping[str, tuple[int, ...]]) -> Iterator[list[str]]:
+    """Names of tensors in groups that together hold few numbers, or one tensor that holds many."""
+    portion: list[str] = []
+    total = 0
+    for name, shape in shapes.items():
+        total += math.prod(shape)
+        portion.append(name)
+        if total >= PORTION_NUMBERS:
+            yield portion
+            portion, total = [], 0
+    if portion:
+        yield portion
 
 
 def check_shapes(

@@ -2,6 +2,9 @@
 
 import json
 import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -16,6 +19,7 @@ from lidarpainter_models.painter.one_step.presets import PRESETS
 from lidarpainter_models.painter.one_step.weights import METADATA_KEY, read_header, save_trained
 
 FLOAT = torch.float32
+ROOT = Path(__file__).resolve().parents[3]
 UNET = "unet/diffusion_pytorch_model.safetensors"
 
 
@@ -226,6 +230,36 @@ def test_a_model_nobody_has_is_not_fetched(monkeypatch, tmp_path):
         with pytest.raises(WeightsError, match="nothing is downloaded unasked") as caught:
             load_painter(name)
         assert "\n" not in str(caught.value)
+
+
+LOADING = """
+import sys
+from pathlib import Path
+import torch
+from lidarpainter_models.painter.one_step import tensor_files
+from tasks.measuring import measured
+
+tensor_files.PORTION_NUMBERS = 1 << 22  # 16 MB of float32
+with torch.device("meta"):
+    layers = [torch.nn.Linear(2048, 2048, bias=False) for _ in range(24)]
+    module = torch.nn.Sequential(*layers)
+with measured() as nothing:
+    pass
+with measured() as loading:
+    tensor_files.fill_from_file(module, Path(sys.argv[1]), dtype=torch.bfloat16)
+assert all(bool((layer.weight == 1).all()) for layer in module)
+print(loading.peak_memory_bytes - nothing.peak_memory_bytes)
+"""
+
+
+def test_a_float32_file_never_lies_beside_its_bfloat16_weights(tmp_path):
+    path = tmp_path / "large.safetensors"
+    save_file({f"{index}.weight": torch.ones(2048, 2048) for index in range(24)}, path)
+    command = [sys.executable, "-c", LOADING, str(path)]
+    answer = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert answer.returncode == 0, answer.stderr
+    weights = 2 * 24 * 2048**2  # 201 MB; with a float32 copy of it all it would be three times that
+    assert 0.9 * weights < int(answer.stdout) < 1.8 * weights
 
 
 def test_a_missing_extra_names_itself(monkeypatch, model_folder):
