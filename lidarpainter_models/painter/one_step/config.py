@@ -1,7 +1,7 @@
 """Settings of the one-step painter: which inputs it sees and how its parts are wired."""
 
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.one_step.denoiser import FirstLayerStart
@@ -14,9 +14,21 @@ recorded pictures carried into the view (the first valid one, the render where n
 NUM_MASKS = 2
 """Share of LiDAR hits and of valid warps in each latent cell."""
 
+LARGEST_RANK = 256
+"""Of an adapter; larger ones are no longer small beside their layer."""
+
 AutoencoderKind = Literal["sd", "taesd"]
 SkipSource = Literal["none", "render", "fused"]
 LidarInput = Literal["pure", "over-render", "bright-over-render"]
+DenoiserInput = Literal["latents", "fused"]
+_CHOICES = {
+    "autoencoder": get_args(AutoencoderKind),
+    "denoise": get_args(Denoise),
+    "skips": get_args(SkipSource),
+    "first_layer": get_args(FirstLayerStart),
+    "denoiser_sees": get_args(DenoiserInput),
+    "lidar": get_args(LidarInput),
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,7 +48,7 @@ class OneStepConfig:
     """Whose features the decoder sees: the first input's, a mix weighed as the latents, or none."""
     skip_bias: bool = False
     first_layer: FirstLayerStart = "zero"
-    denoiser_sees: Literal["latents", "fused"] = "latents"
+    denoiser_sees: DenoiserInput = "latents"
     """All latents side by side, or only their mix (an ablation)."""
     masks: bool = False
     """Two more channels for the U-Net: shares of LiDAR hits and of valid warps."""
@@ -60,8 +72,8 @@ class OneStepConfig:
             raise ConfigError("the tiny autoencoder has no skips and no LoRA: set none and 0")
         if self.skips == "fused" and self.fusion is None:
             raise ConfigError("fused skips need a fusion")
-        if min(self.unet_rank, self.autoencoder_rank) < 0:
-            raise ConfigError("LoRA ranks must not be negative")
+        if not {self.unet_rank, self.autoencoder_rank} <= set(range(LARGEST_RANK + 1)):
+            raise ConfigError(f"LoRA ranks must be in [0, {LARGEST_RANK}]")
         denoising_step(self.timestep)
 
     @property
@@ -85,6 +97,9 @@ class OneStepConfig:
         Raises:
             ConfigError: a field is missing, unknown or of a wrong value.
         """
+        for name, choices in _CHOICES.items():
+            if values.get(name) not in choices:
+                raise ConfigError(f"{name} must be of {choices}, got {values.get(name)!r}")
         try:
             fusion = values["fusion"] and FusionConfig(**values["fusion"])
             config = cls(**values | {"inputs": tuple(values["inputs"]), "fusion": fusion})

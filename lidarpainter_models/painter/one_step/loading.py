@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 from lidarpainter_models.errors import WeightsError
+from lidarpainter_models.painter.one_step.architectures import TEXT_TOKENS
 from lidarpainter_models.painter.one_step.assembly import assemble, made_lean
 from lidarpainter_models.painter.one_step.base_models import (
     SD_TURBO,
@@ -143,9 +144,20 @@ def _base_of(file: TrainedFile, *, may_download: bool) -> BaseModel:
 
 
 def _open_prompts(base: BaseModel, encoded: dict[str, torch.Tensor]) -> PromptBook:
-    """The prompts, the default one encoded now: before the U-Net is there, memory is free."""
+    """The prompts, the default one encoded now: before the U-Net is there, memory is free.
+
+    Raises:
+        WeightsError: they are not what the U-Net expects.
+    """
     prompts = PromptBook(encoded, base.folder)
     prompts.encode(DEFAULT_PROMPT)
+    expected = (TEXT_TOKENS, base.architecture.text_width)
+    for prompt, text in prompts.encoded.items():
+        if tuple(text.shape) != expected:
+            raise WeightsError(
+                f"prompt {prompt!r} for {base.folder} is encoded as {tuple(text.shape)}, its U-Net "
+                f"expects {expected}"
+            )
     return prompts
 
 

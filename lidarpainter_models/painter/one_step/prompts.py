@@ -85,6 +85,7 @@ def encode_text(folder: Path, text: str) -> Float[Tensor, "tokens features"]:
             dtype=torch.bfloat16,
             output_loading_info=True,
         )
+        text_features = run_text_encoder(encoder, tokenize(tokenizer, text))
     except Exception as error:  # noqa: BLE001 - many kinds for one thing: the files do not fit
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise WeightsError(f"the text encoder of {folder} cannot be used: {reason}") from None
@@ -92,7 +93,7 @@ def encode_text(folder: Path, text: str) -> Float[Tensor, "tokens features"]:
         if found[kind]:
             name = sorted(map(str, found[kind]))[0]
             raise WeightsError(f"the text encoder of {folder} has {kind.replace('_', ' ')}: {name}")
-    return run_text_encoder(encoder, tokenize(tokenizer, text))
+    return text_features
 
 
 def tokenize(tokenizer: Any, text: str) -> Tensor:  # noqa: ANN401 - transformers' CLIPTokenizer

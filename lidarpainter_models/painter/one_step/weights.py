@@ -116,6 +116,7 @@ def read_trained(path: Path) -> TrainedFile:
     try:
         config = OneStepConfig.from_dict(header["config"])
         mark = [float(value) for value in header["mark"]]
+        provenance = {**header["provenance"]}
     except (ConfigError, TypeError, ValueError) as error:
         raise WeightsError(f"weights file {path} has unusable settings: {error}") from None
     tensors: dict[str, Tensor] = {}
@@ -134,7 +135,7 @@ def read_trained(path: Path) -> TrainedFile:
         base=str(header["base"]),
         mark=mark,
         licence=str(header["licence"]),
-        provenance=dict(header["provenance"]),
+        provenance=provenance,
         tensors=tensors,
         prompts=prompts,
     )

@@ -130,6 +130,9 @@ def respell(path, change):
         (lambda header, _: header.update(mark=[1.0, 2.0]), "trained on another model"),
         (lambda header, _: header.update(mark="abc"), "unusable settings"),
         (lambda header, _: header["config"].update(timestep=-5), "unusable settings"),
+        (lambda header, _: header.update(provenance="x"), "unusable settings"),
+        (lambda header, _: header["config"].update(autoencoder="jpeg"), "unusable settings"),
+        (lambda _, tensors: tensors.update({"prompt:clear": torch.zeros(3, 4)}), "is encoded as"),
         (lambda header, _: header.update(base="/nowhere"), "needs its model: no painter '/now"),
         (lambda _, tensors: tensors.pop("fusion.layers.0.bias"), "'fusion.layers.0.bias' has sh"),
         (lambda _, tensors: tensors.update(more=torch.zeros(1)), r"'more' has shape \(1,\), exp"),
@@ -146,7 +149,7 @@ def test_wrong_weights_files_are_one_clear_line(trained, change, message):
     with pytest.raises(WeightsError, match=message) as caught:
         load_one_step(str(path))
     assert "\n" not in str(caught.value)
-    assert str(path) in str(caught.value)
+    assert str(path.parent) in str(caught.value)
 
 
 def narrower(folder):
@@ -202,7 +205,7 @@ def half_a_text_encoder(folder):
         (pickled, "is a pickle, which is not read"),
         (without("mid_block.resnets.0.conv1.weight"), "conv1.weight' has shape None, expected"),
         (not_finite, "'conv_in.bias' holds values that are no number"),
-        (narrower, r"has shape \(\d+, 16\), expected \(\d+, 8\)"),
+        (narrower, r"expects \(77, 8\)"),
         (nameless, "make no network"),
         (half_a_text_encoder, "has missing keys"),
         (lambda folder: shutil.rmtree(folder / "tokenizer"), "text encoder of"),

@@ -241,6 +241,7 @@ def test_the_authors_fusion_has_56_parameters():
         {"skips": "fused", "fusion": None},
         {"timestep": 1000},
         {"unet_rank": -1},
+        {"unet_rank": 10**9},
     ],
 )
 def test_wirings_that_cannot_be_are_refused(settings):
@@ -256,7 +257,16 @@ def test_settings_survive_json(preset):
     assert OneStepConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
 
-@pytest.mark.parametrize("change", [{"colour": 1}, {"fusion": {"kind": 3}}, {"timestep": 5000}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"autoencoder": "jpeg"},
+        {"lidar": []},
+        {"colour": 1},
+        {"fusion": {"kind": 3}},
+        {"timestep": 5000},
+    ],
+)
 def test_settings_of_something_else_are_refused(change):
     with pytest.raises(ConfigError):
         OneStepConfig.from_dict(paper().to_dict() | change)
