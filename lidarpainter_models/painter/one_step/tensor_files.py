@@ -48,16 +48,16 @@ def fill_from_file(
     expected = {name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
     stored = {renamed(name): (name, shape) for name, shape in stored_shapes(path).items()}
     check_shapes(path, {name: shape for name, (_, shape) in stored.items()}, expected, widened)
+    # all of it before the first read: read buffers between them would leave holes behind
+    weights = {name: torch.empty(shape, dtype=dtype) for name, shape in expected.items()}
     for names in _portions({name: shape for name, (_, shape) in stored.items()}):
-        part: dict[str, Tensor] = {}
         with open_tensors(path) as file:
             for name in names:
                 tensor = file.get_tensor(stored[name][0])
                 check_finite(path, name, tensor)
-                tensor = adapt(name, tensor) if adapt else tensor
-                part[name] = torch.empty(tensor.shape, dtype=dtype).copy_(tensor)
+                weights[name].copy_(adapt(name, tensor) if adapt else tensor)
                 del tensor
-        module.load_state_dict(part, strict=False, assign=True)
+    module.load_state_dict(weights, assign=True)
 
 
 def _portions(shapes: Mapping[str, tuple[int, ...]]) -> Iterator[list[str]]:

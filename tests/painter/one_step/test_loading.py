@@ -262,7 +262,7 @@ def test_a_float32_file_never_lies_beside_its_bfloat16_weights(tmp_path):
     answer = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert answer.returncode == 0, answer.stderr
     weights = 2 * 24 * 2048**2  # 201 MB; with a float32 copy of it all it would be three times that
-    assert 0.9 * weights < int(answer.stdout) < 1.8 * weights
+    assert 0.9 * weights < int(answer.stdout) < 2.2 * weights
 
 
 def test_a_missing_extra_names_itself(monkeypatch, model_folder):
