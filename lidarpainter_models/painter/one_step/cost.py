@@ -5,6 +5,7 @@ multiplication with its addition counts as two operations.
 """
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -46,7 +47,7 @@ def count_parameters(
     `unet` and `autoencoder` are those of the model underneath; `first_layer_added` is what further
     inputs add to the U-Net's first layer.
     """
-    network = empty_network(config, architecture=architecture, has_adapters=True)
+    network = _shapes(config, architecture, has_adapters=True)
     counts = {name: parameter.numel() for name, parameter in network.named_parameters()}
 
     def total(prefix: str, *, adapters: bool) -> int:
@@ -91,7 +92,7 @@ def count_tflop(
     """
     if min(height_px, width_px) < 1:
         raise ConfigError(f"a view needs pixels, got {width_px}x{height_px}")
-    network = empty_network(config, architecture=architecture)
+    network = _shapes(config, architecture, has_adapters=False)
     rows, columns = (-(-size // STRIDE_PX) * STRIDE_PX // CELL_PX for size in (height_px, width_px))
     pictures = torch.empty(len(config.inputs), 1, 3, rows * CELL_PX, columns * CELL_PX, device=META)
     text = torch.empty(1, TEXT_TOKENS, architecture.text_width, device=META)
@@ -113,8 +114,8 @@ def count_bytes(config: OneStepConfig, architecture: Architecture = SD_TURBO) ->
 
     The file is counted with the prompts of all styles.
     """
-    merged = empty_network(config, architecture=architecture)
-    network = empty_network(config, architecture=architecture, has_adapters=True)
+    merged = _shapes(config, architecture, has_adapters=False)
+    network = _shapes(config, architecture, has_adapters=True)
     state = dict(network.named_parameters())
     trained = sum(
         state[name].numel() * stored_type(name).itemsize for name in trained_names(network)
@@ -136,6 +137,14 @@ def describe_preset(config: OneStepConfig, *, height_px: int, width_px: int) -> 
         "tflop": count_tflop(config, height_px=height_px, width_px=width_px),
         "bytes": count_bytes(config),
     }
+
+
+@lru_cache(maxsize=8)
+def _shapes(
+    config: OneStepConfig, architecture: Architecture, *, has_adapters: bool
+) -> OneStepNetwork:
+    """A network without weights, kept because building a thousand layers takes a second."""
+    return empty_network(config, architecture=architecture, has_adapters=has_adapters)
 
 
 def _fusion_tflop(network: OneStepNetwork, rows: int, columns: int) -> float:
