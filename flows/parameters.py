@@ -31,8 +31,8 @@ class ViewParameters(BaseModel):
     """Cameras to train on and to judge; None takes all."""
     observation: ObservationConfig
     painter: str
-    """Name of a painter, path of its weights, or `none`: then the fit goes on as long without
-    painted views, which is the control for the painted one."""
+    """Name of a painter, path of its weights or model, or `none`: then the fit goes on as long
+    without painted views, which is the control for the painted one."""
     conditions: ConditionConfig
     scoring: ScoringConfig
     feature_weights: Path | None = None

@@ -41,5 +41,9 @@ class BackendError(LidarPainterError, RuntimeError):
     """A kernel backend was asked for that cannot run here."""
 
 
+class MissingPackageError(LidarPainterError, ImportError):
+    """A part of the package needs an extra that is not installed."""
+
+
 class StorageError(LidarPainterError, OSError):
     """The store cannot be written or read (disk full, permissions)."""

@@ -17,6 +17,7 @@ from lidarpainter_models.metrics.squeezenet import SqueezeNetDistance, load_sque
 from lidarpainter_models.painter import load_painter
 from lidarpainter_models.painter.examples import PairSource
 from lidarpainter_models.painter.nano.painter import NanoPainter
+from lidarpainter_models.painter.one_step.painter import OneStepPainter
 from lidarpainter_models.painter.protocol import Painter
 from tasks.harvest import PairSet
 from tasks.measuring import measured
@@ -154,7 +155,7 @@ def feature_distance_of(weights: Path | None) -> SqueezeNetDistance | None:
 
 def _trained_targets(painter: Painter) -> frozenset[str] | None:
     """What a painter was trained on; nothing for one that learns nothing, None if unknown."""
-    if isinstance(painter, NanoPainter):
+    if isinstance(painter, NanoPainter | OneStepPainter):
         return trained_targets(painter.provenance)
     return frozenset()
 

@@ -18,7 +18,7 @@ def demo(
     ] = 1,
     painter: Annotated[
         str | None,
-        typer.Option(help="none, overlay, warp, nano, or weights; the preset's if absent."),
+        typer.Option(help="none, overlay, warp, nano, weights or a model; the preset's if absent."),
     ] = None,
     settings: Annotated[
         list[str] | None,

@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
+from flows.cli import painter_costs
 from flows.cli.output import Cell, format_bytes, print_json, print_pairs, print_table
 from flows.cli.painter_options import (
     parse_inputs,
@@ -134,20 +135,30 @@ def evaluate(
 
 @app.command("info")
 def info(
-    painter: Annotated[str, typer.Option(help="A painter's name, or a weights file.")] = "nano",
+    painter: Annotated[
+        str | None, typer.Option(help="A painter's name (nano), a weights file, or a model.")
+    ] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option(help="A wiring of the one-step painter: paper, as-shipped, fast, ..."),
+    ] = None,
+    size: painter_costs.Size = "1024x576",
     as_json: AsJson = False,
 ) -> None:
-    """Say what a painter is and how it was trained."""
-    from lidarpainter_models.painter import BUNDLED_NANO, load_painter
+    """Say what a painter is, what it costs and how it was trained."""
+    if preset is not None:
+        painter_costs.show_preset(painter, preset, size, as_json=as_json)
+        return
+    painter = painter or "nano"
+    from lidarpainter_models.painter import load_painter
     from lidarpainter_models.painter.description import describe_painter
-    from tasks.painters import painter_digest
+    from tasks.painters import files_of_painter, painter_digest
 
     found = describe_painter(load_painter(painter))
-    path = BUNDLED_NANO if painter == "nano" else Path(painter)
     result = {
         "painter": painter,
         "digest": painter_digest(painter),
-        "num_bytes": path.stat().st_size if path.is_file() else 0,
+        "num_bytes": sum(path.stat().st_size for path in files_of_painter(painter)),
         **found,
     }
     if as_json:
@@ -186,6 +197,9 @@ def ablate(
         print_json(result)
     else:
         _show_scores(result)
+
+
+app.command("benchmark")(painter_costs.benchmark)
 
 
 def _show_pairs(pairs: list[dict[str, Any]]) -> None:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 
 WEIGHTS_SUFFIX = ".safetensors"
+_SIZE = re.compile(r"([1-9]\d{0,4})x([1-9]\d{0,4})")
 _SEEDS = re.compile(r"(\d+)(?::(\d+))?")
 
 
@@ -37,6 +38,18 @@ def parse_seeds(text: str | None) -> tuple[int, ...]:
     if len(set(seeds)) != len(seeds):
         raise ConfigError(f"seeds {text!r}: a seed is named twice")
     return tuple(seeds)
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Width and height of a picture: `1024x576`.
+
+    Raises:
+        ConfigError: the text says something else.
+    """
+    match = _SIZE.fullmatch(text)
+    if match is None:
+        raise ConfigError(f"size {text!r}: expected such as 1024x576")
+    return int(match[1]), int(match[2])
 
 
 def parse_inputs(text: str) -> frozenset[str]:

@@ -13,7 +13,7 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     preset: Annotated[str, typer.Option(help="preview, balanced or paper.")] = "preview",
     painter: Annotated[
         str | None,
-        typer.Option(help="none, overlay, warp, nano, or weights; the preset's if absent."),
+        typer.Option(help="none, overlay, warp, nano, weights or a model; the preset's if absent."),
     ] = None,
     shift: Annotated[
         str | None, typer.Option(help="Metres to both sides to paint at, such as 2,3.")

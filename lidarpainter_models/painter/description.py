@@ -2,7 +2,10 @@
 
 from typing import Any
 
+from torch import nn
+
 from lidarpainter_models.painter.nano.painter import NanoPainter
+from lidarpainter_models.painter.one_step.painter import OneStepPainter
 from lidarpainter_models.painter.protocol import Painter
 
 NO_LICENCE = "Apache-2.0, a rule of the package"
@@ -14,31 +17,44 @@ def describe_painter(painter: Painter) -> dict[str, Any]:
     A painter that learns nothing has no parameters, and its first sentence of documentation says
     what it does.
     """
-    if not isinstance(painter, NanoPainter):
-        summary = (type(painter).__doc__ or painter.name).strip().splitlines()[0]
-        return {
-            "name": painter.name,
-            "architecture": {"summary": summary},
-            "parameters": {},
-            "num_parameters": 0,
-            "licence": NO_LICENCE,
-            "provenance": {},
-        }
-    parts = {
-        name: sum(parameter.numel() for parameter in part.parameters())
-        for name, part in painter.network.named_children()
-    }
-    config = painter.network.config
-    provenance = dict(painter.provenance)
-    return {
-        "name": painter.name,
-        "architecture": {
+    if isinstance(painter, NanoPainter):
+        config = painter.network.config
+        architecture = {
             "summary": "residual U-Net that mixes candidate pictures, plus a bounded residual",
             **config.to_dict(),
             "candidates": list(config.candidates),
-        },
+        }
+        return _learned(painter.name, architecture, painter.network, painter.provenance)
+    if isinstance(painter, OneStepPainter):
+        architecture = {
+            "summary": "one step of a latent diffusion model, guided by LiDAR",
+            **painter.network.config.to_dict(),
+        }
+        return _learned(painter.name, architecture, painter.network, painter.provenance)
+    summary = (type(painter).__doc__ or painter.name).strip().splitlines()[0]
+    return {
+        "name": painter.name,
+        "architecture": {"summary": summary},
+        "parameters": {},
+        "num_parameters": 0,
+        "licence": NO_LICENCE,
+        "provenance": {},
+    }
+
+
+def _learned(
+    name: str, architecture: dict[str, Any], network: nn.Module, provenance: dict[str, Any]
+) -> dict[str, Any]:
+    parts = {
+        part: sum(parameter.numel() for parameter in module.parameters())
+        for part, module in network.named_children()
+    }
+    rest = dict(provenance)
+    return {
+        "name": name,
+        "architecture": architecture,
         "parameters": parts,
         "num_parameters": sum(parts.values()),
-        "licence": provenance.pop("licence", None),
-        "provenance": provenance,
+        "licence": rest.pop("licence", None),
+        "provenance": rest,
     }

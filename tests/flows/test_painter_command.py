@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from random_pairs import write_pairs
+from tiny_diffusion import write_model
 
 from catalog.store import STORE_ENVIRONMENT, open_store
 from flows.cli.main import main
@@ -77,6 +78,11 @@ def test_seeds_may_be_listed_and_ranged():
         (["harvest", "--scene", "toy/street", "--set", "harvest.wrong=1"], "no setting"),
         (["info", "--painter", "picasso"], "no painter 'picasso'"),
         (["info", "--painter", "none.safetensors"], "no painter weights at none.safetensors"),
+        (["info", "--preset", "cubist"], "no painter preset 'cubist'"),
+        (["info", "--preset", "fast", "--size", "big"], "expected such as 1024x576"),
+        (["info", "--preset", "fast", "--painter", "a.safetensors"], "has its own wiring"),
+        (["info", "--preset", "fast", "--painter", "/nowhere"], "no painter '/nowhere'"),
+        (["benchmark", "--size", "0x5"], "expected such as 1024x576"),
         (["evaluate", "--painter", "none", "--pairs", "/nowhere"], "no training pairs in /nowhere"),
         (["evaluate", "--painter", "none,none", "--pairs", "/nowhere"], "expected each once"),
         (["ablate", "--pairs-train", "/nowhere", "--pairs-test", "/else"], "no training pairs in"),
@@ -117,6 +123,33 @@ def test_info_of_a_rule_says_that_nothing_is_learnt(capsys):
     found = json.loads(capsys.readouterr().out)
     assert (found["num_parameters"], found["num_bytes"], found["digest"]) == (0, 0, "warp")
     assert found["architecture"]["summary"].startswith("Averages the render")
+
+
+def test_info_of_a_preset_tells_what_it_costs(capsys):
+    words = ["painter", "info", "--preset", "fast", "--size", "128x64"]
+    assert main([*words, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["parameters"]["unet"] == 865_910_724
+    assert found["size_px"] == [128, 64]
+    assert 0 < found["tflop"]["total"] < 0.1
+    assert found["bytes"]["trained_file"] < 20e6
+    assert "Stability AI" in found["licence"]
+    assert main(words) == 0
+    assert "brought by the user" in capsys.readouterr().out
+
+
+def test_a_model_in_diffusers_layout_is_described_and_judged(make_pairs, tmp_path, capsys):
+    folder = str(write_model(tmp_path / "small-turbo"))
+    assert main(["painter", "info", "--painter", folder, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["name"] == "one-step"
+    assert found["licence"] == "unknown"
+    assert found["num_bytes"] > 0
+    assert found["architecture"]["timestep"] == 999
+    words = ["--painter", f"{folder}:fast", "--pairs", make_pairs("a", [1])]
+    assert main(["painter", "evaluate", *words, "--json"]) == 0
+    judged = json.loads(capsys.readouterr().out)["painters"][f"{folder}:fast"]["total"]
+    assert judged["num_pairs"] == 1
 
 
 def test_evaluate_prints_every_painter_on_the_same_pairs(make_pairs, tmp_path, capsys):

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from tiny_diffusion import write_model
 from toy_store import SMALL, TOY_SCENE, write_toy_scene
 
 from catalog.store import open_store
@@ -91,6 +92,19 @@ def test_the_command_gives_numbers_a_report_and_a_catalog(store):
     assert again["run_id"] == result["run_id"]
     assert not any(again["computed_now"].values())
     assert again["recorded"] == result["recorded"]
+
+
+@pytest.mark.slow
+def test_a_model_in_diffusers_layout_paints_the_views(store, tmp_path):
+    folder = write_model(tmp_path / "small-turbo")
+    result = finish(start(store, f"painter={folder}:with-reference", "rounds=1"))
+    assert result["painter"] == f"{folder}:with-reference"
+    assert {"paint-1", "refine-1"} <= set(result["seconds"])
+    assert not any(
+        finish(start(store, f"painter={folder}:with-reference", "rounds=1"))[
+            "computed_now"
+        ].values()
+    )
 
 
 @pytest.mark.slow

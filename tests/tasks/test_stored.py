@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from tiny_diffusion import write_model
 
 from catalog.errors import DamagedArtefactError
 from lidarpainter_models.errors import WeightsError
@@ -51,6 +52,16 @@ def test_rules_are_named_and_weights_are_hashed(tmp_path):
     first = painter_digest(str(weights))
     weights.write_bytes(b"2")
     assert painter_digest(str(weights)) != first
+
+
+def test_a_models_digest_follows_its_files_and_wiring(tmp_path):
+    folder = write_model(tmp_path / "small-turbo")
+    first = painter_digest(str(folder))
+    assert painter_digest(f"{folder}:paper") == first
+    assert painter_digest(f"{folder}:fast") != first
+    path = folder / "tokenizer" / "merges.txt"
+    path.write_text(path.read_text() + "a b\n")
+    assert painter_digest(str(folder)) != first
 
 
 @pytest.mark.parametrize("name", ["picasso", "missing.safetensors", "weights.pt"])

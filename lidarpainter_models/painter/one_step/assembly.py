@@ -1,0 +1,155 @@
+"""Putting the parts of a one-step network together, with trained, random or no weights."""
+
+import math
+from functools import lru_cache
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from lidarpainter_models.painter.one_step.architectures import (
+    SD_TURBO,
+    Architecture,
+    build_tiny,
+    build_unet,
+    build_vae,
+)
+from lidarpainter_models.painter.one_step.autoencoder import SkipAutoencoder, TinyAutoencoder
+from lidarpainter_models.painter.one_step.config import OneStepConfig
+from lidarpainter_models.painter.one_step.denoiser import Denoiser
+from lidarpainter_models.painter.one_step.latent_fusion import LatentFusion
+from lidarpainter_models.painter.one_step.lora import (
+    ADAPTER_MARK,
+    AUTOENCODER_TARGETS,
+    UNET_TARGETS,
+    add_lora,
+    merge_lora,
+)
+from lidarpainter_models.painter.one_step.network import OneStepNetwork
+from lidarpainter_models.painter.one_step.upsampling import phase_upsamplings
+
+FIRST_LAYER = "denoiser.unet.conv_in."
+LAST_LAYER = "denoiser.unet.conv_out."
+SKIPS = "autoencoder.decoder.skip_convs."
+FUSION = "fusion."
+_POOL = 1 << 20
+"""Random numbers that are drawn; larger weights repeat them."""
+
+
+def assemble(
+    config: OneStepConfig,
+    unet: nn.Module,
+    autoencoder: Any,  # noqa: ANN401 - diffusers' AutoencoderKL or AutoencoderTiny
+    *,
+    has_adapters: bool,
+    seed: int = 0,
+) -> OneStepNetwork:
+    """Wire the parts; new weights follow from the seed and have the type of the U-Net's.
+
+    Args:
+        config: the wiring.
+        unet: with the configured number of input channels.
+        autoencoder: of the configured kind.
+        has_adapters: put adapters in, which change nothing before they are trained.
+        seed: of the adapters and the fusion.
+    """
+    dtype = next(unet.parameters()).dtype
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        if has_adapters:
+            add_lora(unet, rank=config.unet_rank, targets=UNET_TARGETS)
+            add_lora(autoencoder, rank=config.autoencoder_rank, targets=AUTOENCODER_TARGETS)
+        fusion = LatentFusion(config.fusion, len(config.inputs)) if config.fusion else None
+        parts = _autoencoder_parts(config, autoencoder).to(dtype)
+    nn.Module.to(unet, dtype)  # diffusers' own `to` warns about nothing
+    denoiser = Denoiser(unet, timestep=config.timestep)
+    return OneStepNetwork(config, autoencoder=parts, denoiser=denoiser, fusion=fusion).eval()
+
+
+def _autoencoder_parts(
+    config: OneStepConfig,
+    autoencoder: Any,  # noqa: ANN401 - diffusers' AutoencoderKL or AutoencoderTiny
+) -> SkipAutoencoder | TinyAutoencoder:
+    if config.autoencoder == "taesd":
+        return TinyAutoencoder(autoencoder)
+    has_skips = config.skips != "none"
+    return SkipAutoencoder(autoencoder, has_skips=has_skips, skip_bias=config.skip_bias)
+
+
+def made_lean(network: OneStepNetwork) -> OneStepNetwork:
+    """The same network for use alone, in place: adapters merged, doublings by phases."""
+    merge_lora(network)
+    phase_upsamplings(network)
+    return network
+
+
+def trained_names(network: OneStepNetwork) -> list[str]:
+    """Names of the weights that training changes: adapters, first layer, skips, fusion."""
+    whole = (FIRST_LAYER, SKIPS, FUSION)
+    return [
+        name
+        for name, _ in network.named_parameters()
+        if name.startswith(whole) or ADAPTER_MARK in name
+    ]
+
+
+def random_network(
+    config: OneStepConfig,
+    *,
+    architecture: Architecture = SD_TURBO,
+    dtype: torch.dtype = torch.bfloat16,
+    seed: int = 0,
+    has_adapters: bool = False,
+) -> OneStepNetwork:
+    """A network of the true size whose weights follow from the seed, for measuring and testing.
+
+    Adapters are random too, so that merging them changes something.
+    """
+    with torch.device("meta"):
+        unet = build_unet(architecture, config.first_layer_channels)
+        build = build_vae if config.autoencoder == "sd" else build_tiny
+        autoencoder = build(architecture)
+    for part in (unet, autoencoder):
+        nn.Module.to(part, dtype).to_empty(device="cpu")
+        fill_randomly(part, seed=seed)
+    network = assemble(config, unet, autoencoder, has_adapters=has_adapters, seed=seed)
+    pool = _pool(seed)
+    for name, parameter in network.named_parameters():
+        if ADAPTER_MARK in name:
+            _fill(parameter, pool, scale=0.02)
+    return network.requires_grad_(False)
+
+
+def empty_network(
+    config: OneStepConfig, *, architecture: Architecture = SD_TURBO, has_adapters: bool = False
+) -> OneStepNetwork:
+    """A network on the meta device: shapes without weights, for counting."""
+    with torch.device("meta"):
+        unet = build_unet(architecture, config.first_layer_channels)
+        build = build_vae if config.autoencoder == "sd" else build_tiny
+        return assemble(config, unet, build(architecture), has_adapters=has_adapters)
+
+
+@torch.no_grad()
+def fill_randomly(module: nn.Module, *, seed: int) -> None:
+    """Weights that keep activations near one: scaled by their inputs, norms one, biases zero."""
+    pool = _pool(seed)
+    for name, parameter in module.named_parameters():
+        if parameter.dim() > 1:
+            _fill(parameter, pool, scale=1 / math.sqrt(parameter[0].numel()))
+        else:
+            parameter.fill_(1.0 if name.endswith("weight") else 0.0)
+
+
+@lru_cache(maxsize=2)
+def _pool(seed: int) -> Tensor:
+    return torch.randn(_POOL, generator=torch.Generator().manual_seed(seed))
+
+
+@torch.no_grad()
+def _fill(parameter: Tensor, pool: Tensor, *, scale: float) -> None:
+    flat = parameter.view(-1)
+    scaled = (pool[: flat.numel()] * scale).to(parameter.dtype)
+    for first in range(0, flat.numel(), _POOL):
+        part = flat[first : first + _POOL]
+        part.copy_(scaled[: part.numel()])

@@ -1,0 +1,141 @@
+"""The two autoencoders: Stable Diffusion's with skips from encoder to decoder, and the tiny TAESD.
+
+Pictures are (batch, 3, height, width) in [-1, 1], latents (batch, 4, height / 8, width / 8) in the
+units of the noise schedule. Encoding takes the mode of the posterior, so nothing is random. What
+the encoder passes to the decoder is returned as values: no module keeps anything between calls.
+"""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.painter.one_step.skip_decoder import SkipDecoder, run_block
+
+CELL_PX = 8
+"""Side of the pixel block that one latent position stands for."""
+
+Skips = tuple[Tensor, ...]
+"""Features of the encoder, coarsest first; empty without skips."""
+
+
+class SkipAutoencoder(nn.Module):
+    """Stable Diffusion's autoencoder; the decoder may see the encoder's features."""
+
+    def __init__(self, vae: Any, *, has_skips: bool, skip_bias: bool = False) -> None:  # noqa: ANN401
+        """Take the parts of a diffusers `AutoencoderKL`.
+
+        Args:
+            vae: the autoencoder; its modules are used, its own `forward` is not.
+            has_skips: add the four skip convolutions.
+            skip_bias: give them a bias.
+
+        Raises:
+            ConfigError: the autoencoder does not reduce pictures eightfold to four channels.
+        """
+        super().__init__()
+        self.encoder: nn.Module = vae.encoder
+        self.quant_conv: nn.Module = vae.quant_conv or nn.Identity()
+        self.post_quant_conv: nn.Module = vae.post_quant_conv or nn.Identity()
+        self.decoder = SkipDecoder(
+            vae.decoder, vae.config.block_out_channels, has_skips=has_skips, skip_bias=skip_bias
+        )
+        self.scaling_factor = float(vae.config.scaling_factor)
+        self.is_checkpointed = False
+        check_latents(len(vae.config.block_out_channels) - 1, vae.config.latent_channels)
+
+    def encode(
+        self, pictures: Float[Tensor, "batch 3 height width"], *, num_skipped: int
+    ) -> tuple[Float[Tensor, "batch 4 rows columns"], Skips]:
+        """Latents of all pictures, and the inputs of the encoder's levels for the first ones."""
+        encoder: Any = self.encoder
+        features = encoder.conv_in(pictures)
+        skips: list[Tensor] = []
+        for block in encoder.down_blocks:
+            if num_skipped:
+                # a copy of a part lets the rest go
+                kept = features[:num_skipped]
+                skips.insert(0, kept.clone() if num_skipped < len(features) else kept)
+            features = run_block(block, features, is_checkpointed=self.is_checkpointed)
+        features = encoder.mid_block(features)
+        moments = encoder.conv_out(encoder.conv_act(encoder.conv_norm_out(features)))
+        mean, _ = self.quant_conv(moments).chunk(2, dim=1)
+        return mean * self.scaling_factor, tuple(skips)
+
+    def decode(
+        self, latents: Float[Tensor, "batch 4 rows columns"], skips: Skips
+    ) -> Float[Tensor, "batch 3 height width"]:
+        """Pictures of latents, not clamped."""
+        features = self.post_quant_conv(latents / self.scaling_factor)
+        return self.decoder(features, skips, is_checkpointed=self.is_checkpointed)
+
+
+class TinyAutoencoder(nn.Module):
+    """TAESD: 2.4 million parameters in place of 83.7, without skips.
+
+    Its latents have no posterior and are in the schedule's units already.
+    """
+
+    def __init__(self, tiny: Any) -> None:  # noqa: ANN401 - diffusers' AutoencoderTiny
+        super().__init__()
+        self.encoder: nn.Module = tiny.encoder
+        self.decoder: nn.Module = tiny.decoder
+        self.scaling_factor = float(tiny.config.scaling_factor)
+        check_latents(len(tiny.config.encoder_block_out_channels) - 1, tiny.config.latent_channels)
+
+    def encode(
+        self,
+        pictures: Float[Tensor, "batch 3 height width"],
+        *,
+        num_skipped: int,
+    ) -> tuple[Float[Tensor, "batch 4 rows columns"], Skips]:
+        """Latents of all pictures.
+
+        Raises:
+            ConfigError: skips are asked for.
+        """
+        if num_skipped:
+            raise ConfigError("the tiny autoencoder has no skips")
+        return self.encoder(pictures) * self.scaling_factor, ()
+
+    def decode(
+        self,
+        latents: Float[Tensor, "batch 4 rows columns"],
+        skips: Skips,  # noqa: ARG002 - the tiny decoder takes none
+    ) -> Float[Tensor, "batch 3 height width"]:
+        """Pictures of latents, not clamped."""
+        return self.decoder(latents / self.scaling_factor)
+
+
+def check_latents(num_halvings: int, num_channels: int) -> None:
+    """Refuse an autoencoder of other latents than Stable Diffusion's.
+
+    Raises:
+        ConfigError: the latents are not an eighth of the size with four channels.
+    """
+    if 2**num_halvings != CELL_PX or num_channels != 4:
+        raise ConfigError(
+            f"an autoencoder must reduce pictures {CELL_PX} times to 4 channels, this one reduces "
+            f"them {2**num_halvings} times to {num_channels}"
+        )
+
+
+def mix_skips(skips: Skips, weights: Float[Tensor, "inputs batch weights rows columns"]) -> Skips:
+    """The skips of several inputs as one, weighed as the latents were.
+
+    Args:
+        skips: features whose batch holds one input after the other.
+        weights: shares of the inputs at the latents' size; their mean over channels counts.
+    """
+    num_inputs = len(weights)
+    shares = weights.mean(dim=2)
+    mixed = []
+    for features in skips:
+        scaled = nn.functional.interpolate(
+            shares, size=features.shape[2:], mode="bilinear", align_corners=False
+        )
+        parts = features.unflatten(0, (num_inputs, -1))
+        mixed.append(torch.einsum("ib...,ibc...->bc...", scaled.to(features.dtype), parts))
+    return tuple(mixed)

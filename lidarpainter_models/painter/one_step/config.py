@@ -1,0 +1,110 @@
+"""Settings of the one-step painter: which inputs it sees and how its parts are wired."""
+
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal, get_args
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.painter.one_step.denoiser import FirstLayerStart
+from lidarpainter_models.painter.one_step.latent_fusion import LATENT_CHANNELS, FusionConfig
+from lidarpainter_models.painter.one_step.schedule import Denoise, denoising_step
+
+INPUTS = ("render", "lidar", "warp")
+"""What can enter as a latent, in this order: the corrupted render, the LiDAR picture, and the
+recorded pictures carried into the view (the first valid one, the render where none is)."""
+NUM_MASKS = 2
+"""Share of LiDAR hits and of valid warps in each latent cell."""
+
+LARGEST_RANK = 256
+"""Of an adapter; larger ones are no longer small beside their layer."""
+
+AutoencoderKind = Literal["sd", "taesd"]
+SkipSource = Literal["none", "render", "fused"]
+LidarInput = Literal["pure", "over-render", "bright-over-render"]
+DenoiserInput = Literal["latents", "fused"]
+_CHOICES = {
+    "autoencoder": get_args(AutoencoderKind),
+    "denoise": get_args(Denoise),
+    "skips": get_args(SkipSource),
+    "first_layer": get_args(FirstLayerStart),
+    "denoiser_sees": get_args(DenoiserInput),
+    "lidar": get_args(LidarInput),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OneStepConfig:
+    """How the parts of the one-step painter are wired; the defaults are the paper's."""
+
+    inputs: tuple[str, ...] = ("render", "lidar")
+    """Latents that enter, a subset of `INPUTS` in that order; one of them alone is an ablation."""
+    autoencoder: AutoencoderKind = "sd"
+    timestep: int = 999
+    """Time of the one step: 999 is SD-Turbo's own, 200 what the authors' program uses, 199 loses
+    twenty times less to rounding than 999."""
+    denoise: Denoise = "posterior"
+    fusion: FusionConfig | None = field(default_factory=FusionConfig)
+    """Weights of the latents that the step starts from; None starts from the first input alone."""
+    skips: SkipSource = "render"
+    """Whose features the decoder sees: the first input's, a mix weighed as the latents, or none."""
+    skip_bias: bool = False
+    first_layer: FirstLayerStart = "zero"
+    denoiser_sees: DenoiserInput = "latents"
+    """All latents side by side, or only their mix (an ablation)."""
+    masks: bool = False
+    """Two more channels for the U-Net: shares of LiDAR hits and of valid warps."""
+    lidar: LidarInput = "pure"
+    """`pure`: black where no point hits; `over-render`: the render there; `bright-over-render`: the
+    render also where LiDAR is darker than 0.2, as in the authors' program."""
+    is_signed: bool = True
+    """Pictures enter in [-1, 1]; otherwise in [0, 1], as in pix2pix-turbo."""
+    unet_rank: int = 8
+    """Rank of the U-Net's LoRA; 0 for none."""
+    autoencoder_rank: int = 4
+    """Rank of the autoencoder's LoRA; 0 for none."""
+
+    def __post_init__(self) -> None:
+        """Refuse wirings that cannot be built."""
+        if not self.inputs or tuple(name for name in INPUTS if name in self.inputs) != self.inputs:
+            raise ConfigError(f"inputs must be some of {INPUTS} in this order, got {self.inputs}")
+        if self.fusion is not None and len(self.inputs) == 1:
+            raise ConfigError(f"one input, {self.inputs[0]!r}, needs no fusion: set it to None")
+        if self.autoencoder == "taesd" and (self.skips != "none" or self.autoencoder_rank):
+            raise ConfigError("the tiny autoencoder has no skips and no LoRA: set none and 0")
+        if self.skips == "fused" and self.fusion is None:
+            raise ConfigError("fused skips need a fusion")
+        if not {self.unet_rank, self.autoencoder_rank} <= set(range(LARGEST_RANK + 1)):
+            raise ConfigError(f"LoRA ranks must be in [0, {LARGEST_RANK}]")
+        denoising_step(self.timestep)
+
+    @property
+    def num_latents(self) -> int:
+        """Latents that the U-Net sees."""
+        return 1 if self.denoiser_sees == "fused" else len(self.inputs)
+
+    @property
+    def first_layer_channels(self) -> int:
+        """Input channels of the U-Net."""
+        return LATENT_CHANNELS * self.num_latents + NUM_MASKS * self.masks
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as JSON types."""
+        return asdict(self) | {"inputs": list(self.inputs)}
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> "OneStepConfig":
+        """Undo `to_dict`.
+
+        Raises:
+            ConfigError: a field is missing, unknown or of a wrong value.
+        """
+        for name, choices in _CHOICES.items():
+            if values.get(name) not in choices:
+                raise ConfigError(f"{name} must be of {choices}, got {values.get(name)!r}")
+        try:
+            fusion = values["fusion"] and FusionConfig(**values["fusion"])
+            config = cls(**values | {"inputs": tuple(values["inputs"]), "fusion": fusion})
+        except (KeyError, TypeError) as error:
+            raise ConfigError(f"not the settings of a one-step painter: {error}") from None
+        if config.to_dict() != values:
+            raise ConfigError(f"not the settings of a one-step painter: {values}")
+        return config

@@ -1,0 +1,165 @@
+"""A one-step painter from what the user names: a model, or a weights file of ours.
+
+`sd-turbo`, a folder in diffusers' layout and an id of the hub give the model untrained for our
+task, in the wiring of a preset (`sd-turbo:fast`; `paper` unless said). A weights file names its
+model itself; where that folder has moved, one of the same name beside the file is taken.
+"""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lidarpainter_models.errors import WeightsError
+from lidarpainter_models.painter.one_step.architectures import TEXT_TOKENS
+from lidarpainter_models.painter.one_step.assembly import assemble, made_lean
+from lidarpainter_models.painter.one_step.base_models import (
+    SD_TURBO,
+    BaseModel,
+    BaseParts,
+    is_hub_id,
+    load_parts,
+    model_files,
+    open_base,
+)
+from lidarpainter_models.painter.one_step.painter import OneStepPainter
+from lidarpainter_models.painter.one_step.presets import PRESETS, preset_named
+from lidarpainter_models.painter.one_step.prompts import PromptBook
+from lidarpainter_models.painter.one_step.weights import TrainedFile, apply_trained, read_trained
+from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
+
+SUFFIX = ".safetensors"
+UNTRAINED = "none for repairing renders: the model as it comes"
+MARK_TOLERANCE = 1e-2
+"""Biases of one model agree to this share in float32, float16 and bfloat16."""
+
+
+def load_one_step(
+    name: str,
+    *,
+    dtype: torch.dtype = torch.bfloat16,
+    merges: bool = True,
+    may_download: bool = False,
+) -> OneStepPainter:
+    """A painter on the CPU.
+
+    Args:
+        name: see the module.
+        dtype: type of the weights; the step, the fusion and the U-Net's last layer stay float32.
+        merges: merge adapters into the model and make it lean; without, it can be trained on.
+        may_download: fetch a model of the hub that is not in the user's cache.
+
+    Raises:
+        WeightsError: model or weights are missing, damaged, or do not belong together.
+        ConfigError: there is no such preset.
+        MissingPackageError: the extra `diffusion` is not installed.
+    """
+    if name.endswith(SUFFIX):
+        return load_trained(Path(name), dtype=dtype, merges=merges, may_download=may_download)
+    model, preset = split_preset(name)
+    base = open_base(model, may_download=may_download)
+    config = preset_named(preset)
+    prompts = _open_prompts(base, {})
+    parts = load_parts(base, config, dtype=dtype)
+    network = assemble(config, parts.unet, parts.autoencoder, has_adapters=not merges)
+    if merges:
+        made_lean(network)
+    untrained = {"training": UNTRAINED, "trained_targets": []}
+    return OneStepPainter(network, prompts, _origin(base, parts) | untrained)
+
+
+def load_trained(
+    path: Path, *, dtype: torch.dtype, merges: bool, may_download: bool = False
+) -> OneStepPainter:
+    """A painter from a weights file of ours and the model that it names.
+
+    Raises:
+        WeightsError: the file or its model are missing, damaged, or do not belong together.
+    """
+    file = read_trained(path)
+    base = _base_of(file, may_download=may_download)
+    prompts = _open_prompts(base, file.prompts)
+    parts = load_parts(base, file.config, dtype=dtype)
+    check_mark(file, parts)
+    network = assemble(file.config, parts.unet, parts.autoencoder, has_adapters=True)
+    apply_trained(network, file)
+    if merges:
+        made_lean(network)
+    origin = _origin(base, parts) | {"licence": file.licence}
+    return OneStepPainter(network, prompts, file.provenance | origin)
+
+
+def is_model_name(name: str) -> bool:
+    """Whether a name may stand for a model: `sd-turbo`, a folder, an id of the hub."""
+    model, _ = split_preset(name)
+    return model == SD_TURBO or Path(model).is_dir() or is_hub_id(model)
+
+
+def painter_files(name: str) -> list[Path]:
+    """The files that a painter of this name is made of, in a fixed order.
+
+    Raises:
+        WeightsError: the model or the weights file is not there.
+    """
+    if name.endswith(SUFFIX):
+        file = read_trained(Path(name))
+        base = _base_of(file, may_download=False)
+        return [file.path, *model_files(base, file.config.autoencoder)]
+    model, preset = split_preset(name)
+    return model_files(open_base(model), preset_named(preset).autoencoder)
+
+
+def split_preset(name: str) -> tuple[str, str]:
+    """A model and the preset after its last colon, `paper` without one."""
+    model, _, preset = name.rpartition(":")
+    return (model, preset) if model and preset in PRESETS else (name, "paper")
+
+
+def check_mark(file: TrainedFile, parts: BaseParts) -> None:
+    """Refuse weights that were trained on another model.
+
+    Raises:
+        WeightsError: the model's biases are others than the file says.
+    """
+    fits = len(file.mark) == len(parts.mark) and all(
+        math.isclose(found, kept, rel_tol=MARK_TOLERANCE, abs_tol=1e-4)
+        for found, kept in zip(parts.mark, file.mark, strict=True)
+    )
+    if not fits:
+        raise WeightsError(
+            f"weights file {file.path} was trained on another model than {file.base}"
+        )
+
+
+def _base_of(file: TrainedFile, *, may_download: bool) -> BaseModel:
+    beside = file.path.parent / Path(file.base).name
+    moved = not Path(file.base).is_dir() and beside.is_dir()
+    try:
+        base = open_base(str(beside) if moved else file.base, may_download=may_download)
+    except WeightsError as error:
+        raise WeightsError(f"weights file {file.path} needs its model: {error}") from None
+    return replace(base, name=file.base)
+
+
+def _open_prompts(base: BaseModel, encoded: dict[str, torch.Tensor]) -> PromptBook:
+    """The prompts, the default one encoded now: before the U-Net is there, memory is free.
+
+    Raises:
+        WeightsError: they are not what the U-Net expects.
+    """
+    prompts = PromptBook(encoded, base.folder)
+    prompts.encode(DEFAULT_PROMPT)
+    expected = (TEXT_TOKENS, base.architecture.text_width)
+    for prompt, text in prompts.encoded.items():
+        if tuple(text.shape) != expected:
+            raise WeightsError(
+                f"prompt {prompt!r} for {base.folder} is encoded as {tuple(text.shape)}, its U-Net "
+                f"expects {expected}"
+            )
+    return prompts
+
+
+def _origin(base: BaseModel, parts: BaseParts) -> dict[str, Any]:
+    return {"base": base.name, "mark": parts.mark, "licence": base.licence}

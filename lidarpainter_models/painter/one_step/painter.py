@@ -1,0 +1,145 @@
+"""The one-step painter as users meet it: one view in, one repaired view out.
+
+Views of any size: edges are repeated up to multiples of 64 pixels and cut off again.
+"""
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F  # noqa: N812 - the name everyone knows
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.painter.baselines import DISAGREEMENT_SCALE
+from lidarpainter_models.painter.batches import ConditionBatch, stack_conditions
+from lidarpainter_models.painter.one_step.autoencoder import CELL_PX
+from lidarpainter_models.painter.one_step.config import OneStepConfig
+from lidarpainter_models.painter.one_step.cuda_graphs import GraphedNetwork
+from lidarpainter_models.painter.one_step.network import OneStepNetwork
+from lidarpainter_models.painter.one_step.prompts import PromptBook
+from lidarpainter_models.painter.protocol import Painting, PaintingConditions
+
+STRIDE_PX = 64
+"""Autoencoder and U-Net halve a picture six times."""
+NUM_WARPS = 2
+"""Warped pictures that are looked at, best first."""
+BRIGHT = 0.2
+"""A LiDAR pixel darker than this in every colour counts as empty in the authors' program."""
+
+
+class OneStepPainter:
+    """Repairs a view in one step of a diffusion model, guided by LiDAR.
+
+    Confidence: how well what was seen supports the painted colour, exp(-d / 0.1) with d the mean
+    absolute rgb difference: to the LiDAR colour where a point hits, or to the render times its
+    opacity, whichever is larger. It says nothing of what neither saw, and is not calibrated.
+    """
+
+    name = "one-step"
+
+    def __init__(
+        self, network: OneStepNetwork, prompts: PromptBook, provenance: dict[str, Any]
+    ) -> None:
+        """Take a network with its weights.
+
+        Args:
+            network: frozen and laid out for speed here.
+            prompts: encoded prompts.
+            provenance: base model, licence and training of the weights.
+        """
+        frozen = network.eval().requires_grad_(False)
+        # torch's stub lacks memory_format
+        self.network: OneStepNetwork = frozen.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.prompts = prompts
+        self.provenance = provenance
+        self._graphed = GraphedNetwork(self.network)
+
+    def to(self, device: torch.device) -> "OneStepPainter":
+        """Move the network; on CUDA it is then replayed as a graph for each size of picture."""
+        self.network.to(device)
+        self._graphed = GraphedNetwork(self.network)
+        return self
+
+    @torch.inference_mode()
+    def paint(self, conditions: PaintingConditions) -> Painting:
+        """Repair one view of any size.
+
+        Raises:
+            ConfigError: the prompt is new and there is no text encoder.
+        """
+        device = self.network.denoiser.timestep.device
+        home = conditions.render_rgb.device
+        text = self.prompts.encode(conditions.prompt).to(device)[None]
+        batch = stack_conditions([conditions], num_sources=NUM_WARPS).to(device)
+        pictures, masks = painter_inputs(batch, self.network.config)
+        rgb = self._graphed(pictures, text, masks)
+        height_px, width_px = conditions.height_width_px
+        rgb = rgb[..., :height_px, :width_px].clamp(0, 1)
+        confidence = support(batch, rgb)[0]
+        return Painting(
+            rgb=rgb[0].permute(1, 2, 0).contiguous().to(home), confidence=confidence.to(home)
+        )
+
+
+def painter_inputs(
+    batch: ConditionBatch, config: OneStepConfig
+) -> tuple[
+    Float[Tensor, "inputs batch 3 padded_height padded_width"],
+    Float[Tensor, "batch masks rows columns"] | None,
+]:
+    """The pictures and masks that a network of this configuration sees, padded."""
+    found = {
+        "render": batch.render,
+        "lidar": _lidar_picture(batch, config),
+        "warp": _first_valid_warp(batch),
+    }
+    pictures = torch.stack([_padded(found[name]) for name in config.inputs])
+    if not config.masks:
+        return pictures, None
+    any_warp = batch.warp_valid.amax(dim=1, keepdim=True)
+    shares = torch.cat([batch.lidar_hit, any_warp], dim=1)
+    return pictures, F.avg_pool2d(_padded(shares), CELL_PX)
+
+
+def support(
+    batch: ConditionBatch, rgb: Float[Tensor, "batch 3 height width"]
+) -> Float[Tensor, "batch height width"]:
+    """How well render and LiDAR support a colour, in [0, 1]; see `OneStepPainter`."""
+    by_render = _agreement(rgb, batch.render) * batch.render_alpha[:, 0].clamp(0, 1)
+    by_lidar = _agreement(rgb, batch.lidar) * batch.lidar_hit[:, 0]
+    return torch.maximum(by_render, by_lidar)
+
+
+def _agreement(
+    rgb: Float[Tensor, "batch 3 height width"], other: Float[Tensor, "batch 3 height width"]
+) -> Float[Tensor, "batch height width"]:
+    return torch.exp(-(rgb - other).abs().mean(dim=1) / DISAGREEMENT_SCALE)
+
+
+def _lidar_picture(
+    batch: ConditionBatch, config: OneStepConfig
+) -> Float[Tensor, "batch 3 height width"]:
+    if config.lidar == "pure":
+        return batch.lidar
+    if config.lidar == "over-render":
+        return torch.where(batch.lidar_hit > 0, batch.lidar, batch.render)
+    is_bright = (batch.lidar > BRIGHT).any(dim=1, keepdim=True)
+    return torch.where(is_bright, batch.lidar, batch.render)
+
+
+def _first_valid_warp(batch: ConditionBatch) -> Float[Tensor, "batch 3 height width"]:
+    """The best recorded picture that is valid in each pixel, the render where none is."""
+    picture = batch.render
+    for source in reversed(range(batch.warp.shape[1])):
+        is_valid = batch.warp_valid[:, source, None] > 0
+        picture = torch.where(is_valid, batch.warp[:, source], picture)
+    return picture
+
+
+def _padded(
+    picture: Float[Tensor, "batch channels height width"],
+) -> Float[Tensor, "batch channels padded_height padded_width"]:
+    """Repeat the lower and right edge up to multiples of the stride."""
+    height_px, width_px = picture.shape[2:]
+    margins = (0, -width_px % STRIDE_PX, 0, -height_px % STRIDE_PX)
+    return F.pad(picture, margins, mode="replicate")

@@ -1,0 +1,130 @@
+"""Reading safetensors straight into a network: checked by name and shape, one tensor at a time.
+
+A file is mapped into memory while it is read; opening it anew after every 128 MB lets those pages
+go, so a float32 file never lies beside the bfloat16 weights that it becomes.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor, nn
+
+from lidarpainter_models.errors import WeightsError
+
+PORTION_NUMBERS = 1 << 25
+"""Numbers that are read before the file is opened anew: 128 MB of float32."""
+
+Adapt = Callable[[str, Tensor], Tensor]
+"""Makes a stored tensor fit the network: its name in the network, the tensor."""
+
+
+def fill_from_file(
+    module: nn.Module,
+    path: Path,
+    *,
+    dtype: torch.dtype,
+    renamed: Callable[[str], str] = str,
+    widened: Mapping[str, tuple[int, ...]] | None = None,
+    adapt: Adapt | None = None,
+) -> None:
+    """Give a module on the meta device the weights of a file.
+
+    Args:
+        module: every parameter of it must stand in the file, and nothing else.
+        path: the file.
+        dtype: type of the weights in the module.
+        renamed: name in the module of a name in the file.
+        widened: other shapes that weights may have in the file; `adapt` makes them fit.
+        adapt: applied to every tensor.
+
+    Raises:
+        WeightsError: a weight is missing, too many, of a wrong shape, or not finite.
+    """
+    expected = {name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
+    stored = {renamed(name): (name, shape) for name, shape in stored_shapes(path).items()}
+    check_shapes(path, {name: shape for name, (_, shape) in stored.items()}, expected, widened)
+    # all of it before the first read: read buffers between them would leave holes behind
+    weights = {name: torch.empty(shape, dtype=dtype) for name, shape in expected.items()}
+    for names in _portions({name: shape for name, (_, shape) in stored.items()}):
+        with open_tensors(path) as file:
+            for name in names:
+                tensor = file.get_tensor(stored[name][0])
+                check_finite(path, name, tensor)
+                weights[name].copy_(adapt(name, tensor) if adapt else tensor)
+                del tensor
+    module.load_state_dict(weights, assign=True)
+
+
+def _portions(shapes: Mapping[str, tuple[int, ...]]) -> Iterator[list[str]]:
+    """Names of tensors in groups that together hold few numbers, or one tensor that holds many."""
+    portion: list[str] = []
+    total = 0
+    for name, shape in shapes.items():
+        total += math.prod(shape)
+        portion.append(name)
+        if total >= PORTION_NUMBERS:
+            yield portion
+            portion, total = [], 0
+    if portion:
+        yield portion
+
+
+def check_shapes(
+    path: Path,
+    found: Mapping[str, tuple[int, ...]],
+    expected: Mapping[str, tuple[int, ...]],
+    widened: Mapping[str, tuple[int, ...]] | None = None,
+) -> None:
+    """Compare names and shapes.
+
+    Raises:
+        WeightsError: the first weight that differs.
+    """
+    for name in sorted(expected.keys() | found.keys()):
+        fits = (expected.get(name), (widened or {}).get(name))
+        if found.get(name) is None or found[name] not in fits:
+            raise WeightsError(
+                f"weights file {path}: tensor {name!r} has shape {found.get(name)}, "
+                f"expected {expected.get(name)}"
+            )
+
+
+def check_finite(path: Path, name: str, tensor: Tensor) -> None:
+    """Refuse a weight that is not a number.
+
+    Raises:
+        WeightsError: it is not.
+    """
+    if not tensor.is_floating_point() or not bool(tensor.isfinite().all()):
+        raise WeightsError(f"weights file {path}: tensor {name!r} holds values that are no number")
+
+
+def stored_shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of all tensors of a file.
+
+    Raises:
+        WeightsError: the file cannot be read.
+    """
+    with open_tensors(path) as file:
+        return {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
+
+
+@contextmanager
+def open_tensors(path: Path) -> Iterator[Any]:
+    """Open a safetensors file.
+
+    Raises:
+        WeightsError: it is missing or damaged.
+    """
+    if not path.is_file():
+        raise WeightsError(f"no weights at {path}: expected a .safetensors file")
+    try:
+        with safe_open(path, framework="pt") as file:
+            yield file
+    except (SafetensorError, OSError) as error:
+        raise WeightsError(f"{path} is not a readable safetensors file: {error}") from None

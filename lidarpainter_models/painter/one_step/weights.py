@@ -1,0 +1,195 @@
+"""Weights files of the one-step painter: what training changed, and which model it stands on.
+
+One safetensors file under 20 MB at full size: adapters and skips in bfloat16, the U-Net's first
+and last layer and the fusion in float32, and the encoded prompts. The model itself is not in it;
+the header names it, with a few of its biases by which another model is found out.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import save
+from torch import Tensor
+
+from lidarpainter_models.errors import ConfigError, WeightsError
+from lidarpainter_models.painter.one_step.assembly import (
+    FIRST_LAYER,
+    FUSION,
+    LAST_LAYER,
+    trained_names,
+)
+from lidarpainter_models.painter.one_step.config import OneStepConfig
+from lidarpainter_models.painter.one_step.network import OneStepNetwork
+from lidarpainter_models.painter.one_step.tensor_files import (
+    check_finite,
+    check_shapes,
+    open_tensors,
+)
+from lidarpainter_models.painter.whole_files import write_whole
+
+WEIGHTS_FORMAT = "lidarpainter-one-step/1"
+PROMPT = "prompt:"
+"""What names of encoded prompts begin with."""
+METADATA_KEY = "lidarpainter"
+IN_FLOAT32 = (FIRST_LAYER, LAST_LAYER, FUSION)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrainedFile:
+    """A weights file as read."""
+
+    path: Path
+    config: OneStepConfig
+    base: str
+    mark: list[float]
+    licence: str
+    provenance: dict[str, Any]
+    tensors: dict[str, Tensor]
+    prompts: dict[str, Tensor]
+
+
+def save_trained(
+    network: OneStepNetwork,
+    path: Path,
+    *,
+    prompts: Mapping[str, Tensor],
+    base: str,
+    mark: list[float],
+    licence: str,
+    provenance: dict[str, Any],
+) -> None:
+    """Write what training changed, aside and renamed whole.
+
+    Args:
+        network: with its adapters, not merged.
+        path: the file.
+        prompts: encoded prompts by their name.
+        base: folder or hub id of the model underneath.
+        mark: biases of that model (`base_models.BaseParts`).
+        licence: of the result.
+        provenance: what it was trained on and how, as JSON types.
+
+    Raises:
+        WeightsError: a weight is not finite.
+        StorageError: the file cannot be written.
+    """
+    state = dict(network.named_parameters())
+    tensors = {name: _stored(name, state[name]) for name in trained_names(network)}
+    tensors |= {PROMPT + name: _stored(PROMPT, text) for name, text in prompts.items()}
+    for name, tensor in tensors.items():
+        check_finite(path, name, tensor)
+    header = {
+        "format": WEIGHTS_FORMAT,
+        "config": network.config.to_dict(),
+        "base": base,
+        "mark": mark,
+        "licence": licence,
+        "provenance": provenance,
+    }
+    # one entry, because safetensors writes several in random order
+    write_whole(path, save(tensors, {METADATA_KEY: json.dumps(header, sort_keys=True)}))
+
+
+def _stored(name: str, tensor: Tensor) -> Tensor:
+    return tensor.detach().cpu().to(stored_type(name)).contiguous()
+
+
+def stored_type(name: str) -> torch.dtype:
+    """The type in which a weight is stored."""
+    return torch.float32 if name.startswith(IN_FLOAT32) else torch.bfloat16
+
+
+def read_trained(path: Path) -> TrainedFile:
+    """Read a weights file and check its header.
+
+    Raises:
+        WeightsError: it is missing, damaged, or of another format.
+    """
+    header = read_header(path)
+    missing = {"config", "base", "mark", "licence", "provenance"} - header.keys()
+    if missing:
+        raise WeightsError(f"weights file {path} lacks {sorted(missing)} in its header")
+    try:
+        config = OneStepConfig.from_dict(header["config"])
+        mark = [float(value) for value in header["mark"]]
+        provenance = {**header["provenance"]}
+    except (ConfigError, TypeError, ValueError) as error:
+        raise WeightsError(f"weights file {path} has unusable settings: {error}") from None
+    tensors: dict[str, Tensor] = {}
+    prompts: dict[str, Tensor] = {}
+    with open_tensors(path) as file:
+        for name in file.keys():  # noqa: SIM118 - the file is no mapping
+            tensor = file.get_tensor(name)
+            check_finite(path, name, tensor)
+            if name.startswith(PROMPT):
+                prompts[name.removeprefix(PROMPT)] = tensor.clone()
+            else:
+                tensors[name] = tensor.clone()
+    return TrainedFile(
+        path=path,
+        config=config,
+        base=str(header["base"]),
+        mark=mark,
+        licence=str(header["licence"]),
+        provenance=provenance,
+        tensors=tensors,
+        prompts=prompts,
+    )
+
+
+def read_header(path: Path) -> dict[str, Any]:
+    """The header of a weights file of this format.
+
+    Raises:
+        WeightsError: it is missing, damaged, or of another format.
+    """
+    header = painter_header(path)
+    if header.get("format") != WEIGHTS_FORMAT:
+        found = header.get("format", "no format mark")
+        raise WeightsError(f"weights file {path} has {found!r}, expected {WEIGHTS_FORMAT!r}")
+    return header
+
+
+def is_trained_file(path: Path) -> bool:
+    """Whether a file says that it is one of ours; a missing or damaged one says nothing."""
+    try:
+        return painter_header(path).get("format") == WEIGHTS_FORMAT
+    except WeightsError:
+        return False
+
+
+def painter_header(path: Path) -> dict[str, Any]:
+    """What any painter's weights file says of itself.
+
+    Raises:
+        WeightsError: the file is missing or damaged.
+    """
+    with open_tensors(path) as file:
+        metadata = file.metadata() or {}
+    try:
+        header = json.loads(metadata.get(METADATA_KEY, "{}"))
+    except ValueError as error:
+        raise WeightsError(f"weights file {path} has a damaged header: {error}") from None
+    if not isinstance(header, dict):
+        raise WeightsError(f"weights file {path} has a damaged header: no object")
+    return header
+
+
+@torch.no_grad()
+def apply_trained(network: OneStepNetwork, file: TrainedFile) -> None:
+    """Put the weights of a file into a network with adapters.
+
+    Raises:
+        WeightsError: a weight is missing, too many, or of a wrong shape.
+    """
+    state = dict(network.named_parameters())
+    names = trained_names(network)
+    expected = {name: tuple(state[name].shape) for name in names}
+    found = {name: tuple(tensor.shape) for name, tensor in file.tensors.items()}
+    check_shapes(file.path, found, expected)
+    for name in names:
+        state[name].copy_(file.tensors[name])

@@ -1,0 +1,35 @@
+"""Small one-step networks with random weights."""
+
+import pytest
+import torch
+from tiny_diffusion import TEXT_WIDTH, TINY, write_model
+
+from lidarpainter_models.painter.one_step.assembly import random_network
+
+
+@pytest.fixture
+def make_network():
+    """A small network in float32, with adapters if asked."""
+
+    def make(config, **options):
+        return random_network(config, architecture=TINY, dtype=torch.float32, **options)
+
+    return make
+
+
+@pytest.fixture
+def make_inputs():
+    """Random pictures and an encoded prompt."""
+
+    def make(num_inputs=2, batch=1, height_px=64, width_px=128, seed=0):
+        generator = torch.Generator().manual_seed(seed)
+        pictures = torch.rand(num_inputs, batch, 3, height_px, width_px, generator=generator)
+        return pictures, torch.randn(batch, 77, TEXT_WIDTH, generator=generator)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def model_folder(tmp_path_factory):
+    """A whole small model as a user would bring it; not to be changed."""
+    return write_model(tmp_path_factory.mktemp("models") / "small-turbo")

@@ -1,0 +1,70 @@
+"""Parameters, arithmetic and bytes at full size, counted on the meta device."""
+
+import pytest
+import torch
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.painter.one_step.architectures import SD_TURBO, build_tiny
+from lidarpainter_models.painter.one_step.assembly import random_network, trained_names
+from lidarpainter_models.painter.one_step.cost import (
+    count_bytes,
+    count_parameters,
+    count_tflop,
+    describe_preset,
+)
+from lidarpainter_models.painter.one_step.presets import PRESETS, fast, paper
+from lidarpainter_models.painter.one_step.weights import save_trained
+
+
+def test_parameters_are_sd_turbos():
+    counts = count_parameters(paper())
+    assert counts["unet"] == 865_910_724
+    assert counts["first_layer_added"] == 320 * 4 * 9
+    assert counts["autoencoder"] == 83_653_863
+    assert counts["text_encoder"] == 340_387_840
+    assert counts["skips"] == 512 * 512 + 256 * 512 + 128 * 512 + 128 * 256
+    with torch.device("meta"):
+        tiny = build_tiny(SD_TURBO)
+    assert sum(parameter.numel() for parameter in tiny.parameters()) == 2_445_063
+
+
+def test_arithmetic_at_the_papers_size_is_the_computed_floor():
+    whole = count_tflop(paper(), height_px=576, width_px=1024)
+    assert whole["total"] == pytest.approx(13.2, rel=0.02)
+    assert whole["denoise"] == pytest.approx(2.149, rel=0.01)
+    assert whole["encode"] == pytest.approx(5.218, rel=0.01)
+    tiny = count_tflop(fast(), height_px=576, width_px=1024)
+    assert tiny["total"] == pytest.approx(3.0, rel=0.02)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_what_training_changes_fits_in_20_mb(preset):
+    header = 150_000  # 664 names of tensors take 102 kB; settings, provenance
+    assert count_bytes(PRESETS[preset]())["trained_file"] + header < 20e6
+
+
+def test_a_view_without_pixels_costs_nothing_that_could_be_counted():
+    with pytest.raises(ConfigError, match="needs pixels"):
+        count_tflop(fast(), height_px=0, width_px=64)
+
+
+@pytest.mark.slow
+def test_a_full_size_weights_file_is_under_20_mb_and_holds_every_bit(tmp_path):
+    from safetensors.torch import load_file
+
+    network = random_network(paper(), has_adapters=True)
+    path = tmp_path / "full.safetensors"
+    prompts = {name: torch.zeros(77, 1024) for name in ("clear", "foggy", "night", "rain")}
+    save_trained(
+        network, path, prompts=prompts, base="sd-turbo", mark=[], licence="x", provenance={}
+    )
+    assert path.stat().st_size < 20e6
+    state, stored = dict(network.named_parameters()), load_file(path)
+    assert all(
+        torch.equal(state[name], stored[name].to(state[name].dtype))
+        for name in trained_names(network)
+    )
+    described = describe_preset(paper(), height_px=576, width_px=1024)
+    assert described["bytes"]["trained_file"] == sum(
+        tensor.numel() * tensor.element_size() for tensor in stored.values()
+    )
