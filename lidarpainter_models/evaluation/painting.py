@@ -19,6 +19,7 @@ from torch import Tensor
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.kernels.ssim import ssim_map
+from lidarpainter_models.metrics.perceptual import PictureDistance
 from lidarpainter_models.metrics.pictures import psnr_from_error, squared_error
 from lidarpainter_models.painter.baselines import UnpaintedPainter, WarpPainter
 from lidarpainter_models.painter.examples import PaintingPair, PairSource
@@ -32,11 +33,6 @@ HULL_SIDE_PX = 9
 HULL_MARGIN = 0.05
 CONFIDENCE_BINS = 1 << 16
 """Confidences that share a bin count as equal."""
-
-PictureDistance = Callable[
-    [Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]], Float[Tensor, ""]
-]
-"""Of a picture to the truth, such as `metrics.squeezenet.SqueezeNetDistance`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,15 +1,19 @@
 """The stages of a reconstruction, one after the other, without a server."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 from toy_store import TOY_SCENE, small_parameters, write_toy_scene
 
 from catalog.errors import DamagedArtefactError
 from catalog.store import open_store
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+from lidarpainter_models.metrics import lpips
+from lidarpainter_models.metrics.backbones import SQUEEZENET
 from tasks.evaluate import evaluate
 from tasks.fit import fit, refine
 from tasks.ingest import record_scene
@@ -143,6 +147,28 @@ def test_scores_say_why_a_number_is_missing(stages):
     assert left["psnr"] is None
     assert "nobody took pictures" in left["psnr_reason"]
     assert 0 <= left["depth_within_5_percent"] <= 1
+
+
+def test_lpips_stands_in_the_scores_where_both_files_are_given(
+    store, parameters, final, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(lpips, "is_published", lambda _path, _backbone: True)  # random weights
+    torch.manual_seed(0)
+    torch.save(SQUEEZENET.build().state_dict(), tmp_path / "backbone.pth")
+    heads = {
+        lpips.HEAD_KEY.format(index): torch.rand(1, count, 1, 1)
+        for index, count in enumerate(SQUEEZENET.channels)
+    }
+    torch.save(heads, tmp_path / "heads.pth")
+    files = lpips.LpipsFiles(backbone=tmp_path / "backbone.pth", heads=tmp_path / "heads.pth")
+    without = parameters.judge_settings
+    for settings, has_figure in ((without, False), (replace(without, lpips=files), True)):
+        judged = evaluate.fn(store.root, "evaluate", parameters.split_spec, final, settings)
+        recorded = load_scores(judged.ref)["recorded"]
+        assert (recorded["lpips"] is not None) is has_figure
+        assert ("lpips_reason" in recorded) is not has_figure
+    assert recorded["lpips"] > 0
+    assert recorded["recorded_poses"]["lpips"] > 0
 
 
 def test_painting_at_view_time_is_judged_apart(stages):
