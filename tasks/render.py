@@ -1,5 +1,6 @@
 """Render a finished run along a trajectory, painted at view time if asked for."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from jaxtyping import Float
 from prefect import task
 from torch import Tensor
 
-from catalog.store import open_store
+from catalog.store import Store, open_store
 from lidarpainter_models.conditioning.conditions import ConditionBuilder, ConditionConfig
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.export.pictures import write_png
@@ -47,19 +48,39 @@ class RenderRequest:
     conditions: ConditionConfig
 
 
-@task(**STAGE_OPTIONS)
-def render(store_path: Path, run: FinishedRun, request: RenderRequest, out: Path) -> dict[str, Any]:
-    """Write a picture for every recorded moment, and where each was taken.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OpenedRun:
+    """A finished run, ready to be looked at along a trajectory."""
+
+    recorded: DrivingScene
+    builder: ConditionBuilder
+    camera_name: str
+    views: Sequence[RecordedView]
+    """The recorded moments to follow."""
+    request: RenderRequest
+    painter: Painter | None
+
+    def camera(self, number: int) -> Camera:
+        """Where the camera stands at the n-th of the moments."""
+        progress = number / max(len(self.views) - 1, 1)
+        return _shifted(
+            self.recorded, self.builder.scene, self.views[number], self.request, progress
+        )
+
+    def picture(self, camera: Camera, view: RecordedView) -> Float[Tensor, "height width 3"]:
+        """What is seen there, painted if asked for; in [0, 1]."""
+        return _picture(self.builder, self.painter, camera, view).clamp(0, 1)
+
+
+def open_views(store: Store, run: FinishedRun, request: RenderRequest) -> OpenedRun:
+    """Load what a run's pictures are made from.
 
     Raises:
         SceneError: the run did not train on that camera, or no frame is left.
     """
-    store = open_store(store_path)
     recorded = open_scene(store, run.scene_id)
     seen = load_observations(store, run.final.observations)
     scene = load_scene(store, run.final.gaussians)
-    builder = ConditionBuilder(scene, seen.lidar_map, seen.views, config=request.conditions)
-    painter = None if request.painter is None else load_painter(request.painter)
     camera_name = request.camera or seen.camera_names[0]
     if camera_name not in seen.camera_names:
         raise SceneError(
@@ -68,16 +89,33 @@ def render(store_path: Path, run: FinishedRun, request: RenderRequest, out: Path
     views = recorded.views_of(camera_name)[request.frames or slice(None)]
     if not views:
         raise SceneError(f"{run.scene_id}: no frame of {camera_name} is left to render")
+    return OpenedRun(
+        recorded=recorded,
+        builder=ConditionBuilder(scene, seen.lidar_map, seen.views, config=request.conditions),
+        camera_name=camera_name,
+        views=views,
+        request=request,
+        painter=None if request.painter is None else load_painter(request.painter),
+    )
+
+
+@task(**STAGE_OPTIONS)
+def render(store_path: Path, run: FinishedRun, request: RenderRequest, out: Path) -> dict[str, Any]:
+    """Write a picture for every recorded moment, and where each was taken.
+
+    Raises:
+        SceneError: the run did not train on that camera, or no frame is left.
+    """
+    opened = open_views(open_store(store_path), run, request)
     listener().started(STAGE)
     rows = []
-    for number, view in enumerate(views):
-        camera = _shifted(recorded, scene, view, request, number / max(len(views) - 1, 1))
-        rgb = _picture(builder, painter, camera, view)
-        path = write_png(rgb.clamp(0, 1), out / f"{view.frame_index:04d}.png")
-        rows.append(_row(path, camera, view))
-        listener().advanced(STAGE, number + 1, len(views), "")
+    for number, view in enumerate(opened.views):
+        camera = opened.camera(number)
+        path = write_png(opened.picture(camera, view), out / f"{view.frame_index:04d}.png")
+        rows.append(picture_record(path, camera, view))
+        listener().advanced(STAGE, number + 1, len(opened.views), "")
     write_json(out / POSES_FILE, {"trajectory": request.trajectory.spec, "pictures": rows})
-    return {"folder": str(out), "num_pictures": len(rows), "camera": camera_name}
+    return {"folder": str(out), "num_pictures": len(rows), "camera": opened.camera_name}
 
 
 def _shifted(
@@ -111,7 +149,8 @@ def _picture(
         return painter.paint(conditions).rgb
 
 
-def _row(path: Path, camera: Camera, view: RecordedView) -> dict[str, Any]:
+def picture_record(path: Path, camera: Camera, view: RecordedView) -> dict[str, Any]:
+    """Where and when a picture was taken, as JSON types."""
     return {
         "file": path.name,
         "frame_index": view.frame_index,
