@@ -77,6 +77,10 @@ def train(  # noqa: PLR0913 - the options of a command
     inputs: Annotated[
         str, typer.Option(help="What the painter may see, with commas between.")
     ] = "render,lidar,warp",
+    prompts: Annotated[
+        str | None,
+        typer.Option(help="clear, and styles to learn beside it: clear,foggy,night,rain."),
+    ] = None,
     held_back: Annotated[
         float, typer.Option(help="Share of the true pictures kept from training, to judge by.")
     ] = 0.1,
@@ -89,13 +93,16 @@ def train(  # noqa: PLR0913 - the options of a command
     as_json: AsJson = False,
 ) -> None:
     """Train the small painter; a killed training goes on where it stopped."""
+    from flows.cli.ingest import parse_names
     from flows.cli.training import run_training, train_parameters
     from flows.overrides import with_overrides
 
     parameters = train_parameters(
         parse_seeds(seeds), scenes, split, cameras, parse_paths(pairs, "--pairs"), start
     )
-    training = with_length(parameters.training, parse_inputs(inputs), budget, steps)
+    training = with_length(
+        parameters.training, parse_inputs(inputs), budget, steps, parse_names(prompts)
+    )
     changes = {
         "training": training,
         "held_back": held_back,

@@ -6,7 +6,7 @@ Pictures are (batch, 3, height, width); masks (batch, height, width), 1 where th
 from dataclasses import dataclass, fields
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError
@@ -70,9 +70,22 @@ def painting_loss(
     target: Float[Tensor, "batch 3 height width"],
     target_valid: Float[Tensor, "batch height width"],
     weights: LossWeights,
+    *,
+    restyled: Bool[Tensor, " batch"] | None = None,
 ) -> LossTerms:
-    """All terms of a batch and `total`, the sum that is minimised."""
+    """All terms of a batch and `total`, the sum that is minimised.
+
+    Args:
+        output: what the network says.
+        conditions: what it was shown.
+        target: what it should say.
+        target_valid: where that is known.
+        weights: how much each term counts.
+        restyled: views whose target is in another style; they have nothing to keep.
+    """
     agreeing = agreement_mask(conditions, weights.agreement) * target_valid
+    if restyled is not None:
+        agreeing = agreeing * (~restyled)[:, None, None].to(agreeing)
     terms = {
         "absolute": absolute_loss(output.rgb, target, target_valid),
         "squared": squared_loss(output.rgb, target, target_valid),

@@ -23,12 +23,15 @@ from lidarpainter_models.painter.nano.candidates import (
     build_candidates,
     candidate_names,
     check_inputs,
+    with_flat_colour,
 )
 from lidarpainter_models.painter.nano.features import count_features, painting_features
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
 
 CELL_PX = 4
 """Side of the pixel block that one position of the network stands for."""
+TINT = "tint"
+"""The candidate that is no picture but a flat colour, learnt for each style."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,7 +57,8 @@ class NanoConfig:
     confidence_error: float = 0.05
     """Mean absolute error at which the confidence has fallen to 1/e."""
     prompts: tuple[str, ...] = (DEFAULT_PROMPT,)
-    """Prompts the network was trained for, each with its own embedding."""
+    """Prompts the network was trained for, each with its own embedding. Those after the first are
+    styles, and may mix in a flat colour of their own: the white of fog, the black of night."""
 
     def __post_init__(self) -> None:
         """Refuse shapes that cannot be built."""
@@ -69,7 +73,8 @@ class NanoConfig:
     @property
     def candidates(self) -> tuple[str, ...]:
         """The pictures it mixes, in channel order."""
-        return candidate_names(self.inputs, self.num_sources)
+        names = candidate_names(self.inputs, self.num_sources)
+        return (*names, TINT) if len(self.prompts) > 1 else names
 
     def to_dict(self) -> dict[str, Any]:
         """The settings as JSON types."""
@@ -158,6 +163,9 @@ class NanoNetwork(nn.Module):
         self.decode_fine = _blocks(fine, config.blocks[0], config)
         self.last = PixelNorm(fine) if config.normalise else nn.Identity()
         self.head = nn.Conv2d(fine, (len(config.candidates) + 4) * CELL_PX**2, 3, padding=1)
+        if TINT in config.candidates:
+            self.tint = nn.Embedding(len(config.prompts), 3)
+            nn.init.zeros_(self.tint.weight)  # grey
         self._start_as_base()
 
     @torch.no_grad()
@@ -200,8 +208,10 @@ class NanoNetwork(nn.Module):
         """
         features, lidar_filled = painting_features(conditions, self.config.inputs)
         candidates = build_candidates(conditions, self.config.inputs, lidar_filled)
-        rows = torch.tensor([self.prompt_index(prompt) for prompt in prompts])
-        embedding = self.prompt(rows.to(features.device))
+        rows = torch.tensor([self.prompt_index(prompt) for prompt in prompts]).to(features.device)
+        embedding = self.prompt(rows)
+        if TINT in self.config.candidates:
+            candidates = with_flat_colour(candidates, TINT, self.tint(rows).sigmoid(), rows > 0)
         with torch.autocast(features.device.type, torch.bfloat16, enabled=half_precision):
             head = self._head(features, embedding).float()
         num_candidates = len(candidates.names)
