@@ -125,13 +125,23 @@ def evaluate(
     ],
     pairs: Annotated[list[str], typer.Option(help="A folder of pairs. May be repeated.")],
     feature_weights: Features = None,
+    keep_below: Annotated[
+        float | None,
+        typer.Option(
+            help="Judge small painters again, leaving tiles unpainted that differ by less than "
+            "this from LiDAR and warps; 0.01 say."
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Judge painters on pairs that none of them was trained on."""
     from flows.cli.training import judge
 
     found = judge(
-        parse_paths(painters, "--painter"), parse_paths(pairs, "--pairs"), feature_weights
+        parse_paths(painters, "--painter"),
+        parse_paths(pairs, "--pairs"),
+        feature_weights,
+        keep_below,
     )
     if as_json:
         print_json(found)
