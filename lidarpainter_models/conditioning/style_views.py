@@ -1,6 +1,5 @@
 """What a style needs of a fitted scene: a picture of it, distance and sky in every pixel."""
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -31,9 +30,7 @@ def style_view(
     """
     render = builder.scene.render(camera, timestamp_ns)
     lidar = builder.lidar_image(camera, timestamp_ns)
-    sky = 1 - render.alpha.clamp(0, 1)
-    if sky_mask is not None:
-        sky = torch.where(lidar.hit, 0.0, sky_mask.float())
+    sky = 1 - render.alpha.clamp(0, 1) if sky_mask is None else sky_mask.float()
     view = StyleView(
         rgb=picture,
         depth_m=builder.surface_m(render, lidar, camera).detach(),

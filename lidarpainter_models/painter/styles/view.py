@@ -19,8 +19,8 @@ GROUND_TOLERANCE_M = (1.0, 0.4, 0.2)
 """Surfaces count as ground up to this distance from the plane, fitted ever more closely."""
 SKY_M = 1e5
 """Stands for infinity where points are reckoned with."""
-RIM_RAD = 0.002
-"""How far masks of sky stay away from outlines: 2 px at 1000 px focal length."""
+RIM_RAD = 0.004
+"""How far masks of sky stay away from outlines: 4 px at 1000 px focal length."""
 FLATTENED_M = 0.45
 """Depth of a road is noisy by so much ..."""
 SUNKEN_M = 1.5
