@@ -12,7 +12,7 @@ from torch import Tensor
 
 from catalog.store import Store, open_store
 from lidarpainter_models.conditioning.conditions import ConditionBuilder, ConditionConfig
-from lidarpainter_models.errors import SceneError
+from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.export.pictures import write_png
 from lidarpainter_models.gaussians.observations import ObservationConfig, fit_camera
 from lidarpainter_models.gaussians.scene_graph import GaussianScene
@@ -20,7 +20,7 @@ from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectories import road_directions, shift_pose
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
 from lidarpainter_models.painter import load_painter
-from lidarpainter_models.painter.protocol import Painter
+from lidarpainter_models.painter.protocol import DEFAULT_PROMPT, Painter
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
 from tasks.progress import listener
@@ -44,8 +44,15 @@ class RenderRequest:
     """Positions of the recorded frames to follow."""
     painter: str | None = None
     """Painter applied to every picture; None shows the scene as it is."""
+    prompt: str = DEFAULT_PROMPT
+    """What a painter that knows styles is asked for."""
     observation: ObservationConfig
     conditions: ConditionConfig
+
+    def __post_init__(self) -> None:
+        """Refuse a prompt that nobody is asked for."""
+        if self.prompt != DEFAULT_PROMPT and self.painter is None:
+            raise ConfigError(f"prompt {self.prompt!r} needs a painter: --postpaint or --painter")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,7 +76,7 @@ class OpenedRun:
 
     def picture(self, camera: Camera, view: RecordedView) -> Float[Tensor, "height width 3"]:
         """What is seen there, painted if asked for; in [0, 1]."""
-        return _picture(self.builder, self.painter, camera, view).clamp(0, 1)
+        return _picture(self, camera, view).clamp(0, 1)
 
 
 def open_views(store: Store, run: FinishedRun, request: RenderRequest) -> OpenedRun:
@@ -139,14 +146,20 @@ def _shifted(
 
 
 def _picture(
-    builder: ConditionBuilder, painter: Painter | None, camera: Camera, view: RecordedView
+    opened: OpenedRun, camera: Camera, view: RecordedView
 ) -> Float[Tensor, "height width 3"]:
-    if painter is None:
+    builder = opened.builder
+    if opened.painter is None:
         shown = builder.scene.render(camera, view.timestamp_ns, camera_name=view.camera_name)
         return shown.rgb
-    conditions = builder.conditions(camera, view.timestamp_ns, camera_name=view.camera_name)
+    conditions = builder.conditions(
+        camera,
+        view.timestamp_ns,
+        camera_name=view.camera_name,
+        prompt=opened.request.prompt,
+    )
     with torch.inference_mode():
-        return painter.paint(conditions).rgb
+        return opened.painter.paint(conditions).rgb
 
 
 def picture_record(path: Path, camera: Camera, view: RecordedView) -> dict[str, Any]:

@@ -249,6 +249,21 @@ def test_a_run_is_shown_in_fog_beside_the_clear_pictures(
     assert again == (tmp_path / "a" / "0001.png").read_bytes()
 
 
+def test_a_painter_is_asked_for_the_prompt(store, run, parameters, tmp_path):
+    request = RenderRequest(
+        trajectory=parse_trajectory("recorded"),
+        frames=slice(1, 2),
+        painter="nano",
+        prompt="foggy",
+        observation=parameters.observation,
+        conditions=parameters.conditions,
+    )
+    with pytest.raises(ConfigError, match="knows no prompt 'foggy', only: clear"):
+        render.fn(store.root, run, request, tmp_path)
+    with pytest.raises(ConfigError, match="prompt 'foggy' needs a painter"):
+        replace(request, painter=None)
+
+
 def test_recorded_pictures_exist_only_where_somebody_stood(parameters):
     view = RenderRequest(
         trajectory=parse_trajectory("lateral:2"),
