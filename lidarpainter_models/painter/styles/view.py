@@ -85,9 +85,12 @@ def open_sky(view: StyleView) -> Float[Tensor, "height width"]:
     """Share of sky once more, seen through what is thinner than a pixel along its rim.
 
     Masks of sky stop short of wires and outlines, whose pixels still hold much of its light. There
-    a pixel counts as sky as far as it is as bright as the sky around it.
+    a pixel counts as sky as far as it is as bright as the sky around it. A rendered sky has shares
+    of its own and stays as it is.
     """
     sky = view.sky.numpy()
+    if bool(((sky > 0) & (sky < 1)).any()):
+        return view.sky
     solid = cv2.morphologyEx((sky > 0.9).astype(np.float32), cv2.MORPH_OPEN, np.ones((7, 7)))
     grey = luminance(to_linear(view.rgb)).numpy()
     sigma_px = max(RIM_RAD * view.focal_px, 1.0)
