@@ -18,8 +18,8 @@ def is_extension(config: NanoConfig, known: NanoConfig) -> bool:
 def with_more_prompts(network: NanoNetwork, config: NanoConfig) -> NanoNetwork:
     """A network of the given shape that paints every known prompt as before, bit for bit.
 
-    New prompts start with the embedding of the first; where the network had no tint, its head
-    starts without a preference for it.
+    New prompts start as the first; where the network had no tint, its head starts without a
+    preference for it.
 
     Raises:
         ConfigError: the shapes differ by more than prompts.
@@ -34,10 +34,9 @@ def with_more_prompts(network: NanoNetwork, config: NanoConfig) -> NanoNetwork:
     num_known = len(network.config.prompts)
     num_old, num_new = len(network.config.candidates), len(config.candidates)
     for name, tensor in network.state_dict().items():
-        if name in ("prompt.weight", "tint.weight"):
+        if name in ("prompt.weight", "style.weight"):
             state[name][:num_known] = tensor
-            if name == "prompt.weight":
-                state[name][num_known:] = tensor[0]
+            state[name][num_known:] = tensor[0]
         elif name.startswith("head.") and num_new > num_old:
             cells = CELL_PX**2
             state[name][: num_old * cells] = tensor[: num_old * cells]
