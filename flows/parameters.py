@@ -10,6 +10,7 @@ from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.scene_scores import ScoringConfig
 from lidarpainter_models.gaussians.fit_config import FitConfig
 from lidarpainter_models.gaussians.observations import ObservationConfig
+from lidarpainter_models.metrics.lpips import LpipsFiles
 from tasks.evaluate import JudgeSettings
 from tasks.paint import PaintSettings
 from tasks.runs import FinishedRun
@@ -37,6 +38,8 @@ class ViewParameters(BaseModel):
     scoring: ScoringConfig
     feature_weights: Path | None = None
     """SqueezeNet 1.1 weights for the feature distance; None leaves it out."""
+    lpips: LpipsFiles = LpipsFiles()
+    """Weights for LPIPS; without both files it is null, with the reason."""
 
     @property
     def split_spec(self) -> SplitSpec:
@@ -51,6 +54,7 @@ class ViewParameters(BaseModel):
             scoring=self.scoring,
             conditions=self.conditions,
             feature_weights=self.feature_weights,
+            lpips=self.lpips,
         )
 
 
@@ -79,7 +83,8 @@ def view_parameters(run: FinishedRun) -> ViewParameters:
     Raises:
         ConfigError: this version knows other settings.
     """
-    known = {name: run.parameters.get(name) for name in ViewParameters.model_fields}
+    fields = ViewParameters.model_fields.keys() & run.parameters.keys()
+    known = {name: run.parameters[name] for name in fields}
     try:
         return ViewParameters.model_validate(known)
     except ValidationError as error:

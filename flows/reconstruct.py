@@ -14,7 +14,7 @@ from catalog.store import open_store
 from flows.overrides import with_overrides
 from flows.parameters import ReconstructParameters
 from flows.presets import preset as preset_named
-from lidarpainter_models.metrics.squeezenet import load_squeezenet_distance
+from lidarpainter_models.metrics.perceptual import load_distances
 from lidarpainter_models.painter import load_painter
 from tasks.evaluate import evaluate
 from tasks.fit import fit, refine
@@ -59,12 +59,11 @@ def check_inputs(parameters: ReconstructParameters, store_path: Path) -> None:
     Raises:
         SceneError: the scene is not there, or lacks a camera.
         ConfigError: the split leaves nothing to train on.
-        WeightsError: the painter or the weights of the feature distance cannot be used.
+        WeightsError: the painter or the weights of a perceptual distance cannot be used.
     """
     open_split(open_store(store_path), parameters.split_spec)
     load_painter(parameters.painter)
-    if parameters.feature_weights is not None:
-        load_squeezenet_distance(parameters.feature_weights)
+    load_distances(parameters.feature_weights, parameters.lpips)
 
 
 @flow(name="reconstruct-scene")

@@ -1,7 +1,7 @@
 """Judge a fitted scene on views it never saw, as it is or painted at view time."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,8 @@ from lidarpainter_models.evaluation.scene_scores import (
 )
 from lidarpainter_models.gaussians.observations import ObservationConfig
 from lidarpainter_models.gaussians.scene_graph import GaussianScene
-from lidarpainter_models.metrics.squeezenet import SqueezeNetDistance, load_squeezenet_distance
+from lidarpainter_models.metrics.lpips import LpipsFiles
+from lidarpainter_models.metrics.perceptual import load_distances
 from lidarpainter_models.painter import load_painter
 from tasks.judging import Judgement
 from tasks.painters import painter_digest
@@ -41,6 +42,8 @@ class JudgeSettings:
     conditions: ConditionConfig
     feature_weights: Path | None = None
     """SqueezeNet 1.1 weights for the feature distance; None leaves it out."""
+    lpips: LpipsFiles = field(default_factory=LpipsFiles)
+    """Weights for LPIPS; without both files it is left out."""
 
 
 @task(**STAGE_OPTIONS)
@@ -62,8 +65,7 @@ def evaluate(
     }
     if view_time_painter is not None:
         inputs["painter"] = painter_digest(view_time_painter)
-    if settings.feature_weights is not None:
-        inputs["features"] = _digest_of(settings.feature_weights)
+    inputs |= _weights_digests(settings)
 
     def build(place: Workplace) -> dict[str, Any]:
         scene = load_scene(store, fitted.gaussians)
@@ -73,7 +75,7 @@ def evaluate(
             fitted=scene,
             render_as=_renderer(store, fitted, scene, settings.conditions, view_time_painter),
             shifts=settings.scoring.shifts,
-            feature_distance=_feature_distance(settings.feature_weights),
+            distances=load_distances(settings.feature_weights, settings.lpips),
             progress=lambda done, total: listener().advanced(stage, done, total, ""),
         )
         scores = judgement.scores()
@@ -111,12 +113,18 @@ def _renderer(
     return lambda camera_name: painted_renderer(builder, loaded, camera_name)
 
 
-def _feature_distance(path: Path | None) -> SqueezeNetDistance | None:
-    return None if path is None else load_squeezenet_distance(path)
+def _weights_digests(settings: JudgeSettings) -> dict[str, str]:
+    """What the perceptual distances depend on."""
+    files = {
+        "features": settings.feature_weights,
+        "lpips backbone": settings.lpips.backbone,
+        "lpips heads": settings.lpips.heads,
+    }
+    return {name: _digest_of(path) for name, path in files.items() if path is not None}
 
 
 def _digest_of(path: Path) -> str:
     try:
         return digest_file(path)[:DIGEST_LENGTH]
     except OSError as error:
-        raise WeightsError(f"no SqueezeNet weights at {path}: {error.strerror}") from None
+        raise WeightsError(f"no weights at {path}: {error.strerror}") from None

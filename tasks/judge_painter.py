@@ -17,6 +17,7 @@ from lidarpainter_models.metrics.squeezenet import SqueezeNetDistance, load_sque
 from lidarpainter_models.painter import load_painter
 from lidarpainter_models.painter.examples import PairSource
 from lidarpainter_models.painter.nano.painter import NanoPainter
+from lidarpainter_models.painter.nano.tiles import TileConfig
 from lidarpainter_models.painter.one_step.painter import OneStepPainter
 from lidarpainter_models.painter.protocol import Painter
 from tasks.harvest import PairSet
@@ -36,11 +37,12 @@ PAINTING_COLUMNS = (
     "outside hull, %",
     "confidence AUC",
     "CPU ms",
+    "kept, %",
 )
 PAINTING_NOTE = (
     "PSNR, damaged and undamaged in dB; damaged: error of the render above 0.1; outside hull: more "
     "than 0.05 beyond what any input shows within 9x9 pixels; AUC: of the confidence for an error "
-    "above 0.05; features: SqueezeNet distance, with --feature-weights."
+    "above 0.05; features: SqueezeNet distance, with --feature-weights; kept: left unpainted."
 )
 FIGURES = ("psnr", "ssim", "feature_distance", "damaged_psnr", "undamaged_psnr")
 
@@ -49,7 +51,10 @@ PaintingCell = str | float | None
 
 @task(**STAGE_OPTIONS)
 def judge_painters(
-    painters: Mapping[str, str], sets: Sequence[PairSet], feature_weights: Path | None = None
+    painters: Mapping[str, str],
+    sets: Sequence[PairSet],
+    feature_weights: Path | None = None,
+    keep_below: float | None = None,
 ) -> dict[str, Any]:
     """Scores of several painters on the same pairs, those left out that any was trained on.
 
@@ -57,12 +62,16 @@ def judge_painters(
         painters: names or weights files of painters, by what tables call them.
         sets: the pairs.
         feature_weights: SqueezeNet 1.1, for the feature distance.
+        keep_below: judge the small painter a second time, leaving tiles unpainted on which all that
+            is known differs by less than this.
 
     Returns:
         `painters`: scores by label; `pairs`: how many of every set were judged and left out;
         `training_unknown`: learned painters whose weights do not say what they were trained on.
     """
     loaded = {label: load_painter(name) for label, name in painters.items()}
+    if keep_below is not None:
+        loaded |= _sparing(loaded, TileConfig(keep_below=keep_below))
     distance = feature_distance_of(feature_weights)
     folders = open_sets(sets)
     known = {label: _trained_targets(painter) for label, painter in loaded.items()}
@@ -130,6 +139,20 @@ def judge_held_back(
     )
 
 
+def _sparing(painters: Mapping[str, Painter], tiles: TileConfig) -> dict[str, Painter]:
+    """The small painters among these once more, painting only what needs it."""
+    return {
+        f"{label}, tiles kept": NanoPainter(
+            painter.network,
+            provenance=painter.provenance,
+            half_precision=painter.half_precision,
+            tiles=tiles,
+        )
+        for label, painter in painters.items()
+        if isinstance(painter, NanoPainter)
+    }
+
+
 def load_painting_scores(ref: ArtefactRef) -> dict[str, Any]:
     """Read the scores of `judge_held_back`."""
     return read_json(ref.folder / SCORES_FILE)
@@ -175,12 +198,14 @@ def painting_rows(
     }
     first = next(iter(found.values()))
     rows = [
-        [*_figures("input render", first["input"]), None, None],
-        [*_figures("mean with warps", first["warp_mean"]), None, None],
+        [*_figures("input render", first["input"]), None, None, None],
+        [*_figures("mean with warps", first["warp_mean"]), None, None, None],
     ]
     for label, one in found.items():
         painted = _figures(label, one["painted"])
-        rows.append([*painted, one["confidence_auc"], one["cpu_ms_per_frame"]])
+        rows.append(
+            [*painted, one["confidence_auc"], one["cpu_ms_per_frame"], 100 * one["kept_share"]]
+        )
     return rows
 
 

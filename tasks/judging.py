@@ -13,7 +13,7 @@ from lidarpainter_models.evaluation.scene_scores import (
 )
 from lidarpainter_models.gaussians.scene_graph import GaussianScene
 from lidarpainter_models.geometry.trajectories import Shift
-from lidarpainter_models.metrics.squeezenet import SqueezeNetDistance
+from lidarpainter_models.metrics.perceptual import PerceptualDistances
 from lidarpainter_models.scenes.synthetic.street import SyntheticStreet
 from tasks.scores import DEPTH, Scores
 
@@ -32,7 +32,7 @@ class Judgement:
     render_as: Callable[[str], Renderer]
     """Renderer in the colours of a camera."""
     shifts: Sequence[Shift]
-    feature_distance: SqueezeNetDistance | None
+    distances: PerceptualDistances
     progress: Callable[[int, int], None]
 
     def scores(self) -> Scores:
@@ -53,12 +53,14 @@ class Judgement:
     def _of_camera(self, name: str) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
         views = [view for view in self.held_out.test_views if view.camera_name == name]
         part, render = replace(self.held_out, test_views=views), self.render_as(name)
-        options = {"feature_distance": self.feature_distance}
-        recorded = score_recorded(render, part, self.fitted, **options)
+        recorded = score_recorded(render, part, self.fitted, distances=self.distances)
         if GENERATOR_ENTRY not in part.scene.manifest:
             return recorded, {shift.name: _unknown(len(views)) for shift in self.shifts}
         street = SyntheticStreet.from_manifest(part.scene.manifest)
-        return recorded, score_synthetic(render, part, self.fitted, street, self.shifts, **options)
+        novel = score_synthetic(
+            render, part, self.fitted, street, self.shifts, distances=self.distances
+        )
+        return recorded, novel
 
 
 def _mean(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Render a finished run along a trajectory, painted at view time if asked for."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,9 @@ from jaxtyping import Float
 from prefect import task
 from torch import Tensor
 
-from catalog.store import open_store
+from catalog.store import Store, open_store
 from lidarpainter_models.conditioning.conditions import ConditionBuilder, ConditionConfig
-from lidarpainter_models.errors import SceneError
+from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.export.pictures import write_png
 from lidarpainter_models.gaussians.observations import ObservationConfig, fit_camera
 from lidarpainter_models.gaussians.scene_graph import GaussianScene
@@ -19,7 +20,7 @@ from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectories import road_directions, shift_pose
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
 from lidarpainter_models.painter import load_painter
-from lidarpainter_models.painter.protocol import Painter
+from lidarpainter_models.painter.protocol import DEFAULT_PROMPT, Painter
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
 from tasks.progress import listener
@@ -43,8 +44,66 @@ class RenderRequest:
     """Positions of the recorded frames to follow."""
     painter: str | None = None
     """Painter applied to every picture; None shows the scene as it is."""
+    prompt: str = DEFAULT_PROMPT
+    """What a painter that knows styles is asked for."""
     observation: ObservationConfig
     conditions: ConditionConfig
+
+    def __post_init__(self) -> None:
+        """Refuse a prompt that nobody is asked for."""
+        if self.prompt != DEFAULT_PROMPT and self.painter is None:
+            raise ConfigError(f"prompt {self.prompt!r} needs a painter: --postpaint or --painter")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OpenedRun:
+    """A finished run, ready to be looked at along a trajectory."""
+
+    recorded: DrivingScene
+    builder: ConditionBuilder
+    camera_name: str
+    views: Sequence[RecordedView]
+    """The recorded moments to follow."""
+    request: RenderRequest
+    painter: Painter | None
+
+    def camera(self, number: int) -> Camera:
+        """Where the camera stands at the n-th of the moments."""
+        progress = number / max(len(self.views) - 1, 1)
+        return _shifted(
+            self.recorded, self.builder.scene, self.views[number], self.request, progress
+        )
+
+    def picture(self, camera: Camera, view: RecordedView) -> Float[Tensor, "height width 3"]:
+        """What is seen there, painted if asked for; in [0, 1]."""
+        return _picture(self, camera, view).clamp(0, 1)
+
+
+def open_views(store: Store, run: FinishedRun, request: RenderRequest) -> OpenedRun:
+    """Load what a run's pictures are made from.
+
+    Raises:
+        SceneError: the run did not train on that camera, or no frame is left.
+    """
+    recorded = open_scene(store, run.scene_id)
+    seen = load_observations(store, run.final.observations)
+    scene = load_scene(store, run.final.gaussians)
+    camera_name = request.camera or seen.camera_names[0]
+    if camera_name not in seen.camera_names:
+        raise SceneError(
+            f"run {run.run_id} has no camera {camera_name!r}, it has {', '.join(seen.camera_names)}"
+        )
+    views = recorded.views_of(camera_name)[request.frames or slice(None)]
+    if not views:
+        raise SceneError(f"{run.scene_id}: no frame of {camera_name} is left to render")
+    return OpenedRun(
+        recorded=recorded,
+        builder=ConditionBuilder(scene, seen.lidar_map, seen.views, config=request.conditions),
+        camera_name=camera_name,
+        views=views,
+        request=request,
+        painter=None if request.painter is None else load_painter(request.painter),
+    )
 
 
 @task(**STAGE_OPTIONS)
@@ -54,30 +113,16 @@ def render(store_path: Path, run: FinishedRun, request: RenderRequest, out: Path
     Raises:
         SceneError: the run did not train on that camera, or no frame is left.
     """
-    store = open_store(store_path)
-    recorded = open_scene(store, run.scene_id)
-    seen = load_observations(store, run.final.observations)
-    scene = load_scene(store, run.final.gaussians)
-    builder = ConditionBuilder(scene, seen.lidar_map, seen.views, config=request.conditions)
-    painter = None if request.painter is None else load_painter(request.painter)
-    camera_name = request.camera or seen.camera_names[0]
-    if camera_name not in seen.camera_names:
-        raise SceneError(
-            f"run {run.run_id} has no camera {camera_name!r}, it has {', '.join(seen.camera_names)}"
-        )
-    views = recorded.views_of(camera_name)[request.frames or slice(None)]
-    if not views:
-        raise SceneError(f"{run.scene_id}: no frame of {camera_name} is left to render")
+    opened = open_views(open_store(store_path), run, request)
     listener().started(STAGE)
     rows = []
-    for number, view in enumerate(views):
-        camera = _shifted(recorded, scene, view, request, number / max(len(views) - 1, 1))
-        rgb = _picture(builder, painter, camera, view)
-        path = write_png(rgb.clamp(0, 1), out / f"{view.frame_index:04d}.png")
-        rows.append(_row(path, camera, view))
-        listener().advanced(STAGE, number + 1, len(views), "")
+    for number, view in enumerate(opened.views):
+        camera = opened.camera(number)
+        path = write_png(opened.picture(camera, view), out / f"{view.frame_index:04d}.png")
+        rows.append(picture_record(path, camera, view))
+        listener().advanced(STAGE, number + 1, len(opened.views), "")
     write_json(out / POSES_FILE, {"trajectory": request.trajectory.spec, "pictures": rows})
-    return {"folder": str(out), "num_pictures": len(rows), "camera": camera_name}
+    return {"folder": str(out), "num_pictures": len(rows), "camera": opened.camera_name}
 
 
 def _shifted(
@@ -101,17 +146,24 @@ def _shifted(
 
 
 def _picture(
-    builder: ConditionBuilder, painter: Painter | None, camera: Camera, view: RecordedView
+    opened: OpenedRun, camera: Camera, view: RecordedView
 ) -> Float[Tensor, "height width 3"]:
-    if painter is None:
+    builder = opened.builder
+    if opened.painter is None:
         shown = builder.scene.render(camera, view.timestamp_ns, camera_name=view.camera_name)
         return shown.rgb
-    conditions = builder.conditions(camera, view.timestamp_ns, camera_name=view.camera_name)
+    conditions = builder.conditions(
+        camera,
+        view.timestamp_ns,
+        camera_name=view.camera_name,
+        prompt=opened.request.prompt,
+    )
     with torch.inference_mode():
-        return painter.paint(conditions).rgb
+        return opened.painter.paint(conditions).rgb
 
 
-def _row(path: Path, camera: Camera, view: RecordedView) -> dict[str, Any]:
+def picture_record(path: Path, camera: Camera, view: RecordedView) -> dict[str, Any]:
+    """Where and when a picture was taken, as JSON types."""
     return {
         "file": path.name,
         "frame_index": view.frame_index,

@@ -11,7 +11,7 @@ from lidarpainter_models.errors import ConfigError
 PROTOCOLS = ("paper", "truth", "cross-camera")
 
 
-def evaluate(
+def evaluate(  # noqa: PLR0913 - the options of a command
     run: Annotated[str, typer.Argument(help="A run id, a unique prefix of one, or latest.")],
     protocol: Annotated[str, typer.Option(help=f"{', '.join(PROTOCOLS)}.")] = "paper",
     postpaint: Annotated[
@@ -22,6 +22,12 @@ def evaluate(
     ] = None,
     feature_weights: Annotated[
         Path | None, typer.Option(help="SqueezeNet 1.1 weights for the feature distance.")
+    ] = None,
+    lpips_backbone: Annotated[
+        Path | None, typer.Option(help="torchvision's VGG-16, AlexNet or SqueezeNet, for LPIPS.")
+    ] = None,
+    lpips_heads: Annotated[
+        Path | None, typer.Option(help="LPIPS heads (version 0.1) of the same network.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
@@ -42,8 +48,7 @@ def evaluate(
     store = open_store()
     finished = open_run(store, run)
     parameters = view_parameters(finished)
-    if feature_weights is not None:
-        parameters = with_changes(parameters, {"feature_weights": feature_weights})
+    parameters = with_changes(parameters, _weights(feature_weights, lpips_backbone, lpips_heads))
     variants: dict[str, tuple[Any, str | None]] = {
         "unpainted": (finished.unpainted, None),
         "painted": (finished.final, None),
@@ -73,6 +78,16 @@ def evaluate(
         _show_strips(result, list(variants))
     else:
         _show(result, list(variants))
+
+
+def _weights(features: Path | None, backbone: Path | None, heads: Path | None) -> dict[str, Any]:
+    """The weights that are given; the run's own stay otherwise."""
+    from lidarpainter_models.metrics.lpips import LpipsFiles
+
+    changes: dict[str, Any] = {} if features is None else {"feature_weights": features}
+    if backbone is not None or heads is not None:
+        changes["lpips"] = LpipsFiles(backbone=backbone, heads=heads)
+    return changes
 
 
 def _with_truth(scores: dict[str, Any], scene_id: str) -> dict[str, Any]:

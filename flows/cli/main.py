@@ -16,7 +16,7 @@ import typer
 
 from catalog.errors import CatalogError
 from catalog.store import STORE_ENVIRONMENT
-from flows.cli import catalog, demo, doctor, evaluate, ingest, painter, reconstruct, render
+from flows.cli import catalog, demo, doctor, evaluate, ingest, painter, reconstruct, render, stylize
 from flows.cli.output import complain
 from flows.environment import prepare_environment
 from lidarpainter_models import __version__
@@ -40,6 +40,7 @@ app.command("doctor")(doctor.doctor)
 app.command("ingest")(ingest.ingest)
 app.command("reconstruct")(reconstruct.reconstruct)
 app.command("render")(render.render)
+app.command("stylize")(stylize.stylize)
 app.command("evaluate")(evaluate.evaluate)
 app.add_typer(painter.app, name="painter")
 app.add_typer(catalog.app, name="catalog")

@@ -78,6 +78,10 @@ def train(  # noqa: PLR0913 - the options of a command
     inputs: Annotated[
         str, typer.Option(help="What the painter may see, with commas between.")
     ] = "render,lidar,warp",
+    prompts: Annotated[
+        str | None,
+        typer.Option(help="clear, and styles to learn beside it: clear,foggy,night,rain."),
+    ] = None,
     held_back: Annotated[
         float, typer.Option(help="Share of the true pictures kept from training, to judge by.")
     ] = 0.1,
@@ -90,13 +94,16 @@ def train(  # noqa: PLR0913 - the options of a command
     as_json: AsJson = False,
 ) -> None:
     """Train the small painter; a killed training goes on where it stopped."""
+    from flows.cli.ingest import parse_names
     from flows.cli.training import run_training, train_parameters
     from flows.overrides import with_overrides
 
     parameters = train_parameters(
         parse_seeds(seeds), scenes, split, cameras, parse_paths(pairs, "--pairs"), start
     )
-    training = with_length(parameters.training, parse_inputs(inputs), budget, steps)
+    training = with_length(
+        parameters.training, parse_inputs(inputs), budget, steps, parse_names(prompts)
+    )
     changes = {
         "training": training,
         "held_back": held_back,
@@ -119,13 +126,23 @@ def evaluate(
     ],
     pairs: Annotated[list[str], typer.Option(help="A folder of pairs. May be repeated.")],
     feature_weights: Features = None,
+    keep_below: Annotated[
+        float | None,
+        typer.Option(
+            help="Judge small painters again, leaving tiles unpainted that differ by less than "
+            "this from LiDAR and warps; 0.01 say."
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Judge painters on pairs that none of them was trained on."""
     from flows.cli.training import judge
 
     found = judge(
-        parse_paths(painters, "--painter"), parse_paths(pairs, "--pairs"), feature_weights
+        parse_paths(painters, "--painter"),
+        parse_paths(pairs, "--pairs"),
+        feature_weights,
+        keep_below,
     )
     if as_json:
         print_json(found)

@@ -80,15 +80,16 @@ def with_length(
     inputs: frozenset[str],
     budget_s: float | None,
     steps: int | None,
+    prompts: tuple[str, ...] | None = None,
 ) -> "NanoTrainingConfig":
-    """The settings with other inputs, and as long as asked for.
+    """The settings with other inputs and prompts, and as long as asked for.
 
     Raises:
-        ConfigError: both lengths are given, or one is not positive.
+        ConfigError: both lengths are given, one is not positive, or a prompt is no style.
     """
     if budget_s is not None and steps is not None:
         raise ConfigError("give --budget or --steps, not both")
-    network = replace(training.network, inputs=inputs)
+    network = replace(training.network, inputs=inputs, prompts=prompts or training.network.prompts)
     if steps is None:
         steps = training.steps
     return replace(training, network=network, max_cpu_s=budget_s, steps=steps)

@@ -27,6 +27,9 @@ def render(  # noqa: PLR0913 - the options of a command
     painter: Annotated[
         str | None, typer.Option(help="Painter for --postpaint; the run's own if absent.")
     ] = None,
+    prompt: Annotated[
+        str, typer.Option(help="What a painter that was trained for styles is asked for.")
+    ] = "clear",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Render a finished run where nobody drove."""
@@ -48,6 +51,7 @@ def render(  # noqa: PLR0913 - the options of a command
         camera=camera,
         frames=parse_frames(frames),
         painter=(painter or parameters.painter) if postpaint or painter else None,
+        prompt=prompt,
         observation=parameters.observation,
         conditions=parameters.conditions,
     )
@@ -57,6 +61,7 @@ def render(  # noqa: PLR0913 - the options of a command
         "run_id": finished.run_id,
         "trajectory": path.spec,
         "painter": request.painter,
+        "prompt": request.prompt,
         **made,
     }
     if as_json:

@@ -100,9 +100,12 @@ def run_ablation(parameters: AblationParameters) -> dict[str, Any]:
 
 
 def judge(
-    painters: Sequence[Path], pair_folders: Sequence[Path], feature_weights: Path | None
+    painters: Sequence[Path],
+    pair_folders: Sequence[Path],
+    feature_weights: Path | None,
+    keep_below: float | None = None,
 ) -> dict[str, Any]:
     """Judge painters here and now; nothing is stored."""
     labels = {str(painter): str(painter) for painter in painters}
     with shown_progress():
-        return judge_painters.fn(labels, named_sets(pair_folders), feature_weights)
+        return judge_painters.fn(labels, named_sets(pair_folders), feature_weights, keep_below)

@@ -93,7 +93,7 @@ class ConditionBuilder:
         if key not in self._sources:
             view, camera = self._views[key], self._cameras[key]
             render = self.scene.render(camera, view.timestamp_ns)
-            lidar = self._lidar(camera, view.timestamp_ns)
+            lidar = self.lidar_image(camera, view.timestamp_ns)
             # the sky mask knows better than the render where there is sky; what else is clear in
             # the render is drawn by the sky too, so it stands at infinity in both views
             self._sources[key] = SourcePicture(
@@ -101,7 +101,7 @@ class ConditionBuilder:
                 camera=camera,
                 timestamp_ns=view.timestamp_ns,
                 rgb=self._without_exposure(view.rgb, key[1]),
-                depth_m=torch.where(view.sky_mask, 0.0, self._surface_m(render, lidar, camera)),
+                depth_m=torch.where(view.sky_mask, 0.0, self.surface_m(render, lidar, camera)),
                 alpha=torch.where(view.sky_mask, 0.0, render.alpha),
             )
         return self._sources[key]
@@ -149,13 +149,13 @@ class ConditionBuilder:
             prompt: Passed on to the painter.
         """
         render = self.scene.render(camera, timestamp_ns)
-        lidar = self._lidar(camera, timestamp_ns)
+        lidar = self.lidar_image(camera, timestamp_ns)
         is_sky = (render.alpha < self.config.warp.sky_alpha) & (lidar.depth_m == 0)
         references = warped_references(
             WarpTarget(
                 camera,
                 timestamp_ns,
-                [self._surface_m(render, lidar, camera), lidar.depth_m],
+                [self.surface_m(render, lidar, camera), lidar.depth_m],
                 is_sky,
             ),
             self.sources_for(camera, timestamp_ns, exclude=exclude),
@@ -177,13 +177,13 @@ class ConditionBuilder:
             prompt=prompt,
         )
 
-    def _lidar(self, camera: Camera, timestamp_ns: int) -> LidarImage:
+    def lidar_image(self, camera: Camera, timestamp_ns: int) -> LidarImage:
         """What the LiDAR knows of a view."""
         return render_lidar(
             self.lidar_map, self.tracks, camera, timestamp_ns, config=self.config.lidar
         )
 
-    def _surface_m(
+    def surface_m(
         self, render: SceneRender, lidar: LidarImage, camera: Camera
     ) -> Float[Tensor, "height width"]:
         """The best known depth of a view."""

@@ -16,8 +16,8 @@ from torch import Tensor
 from lidarpainter_models.geometry.boxes import box_corners
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import transform_points
+from lidarpainter_models.metrics.perceptual import PerceptualDistances
 from lidarpainter_models.metrics.pictures import PictureScores, pooled_psnr, score_picture
-from lidarpainter_models.metrics.squeezenet import SqueezeNetDistance
 from lidarpainter_models.scenes.driving_scene import ActorTrack
 
 Renderer = Callable[[Camera, int], Float[Tensor, "height width 3"]]
@@ -47,6 +47,9 @@ class ViewScores:
     ssim: float
     actors_psnr: float | None
     feature_distance: float | None
+    lpips: float | None
+    lpips_reason: str | None
+    """Why there is no LPIPS."""
     num_views: int
     per_view_psnr: tuple[float, ...]
 
@@ -75,23 +78,28 @@ def score_views(
     render: Renderer,
     views: Sequence[JudgedView],
     *,
-    feature_distance: SqueezeNetDistance | None = None,
+    distances: PerceptualDistances,
 ) -> ViewScores | None:
     """Render every view and average its scores; None without views."""
     if not views:
         return None
     scores: list[PictureScores] = []
-    distances: list[float] = []
+    features: list[float] = []
+    lpips: list[float] = []
     for view in views:
         picture = render(view.camera, view.timestamp_ns).clamp(0, 1)
         scores.append(score_picture(picture, view.truth_rgb, view.actor_mask))
-        if feature_distance is not None:
-            distances.append(float(feature_distance(picture, view.truth_rgb)))
+        if distances.features is not None:
+            features.append(float(distances.features(picture, view.truth_rgb)))
+        if distances.lpips is not None:
+            lpips.append(float(distances.lpips(picture, view.truth_rgb)))
     return ViewScores(
         psnr=sum(score.psnr_db for score in scores) / len(scores),
         ssim=sum(score.ssim for score in scores) / len(scores),
         actors_psnr=pooled_psnr(scores),
-        feature_distance=sum(distances) / len(distances) if distances else None,
+        feature_distance=sum(features) / len(features) if features else None,
+        lpips=sum(lpips) / len(lpips) if lpips else None,
+        lpips_reason=distances.lpips_missing,
         num_views=len(scores),
         per_view_psnr=tuple(score.psnr_db for score in scores),
     )

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.kernels.ssim import ssim_map
+from lidarpainter_models.metrics.perceptual import PictureDistance
 from lidarpainter_models.metrics.pictures import psnr_from_error, squared_error
 from lidarpainter_models.painter.baselines import UnpaintedPainter, WarpPainter
 from lidarpainter_models.painter.examples import PaintingPair, PairSource
@@ -32,11 +33,6 @@ HULL_SIDE_PX = 9
 HULL_MARGIN = 0.05
 CONFIDENCE_BINS = 1 << 16
 """Confidences that share a bin count as equal."""
-
-PictureDistance = Callable[
-    [Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]], Float[Tensor, ""]
-]
-"""Of a picture to the truth, such as `metrics.squeezenet.SqueezeNetDistance`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,6 +48,19 @@ class PictureFigures:
     undamaged_psnr: float | None
     outside_hull: float
     """Share of pixels further than 0.05 outside what any input shows within 9x9 pixels."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PaintingGains:
+    """PSNR of the painted picture over that of others; None where one of them has no pixels."""
+
+    over_input: float
+    over_warp_mean: float
+    """Over the mean of the render and the valid warps, which needs no learning."""
+    damaged: float | None
+    """Over the input, in damaged pixels."""
+    undamaged: float | None
+    """The same in undamaged ones; negative where painting harms them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,6 +80,9 @@ class SourceScores:
     ties count half); None where all pixels are right, or all wrong."""
     cpu_ms_per_frame: float
     """Process CPU time of painting one pair, all threads together; the median."""
+    kept_share: float
+    """Of the pixels that the painter left unpainted; 0 for painters that paint everything."""
+    gains_db: PaintingGains
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -215,6 +227,7 @@ class _SourceTally:
     num_right: Tensor = field(default_factory=_no_counts)
     num_wrong: Tensor = field(default_factory=_no_counts)
     cpu_s: list[float] = field(default_factory=list)
+    kept_shares: list[float] = field(default_factory=list)
 
     def add_confidence(self, painting: Painting, pair: PaintingPair) -> None:
         known = pair.target_valid
@@ -225,14 +238,23 @@ class _SourceTally:
 
     def scores(self) -> SourceScores:
         counts = (self.num_known, self.num_damaged)
+        before, mean = self.input.figures(*counts), self.warp_mean.figures(*counts)
+        painted = self.painted.figures(*counts)
         return SourceScores(
             num_pairs=len(self.cpu_s),
             damaged_share=self.num_damaged / self.num_known,
-            input=self.input.figures(*counts),
-            warp_mean=self.warp_mean.figures(*counts),
-            painted=self.painted.figures(*counts),
+            input=before,
+            warp_mean=mean,
+            painted=painted,
             confidence_auc=confidence_auc(self.num_right, self.num_wrong),
             cpu_ms_per_frame=1000 * median(self.cpu_s),
+            kept_share=fmean(self.kept_shares),
+            gains_db=PaintingGains(
+                over_input=painted.psnr - before.psnr,
+                over_warp_mean=painted.psnr - mean.psnr,
+                damaged=_gain(painted.damaged_psnr, before.damaged_psnr),
+                undamaged=_gain(painted.undamaged_psnr, before.undamaged_psnr),
+            ),
         )
 
 
@@ -254,6 +276,7 @@ def _score_pair(
     started = time.process_time()
     painting = painter.paint(conditions)
     tally.cpu_s.append(time.process_time() - started)
+    tally.kept_shares.append(painting.kept_share)
     damaged = _absolute_error(conditions.render_rgb, pair.target_rgb) > DAMAGED_ERROR
     tally.num_known += int(pair.target_valid.sum())
     tally.num_damaged += int((damaged & pair.target_valid).sum())
@@ -278,6 +301,7 @@ def _joined(tallies: Sequence[_SourceTally]) -> _SourceTally:
         num_right=torch.stack([tally.num_right for tally in tallies]).sum(dim=0),
         num_wrong=torch.stack([tally.num_wrong for tally in tallies]).sum(dim=0),
         cpu_s=[seconds for tally in tallies for seconds in tally.cpu_s],
+        kept_shares=[share for tally in tallies for share in tally.kept_shares],
     )
 
 
@@ -296,6 +320,10 @@ def _absolute_error(
     picture: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]
 ) -> Float[Tensor, "height width"]:
     return (picture.clamp(0, 1) - truth).abs().mean(dim=-1)
+
+
+def _gain(after: float | None, before: float | None) -> float | None:
+    return None if after is None or before is None else after - before
 
 
 def _pooled_psnr(error_sum: float, num_pixels: int) -> float | None:

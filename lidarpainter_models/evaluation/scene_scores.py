@@ -18,7 +18,7 @@ from lidarpainter_models.metrics.depth import (
     pooled_inlier_fraction,
     score_depth,
 )
-from lidarpainter_models.metrics.squeezenet import SqueezeNetDistance
+from lidarpainter_models.metrics.perceptual import PerceptualDistances
 from lidarpainter_models.painter.protocol import Painter
 from lidarpainter_models.scenes.synthetic.street import SyntheticStreet
 
@@ -66,8 +66,8 @@ def _view_scores(scores: ViewScores | None) -> dict[str, Any]:
         return {"psnr": None, "ssim": None, "num_views": 0}
     found = asdict(scores)
     found.pop("per_view_psnr")
-    found["lpips"] = None
-    found["lpips_reason"] = "LPIPS backbone weights are user-supplied and none were given"
+    if scores.lpips is not None:
+        found.pop("lpips_reason")
     return found
 
 
@@ -76,17 +76,15 @@ def score_recorded(
     held_out: HeldOut,
     fitted: GaussianScene,
     *,
-    feature_distance: SqueezeNetDistance | None = None,
+    distances: PerceptualDistances,
 ) -> dict[str, Any]:
     """Held-out pictures with interpolated poses, and beside them with recorded poses."""
     interpolated = score_views(
         render,
         held_out.recorded_views(fitted, "interpolated"),
-        feature_distance=feature_distance,
+        distances=distances,
     )
-    recorded = score_views(
-        render, held_out.recorded_views(fitted, "recorded"), feature_distance=feature_distance
-    )
+    recorded = score_views(render, held_out.recorded_views(fitted, "recorded"), distances=distances)
     return {**_view_scores(interpolated), "recorded_poses": _view_scores(recorded)}
 
 
@@ -97,7 +95,7 @@ def score_synthetic(
     street: SyntheticStreet,
     shifts: Sequence[Shift],
     *,
-    feature_distance: SqueezeNetDistance | None = None,
+    distances: PerceptualDistances,
 ) -> dict[str, Any]:
     """Exact truth beside the path, per trajectory."""
     return {
@@ -105,7 +103,7 @@ def score_synthetic(
             score_views(
                 render,
                 held_out.synthetic_views(fitted, street, shift),
-                feature_distance=feature_distance,
+                distances=distances,
             )
         )
         for shift in shifts

@@ -9,13 +9,15 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.batches import ConditionBatch, stack_conditions
 from lidarpainter_models.painter.examples import PaintingPair, PairSource, Window
+from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
 from lidarpainter_models.painter.render_damage import damage_render
+from lidarpainter_models.painter.style_pairs import styled_pair
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,6 +44,8 @@ class AugmentationConfig:
     """The same for each channel by itself."""
     mismatch_range: float = 0.06
     """Largest change of the logarithm of exposure of one warp or the LiDAR alone."""
+    style_share: float = 0.5
+    """Samples whose target is in a style, where the network has prompts for any."""
 
     def __post_init__(self) -> None:
         """Refuse shares outside [0, 1] and windows of broken cells."""
@@ -60,6 +64,12 @@ class TrainingBatch(NamedTuple):
     target_valid: Float[Tensor, "batch height width"]
     prompts: tuple[str, ...]
 
+    @property
+    def restyled(self) -> Bool[Tensor, " batch"]:
+        """Samples whose target is in a style."""
+        styled = [prompt != DEFAULT_PROMPT for prompt in self.prompts]
+        return torch.tensor(styled, device=self.target.device)
+
     def to(self, device: torch.device) -> "TrainingBatch":
         """The same batch on another device."""
         return self._replace(
@@ -75,17 +85,49 @@ def draw_batch(
     *,
     batch_size: int,
     num_warps: int,
+    prompts: Sequence[str] = (DEFAULT_PROMPT,),
     config: AugmentationConfig,
     generator: Generator,
 ) -> TrainingBatch:
-    """Draw windows from the sources, each source by its share, and vary them."""
+    """Draw windows from the sources, each source by its share, and vary them.
+
+    Args:
+        sources: sets of pairs.
+        source_shares: how likely each is.
+        batch_size: samples.
+        num_warps: warps of each.
+        prompts: the first restores; the others are styles that targets are put into.
+        config: see there.
+        generator: decides everything.
+    """
     shares = torch.tensor(source_shares, dtype=torch.float64)
     pairs = []
     for _ in range(batch_size):
         source = sources[int(torch.multinomial(shares, 1, generator=generator))]
         index = int(torch.randint(len(source), (), generator=generator))
-        pairs.append(source.read(index, random_window(source.size_px(index), config, generator)))
+        window = random_window(source.size_px(index), config, generator)
+        pairs.append(_read(source, index, window, prompts, config, generator))
     return augment(batch_pairs(pairs, num_warps), config, generator)
+
+
+def _read(
+    source: PairSource,
+    index: int,
+    window: Window,
+    prompts: Sequence[str],
+    config: AugmentationConfig,
+    generator: Generator,
+) -> PaintingPair:
+    """A window of a pair, its target in a style that is drawn if there are any.
+
+    Airlight, glow and lamps belong to the whole picture, so that is styled before it is cut.
+    """
+    if len(prompts) == 1 or float(torch.rand((), generator=generator)) >= config.style_share:
+        return source.read(index, window)
+    chosen = 1 + int(torch.randint(len(prompts) - 1, (), generator=generator))
+    seed = int(torch.randint(1 << 31, (), generator=generator))
+    pair = styled_pair(source.read(index), prompts[chosen], Generator().manual_seed(seed))
+    return pair.cropped(window)
 
 
 def random_window(
@@ -179,7 +221,8 @@ def _change_render(
     """Damage some renders and replace some by the truth."""
     size = len(batch.target)
     damaged = _chosen(config.damage_share, size, generator)
-    perfect = _chosen(config.identity_share, size, generator)
+    # a styled target is no perfect render of a clear view
+    perfect = _chosen(config.identity_share, size, generator) & ~batch.restyled
     render = batch.conditions.render.clone()
     for index in damaged.nonzero()[:, 0].tolist():
         render[index] = damage_render(render[index], generator)

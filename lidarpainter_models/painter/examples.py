@@ -22,6 +22,14 @@ class Window(NamedTuple):
     height_px: int
     width_px: int
 
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Its rows and columns."""
+        return (
+            slice(self.top_px, self.top_px + self.height_px),
+            slice(self.left_px, self.left_px + self.width_px),
+        )
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PaintingPair:
@@ -43,20 +51,8 @@ class PaintingPair:
 
     def cropped(self, window: Window) -> "PaintingPair":
         """The pair inside a window."""
-        rows = slice(window.top_px, window.top_px + window.height_px)
-        columns = slice(window.left_px, window.left_px + window.width_px)
-        old = self.conditions
-        conditions = PaintingConditions(
-            render_rgb=old.render_rgb[rows, columns],
-            render_depth_m=old.render_depth_m[rows, columns],
-            render_alpha=old.render_alpha[rows, columns],
-            lidar_rgb=old.lidar_rgb[rows, columns],
-            lidar_depth_m=old.lidar_depth_m[rows, columns],
-            lidar_hit=old.lidar_hit[rows, columns],
-            warp_rgb=old.warp_rgb[:, rows, columns],
-            warp_valid=old.warp_valid[:, rows, columns],
-            prompt=old.prompt,
-        )
+        rows, columns = window.slices
+        conditions = self.conditions.cropped(rows, columns)
         return type(self)(
             conditions=conditions,
             target_rgb=self.target_rgb[rows, columns],

@@ -36,6 +36,20 @@ class PaintingConditions:
         """Rows and columns of every picture."""
         return self.render_rgb.shape[0], self.render_rgb.shape[1]
 
+    def cropped(self, rows: slice, columns: slice) -> "PaintingConditions":
+        """What is known inside a rectangle."""
+        return PaintingConditions(
+            render_rgb=self.render_rgb[rows, columns],
+            render_depth_m=self.render_depth_m[rows, columns],
+            render_alpha=self.render_alpha[rows, columns],
+            lidar_rgb=self.lidar_rgb[rows, columns],
+            lidar_depth_m=self.lidar_depth_m[rows, columns],
+            lidar_hit=self.lidar_hit[rows, columns],
+            warp_rgb=self.warp_rgb[:, rows, columns],
+            warp_valid=self.warp_valid[:, rows, columns],
+            prompt=self.prompt,
+        )
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Painting:
@@ -44,6 +58,8 @@ class Painting:
     rgb: Float[Tensor, "height width 3"]
     confidence: Float[Tensor, "height width"]
     """In [0, 1]: 1 where the painter expects no error."""
+    kept_share: float = 0.0
+    """Of the picture that was not painted because there was nothing to gain."""
 
 
 @runtime_checkable

@@ -177,3 +177,24 @@ def test_nothing_to_judge_by_is_one_clear_line(make_flat_pair, listed_pairs):
         with pytest.raises(DataError) as caught:
             score_painter(UnpaintedPainter(), sources)
         assert "\n" not in str(caught.value)
+
+
+def test_gains_are_differences_of_the_figures_they_name(two_cases):
+    painter = FixedPainter(grey(0.51), torch.ones(SIDE_PX, SIDE_PX))
+    rows = score_painter(painter, two_cases).sources["rows"]
+    gains = rows.gains_db
+    # everything is 0.01 off now: 40 dB, against 23.98 of the input and 30 of the mean
+    assert gains.over_input == pytest.approx(40 + 10 * math.log10(0.004), abs=1e-2)
+    assert gains.over_warp_mean == pytest.approx(10.0, abs=1e-2)
+    assert gains.damaged == pytest.approx(40 + 10 * math.log10(0.04), abs=1e-2)
+    assert gains.undamaged == -math.inf  # what was perfect no longer is
+    light = score_painter(UnpaintedPainter(), two_cases).sources["light"].gains_db
+    assert (light.over_input, light.undamaged) == (0, 0)
+    assert light.damaged is None
+
+
+def test_the_share_that_was_kept_is_averaged_over_pairs(two_cases):
+    painter = FixedPainter(grey(), torch.ones(SIDE_PX, SIDE_PX))
+    assert score_painter(painter, two_cases).total.kept_share == 0
+    painter.painting = replace(painter.painting, kept_share=0.75)
+    assert score_painter(painter, two_cases).total.kept_share == 0.75

@@ -1,15 +1,20 @@
 """The stages of a reconstruction, one after the other, without a server."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import pytest
+import torch
 from toy_store import TOY_SCENE, small_parameters, write_toy_scene
 
 from catalog.errors import DamagedArtefactError
 from catalog.store import open_store
-from lidarpainter_models.errors import SceneError
+from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+from lidarpainter_models.metrics import lpips
+from lidarpainter_models.metrics.backbones import SQUEEZENET
 from tasks.evaluate import evaluate
 from tasks.fit import fit, refine
 from tasks.ingest import record_scene
@@ -22,6 +27,7 @@ from tasks.report import ReportInputs, report_path, write_report
 from tasks.runs import open_run
 from tasks.scores import load_scores
 from tasks.stored import FittedRef, load_history, load_scene
+from tasks.stylize import StylizeRequest, stylize
 
 
 @pytest.fixture(scope="module")
@@ -145,6 +151,28 @@ def test_scores_say_why_a_number_is_missing(stages):
     assert 0 <= left["depth_within_5_percent"] <= 1
 
 
+def test_lpips_stands_in_the_scores_where_both_files_are_given(
+    store, parameters, final, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(lpips, "is_published", lambda _path, _backbone: True)  # random weights
+    torch.manual_seed(0)
+    torch.save(SQUEEZENET.build().state_dict(), tmp_path / "backbone.pth")
+    heads = {
+        lpips.HEAD_KEY.format(index): torch.rand(1, count, 1, 1)
+        for index, count in enumerate(SQUEEZENET.channels)
+    }
+    torch.save(heads, tmp_path / "heads.pth")
+    files = lpips.LpipsFiles(backbone=tmp_path / "backbone.pth", heads=tmp_path / "heads.pth")
+    without = parameters.judge_settings
+    for settings, has_figure in ((without, False), (replace(without, lpips=files), True)):
+        judged = evaluate.fn(store.root, "evaluate", parameters.split_spec, final, settings)
+        recorded = load_scores(judged.ref)["recorded"]
+        assert (recorded["lpips"] is not None) is has_figure
+        assert ("lpips_reason" in recorded) is not has_figure
+    assert recorded["lpips"] > 0
+    assert recorded["recorded_poses"]["lpips"] > 0
+
+
 def test_painting_at_view_time_is_judged_apart(stages):
     assert stages["evaluate-view-time"].ref != stages["evaluate"].ref
 
@@ -194,6 +222,60 @@ def test_a_run_is_rendered_where_nobody_drove(store, run, parameters, tmp_path, 
     assert [row["file"] for row in described["pictures"]] == ["0001.png", "0002.png"]
     first, last = (row["world_from_camera"] for row in described["pictures"])
     assert last[7] - first[7] == pytest.approx(2.0, abs=0.2)  # y is to the left
+
+
+@pytest.mark.parametrize("pictures", ["rendered", "recorded"])
+def test_a_run_is_shown_in_fog_beside_the_clear_pictures(
+    store, run, parameters, tmp_path, pictures
+):
+    view = RenderRequest(
+        trajectory=parse_trajectory("recorded"),
+        frames=slice(1, 3),
+        observation=parameters.observation,
+        conditions=parameters.conditions,
+    )
+    request = StylizeRequest(prompt="foggy", view=view, pictures=pictures)
+    made = stylize.fn(store.root, run, request, tmp_path / "a")
+    assert made["num_pictures"] == 2
+    assert 0.5 < made["edge_f1"] <= 1
+    described = json.loads((tmp_path / "a" / "trajectory.json").read_text())
+    assert (described["prompt"], len(described["pictures"])) == ("foggy", 2)
+    foggy, clear = (
+        cv2.imread(str(tmp_path / "a" / name)) for name in ("0001.png", "clear/0001.png")
+    )
+    assert float(foggy.std()) < float(clear.std())
+    stylize.fn(store.root, run, request, tmp_path / "b")
+    again = (tmp_path / "b" / "0001.png").read_bytes()
+    assert again == (tmp_path / "a" / "0001.png").read_bytes()
+
+
+def test_a_painter_is_asked_for_the_prompt(store, run, parameters, tmp_path):
+    request = RenderRequest(
+        trajectory=parse_trajectory("recorded"),
+        frames=slice(1, 2),
+        painter="nano",
+        prompt="foggy",
+        observation=parameters.observation,
+        conditions=parameters.conditions,
+    )
+    with pytest.raises(ConfigError, match="knows no prompt 'foggy', only: clear"):
+        render.fn(store.root, run, request, tmp_path)
+    with pytest.raises(ConfigError, match="prompt 'foggy' needs a painter"):
+        replace(request, painter=None)
+
+
+def test_recorded_pictures_exist_only_where_somebody_stood(parameters):
+    view = RenderRequest(
+        trajectory=parse_trajectory("lateral:2"),
+        observation=parameters.observation,
+        conditions=parameters.conditions,
+    )
+    with pytest.raises(ConfigError, match="on the recorded trajectory"):
+        StylizeRequest(prompt="foggy", view=view, pictures="recorded")
+    with pytest.raises(ConfigError, match="no pictures 'drawn'"):
+        StylizeRequest(prompt="foggy", view=view, pictures="drawn")
+    with pytest.raises(ConfigError, match="no style 'snow'"):
+        StylizeRequest(prompt="snow", view=view)
 
 
 def test_an_unknown_camera_is_named_before_anything_is_drawn(store, run, parameters, tmp_path):

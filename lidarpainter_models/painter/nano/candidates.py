@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError
@@ -104,6 +104,23 @@ def build_candidates(
         pictures=torch.stack([made[name] for name in names], dim=1),
         exists=torch.stack([exists.get(name, everywhere) for name in names], dim=1),
         base=base,
+    )
+
+
+def with_flat_colour(
+    candidates: Candidates,
+    name: str,
+    rgb: Float[Tensor, "batch 3"],
+    exists: Bool[Tensor, " batch"],
+) -> Candidates:
+    """One more candidate: a colour of its own for every view, or none for views without."""
+    flat = rgb[:, None, :, None, None].expand_as(candidates.pictures[:, :1])
+    everywhere = torch.ones_like(candidates.exists[:, :1]) * exists[:, None, None, None]
+    return Candidates(
+        names=(*candidates.names, name),
+        pictures=torch.cat([candidates.pictures, flat], dim=1),
+        exists=torch.cat([candidates.exists, everywhere], dim=1),
+        base=candidates.base,
     )
 
 

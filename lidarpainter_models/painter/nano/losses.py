@@ -1,18 +1,24 @@
-"""What the small painter is trained to lower; every term stands alone and is averaged over pixels.
+"""What the small painter is trained to lower: its own sum of the terms of `painter.losses`.
 
 Pictures are (batch, 3, height, width); masks (batch, height, width), 1 where the target is known.
-A term over no pixel is 0.
 """
 
 from dataclasses import dataclass, fields
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.kernels.ssim import ssim_map
 from lidarpainter_models.painter.batches import ConditionBatch
+from lidarpainter_models.painter.losses import (
+    absolute_loss,
+    agreement_mask,
+    gradient_loss,
+    masked_mean,
+    squared_loss,
+    structure_loss,
+)
 from lidarpainter_models.painter.nano.network import NanoOutput
 
 
@@ -64,9 +70,22 @@ def painting_loss(
     target: Float[Tensor, "batch 3 height width"],
     target_valid: Float[Tensor, "batch height width"],
     weights: LossWeights,
+    *,
+    restyled: Bool[Tensor, " batch"] | None = None,
 ) -> LossTerms:
-    """All terms of a batch and `total`, the sum that is minimised."""
+    """All terms of a batch and `total`, the sum that is minimised.
+
+    Args:
+        output: what the network says.
+        conditions: what it was shown.
+        target: what it should say.
+        target_valid: where that is known.
+        weights: how much each term counts.
+        restyled: views whose target is in another style; they have nothing to keep.
+    """
     agreeing = agreement_mask(conditions, weights.agreement) * target_valid
+    if restyled is not None:
+        agreeing = agreeing * (~restyled)[:, None, None].to(agreeing)
     terms = {
         "absolute": absolute_loss(output.rgb, target, target_valid),
         "squared": squared_loss(output.rgb, target, target_valid),
@@ -79,49 +98,6 @@ def painting_loss(
     return LossTerms(**terms, total=total)
 
 
-def absolute_loss(
-    picture: Float[Tensor, "batch 3 height width"],
-    target: Float[Tensor, "batch 3 height width"],
-    mask: Float[Tensor, "batch height width"],
-) -> Float[Tensor, ""]:
-    """Mean absolute difference inside the mask."""
-    return _masked_mean((picture - target).abs().mean(dim=1), mask)
-
-
-def squared_loss(
-    picture: Float[Tensor, "batch 3 height width"],
-    target: Float[Tensor, "batch 3 height width"],
-    mask: Float[Tensor, "batch height width"],
-) -> Float[Tensor, ""]:
-    """Mean squared difference inside the mask."""
-    return _masked_mean((picture - target).square().mean(dim=1), mask)
-
-
-def structure_loss(
-    picture: Float[Tensor, "batch 3 height width"],
-    target: Float[Tensor, "batch 3 height width"],
-    mask: Float[Tensor, "batch height width"],
-) -> Float[Tensor, ""]:
-    """Mean of 1 - SSIM inside the mask; outside it the picture counts as equal to the target."""
-    known = torch.where(mask[:, None] > 0, picture, target)
-    rows = zip(known.permute(0, 2, 3, 1), target.permute(0, 2, 3, 1), strict=True)
-    similarity = torch.stack([ssim_map(ours, truth).mean(dim=-1) for ours, truth in rows])
-    return _masked_mean(1 - similarity, mask)
-
-
-def gradient_loss(
-    picture: Float[Tensor, "batch 3 height width"],
-    target: Float[Tensor, "batch 3 height width"],
-    mask: Float[Tensor, "batch height width"],
-) -> Float[Tensor, ""]:
-    """Mean absolute difference of horizontal and vertical steps between known neighbours."""
-    gap = picture - target
-    across = (gap[..., 1:] - gap[..., :-1]).abs().mean(dim=1)
-    down = (gap[..., 1:, :] - gap[..., :-1, :]).abs().mean(dim=1)
-    horizontal = _masked_mean(across, mask[..., 1:] * mask[..., :-1])
-    return horizontal + _masked_mean(down, mask[..., 1:, :] * mask[..., :-1, :])
-
-
 def expected_error_loss(
     output: NanoOutput,
     target: Float[Tensor, "batch 3 height width"],
@@ -132,20 +108,4 @@ def expected_error_loss(
     The error is taken as given, so this term never changes the picture.
     """
     error = (output.rgb.detach().clamp(0, 1) - target).abs().mean(dim=1)
-    return _masked_mean(error * torch.exp(-output.log_error) + output.log_error, mask)
-
-
-def agreement_mask(
-    conditions: ConditionBatch, difference: float
-) -> Float[Tensor, "batch height width"]:
-    """1 where a warp is valid and every valid warp agrees with the render."""
-    gaps = (conditions.warp - conditions.render[:, None]).abs().mean(dim=2)
-    disagreeing = (gaps > difference) & (conditions.warp_valid > 0)
-    some = conditions.warp_valid.amax(dim=1) > 0
-    return (some & ~disagreeing.any(dim=1)).float()
-
-
-def _masked_mean(
-    values: Float[Tensor, "batch rows columns"], mask: Float[Tensor, "batch rows columns"]
-) -> Float[Tensor, ""]:
-    return (values * mask).sum() / mask.sum().clamp_min(1)
+    return masked_mean(error * torch.exp(-output.log_error) + output.log_error, mask)

@@ -8,11 +8,11 @@ Because colours come from the inputs it cannot invent much; at first it returns 
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from lidarpainter_models.errors import ConfigError
@@ -23,12 +23,18 @@ from lidarpainter_models.painter.nano.candidates import (
     build_candidates,
     candidate_names,
     check_inputs,
+    with_flat_colour,
 )
 from lidarpainter_models.painter.nano.features import count_features, painting_features
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
 
 CELL_PX = 4
 """Side of the pixel block that one position of the network stands for."""
+TINT = "tint"
+"""The candidate that is no picture but a flat colour, learnt for each style."""
+STYLE_PACE = 10.0
+"""Factor of what is learnt for each style: it has to go far while the rest of a trained network
+stays close to what it knows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,7 +60,8 @@ class NanoConfig:
     confidence_error: float = 0.05
     """Mean absolute error at which the confidence has fallen to 1/e."""
     prompts: tuple[str, ...] = (DEFAULT_PROMPT,)
-    """Prompts the network was trained for, each with its own embedding."""
+    """Prompts the network was trained for, each with its own embedding. Those after the first are
+    styles, and may mix in a flat colour of their own: the white of fog, the black of night."""
 
     def __post_init__(self) -> None:
         """Refuse shapes that cannot be built."""
@@ -69,7 +76,8 @@ class NanoConfig:
     @property
     def candidates(self) -> tuple[str, ...]:
         """The pictures it mixes, in channel order."""
-        return candidate_names(self.inputs, self.num_sources)
+        names = candidate_names(self.inputs, self.num_sources)
+        return (*names, TINT) if len(self.prompts) > 1 else names
 
     def to_dict(self) -> dict[str, Any]:
         """The settings as JSON types."""
@@ -102,6 +110,18 @@ class NanoOutput:
     """Logarithm of the mean absolute error it expects."""
     weights: Float[Tensor, "batch candidates height width"]
     """Shares of the candidates; they sum to one."""
+
+
+class Style(NamedTuple):
+    """What a prompt adds to the network; all zero changes nothing."""
+
+    colour: Float[Tensor, "batch 3"]
+    """Of the tint, before the sigmoid that makes it rgb."""
+    logits: Float[Tensor, "batch candidates"]
+    """Added to those of the candidates everywhere."""
+    gain: Float[Tensor, "batch channels"]
+    shift: Float[Tensor, "batch channels"]
+    """Of the features before the head, as in FiLM (Perez et al., 2018)."""
 
 
 class PixelNorm(nn.Module):
@@ -158,6 +178,10 @@ class NanoNetwork(nn.Module):
         self.decode_fine = _blocks(fine, config.blocks[0], config)
         self.last = PixelNorm(fine) if config.normalise else nn.Identity()
         self.head = nn.Conv2d(fine, (len(config.candidates) + 4) * CELL_PX**2, 3, padding=1)
+        if TINT in config.candidates:
+            # colour of the tint, logits of the candidates, gain and shift of the last features
+            self.style = nn.Embedding(len(config.prompts), 3 + len(config.candidates) + 2 * fine)
+            nn.init.zeros_(self.style.weight)
         self._start_as_base()
 
     @torch.no_grad()
@@ -200,12 +224,17 @@ class NanoNetwork(nn.Module):
         """
         features, lidar_filled = painting_features(conditions, self.config.inputs)
         candidates = build_candidates(conditions, self.config.inputs, lidar_filled)
-        rows = torch.tensor([self.prompt_index(prompt) for prompt in prompts])
-        embedding = self.prompt(rows.to(features.device))
+        rows = torch.tensor([self.prompt_index(prompt) for prompt in prompts]).to(features.device)
+        embedding, style = self.prompt(rows), self._style(rows)
+        if style is not None:
+            candidates = with_flat_colour(candidates, TINT, style.colour.sigmoid(), rows > 0)
         with torch.autocast(features.device.type, torch.bfloat16, enabled=half_precision):
-            head = self._head(features, embedding).float()
+            head = self._head(features, embedding, style).float()
         num_candidates = len(candidates.names)
-        logits = head[:, :num_candidates].masked_fill(candidates.exists == 0, -torch.inf)
+        logits = head[:, :num_candidates]
+        if style is not None:
+            logits = logits + style.logits[..., None, None]
+        logits = logits.masked_fill(candidates.exists == 0, -torch.inf)
         weights = torch.softmax(logits, dim=1)
         mixed = (weights[:, :, None] * candidates.pictures).sum(dim=1)
         residual = torch.tanh(head[:, num_candidates : num_candidates + 3])
@@ -216,10 +245,19 @@ class NanoNetwork(nn.Module):
             weights=weights,
         )
 
+    def _style(self, rows: Int[Tensor, " batch"]) -> Style | None:
+        """What was learnt for each view's prompt; None where there are no styles."""
+        if TINT not in self.config.candidates:
+            return None
+        learnt = STYLE_PACE * self.style(rows)
+        fine = self.config.widths[0]
+        return Style(*learnt.split([3, len(self.config.candidates), fine, fine], dim=1))
+
     def _head(
         self,
         features: Float[Tensor, "batch features height width"],
         embedding: Float[Tensor, "batch channels"],
+        style: Style | None,
     ) -> Float[Tensor, "batch outputs height width"]:
         """Run the U-Net on a picture of any size, padded to whole cells by repeating the edge."""
         height_px, width_px = features.shape[2:]
@@ -234,7 +272,10 @@ class NanoNetwork(nn.Module):
         coarse = self.encode_coarse(coarse)
         middle = self.decode_middle(middle + F.pixel_shuffle(self.up_middle(coarse), 2))
         fine = self.decode_fine(fine + F.pixel_shuffle(self.up_fine(middle), 2))
-        outputs = F.pixel_shuffle(self.head(F.silu(self.last(fine))), CELL_PX)
+        last = self.last(fine)
+        if style is not None:
+            last = last * (1 + style.gain[..., None, None]) + style.shift[..., None, None]
+        outputs = F.pixel_shuffle(self.head(F.silu(last)), CELL_PX)
         return outputs[..., :height_px, :width_px]
 
 

@@ -9,15 +9,24 @@ from typing import Any
 import torch
 
 from lidarpainter_models.painter.batches import stack_conditions
+from lidarpainter_models.painter.examples import Window
 from lidarpainter_models.painter.nano.network import NanoNetwork
-from lidarpainter_models.painter.protocol import Painting, PaintingConditions
+from lidarpainter_models.painter.nano.tiles import (
+    TileConfig,
+    doubt,
+    doubtful_tiles,
+    grown_to_pixels,
+    painted_parts,
+)
+from lidarpainter_models.painter.protocol import DEFAULT_PROMPT, Painting, PaintingConditions
 
 
 class NanoPainter:
     """Repairs a view by mixing what is known about it.
 
     Confidence: exp(-e / 0.05) with e the mean absolute error the network expects in the pixel
-    (its scale is `NanoConfig.confidence_error`).
+    (its scale is `NanoConfig.confidence_error`); for e, a tile that was not painted takes what is
+    known beside the render.
     """
 
     name = "nano"
@@ -28,6 +37,7 @@ class NanoPainter:
         *,
         provenance: dict[str, Any] | None = None,
         half_precision: bool = True,
+        tiles: TileConfig | None = None,
     ) -> None:
         """Take a trained network.
 
@@ -35,12 +45,14 @@ class NanoPainter:
             network: the fusion network; frozen and laid out for speed here.
             provenance: where its weights come from, as stored beside them.
             half_precision: run the convolutions in bfloat16.
+            tiles: paint only tiles that need it; None paints the whole picture.
         """
         frozen = network.eval().requires_grad_(False)
         # torch's stub lacks memory_format
         self.network = frozen.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.provenance = provenance or {}
         self.half_precision = half_precision
+        self.tiles = tiles
 
     @torch.inference_mode()
     def paint(self, conditions: PaintingConditions) -> Painting:
@@ -49,6 +61,37 @@ class NanoPainter:
         Raises:
             ConfigError: the network was not trained for the prompt.
         """
+        self.network.prompt_index(conditions.prompt)
+        # a style changes every pixel
+        if self.tiles is None or conditions.prompt != DEFAULT_PROMPT:
+            return self._painted(conditions)
+        return self._painted_where_needed(conditions, self.tiles)
+
+    def _painted_where_needed(self, conditions: PaintingConditions, config: TileConfig) -> Painting:
+        """Paint the doubtful tiles; a kept one is as sure as what is known agrees with it."""
+        height_px, width_px = conditions.height_width_px
+        tiles = doubtful_tiles(conditions, config)
+        is_doubtful = grown_to_pixels(tiles, height_px, width_px, config)
+        rgb = conditions.render_rgb.clone()
+        confidence = torch.exp(-doubt(conditions) / self.network.config.confidence_error)
+        for seen, changed in painted_parts(tiles, height_px, width_px, config):
+            part = self._painted(conditions.cropped(*seen.slices))
+            inside = Window(
+                changed.top_px - seen.top_px,
+                changed.left_px - seen.left_px,
+                changed.height_px,
+                changed.width_px,
+            ).slices
+            rows, columns = changed.slices
+            chosen = is_doubtful[rows, columns]
+            rgb[rows, columns][chosen] = part.rgb[inside][chosen]
+            confidence[rows, columns][chosen] = part.confidence[inside][chosen]
+        return Painting(
+            rgb=rgb, confidence=confidence, kept_share=1 - float(is_doubtful.float().mean())
+        )
+
+    def _painted(self, conditions: PaintingConditions) -> Painting:
+        """Paint every pixel."""
         config = self.network.config
         device = self.network.head.weight.device
         batch = stack_conditions([conditions], num_sources=config.num_sources).to(device)

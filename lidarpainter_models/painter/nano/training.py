@@ -26,6 +26,8 @@ from lidarpainter_models.painter.nano.training_checkpoints import (
     training_digest,
     write_checkpoint,
 )
+from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
+from lidarpainter_models.painter.styles import check_prompt
 
 CPU = torch.device("cpu")
 ALIVE_AFTER_STEPS = 1000
@@ -71,6 +73,10 @@ class NanoTrainingConfig:
                 raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
         if self.max_cpu_s is not None and self.max_cpu_s <= 0:
             raise ConfigError(f"max_cpu_s must be positive, got {self.max_cpu_s}")
+        for prompt in self.network.prompts:
+            check_prompt(prompt)
+        if self.network.prompts[0] != DEFAULT_PROMPT:
+            raise ConfigError(f"the first prompt must be {DEFAULT_PROMPT!r}, which restores")
         if not 0 <= self.average_decay < 1:
             raise ConfigError(f"average_decay must be in [0, 1), got {self.average_decay}")
 
@@ -201,6 +207,7 @@ def _draw(
         shares,
         batch_size=config.batch_size,
         num_warps=config.network.num_sources,
+        prompts=config.network.prompts,
         config=config.augmentation,
         generator=generator,
     )
@@ -224,7 +231,14 @@ def _step(
         group["lr"] = _learning_rate(state, config)
         group["weight_decay"] = config.weight_decay
     output = state.network(batch.conditions, batch.prompts, half_precision=config.half_precision)
-    terms = painting_loss(output, batch.conditions, batch.target, batch.target_valid, config.loss)
+    terms = painting_loss(
+        output,
+        batch.conditions,
+        batch.target,
+        batch.target_valid,
+        config.loss,
+        restyled=batch.restyled,
+    )
     state.optimiser.zero_grad(set_to_none=True)
     terms.total.backward()
     norm = torch.nn.utils.clip_grad_norm_(state.network.parameters(), config.max_gradient_norm)

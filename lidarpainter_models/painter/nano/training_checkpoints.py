@@ -17,6 +17,7 @@ from typing import Any
 import torch
 
 from lidarpainter_models.errors import ConfigError, DataError
+from lidarpainter_models.painter.nano.more_prompts import with_more_prompts
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.whole_files import write_whole
 
@@ -41,18 +42,11 @@ class TrainingState:
         """First weights: those given, or such as follow from the seed alone.
 
         Raises:
-            ConfigError: the weights given belong to another network.
+            ConfigError: the weights given belong to a network that differs by more than prompts.
         """
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            network = NanoNetwork(config)
-        if weights is not None:
-            if weights.config != config:
-                raise ConfigError(
-                    f"cannot start a network {config.to_dict()} from the weights of "
-                    f"{weights.config.to_dict()}"
-                )
-            network.load_state_dict(weights.state_dict())
+            network = NanoNetwork(config) if weights is None else with_more_prompts(weights, config)
         # torch's stub lacks memory_format
         network = network.to(device=device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         averaged = deepcopy(network).requires_grad_(False)

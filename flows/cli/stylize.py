@@ -1,0 +1,73 @@
+"""`lidarpainter stylize`: pictures of a run in fog, at night or in rain."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from flows.cli.output import print_json, print_pairs
+
+
+def stylize(  # noqa: PLR0913 - the options of a command
+    run: Annotated[str, typer.Argument(help="A run id, a unique prefix of one, or latest.")],
+    prompt: Annotated[str, typer.Option(help="clear, foggy, night or rain.")],
+    out: Annotated[Path, typer.Option(help="Folder for the pictures.")],
+    trajectory: Annotated[
+        str,
+        typer.Option(help="recorded, lateral:2, up:1.5, yaw:15, lane-change:3.5; parts with +."),
+    ] = "recorded",
+    pictures: Annotated[
+        str, typer.Option(help="rendered, or recorded: style what the camera saw.")
+    ] = "rendered",
+    camera: Annotated[
+        str | None, typer.Option(help="Camera whose path is followed; the first if absent.")
+    ] = None,
+    frames: Annotated[
+        str | None, typer.Option(help="Recorded frames A:B to follow, B excluded.")
+    ] = None,
+    width: Annotated[
+        int | None, typer.Option(help="Width of the pictures in pixels; that of the fit if absent.")
+    ] = None,
+    painter: Annotated[
+        str | None, typer.Option(help="Paint every picture with this before it is styled.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Decides lit windows, drops and noise.", min=0)] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Show a finished run in another weather or at night, and how well its edges are kept."""
+    from dataclasses import replace
+
+    from catalog.store import open_store
+    from flows.cli.ingest import parse_frames
+    from flows.cli.progress import shown_progress
+    from flows.parameters import view_parameters
+    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+    from tasks.render import RenderRequest
+    from tasks.runs import open_run
+    from tasks.stylize import StylizeRequest
+    from tasks.stylize import stylize as stylize_task
+
+    path = parse_trajectory(trajectory)
+    store = open_store()
+    finished = open_run(store, run)
+    parameters = view_parameters(finished)
+    observation = parameters.observation
+    if width is not None:
+        observation = replace(observation, width_px=width)
+    view = RenderRequest(
+        trajectory=path,
+        camera=camera,
+        frames=parse_frames(frames),
+        painter=painter,
+        observation=observation,
+        conditions=parameters.conditions,
+    )
+    asked: Any = pictures  # the request says which there are
+    request = StylizeRequest(prompt=prompt, view=view, pictures=asked, seed=seed)
+    with shown_progress():
+        made = stylize_task.fn(store.root, finished, request, out.absolute())
+    result = {"run_id": finished.run_id, "prompt": prompt, "trajectory": path.spec, **made}
+    if as_json:
+        print_json(result)
+    else:
+        print_pairs(f"{prompt} pictures of {finished.scene_id}", result)

@@ -1,0 +1,40 @@
+"""What a style needs of a fitted scene: a picture of it, distance and sky in every pixel."""
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidarpainter_models.conditioning.conditions import ConditionBuilder
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.painter.styles import StyleView
+
+
+def style_view(
+    builder: ConditionBuilder,
+    camera: Camera,
+    timestamp_ns: int,
+    picture: Float[Tensor, "height width 3"],
+    sky_mask: Bool[Tensor, "height width"] | None = None,
+) -> tuple[StyleView, Float[Tensor, "height width"]]:
+    """A picture of the scene with what styles it, and the LiDAR depth that supports it.
+
+    Args:
+        builder: of the scene.
+        camera: where the picture was taken.
+        timestamp_ns: and when.
+        picture: rendered, painted or recorded there, in [0, 1].
+        sky_mask: of a recorded picture; by default what the Gaussians leave open is sky.
+
+    Returns:
+        The view, its depth that of the render corrected by LiDAR; and camera z in metres where the
+        LiDAR hit, 0 elsewhere.
+    """
+    render = builder.scene.render(camera, timestamp_ns)
+    lidar = builder.lidar_image(camera, timestamp_ns)
+    sky = 1 - render.alpha.clamp(0, 1) if sky_mask is None else sky_mask.float()
+    view = StyleView(
+        rgb=picture,
+        depth_m=builder.surface_m(render, lidar, camera).detach(),
+        sky=sky.detach(),
+        camera=camera,
+    )
+    return view, lidar.depth_m

@@ -1,0 +1,142 @@
+"""Whether a restyled picture keeps the structure of the clear one: agreement of their edges.
+
+An edge is a pixel whose gradient, relative to the gradients around it, belongs to the strongest
+share of the pixels judged, and is the largest across its own direction (the thinning of Canny,
+1986). Relative, because fog and lamps scale contrast smoothly over the picture and leave structure
+as it is; the same share in both pictures, because a threshold of grey values would mean something
+else in each. Precision and recall allow for a small distance, as in the boundary benchmark of
+Martin et al. (2004). Only pixels near LiDAR hits are judged, where the depth that drove the style
+was measured.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidarpainter_models.errors import ConfigError, ShapeError
+
+_GREY = np.array([0.2126, 0.7152, 0.0722], np.float32)
+_LEAST_GRADIENT = 1e-3  # of display white per pixel: below it is rounding and sensor noise
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EdgeConfig:
+    """What counts as an edge and as found again."""
+
+    strongest_share: float = 0.1
+    """Share of the pixels judged that may be edges, before thinning."""
+    smoothing_px: float = 1.2
+    """Blur before the gradient; lifts edges above noise and rain."""
+    around_px: float = 12.0
+    """Reach of the mean gradient that a pixel's own is compared with."""
+    tolerance_px: int = 2
+    """An edge is found again if the other picture has one within this distance."""
+    support_px: int = 3
+    """Pixels within this distance of a LiDAR hit are judged."""
+    farthest_m: float = 40.0
+    """Hits beyond this are left out: fog may hide what is there, which is what fog does."""
+
+    def __post_init__(self) -> None:
+        """Refuse shares and reaches that find nothing."""
+        if not 0 < self.strongest_share < 1:
+            raise ConfigError(f"strongest_share must be in (0, 1), got {self.strongest_share}")
+        for name in ("smoothing_px", "around_px", "farthest_m"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EdgeScores:
+    """How well the edges of a restyled picture are those of the clear one."""
+
+    f1: float
+    precision: float
+    """Share of the restyled picture's edges that the clear one has."""
+    recall: float
+    """Share of the clear picture's edges that are kept."""
+    judged_share: float
+    """Of the picture's pixels."""
+
+
+def edge_agreement(
+    styled: Float[Tensor, "height width 3"],
+    clear: Float[Tensor, "height width 3"],
+    lidar_depth_m: Float[Tensor, "rows columns"],
+    config: EdgeConfig | None = None,
+) -> EdgeScores | None:
+    """Compare edges near LiDAR hits; None where the clear picture has none to keep.
+
+    Raises:
+        ShapeError: the pictures or the depth differ in size.
+    """
+    config = config or EdgeConfig()
+    if styled.shape != clear.shape or lidar_depth_m.shape != clear.shape[:2]:
+        raise ShapeError(
+            f"need pictures and depth of one size, got {tuple(styled.shape)}, "
+            f"{tuple(clear.shape)} and {tuple(lidar_depth_m.shape)}"
+        )
+    judged = supported_pixels(lidar_depth_m, config).numpy()
+    if not judged.any():
+        return None
+    found, wanted = (_edges(picture, judged, config) for picture in (styled, clear))
+    if not wanted.any():
+        return None
+    precision = _share_near(found, wanted, config.tolerance_px)
+    recall = _share_near(wanted, found, config.tolerance_px)
+    total = precision + recall
+    return EdgeScores(
+        f1=2 * precision * recall / total if total else 0.0,
+        precision=precision,
+        recall=recall,
+        judged_share=float(judged.mean()),
+    )
+
+
+def supported_pixels(
+    lidar_depth_m: Float[Tensor, "height width"], config: EdgeConfig
+) -> Bool[Tensor, "height width"]:
+    """Pixels near a LiDAR hit that is not too far."""
+    hits = ((lidar_depth_m > 0) & (lidar_depth_m <= config.farthest_m)).numpy().astype(np.uint8)
+    return torch.from_numpy(_grown(hits, config.support_px) > 0)
+
+
+def _edges(
+    picture: Float[Tensor, "height width 3"], judged: np.ndarray, config: EdgeConfig
+) -> np.ndarray:
+    """The thinned strongest edges among the pixels judged."""
+    grey = picture.detach().clamp(0, 1).numpy().astype(np.float32) @ _GREY
+    smooth = cv2.GaussianBlur(grey, (0, 0), config.smoothing_px)
+    across, down = (cv2.Sobel(smooth, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1)))
+    strength = np.hypot(across, down)
+    relative = strength / (cv2.GaussianBlur(strength, (0, 0), config.around_px) + _LEAST_GRADIENT)
+    threshold = np.quantile(relative[judged], 1 - config.strongest_share)
+    strong = judged & (relative > max(threshold, 1e-6)) & (strength > _LEAST_GRADIENT)
+    return strong & _is_ridge(strength, across, down)
+
+
+def _is_ridge(strength: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """Whether a gradient is as large as both its neighbours along its direction."""
+    padded = np.pad(strength, 1, mode="edge")
+    octant = np.round(np.arctan2(down, across) / (np.pi / 4)).astype(int) % 4
+    height, width = strength.shape
+    ridge = np.zeros(strength.shape, bool)
+    for number, (row, column) in enumerate(((0, 1), (1, 1), (1, 0), (1, -1))):
+        ahead = padded[1 + row : 1 + row + height, 1 + column : 1 + column + width]
+        behind = padded[1 - row : 1 - row + height, 1 - column : 1 - column + width]
+        ridge |= (octant == number) & (strength >= ahead) & (strength >= behind)
+    return ridge
+
+
+def _share_near(edges: np.ndarray, others: np.ndarray, reach_px: int) -> float:
+    if not edges.any():
+        return 0.0
+    return float((_grown(others.astype(np.uint8), reach_px)[edges] > 0).mean())
+
+
+def _grown(mask: np.ndarray, reach_px: int) -> np.ndarray:
+    side = 2 * reach_px + 1
+    return cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))

@@ -1,0 +1,39 @@
+"""The perceptual distances that a judge may have at hand, and why one is absent."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.metrics.lpips import LpipsFiles, load_lpips
+from lidarpainter_models.metrics.squeezenet import load_squeezenet_distance
+
+PictureDistance = Callable[
+    [Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]], Float[Tensor, ""]
+]
+"""Of a picture to the truth, such as `SqueezeNetDistance` or `Lpips`."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PerceptualDistances:
+    """What can be said beside PSNR and SSIM."""
+
+    features: PictureDistance | None = None
+    """The SqueezeNet feature distance."""
+    lpips: PictureDistance | None = None
+    lpips_missing: str | None = LpipsFiles().missing
+    """Why there is no LPIPS; None where there is."""
+
+
+def load_distances(feature_weights: Path | None, lpips: LpipsFiles) -> PerceptualDistances:
+    """Load every distance whose weights are named.
+
+    Raises:
+        WeightsError: a file that is named cannot be used.
+    """
+    features = None if feature_weights is None else load_squeezenet_distance(feature_weights)
+    return PerceptualDistances(
+        features=features, lpips=load_lpips(lpips), lpips_missing=lpips.missing
+    )

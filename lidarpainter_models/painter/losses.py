@@ -1,0 +1,155 @@
+"""What painters are trained to lower: terms that stand alone, and the sum of the paper.
+
+Pictures are (batch, 3, height, width); masks (batch, height, width), 1 where the target is known.
+A term is averaged over the pixels of its mask; over no pixel it is 0.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.kernels.ssim import ssim_map
+from lidarpainter_models.painter.adversarial import Discriminator, generator_hinge_loss
+from lidarpainter_models.painter.batches import ConditionBatch
+
+BatchDistance = Callable[
+    [Float[Tensor, "batch 3 height width"], Float[Tensor, "batch 3 height width"]],
+    Float[Tensor, " batch"],
+]
+"""Of pictures to their targets, differentiable, such as `metrics.lpips.Lpips.of_batch`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PaperLossWeights:
+    """How much each term of the paper's loss counts: 0.2 LPIPS + 0.6 L2 + 0.4 SSIM + GAN."""
+
+    lpips: float = 0.2
+    """Of LPIPS; its weights are user-supplied, 0 leaves it out."""
+    squared: float = 0.6
+    """Of the mean squared error."""
+    structure: float = 0.4
+    """Of 1 - SSIM."""
+    adversarial: float = 1.0
+    """Of the generator's hinge loss; 0 trains without a discriminator."""
+
+    def __post_init__(self) -> None:
+        """Refuse negative weights."""
+        for field in fields(self):
+            if not getattr(self, field.name) >= 0:
+                raise ConfigError(f"loss weight {field.name} must not be negative")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PaperLoss:
+    """The terms before weighting, and their weighted sum; a term of weight 0 is 0."""
+
+    lpips: Float[Tensor, ""]
+    squared: Float[Tensor, ""]
+    structure: Float[Tensor, ""]
+    adversarial: Float[Tensor, ""]
+    total: Float[Tensor, ""]
+
+    def to_dict(self) -> dict[str, float]:
+        """Plain numbers for a log."""
+        return {field.name: float(getattr(self, field.name).detach()) for field in fields(self)}
+
+
+def paper_loss(
+    picture: Float[Tensor, "batch 3 height width"],
+    target: Float[Tensor, "batch 3 height width"],
+    mask: Float[Tensor, "batch height width"],
+    weights: PaperLossWeights,
+    *,
+    lpips: BatchDistance | None = None,
+    discriminator: Discriminator | None = None,
+) -> PaperLoss:
+    """The painter's loss of the paper.
+
+    LPIPS and the discriminator look at whole pictures, so where the target is unknown they see it
+    in place of the picture, and no gradient passes there.
+
+    Raises:
+        ConfigError: a term counts that nothing is given for; none is left out unasked.
+    """
+    known = torch.where(mask[:, None] > 0, picture, target)
+    nothing = picture.new_zeros(())
+    terms = {
+        "lpips": nothing,
+        "squared": squared_loss(picture, target, mask),
+        "structure": structure_loss(picture, target, mask),
+        "adversarial": nothing,
+    }
+    if weights.lpips > 0:
+        if lpips is None:
+            raise ConfigError("the loss weighs LPIPS but has none: give its weights or lpips=0")
+        terms["lpips"] = lpips(known, target).mean()
+    if weights.adversarial > 0:
+        if discriminator is None:
+            raise ConfigError("the loss weighs a discriminator but has none: give adversarial=0")
+        terms["adversarial"] = generator_hinge_loss(discriminator(known))
+    total = torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum()
+    return PaperLoss(**terms, total=total)
+
+
+def absolute_loss(
+    picture: Float[Tensor, "batch 3 height width"],
+    target: Float[Tensor, "batch 3 height width"],
+    mask: Float[Tensor, "batch height width"],
+) -> Float[Tensor, ""]:
+    """Mean absolute difference inside the mask."""
+    return masked_mean((picture - target).abs().mean(dim=1), mask)
+
+
+def squared_loss(
+    picture: Float[Tensor, "batch 3 height width"],
+    target: Float[Tensor, "batch 3 height width"],
+    mask: Float[Tensor, "batch height width"],
+) -> Float[Tensor, ""]:
+    """Mean squared difference inside the mask."""
+    return masked_mean((picture - target).square().mean(dim=1), mask)
+
+
+def structure_loss(
+    picture: Float[Tensor, "batch 3 height width"],
+    target: Float[Tensor, "batch 3 height width"],
+    mask: Float[Tensor, "batch height width"],
+) -> Float[Tensor, ""]:
+    """Mean of 1 - SSIM inside the mask; outside it the picture counts as equal to the target."""
+    known = torch.where(mask[:, None] > 0, picture, target)
+    rows = zip(known.permute(0, 2, 3, 1), target.permute(0, 2, 3, 1), strict=True)
+    similarity = torch.stack([ssim_map(ours, truth).mean(dim=-1) for ours, truth in rows])
+    return masked_mean(1 - similarity, mask)
+
+
+def gradient_loss(
+    picture: Float[Tensor, "batch 3 height width"],
+    target: Float[Tensor, "batch 3 height width"],
+    mask: Float[Tensor, "batch height width"],
+) -> Float[Tensor, ""]:
+    """Mean absolute difference of horizontal and vertical steps between known neighbours."""
+    gap = picture - target
+    across = (gap[..., 1:] - gap[..., :-1]).abs().mean(dim=1)
+    down = (gap[..., 1:, :] - gap[..., :-1, :]).abs().mean(dim=1)
+    horizontal = masked_mean(across, mask[..., 1:] * mask[..., :-1])
+    return horizontal + masked_mean(down, mask[..., 1:, :] * mask[..., :-1, :])
+
+
+def agreement_mask(
+    conditions: ConditionBatch, difference: float
+) -> Float[Tensor, "batch height width"]:
+    """1 where a warp is valid and every valid warp agrees with the render."""
+    gaps = (conditions.warp - conditions.render[:, None]).abs().mean(dim=2)
+    disagreeing = (gaps > difference) & (conditions.warp_valid > 0)
+    some = conditions.warp_valid.amax(dim=1) > 0
+    return (some & ~disagreeing.any(dim=1)).float()
+
+
+def masked_mean(
+    values: Float[Tensor, "batch rows columns"], mask: Float[Tensor, "batch rows columns"]
+) -> Float[Tensor, ""]:
+    """Mean inside the mask; 0 where it is empty."""
+    return (values * mask).sum() / mask.sum().clamp_min(1)

@@ -1,0 +1,256 @@
+"""Night by relighting: daylight is taken out, lamps are put in.
+
+The picture's brightness relative to its sunlit surfaces stands for reflectance. It is lit anew by a
+dark blue sky, whose colour shift follows the night tonal reproduction of Jensen et al. (2000), by a
+low beam of the car that looks on, and by the lamps found in the picture (`lamps.py`), each with the
+inverse square of the distance. Around lamps light scatters in lens and air: the point spread is a
+sum of Gaussians (after Spencer et al., "Physically-based glare effects", 1995). The sensor adds
+shot and read noise. Shadows of the sun stay where they are, only weaker: nothing tells reflectance
+and shadow apart.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.painter.styles.lamps import Lamp, LampKind, Place, find_lamps
+from lidarpainter_models.painter.styles.light import luminance, to_display, to_linear
+from lidarpainter_models.painter.styles.view import (
+    StyleView,
+    distances,
+    elevations,
+    fit_ground,
+    open_sky,
+    ray_directions,
+    surface_points,
+)
+
+SKYLIGHT_RGB = (0.55, 0.75, 1.25)
+"""The blue of what is left when the sun is gone, of luminance about 0.75."""
+SKYGLOW_RGB = (1.0, 0.76, 0.58)
+"""Town light thrown back by the air near the horizon."""
+COLOUR_LEFT = 0.4
+"""Of a surface's own colour under skylight (the eye's cones no longer see it)."""
+BEAM_RGB = (1.0, 0.93, 0.78)
+HEADLAMP_HEIGHT_M = 0.65
+HEADLAMP_AHEAD_M = 1.2
+HEADLAMP_SIDE_M = 0.6
+BEAM_ACROSS_RAD = 0.26
+"""Deviation of the low beam to the sides."""
+BEAM_CUT_RAD = -0.008
+"""The cut-off: half a degree below the horizon."""
+BEAM_DOWN_RAD = 0.09
+LEAST_GRAZING = 0.12
+"""Share of a grazing beam that rough asphalt still sends back."""
+FACING = 0.15
+"""Share that surfaces above the ground send back; few face the lamp."""
+GLARE_SIGMAS_RAD = ((0.0015, 0.5), (0.006, 0.3), (0.025, 0.14), (0.09, 0.06))
+"""Width and share of the Gaussians of the point spread; the rest passes straight."""
+RADIANCE: dict[LampKind, float] = {"signal": 1.6, "window": 0.55, "street": 6.0}
+"""Of a lamp's own pixels, in units of display white."""
+POWER: dict[LampKind, float] = {"signal": 0.02, "window": 0.25, "street": 4.0}
+"""Irradiance a metre away, in the same units."""
+MOST_SOURCES = 60
+NEAREST_M2 = 2.0
+"""Square of a distance that is added to all: a lamp lights what stands beside it little more."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NightConfig:
+    """A clear night in a town."""
+
+    strength: float = 1.0
+    """0 is day and leaves the picture as it is; between, day and night light are mixed."""
+    ambient: float = 0.055
+    """Skylight against daylight; a camera at night is exposed far longer than the eye."""
+    sky_glow: float = 0.022
+    """Radiance of the sky at the horizon, in units of display white."""
+    beam: float = 280.0
+    """Irradiance of the low beam at a metre, in the same units; 0 turns it off."""
+    lit_windows: float = 0.4
+    """Share of the windows found that are lit."""
+    shadow_softening: float = 0.75
+    """Power of reflectance: below 1 the sun's shadows fade."""
+    noise: float = 0.012
+    """Deviation of the sensor's noise at a tenth of display white."""
+
+    def __post_init__(self) -> None:
+        """Refuse shares outside [0, 1] and light that darkens."""
+        for name in ("strength", "lit_windows"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f"{name} must be in [0, 1], got {getattr(self, name)}")
+        for name in ("ambient", "sky_glow", "beam", "noise"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}")
+
+
+def turn_to_night(
+    view: StyleView, generator: Generator, config: NightConfig | None = None
+) -> Float[Tensor, "height width 3"]:
+    """The view at night, as displayed; the generator lights windows and draws noise."""
+    config = config or NightConfig()
+    day = to_linear(view.rgb)
+    night = _relit(view, day, generator, config)
+    return to_display(day + config.strength * (night - day))
+
+
+def _relit(
+    view: StyleView,
+    day: Float[Tensor, "height width 3"],
+    generator: Generator,
+    config: NightConfig,
+) -> Float[Tensor, "height width 3"]:
+    """Night light of the whole view, with glare and noise."""
+    distance_m = _without_specks(distances(view))
+    points_m = None if view.camera is None else surface_points(view.camera, distance_m)
+    ground = None if points_m is None else fit_ground(points_m, view.surface)
+    if points_m is not None and ground is not None:
+        points_m = ground.flattened(points_m)
+    place = Place(
+        light=day,
+        display=view.rgb,
+        distance_m=distance_m,
+        height_m=None if points_m is None or ground is None else ground.heights(points_m),
+        surface=view.surface,
+        focal_px=view.focal_px,
+    )
+    lamps = find_lamps(place, lit_share=config.lit_windows, generator=generator)
+    reflectance = _reflectance(day, view, config.shadow_softening)
+    surface = _by_skylight(reflectance, config)
+    irradiance = torch.zeros_like(day)
+    if view.camera is not None and points_m is not None and place.height_m is not None:
+        irradiance += config.beam * low_beam(view.camera, points_m, place.height_m)
+    irradiance += lamp_irradiance(lamps, points_m, place)
+    surface = surface + reflectance * irradiance
+    light = surface + open_sky(view)[..., None] * (_night_sky(view, config) - surface)
+    glowing = add_glare(light + _emission(lamps, day), view.focal_px)
+    return _with_noise(glowing, config.noise, generator)
+
+
+def _by_skylight(
+    reflectance: Float[Tensor, "height width 3"], config: NightConfig
+) -> Float[Tensor, "height width 3"]:
+    """Surfaces under the sky alone; so little light has hardly any colour of its own."""
+    grey = luminance(reflectance)[..., None]
+    return config.ambient * torch.tensor(SKYLIGHT_RGB) * (grey + COLOUR_LEFT * (reflectance - grey))
+
+
+def _without_specks(
+    distance_m: Float[Tensor, "height width"],
+) -> Float[Tensor, "height width"]:
+    """The median of five by five pixels: light falls off smoothly on a road."""
+    return 1 / torch.from_numpy(cv2.medianBlur((1 / distance_m).numpy(), 5))
+
+
+def _reflectance(
+    day: Float[Tensor, "height width 3"], view: StyleView, softening: float
+) -> Float[Tensor, "height width 3"]:
+    """Daylight over that of the brightest tenth of the surfaces, contrast softened."""
+    grey = luminance(day)
+    seen = grey[view.surface] if bool(view.surface.any()) else grey.flatten()
+    white = seen.kthvalue(max(1, round(0.9 * len(seen)))).values.clamp_min(1e-3)
+    relative = (grey / white).clamp(1e-4, 1.5)
+    return day / white * (relative ** (softening - 1))[..., None] * 0.8
+
+
+def _night_sky(view: StyleView, config: NightConfig) -> Float[Tensor, "height width 3"]:
+    """Glow that fades upwards over a dark blue; without a camera the picture's rows stand in."""
+    if view.camera is None:
+        rows = torch.linspace(0.6, 0.0, len(view.rgb))[:, None]
+        elevation = rows.expand(view.rgb.shape[:2])
+    else:
+        elevation = elevations(view.camera).clamp_min(0)
+    glow = torch.exp(-elevation / 0.15)[..., None] * torch.tensor(SKYGLOW_RGB)
+    return config.sky_glow * glow + 0.2 * config.ambient * torch.tensor(SKYLIGHT_RGB)
+
+
+def low_beam(
+    camera: Camera,
+    points_m: Float[Tensor, "height width 3"],
+    height_m: Float[Tensor, "height width"],
+) -> Float[Tensor, "height width 3"]:
+    """Irradiance of two dipped headlamps under the camera, 1 a metre ahead of one on its axis.
+
+    Bright below a sharp cut-off and fading downwards and to the sides, as in UN Regulation 112;
+    the ground is lit at the grazing angle at which it lies, all else as if it faced the lamp.
+    """
+    ahead = ray_directions(camera)[camera.height_px // 2, camera.width_px // 2].clone()
+    ahead[2] = 0
+    ahead = torch.nn.functional.normalize(ahead, dim=0)
+    left = torch.stack([-ahead[1], ahead[0], ahead[2]])
+    forward = points_m @ ahead - HEADLAMP_AHEAD_M
+    sideways = points_m @ left
+    found = torch.zeros_like(height_m)
+    for side_m in (HEADLAMP_SIDE_M, -HEADLAMP_SIDE_M):
+        across, up = sideways - side_m, height_m - HEADLAMP_HEIGHT_M
+        distance = (forward**2 + across**2 + up**2).sqrt().clamp_min(1.0)
+        level = forward.clamp_min(0.1)
+        azimuth, elevation = torch.atan2(across, level), torch.atan2(up, level)
+        below = BEAM_CUT_RAD - elevation
+        beam = torch.where(
+            below > 0,
+            torch.exp(-below / BEAM_DOWN_RAD),
+            0.03 + 0.97 * torch.exp(-0.5 * (below / 0.012) ** 2),  # stray light over a soft edge
+        )
+        beam = beam * torch.exp(-0.5 * (azimuth / BEAM_ACROSS_RAD) ** 2) * (forward > 0)
+        grazing = (HEADLAMP_HEIGHT_M / distance).clamp_min(LEAST_GRAZING)
+        facing = grazing + ((height_m - 0.15) / 0.5).clamp(0, 1) * (FACING - grazing)
+        found += beam * facing / distance**2
+    return torch.nan_to_num(found)[..., None] * torch.tensor(BEAM_RGB)
+
+
+def lamp_irradiance(
+    lamps: list[Lamp], points_m: Float[Tensor, "height width 3"] | None, place: Place
+) -> Float[Tensor, "height width 3"]:
+    """What the strongest lamps throw onto the surfaces around them."""
+    found = torch.zeros_like(place.light)
+    if points_m is None:
+        return found
+    points = torch.where(place.surface[..., None], points_m, 1e6)
+    strongest = sorted(lamps, key=lambda lamp: -POWER[lamp.kind] / lamp.distance_m)
+    for lamp in strongest[:MOST_SOURCES]:
+        where = points_m[lamp.window][lamp.patch].median(dim=0).values
+        squared = (points - where).square().sum(dim=-1)
+        found += (POWER[lamp.kind] / (squared + NEAREST_M2))[..., None] * lamp.colour
+    return found
+
+
+def _emission(
+    lamps: list[Lamp], day: Float[Tensor, "height width 3"]
+) -> Float[Tensor, "height width 3"]:
+    """Light of the lamps' own pixels; a lamp keeps the texture that it has by day."""
+    found = torch.zeros_like(day)
+    for lamp in lamps:
+        texture = luminance(day[lamp.window]).clamp_min(1e-4)
+        texture = (texture / texture[lamp.patch].mean()).clamp(0.3, 1.5)
+        own = RADIANCE[lamp.kind] * (texture * lamp.patch)[..., None] * lamp.colour
+        found[lamp.window] = torch.maximum(found[lamp.window], own)
+    return found
+
+
+def add_glare(
+    light: Float[Tensor, "height width 3"], focal_px: float
+) -> Float[Tensor, "height width 3"]:
+    """Spread what is brighter than the display; the total light stays the same."""
+    bright = (light - 0.5).clamp_min(0)
+    spread = torch.zeros_like(light)
+    rest = 1.0
+    for sigma_rad, share in GLARE_SIGMAS_RAD:
+        sigma_px = max(sigma_rad * focal_px, 0.3)
+        spread += share * torch.from_numpy(cv2.GaussianBlur(bright.numpy(), (0, 0), sigma_px))
+        rest -= share
+    return light - bright + rest * bright + spread
+
+
+def _with_noise(
+    light: Float[Tensor, "height width 3"], deviation: float, generator: Generator
+) -> Float[Tensor, "height width 3"]:
+    """Shot noise that grows with the root of light, over a third as much read noise."""
+    drawn = torch.randn(light.shape, generator=generator)
+    shot = (light.clamp_min(0) / 0.1 + 0.1).sqrt()
+    return light + deviation * 0.1 * shot * drawn
