@@ -26,6 +26,8 @@ BETA1, BETA2 = 0.9, 0.99
 MEANS, LOG_SCALE = 0, 7
 """First of three columns each in a row of parameters; rotations lie between them."""
 OPACITY, HARMONICS = 10, 11
+VECTOR = 16
+"""Rows of moments are this many float32, a cache line, or several times as long."""
 RUN_ENDS = np.array([2, 4, 6, 8, 12, 20, 36, 68, 132, 260])
 """Last missed step of each run."""
 CHUNKS = 64
@@ -188,7 +190,7 @@ def present(kept, first, second, last, rows, nodes, now, eps, out):
     """Write the given rows as the steps they missed left them to `out`."""
     count, starts = len(rows), len(nodes.length)
     for chunk in numba.prange(CHUNKS):
-        values, work = np.empty(len(eps), np.float32), np.empty((2, len(eps)), np.float32)
+        values, work = np.zeros(len(eps), np.float32), np.empty((2, len(eps)), np.float32)
         for k in range(chunk * count // CHUNKS, (chunk + 1) * count // CHUNKS):
             row = rows[k]
             _load(kept, row, values)
@@ -212,7 +214,7 @@ def catch_up(kept, first, second, last, nodes, now, eps):
     """Bring every row and its moments up to the step `now`, in place."""
     count, starts = len(last), len(nodes.length)
     for chunk in numba.prange(CHUNKS):
-        values, work = np.empty(len(eps), np.float32), np.empty((2, len(eps)), np.float32)
+        values, work = np.zeros(len(eps), np.float32), np.empty((2, len(eps)), np.float32)
         for row in range(chunk * count // CHUNKS, (chunk + 1) * count // CHUNKS):
             if last[row] < now:
                 _load(kept, row, values)
@@ -260,7 +262,7 @@ def step_rows(kept, first, second, last, rows, seen, gradients, rates, now, eps)
     rates = (rates / (1.0 - BETA1**now)).astype(np.float32)
     spread = np.float32(math.sqrt(1.0 - BETA2**now))
     for chunk in numba.prange(CHUNKS):
-        values, gradient = np.empty(len(eps), np.float32), np.empty(len(eps), np.float32)
+        values, gradient = np.zeros(len(eps), np.float32), np.zeros(len(eps), np.float32)
         for k in range(chunk * count // CHUNKS, (chunk + 1) * count // CHUNKS):
             row = rows[k]
             _load(gradients, k, gradient)

@@ -33,6 +33,7 @@ class GaussianAdam:
         """Start with empty moments."""
         self.rates = rates
         widths = [value.shape[1:].numel() for value in gaussians.parameters().values()]
+        widths[-1] += -sum(widths) % adam_kernels.VECTOR  # no vector loop ends in single numbers
         self._kind_of_column = np.repeat(np.arange(len(PARAMETERS)), widths)
         eps = [
             LEAST_COLOUR_GRADIENT if name in COLOURS else LEAST_SHAPE_GRADIENT
@@ -40,6 +41,7 @@ class GaussianAdam:
         ]
         self._eps = np.array(eps, np.float32)[self._kind_of_column]
         self.first = torch.zeros(len(gaussians), sum(widths))
+        """Moments, a row per Gaussian in the order of `PARAMETERS`."""
         self.second = torch.zeros(len(gaussians), sum(widths))
         self.last = torch.zeros(len(gaussians), dtype=torch.int32)
         """The step after which a row was left; its parameters and moments are those of then."""

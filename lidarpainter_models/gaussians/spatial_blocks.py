@@ -52,9 +52,8 @@ class SpatialBlocks:
     @classmethod
     def of(cls, gaussians: GaussianSet, rates: LearningRates) -> "SpatialBlocks":
         """Blocks of a set whose Gaussians move at these rates at most."""
-        keys = _cell_keys(gaussians, _reach_sigmas(rates))
-        _, block_of_row = np.unique(keys, axis=0, return_inverse=True)
-        return cls.with_rows_in(torch.from_numpy(block_of_row.reshape(-1)), gaussians, rates)
+        block_of_row = _numbered(_cell_keys(gaussians, _reach_sigmas(rates)))
+        return cls.with_rows_in(torch.from_numpy(block_of_row), gaussians, rates)
 
     @classmethod
     def with_rows_in(
@@ -123,6 +122,15 @@ def _cell_keys(gaussians: GaussianSet, reach_sigmas: float) -> Int[np.ndarray, "
     place = np.where((body == 0)[:, None], np.nan_to_num(place, posinf=0.0, neginf=0.0), 0.0)
     cells = np.column_stack([level, np.clip(place, -1e9, 1e9)]).astype(np.int64)
     return np.column_stack([body, cells])
+
+
+def _numbered(keys: Int[np.ndarray, "gaussians 5"]) -> Int[np.ndarray, " gaussians"]:
+    """A number for each different key, from 0 on."""
+    order = np.lexsort(keys.T)
+    differs = (keys[order[1:]] != keys[order[:-1]]).any(axis=1)
+    numbers = np.zeros(len(keys), np.int64)
+    numbers[order[1:]] = np.cumsum(differs)
+    return numbers
 
 
 def _frustum(camera: Camera, actor_slack: tuple[float, float]) -> Frustum:

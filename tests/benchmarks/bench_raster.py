@@ -10,7 +10,7 @@ from bench_records import Figure
 from bench_scenes import street_like_splats
 from bench_work import BACKWARD_LANE_FLOP, FORWARD_LANE_FLOP, count_lanes, raster_bytes
 
-from lidarpainter_models.kernels.gaussian_raster import cpu, render_gaussians
+from lidarpainter_models.kernels.gaussian_raster import cpu, render_gaussians, render_views
 from lidarpainter_models.kernels.gaussian_raster.binning import list_tiles
 from lidarpainter_models.kernels.gaussian_raster.blending import Pictures, blend
 from lidarpainter_models.kernels.gaussian_raster.blending_gradients import entry_sums
@@ -22,6 +22,9 @@ GAUSSIAN_GROWTH = (20_000, 40_000, 80_000, 160_000, 320_000, 640_000, 1_000_000)
 PIXEL_GROWTH = ((400, 250), (560, 360), (800, 500), (1120, 720), (1600, 1000), (2000, 1000))
 
 
+CAMERA = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
+
+
 class Stages:
     """The compiled stages of one scene, each callable alone on what the one before made."""
 
@@ -31,9 +34,8 @@ class Stages:
         tensors = tuple(splats[name] for name in names)
         tensors += (torch.zeros(count, 0), torch.zeros(count, 2))
         tensors += (splats["camera_from_body"], splats["body_index"])
-        camera = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
         self.gaussians = cpu._gaussians(tensors)
-        self.view = cpu._compiled_view(SplatView(**{name: splats[name] for name in camera}))
+        self.view = cpu._compiled_view(SplatView(**{name: splats[name] for name in CAMERA}))
         self.records = self.project()
         self.lists = self.list_tiles()
         self.drawn = self.blend()
@@ -78,9 +80,11 @@ def forward(splats):
 
 def step(splats, backend="cpu"):
     """One picture and all gradients."""
-    image = render_gaussians(**splats, backend=backend)
-    loss = image.rgb.square().sum() + 0.01 * image.depth_m.sum() + image.alpha.sum()
-    loss.backward()
+    _loss(render_gaussians(**splats, backend=backend)).backward()
+
+
+def _loss(image):
+    return image.rgb.square().sum() + 0.01 * image.depth_m.sum() + image.alpha.sum()
 
 
 def raster_figures(machine, size, repeats):
@@ -181,6 +185,30 @@ def thread_figures(size, repeats):
             threads=2,
             better="higher",
             limit=1.7,
+        )
+    ]
+
+
+def view_figures(size, repeats, *, num_views=3):
+    """Several views with all gradients in one call, against as many calls."""
+    numba.set_num_threads(1)
+    splats = street_like_splats(*size)
+    camera = {name: splats[name] for name in CAMERA}
+    shared = {name: value for name, value in splats.items() if name not in CAMERA}
+    shared["camera_from_body"] = shared["camera_from_body"].detach().repeat(num_views, 1, 1, 1)
+    views = [SplatView(**camera) for _ in range(num_views)]
+
+    def together():
+        images = render_views(**shared, views=views, backend="cpu")
+        sum(_loss(image) for image in images).backward()
+
+    one_ms = 1e3 * best_cpu_s(lambda: step(splats), repeats)
+    return [
+        Figure(
+            name=f"gaussian_raster.{num_views}_views",
+            value=1e3 * best_cpu_s(together, repeats),
+            unit="ms",
+            floor=num_views * one_ms,
         )
     ]
 

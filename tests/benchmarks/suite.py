@@ -28,6 +28,7 @@ from bench_raster import (
     raster_figures,
     reference_figures,
     thread_figures,
+    view_figures,
 )
 from bench_records import Figure, baseline_of, kept_to, table, write_figures
 from rich.console import Console
@@ -68,10 +69,12 @@ def measure(*, quick):
         figures += growth_figures(1, gaussians=(1000, 2000), sizes=((80, 48), (160, 96)))
         return machine.figures() + figures + point_figures(machine, 1, counts=(1000, 2000))
     figures = raster_figures(machine, SCENE, 7)
-    figures += thread_figures(SCENE, 7) + reference_figures(REFERENCE_SCENE, 7)
+    figures += (
+        thread_figures(SCENE, 7) + view_figures(SCENE, 5) + reference_figures(REFERENCE_SCENE, 7)
+    )
     figures += iteration_figures(machine, 15)
     figures += point_figures(machine, 5)
-    figures += growth_figures(3) + frame_growth_figures(8) + memory_figures()
+    figures += growth_figures(3) + frame_growth_figures(48) + memory_figures()
     return machine.figures() + figures
 
 

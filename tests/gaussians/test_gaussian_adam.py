@@ -1,5 +1,6 @@
 """The lazy Adam against a dense one: torch's, but for centres, which move in units of sizes."""
 
+import numba
 import pytest
 import torch
 from gaussian_world import round_gaussians
@@ -132,6 +133,27 @@ def test_a_row_left_alone_is_where_its_momentum_takes_it(missed, before):
     assert torch.equal(looked_at.means, gaussians.means)
     assert torch.equal(looked_at.sh[:, 1:], gaussians.sh_rest)
     assert_as_dense(gaussians, dense.gaussians, units=1e-4)
+
+
+def test_threads_change_no_bit():
+    if numba.config.NUMBA_NUM_THREADS < 2:
+        pytest.skip("one core")
+    before, fitted = numba.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            numba.set_num_threads(threads)
+            generator = torch.Generator().manual_seed(5)
+            gaussians = some_gaussians(500, generator).as_leaves()
+            adam = GaussianAdam(gaussians, RATES)
+            for step in range(12):
+                rows = (torch.rand(500, generator=generator) < 0.4).nonzero()[:, 0]
+                gradients = sparse_gradients(gaussians, torch.ones(500), generator)
+                lazy_step(adam, gaussians, rows, gradients, step / 12)
+            adam.catch_up(gaussians)
+            fitted.append(gaussians.columns())
+    finally:
+        numba.set_num_threads(before)
+    assert all(torch.equal(value, fitted[1][name]) for name, value in fitted[0].items())
 
 
 def test_looking_changes_nothing():

@@ -39,6 +39,7 @@ from lidarpainter_models.kernels.gaussian_raster.lanes import (
     load,
     load_triples,
     magnitude,
+    prefetch,
     smallest,
     spread,
     store,
@@ -50,6 +51,7 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
     BLUE,
     DEPTH,
     GREEN,
+    IS_VISIBLE,
     LOG_OPACITY,
     RECORD_FLOATS,
     RED,
@@ -290,3 +292,34 @@ def entry_sums(
         _load_tile(corner, drawn, gradients, lanes)
         _walk_tile(records, features, lists, tile, lanes, slots, feature_slots)
     return slots, feature_slots
+
+
+@numba.njit(**EXACT)
+def prefetch_entries(lists: TileLists, index: int, records: np.ndarray, slots: np.ndarray) -> None:
+    """Ask for the sums that a later Gaussian will add up: they lie all over the memory."""
+    if records[index, IS_VISIBLE] > 0.0:
+        for position in range(lists.own[index, 0], lists.own[index, 1]):
+            prefetch(slots, np.int64(lists.entry[position]) * SUMS)
+
+
+@numba.njit(**EXACT)
+def add_entries(
+    lists: TileLists,
+    index: int,
+    slots: np.ndarray,
+    feature_slots: np.ndarray,
+    sums: np.ndarray,
+    feature_sums: np.ndarray,
+) -> None:
+    """Sums of a Gaussian over its entries."""
+    for k in range(SUMS):
+        sums[k] = 0.0
+    for k in range(len(feature_sums)):
+        feature_sums[k] = 0.0
+    for position in range(lists.own[index, 0], lists.own[index, 1]):
+        entry = lists.entry[position]
+        slot = np.int64(entry) * SUMS
+        for k in range(SUMS):
+            sums[k] += slots[slot + k]
+        for k in range(len(feature_sums)):
+            feature_sums[k] += feature_slots[entry, k]

@@ -27,10 +27,11 @@ from lidarpainter_models.kernels.gaussian_raster.blending_gradients import (
     SUM_GYY,
     SUM_RED,
     SUMS,
+    add_entries,
+    prefetch_entries,
 )
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import MIN_COMPENSATION
 from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry
-from lidarpainter_models.kernels.gaussian_raster.lanes import prefetch
 from lidarpainter_models.kernels.gaussian_raster.projection import (
     ACROSS,
     ALONG,
@@ -281,37 +282,6 @@ def _unproject_one(  # noqa: PLR0913 - a compiled loop body
 
 
 @numba.njit(**EXACT)
-def _prefetch_entries(lists: TileLists, index: int, records: np.ndarray, slots: np.ndarray) -> None:
-    """Ask for the sums that a later Gaussian will add up: they lie all over the memory."""
-    if records[index, IS_VISIBLE] > 0.0:
-        for position in range(lists.own[index, 0], lists.own[index, 1]):
-            prefetch(slots, np.int64(lists.entry[position]) * SUMS)
-
-
-@numba.njit(**EXACT)
-def _add_entries(
-    lists: TileLists,
-    index: int,
-    slots: np.ndarray,
-    feature_slots: np.ndarray,
-    sums: np.ndarray,
-    feature_sums: np.ndarray,
-) -> None:
-    """Sums of a Gaussian over its entries."""
-    for k in range(SUMS):
-        sums[k] = 0.0
-    for k in range(len(feature_sums)):
-        feature_sums[k] = 0.0
-    for position in range(lists.own[index, 0], lists.own[index, 1]):
-        entry = lists.entry[position]
-        slot = np.int64(entry) * SUMS
-        for k in range(SUMS):
-            sums[k] += slots[slot + k]
-        for k in range(len(feature_sums)):
-            feature_sums[k] += feature_slots[entry, k]
-
-
-@numba.njit(**EXACT)
 def _unproject_run(  # noqa: PLR0913 - a compiled loop body
     gaussians: Gaussians,
     view: View,
@@ -327,9 +297,9 @@ def _unproject_run(  # noqa: PLR0913 - a compiled loop body
     count = len(records)
     first, end = run * count // CHUNKS, (run + 1) * count // CHUNKS
     for index in range(first, end):
-        _prefetch_entries(lists, min(index + AHEAD, end - 1), records, slots[0])
+        prefetch_entries(lists, min(index + AHEAD, end - 1), records, slots[0])
         if records[index, IS_VISIBLE] > 0.0:
-            _add_entries(lists, index, slots[0], slots[1], sums, feature_sums)
+            add_entries(lists, index, slots[0], slots[1], sums, feature_sums)
             for k in range(len(feature_sums)):
                 _put(gradients.features, (index, k), feature_sums[k], adds)
             _unproject_one(
