@@ -223,7 +223,7 @@ def test_picture_of_another_size(refusal, messages):
 def test_picture_of_another_frame(refusal, messages):
     for field in (5, 7, 8):  # pose, trigger and readout, half a second late
         messages = with_frame(messages, [IMAGES, field], lambda value: value + 0.5)
-    assert "images[0] (FRONT): taken +0.498 s after the frame" in refusal(messages)
+    assert "images[0] (FRONT): taken +0.498 s after the middle of the sweep" in refusal(messages)
 
 
 def test_picture_whose_pose_is_elsewhere(refusal, messages):
