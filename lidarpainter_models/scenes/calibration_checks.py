@@ -89,7 +89,9 @@ class CameraTurn:
 
 def check_calibration(scene: DrivingScene) -> tuple[Verdict, str]:
     """Whether depth edges lie on picture edges without turning any camera."""
-    edges = {frame_index: depth_edges(scene, frame_index) for frame_index in slow_frames(scene)}
+    edges: dict[int, dict[str, EdgePoints]] = {}
+    if any(_is_fine_enough(_reduced(view.camera)) for view in scene.views):
+        edges = {frame_index: depth_edges(scene, frame_index) for frame_index in slow_frames(scene)}
     found = {name: best_turn(scene, name, edges) for name in scene.camera_names}
     wrong, unsure, details = [], [], []
     for name, turn in found.items():
@@ -130,11 +132,10 @@ def best_turn(
     views = [view for view in scene.views_of(camera_name) if view.frame_index in edges]
     pictures = []
     for view in views:
-        share = min(1.0, _MAX_WIDTH_PX / view.camera.width_px)
-        size = round(view.camera.width_px * share), round(view.camera.height_px * share)
-        camera = view.camera.resized(width_px=size[0], height_px=size[1])
-        if camera.fx_px * np.radians(1.0) < _MIN_PX_PER_DEG:
+        camera = _reduced(view.camera)
+        if not _is_fine_enough(camera):
             return None
+        size = camera.width_px, camera.height_px
         rgb = cv2.resize(scene.read_image(view).numpy(), size, interpolation=cv2.INTER_AREA)
         points = _in_camera(edges[view.frame_index], camera)
         pictures.append((_edge_strengths(rgb, camera), camera, points))
@@ -150,6 +151,18 @@ def best_turn(
         peak=_peak(plane, yaw_deg, pitch_deg),
         num_points=num_points,
     )
+
+
+def _reduced(camera: Camera) -> Camera:
+    """The camera of the picture that is looked at."""
+    share = min(1.0, _MAX_WIDTH_PX / camera.width_px)
+    return camera.resized(
+        width_px=round(camera.width_px * share), height_px=round(camera.height_px * share)
+    )
+
+
+def _is_fine_enough(camera: Camera) -> bool:
+    return camera.fx_px * np.radians(1.0) >= _MIN_PX_PER_DEG
 
 
 def depth_edges(scene: DrivingScene, frame_index: int) -> dict[str, EdgePoints]:
