@@ -15,6 +15,7 @@ picture and is not judged.
 Camera frame: x right, y down, z forward. Yaw turns about y, pitch about x.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -162,7 +163,7 @@ def _reduced(camera: Camera) -> Camera:
 
 
 def _is_fine_enough(camera: Camera) -> bool:
-    return camera.fx_px * np.radians(1.0) >= _MIN_PX_PER_DEG
+    return camera.fx_px * math.radians(1.0) >= _MIN_PX_PER_DEG
 
 
 def depth_edges(scene: DrivingScene, frame_index: int) -> dict[str, EdgePoints]:

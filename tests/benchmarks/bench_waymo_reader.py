@@ -19,9 +19,11 @@ import cv2
 import google_crc32c
 import numpy as np
 import pyarrow.parquet as pq
-import waymo_log
+import waymo_records
 from rich.console import Console
-from waymo_log import FrameNumbers, component_tables_of, frame_message, tfrecord
+from waymo_components import component_tables_of
+from waymo_numbers import FrameNumbers
+from waymo_records import frame_message, tfrecord
 
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.readers import ingest_scene
@@ -146,9 +148,9 @@ def write_releases(folder, num_frames):
     """Both releases, a record and a few rows at a time."""
     first = frame(np.random.default_rng(1))
     cameras, lidars = calibrations()
-    context = waymo_log.context_of(cameras, lidars)
+    context = waymo_records.context_of(cameras, lidars)
     lasers = b"".join(
-        waymo_log.message(5, waymo_log.laser_message(laser)) for laser in first.lasers
+        waymo_records.message(5, waymo_records.laser_message(laser)) for laser in first.lasers
     )
     (folder / "v1").mkdir()
     with (folder / "v1/segment-bench_with_camera_labels.tfrecord").open("wb") as file:

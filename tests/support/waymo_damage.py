@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from mutations import STRANGE_NUMBERS, TRAVERSALS, Damage, damaged_bytes
-from waymo_log import matrix, message, tfrecord, varint, whole
+from waymo_records import matrix, message, tfrecord, varint, whole
 
 FRAME_IMAGES, FRAME_LASERS, FRAME_LABELS = 4, 5, 6
 _VARINT, _DOUBLE, _BYTES, _GROUP, _FLOAT = 0, 1, 2, 3, 5

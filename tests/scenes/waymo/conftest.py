@@ -4,7 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from waymo_log import SEGMENT, write_v1, write_v2
+from waymo_components import write_v2
+from waymo_edits import FILE, refused_line
+from waymo_numbers import SEGMENT
+from waymo_records import frame_messages, tfrecord, write_v1
 from waymo_truth import WaymoTruth, seen_with, street_config, write_truth
 
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -80,3 +83,20 @@ def components(tiny_truth, tmp_path) -> WaymoFolder:
     """A small segment of version 2."""
     write_v2(tiny_truth, tmp_path / "v2")
     return WaymoFolder(tmp_path / "v2", tiny_truth)
+
+
+@pytest.fixture(scope="session")
+def messages(tiny_truth):
+    return frame_messages(tiny_truth)
+
+
+@pytest.fixture
+def refusal(records, tmp_path):
+    """Write records, ingest them, and give the one line they are refused with."""
+
+    def refused(content):
+        file = records.root / FILE
+        file.write_bytes(content if isinstance(content, bytes) else tfrecord(content))
+        return refused_line(records, tmp_path / "store", FILE)
+
+    return refused

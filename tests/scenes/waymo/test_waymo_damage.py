@@ -2,8 +2,10 @@
 
 import pytest
 from fuzzing import MAX_MEMORY_BYTES, fuzz, peak_bytes
+from waymo_components import write_v2
 from waymo_damage import damaged_component, damaged_record_file
-from waymo_log import SEGMENT, frame_messages, write_v1, write_v2
+from waymo_numbers import SEGMENT
+from waymo_records import frame_messages, write_v1
 
 from lidarpainter_models.scenes.readers import ingest_scene
 
