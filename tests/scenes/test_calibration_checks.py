@@ -4,21 +4,22 @@ from dataclasses import replace
 
 import pytest
 import torch
+from drawn_streets import drawn_street
 
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.scenes.calibration_checks import check_calibration
 from lidarpainter_models.scenes.doctor import check_licence
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.readers import ingest_scene
-from lidarpainter_models.scenes.synthetic import SyntheticStreetConfig, write_street
+from lidarpainter_models.scenes.synthetic import SyntheticStreetConfig, record_street
 
 PITCH, YAW = 0, 1
 
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
-    config = SyntheticStreetConfig(seed=6, num_frames=4, width_px=320, height_px=180)
-    return write_street(config, tmp_path_factory.mktemp("street"))
+    config = SyntheticStreetConfig(seed=7, num_frames=4, width_px=320, height_px=180)
+    return record_street(drawn_street(config), tmp_path_factory.mktemp("street"))
 
 
 @pytest.fixture(scope="module")

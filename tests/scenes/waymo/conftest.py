@@ -4,11 +4,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from drawn_streets import drawn_street
 from waymo_components import write_v2
 from waymo_edits import FILE, refused_line
 from waymo_numbers import SEGMENT
 from waymo_records import frame_messages, tfrecord, write_v1
-from waymo_truth import WaymoTruth, seen_with, street_config, write_truth
+from waymo_truth import WaymoTruth, street_config, write_truth
 
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.readers import ingest_scene
@@ -30,7 +31,7 @@ class WaymoFolder:
 
 @pytest.fixture(scope="session")
 def street() -> SyntheticStreet:
-    return SyntheticStreet(street_config())
+    return drawn_street(street_config())
 
 
 @pytest.fixture(scope="session")
@@ -49,8 +50,9 @@ def tiny_truth(street, tmp_path_factory) -> WaymoTruth:
         lidar=RigLidar(name="TOP", beams=32, columns=360, up_m=2.18),
     )
     folder = tmp_path_factory.mktemp("tiny-truth")
-    other = seen_with(street, config)
-    return write_truth(other, folder, near_lidars=("REAR",), near_size=(6, 20), reach_m=22.0)
+    return write_truth(
+        drawn_street(config), folder, near_lidars=("REAR",), near_size=(6, 20), reach_m=22.0
+    )
 
 
 @pytest.fixture(scope="session")
