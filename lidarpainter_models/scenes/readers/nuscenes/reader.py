@@ -145,18 +145,15 @@ class NuscenesLog:
     def _sweep(
         self, sweep: Recording, points: LidarPoints, xyz_m: Float[Tensor, "points 3"]
     ) -> SourceSweep:
-        count = len(xyz_m)
         middle_ns = sweep.timestamp_ns - TURN_NS // 2
         global_from_lidar = pose_at(self._global_from_lidar, self._sweep_ns, middle_ns)
         return SourceSweep(
             lidar_name=LIDAR_NAME,
-            points=SweepPoints(
-                xyz_m=xyz_m.to(torch.float32),
+            points=SweepPoints.of(
+                xyz_m.to(torch.float32),
                 intensity=torch.from_numpy(points.intensity),
                 time_offset_ns=torch.from_numpy(points.time_offset_ns + TURN_NS // 2),
                 ring=torch.from_numpy(points.ring),
-                return_index=torch.zeros(count, dtype=torch.int8),
-                lidar=torch.zeros(count, dtype=torch.uint8),
             ),
             timestamp_ns=middle_ns,
             world_from_lidar=self._world_from_global @ global_from_lidar,

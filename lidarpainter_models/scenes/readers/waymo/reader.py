@@ -198,13 +198,12 @@ class WaymoLog:
         xyz_world_m = transform_points(world_from_vehicle, torch.from_numpy(found.xyz_vehicle_m))
         return SourceSweep(
             lidar_name=sweep.lidar_name,
-            points=SweepPoints(
-                xyz_m=xyz_world_m.to(torch.float32),
+            points=SweepPoints.of(
+                xyz_world_m.to(torch.float32),
                 intensity=torch.from_numpy(found.intensity),
                 time_offset_ns=torch.from_numpy(np.rint(offset_s * NS_PER_S).astype(np.int32)),
                 ring=torch.from_numpy(found.row.astype(np.int16)),
                 return_index=torch.from_numpy(found.return_index.astype(np.int8)),
-                lidar=torch.zeros(count, dtype=torch.uint8),
             ),
             timestamp_ns=nanoseconds(points.time_s),
             world_from_lidar=world_from_vehicle @ calibration.vehicle_from_lidar,
