@@ -123,13 +123,9 @@ def write(date_folder: Path, drive: str, store: Path) -> Path:
             )
             writer.add_sweep(
                 "velodyne",
-                SweepPoints(
-                    xyz_m=torch.from_numpy(xyz_m.astype(np.float32)),
+                SweepPoints.of(
+                    torch.from_numpy(xyz_m.astype(np.float32)),
                     intensity=torch.from_numpy(scan[:, 3].astype(np.float32)),
-                    time_offset_ns=torch.zeros(len(scan), dtype=torch.int32),
-                    ring=torch.full((len(scan),), -1, dtype=torch.int16),
-                    return_index=torch.zeros(len(scan), dtype=torch.int8),
-                    lidar=torch.zeros(len(scan), dtype=torch.uint8),
                 ),
                 timestamp_ns=time_ns,
                 world_from_lidar=pose,

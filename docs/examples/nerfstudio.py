@@ -61,16 +61,10 @@ def write(folder: Path, store: Path, licence: str) -> Path:
             )
             writer.add_image(record, (folder / frame["file_path"]).read_bytes())
             dealt_m = (cloud_m - origin_m)[index :: len(poses)].astype(np.float32)
-            count = len(dealt_m)
             writer.add_sweep(
                 "points",
-                SweepPoints(
-                    xyz_m=torch.from_numpy(dealt_m),
-                    intensity=torch.zeros(count),
-                    time_offset_ns=torch.zeros(count, dtype=torch.int32),
-                    ring=torch.full((count,), -1, dtype=torch.int16),
-                    return_index=torch.zeros(count, dtype=torch.int8),
-                    lidar=torch.zeros(count, dtype=torch.uint8),
+                SweepPoints.of(
+                    torch.from_numpy(dealt_m),
                 ),
                 timestamp_ns=time_ns,
                 world_from_lidar=world_from_ego,

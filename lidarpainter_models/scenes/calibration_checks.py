@@ -9,12 +9,14 @@ Depth edges across the beams are compared with vertical picture edges and those 
 horizontal ones. The edge strength is taken against its surroundings of two degrees, else trees and
 other broad texture would draw everything to them. Points of moving actors are left out, and the
 slower half of the frames is taken: a camera clock that is off moves what is seen as a turn would,
-the more the faster the car is. A turn about the optical axis (roll) hardly moves the middle of a
-picture and is not judged.
+the more the faster the car is. A turn about the optical axis (roll) is looked for last, at the best
+yaw and pitch and at none (a roll can look like a small one of these), and judged where it stands
+out: it moves the sides of a picture alone.
 
-Camera frame: x right, y down, z forward. Yaw turns about y, pitch about x.
+Camera frame: x right, y down, z forward. Yaw turns about y, pitch about x, roll about z.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -33,7 +35,8 @@ MAX_TURN_DEG = 0.6
 """A camera farther off is wrong.
 
 Sound cameras of PandaSet 002 and of synthetic streets are found within 0.25 degrees, one step of
-the search: those a degree off at 0.75 at least.
+the search (one of twelve at 0.5 in roll); those a degree off in yaw or pitch at 0.75 at least. Of
+twelve rolls of a degree planted in PandaSet 002 ten are found, the others at 0.5 and as a pitch.
 """
 MIN_PEAK = 3.5
 """How many deviations the best turn must stand out from the turns around it to be believed.
@@ -45,7 +48,8 @@ MIN_EDGE_POINTS = 500
 """Fewer, over all frames, say nothing."""
 _NUM_FRAMES = 8
 _TURNS_DEG = np.arange(-2.0, 2.01, 0.25)
-_PEAK_WIDTH_DEG = 0.6
+_ROLLS_DEG = np.arange(-3.0, 3.01, 0.25)
+_PEAK_WIDTH_DEG, _ROLL_PEAK_WIDTH_DEG = 0.6, 0.8
 """Turns this near to the best one score well because of it."""
 _MAX_WIDTH_PX = 960
 """Larger pictures are halved or more first: a degree stays at least eight pixels."""
@@ -78,30 +82,37 @@ class CameraTurn:
     yaw_deg: float
     pitch_deg: float
     peak: float
-    """How many deviations it stands out."""
+    """How many deviations yaw and pitch stand out."""
+    roll_deg: float
+    roll_peak: float
+    """How many deviations the roll stands out."""
     num_points: int
 
     @property
-    def largest_deg(self) -> float:
-        """The larger of both angles."""
-        return max(abs(self.yaw_deg), abs(self.pitch_deg))
+    def is_wrong(self) -> bool:
+        """Whether a turn that stands out is larger than sound cameras show."""
+        turned_deg = max(abs(self.yaw_deg), abs(self.pitch_deg))
+        is_turned = self.peak >= MIN_PEAK and turned_deg > MAX_TURN_DEG
+        return is_turned or (self.roll_peak >= MIN_PEAK and abs(self.roll_deg) > MAX_TURN_DEG)
 
 
 def check_calibration(scene: DrivingScene) -> tuple[Verdict, str]:
     """Whether depth edges lie on picture edges without turning any camera."""
-    edges = {frame_index: depth_edges(scene, frame_index) for frame_index in slow_frames(scene)}
+    edges: dict[int, dict[str, EdgePoints]] = {}
+    if any(_is_fine_enough(_reduced(view.camera)) for view in scene.views):
+        edges = {frame_index: depth_edges(scene, frame_index) for frame_index in slow_frames(scene)}
     found = {name: best_turn(scene, name, edges) for name in scene.camera_names}
     wrong, unsure, details = [], [], []
     for name, turn in found.items():
         if turn is None:
             details.append(f"{name} cannot be told (small picture or few edges)")
             continue
-        details.append(f"{name} {turn.yaw_deg:+.2f} {turn.pitch_deg:+.2f}")
-        if turn.peak < MIN_PEAK:
-            unsure.append(name)
-        elif turn.largest_deg > MAX_TURN_DEG:
+        details.append(f"{name} {turn.yaw_deg:+.2f} {turn.pitch_deg:+.2f} {turn.roll_deg:+.2f}")
+        if turn.is_wrong:
             wrong.append(name)
-    detail = f"degrees of yaw and pitch off: {', '.join(details)}"
+        elif turn.peak < MIN_PEAK:
+            unsure.append(name)
+    detail = f"degrees of yaw, pitch and roll off: {', '.join(details)}"
     if wrong:
         return "fail", f"{', '.join(wrong)} turned on its mount; {detail}"
     if unsure:
@@ -130,26 +141,42 @@ def best_turn(
     views = [view for view in scene.views_of(camera_name) if view.frame_index in edges]
     pictures = []
     for view in views:
-        share = min(1.0, _MAX_WIDTH_PX / view.camera.width_px)
-        size = round(view.camera.width_px * share), round(view.camera.height_px * share)
-        camera = view.camera.resized(width_px=size[0], height_px=size[1])
-        if camera.fx_px * np.radians(1.0) < _MIN_PX_PER_DEG:
+        camera = _reduced(view.camera)
+        if not _is_fine_enough(camera):
             return None
+        size = camera.width_px, camera.height_px
         rgb = cv2.resize(scene.read_image(view).numpy(), size, interpolation=cv2.INTER_AREA)
         points = _in_camera(edges[view.frame_index], camera)
         pictures.append((_edge_strengths(rgb, camera), camera, points))
     num_points = sum(len(points) for *_, kinds in pictures for points, _ in kinds.values())
     if num_points < MIN_EDGE_POINTS:
         return None
-    plane = np.array([[_score(pictures, yaw, p) for yaw in _TURNS_DEG] for p in _TURNS_DEG])
+    plane = np.array([[_score(pictures, (p, yaw, 0)) for yaw in _TURNS_DEG] for p in _TURNS_DEG])
     row, column = np.unravel_index(plane.argmax(), plane.shape)
     yaw_deg, pitch_deg = _TURNS_DEG[column], _TURNS_DEG[row]
+    line = max(_roll_scores(pictures, pitch_deg, yaw_deg), _roll_scores(pictures, 0, 0), key=max)
+    roll_deg = _ROLLS_DEG[line.argmax()]
+    apart = np.hypot(_TURNS_DEG[None] - yaw_deg, _TURNS_DEG[:, None] - pitch_deg)
     return CameraTurn(
         yaw_deg=float(yaw_deg),
         pitch_deg=float(pitch_deg),
-        peak=_peak(plane, yaw_deg, pitch_deg),
+        peak=_peak(plane, apart > _PEAK_WIDTH_DEG),
+        roll_deg=float(roll_deg),
+        roll_peak=_peak(line, np.abs(_ROLLS_DEG - roll_deg) > _ROLL_PEAK_WIDTH_DEG),
         num_points=num_points,
     )
+
+
+def _reduced(camera: Camera) -> Camera:
+    """The camera of the picture that is looked at."""
+    share = min(1.0, _MAX_WIDTH_PX / camera.width_px)
+    return camera.resized(
+        width_px=round(camera.width_px * share), height_px=round(camera.height_px * share)
+    )
+
+
+def _is_fine_enough(camera: Camera) -> bool:
+    return camera.fx_px * math.radians(1.0) >= _MIN_PX_PER_DEG
 
 
 def depth_edges(scene: DrivingScene, frame_index: int) -> dict[str, EdgePoints]:
@@ -252,10 +279,12 @@ def _in_camera(
     return kinds
 
 
-def _score(pictures: list, yaw_deg: float, pitch_deg: float) -> float:
-    """Weighted mean edge strength at the points of all pictures, with the camera turned."""
-    turn = np.radians(np.array([pitch_deg, yaw_deg, 0.0], dtype=np.float64))
-    rotation = cv2.Rodrigues(turn)[0]
+def _score(pictures: list, turn_deg: tuple[float, float, float]) -> float:
+    """Weighted mean edge strength at the points of all pictures, with the camera turned.
+
+    The turn is a rotation vector: pitch, yaw, roll.
+    """
+    rotation = cv2.Rodrigues(np.radians(np.array(turn_deg, dtype=np.float64)))[0]
     total = weights = 0.0
     for strengths, camera, kinds in pictures:
         for kind, (xyz_m, weight) in kinds.items():
@@ -270,8 +299,11 @@ def _score(pictures: list, yaw_deg: float, pitch_deg: float) -> float:
     return total / max(weights, 1e-9)
 
 
-def _peak(plane: np.ndarray, yaw_deg: float, pitch_deg: float) -> float:
+def _roll_scores(pictures: list, pitch_deg: float, yaw_deg: float) -> np.ndarray:
+    return np.array([_score(pictures, (pitch_deg, yaw_deg, roll)) for roll in _ROLLS_DEG])
+
+
+def _peak(scores: np.ndarray, is_apart: np.ndarray) -> float:
     """How many deviations the best score stands out from those of turns not near it."""
-    apart = np.hypot(_TURNS_DEG[None] - yaw_deg, _TURNS_DEG[:, None] - pitch_deg)
-    others = plane[apart > _PEAK_WIDTH_DEG]
-    return float((plane.max() - others.mean()) / max(float(others.std()), 1e-9))
+    others = scores[is_apart]
+    return float((scores.max() - others.mean()) / max(float(others.std()), 1e-9))

@@ -221,26 +221,38 @@ def check_sweeps_agree(scene: DrivingScene) -> tuple[Verdict, str]:
     if len(frames) < 2:
         return "warn", "a single sweep: nothing to compare"
     gaps_m = []
-    for position in _sampled(len(frames) - 1):
+    for position in sampled_positions(len(frames) - 1):
         first, second = (
             _points_near_ego(scene, frame) for frame in frames[position : position + 2]
         )
-        if len(first) and len(second):
-            distance_m, _ = KDTree(second).query(
-                first[:: max(1, len(first) // _NUM_SAMPLED_POINTS)]
-            )
-            gaps_m.append(float(np.median(distance_m)))
+        gap_m = sweep_gap_m(first, second)
+        if gap_m is not None:
+            gaps_m.append(gap_m)
     if not gaps_m:
         return "warn", f"no points within {_NEIGHBOURHOOD_M:.0f} m of the car"
     detail = f"median gap {max(gaps_m):.3f} m between sweeps near the car"
     return ("ok" if max(gaps_m) <= MAX_SWEEP_GAP_M else "fail"), detail
 
 
+def points_near(xyz_m: Float[Tensor, "points 3"], centre_m: Float[Tensor, "3"]) -> np.ndarray:
+    """The points around a place among which two sweeps are compared, float64."""
+    xyz_m = xyz_m.double()
+    return xyz_m[(xyz_m - centre_m).norm(dim=1) < _NEIGHBOURHOOD_M].numpy()
+
+
+def sweep_gap_m(first_m: np.ndarray, second_m: np.ndarray) -> float | None:
+    """Median distance from points of one sweep to the nearest of another; None without any."""
+    if len(first_m) == 0 or len(second_m) == 0:
+        return None
+    some_m = first_m[:: max(1, len(first_m) // _NUM_SAMPLED_POINTS)]
+    return float(np.median(KDTree(second_m).query(some_m)[0]))
+
+
 def check_coverage(scene: DrivingScene) -> tuple[Verdict, str]:
     """How much of each camera's picture the LiDAR reaches, in cells of a 16 x 9 grid."""
     covered: dict[str, list[float]] = {name: [] for name in scene.camera_names}
     frames = sorted({sweep.frame_index for sweep in scene.sweeps})
-    for position in _sampled(len(frames)):
+    for position in sampled_positions(len(frames)):
         xyz_m = scene.read_points(frames[position]).xyz_m[::_POINT_STRIDE]
         for view in scene.views:
             if view.frame_index == frames[position]:
@@ -263,9 +275,8 @@ def _covered_share(view: RecordedView, xyz_m: Float[Tensor, "points 3"]) -> floa
 
 
 def _points_near_ego(scene: DrivingScene, frame_index: int) -> np.ndarray:
-    centre = scene.world_from_ego[scene.frame_position(frame_index), :3, 3]
-    xyz_m = scene.read_points(frame_index).xyz_m.double()
-    return xyz_m[(xyz_m - centre).norm(dim=1) < _NEIGHBOURHOOD_M].numpy()
+    centre_m = scene.world_from_ego[scene.frame_position(frame_index), :3, 3]
+    return points_near(scene.read_points(frame_index).xyz_m, centre_m)
 
 
 def _robust_plane(points_m: np.ndarray) -> np.ndarray:
@@ -291,6 +302,6 @@ def _frame_after(scene: DrivingScene, step: int) -> int:
     return scene.frame_indices[min(step + 1, len(scene.frame_indices) - 1)]
 
 
-def _sampled(count: int) -> list[int]:
+def sampled_positions(count: int) -> list[int]:
     """A few positions spread evenly over `count`."""
     return sorted({round(x) for x in np.linspace(0, count - 1, min(count, _NUM_SAMPLED_FRAMES))})

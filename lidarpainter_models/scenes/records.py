@@ -120,6 +120,30 @@ class SweepPoints:
     lidar: Shaped[Tensor, " points"]
     """Position of the LiDAR's name in the scene's `lidar_names`."""
 
+    @classmethod
+    def of(
+        cls,
+        xyz_m: Float[Tensor, "points 3"],
+        *,
+        intensity: Float[Tensor, " points"] | None = None,
+        time_offset_ns: Int[Tensor, " points"] | None = None,
+        ring: Int[Tensor, " points"] | None = None,
+        return_index: Integer[Tensor, " points"] | None = None,
+    ) -> "SweepPoints":
+        """The points of one LiDAR, which the writer names; what is not known may be left out."""
+        count = len(xyz_m)
+        unmeasured = torch.zeros(count, dtype=torch.int32)
+        return cls(
+            xyz_m=xyz_m,
+            intensity=torch.zeros(count) if intensity is None else intensity,
+            time_offset_ns=unmeasured if time_offset_ns is None else time_offset_ns,
+            ring=torch.full((count,), -1, dtype=torch.int16) if ring is None else ring,
+            return_index=(
+                torch.zeros(count, dtype=torch.int8) if return_index is None else return_index
+            ),
+            lidar=torch.zeros(count, dtype=torch.uint8),
+        )
+
     @property
     def num_points(self) -> int:
         """How many points there are."""

@@ -77,7 +77,7 @@ class StoredScene:
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
         self.manifest = read_manifest(self.path)
-        self._group: zarr.Group | None = None
+        self._arrays: dict[str, zarr.Array] = {}
 
     def table(self, name: str) -> pa.Table:
         """One of the tables of the schema, whole; its columns are checked."""
@@ -110,20 +110,23 @@ class StoredScene:
                 f"{self.path}: rows {offset} to {offset + num_rows} of {name}, which has {total}"
             )
         try:
-            if self._group is None:
-                self._group = zarr.open_group(
-                    self.path / schema.ARRAYS_NAME,
-                    mode="r",
-                    zarr_format=3,  # version 2 has codecs that unpickle
-                    use_consolidated=False,
-                )
-            rows = self._group[name][offset : offset + num_rows]  # type: ignore[index]
+            rows = self._array(name)[offset : offset + num_rows]
         except (OSError, ValueError, KeyError, RuntimeError) as error:
             raise SceneError(
                 f"{self.path}: array {name} cannot be read ({shown(str(error))}); "
                 "ingest the scene again"
             ) from None
         return np.asarray(rows)
+
+    def _array(self, name: str) -> zarr.Array:
+        """An array, opened once: that takes as long as reading a sweep."""
+        if name not in self._arrays:
+            self._arrays[name] = zarr.open_array(
+                self.path / schema.ARRAYS_NAME / name,
+                mode="r",
+                zarr_format=3,  # version 2 has codecs that unpickle
+            )
+        return self._arrays[name]
 
     def verify_content(self) -> None:
         """Read everything and compare it with the digests in the manifest.

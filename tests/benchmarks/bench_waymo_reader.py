@@ -1,6 +1,7 @@
 """Time and memory of the Waymo readers on frames of real size.
 
     PYTHONPATH=.:tests/support python tests/benchmarks/bench_waymo_reader.py [--frames 20]
+        [--release v1]
 
 A frame has five 1920 x 1280 pictures, two echoes of five LiDARs (64 x 2650 pixels with poses for
 TOP, 116 x 150 for the others; eight of ten pixels hold an echo) and 75 labels, 40 of them
@@ -9,7 +10,6 @@ read once to warm up (imports, compilation, page cache), then read again and tim
 """
 
 import argparse
-import resource
 import tempfile
 import time
 from dataclasses import replace
@@ -19,12 +19,15 @@ import cv2
 import google_crc32c
 import numpy as np
 import pyarrow.parquet as pq
-import waymo_log
+import waymo_records
 from rich.console import Console
-from waymo_log import FrameNumbers, component_tables_of, frame_message, tfrecord
+from waymo_components import component_tables_of
+from waymo_numbers import FrameNumbers
+from waymo_records import frame_message, tfrecord
 
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.readers import ingest_scene
+from tasks.measuring import measured
 
 WIDTH_PX, HEIGHT_PX = 1920, 1280
 TOP_SHAPE, NEAR_SHAPE = (64, 2650), (116, 150)
@@ -146,9 +149,9 @@ def write_releases(folder, num_frames):
     """Both releases, a record and a few rows at a time."""
     first = frame(np.random.default_rng(1))
     cameras, lidars = calibrations()
-    context = waymo_log.context_of(cameras, lidars)
+    context = waymo_records.context_of(cameras, lidars)
     lasers = b"".join(
-        waymo_log.message(5, waymo_log.laser_message(laser)) for laser in first.lasers
+        waymo_records.message(5, waymo_records.laser_message(laser)) for laser in first.lasers
     )
     (folder / "v1").mkdir()
     with (folder / "v1/segment-bench_with_camera_labels.tfrecord").open("wb") as file:
@@ -172,16 +175,14 @@ def write_releases(folder, num_frames):
 
 
 def timed(release, folder, num_frames):
-    """Read all frames; wall and processor seconds per frame, and the peak of memory so far."""
-    wall, processor = time.perf_counter(), time.process_time()
-    path = ingest_scene("waymo", folder / release, "bench", folder / f"store-{release}")
-    wall_s = (time.perf_counter() - wall) / num_frames
-    processor_s = (time.process_time() - processor) / num_frames
-    peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    """Read all frames; wall and processor seconds per frame, and the peak of memory."""
+    with measured() as cost:
+        path = ingest_scene("waymo", folder / release, "bench", folder / f"store-{release}")
     points = DrivingScene.open(path).manifest["counts"]["points"] // num_frames
     Console().print(
-        f"{release}: {wall_s:.3f} s a frame ({processor_s:.3f} s of processor), "
-        f"{points} points a frame, peak {peak_mib:.0f} MiB"
+        f"{release}: {cost.seconds / num_frames:.3f} s a frame "
+        f"({cost.cpu_seconds / num_frames:.3f} s of processor), {points} points a frame, "
+        f"peak {cost.peak_memory_bytes / 1e6:.0f} MB"
     )
 
 
@@ -189,7 +190,10 @@ def main():
     """Write, warm up, time."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=20)
-    num_frames = parser.parse_args().frames
+    parser.add_argument("--release", choices=("v1", "v2"), help="one of both alone")
+    options = parser.parse_args()
+    num_frames = options.frames
+    releases = [options.release] if options.release else ["v1", "v2"]
     content = bytes(64 << 20)
     start = time.process_time()
     google_crc32c.value(content)
@@ -199,9 +203,9 @@ def main():
         folder = Path(name)
         num_bytes = write_releases(folder, num_frames)
         Console().print(f"{num_frames} frames, {num_bytes / 1e6:.1f} MB a frame in version 1")
-        for release in ("v1", "v2"):
+        for release in releases:
             ingest_scene("waymo", folder / release, "bench", folder / "warm", frames=slice(0, 1))
-        for release in ("v1", "v2"):
+        for release in releases:
             timed(release, folder, num_frames)
 
 

@@ -4,10 +4,11 @@ import json
 import time
 from collections import Counter
 
-import mutations
+import fuzzing
 import numpy as np
 import pytest
-from mutations import damaged_bytes, damaged_json, judge
+from fuzzing import judge
+from mutations import damaged_bytes, damaged_json
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -86,7 +87,7 @@ def test_other_ends_are_not_good(tmp_path):
 
 
 def test_ingest_without_end_is_stopped(tmp_path, monkeypatch):
-    monkeypatch.setattr(mutations, "MAX_SECONDS", 0.1)
+    monkeypatch.setattr(fuzzing, "MAX_SECONDS", 0.1)
 
     def spin():
         while True:

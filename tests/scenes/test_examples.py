@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -37,6 +38,12 @@ def test_scene_of_ones_own_rig_passes_the_doctor_and_comes_into_the_store(tmp_pa
     points = scene.read_points(0).xyz_m
     inside = (points[:, 1] > 3.0) & (points[:, 2] > 0.1)
     assert int(inside.sum()) == int(scene.tracks[0].num_points[0])
+
+
+def test_example_stands_whole_in_the_description_of_the_format():
+    page = (EXAMPLES.parent / "canonical-format.md").read_text()
+    (shown,) = re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    assert shown == (EXAMPLES / "own_rig.py").read_text()
 
 
 def write_kitti(folder, num_frames=4):

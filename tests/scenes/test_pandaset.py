@@ -11,10 +11,9 @@ import torch
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.readers import ingest_scene, list_sequences
-from lidarpainter_models.scenes.readers.frame_content import read_ahead
+from lidarpainter_models.scenes.readers import ingest_scene, list_sequences, open_log
 from lidarpainter_models.scenes.readers.pandaset.dataframe_pickle import read_table_bytes
-from lidarpainter_models.scenes.readers.pandaset.reader import read_pandaset
+from lidarpainter_models.scenes.readers.source_log import read_ahead, write_log
 from lidarpainter_models.scenes.stored import stored_digest
 
 
@@ -109,11 +108,13 @@ def test_frames_and_cameras_can_be_chosen(sound_pandaset, tmp_path):
     assert torch.allclose(scene.world_from_ego[0], torch.eye(4, dtype=torch.float64), atol=1e-9)
 
 
-@pytest.mark.parametrize("num_threads", [1, 3])
-def test_frames_read_ahead_give_the_same_scene(sound_pandaset, tmp_path, num_threads):
+@pytest.mark.parametrize("num_ahead", [1, 3])
+def test_frames_read_ahead_give_the_same_scene(sound_pandaset, tmp_path, num_ahead):
     serial, ahead = (
-        read_pandaset(sound_pandaset.root, "002", tmp_path / str(count), num_threads=count)
-        for count in (0, num_threads)
+        write_log(
+            open_log("pandaset", sound_pandaset.root, "002"), tmp_path / str(count), num_ahead=count
+        )
+        for count in (0, num_ahead)
     )
     assert stored_digest(serial) == stored_digest(ahead)
     files = [path.relative_to(serial) for path in serial.rglob("*") if path.is_file()]
@@ -127,7 +128,7 @@ def test_frames_are_read_only_a_little_ahead():
         read.append(frame_index)
         return frame_index
 
-    with read_ahead(note, range(20), num_threads=2) as frames:
+    with read_ahead(note, range(20), num_ahead=2) as frames:
         for frame_index in frames:
             assert max(read) <= frame_index + 2
     assert read == list(range(20))
@@ -139,7 +140,7 @@ def test_error_in_a_frame_is_raised_when_the_frame_is_due():
             raise DataError("frame 1")
         return frame_index
 
-    with read_ahead(refuse, range(4), num_threads=2) as frames:
+    with read_ahead(refuse, range(4), num_ahead=2) as frames:
         assert next(frames) == 0
         with pytest.raises(DataError, match="frame 1"):
             next(frames)

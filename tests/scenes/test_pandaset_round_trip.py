@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from drawn_streets import drawn_street
 from pandaset_log import CAMERA_NAMES, far_away_frame, set_boxes_upright, write_pandaset_log
 from scene_differences import scene_differences
 
@@ -13,7 +14,7 @@ from lidarpainter_models.scenes.synthetic import (
     RigCamera,
     RigLidar,
     SyntheticStreetConfig,
-    write_street,
+    record_street,
 )
 
 YAW_RAD = dict(zip(CAMERA_NAMES, np.radians([0, 57, -57, 90, -90, 180]).tolist(), strict=True))
@@ -36,7 +37,7 @@ def scenes(tmp_path_factory):
         cameras=cameras,
         lidar=RigLidar(columns=600),
     )
-    truth = DrivingScene.open(write_street(config, folder / "truth"))
+    truth = DrivingScene.open(record_street(drawn_street(config), folder / "truth"))
     set_boxes_upright(truth)
     truth.manifest["global_from_world"] = far_away_frame().reshape(16).tolist()
     write_pandaset_log(truth, folder / "log")

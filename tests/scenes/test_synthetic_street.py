@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from drawn_streets import drawn_street
 
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.geometry.boxes import is_inside_box
@@ -37,12 +38,12 @@ NEAREST_M = 0.6
 
 @pytest.fixture(scope="module")
 def street():
-    return SyntheticStreet(SyntheticStreetConfig(seed=7, **SMALL))
+    return drawn_street(SyntheticStreetConfig(seed=7, **SMALL))
 
 
 @pytest.fixture(scope="module")
 def other_street():
-    return SyntheticStreet(SyntheticStreetConfig(seed=8, **SMALL))
+    return drawn_street(SyntheticStreetConfig(seed=8, **SMALL))
 
 
 def front(street, frame=1):

@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from drawn_streets import drawn_street
 
 from lidarpainter_models.geometry.transforms import (
     interpolate_rigid,
@@ -31,7 +32,7 @@ from lidarpainter_models.scenes.synthetic import (
     RigCamera,
     RigLidar,
     SyntheticStreetConfig,
-    write_street,
+    record_street,
 )
 
 HALF_TURN_US = 25_000
@@ -79,7 +80,7 @@ def street_like_nuscenes(store, *, global_from_world=FAR_AWAY, **settings):
         "lidar": RigLidar(beams=32, columns=360),
     } | settings
     config = SyntheticStreetConfig(frame_interval_s=0.05, cameras=CAMERAS, **chosen)
-    scene = DrivingScene.open(write_street(config, store))
+    scene = DrivingScene.open(record_street(drawn_street(config), store))
     scene.manifest["global_from_world"] = global_from_world.reshape(16).tolist()
     scene.tracks = tuple(_when_seen(track, scene) for track in scene.tracks)
     return scene

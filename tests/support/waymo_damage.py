@@ -1,9 +1,10 @@
 """Damage Waymo's files below their checksums: messages, matrices and tables that look whole.
 
 Every way takes a seeded `numpy.random.Generator`. `damaged_record_file` gives a TFRecord file,
-`damage_component` changes one Parquet file of a folder; both say what was done.
+`damaged_component` one Parquet file of a folder; both say what was done.
 """
 
+import io
 import struct
 import zlib
 
@@ -11,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from mutations import STRANGE_NUMBERS, TRAVERSALS, Damage, damaged_bytes
-from waymo_log import matrix, message, tfrecord, varint, whole
+from waymo_records import matrix, message, tfrecord, varint, whole
 
 FRAME_IMAGES, FRAME_LASERS, FRAME_LABELS = 4, 5, 6
 _VARINT, _DOUBLE, _BYTES, _GROUP, _FLOAT = 0, 1, 2, 3, 5
@@ -212,20 +213,18 @@ def _read_varint(content, position):
 # --- version 2
 
 
-def damage_component(folder, rng):
-    """Damage one Parquet file of a folder: its bytes, or a table that is then written anew."""
+def damaged_component(folder, rng):
+    """One Parquet file of a folder, and what is to stand in it: other bytes, or another table."""
     paths = sorted(folder.glob("*/*.parquet"))
     path = paths[rng.integers(len(paths))]
-    name = path.parent.name
     if rng.random() < 0.4:
-        damage = damaged_bytes(path.read_bytes(), rng)
-        path.write_bytes(damage.content)
-        return f"{name}: {damage.description}"
+        return path, damaged_bytes(path.read_bytes(), rng)
     table = pq.read_table(path)
     ways = (_column_gone, _column_of_texts, _null, _strange_value, _rows_moved, _strange_value)
     table, description = ways[rng.integers(len(ways))](table, rng)
-    pq.write_table(table, path, row_group_size=int(rng.choice([1, 2, 5, 1000])))
-    return f"{name}: {description}"
+    written = io.BytesIO()
+    pq.write_table(table, written, row_group_size=int(rng.choice([1, 2, 5, 1000])))
+    return path, Damage(written.getvalue(), description)
 
 
 def _column_gone(table, rng):

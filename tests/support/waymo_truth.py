@@ -12,7 +12,6 @@ The truth is what the formats can express, so that a reader must give it back as
   through a distorted lens. The pixels of the pictures are the street's, which nobody looks at.
 """
 
-import copy
 from collections import defaultdict
 from dataclasses import dataclass, field, replace
 
@@ -138,14 +137,6 @@ def street_config(**changes):
         "lidar": RigLidar(name="TOP", beams=32, columns=450, up_m=2.18),
     }
     return SyntheticStreetConfig(**{**settings, **changes})
-
-
-def seen_with(street, config):
-    """The same street through other sensors, without drawing it again."""
-    other = copy.copy(street)
-    vars(other).pop("timestamps_ns", None)
-    other.config = config
-    return other
 
 
 def write_truth(

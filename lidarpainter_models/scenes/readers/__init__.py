@@ -4,25 +4,27 @@ from collections.abc import Callable
 from pathlib import Path
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.scenes.readers.canonical.reader import (
-    list_canonical_scenes,
-    read_canonical,
+from lidarpainter_models.scenes.readers.canonical.reader import ForeignScene, list_canonical_scenes
+from lidarpainter_models.scenes.readers.nuscenes.reader import NuscenesLog, list_nuscenes_scenes
+from lidarpainter_models.scenes.readers.pandaset.reader import PandasetLog, list_pandaset_sequences
+from lidarpainter_models.scenes.readers.source_log import (
+    Progress,
+    SourceLog,
+    write_log,
 )
-from lidarpainter_models.scenes.readers.nuscenes.reader import list_nuscenes_scenes, read_nuscenes
-from lidarpainter_models.scenes.readers.pandaset.reader import (
-    list_pandaset_sequences,
-    read_pandaset,
-)
-from lidarpainter_models.scenes.readers.waymo.reader import list_waymo_segments, read_waymo
+from lidarpainter_models.scenes.readers.waymo.reader import WaymoLog, list_waymo_segments
+from lidarpainter_models.scenes.validation import require_name
 
-Progress = Callable[[int, int], None]
-"""Told frames done and frames in all."""
+ListSequences = Callable[[Path], tuple[str, ...]]
+"""The sequences below a root, by name."""
+OpenLog = Callable[[Path, str, slice | None, tuple[str, ...] | None], SourceLog]
+"""Takes the root, the sequence, and which frames and cameras to take, all of them if None."""
 
-_READERS = {
-    "pandaset": (list_pandaset_sequences, read_pandaset),
-    "nuscenes": (list_nuscenes_scenes, read_nuscenes),
-    "waymo": (list_waymo_segments, read_waymo),
-    "canonical": (list_canonical_scenes, read_canonical),
+_READERS: dict[str, tuple[ListSequences, OpenLog]] = {
+    "pandaset": (list_pandaset_sequences, PandasetLog),
+    "nuscenes": (list_nuscenes_scenes, NuscenesLog),
+    "waymo": (list_waymo_segments, WaymoLog),
+    "canonical": (list_canonical_scenes, ForeignScene),
 }
 
 
@@ -37,7 +39,7 @@ def list_sequences(dataset: str, root: Path) -> tuple[str, ...]:
     Raises:
         DataError: the dataset is not known, or the root is no folder or holds no sequence.
     """
-    list_found, _read = _reader(dataset)
+    list_found, _open_log = _reader(dataset)
     if not Path(root).is_dir():
         raise DataError(f"{root}: no such folder, expected the root of {dataset}")
     found = list_found(Path(root))
@@ -62,13 +64,36 @@ def ingest_scene(
         DataError: the dataset is not known, or the log is missing something, damaged or senseless.
         StorageError: the store cannot be written.
     """
-    _list_found, read = _reader(dataset)
-    return read(
-        Path(root), sequence, Path(store), frames=frames, cameras=cameras, progress=progress
-    )
+    log = open_log(dataset, root, sequence, frames=frames, cameras=cameras)
+    return write_log(log, Path(store), progress=progress)
 
 
-def _reader(dataset: str) -> tuple[Callable[..., tuple[str, ...]], Callable[..., Path]]:
+def open_log(
+    dataset: str,
+    root: Path,
+    sequence: str,
+    *,
+    frames: slice | None = None,
+    cameras: tuple[str, ...] | None = None,
+) -> SourceLog:
+    """Open one sequence of a dataset.
+
+    Args:
+        dataset: one of `known_datasets`.
+        root: the folder as downloaded.
+        sequence: one of `list_sequences`.
+        frames: which frames to take, by position; all of them if None.
+        cameras: which cameras to take, by name; all of them if None.
+
+    Raises:
+        DataError: the dataset is not known, or the log is missing something, damaged or senseless.
+    """
+    _list_found, open_found = _reader(dataset)
+    require_name(sequence, "sequence")
+    return open_found(Path(root), sequence, frames, cameras)
+
+
+def _reader(dataset: str) -> tuple[ListSequences, OpenLog]:
     try:
         return _READERS[dataset]
     except KeyError:

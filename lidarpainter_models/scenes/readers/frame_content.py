@@ -1,27 +1,12 @@
-"""One frame as a reader hands it to the writer, and frames read ahead of the one being written.
+"""One frame as a reader hands it to the writer."""
 
-Unpacking, hashing and sorting release the interpreter, so threads prepare the next frames while
-the last one is written. They are handed on in order: what is stored does not depend on the
-number of threads, and never more than `num_threads` + 1 frames are in memory.
-"""
-
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TypeVar
 
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, SweepPoints
 from lidarpainter_models.scenes.writer import SceneWriter
-
-NUM_READING_THREADS = 1
-"""Beside the threads that check and write: on two cores a second one only waits for the others."""
-
-Content = TypeVar("Content")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,7 +27,7 @@ class SourceSweep:
     timestamp_ns: int
     """Middle of the sweep."""
     world_from_lidar: Float[Tensor, "4 4"]
-    semantics: UInt8[Tensor, " points"] | None
+    semantics: UInt8[Tensor, " points"] | None = None
     source: str
 
 
@@ -51,6 +36,8 @@ class FrameContent:
     """Everything of one frame."""
 
     frame_index: int
+    place: str
+    """File or folder and frame, to name in errors."""
     timestamp_ns: int
     world_from_ego: Float[Tensor, "4 4"]
     images: list[SourceImage]
@@ -74,36 +61,3 @@ class FrameContent:
                 source=sweep.source,
             )
         writer.add_boxes(self.boxes)
-
-
-@contextmanager
-def read_ahead(
-    read: Callable[[int], Content], frame_indices: Sequence[int], *, num_threads: int
-) -> Iterator[Iterator[Content]]:
-    """What `read` gives for each frame, in order; an error is raised when its frame is due.
-
-    With zero threads each frame is read when it is asked for. Leaving the block ends the threads.
-    """
-    if num_threads == 0:
-        yield map(read, frame_indices)
-        return
-    pool = ThreadPoolExecutor(num_threads, thread_name_prefix="frame")
-    try:
-        yield _in_order(pool, read, frame_indices, num_threads)
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _in_order(
-    pool: ThreadPoolExecutor,
-    read: Callable[[int], Content],
-    frame_indices: Sequence[int],
-    num_ahead: int,
-) -> Iterator[Content]:
-    waiting: deque[Future[Content]] = deque()
-    for frame_index in frame_indices:
-        waiting.append(pool.submit(read, frame_index))
-        if len(waiting) > num_ahead:
-            yield waiting.popleft().result()
-    while waiting:
-        yield waiting.popleft().result()

@@ -6,7 +6,7 @@ from lidarpainter_models.scenes.synthetic.config import (
     RigLidar,
     SyntheticStreetConfig,
 )
-from lidarpainter_models.scenes.synthetic.sequence import street_name, write_street
+from lidarpainter_models.scenes.synthetic.sequence import record_street, street_name, write_street
 from lidarpainter_models.scenes.synthetic.street import SyntheticStreet, TruePicture
 
 __all__ = [
@@ -16,6 +16,7 @@ __all__ = [
     "SyntheticStreet",
     "SyntheticStreetConfig",
     "TruePicture",
+    "record_street",
     "street_name",
     "write_street",
 ]

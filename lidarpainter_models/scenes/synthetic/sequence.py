@@ -48,7 +48,17 @@ def write_street(
     Returns:
         The folder of the scene.
     """
-    street = SyntheticStreet(config)
+    return record_street(SyntheticStreet(config), store, progress=progress)
+
+
+def record_street(
+    street: SyntheticStreet,
+    store: Path,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Record a street that is drawn already, as `write_street` does."""
+    config = street.config
     header = SceneHeader(
         licence=LICENCE,
         global_from_world=torch.eye(4, dtype=torch.float64),

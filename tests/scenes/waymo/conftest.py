@@ -4,8 +4,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from waymo_log import SEGMENT, write_v1, write_v2
-from waymo_truth import WaymoTruth, seen_with, street_config, write_truth
+from drawn_streets import drawn_street
+from waymo_components import write_v2
+from waymo_edits import FILE, refused_line
+from waymo_numbers import SEGMENT
+from waymo_records import frame_messages, tfrecord, write_v1
+from waymo_truth import WaymoTruth, street_config, write_truth
 
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.readers import ingest_scene
@@ -27,7 +31,7 @@ class WaymoFolder:
 
 @pytest.fixture(scope="session")
 def street() -> SyntheticStreet:
-    return SyntheticStreet(street_config())
+    return drawn_street(street_config())
 
 
 @pytest.fixture(scope="session")
@@ -46,8 +50,9 @@ def tiny_truth(street, tmp_path_factory) -> WaymoTruth:
         lidar=RigLidar(name="TOP", beams=32, columns=360, up_m=2.18),
     )
     folder = tmp_path_factory.mktemp("tiny-truth")
-    other = seen_with(street, config)
-    return write_truth(other, folder, near_lidars=("REAR",), near_size=(6, 20), reach_m=22.0)
+    return write_truth(
+        drawn_street(config), folder, near_lidars=("REAR",), near_size=(6, 20), reach_m=22.0
+    )
 
 
 @pytest.fixture(scope="session")
@@ -80,3 +85,20 @@ def components(tiny_truth, tmp_path) -> WaymoFolder:
     """A small segment of version 2."""
     write_v2(tiny_truth, tmp_path / "v2")
     return WaymoFolder(tmp_path / "v2", tiny_truth)
+
+
+@pytest.fixture(scope="session")
+def messages(tiny_truth):
+    return frame_messages(tiny_truth)
+
+
+@pytest.fixture
+def refusal(records, tmp_path):
+    """Write records, ingest them, and give the one line they are refused with."""
+
+    def refused(content):
+        file = records.root / FILE
+        file.write_bytes(content if isinstance(content, bytes) else tfrecord(content))
+        return refused_line(records, tmp_path / "store", FILE)
+
+    return refused

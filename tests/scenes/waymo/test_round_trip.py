@@ -5,7 +5,9 @@ import pytest
 import torch
 from scene_differences import scene_differences
 from scipy.spatial import cKDTree
-from waymo_log import SEGMENT, frame_messages, tfrecord, write_v1, write_v2
+from waymo_components import write_v2
+from waymo_numbers import SEGMENT
+from waymo_records import frame_messages, tfrecord, write_v1
 from waymo_truth import CAMERAS, LENS_TERMS, NEAR_LIDARS, TURN_S
 
 from lidarpainter_models.errors import DataError

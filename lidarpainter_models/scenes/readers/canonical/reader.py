@@ -7,24 +7,22 @@ same rules, and nothing that the format does not know is carried over. The scene
 and sequence of its own manifest.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from lidarpainter_models.errors import DataError, LidarPainterError, StorageError
+from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.scenes import schema
 from lidarpainter_models.scenes.readers.canonical.checks import read_foreign_manifest
 from lidarpainter_models.scenes.readers.frame_content import (
-    NUM_READING_THREADS,
     FrameContent,
     SourceImage,
     SourceSweep,
-    read_ahead,
 )
 from lidarpainter_models.scenes.readers.selection import chosen_cameras, chosen_frames
+from lidarpainter_models.scenes.readers.source_log import naming
 from lidarpainter_models.scenes.records import (
     BoxRecord,
     Distortion,
@@ -33,15 +31,9 @@ from lidarpainter_models.scenes.records import (
     SweepPoints,
 )
 from lidarpainter_models.scenes.stored import StoredScene
-from lidarpainter_models.scenes.validation import (
-    SHUTTER_DIRECTIONS,
-    require_name,
-    require_pose,
-)
-from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
+from lidarpainter_models.scenes.validation import SHUTTER_DIRECTIONS, require_pose
+from lidarpainter_models.scenes.writer import SceneHeader
 
-Progress = Callable[[int, int], None]
-"""Told frames done and frames in all."""
 _MAX_JPEG_BYTES = 64_000_000
 _MAX_SWEEP_POINTS = 10_000_000
 _KNOWN_ENTRIES = frozenset(
@@ -60,75 +52,37 @@ def list_canonical_scenes(root: Path) -> tuple[str, ...]:
     return tuple(sorted(file.parent.name for file in root.glob(f"*/{schema.MANIFEST_NAME}")))
 
 
-def read_canonical(
-    root: Path,
-    sequence: str,
-    store: Path,
-    *,
-    frames: slice | None = None,
-    cameras: tuple[str, ...] | None = None,
-    progress: Progress | None = None,
-) -> Path:
-    """Check one scene folder and write it into the store; gives the scene's path.
-
-    Args:
-        root: the folder that holds the scene folders, or the scene folder itself.
-        sequence: a folder name below the root.
-        store: where scenes live.
-        frames: which frames to take, by position; all of them if None.
-        cameras: which cameras to take, by name; all of them if None.
-        progress: told after every frame.
-
-    Raises:
-        DataError: something of the scene is missing, damaged or makes no sense.
-        StorageError: the store cannot be written.
-    """
-    require_name(sequence, "sequence")
-    is_scene = (root / schema.MANIFEST_NAME).is_file() and root.resolve().name == sequence
-    folder = root if is_scene else root / sequence
-    if not folder.is_dir():
-        raise DataError(f"{folder}: no such scene folder")
-    try:
-        return _read(folder, store, frames, cameras, progress)
-    except StorageError:
-        raise
-    except LidarPainterError as error:
-        if str(folder) in str(error):
-            raise
-        raise DataError(f"{folder}: {error}") from None
-
-
-def _read(
-    folder: Path,
-    store: Path,
-    frames: slice | None,
-    cameras: tuple[str, ...] | None,
-    progress: Progress | None,
-) -> Path:
-    scene = _ForeignScene(folder, frames, cameras)
-    manifest = scene.manifest
-    with (
-        SceneWriter(store, manifest["dataset"], manifest["sequence"], scene.header) as writer,
-        read_ahead(
-            scene.read_frame, range(len(scene.frames)), num_threads=NUM_READING_THREADS
-        ) as contents,
-    ):
-        for done, content in enumerate(contents, start=1):
-            content.write(writer)
-            if progress is not None:
-                progress(done, len(scene.frames))
-        writer.set_provenance(
-            {"root": str(folder), "content_digest": str(manifest.get("content_digest"))[:64]}
-        )
-    return writer.path
-
-
-class _ForeignScene:
+class ForeignScene:
     """The tables of a checked scene folder, by frame."""
 
-    def __init__(self, folder: Path, frames: slice | None, cameras: tuple[str, ...] | None) -> None:
-        self.folder = folder
+    is_drive = False
+
+    def __init__(
+        self, root: Path, sequence: str, frames: slice | None, cameras: tuple[str, ...] | None
+    ) -> None:
+        """Check one scene folder, all of it.
+
+        Args:
+            root: the folder that holds the scene folders, or the scene folder itself.
+            sequence: a folder name below the root.
+            frames: which frames to take, by position; all of them if None.
+            cameras: which cameras to take, by name; all of them if None.
+
+        Raises:
+            DataError: something of the scene is missing, damaged or makes no sense.
+        """
+        is_scene = (root / schema.MANIFEST_NAME).is_file() and root.resolve().name == sequence
+        self.folder = root if is_scene else root / sequence
+        if not self.folder.is_dir():
+            raise DataError(f"{self.folder}: no such scene folder")
+        self.place = str(self.folder)
+        with naming(self.place):
+            self._open(frames, cameras)
+
+    def _open(self, frames: slice | None, cameras: tuple[str, ...] | None) -> None:
+        folder = self.folder
         self.manifest = read_foreign_manifest(folder)
+        self.dataset, self.sequence = self.manifest["dataset"], self.manifest["sequence"]
         self.stored = StoredScene(folder)
         self.stored.verify_content()
         used = chosen_cameras(cameras, self.manifest["camera_names"], folder)
@@ -139,7 +93,9 @@ class _ForeignScene:
             frame: [row for row in rows if row["camera"] in used]
             for frame, rows in self._rows["cameras"].items()
         }
-        self.frames = [all_frames[i] for i in chosen_frames(len(all_frames), frames, folder)]
+        chosen = [all_frames[i] for i in chosen_frames(len(all_frames), frames, folder)]
+        self.frames = {row["frame_index"]: row for row in chosen}
+        self.frame_indices = list(self.frames)
         self.header = SceneHeader(
             licence=self.manifest["licence"],
             global_from_world=require_pose(
@@ -151,12 +107,17 @@ class _ForeignScene:
             more={k: v for k, v in self.manifest.items() if k not in _KNOWN_ENTRIES},
         )
 
-    def read_frame(self, position: int) -> FrameContent:
+    def provenance(self) -> dict[str, object]:
+        """Where the scene lay, and the digest of its content."""
+        digest = str(self.manifest.get("content_digest"))[:64]
+        return {"root": self.place, "content_digest": digest}
+
+    def read_frame(self, frame_index: int) -> FrameContent:
         """Everything of one frame, as the writer takes it."""
-        row = self.frames[position]
-        frame_index = row["frame_index"]
+        row = self.frames[frame_index]
         return FrameContent(
             frame_index=frame_index,
+            place=self.place,
             timestamp_ns=row["timestamp_ns"],
             world_from_ego=_pose(row["world_from_ego"]),
             images=[self._image(found) for found in self._rows["cameras"].get(frame_index, [])],

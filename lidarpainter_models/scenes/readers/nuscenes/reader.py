@@ -13,7 +13,6 @@ heading in the level plane, z up. Pictures are undistorted in the dataset; senso
 once a scene.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -23,6 +22,11 @@ from torch import Tensor
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.scenes.readers.drive_poses import level_frame, pose_at
+from lidarpainter_models.scenes.readers.frame_content import (
+    FrameContent,
+    SourceImage,
+    SourceSweep,
+)
 from lidarpainter_models.scenes.readers.nuscenes.boxes import Annotations, PointsByPlace
 from lidarpainter_models.scenes.readers.nuscenes.dataset import (
     find_scene,
@@ -45,13 +49,10 @@ from lidarpainter_models.scenes.readers.nuscenes.sweeps import (
 from lidarpainter_models.scenes.readers.selection import chosen_cameras, chosen_frames
 from lidarpainter_models.scenes.readers.source_folder import SourceFolder
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, SweepPoints
-from lidarpainter_models.scenes.validation import require_name
-from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
+from lidarpainter_models.scenes.writer import SceneHeader
 
 DATASET = "nuscenes"
 LICENCE = "CC BY-NC-SA 4.0 (non-commercial), nuScenes by Motional"
-Progress = Callable[[int, int], None]
-"""Told frames done and frames in all."""
 
 
 def list_nuscenes_scenes(root: Path) -> tuple[str, ...]:
@@ -63,47 +64,27 @@ def list_nuscenes_scenes(root: Path) -> tuple[str, ...]:
     )
 
 
-def read_nuscenes(
-    root: Path,
-    sequence: str,
-    store: Path,
-    *,
-    frames: slice | None = None,
-    cameras: tuple[str, ...] | None = None,
-    progress: Progress | None = None,
-) -> Path:
-    """Write one scene into the store as a canonical scene; gives its path.
-
-    Args:
-        root: the folder that holds `v1.0-*`, `samples` and `sweeps`.
-        sequence: the name of a scene.
-        store: where scenes live.
-        frames: which sweeps to take, by position; all of them if None.
-        cameras: which cameras to take, by channel; all of them if None.
-        progress: told after every frame.
-
-    Raises:
-        DataError: something in the log is missing, damaged or makes no sense.
-        StorageError: the store cannot be written.
-    """
-    require_name(sequence, "sequence")
-    log = _NuscenesLog(Path(root), sequence, frames, cameras)
-    header = SceneHeader(licence=LICENCE, global_from_world=log.global_from_world)
-    with SceneWriter(store, DATASET, sequence, header) as writer:
-        for done, frame_index in enumerate(log.frame_indices, start=1):
-            log.write_frame(writer, frame_index)
-            if progress is not None:
-                progress(done, len(log.frame_indices))
-        writer.set_provenance({"root": str(root), **log.provenance()})
-    return writer.path
-
-
-class _NuscenesLog:
+class NuscenesLog:
     """One scene; all its rows are read at once, files frame by frame."""
+
+    dataset = DATASET
+    is_drive = True
 
     def __init__(
         self, root: Path, sequence: str, frames: slice | None, cameras: tuple[str, ...] | None
     ) -> None:
+        """Open a scene.
+
+        Args:
+            root: the folder that holds `v1.0-*`, `samples` and `sweeps`.
+            sequence: the name of a scene.
+            frames: which sweeps to take, by position; all of them if None.
+            cameras: which cameras to take, by channel; all of them if None.
+
+        Raises:
+            DataError: something in the tables is missing, damaged or makes no sense.
+        """
+        self.place, self.sequence = str(root), sequence
         self.source = SourceFolder(root)
         self._tables, scene = find_scene(root, sequence)
         samples = read_samples(self._tables, scene)
@@ -115,35 +96,37 @@ class _NuscenesLog:
         self.frame_indices = chosen_frames(len(self._frames), frames, scene.where)
         first = self._frames[self.frame_indices[0]]
         self.global_from_world = level_frame(first.sweep.global_from_ego)
+        self.header = SceneHeader(licence=LICENCE, global_from_world=self.global_from_world)
         self._world_from_global = invert_rigid(self.global_from_world)
         self._sweep_ns = [sweep.timestamp_ns for sweep in self._sweeps]
         self._global_from_lidar = torch.stack([sweep.global_from_sensor for sweep in self._sweeps])
 
-    def write_frame(self, writer: SceneWriter, frame_index: int) -> None:
-        """Everything of one frame."""
+    def read_frame(self, frame_index: int) -> FrameContent:
+        """Everything of one frame, as the writer takes it."""
         frame = self._frames[frame_index]
-        writer.add_frame(
-            frame_index,
-            timestamp_ns=frame.sweep.timestamp_ns,
-            world_from_ego=self._world_from_global @ frame.sweep.global_from_ego,
-        )
-        for picture in frame.pictures.values():
-            self._write_image(writer, picture)
         points = read_lidar_points(self.source, frame.sweep.file)
         world_from_lidar = self._world_from_global @ frame.sweep.global_from_sensor
         xyz_m = transform_points(world_from_lidar, torch.from_numpy(points.xyz_m))
-        self._write_sweep(writer, frame.sweep, points, xyz_m)
-        self._write_boxes(writer, frame, xyz_m)
+        return FrameContent(
+            frame_index=frame_index,
+            place=frame.sweep.where,
+            timestamp_ns=frame.sweep.timestamp_ns,
+            world_from_ego=self._world_from_global @ frame.sweep.global_from_ego,
+            images=[self._read_image(picture) for picture in frame.pictures.values()],
+            sweeps=[self._sweep(frame.sweep, points, xyz_m)],
+            boxes=self._boxes(frame, xyz_m),
+        )
 
     def provenance(self) -> dict[str, object]:
         """The version, and digests of its tables and of the files that were read."""
         return {
+            "root": str(self.source.root),
             "version": self._tables.folder.name,
             "tables_sha256": self._tables.digests(),
             **self.source.provenance(),
         }
 
-    def _write_image(self, writer: SceneWriter, picture: Recording) -> None:
+    def _read_image(self, picture: Recording) -> SourceImage:
         width_px, height_px = picture.size_px
         camera = Camera(
             world_from_camera=self._world_from_global @ picture.global_from_sensor,
@@ -157,39 +140,32 @@ class _NuscenesLog:
             camera=camera,
         )
         jpeg = self.source.read_bytes(picture.file)
-        writer.add_image(record, jpeg, source=str(self.source.root / picture.file))
+        return SourceImage(record=record, jpeg=jpeg, source=str(self.source.root / picture.file))
 
-    def _write_sweep(
-        self,
-        writer: SceneWriter,
-        sweep: Recording,
-        points: LidarPoints,
-        xyz_m: Float[Tensor, "points 3"],
-    ) -> None:
-        count = len(xyz_m)
+    def _sweep(
+        self, sweep: Recording, points: LidarPoints, xyz_m: Float[Tensor, "points 3"]
+    ) -> SourceSweep:
         middle_ns = sweep.timestamp_ns - TURN_NS // 2
         global_from_lidar = pose_at(self._global_from_lidar, self._sweep_ns, middle_ns)
-        writer.add_sweep(
-            LIDAR_NAME,
-            SweepPoints(
-                xyz_m=xyz_m.to(torch.float32),
+        return SourceSweep(
+            lidar_name=LIDAR_NAME,
+            points=SweepPoints.of(
+                xyz_m.to(torch.float32),
                 intensity=torch.from_numpy(points.intensity),
                 time_offset_ns=torch.from_numpy(points.time_offset_ns + TURN_NS // 2),
                 ring=torch.from_numpy(points.ring),
-                return_index=torch.zeros(count, dtype=torch.int8),
-                lidar=torch.zeros(count, dtype=torch.uint8),
             ),
             timestamp_ns=middle_ns,
             world_from_lidar=self._world_from_global @ global_from_lidar,
+            source=str(self.source.root / sweep.file),
         )
 
-    def _write_boxes(
-        self, writer: SceneWriter, frame: RecordedFrame, xyz_m: Float[Tensor, "points 3"]
-    ) -> None:
+    def _boxes(self, frame: RecordedFrame, xyz_m: Float[Tensor, "points 3"]) -> list[BoxRecord]:
         points = PointsByPlace(xyz_m)
+        records = []
         for box in self.annotations.boxes_at(frame.sweep):
             world_from_box = self._world_from_global @ box.global_from_box
-            writer.add_box(
+            records.append(
                 BoxRecord(
                     actor_id=box.actor_id,
                     category=box.category,
@@ -200,3 +176,4 @@ class _NuscenesLog:
                     num_points=points.count_inside(world_from_box, box.size_m),
                 )
             )
+        return records

@@ -45,14 +45,10 @@ class PandasetPoints:
     ) -> SweepPoints:
         """The points of one LiDAR, whose rows and middle time are given."""
         offset_ns = np.rint((self.time_s[rows] - middle_ns / NS_PER_S) * NS_PER_S)
-        count = len(rows)
-        return SweepPoints(
-            xyz_m=xyz_world_m[torch.from_numpy(rows)],
+        return SweepPoints.of(
+            xyz_world_m[torch.from_numpy(rows)],
             intensity=torch.from_numpy(self.intensity[rows].astype(np.float32)),
             time_offset_ns=torch.from_numpy(offset_ns.astype(np.int32)),
-            ring=torch.full((count,), -1, dtype=torch.int16),
-            return_index=torch.zeros(count, dtype=torch.int8),
-            lidar=torch.zeros(count, dtype=torch.uint8),  # the writer sets it by name
         )
 
 

@@ -11,7 +11,6 @@ The scene's world has its origin at the first ego pose read and its x along that
 the dataset's up and not the vehicle's, which leans 2 degrees: the road is level in the former.
 """
 
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -31,11 +30,9 @@ from lidarpainter_models.scenes.readers.drive_poses import (
     turned_about_up,
 )
 from lidarpainter_models.scenes.readers.frame_content import (
-    NUM_READING_THREADS,
     FrameContent,
     SourceImage,
     SourceSweep,
-    read_ahead,
 )
 from lidarpainter_models.scenes.readers.pandaset.boxes import merge_boxes, read_boxes
 from lidarpainter_models.scenes.readers.pandaset.calibration import (
@@ -54,17 +51,11 @@ from lidarpainter_models.scenes.readers.selection import chosen_cameras, chosen_
 from lidarpainter_models.scenes.readers.source_folder import SourceFolder
 from lidarpainter_models.scenes.readers.swept_boxes import SweepTimes, moving_actors
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord
-from lidarpainter_models.scenes.validation import (
-    jpeg_header_size,
-    require_classes,
-    require_name,
-)
-from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
+from lidarpainter_models.scenes.validation import jpeg_header_size, require_classes
+from lidarpainter_models.scenes.writer import SceneHeader
 
 DATASET = "pandaset"
 LICENCE = "CC BY 4.0, PandaSet by Hesai and Scale AI"
-Progress = Callable[[int, int], None]
-"""Told frames done and frames in all."""
 
 # x forward, y left, z up seen from x right, y forward, z up
 _VEHICLE_FROM_EGO = torch.tensor(
@@ -84,54 +75,28 @@ def list_pandaset_sequences(root: Path) -> tuple[str, ...]:
     return tuple(sorted(file.parent.parent.name for file in Path(root).glob("*/lidar/poses.json")))
 
 
-def read_pandaset(
-    root: Path,
-    sequence: str,
-    store: Path,
-    *,
-    frames: slice | None = None,
-    cameras: tuple[str, ...] | None = None,
-    progress: Progress | None = None,
-    num_threads: int = NUM_READING_THREADS,
-) -> Path:
-    """Write one sequence into the store as a canonical scene; gives the scene's path.
-
-    Args:
-        root: the folder that holds the sequences.
-        sequence: a folder name below the root.
-        store: where scenes live.
-        frames: which frames to take, by position; all of them if None.
-        cameras: which cameras to take, by name; all of them if None.
-        progress: told after every frame.
-        num_threads: how many frames are prepared at once; what is stored does not depend on it.
-
-    Raises:
-        DataError: something in the log is missing, damaged or makes no sense.
-        StorageError: the store cannot be written.
-    """
-    require_name(sequence, "sequence")
-    log = _PandasetLog(Path(root) / sequence, frames, cameras)
-    header = SceneHeader(
-        licence=LICENCE,
-        global_from_world=log.global_from_world,
-        semantic_classes=log.semantic_classes,
-    )
-    with (
-        SceneWriter(store, DATASET, sequence, header) as writer,
-        read_ahead(log.read_frame, log.frame_indices, num_threads=num_threads) as contents,
-    ):
-        for done, content in enumerate(contents, start=1):
-            content.write(writer)
-            if progress is not None:
-                progress(done, len(log.frame_indices))
-        writer.set_provenance({"root": str(root), **log.source.provenance()})
-    return writer.path
-
-
-class _PandasetLog:
+class PandasetLog:
     """One sequence; what is needed before its first frame can be written is read at once."""
 
-    def __init__(self, folder: Path, frames: slice | None, cameras: tuple[str, ...] | None) -> None:
+    dataset = DATASET
+    is_drive = True
+
+    def __init__(
+        self, root: Path, sequence: str, frames: slice | None, cameras: tuple[str, ...] | None
+    ) -> None:
+        """Open a sequence.
+
+        Args:
+            root: the folder that holds the sequences.
+            sequence: a folder name below the root.
+            frames: which frames to take, by position; all of them if None.
+            cameras: which cameras to take, by name; all of them if None.
+
+        Raises:
+            DataError: something in the log is missing, damaged or makes no sense.
+        """
+        folder = root / sequence
+        self.place, self.sequence = str(folder), sequence
         if not folder.is_dir():
             raise DataError(f"{folder}: no such sequence folder")
         self.source = SourceFolder(folder)
@@ -148,11 +113,20 @@ class _PandasetLog:
             for name in chosen_cameras(cameras, CAMERA_NAMES, folder)
         }
         self.semantic_classes = _semantic_classes(self.source)
+        self.header = SceneHeader(
+            licence=LICENCE,
+            global_from_world=self.global_from_world,
+            semantic_classes=self.semantic_classes,
+        )
         boxes = {index: read_boxes(self.source, index) for index in self.frame_indices}
         self.boxes = merge_boxes(boxes)
         self.moving = moving_actors(
             self.boxes, {index: self.timestamps_ns[index] / NS_PER_S for index in boxes}
         )
+
+    def provenance(self) -> dict[str, object]:
+        """Where the log lies and what was read of it."""
+        return {"root": str(self.source.root.parent), **self.source.provenance()}
 
     def read_frame(self, frame_index: int) -> FrameContent:
         """Everything of one frame, as the writer takes it."""
@@ -164,6 +138,7 @@ class _PandasetLog:
         )
         return FrameContent(
             frame_index=frame_index,
+            place=f"{self.place}, frame {frame_index}",
             timestamp_ns=self.timestamps_ns[frame_index],
             world_from_ego=self.world_from_global @ self.global_from_ego[frame_index],
             images=[self._read_image(frame_index, name) for name in self.cameras],

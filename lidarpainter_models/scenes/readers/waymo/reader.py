@@ -21,25 +21,27 @@ derived files have none of these), is refused.
 """
 
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from lidarpainter_models.errors import ConfigError, DataError
+from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
-from lidarpainter_models.scenes.readers.drive_poses import level_frame, nanoseconds
+from lidarpainter_models.scenes.readers.drive_checks import require_timely
+from lidarpainter_models.scenes.readers.drive_poses import NS_PER_S, level_frame, nanoseconds
+from lidarpainter_models.scenes.readers.frame_content import (
+    FrameContent,
+    SourceImage,
+    SourceSweep,
+)
 from lidarpainter_models.scenes.readers.selection import chosen_cameras, chosen_frames
+from lidarpainter_models.scenes.readers.source_log import naming
 from lidarpainter_models.scenes.readers.waymo.boxes import FramePoints, box_records, moving_ids
 from lidarpainter_models.scenes.readers.waymo.calibration import CAMERA_NAMES, TOP
 from lidarpainter_models.scenes.readers.waymo.cameras import exposure_s, image_record
-from lidarpainter_models.scenes.readers.waymo.checks import (
-    require_agreement,
-    require_drive,
-    require_timely,
-)
+from lidarpainter_models.scenes.readers.waymo.checks import require_agreement, require_drive
 from lidarpainter_models.scenes.readers.waymo.log import (
     MAX_LAG_S,
     WaymoFrame,
@@ -51,20 +53,16 @@ from lidarpainter_models.scenes.readers.waymo.range_images import range_points
 from lidarpainter_models.scenes.readers.waymo.v1 import WaymoRecordSegment
 from lidarpainter_models.scenes.readers.waymo.v2 import WaymoParquetSegment
 from lidarpainter_models.scenes.records import SweepPoints
-from lidarpainter_models.scenes.validation import jpeg_header_size, require_name
-from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
+from lidarpainter_models.scenes.validation import jpeg_header_size
+from lidarpainter_models.scenes.writer import SceneHeader
 
 DATASET = "waymo"
 LICENCE = "Waymo Open Dataset License Agreement for Non-Commercial Use (waymo.com/open/terms)"
-Progress = Callable[[int, int], None]
-"""Told frames done and frames in all."""
-
 _RECORD_NAME = re.compile(r"(?:(?:[a-z]+_)?segment-)?(.+?)(?:_with_camera_labels)?")
 _DEPTHS = ("", "*/", "*/*/")
 _TURN_S = 0.1
 _TURN_LIMITS_S = (0.05, 0.2)
 _US_PER_S = 1_000_000
-_NS_PER_S = 1_000_000_000
 _SAME_POSE_M = 0.01
 
 
@@ -73,102 +71,87 @@ def list_waymo_segments(root: Path) -> tuple[str, ...]:
     return tuple(sorted({name for name, _path in _segments(Path(root))}))
 
 
-def read_waymo(
-    root: Path,
-    sequence: str,
-    store: Path,
-    *,
-    frames: slice | None = None,
-    cameras: tuple[str, ...] | None = None,
-    progress: Progress | None = None,
-) -> Path:
-    """Write one segment into the store as a canonical scene; gives the scene's path.
+class WaymoLog:
+    """One segment; poses and labels of all frames are in memory, sensors of one or two."""
 
-    Args:
-        root: the folder that holds the segments.
-        sequence: a segment's name.
-        store: where scenes live.
-        frames: which frames to take, by position; all of them if None.
-        cameras: which cameras to take, by name; all of them if None.
-        progress: told after every frame.
-
-    Raises:
-        DataError: something in the segment is missing, damaged or makes no sense.
-        StorageError: the store cannot be written.
-    """
-    require_name(sequence, "sequence")
-    segment = _open_segment(Path(root), sequence)
-    with _naming(segment.place):
-        log = _WaymoLog(segment, frames, cameras)
-        header = SceneHeader(licence=LICENCE, global_from_world=log.global_from_world)
-        with SceneWriter(store, DATASET, sequence, header) as writer:
-            for done, index in enumerate(log.frames, start=1):
-                log.write_frame(writer, index)
-                if progress is not None:
-                    progress(done, len(log.frames))
-            writer.set_provenance({"root": str(root), **segment.provenance()})
-    return writer.path
-
-
-class _WaymoLog:
-    """One segment; poses and labels of all frames are in memory, sensors of one at a time."""
+    dataset = DATASET
+    is_drive = True
 
     def __init__(
-        self, segment: WaymoSegment, frames: slice | None, cameras: tuple[str, ...] | None
+        self, root: Path, sequence: str, frames: slice | None, cameras: tuple[str, ...] | None
     ) -> None:
-        self.segment = segment
-        chosen = chosen_frames(segment.num_frames, frames, segment.place)
-        self.frames = {index: segment.read_frame(index) for index in chosen}
-        self.cameras = chosen_cameras(cameras, CAMERA_NAMES.values(), segment.place)
-        require_drive(list(self.frames.values()))
-        self.turn_s = _turn_s(self.frames)
-        self.global_from_world = level_frame(self.frames[chosen[0]].global_from_vehicle)
-        self.world_from_global = invert_rigid(self.global_from_world)
-        self.moving = moving_ids(list(self.frames.values()))
-        self._last_exposure_s: dict[str, float] = {}
+        """Open a segment.
 
-    def write_frame(self, writer: SceneWriter, index: int) -> None:
-        """Everything of one frame."""
-        frame = self.frames[index]
-        with _naming(frame.place):
-            sensors = self.segment.read_sensors(index)
+        Args:
+            root: the folder that holds the segments.
+            sequence: a segment's name.
+            frames: which frames to take, by position; all of them if None.
+            cameras: which cameras to take, by name; all of them if None.
+
+        Raises:
+            DataError: something in the segment is missing, damaged or makes no sense.
+        """
+        self._segment = _open_segment(root, sequence)
+        self.place, self.sequence, self._root = self._segment.place, sequence, root
+        with naming(self.place):
+            self.frame_indices = chosen_frames(self._segment.num_frames, frames, self.place)
+            self._frames = {index: self._segment.read_frame(index) for index in self.frame_indices}
+            self._cameras = chosen_cameras(cameras, CAMERA_NAMES.values(), self.place)
+            require_drive(list(self._frames.values()))
+            self._turn_s = _turn_s(self._frames)
+            first = self._frames[self.frame_indices[0]]
+            self._global_from_world = level_frame(first.global_from_vehicle)
+            self._world_from_global = invert_rigid(self._global_from_world)
+            self._moving = moving_ids(list(self._frames.values()))
+        self.header = SceneHeader(licence=LICENCE, global_from_world=self._global_from_world)
+
+    def provenance(self) -> dict[str, object]:
+        """The release, and digests of what was read."""
+        return {"root": str(self._root), **self._segment.provenance()}
+
+    def read_frame(self, frame_index: int) -> FrameContent:
+        """Everything of one frame, as the writer takes it."""
+        frame = self._frames[frame_index]
+        with naming(frame.place):
+            sensors = self._segment.read_sensors(frame_index)
             if not sensors.images:
                 raise DataError("zero pictures, expected at least one")
             images = {image.camera_name: image for image in sensors.images}
             time_s = self._time_s(frame, images)
-            writer.add_frame(
-                index,
-                timestamp_ns=nanoseconds(time_s),
-                world_from_ego=self.world_from_global @ frame.global_from_vehicle,
+            world_from_vehicle = self._world_from_global @ frame.global_from_vehicle
+            points = FramePoints(time_s, self._top_position_m())
+            sweeps = self._sweeps(frame, sensors.sweeps, points)
+            boxes = box_records(
+                frame, points, images, self._segment.cameras, world_from_vehicle, self._moving
             )
-            for image in sensors.images:
-                self._write_image(writer, frame, image, time_s)
-            points = self._write_sweeps(writer, frame, sensors.sweeps, time_s)
-            world_from_vehicle = self.world_from_global @ frame.global_from_vehicle
-            for record in box_records(
-                frame, points, images, self.segment.cameras, world_from_vehicle, self.moving
-            ):
-                writer.add_box(record)
+            return FrameContent(
+                frame_index=frame_index,
+                place=frame.place,
+                timestamp_ns=nanoseconds(time_s),
+                world_from_ego=world_from_vehicle,
+                images=[
+                    self._image(frame, image, time_s)
+                    for image in sensors.images
+                    if image.camera_name in self._cameras
+                ],
+                sweeps=sweeps,
+                boxes=list(boxes),
+            )
 
     def _time_s(self, frame: WaymoFrame, images: dict[str, WaymoImage]) -> float:
         """When the frame's pose holds: with the FRONT picture, or in the middle of the turn."""
-        middle_s = frame.start_us / _US_PER_S + self.turn_s / 2
+        middle_s = frame.start_us / _US_PER_S + self._turn_s / 2
         front = images.get(CAMERA_NAMES[1])
         if front is None or abs(front.pose_time_s - middle_s) > MAX_LAG_S:
             return middle_s
         apart_m = (front.global_from_vehicle - frame.global_from_vehicle)[:3, 3].norm()
         return front.pose_time_s if float(apart_m) <= _SAME_POSE_M else middle_s
 
-    def _write_image(
-        self, writer: SceneWriter, frame: WaymoFrame, image: WaymoImage, time_s: float
-    ) -> None:
-        if image.camera_name not in self.cameras:
-            return
-        calibration = self.segment.cameras.get(image.camera_name)
+    def _image(self, frame: WaymoFrame, image: WaymoImage, time_s: float) -> SourceImage:
+        calibration = self._segment.cameras.get(image.camera_name)
         if calibration is None:
             raise DataError(f"{image.place}: the camera has no calibration")
-        require_timely(image, time_s, self._last_exposure_s.get(image.camera_name))
-        self._last_exposure_s[image.camera_name] = exposure_s(image)
+        require_timely(nanoseconds(exposure_s(image)), nanoseconds(time_s), image.place)
         require_agreement(image, frame, time_s)
         lens = calibration.lens
         stated_px = jpeg_header_size(image.jpeg, image.place)
@@ -177,57 +160,58 @@ class _WaymoLog:
                 f"{image.place}: the picture is {stated_px[0]} x {stated_px[1]} px, expected "
                 f"{lens.width_px} x {lens.height_px} px as calibrated"
             )
-        record = image_record(image, calibration, self.world_from_global)
-        writer.add_image(record, image.jpeg, source=image.place)
+        record = image_record(image, calibration, self._world_from_global)
+        return SourceImage(record=record, jpeg=image.jpeg, source=image.place)
 
-    def _write_sweeps(
-        self,
-        writer: SceneWriter,
-        frame: WaymoFrame,
-        sweeps: tuple[WaymoSweep, ...],
-        time_s: float,
-    ) -> FramePoints:
-        points = FramePoints(time_s, self._top_position_m())
-        world_from_vehicle = self.world_from_global @ frame.global_from_vehicle
-        num_points = 0
-        for number, sweep in enumerate(sweeps):
-            calibration = self.segment.lidars.get(sweep.lidar_name)
-            if calibration is None:
-                raise DataError(f"{sweep.place}: the LiDAR has no calibration")
-            is_top = sweep.lidar_name == TOP
-            if is_top and sweep.pixel_poses is None:
-                raise DataError(f"{sweep.place}: the pixel poses are missing")
-            found = range_points(sweep, calibration, frame.global_from_vehicle)
-            if len(found.row) == 0:
-                continue
-            num_points += len(found.row)
-            offset_s = np.zeros(len(found.row))
-            if is_top:
-                begins_s = frame.start_us / _US_PER_S - time_s
-                offset_s = begins_s + (found.column + 0.5) / found.num_columns * self.turn_s
-            points.add(found.xyz_vehicle_m, offset_s, is_top=is_top)
-            xyz_world_m = transform_points(
-                world_from_vehicle, torch.from_numpy(found.xyz_vehicle_m)
-            )
-            writer.add_sweep(
-                sweep.lidar_name,
-                SweepPoints(
-                    xyz_m=xyz_world_m.to(torch.float32),
-                    intensity=torch.from_numpy(found.intensity),
-                    time_offset_ns=torch.from_numpy(np.rint(offset_s * _NS_PER_S).astype(np.int32)),
-                    ring=torch.from_numpy(found.row.astype(np.int16)),
-                    return_index=torch.from_numpy(found.return_index.astype(np.int8)),
-                    lidar=torch.full((len(found.row),), number, dtype=torch.uint8),
-                ),
-                timestamp_ns=nanoseconds(time_s),
-                world_from_lidar=world_from_vehicle @ calibration.vehicle_from_lidar,
-            )
-        if num_points == 0:
+    def _sweeps(
+        self, frame: WaymoFrame, sweeps: tuple[WaymoSweep, ...], points: FramePoints
+    ) -> list[SourceSweep]:
+        """The sweeps that have points, which are added to those of the frame."""
+        found = [
+            sweep
+            for sweep in (self._sweep(frame, sweep, points) for sweep in sweeps)
+            if sweep is not None
+        ]
+        if not found:
             raise DataError("no LiDAR has a point, expected range images")
-        return points
+        return found
+
+    def _sweep(
+        self, frame: WaymoFrame, sweep: WaymoSweep, points: FramePoints
+    ) -> SourceSweep | None:
+        calibration = self._segment.lidars.get(sweep.lidar_name)
+        if calibration is None:
+            raise DataError(f"{sweep.place}: the LiDAR has no calibration")
+        is_top = sweep.lidar_name == TOP
+        if is_top and sweep.pixel_poses is None:
+            raise DataError(f"{sweep.place}: the pixel poses are missing")
+        found = range_points(sweep, calibration, frame.global_from_vehicle)
+        count = len(found.row)
+        if count == 0:
+            return None
+        offset_s = np.zeros(count)
+        if is_top:
+            begins_s = frame.start_us / _US_PER_S - points.time_s
+            offset_s = begins_s + (found.column + 0.5) / found.num_columns * self._turn_s
+        points.add(found.xyz_vehicle_m, offset_s, is_top=is_top)
+        world_from_vehicle = self._world_from_global @ frame.global_from_vehicle
+        xyz_world_m = transform_points(world_from_vehicle, torch.from_numpy(found.xyz_vehicle_m))
+        return SourceSweep(
+            lidar_name=sweep.lidar_name,
+            points=SweepPoints.of(
+                xyz_world_m.to(torch.float32),
+                intensity=torch.from_numpy(found.intensity),
+                time_offset_ns=torch.from_numpy(np.rint(offset_s * NS_PER_S).astype(np.int32)),
+                ring=torch.from_numpy(found.row.astype(np.int16)),
+                return_index=torch.from_numpy(found.return_index.astype(np.int8)),
+            ),
+            timestamp_ns=nanoseconds(points.time_s),
+            world_from_lidar=world_from_vehicle @ calibration.vehicle_from_lidar,
+            source=sweep.place,
+        )
 
     def _top_position_m(self) -> np.ndarray:
-        top = self.segment.lidars.get(TOP)
+        top = self._segment.lidars.get(TOP)
         return np.zeros(3) if top is None else top.vehicle_from_lidar[:3, 3].numpy()
 
 
@@ -262,14 +246,3 @@ def _turn_s(frames: dict[int, WaymoFrame]) -> float:
     usual_s = float(np.median(steps_s)) if steps_s else _TURN_S
     low_s, high_s = _TURN_LIMITS_S
     return usual_s if low_s <= usual_s <= high_s else _TURN_S
-
-
-@contextmanager
-def _naming(place: str) -> Iterator[None]:
-    """Errors of the writer know the scene but not the file: put its place in front."""
-    try:
-        yield
-    except (DataError, ConfigError) as error:
-        if place in str(error):
-            raise
-        raise DataError(f"{place}: {error}") from None
