@@ -13,7 +13,6 @@ from statistics import fmean, median
 from typing import Any
 
 import torch
-import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -23,14 +22,13 @@ from lidarpainter_models.metrics.perceptual import PictureDistance
 from lidarpainter_models.metrics.pictures import psnr_from_error, squared_error
 from lidarpainter_models.painter.baselines import UnpaintedPainter, WarpPainter
 from lidarpainter_models.painter.examples import PaintingPair, PairSource
+from lidarpainter_models.painter.input_hull import input_hull
 from lidarpainter_models.painter.protocol import Painter, Painting, PaintingConditions
 
 DAMAGED_ERROR = 0.1
 """A pixel is damaged where the error of the render is above this."""
 WRONG_ERROR = 0.05
 """A painted pixel is wrong where its error is above this: what the confidence should foretell."""
-HULL_SIDE_PX = 9
-HULL_MARGIN = 0.05
 CONFIDENCE_BINS = 1 << 16
 """Confidences that share a bin count as equal."""
 
@@ -144,12 +142,8 @@ def outside_hull(
 
     Nearby is a square of 9 pixels; inputs are the render, LiDAR hits and valid warps.
     """
-    shown = torch.stack([conditions.render_rgb, conditions.lidar_rgb, *conditions.warp_rgb])
-    everywhere = torch.ones_like(conditions.lidar_hit)
-    exists = torch.stack([everywhere, conditions.lidar_hit, *conditions.warp_valid])[..., None]
-    upper = _largest_nearby(torch.where(exists, shown, -torch.inf).amax(dim=0))
-    lower = -_largest_nearby(torch.where(exists, -shown, -torch.inf).amax(dim=0))
-    return ((picture > upper + HULL_MARGIN) | (picture < lower - HULL_MARGIN)).any(dim=-1)
+    hull = input_hull(conditions)
+    return ((picture > hull.upper) | (picture < hull.lower)).any(dim=-1)
 
 
 def confidence_auc(
@@ -161,14 +155,6 @@ def confidence_auc(
         return None
     num_right_above = num_right.sum() - num_right.cumsum(0)
     return float((num_wrong * (num_right_above + 0.5 * num_right)).sum()) / total
-
-
-def _largest_nearby(values: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 3"]:
-    reach = HULL_SIDE_PX // 2
-    planes = values.permute(2, 0, 1)[None]
-    rows = F.max_pool2d(planes, (1, HULL_SIDE_PX), stride=1, padding=(0, reach))
-    both = F.max_pool2d(rows, (HULL_SIDE_PX, 1), stride=1, padding=(reach, 0))
-    return both[0].permute(1, 2, 0)
 
 
 @dataclass

@@ -10,6 +10,7 @@ import torch
 
 from lidarpainter_models.painter.batches import stack_conditions
 from lidarpainter_models.painter.examples import Window
+from lidarpainter_models.painter.input_hull import input_hull
 from lidarpainter_models.painter.nano.network import NanoNetwork
 from lidarpainter_models.painter.nano.tiles import (
     TileConfig,
@@ -23,6 +24,9 @@ from lidarpainter_models.painter.protocol import DEFAULT_PROMPT, Painting, Paint
 
 class NanoPainter:
     """Repairs a view by mixing what is known about it.
+
+    For the prompt it restores with, no colour leaves the hull of what the inputs show nearby
+    (`input_hull`): the network's residual may sharpen, not invent.
 
     Confidence: exp(-e / 0.05) with e the mean absolute error the network expects in the pixel
     (its scale is `NanoConfig.confidence_error`); for e, a tile that was not painted takes what is
@@ -98,7 +102,8 @@ class NanoPainter:
         output = self.network(batch, [conditions.prompt], half_precision=self.half_precision)
         confidence = torch.exp(-output.log_error[0].exp() / config.confidence_error)
         home = conditions.render_rgb.device
-        return Painting(
-            rgb=output.rgb[0].permute(1, 2, 0).clamp(0, 1).contiguous().to(home),
-            confidence=confidence.to(home),
-        )
+        rgb = output.rgb[0].permute(1, 2, 0).contiguous().to(home)
+        if conditions.prompt == DEFAULT_PROMPT:
+            hull = input_hull(conditions)
+            rgb = torch.minimum(torch.maximum(rgb, hull.lower), hull.upper)
+        return Painting(rgb=rgb.clamp(0, 1), confidence=confidence.to(home))

@@ -9,6 +9,7 @@ from lidarpainter_models.errors import ConfigError, ShapeError
 from lidarpainter_models.painter import load_painter
 from lidarpainter_models.painter.batches import stack_conditions
 from lidarpainter_models.painter.filters import blur, fill_push_pull, masked_blur
+from lidarpainter_models.painter.input_hull import HULL_MARGIN
 from lidarpainter_models.painter.nano.candidates import build_candidates, candidate_names
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork, PixelNorm
 from lidarpainter_models.painter.nano.painter import NanoPainter
@@ -115,6 +116,21 @@ def test_residual_is_bounded(make_conditions):
     low = candidates.pictures.amin(dim=1) - config.residual_limit
     high = candidates.pictures.amax(dim=1) + config.residual_limit
     assert bool(((output.rgb >= low - 1e-6) & (output.rgb <= high + 1e-6)).all())
+
+
+def test_the_painter_shows_no_colour_that_no_input_shows_nearby(make_conditions):
+    noise = make_conditions()
+    flat = {
+        name: torch.full_like(getattr(noise, name), 0.5)
+        for name in ("render_rgb", "lidar_rgb", "warp_rgb")
+    }
+    conditions = replace(noise, **flat)
+    network = scrambled(NanoConfig(**SMALL))
+    batch = stack_conditions([conditions], num_sources=2)
+    output = network(batch, ["clear"]).rgb.detach()
+    assert float((output - 0.5).abs().max()) > HULL_MARGIN  # the network alone would
+    painted = NanoPainter(network, half_precision=False).paint(conditions).rgb
+    assert float((painted - 0.5).abs().max()) <= HULL_MARGIN + 1e-6
 
 
 def test_pixel_norm_brings_every_pixel_to_one():
