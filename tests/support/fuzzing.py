@@ -164,17 +164,27 @@ def _contents(sandbox, store):
 
 @contextmanager
 def _memory_limit(num_bytes):
-    """An error once the process asks for so much more; the resident set is judged afterwards."""
-    status = Path("/proc/self/status").read_text().splitlines()
-    data_bytes = next(int(line.split()[1]) * 1024 for line in status if "VmData" in line)
+    """An error once the process asks for so much more; the resident set is judged afterwards.
+
+    Both count from where the process stands: tests before may have left gigabytes with it.
+    """
+    resident_bytes = _process_bytes("VmRSS")
     earlier = resource.getrlimit(resource.RLIMIT_DATA)
-    resource.setrlimit(resource.RLIMIT_DATA, (data_bytes + 2 * num_bytes, earlier[1]))
+    most_bytes = _process_bytes("VmData") + 2 * num_bytes
+    resource.setrlimit(resource.RLIMIT_DATA, (most_bytes, earlier[1]))
     try:
         with measured() as cost:
             yield
     finally:
         resource.setrlimit(resource.RLIMIT_DATA, earlier)
-    assert cost.peak_memory_bytes < num_bytes, f"{cost.peak_memory_bytes} bytes of memory"
+    taken_bytes = cost.peak_memory_bytes - resident_bytes
+    assert taken_bytes < num_bytes, f"{taken_bytes} bytes of memory"
+
+
+def _process_bytes(name):
+    """A size from this process's status, such as the resident set (proc(5))."""
+    status = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in status if line.startswith(f"{name}:"))
 
 
 @contextmanager
