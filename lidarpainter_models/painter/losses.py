@@ -6,6 +6,7 @@ A term is averaged over the pixels of its mask; over no pixel it is 0.
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
@@ -15,6 +16,9 @@ from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.kernels.ssim import ssim_map
 from lidarpainter_models.painter.adversarial import Discriminator, generator_hinge_loss
 from lidarpainter_models.painter.batches import ConditionBatch
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 BatchDistance = Callable[
     [Float[Tensor, "batch 3 height width"], Float[Tensor, "batch 3 height width"]],
@@ -38,9 +42,7 @@ class PaperLossWeights:
 
     def __post_init__(self) -> None:
         """Refuse negative weights."""
-        for field in fields(self):
-            if not getattr(self, field.name) >= 0:
-                raise ConfigError(f"loss weight {field.name} must not be negative")
+        refuse_negative(self)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,6 +58,17 @@ class PaperLoss:
     def to_dict(self) -> dict[str, float]:
         """Plain numbers for a log."""
         return {field.name: float(getattr(self, field.name).detach()) for field in fields(self)}
+
+
+def refuse_negative(weights: "DataclassInstance") -> None:
+    """Refuse loss weights under 0, and those that are no number.
+
+    Raises:
+        ConfigError: with the weight's name.
+    """
+    for field in fields(weights):
+        if not getattr(weights, field.name) >= 0:
+            raise ConfigError(f"loss weight {field.name} must not be negative")
 
 
 def paper_loss(

@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from quiet_augmentation import QUIET
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.painter.augmentation import AugmentationConfig, draw_batch
+from lidarpainter_models.painter.augmentation import draw_batch
 from lidarpainter_models.painter.examples import Window
 from lidarpainter_models.painter.nano.more_prompts import with_more_prompts
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
@@ -17,18 +18,6 @@ from lidarpainter_models.painter.style_pairs import styled_pair, target_view
 
 SMALL = NanoConfig(widths=(8, 16, 16), blocks=(1, 1, 1))
 STYLED = replace(SMALL, prompts=("clear", "foggy", "night"))
-QUIET = AugmentationConfig(
-    crop_px=32,
-    lidar_dropout_share=0,
-    lidar_thinning_share=0,
-    warp_dropout_share=0,
-    warp_swap_share=0,
-    damage_share=0,
-    identity_share=0,
-    gain_range=0,
-    tint_range=0,
-    mismatch_range=0,
-)
 
 
 def generator_of(seed):

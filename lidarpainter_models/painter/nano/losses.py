@@ -9,13 +9,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.batches import ConditionBatch
 from lidarpainter_models.painter.losses import (
     absolute_loss,
     agreement_mask,
     gradient_loss,
     masked_mean,
+    refuse_negative,
     squared_loss,
     structure_loss,
 )
@@ -42,9 +42,7 @@ class LossWeights:
 
     def __post_init__(self) -> None:
         """Refuse negative weights."""
-        for field in fields(self):
-            if getattr(self, field.name) < 0:
-                raise ConfigError(f"loss weight {field.name} must not be negative")
+        refuse_negative(self)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from quiet_augmentation import QUIET
 
 from lidarpainter_models.errors import ConfigError, DataError, TrainingError
 from lidarpainter_models.painter.augmentation import (
@@ -18,18 +19,6 @@ from lidarpainter_models.painter.nano.training import NanoTrainingConfig, train_
 from lidarpainter_models.painter.render_damage import damage_render, random_blobs
 
 NETWORK = NanoConfig(widths=(16, 16, 16), blocks=(1, 1, 1))
-QUIET = AugmentationConfig(
-    crop_px=32,
-    lidar_dropout_share=0,
-    lidar_thinning_share=0,
-    warp_dropout_share=0,
-    warp_swap_share=0,
-    damage_share=0,
-    identity_share=0,
-    gain_range=0,
-    tint_range=0,
-    mismatch_range=0,
-)
 SHORT = NanoTrainingConfig(
     network=NETWORK,
     augmentation=AugmentationConfig(crop_px=32),
