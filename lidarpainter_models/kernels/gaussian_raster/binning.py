@@ -1,9 +1,10 @@
-"""Sort visible Gaussians by depth and list, for every screen tile, those that reach it.
+"""List, for every screen tile, the visible Gaussians that reach it, nearest first.
 
 A Gaussian is listed in a tile only if its ellipse alpha >= 1/255 crosses the tile's pixel centres
 row band by row band ("AccuTile" of Hanson et al. 2025, "Speedy-Splat"), and with the rows that the
-ellipse reaches inside the tile's columns. The lists are filled in depth order by counting, so they
-need no sort of their own. Compiled code.
+ellipse reaches inside the tile's columns. Entries are dealt to their tiles in the order of the
+Gaussians, which goes through memory in streams, and then sorted by depth tile by tile: the entries
+of a tile fit in the cache, and tiles do not wait for each other. Compiled code.
 """
 
 from typing import NamedTuple
@@ -22,11 +23,10 @@ from lidarpainter_models.kernels.gaussian_raster.screen_ellipses import (
 )
 from lidarpainter_models.kernels.gaussian_raster.work_sharing import jump_of
 
-RUNS = 16
-"""The depth order is cut into this many runs that are listed independently of each other."""
-RADIX_BITS = 11
 REACHES = TILE_PX * TILE_PX
 """A tile and the reach inside it are found as one number, tile times this plus reach."""
+FEW_ENTRIES = 32
+"""Up to this many entries insertion is faster than counting digits."""
 
 
 class TileLists(NamedTuple):
@@ -58,69 +58,53 @@ def end_row_of(reach: int) -> int:
     return reach % TILE_PX + 1
 
 
+class _DealtEntries(NamedTuple):
+    """The entries of every tile in the order of the Gaussians, as pairs of 32 bit numbers."""
+
+    key: np.ndarray
+    """(entries): depth, and in the low half the place among the tile's entries."""
+    owner: np.ndarray
+    """(entries): the Gaussian, and in the low half where its entry stands in `TileLists.entry`."""
+
+
+@numba.njit(**EXACT)
+def _pair(high: int, low: int) -> np.uint64:
+    return np.uint64(high) << np.uint64(32) | np.uint64(low)
+
+
+@numba.njit(**EXACT)
+def _high(pair: np.uint64) -> np.int64:
+    return np.int64(pair >> np.uint64(32))
+
+
+@numba.njit(**EXACT)
+def _low(pair: np.uint64) -> np.int64:
+    return np.int64(pair & np.uint64(0xFFFFFFFF))
+
+
 @numba.njit(**EXACT)
 def _count_boxes(
     records: np.ndarray, first: int, end: int, grid: tuple[int, int], own: np.ndarray
-) -> int:
-    """Tiles that each Gaussian's bounding box touches; returns how many Gaussians are visible."""
-    visible = 0
+) -> None:
+    """Tiles that each Gaussian's bounding box touches."""
     for index in range(first, end):
         own[index, 1] = 0
         if records[index, IS_VISIBLE] > 0.0:
             box = tile_box(records[index], grid[0], grid[1])
             own[index, 1] = max(box[1] - box[0], 0) * max(box[3] - box[2], 0)
-            visible += 1
-    return visible
-
-
-@numba.njit(**EXACT)
-def _depth_order(records: np.ndarray, count: int) -> np.ndarray:
-    """Indices of the visible Gaussians by depth; equal depths keep the order of their index."""
-    order = np.empty(count, np.int32)
-    depth = np.empty(count, np.float32)
-    place = 0
-    for index in range(len(records)):
-        if records[index, IS_VISIBLE] > 0.0:
-            order[place] = index
-            depth[place] = records[index, DEPTH]
-            place += 1
-    # positive floats sort as their bit patterns do
-    return _radix_sorted(depth.view(np.uint32), order)
-
-
-@numba.njit(**EXACT)
-def _radix_sorted(keys: np.ndarray, order: np.ndarray) -> np.ndarray:
-    digits = 1 << RADIX_BITS
-    mask = np.uint32(digits - 1)
-    other_keys, other_order = np.empty_like(keys), np.empty_like(order)
-    for shift in range(0, 32, RADIX_BITS):
-        starts = np.zeros(digits + 1, np.int64)
-        for key in keys:
-            starts[((key >> np.uint32(shift)) & mask) + 1] += 1
-        for digit in range(digits):
-            starts[digit + 1] += starts[digit]
-        for place in range(len(keys)):
-            digit = (keys[place] >> np.uint32(shift)) & mask
-            target = starts[digit]
-            starts[digit] += 1
-            other_keys[target] = keys[place]
-            other_order[target] = order[place]
-        keys, other_keys = other_keys, keys
-        order, other_order = other_order, order
-    return order
 
 
 @numba.njit(**EXACT)
 def _find_run(
     records: np.ndarray,
-    first: int,
-    end: int,
+    run: tuple[int, int],
     grid: tuple[int, int],
     own: np.ndarray,
     found: np.ndarray,
+    tile_count: np.ndarray,
 ) -> None:
     """Write the tiles of each Gaussian and its reach in them where its entries will stand."""
-    for index in range(first, end):
+    for index in range(run[0], run[1]):
         if records[index, IS_VISIBLE] > 0.0:
             record = records[index]
             position = own[index, 0]
@@ -131,33 +115,85 @@ def _find_run(
                 for column in range(columns[0], columns[1]):
                     first_row, end_row = rows_in_tile(ellipse, row, column, box)
                     if first_row < end_row:
-                        reach = first_row * TILE_PX + end_row - 1
-                        found[position] = (row * grid[0] + column) * REACHES + reach
+                        tile = row * grid[0] + column
+                        tile_count[tile] += 1
+                        found[position] = tile * REACHES + first_row * TILE_PX + end_row - 1
                         position += 1
             own[index, 1] = position
 
 
 @numba.njit(**EXACT)
-def _count_run(
-    order: np.ndarray, own: np.ndarray, found: np.ndarray, tile_count: np.ndarray
+def _deal_run(
+    depth_bits: np.ndarray,
+    run: tuple[int, int],
+    lists: TileLists,
+    cursor: np.ndarray,
+    dealt: _DealtEntries,
 ) -> None:
-    """Count the entries of each tile."""
-    for index in order:
-        for position in range(own[index, 0], own[index, 1]):
-            tile_count[found[position] // REACHES] += 1
+    """Put the entries of each Gaussian behind those that its tiles already have."""
+    for index in range(run[0], run[1]):
+        for position in range(lists.own[index, 0], lists.own[index, 1]):
+            tile = lists.entry[position] // REACHES
+            entry = cursor[tile]
+            cursor[tile] += 1
+            # positive floats sort as their bit patterns do
+            dealt.key[entry] = _pair(depth_bits[index], entry - lists.tile_first[tile])
+            dealt.owner[entry] = _pair(index, position)
 
 
 @numba.njit(**EXACT)
-def _list_run(order: np.ndarray, lists: TileLists, cursor: np.ndarray) -> None:
-    """Turn the tiles of each Gaussian into entries of these tiles' lists."""
-    for index in order:
-        for position in range(lists.own[index, 0], lists.own[index, 1]):
-            tile, reach = lists.entry[position] // REACHES, lists.entry[position] % REACHES
-            entry = cursor[tile]
-            cursor[tile] += 1
-            lists.gaussian[entry] = index
-            lists.reach[entry] = reach
-            lists.entry[position] = entry
+def _sort_few(keys: np.ndarray) -> None:
+    """Sort in place by insertion."""
+    for place in range(1, len(keys)):
+        key = keys[place]
+        target = place
+        while target > 0 and keys[target - 1] > key:
+            keys[target] = keys[target - 1]
+            target -= 1
+        keys[target] = key
+
+
+@numba.njit(**EXACT)
+def _sorted_by_depth(keys: np.ndarray) -> np.ndarray:
+    """Keys by their high half, equal ones as they stood; byte by byte, the lowest first."""
+    starts = np.zeros((4, 256), np.int32)
+    for key in keys:
+        for digit in range(4):
+            starts[digit, (key >> np.uint64(32 + 8 * digit)) & np.uint64(255)] += 1
+    other = np.empty_like(keys)
+    for digit in range(4):
+        shift = np.uint64(32 + 8 * digit)
+        start = starts[digit]
+        if start[(keys[0] >> shift) & np.uint64(255)] == len(keys):
+            continue
+        total = 0
+        for value in range(256):
+            count = start[value]
+            start[value] = total
+            total += count
+        for key in keys:
+            value = (key >> shift) & np.uint64(255)
+            other[start[value]] = key
+            start[value] += 1
+        keys, other = other, keys
+    return keys
+
+
+@numba.njit(**EXACT)
+def _list_tile(lists: TileLists, tile: int, dealt: _DealtEntries) -> None:
+    """Sort the entries of a tile and note for each Gaussian where its entry went."""
+    first, end = lists.tile_first[tile], lists.tile_first[tile + 1]
+    keys = dealt.key[first:end]
+    if end - first <= FEW_ENTRIES:
+        _sort_few(keys)
+    else:
+        keys = _sorted_by_depth(keys)
+    for rank in range(end - first):
+        owner = dealt.owner[first + _low(keys[rank])]
+        position = _low(owner)
+        lists.gaussian[first + rank] = _high(owner)
+        lists.reach[first + rank] = lists.entry[position] % REACHES
+        lists.entry[position] = first + rank
 
 
 @numba.njit(**EXACT)
@@ -191,28 +227,29 @@ def _entry_starts(own: np.ndarray) -> int:
 def list_tiles(records: np.ndarray, width: int, height: int) -> TileLists:
     """The tile lists of projected Gaussians; the same for any number of threads."""
     columns, rows = (width + TILE_PX - 1) // TILE_PX, (height + TILE_PX - 1) // TILE_PX
-    count, grid = len(records), (columns, rows)
+    count, tiles, grid = len(records), columns * rows, (columns, rows)
     own = np.empty((count, 2), np.int32)
-    visible = 0
     jump = jump_of(CHUNKS)
     for place in numba.prange(CHUNKS):
         run = place * jump % CHUNKS
-        first, end = run * count // CHUNKS, (run + 1) * count // CHUNKS
-        visible += _count_boxes(records, first, end, grid, own)
+        _count_boxes(records, run * count // CHUNKS, (run + 1) * count // CHUNKS, grid, own)
     found = np.empty(_entry_starts(own), np.int32)
+    tile_count = np.zeros((CHUNKS, tiles), np.int32)
     for place in numba.prange(CHUNKS):
         run = place * jump % CHUNKS
-        first, end = run * count // CHUNKS, (run + 1) * count // CHUNKS
-        _find_run(records, first, end, grid, own, found)
-    order = _depth_order(records, visible)
-    tile_count = np.zeros((RUNS, columns * rows), np.int64)
-    for run in numba.prange(RUNS):
-        part = order[run * visible // RUNS : (run + 1) * visible // RUNS]
-        _count_run(part, own, found, tile_count[run])
+        span = (run * count // CHUNKS, (run + 1) * count // CHUNKS)
+        _find_run(records, span, grid, own, found, tile_count[run])
     tile_first = _tile_starts(tile_count)
-    gaussian, reach = np.empty(tile_first[-1], np.int32), np.empty(tile_first[-1], np.uint8)
+    entries = tile_first[-1]
+    gaussian, reach = np.empty(entries, np.int32), np.empty(entries, np.uint8)
     lists = TileLists(columns, rows, tile_first, gaussian, reach, own, found)
-    for run in numba.prange(RUNS):
-        part = order[run * visible // RUNS : (run + 1) * visible // RUNS]
-        _list_run(part, lists, tile_count[run])
+    dealt = _DealtEntries(np.empty(entries, np.uint64), np.empty(entries, np.uint64))
+    depth_bits = records.view(np.uint32)[:, DEPTH]
+    for place in numba.prange(CHUNKS):
+        run = place * jump % CHUNKS
+        span = (run * count // CHUNKS, (run + 1) * count // CHUNKS)
+        _deal_run(depth_bits, span, lists, tile_count[run], dealt)
+    jump = jump_of(tiles)
+    for place in numba.prange(tiles):
+        _list_tile(lists, place * jump % tiles, dealt)
     return lists
