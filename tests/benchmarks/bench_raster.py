@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from bench_machine import best_cpu_s, best_wall_s
 from bench_records import Figure
-from bench_scenes import street_like_splats
+from bench_scenes import LEARNED, street_like_splats
 from bench_work import BACKWARD_LANE_FLOP, FORWARD_LANE_FLOP, count_lanes, raster_bytes
 
 from lidarpainter_models.kernels.gaussian_raster import cpu, render_gaussians, render_views
@@ -61,7 +61,7 @@ class Stages:
 
     def unproject(self):
         one_view = self.gaussians._replace(camera_from_body=self.gaussians.camera_from_body[None])
-        room = cpu._gradients_of_view(cpu._no_gradients(one_view), 0)
+        room = cpu._gradients_of_view(cpu._room_for_gradients(one_view), 0)
         unproject(self.gaussians, self.view, self.records, self.lists, self.slots, room, False)
 
 
@@ -79,8 +79,9 @@ def forward(splats):
 
 
 def step(splats, backend="cpu"):
-    """One picture and all gradients."""
-    _loss(render_gaussians(**splats, backend=backend)).backward()
+    """One picture and all gradients, not added to earlier ones."""
+    image = render_gaussians(**splats, backend=backend)
+    torch.autograd.grad(_loss(image), [splats[name] for name in LEARNED])
 
 
 def _loss(image):
@@ -196,11 +197,12 @@ def view_figures(size, repeats, *, num_views=3):
     camera = {name: splats[name] for name in CAMERA}
     shared = {name: value for name, value in splats.items() if name not in CAMERA}
     shared["camera_from_body"] = shared["camera_from_body"].detach().repeat(num_views, 1, 1, 1)
+    learned = [value for name, value in shared.items() if name in LEARNED[:-1]]
     views = [SplatView(**camera) for _ in range(num_views)]
 
     def together():
         images = render_views(**shared, views=views, backend="cpu")
-        sum(_loss(image) for image in images).backward()
+        torch.autograd.grad(sum(_loss(image) for image in images), learned)
 
     one_ms = 1e3 * best_cpu_s(lambda: step(splats), repeats)
     return [

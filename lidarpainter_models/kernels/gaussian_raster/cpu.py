@@ -158,7 +158,7 @@ class _DrawViews(torch.autograd.Function):
         count = len(ctx.saved_tensors) - 4 * len(ctx.views)
         tensors, pictures = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
         gaussians = _gaussians(tensors)
-        found = _no_gradients(gaussians)
+        found = _room_for_gradients(gaussians)
         with ONE_AT_A_TIME:
             for place, drawn in enumerate(ctx.views):
                 given = output_gradients[PICTURES * place : PICTURES * place + 4]
@@ -177,18 +177,18 @@ class _DrawViews(torch.autograd.Function):
         return (*_tensor_gradients(found, tensors), None, None, None)
 
 
-def _no_gradients(gaussians: Gaussians) -> Gradients:
-    """Zeros for every view; the last three arrays have a row per view."""
+def _room_for_gradients(gaussians: Gaussians) -> Gradients:
+    """Arrays for `unproject` to fill; the last three have a row per view."""
     count, (views, bodies) = len(gaussians.means), gaussians.camera_from_body.shape[:2]
     return Gradients(
-        means=np.zeros((count, 3), np.float32),
-        rotation_wxyz=np.zeros((count, 4), np.float32),
-        scale_m=np.zeros((count, 3), np.float32),
-        opacity=np.zeros(count, np.float32),
-        sh=np.zeros(gaussians.sh.shape, np.float32),
-        features=np.zeros(gaussians.features.shape, np.float32),
-        screen_offset=np.zeros((views, count, 2), np.float32),
-        absolute=np.zeros((views, count), np.float32),
+        means=np.empty((count, 3), np.float32),
+        rotation_wxyz=np.empty((count, 4), np.float32),
+        scale_m=np.empty((count, 3), np.float32),
+        opacity=np.empty(count, np.float32),
+        sh=np.empty(gaussians.sh.shape, np.float32),
+        features=np.empty(gaussians.features.shape, np.float32),
+        screen_offset=np.empty((views, count, 2), np.float32),
+        absolute=np.empty((views, count), np.float32),
         camera_from_body=np.zeros((views, CHUNKS, bodies, 3, 4)),
     )
 

@@ -282,6 +282,20 @@ def _unproject_one(  # noqa: PLR0913 - a compiled loop body
 
 
 @numba.njit(**EXACT)
+def _store_nothing(index: int, gradients: Gradients, adds: bool) -> None:
+    """Gradients of a Gaussian that the view does not see."""
+    gradients.screen_offset[index] = 0.0
+    gradients.absolute[index] = 0.0
+    if not adds:
+        gradients.means[index] = 0.0
+        gradients.rotation_wxyz[index] = 0.0
+        gradients.scale_m[index] = 0.0
+        gradients.opacity[index] = 0.0
+        gradients.sh[index] = 0.0
+        gradients.features[index] = 0.0
+
+
+@numba.njit(**EXACT)
 def _unproject_run(  # noqa: PLR0913 - a compiled loop body
     gaussians: Gaussians,
     view: View,
@@ -305,6 +319,8 @@ def _unproject_run(  # noqa: PLR0913 - a compiled loop body
             _unproject_one(
                 gaussians, index, view, records[index], sums, weights, gradients, run, adds
             )
+        else:
+            _store_nothing(index, gradients, adds)
 
 
 @compiled_entry
@@ -325,8 +341,7 @@ def unproject(
         records: from `projection.project`.
         lists: from `binning.list_tiles`.
         slots: from `blending_gradients.entry_sums`.
-        gradients: zeros, or the sums so far; the view's own arrays are always zeros. What was not
-            visible is left as it is.
+        gradients: room, or the sums so far; the transforms' must be zeros. Every row is written.
         adds: whether other views came before.
     """
     jump = jump_of(CHUNKS)
