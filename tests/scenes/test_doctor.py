@@ -128,6 +128,13 @@ def test_boxes_that_drive_sideways_are_found(pandaset, tmp_path):
     assert verdicts(ingested(pandaset, tmp_path))["boxes point ahead"] == "fail"
 
 
+def test_some_turned_boxes_are_no_wrong_convention(pandaset, tmp_path):
+    for index, time_s in enumerate(pandaset.frame_times_s()[1:], start=1):
+        boxes = pandaset.boxes_at(time_s)
+        pandaset.write_boxes(index, [{**box, "yaw_deg": 45.0} for box in boxes])
+    assert verdicts(ingested(pandaset, tmp_path))["boxes point ahead"] == "warn"
+
+
 def test_actor_with_two_tracks_is_found(pandaset, tmp_path):
     change_boxes(pandaset, lambda box: {**box, "sibling": "-"})
     scene = ingested(pandaset, tmp_path)
