@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from lidarpainter_models.scenes.actor_checks import check_box_axes
 from lidarpainter_models.scenes.doctor import check_scene, draw_overlay
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 
@@ -133,6 +134,21 @@ def test_some_turned_boxes_are_no_wrong_convention(pandaset, tmp_path):
         boxes = pandaset.boxes_at(time_s)
         pandaset.write_boxes(index, [{**box, "yaw_deg": 45.0} for box in boxes])
     assert verdicts(ingested(pandaset, tmp_path))["boxes point ahead"] == "warn"
+
+
+def test_one_step_aside_is_no_wrong_convention(scene):
+    def moved_aside(num_boxes):
+        track = next(track for track in scene.tracks if track.is_moving)
+        boxes = track.world_from_box[:1].repeat(num_boxes, 1, 1)
+        boxes[:, :3, 3] += 2.0 * torch.arange(num_boxes)[:, None] * boxes[:, :3, 1]
+        rows = dict.fromkeys(
+            ("frame_indices", "timestamps_ns", "num_points"), torch.arange(num_boxes)
+        )
+        scene.tracks = (replace(track, world_from_box=boxes, **rows),)
+        return check_box_axes(scene)[0]
+
+    assert moved_aside(2) == "warn"
+    assert moved_aside(3) == "fail"
 
 
 def test_actor_with_two_tracks_is_found(pandaset, tmp_path):
