@@ -241,11 +241,19 @@ def points_near(xyz_m: Float[Tensor, "points 3"], centre_m: Float[Tensor, "3"]) 
 
 
 def sweep_gap_m(first_m: np.ndarray, second_m: np.ndarray) -> float | None:
-    """Median distance from points of one sweep to the nearest of another; None without any."""
+    """Median distance from points of one sweep to the nearest of another; None without any.
+
+    The smaller of both directions: a LiDAR that is silent for a frame, or points of chance, leave
+    surfaces that only one of the sweeps holds; poses that are off part them in both directions.
+    """
     if len(first_m) == 0 or len(second_m) == 0:
         return None
-    some_m = first_m[:: max(1, len(first_m) // _NUM_SAMPLED_POINTS)]
-    return float(np.median(KDTree(second_m).query(some_m)[0]))
+    return min(_median_distance_m(first_m, second_m), _median_distance_m(second_m, first_m))
+
+
+def _median_distance_m(from_m: np.ndarray, to_m: np.ndarray) -> float:
+    some_m = from_m[:: max(1, len(from_m) // _NUM_SAMPLED_POINTS)]
+    return float(np.median(KDTree(to_m).query(some_m)[0]))
 
 
 def check_coverage(scene: DrivingScene) -> tuple[Verdict, str]:
