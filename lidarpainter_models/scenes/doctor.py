@@ -13,7 +13,6 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
@@ -32,6 +31,7 @@ from lidarpainter_models.scenes.calibration_checks import check_calibration
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.overlay import draw_overlay
 from lidarpainter_models.scenes.records import RecordedView
+from lidarpainter_models.scenes.sweep_agreement import NEIGHBOURHOOD_M, points_near, sweep_offset_m
 
 __all__ = ["Check", "check_scene", "draw_overlay"]
 
@@ -44,15 +44,12 @@ MAX_CAMERA_LAG_S = 0.15
 """A camera takes its picture while the LiDAR turns; farther apart is another frame's picture."""
 MAX_RIG_SPREAD_M = 0.15
 MIN_COVERAGE = 0.15
-MAX_SWEEP_GAP_M = 0.15
-"""Median distance between two sweeps' points on the same surfaces."""
+MAX_SWEEP_OFFSET_M = 0.15
+"""By which a sweep must be moved onto the next."""
 MAX_GROUND_SLOPE_RAD = 0.15
 _NON_COMMERCIAL = ("non-commercial", "noncommercial", "-nc-", " nc ", "-nc ")
 _COVERAGE_CELLS = (9, 16)
-_NEIGHBOURHOOD_M = 25.0
-"""Around the car, where two sweeps are dense enough to be compared."""
 _NUM_SAMPLED_FRAMES = 4
-_NUM_SAMPLED_POINTS = 3000
 _POINT_STRIDE = 3
 """Every third point tells as well which cells of a picture are covered."""
 
@@ -199,9 +196,9 @@ def check_ground(scene: DrivingScene) -> tuple[Verdict, str]:
     """Whether up is up: the lowest points around the car form a level plane below it."""
     position = scene.world_from_ego[0, :3, 3]
     xyz_m = scene.read_points(scene.sweeps[0].frame_index).xyz_m.double() - position
-    near = xyz_m[(xyz_m[:, :2].norm(dim=1) < _NEIGHBOURHOOD_M) & (xyz_m[:, 2].abs() < 4)].numpy()
+    near = xyz_m[(xyz_m[:, :2].norm(dim=1) < NEIGHBOURHOOD_M) & (xyz_m[:, 2].abs() < 4)].numpy()
     if len(near) < 100:
-        return "warn", f"only {len(near)} points within {_NEIGHBOURHOOD_M:.0f} m of the car"
+        return "warn", f"only {len(near)} points within {NEIGHBOURHOOD_M:.0f} m of the car"
     cells = np.floor(near[:, :2] / 2.0).astype(int)
     order = np.lexsort((near[:, 2], cells[:, 1], cells[:, 0]))
     first = np.ones(len(order), dtype=bool)
@@ -220,40 +217,18 @@ def check_sweeps_agree(scene: DrivingScene) -> tuple[Verdict, str]:
     frames = sorted({sweep.frame_index for sweep in scene.sweeps})
     if len(frames) < 2:
         return "warn", "a single sweep: nothing to compare"
-    gaps_m = []
+    offsets_m = []
     for position in sampled_positions(len(frames) - 1):
         first, second = (
             _points_near_ego(scene, frame) for frame in frames[position : position + 2]
         )
-        gap_m = sweep_gap_m(first, second)
-        if gap_m is not None:
-            gaps_m.append(gap_m)
-    if not gaps_m:
-        return "warn", f"no points within {_NEIGHBOURHOOD_M:.0f} m of the car"
-    detail = f"median gap {max(gaps_m):.3f} m between sweeps near the car"
-    return ("ok" if max(gaps_m) <= MAX_SWEEP_GAP_M else "fail"), detail
-
-
-def points_near(xyz_m: Float[Tensor, "points 3"], centre_m: Float[Tensor, "3"]) -> np.ndarray:
-    """The points around a place among which two sweeps are compared, float64."""
-    xyz_m = xyz_m.double()
-    return xyz_m[(xyz_m - centre_m).norm(dim=1) < _NEIGHBOURHOOD_M].numpy()
-
-
-def sweep_gap_m(first_m: np.ndarray, second_m: np.ndarray) -> float | None:
-    """Median distance from points of one sweep to the nearest of another; None without any.
-
-    The smaller of both directions: a LiDAR that is silent for a frame, or points of chance, leave
-    surfaces that only one of the sweeps holds; poses that are off part them in both directions.
-    """
-    if len(first_m) == 0 or len(second_m) == 0:
-        return None
-    return min(_median_distance_m(first_m, second_m), _median_distance_m(second_m, first_m))
-
-
-def _median_distance_m(from_m: np.ndarray, to_m: np.ndarray) -> float:
-    some_m = from_m[:: max(1, len(from_m) // _NUM_SAMPLED_POINTS)]
-    return float(np.median(KDTree(to_m).query(some_m)[0]))
+        offset_m = sweep_offset_m(first, second)
+        if offset_m is not None:
+            offsets_m.append(offset_m)
+    if not offsets_m:
+        return "warn", f"no surface within {NEIGHBOURHOOD_M:.0f} m of the car is in two sweeps"
+    detail = f"surfaces of two sweeps near the car lie up to {max(offsets_m):.3f} m apart"
+    return ("ok" if max(offsets_m) <= MAX_SWEEP_OFFSET_M else "fail"), detail
 
 
 def check_coverage(scene: DrivingScene) -> tuple[Verdict, str]:

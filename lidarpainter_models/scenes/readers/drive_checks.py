@@ -17,9 +17,7 @@ from lidarpainter_models.scenes.doctor import (
     MAX_CAMERA_LAG_S,
     MAX_SPEED_MPS,
     MAX_TURN_RADPS,
-    points_near,
     sampled_positions,
-    sweep_gap_m,
 )
 from lidarpainter_models.scenes.readers.drive_poses import NS_PER_S
 from lidarpainter_models.scenes.readers.frame_content import (
@@ -27,6 +25,7 @@ from lidarpainter_models.scenes.readers.frame_content import (
     SourceImage,
     SourceSweep,
 )
+from lidarpainter_models.scenes.sweep_agreement import nearest_gap_m, points_near
 
 MAX_MOUNT_M = 20.0
 """A sensor is on the car, which drives 9 m at most between the poses of both."""
@@ -156,7 +155,7 @@ def _require_agreement(before: FrameContent, after: FrameContent) -> None:
     """Consecutive sweeps lie on each other near the car."""
     if not (before.sweeps and after.sweeps):
         return
-    gap_m = sweep_gap_m(_near(before), _near(after))
+    gap_m = nearest_gap_m(_near(before), _near(after))
     if gap_m is not None and gap_m > MAX_GAP_M:
         raise DataError(
             f"{after.sweeps[0].source}: the points lie {gap_m:.1f} m (median) from those of the "

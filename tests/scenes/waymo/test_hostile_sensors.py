@@ -134,6 +134,14 @@ def test_frame_without_points(refusal, messages):
     assert "no LiDAR has a point, expected range images" in refusal(messages)
 
 
+def test_frame_without_its_top_lidar(refusal, messages):
+    for echo in (FIRST, SECOND):
+        messages = with_frame(
+            messages, [(LASERS, 0), echo, RANGES], changed_matrix(fill(..., -1.0))
+        )
+    assert "the TOP LiDAR has no point, expected its range images" in refusal(messages)
+
+
 def test_lidar_without_calibration(refusal, messages):
     line = refusal(everywhere(messages, [CONTEXT, (LIDARS, 1)], lambda _: None))
     assert "lasers[1] (REAR): the LiDAR has no calibration" in line

@@ -174,6 +174,8 @@ class WaymoLog:
         ]
         if not found:
             raise DataError("no LiDAR has a point, expected range images")
+        if TOP in self._segment.lidars and TOP not in [sweep.lidar_name for sweep in found]:
+            raise DataError(f"the {TOP} LiDAR has no point, expected its range images")
         return found
 
     def _sweep(
