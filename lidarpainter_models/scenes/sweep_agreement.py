@@ -25,7 +25,7 @@ _MIN_COMPARED = 50
 _NUM_REWEIGHTINGS = 10
 _LEAST_RESIDUAL_M = 0.01
 """Smaller ones weigh no more: the noise of a LiDAR."""
-_LEAST_SHARE = 0.03
+_LEAST_SHARE = 0.06
 """Of all planes that must pin down a way of moving: the rest is what corners make up."""
 
 
