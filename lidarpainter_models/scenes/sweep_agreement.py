@@ -25,7 +25,9 @@ _MIN_COMPARED = 50
 _NUM_REWEIGHTINGS = 10
 _LEAST_RESIDUAL_M = 0.01
 """Smaller ones weigh no more: the noise of a LiDAR."""
-_LEAST_SHARE = 0.06
+_MOST_UNEXPLAINED = 0.67
+"""Sound sweeps keep 0.82 and more of their residuals, sweeps moved by 0.2 m lose 0.42 and more."""
+_LEAST_SHARE = 0.03
 """Of all planes that must pin down a way of moving: the rest is what corners make up."""
 
 
@@ -49,11 +51,13 @@ def nearest_gap_m(
 def sweep_offset_m(
     first_m: Float[np.ndarray, "first 3"], second_m: Float[np.ndarray, "second 3"]
 ) -> float | None:
-    """How far one sweep must be moved onto another: the median displacement of its points.
+    """How far apart two sweeps hold the surfaces that both saw.
 
     One linearised step of point-to-plane registration (Chen and Medioni, 1992) with least absolute
-    residuals. Only points around which the other sweep makes a plane take part; None where too few
-    do. What hardly any plane pins down (a shift along an empty road) counts as no motion.
+    residuals gives the motion that best explains them. If it explains a third of their sum, the
+    answer is the median displacement of the points by it; otherwise nothing has moved as a whole,
+    and it is the median residual. Only points around which the other sweep makes a plane take part;
+    None where too few do. A shift that no plane pins down (along an empty road) is not seen.
     """
     forth, back = _plane_residuals(first_m, second_m), _plane_residuals(second_m, first_m)
     points_m = np.concatenate([forth.points_m, back.points_m])
@@ -63,7 +67,11 @@ def sweep_offset_m(
     residuals_m = np.concatenate([forth.residuals_m, back.residuals_m])
     away_m = points_m - points_m.mean(axis=0)
     turn, shift_m = _least_absolute_motion(away_m, normals, residuals_m)
-    return float(np.median(np.linalg.norm(np.cross(turn, away_m) + shift_m, axis=1)))
+    motion_m = np.cross(turn, away_m) + shift_m
+    unexplained_m = residuals_m - np.einsum("pi,pi->p", normals, motion_m)
+    if np.abs(unexplained_m).sum() > _MOST_UNEXPLAINED * np.abs(residuals_m).sum():
+        return float(np.median(np.abs(residuals_m)))
+    return float(np.median(np.linalg.norm(motion_m, axis=1)))
 
 
 def _some(points_m: np.ndarray) -> np.ndarray:

@@ -142,6 +142,12 @@ def test_frame_without_its_top_lidar(refusal, messages):
     assert "the TOP LiDAR has no point, expected its range images" in refusal(messages)
 
 
+def test_second_echoes_without_first_ones(refusal, messages):
+    change = changed_matrix(fill(..., -1.0))
+    line = refusal(with_frame(messages, [(LASERS, 0), FIRST, RANGES], change))
+    assert "later echoes have no earlier one" in line
+
+
 def test_lidar_without_calibration(refusal, messages):
     line = refusal(everywhere(messages, [CONTEXT, (LIDARS, 1)], lambda _: None))
     assert "lasers[1] (REAR): the LiDAR has no calibration" in line

@@ -11,6 +11,7 @@ other images are virtual: their points have already been moved to the vehicle at
 
 import zlib
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -30,6 +31,8 @@ _MESSAGE_BYTES = 64
 """What a matrix message takes beside its numbers."""
 _MAX_MOTION_M = 20.0
 """The vehicle does not get farther from the frame's pose while the LiDAR turns once."""
+_MAX_ALONE_SHARE = 0.1
+"""Of later echoes without an earlier one: no more than stray pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,11 +104,13 @@ def range_points(
     """The points of a LiDAR's range images; a pixel without an echo has a range of 0 or less.
 
     Raises:
-        DataError: the echoes differ in shape, or a range or pose makes no sense.
+        DataError: the echoes differ in shape or come without an earlier one, or a range or pose
+            makes no sense.
     """
     num_rows, num_columns = sweep.returns[0].shape[:2]
     if any(image.shape[:2] != (num_rows, num_columns) for image in sweep.returns):
         raise DataError(f"{sweep.place}: the echoes differ in shape")
+    _require_first_echoes(sweep)
     inclination = calibration.row_inclinations_rad(num_rows, sweep.place)
     turned = calibration.vehicle_from_lidar[:2, 0].numpy()
     azimuth = column_azimuths_rad(num_columns) - np.arctan2(turned[1], turned[0])
@@ -143,6 +148,16 @@ def range_points(
 def column_azimuths_rad(num_columns: int) -> np.ndarray:
     """Direction of each column about the vehicle's z, counter-clockwise from ahead."""
     return np.pi * (1 - 2 * (np.arange(num_columns) + 0.5) / num_columns)
+
+
+def _require_first_echoes(sweep: WaymoSweep) -> None:
+    """A beam has a second echo because something behind the first one sent it back."""
+    for first, second in pairwise(image[..., 0] > 0 for image in sweep.returns):
+        num_alone, num_second = int((second & ~first).sum()), int(second.sum())
+        if num_alone > _MAX_ALONE_SHARE * num_second:
+            raise DataError(
+                f"{sweep.place}: {num_alone} of {num_second} later echoes have no earlier one"
+            )
 
 
 def _measured(image: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
