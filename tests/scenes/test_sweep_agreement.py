@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from lidarpainter_models.scenes.sweep_agreement import nearest_gap_m, sweep_offset_m
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.readers import ingest_scene
+from lidarpainter_models.scenes.sweep_agreement import nearest_gap_m, points_near, sweep_offset_m
 
 
 @pytest.fixture
@@ -52,3 +54,26 @@ def test_sweeps_without_a_common_surface_are_not_compared(street):
     assert sweep_offset_m(street(1), apart) is None
     assert sweep_offset_m(street(1), np.empty((0, 3))) is None
     assert nearest_gap_m(street(1), np.empty((0, 3))) is None
+
+
+@pytest.fixture(scope="module")
+def real_sweeps(shared_folder, tmp_path_factory):
+    root, store = shared_folder / "data" / "pandaset", tmp_path_factory.mktemp("store")
+    options = {"frames": slice(0, 2), "cameras": ("front_camera",)}
+    scene = DrivingScene.open(ingest_scene("pandaset", root, "002", store, **options))
+    centres_m = scene.world_from_ego[:, :3, 3]
+    return [
+        points_near(scene.read_points(frame).xyz_m, centre_m)
+        for frame, centre_m in zip(scene.frame_indices, centres_m, strict=True)
+    ]
+
+
+def test_sweeps_of_the_real_log_agree(real_sweeps):
+    assert sweep_offset_m(*real_sweeps) < 0.015
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_moved_sweep_of_the_real_log_is_found(real_sweeps, axis):
+    first_m, second_m = real_sweeps
+    moved_m = second_m + 0.2 * np.eye(3)[axis]
+    assert sweep_offset_m(first_m, moved_m) == pytest.approx(0.2, abs=0.02)
