@@ -26,13 +26,10 @@ from lidarpainter_models.evaluation.held_back import (
 )
 from lidarpainter_models.painter import load_painter
 from lidarpainter_models.painter.nano.painter import NanoPainter
-from lidarpainter_models.painter.nano.training import (
-    NanoTrainingConfig,
-    TrainingProgress,
-    train_nano,
-)
-from lidarpainter_models.painter.nano.training_checkpoints import training_digest
+from lidarpainter_models.painter.nano.training import NanoTrainingConfig, train_nano
 from lidarpainter_models.painter.nano.weights import save_weights
+from lidarpainter_models.painter.training.checkpoints import training_digest
+from lidarpainter_models.painter.training.loop import TrainingProgress
 from lidarpainter_models.scenes.readers.pandaset.reader import LICENCE as PANDASET_LICENCE
 from tasks.harvest import PairSet
 from tasks.judge_painter import open_sets
@@ -116,7 +113,9 @@ def train(
 
     inputs = {f"pairs {name}": subset.digest for name, subset in learnt.items()}
     if first is not None:
-        inputs["first weights"] = training_digest({}, [], first.network)[:DIGEST_LENGTH]
+        inputs["first weights"] = training_digest({}, [], first.network.state_dict())[
+            :DIGEST_LENGTH
+        ]
     return run_stage(
         open_store(store_path),
         stage=stage,
