@@ -42,6 +42,7 @@ from tasks.judge_painter import (
     judge_held_back,
     judge_painters,
     load_painting_scores,
+    samples_path,
 )
 from tasks.painter_students import PainterTraining, student_of
 from tasks.scenes import SplitSpec
@@ -98,6 +99,8 @@ class TrainPainterParameters(HarvestParameters):
     training: PainterTraining = NanoTrainingConfig()
     lpips: LpipsFiles = LpipsFiles()
     """Weights for the loss of the one-step painter."""
+    processes: int = 1
+    """In which the one-step painter is trained, each on a GPU of its own."""
     held_back: float = 0.1
     """Share of the true pictures that are kept from training, to judge by."""
     feature_weights: Path | None = None
@@ -140,14 +143,15 @@ def train_painter(parameters: TrainPainterParameters, store_path: Path) -> dict[
         parameters.held_back,
         start,
         parameters.lpips,
+        parameters.processes,
     )
-    scores = None
+    scores, samples = None, None
     if parameters.held_back > 0:
         weights = weights_path(trained.ref)
         judged = judge_held_back(
             store_path, "judge", weights, sets, parameters.held_back, parameters.feature_weights
         )
-        scores = load_painting_scores(judged.ref)
+        scores, samples = load_painting_scores(judged.ref), str(samples_path(judged.ref))
     row = publish_painter(store_path, trained.ref, scores)
     return {
         "painter_id": row["painter_id"],
@@ -156,6 +160,7 @@ def train_painter(parameters: TrainPainterParameters, store_path: Path) -> dict[
         "pairs": [_described(*made) for made in harvested],
         "training": _cost(trained),
         "held_back": scores,
+        "samples": samples,
         "record": training_record(trained.ref, scores),
     }
 
@@ -203,7 +208,7 @@ def tables_of(training: PainterTraining) -> dict[str, dict[str, str]]:
     tables = ablations(training.network)
     labels = {wiring: label for label, wiring in distinct(tables).items()}
     return {
-        choice: rules | {value: labels[wiring] for value, wiring in wirings.items()}
+        choice: rules | {f"{choice}: {value}": labels[wiring] for value, wiring in wirings.items()}
         for choice, wirings in tables.items()
     }
 
@@ -218,7 +223,8 @@ def check_sources(parameters: TrainPainterParameters) -> None:
         WeightsError: the model, the first weights, or those for a distance cannot be used.
     """
     feature_distance_of(parameters.feature_weights)
-    student_of(parameters.training, parameters.base or parameters.start, parameters.lpips)
+    start = parameters.base or parameters.start
+    student_of(parameters.training, start, parameters.lpips, parameters.processes)
     if not (parameters.street_seeds or parameters.scenes or parameters.pair_folders):
         raise ConfigError("nothing to train on: expected street seeds, scenes or folders of pairs")
     for seed in parameters.street_seeds:

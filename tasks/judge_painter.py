@@ -22,11 +22,13 @@ from lidarpainter_models.painter.one_step.painter import OneStepPainter
 from lidarpainter_models.painter.protocol import Painter
 from tasks.harvest import PairSet
 from tasks.measuring import measured
+from tasks.painting_samples import write_samples
 from tasks.progress import listener
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
 from tasks.stored import read_json, write_json
 
 SCORES_FILE = "painting-scores.json"
+SAMPLES_FILE = "samples.png"
 PAINTING_COLUMNS = (
     "picture",
     "PSNR",
@@ -125,8 +127,10 @@ def judge_held_back(
         inputs["features"] = digest_file(feature_weights)[:DIGEST_LENGTH]
 
     def build(place: Workplace) -> dict[str, Any]:
-        scores = _scores(load_painter(weights), judged, distance, stage)
+        painter = load_painter(weights)
+        scores = _scores(painter, judged, distance, stage)
         write_json(place.output / SCORES_FILE, scores)
+        write_samples(painter, judged, place.output / SAMPLES_FILE)
         total = scores["total"]
         return {
             "num_pairs": total["num_pairs"],
@@ -157,6 +161,11 @@ def _sparing(painter: NanoPainter, tiles: TileConfig) -> NanoPainter:
 def load_painting_scores(ref: ArtefactRef) -> dict[str, Any]:
     """Read the scores of `judge_held_back`."""
     return read_json(ref.folder / SCORES_FILE)
+
+
+def samples_path(ref: ArtefactRef) -> Path:
+    """The pictures that `judge_held_back` has painted: render, LiDAR, painted, true."""
+    return ref.folder / SAMPLES_FILE
 
 
 def open_sets(sets: Sequence[PairSet]) -> dict[str, PairFolder]:

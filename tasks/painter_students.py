@@ -8,31 +8,24 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-import torch
-
 from catalog.digests import DIGEST_LENGTH, digest_file
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.held_back import trained_targets
-from lidarpainter_models.metrics.lpips import LpipsFiles, load_lpips
+from lidarpainter_models.metrics.lpips import LpipsFiles
 from lidarpainter_models.painter import is_one_step, load_painter
-from lidarpainter_models.painter.adversarial import FrozenFeatures
 from lidarpainter_models.painter.examples import PairSource
 from lidarpainter_models.painter.nano.painter import NanoPainter
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig, train_nano
 from lidarpainter_models.painter.nano.weights import save_weights
 from lidarpainter_models.painter.one_step.base_models import open_base
-from lidarpainter_models.painter.one_step.loading import SUFFIX, load_trainable, split_preset
+from lidarpainter_models.painter.one_step.loading import SUFFIX, Trainable, split_preset
 from lidarpainter_models.painter.one_step.presets import preset_named
-from lidarpainter_models.painter.one_step.training import (
-    Judges,
-    OneStepTrainee,
-    OneStepTrainingConfig,
-    train_one_step,
-)
+from lidarpainter_models.painter.one_step.training import Judges, OneStepTrainingConfig
 from lidarpainter_models.painter.one_step.weights import read_trained, save_trained
 from lidarpainter_models.painter.training.checkpoints import training_digest
 from lidarpainter_models.painter.training.loop import TrainingProgress
 from tasks.painters import painter_digest
+from tasks.training_processes import Lesson, train_together
 
 NO_FILES = LpipsFiles()
 _ORIGIN = ("training_digest", "num_pairs", "steps", "cpu_s", "pairs", "licence", "started_from")
@@ -82,7 +75,10 @@ class Student(Protocol):
 
 
 def student_of(
-    config: PainterTraining, start: str | Path | None, lpips: LpipsFiles = NO_FILES
+    config: PainterTraining,
+    start: str | Path | None,
+    lpips: LpipsFiles = NO_FILES,
+    num_processes: int = 1,
 ) -> Student:
     """The painter that a recipe trains; what it needs is checked, and not yet read whole.
 
@@ -91,17 +87,23 @@ def student_of(
         start: for the small painter weights to go on from, or None; for the one-step painter its
             model or weights to go on from.
         lpips: weights for the loss of the one-step painter.
+        num_processes: in which the one-step painter is trained.
 
     Raises:
-        ConfigError: the one-step painter has no model, its loss lacks what it weighs, or first
-            weights do not say what they have learnt.
+        ConfigError: the one-step painter has no model, its loss lacks what it weighs, several
+            processes that cannot train together, or first weights that do not say what they have
+            learnt.
         WeightsError: the model or the first weights cannot be used.
     """
+    if num_processes < 1 or (num_processes > 1 and config.max_cpu_s is not None):
+        raise ConfigError(f"{num_processes} processes cannot share a budget: give --steps")
     if isinstance(config, NanoTrainingConfig):
+        if num_processes > 1:
+            raise ConfigError("the small painter is trained in one process")
         return NanoStudent(config, None if start is None else first_weights(Path(start)))
     if start is None:
         raise ConfigError("the one-step painter is trained on a model: give --base")
-    return OneStepStudent(config, str(start), lpips)
+    return OneStepStudent(config, str(start), lpips, num_processes)
 
 
 def recipe_for(start: str) -> OneStepTrainingConfig:
@@ -185,15 +187,19 @@ class OneStepStudent:
     """The one-step painter; its model is read when it learns."""
 
     name = "one-step"
+    _made: Trainable
 
-    def __init__(self, config: OneStepTrainingConfig, start: str, lpips: LpipsFiles) -> None:
+    def __init__(
+        self, config: OneStepTrainingConfig, start: str, lpips: LpipsFiles, num_processes: int
+    ) -> None:
         self._config = config
+        self._num_processes = num_processes
         self._start = start
         self._files = lpips
         if lpips.missing and lpips != NO_FILES:
             raise ConfigError(lpips.missing)
         if lpips == NO_FILES:
-            Judges().check(config.loss)
+            Judges().check(config.loss)  # before the model is read
         self._goes_on = start.endswith(SUFFIX)
         self._known: dict[str, Any] = {}
         if self._goes_on:
@@ -231,20 +237,15 @@ class OneStepStudent:
         folder: Path,
         told: Callable[[TrainingProgress], None],
     ) -> dict[str, Any]:
-        """See `Student`; runs on a GPU where there is one."""
-        device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        config = self._config
-        self._made = load_trainable(
-            self._start,
-            config.network,
-            prompts=config.prompts,
-            dtype=torch.bfloat16 if config.half_precision else torch.float32,
-            seed=config.seed,
+        """See `Student`; runs on GPUs where there are any."""
+        lesson = Lesson(
+            start=self._start,
+            config=self._config,
+            lpips=self._files,
+            sources=sources,
+            checkpoints=folder,
         )
-        judges = judges_of(self._files, device)
-        network = self._made.network.to(device)
-        trainee = OneStepTrainee(network, self._made.texts, config, judges)
-        record = train_one_step(trainee, sources, checkpoint_folder=folder, progress=told)
+        self._made, record = train_together(lesson, self._num_processes, told)
         return record | {"base": self._made.base, "base_licence": self._made.licence}
 
     def licence(self, of_pairs: str) -> str:
@@ -262,20 +263,6 @@ class OneStepStudent:
             licence=licence,
             provenance=provenance,
         )
-
-
-def judges_of(files: LpipsFiles, device: torch.device) -> Judges:
-    """LPIPS, and its backbone for the discriminator to look through, where there are weights.
-
-    Raises:
-        WeightsError: the files cannot be used.
-    """
-    lpips = load_lpips(files)
-    if lpips is None:
-        return Judges()
-    lpips = lpips.to(device)
-    features = FrozenFeatures(extract=lpips.features, channels=lpips.channels)
-    return Judges(lpips=lpips.of_batch, features=features)
 
 
 def _kept(provenance: Mapping[str, Any]) -> dict[str, Any]:

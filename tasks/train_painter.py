@@ -43,7 +43,7 @@ ATTRIBUTIONS = {
 
 
 @task(**STAGE_OPTIONS)
-def train(
+def train(  # noqa: PLR0913 - what a training stands on
     store_path: Path,
     stage: str,
     sets: Sequence[PairSet],
@@ -51,6 +51,7 @@ def train(
     held_back: float,
     start: str | Path | None = None,
     lpips: LpipsFiles = NO_FILES,
+    num_processes: int = 1,
 ) -> StageResult:
     """Train on all pairs but those held back.
 
@@ -62,6 +63,7 @@ def train(
         held_back: share of the true pictures kept to judge by.
         start: weights to go on from, a name or a file; for the one-step painter also its model.
         lpips: weights for the loss of the one-step painter.
+        num_processes: in which the one-step painter is trained, each on a GPU.
 
     Raises:
         ConfigError: pairs of a street that is kept for judging, nothing left to learn from, a loss
@@ -71,7 +73,7 @@ def train(
     folders = open_sets(sets)
     for folder in folders.values():
         check_training_pairs(folder)
-    student = student_of(config, start, lpips)
+    student = student_of(config, start, lpips, num_processes)
     learnt, judged = hold_back(folders, held_back, known=student.learnt)
 
     def told(progress: TrainingProgress) -> None:
@@ -107,7 +109,11 @@ def train(
         stage=stage,
         kind="painter",
         inputs=inputs | student.inputs,
-        config={"training": config.to_dict(), "held_back": held_back},
+        config={
+            "training": config.to_dict(),
+            "held_back": held_back,
+            "num_processes": num_processes,
+        },
         build=build,
     )
 

@@ -104,6 +104,9 @@ def train(  # noqa: PLR0913 - the options of a command
     feature_weights: Features = None,
     lpips_backbone: LpipsBackbone = None,
     lpips_heads: LpipsHeads = None,
+    processes: Annotated[
+        int, typer.Option(min=1, help="Train with --base in so many processes, a GPU for each.")
+    ] = 1,
     out: Annotated[
         Path | None,
         typer.Option(help="Folder, or .safetensors file, for the weights and their record."),
@@ -123,7 +126,11 @@ def train(  # noqa: PLR0913 - the options of a command
         parse_seeds(seeds), scenes, split, cameras, parse_paths(pairs, "--pairs")
     )
     changes = first_choices(base, start, lpips_backbone, lpips_heads)
-    changes |= {"held_back": held_back, "feature_weights": feature_weights}
+    changes |= {
+        "held_back": held_back,
+        "feature_weights": feature_weights,
+        "processes": processes,
+    }
     parameters = with_changes(parameters, changes)
     training = with_length(
         parameters.training, parse_inputs(inputs), budget, steps, parse_names(prompts)
@@ -265,6 +272,7 @@ def _show_training(result: dict[str, Any]) -> None:
         "pairs": result["record"]["num_pairs"],
         "training, CPU s": result["record"]["cpu_s"],
         "record": result.get("record_path"),
+        "sample pictures": result["samples"],
     }
     print_pairs("painter", pairs)
 

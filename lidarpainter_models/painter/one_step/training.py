@@ -248,7 +248,8 @@ def train_one_step(
     """
     network, config, opponent = trainee.network, trainee.config, trainee.opponent
     first = dict(network.named_parameters())
-    digest = training_digest(config.to_dict(), [source.digest for source in sources], first)
+    settings = config.to_dict() | {"processes": processes.count}
+    digest = training_digest(settings, [source.digest for source in sources], first)
     record = run_training(
         trainee,
         sources,
