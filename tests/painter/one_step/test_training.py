@@ -5,11 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 from quiet_augmentation import QUIET
+from small_training import CONTEST
 from tiny_diffusion import TEXT_WIDTH
 
 from lidarpainter_models.errors import ConfigError, DataError, TrainingError
 from lidarpainter_models.painter import load_painter
-from lidarpainter_models.painter.adversarial import DiscriminatorConfig, FrozenFeatures
+from lidarpainter_models.painter.adversarial import FrozenFeatures
 from lidarpainter_models.painter.augmentation import batch_pairs
 from lidarpainter_models.painter.losses import PaperLossWeights
 from lidarpainter_models.painter.one_step.assembly import trained_names
@@ -18,27 +19,11 @@ from lidarpainter_models.painter.one_step.presets import fast, paper
 from lidarpainter_models.painter.one_step.training import (
     Judges,
     OneStepTrainee,
-    OneStepTrainingConfig,
     train_one_step,
 )
 from lidarpainter_models.painter.one_step.weights import save_trained
 
-PLAIN = PaperLossWeights(lpips=0, adversarial=0)
-SHORT = OneStepTrainingConfig(
-    augmentation=replace(QUIET, crop_px=64),
-    loss=PLAIN,
-    discriminator=DiscriminatorConfig(width=4, num_scales=1),
-    penalty_every_steps=2,
-    recomputes=False,
-    half_precision=False,
-    steps=4,
-    accumulated_batches=1,
-    learning_rate=1e-2,
-    warm_up_steps=1,
-    average_decay=0.5,
-    log_every_steps=1,
-)
-CONTEST = replace(SHORT, loss=PaperLossWeights(lpips=0, adversarial=0.1))
+SHORT = replace(CONTEST, loss=PaperLossWeights(lpips=0, adversarial=0), learning_rate=1e-2)
 TEXTS = {"clear": torch.randn(77, TEXT_WIDTH, generator=torch.Generator().manual_seed(0))}
 
 
@@ -90,10 +75,9 @@ def test_interrupted_training_resumes_bit_for_bit(train, source, tmp_path):
         if progress.step == 2:
             raise Interruption
 
-    config = replace(CONTEST, checkpoint_every_s=0.0)
     with pytest.raises(Interruption):
-        train(config, [source], checkpoint_folder=tmp_path, progress=stop_at_two)
-    resumed, again = train(config, [source], checkpoint_folder=tmp_path)
+        train(CONTEST, [source], checkpoint_folder=tmp_path, progress=stop_at_two)
+    resumed, again = train(CONTEST, [source], checkpoint_folder=tmp_path)
     assert torch.equal(weights_of(straight), weights_of(resumed))
     for name in ("total", "discriminator", "gradient_penalty"):
         assert [entry[name] for entry in again["history"]] == [
@@ -108,7 +92,7 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_checkpoint(
 ):
     good = make_pair(64)
     source = memory_pairs([good])
-    config = replace(SHORT, steps=2, checkpoint_every_s=0.0)
+    config = replace(SHORT, steps=2)
 
     def spoil(progress):
         if progress.step == 1:

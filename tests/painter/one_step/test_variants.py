@@ -1,6 +1,7 @@
 """Ablations of the one-step painter: one choice at a time, every wiring once."""
 
 import pytest
+from tiny_diffusion import TINY
 
 from lidarpainter_models.painter.one_step.assembly import empty_network
 from lidarpainter_models.painter.one_step.presets import PRESETS, fast, paper
@@ -9,8 +10,6 @@ from lidarpainter_models.painter.one_step.variants import ablations, distinct
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_table_holds_the_wiring_itself_and_can_be_built(preset):
-    from tiny_diffusion import TINY
-
     config = PRESETS[preset]()
     tables = ablations(config)
     for wirings in tables.values():
