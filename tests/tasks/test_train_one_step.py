@@ -13,7 +13,8 @@ from tiny_diffusion import write_model
 
 from catalog.store import open_store
 from lidarpainter_models.errors import ConfigError, DataError, WeightsError
-from lidarpainter_models.metrics.lpips import LpipsFiles
+from lidarpainter_models.metrics.backbones import SQUEEZENET
+from lidarpainter_models.metrics.lpips import Lpips, LpipsFiles
 from lidarpainter_models.painter import load_painter
 from lidarpainter_models.painter.losses import PaperLossWeights
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
@@ -123,6 +124,21 @@ def test_what_cannot_be_trained_is_refused_at_once(model, changes, start, option
     with pytest.raises((ConfigError, WeightsError), match=expected) as caught:
         student_of(replace(CONFIG, **changes), start, **options)
     assert "\n" not in str(caught.value)
+
+
+def test_lpips_enters_the_loss_and_lends_its_features(pairs, store, model, tmp_path, monkeypatch):
+    heads = [torch.rand(channels) for channels in SQUEEZENET.channels]
+    lpips = Lpips(SQUEEZENET.build(), heads).requires_grad_(False)
+    monkeypatch.setattr("tasks.training_processes.load_lpips", lambda _files: lpips)
+    files = LpipsFiles(backbone=tmp_path / "backbone", heads=tmp_path / "heads")
+    for path in (files.backbone, files.heads):
+        path.write_bytes(b"stands for weights")
+    config = replace(CONFIG, steps=1, loss=PaperLossWeights())
+    trained = train.fn(store.root, "train", pairs, config, 0.0, model, files)
+    record = training_record(trained.ref, None)
+    assert record["discriminator"] == "FeatureDiscriminator"
+    assert record["history"][0]["lpips"] > 0
+    assert {"lpips backbone", "lpips heads"} <= set(record)
 
 
 def test_the_small_painter_is_trained_alone():

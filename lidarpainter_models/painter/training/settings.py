@@ -43,10 +43,14 @@ class TrainingConfig:
 
     def __post_init__(self) -> None:
         """Refuse schedules that cannot run."""
-        positive = ("steps", "batch_size", "accumulated_batches", "learning_rate")
-        for name in (*positive, "log_every_steps", "max_gradient_norm"):
+        positive = ("steps", "batch_size", "accumulated_batches", "log_every_steps")
+        for name in (*positive, "max_gradient_norm"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
+        if not 0 < self.learning_rate <= 1:
+            raise ConfigError(f"learning_rate must be in (0, 1], got {self.learning_rate}")
+        if not 0 <= self.weight_decay <= 1:
+            raise ConfigError(f"weight_decay must be in [0, 1], got {self.weight_decay}")
         if self.max_cpu_s is not None and self.max_cpu_s <= 0:
             raise ConfigError(f"max_cpu_s must be positive, got {self.max_cpu_s}")
         if not 0 <= self.average_decay < 1:

@@ -24,6 +24,8 @@ from lidarpainter_models.painter.one_step.training import (
 from lidarpainter_models.painter.one_step.weights import save_trained
 
 SHORT = replace(CONTEST, loss=PaperLossWeights(lpips=0, adversarial=0), learning_rate=1e-2)
+BRIEF = replace(SHORT, network=fast())
+"""Without the skips and the adapters of the large autoencoder."""
 TEXTS = {"clear": torch.randn(77, TEXT_WIDTH, generator=torch.Generator().manual_seed(0))}
 
 
@@ -51,10 +53,10 @@ def weights_of(network):
 def test_training_lowers_the_loss_and_leaves_the_model_alone(
     train, make_network, make_pair, memory_pairs
 ):
-    config = replace(SHORT, steps=10, learning_rate=2e-2)
+    config = replace(SHORT, steps=7, learning_rate=3e-2)
     network, record = train(config, [memory_pairs([make_pair(64)])])
     totals = [entry["total"] for entry in record["history"]]
-    assert sum(totals[-3:]) < 0.8 * sum(totals[:3])
+    assert sum(totals[-2:]) < 0.8 * sum(totals[:2])
     before = dict(make_network(config.network, has_adapters=True).named_parameters())
     names = set(trained_names(network))
     changed = {
@@ -68,23 +70,24 @@ class Interruption(Exception):  # noqa: N818 - what a kill looks like from insid
 
 
 def test_interrupted_training_resumes_bit_for_bit(train, source, tmp_path):
-    straight, record = train(CONTEST, [source])
+    config = replace(CONTEST, steps=3)
+    straight, record = train(config, [source])
     assert record["discriminator"] == "PatchDiscriminator"
 
-    def stop_at_two(progress):
-        if progress.step == 2:
+    def stop_at_one(progress):
+        if progress.step == 1:
             raise Interruption
 
     with pytest.raises(Interruption):
-        train(CONTEST, [source], checkpoint_folder=tmp_path, progress=stop_at_two)
-    resumed, again = train(CONTEST, [source], checkpoint_folder=tmp_path)
+        train(config, [source], checkpoint_folder=tmp_path, progress=stop_at_one)
+    resumed, again = train(config, [source], checkpoint_folder=tmp_path)
     assert torch.equal(weights_of(straight), weights_of(resumed))
     for name in ("total", "discriminator", "gradient_penalty"):
         assert [entry[name] for entry in again["history"]] == [
             entry[name] for entry in record["history"]
         ]
     penalties = [entry["gradient_penalty"] for entry in record["history"]]
-    assert [penalty > 0 for penalty in penalties] == [True, False, True, False]
+    assert [penalty > 0 for penalty in penalties] == [True, False, True]
 
 
 def test_a_loss_that_is_no_number_stops_and_keeps_the_checkpoint(
@@ -92,7 +95,7 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_checkpoint(
 ):
     good = make_pair(64)
     source = memory_pairs([good])
-    config = replace(SHORT, steps=2)
+    config = replace(BRIEF, steps=2)
 
     def spoil(progress):
         if progress.step == 1:
@@ -108,11 +111,11 @@ def test_a_loss_that_is_no_number_stops_and_keeps_the_checkpoint(
 
 def test_no_pairs_are_one_clear_line(train, memory_pairs):
     with pytest.raises(DataError, match="no training pairs"):
-        train(SHORT, [memory_pairs([])])
+        train(BRIEF, [memory_pairs([])])
 
 
 def test_a_checkpoint_with_weights_of_a_wrong_shape_is_refused(train, source, tmp_path):
-    config = replace(SHORT, steps=1)
+    config = replace(BRIEF, steps=1)
     train(config, [source], checkpoint_folder=tmp_path)
     path = tmp_path / "training.pt"
     saved = torch.load(path, weights_only=True)
@@ -124,7 +127,7 @@ def test_a_checkpoint_with_weights_of_a_wrong_shape_is_refused(train, source, tm
 
 
 def test_lpips_is_never_left_out_unasked(train, source):
-    config = replace(SHORT, steps=1, loss=PaperLossWeights(adversarial=0))
+    config = replace(BRIEF, steps=1, loss=PaperLossWeights(adversarial=0))
     with pytest.raises(ConfigError, match=r"weighs LPIPS by 0\.2 but has no weights for it"):
         train(config, [source])
 
@@ -140,7 +143,7 @@ def test_lpips_is_never_left_out_unasked(train, source):
 
 def test_a_discriminator_looks_through_features_where_there_are_any(train, source):
     features = FrozenFeatures(extract=lambda pictures: [pictures], channels=(3,))
-    config = replace(CONTEST, steps=1)
+    config = replace(CONTEST, network=fast(), steps=1)
     _, record = train(config, [source], Judges(features=features))
     assert record["discriminator"] == "FeatureDiscriminator"
 
@@ -152,6 +155,8 @@ def test_a_discriminator_looks_through_features_where_there_are_any(train, sourc
         ({"prompts": ("foggy",)}, "the first prompt must be"),
         ({"penalty_every_steps": 0}, "penalty_every_steps must be positive"),
         ({"accumulated_batches": 0}, "accumulated_batches must be positive"),
+        ({"learning_rate": 1e38}, "learning_rate must be in"),
+        ({"weight_decay": -0.1}, "weight_decay must be in"),
     ],
 )
 def test_impossible_settings_are_refused(settings, expected):
@@ -206,8 +211,8 @@ def test_in_half_precision_what_is_trained_stays_in_float32(make_network, make_p
 
 def test_accumulated_batches_are_averaged(make_network, make_pair):
     pairs = [make_pair(64), make_pair(64, seed=1)]
-    _, whole = gradients(make_network(paper(), has_adapters=True), SHORT, pairs[0])
-    trainee = OneStepTrainee(make_network(paper(), has_adapters=True), TEXTS, SHORT)
+    _, whole = gradients(make_network(fast(), has_adapters=True), BRIEF, pairs[0])
+    trainee = OneStepTrainee(make_network(fast(), has_adapters=True), TEXTS, BRIEF)
     for pair in (pairs[0], pairs[0]):
         trainee.learn(batch_pairs([pair], trainee.num_warps), step=0, share=0.5)
     for name, gradient in whole.items():
