@@ -113,6 +113,14 @@ def test_pairs_of_a_street_that_judges_are_refused(make_pairs, capsys):
     assert "street seed 7 is kept for" in capsys.readouterr().err
 
 
+def test_a_folder_without_any_pair_is_one_line(tmp_path, capsys):
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    (folder / "index.json").write_text('{"format": "lidarpainter-pair/1", "pairs": []}')
+    assert main(["painter", "train", "--pairs", str(folder)]) == 2
+    assert capsys.readouterr().err.count("no training pairs in") == 1
+
+
 def test_info_tells_parts_size_licence_and_origin(tmp_path, capsys):
     path = tmp_path / "own.safetensors"
     provenance = {"steps": 3, "trained_targets": ["a", "b"]}
