@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from lidarpainter_models.errors import ConfigError, TrainingError
+from lidarpainter_models.errors import ConfigError, LidarPainterError, TrainingError
 from lidarpainter_models.metrics.lpips import LpipsFiles, load_lpips
 from lidarpainter_models.painter.adversarial import FrozenFeatures
 from lidarpainter_models.painter.examples import PairSource
@@ -80,22 +80,26 @@ def train_together(
     try:
         with _accelerated(0, num_processes, port) as (device, processes):
             return _train(lesson, device, processes, told)
+    except TrainingError:
+        raise
     except RuntimeError as error:
-        if isinstance(error, TrainingError):
-            raise
-        reason = str(error).splitlines()[0]
         raise TrainingError(
-            f"the processes that train together lost each other, the last checkpoint is kept: "
-            f"{reason}"
+            "a training in several processes broke off, its last checkpoint is kept: "
+            f"{_first_line(error)}"
         ) from None
     finally:
         _end(others)
 
 
 def _join(lesson: Lesson, index: int, num_processes: int, port: int) -> None:
-    """Train as one of the others."""
-    with _accelerated(index, num_processes, port) as (device, processes):
-        _train(lesson, device, processes, None)
+    """Train as one of the others; what ends this one alone is a line on its way out."""
+    try:
+        with _accelerated(index, num_processes, port) as (device, processes):
+            _train(lesson, device, processes, None)
+    except TrainingError:
+        return  # the loss is everyone's: the first process says it
+    except (LidarPainterError, RuntimeError) as error:
+        raise SystemExit(f"process {index} of the training: {_first_line(error)}") from None
 
 
 def _train(
@@ -148,14 +152,21 @@ def _accelerated(
         "MASTER_ADDR": HOST,
         "MASTER_PORT": str(port),
     }
+    accelerate = diffusion_package("accelerate")
     try:
-        accelerator = diffusion_package("accelerate").Accelerator(cpu=not torch.cuda.is_available())
+        accelerator = accelerate.Accelerator(cpu=not torch.cuda.is_available())
         yield accelerator.device, AcceleratedProcesses(accelerator)
     finally:
+        # accelerate remembers its processes for the life of this one, and they end here
+        accelerate.state.AcceleratorState._reset_state(reset_partial_state=True)
         if torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()
         os.environ.clear()
         os.environ.update(before)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def _free_port() -> int:

@@ -1,6 +1,9 @@
 """Training the one-step painter as a stage: what it refuses, keeps and leaves."""
 
 import json
+import multiprocessing
+import os
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +15,7 @@ from random_pairs import write_pairs
 from tiny_diffusion import write_model
 
 from catalog.store import open_store
-from lidarpainter_models.errors import ConfigError, DataError, WeightsError
+from lidarpainter_models.errors import ConfigError, DataError, TrainingError, WeightsError
 from lidarpainter_models.metrics.backbones import SQUEEZENET
 from lidarpainter_models.metrics.lpips import Lpips, LpipsFiles
 from lidarpainter_models.painter import load_painter
@@ -156,3 +159,23 @@ def test_two_processes_train_one_painter(pairs, store, model):
     assert [record["processes"] for record in records] == [2, 1]
     for ours, theirs in zip(*(record["history"] for record in records), strict=True):
         assert ours["total"] == pytest.approx(theirs["total"], rel=1e-4)
+
+
+class ChildKiller(Killer):
+    """Kills every process that this one has started."""
+
+    def advanced(self, _stage, _done, _total, _note):
+        for child in multiprocessing.active_children():
+            os.kill(child.pid, signal.SIGKILL)
+
+
+@pytest.mark.slow
+def test_a_lost_process_ends_the_training_with_one_line(pairs, store, model):
+    config = replace(CONFIG, steps=50)
+    with (
+        listening(ChildKiller()),
+        pytest.raises(TrainingError, match="in several processes broke off") as caught,
+    ):
+        train.fn(store.root, "train", pairs, config, 0.0, model, num_processes=2)
+    assert "\n" not in str(caught.value)
+    assert list((store.root / "work").glob("*/training.pt"))
