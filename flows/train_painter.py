@@ -1,7 +1,8 @@
 """From scenes to a trained painter: harvest pairs, train, judge on pairs held back, publish.
 
-The ablation trains painters that see only some of the inputs, on the same pairs at the same
-budget, and judges all of them on the same other pairs.
+The ablation trains painters that see only some of the inputs, or one-step painters that differ in
+one choice of their wiring, on the same pairs at the same budget, and judges all of them on the same
+other pairs.
 """
 
 from collections.abc import Iterable
@@ -22,8 +23,11 @@ from lidarpainter_models.evaluation.held_back import (
     check_training_pairs,
     check_training_scene,
 )
+from lidarpainter_models.metrics.lpips import LpipsFiles
 from lidarpainter_models.painter import OverlayPainter, UnpaintedPainter, WarpPainter
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
+from lidarpainter_models.painter.one_step.training import OneStepTrainingConfig
+from lidarpainter_models.painter.one_step.variants import ablations, distinct
 from lidarpainter_models.scenes.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
 from tasks.harvest import (
     PairSet,
@@ -38,11 +42,12 @@ from tasks.judge_painter import (
     judge_held_back,
     judge_painters,
     load_painting_scores,
+    samples_path,
 )
+from tasks.painter_students import PainterTraining, student_of
 from tasks.scenes import SplitSpec
 from tasks.stages import StageResult
 from tasks.train_painter import (
-    first_weights,
     publish_painter,
     train,
     training_record,
@@ -89,7 +94,13 @@ class TrainPainterParameters(HarvestParameters):
     """Pairs that were harvested before."""
     start: Path | None = None
     """Weights to go on from, a name or a file; None starts from nothing."""
-    training: NanoTrainingConfig = NanoTrainingConfig()
+    base: str | None = None
+    """Model that the one-step painter is trained on; None trains the small painter."""
+    training: PainterTraining = NanoTrainingConfig()
+    lpips: LpipsFiles = LpipsFiles()
+    """Weights for the loss of the one-step painter."""
+    processes: int = 1
+    """In which the one-step painter is trained, each on a GPU of its own."""
     held_back: float = 0.1
     """Share of the true pictures that are kept from training, to judge by."""
     feature_weights: Path | None = None
@@ -97,13 +108,17 @@ class TrainPainterParameters(HarvestParameters):
 
 
 class AblationParameters(BaseModel):
-    """Painters with fewer inputs, trained alike and judged alike."""
+    """Painters that differ in one thing, trained alike and judged alike."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     train_folders: tuple[Path, ...]
     test_folders: tuple[Path, ...]
-    training: NanoTrainingConfig = NanoTrainingConfig()
+    base: str | None = None
+    """Model that one-step painters are trained on; None trains small painters."""
+    training: PainterTraining = NanoTrainingConfig()
+    lpips: LpipsFiles = LpipsFiles()
+    """Weights for the loss of the one-step painter."""
     feature_weights: Path | None = None
 
 
@@ -119,16 +134,24 @@ def train_painter(parameters: TrainPainterParameters, store_path: Path) -> dict[
     check_sources(parameters)
     harvested = _harvested(parameters, store_path)
     sets = (*(made for made, _ in harvested), *named_sets(parameters.pair_folders))
+    start = parameters.base or parameters.start
     trained = train(
-        store_path, "train", sets, parameters.training, parameters.held_back, parameters.start
+        store_path,
+        "train",
+        sets,
+        parameters.training,
+        parameters.held_back,
+        start,
+        parameters.lpips,
+        parameters.processes,
     )
-    scores = None
+    scores, samples = None, None
     if parameters.held_back > 0:
         weights = weights_path(trained.ref)
         judged = judge_held_back(
             store_path, "judge", weights, sets, parameters.held_back, parameters.feature_weights
         )
-        scores = load_painting_scores(judged.ref)
+        scores, samples = load_painting_scores(judged.ref), str(samples_path(judged.ref))
     row = publish_painter(store_path, trained.ref, scores)
     return {
         "painter_id": row["painter_id"],
@@ -137,41 +160,71 @@ def train_painter(parameters: TrainPainterParameters, store_path: Path) -> dict[
         "pairs": [_described(*made) for made in harvested],
         "training": _cost(trained),
         "held_back": scores,
+        "samples": samples,
         "record": training_record(trained.ref, scores),
     }
 
 
 @flow(name="ablate_painter")
 def ablate_painter(parameters: AblationParameters, store_path: Path) -> dict[str, Any]:
-    """Train one painter per set of inputs and judge them beside those that learn nothing."""
+    """Train one painter per variant and judge them beside those that learn nothing."""
     learnt = named_sets(parameters.train_folders)
     painters = {name: name for name in UNLEARNED}
     costs = {}
-    for inputs in ABLATED_INPUTS:
-        label = "+".join(inputs)
-        network = replace(parameters.training.network, inputs=frozenset(inputs))
-        config = replace(parameters.training, network=network)
-        trained = train(store_path, f"train {label}", learnt, config, 0.0)
+    for label, config in variants_of(parameters.training).items():
+        stage = f"train {label}"
+        trained = train(store_path, stage, learnt, config, 0.0, parameters.base, parameters.lpips)
         painters[label] = str(weights_path(trained.ref))
         costs[label] = _cost(trained)
     judged = judge_painters(
         painters, named_sets(parameters.test_folders), parameters.feature_weights
     )
-    return {**judged, "weights": {label: painters[label] for label in costs}, "training": costs}
+    return {
+        **judged,
+        "tables": tables_of(parameters.training),
+        "weights": {label: painters[label] for label in costs},
+        "training": costs,
+    }
+
+
+def variants_of(training: PainterTraining) -> dict[str, PainterTraining]:
+    """What an ablation trains, by label."""
+    if isinstance(training, OneStepTrainingConfig):
+        wirings = distinct(ablations(training.network))
+        return {label: replace(training, network=wiring) for label, wiring in wirings.items()}
+    return {
+        "+".join(inputs): replace(
+            training, network=replace(training.network, inputs=frozenset(inputs))
+        )
+        for inputs in ABLATED_INPUTS
+    }
+
+
+def tables_of(training: PainterTraining) -> dict[str, dict[str, str]]:
+    """Labels of painters by the choice that is varied and the value it has; rules come first."""
+    rules = {name: name for name in UNLEARNED}
+    if not isinstance(training, OneStepTrainingConfig):
+        return {"inputs": rules | {label: label for label in variants_of(training)}}
+    tables = ablations(training.network)
+    labels = {wiring: label for label, wiring in distinct(tables).items()}
+    return {
+        choice: rules | {f"{choice}: {value}": labels[wiring] for value, wiring in wirings.items()}
+        for choice, wirings in tables.items()
+    }
 
 
 def check_sources(parameters: TrainPainterParameters) -> None:
     """Refuse to train on nothing, or on what judges painters.
 
     Raises:
-        ConfigError: no source of pairs, a street whose seed is kept for judging, or first weights
-            that do not say what they have learnt.
+        ConfigError: no source of pairs, a street whose seed is kept for judging, a loss that lacks
+            what it weighs, or first weights that do not say what they have learnt.
         DataError: a folder holds no pairs.
-        WeightsError: the first weights, or those for the feature distance, cannot be used.
+        WeightsError: the model, the first weights, or those for a distance cannot be used.
     """
     feature_distance_of(parameters.feature_weights)
-    if parameters.start is not None:
-        first_weights(parameters.start)
+    start = parameters.base or parameters.start
+    student_of(parameters.training, start, parameters.lpips, parameters.processes)
     if not (parameters.street_seeds or parameters.scenes or parameters.pair_folders):
         raise ConfigError("nothing to train on: expected street seeds, scenes or folders of pairs")
     for seed in parameters.street_seeds:

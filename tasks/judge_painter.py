@@ -22,11 +22,13 @@ from lidarpainter_models.painter.one_step.painter import OneStepPainter
 from lidarpainter_models.painter.protocol import Painter
 from tasks.harvest import PairSet
 from tasks.measuring import measured
+from tasks.painting_samples import write_samples
 from tasks.progress import listener
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
 from tasks.stored import read_json, write_json
 
 SCORES_FILE = "painting-scores.json"
+SAMPLES_FILE = "samples.png"
 PAINTING_COLUMNS = (
     "picture",
     "PSNR",
@@ -69,12 +71,11 @@ def judge_painters(
         `painters`: scores by label; `pairs`: how many of every set were judged and left out;
         `training_unknown`: learned painters whose weights do not say what they were trained on.
     """
-    loaded = {label: load_painter(name) for label, name in painters.items()}
-    if keep_below is not None:
-        loaded |= _sparing(loaded, TileConfig(keep_below=keep_below))
+    tiles = None if keep_below is None else TileConfig(keep_below=keep_below)
     distance = feature_distance_of(feature_weights)
     folders = open_sets(sets)
-    known = {label: _trained_targets(painter) for label, painter in loaded.items()}
+    # one at a time: several at full size do not fit into memory
+    known = {label: _trained_targets(load_painter(name)) for label, name in painters.items()}
     unseen = unseen_pairs(folders, [targets for targets in known.values() if targets is not None])
     pairs = {
         name: {
@@ -84,11 +85,17 @@ def judge_painters(
         }
         for name, folder in folders.items()
     }
+    scores: dict[str, Any] = {}
+    sparing: dict[str, Any] = {}
+    for label, name in painters.items():
+        painter = load_painter(name)
+        scores[label] = _told_scores(painter, unseen, distance, f"judge {label}")
+        if tiles is not None and isinstance(painter, NanoPainter):
+            twice = f"{label}, tiles kept"
+            again = _sparing(painter, tiles)
+            sparing[twice] = _told_scores(again, unseen, distance, f"judge {twice}")
     return {
-        "painters": {
-            label: _told_scores(painter, unseen, distance, f"judge {label}")
-            for label, painter in loaded.items()
-        },
+        "painters": scores | sparing,
         "pairs": pairs,
         "training_unknown": [label for label, targets in known.items() if targets is None],
     }
@@ -120,8 +127,10 @@ def judge_held_back(
         inputs["features"] = digest_file(feature_weights)[:DIGEST_LENGTH]
 
     def build(place: Workplace) -> dict[str, Any]:
-        scores = _scores(load_painter(weights), judged, distance, stage)
+        painter = load_painter(weights)
+        scores = _scores(painter, judged, distance, stage)
         write_json(place.output / SCORES_FILE, scores)
+        write_samples(painter, judged, place.output / SAMPLES_FILE)
         total = scores["total"]
         return {
             "num_pairs": total["num_pairs"],
@@ -139,23 +148,24 @@ def judge_held_back(
     )
 
 
-def _sparing(painters: Mapping[str, Painter], tiles: TileConfig) -> dict[str, Painter]:
-    """The small painters among these once more, painting only what needs it."""
-    return {
-        f"{label}, tiles kept": NanoPainter(
-            painter.network,
-            provenance=painter.provenance,
-            half_precision=painter.half_precision,
-            tiles=tiles,
-        )
-        for label, painter in painters.items()
-        if isinstance(painter, NanoPainter)
-    }
+def _sparing(painter: NanoPainter, tiles: TileConfig) -> NanoPainter:
+    """The same painter, painting only what needs it."""
+    return NanoPainter(
+        painter.network,
+        provenance=painter.provenance,
+        half_precision=painter.half_precision,
+        tiles=tiles,
+    )
 
 
 def load_painting_scores(ref: ArtefactRef) -> dict[str, Any]:
     """Read the scores of `judge_held_back`."""
     return read_json(ref.folder / SCORES_FILE)
+
+
+def samples_path(ref: ArtefactRef) -> Path:
+    """The pictures that `judge_held_back` has painted: render, LiDAR, painted, true."""
+    return ref.folder / SAMPLES_FILE
 
 
 def open_sets(sets: Sequence[PairSet]) -> dict[str, PairFolder]:

@@ -1,7 +1,8 @@
-"""Measure the wirings of the one-step painter, each in a process of its own."""
+"""Measure the one-step painter, painting and in training, each time in a process of its own."""
 
 import multiprocessing
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from statistics import median
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 from tasks.measuring import measured
 
 SLOWEST = "plain"
+TRAINED_PRESETS = ("paper", "fast")
 
 
 def measure_wiring(wiring: str, height_px: int, width_px: int, passes: int) -> dict[str, Any]:
@@ -59,7 +61,9 @@ def compare_wirings(
     found: dict[str, list[dict[str, Any]]] = {wiring: [] for wiring in WIRINGS}
     for _ in range(rounds):
         for wiring in WIRINGS:
-            found[wiring].append(_in_own_process(wiring, height_px, width_px, passes))
+            found[wiring].append(
+                _in_own_process(measure_wiring, wiring, height_px, width_px, passes)
+            )
     slowest = _summary(found[SLOWEST])
     picture = found[SLOWEST][0]["picture"]
     return {
@@ -72,10 +76,46 @@ def compare_wirings(
     }
 
 
-def _in_own_process(wiring: str, height_px: int, width_px: int, passes: int) -> dict[str, Any]:
+def measure_training(preset: str, height_px: int, width_px: int) -> dict[str, Any]:
+    """Seconds of one training step with one view and peak memory, in this process.
+
+    Args:
+        preset: name of the wiring.
+        height_px: rows of the view; padded to a multiple of 64.
+        width_px: columns of the view.
+    """
+    from lidarpainter_models.painter.one_step.painter import STRIDE_PX
+    from lidarpainter_models.painter.one_step.presets import preset_named
+    from lidarpainter_models.painter.one_step.training_trial import build_trial
+
+    rows, columns = (-(-size // STRIDE_PX) * STRIDE_PX for size in (height_px, width_px))
+    with measured() as whole:
+        step = build_trial(preset_named(preset), rows, columns)
+        started, cpu_started = time.perf_counter(), time.process_time()
+        loss = step()
+        cpu_seconds, seconds = time.process_time() - cpu_started, time.perf_counter() - started
+    return {
+        "cpu_seconds": cpu_seconds,
+        "seconds": seconds,
+        "peak_bytes": whole.peak_memory_bytes,
+        "loss": loss,
+    }
+
+
+def compare_training(height_px: int, width_px: int) -> dict[str, dict[str, Any]]:
+    """One training step of every preset in `TRAINED_PRESETS`; see `measure_training`."""
+    return {
+        preset: _in_own_process(measure_training, preset, height_px, width_px)
+        for preset in TRAINED_PRESETS
+    }
+
+
+def _in_own_process(
+    measure: Callable[..., dict[str, Any]], *arguments: str | int
+) -> dict[str, Any]:
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(max_workers=1, mp_context=context) as pool:
-        return pool.submit(measure_wiring, wiring, height_px, width_px, passes).result()
+        return pool.submit(measure, *arguments).result()
 
 
 def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:

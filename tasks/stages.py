@@ -36,7 +36,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "strips": (*BASE, "gaussians", "painter", "conditioning", "metrics", "evaluation"),
     "report": (*BASE, "gaussians", "painter", "conditioning", "metrics", "evaluation", "export"),
     "pairs": (*BASE, "gaussians", "painter", "conditioning"),
-    "painter": (*BASE, "painter"),
+    "painter": (*BASE, "painter", "metrics"),
 }
 """Library packages by kind of artefact."""
 TASKS = Path(__file__).parent

@@ -1,4 +1,4 @@
-"""Train the small painter on pairs and enter it into the catalog.
+"""Train a painter on pairs and enter it into the catalog.
 
 Training is a stage like any other: keyed on the pairs and every setting, resumed from its last
 checkpoint when it was killed.
@@ -16,33 +16,24 @@ from catalog.artefacts import ArtefactRef, Workplace
 from catalog.digests import DIGEST_LENGTH, canonical_json, digest_file, finite_or_none
 from catalog.store import open_store
 from lidarpainter_models.conditioning.pairs import PairFolder
-from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.held_back import (
     TARGETS_KEY,
     PairSubset,
     check_training_pairs,
     hold_back,
-    trained_targets,
 )
-from lidarpainter_models.painter import load_painter
-from lidarpainter_models.painter.nano.painter import NanoPainter
-from lidarpainter_models.painter.nano.training import (
-    NanoTrainingConfig,
-    TrainingProgress,
-    train_nano,
-)
-from lidarpainter_models.painter.nano.training_checkpoints import training_digest
-from lidarpainter_models.painter.nano.weights import save_weights
+from lidarpainter_models.metrics.lpips import LpipsFiles
+from lidarpainter_models.painter.training.loop import TrainingProgress
 from lidarpainter_models.scenes.readers.pandaset.reader import LICENCE as PANDASET_LICENCE
 from tasks.harvest import PairSet
 from tasks.judge_painter import open_sets
+from tasks.painter_students import NO_FILES, PainterTraining, student_of
 from tasks.progress import listener
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
 from tasks.stored import read_json, write_json
 
-WEIGHTS_FILE = "nano.safetensors"
-RECORD_FILE = "nano.json"
-PAINTER_NAME = "nano"
+WEIGHTS_SUFFIX = ".safetensors"
+RECORD_SUFFIX = ".json"
 LICENCE = "Apache-2.0"
 ATTRIBUTIONS = {
     "synthetic": "LidarPainter's synthetic street, Apache-2.0",
@@ -52,13 +43,15 @@ ATTRIBUTIONS = {
 
 
 @task(**STAGE_OPTIONS)
-def train(
+def train(  # noqa: PLR0913 - what a training stands on
     store_path: Path,
     stage: str,
     sets: Sequence[PairSet],
-    config: NanoTrainingConfig,
+    config: PainterTraining,
     held_back: float,
-    start: Path | None = None,
+    start: str | Path | None = None,
+    lpips: LpipsFiles = NO_FILES,
+    num_processes: int = 1,
 ) -> StageResult:
     """Train on all pairs but those held back.
 
@@ -68,18 +61,20 @@ def train(
         sets: pairs to learn from and to judge by.
         config: the recipe.
         held_back: share of the true pictures kept to judge by.
-        start: weights to go on from, a name or a file; None starts from nothing.
+        start: weights to go on from, a name or a file; for the one-step painter also its model.
+        lpips: weights for the loss of the one-step painter.
+        num_processes: in which the one-step painter is trained, each on a GPU.
 
     Raises:
-        ConfigError: pairs of a street that is kept for judging, nothing left to learn from, or
-            first weights that do not say what they have learnt.
-        WeightsError: the first weights cannot be used.
+        ConfigError: pairs of a street that is kept for judging, nothing left to learn from, a loss
+            that lacks what it weighs, or first weights that do not say what they have learnt.
+        WeightsError: the model or the first weights cannot be used.
     """
     folders = open_sets(sets)
     for folder in folders.values():
         check_training_pairs(folder)
-    first = None if start is None else first_weights(start)
-    learnt, judged = hold_back(folders, held_back, known=_learnt_by(first))
+    student = student_of(config, start, lpips, num_processes)
+    learnt, judged = hold_back(folders, held_back, known=student.learnt)
 
     def told(progress: TrainingProgress) -> None:
         loss = progress.losses.get("total")
@@ -89,40 +84,36 @@ def train(
     def build(place: Workplace) -> dict[str, Any]:
         for folder in folders.values():
             folder.verify()
-        result = train_nano(
-            list(learnt.values()),
-            config,
-            start=None if first is None else first.network,
-            checkpoint_folder=place.scratch,
-            progress=told,
-        )
-        licence, attribution = _terms(folders.values())
+        trained = student.learn(list(learnt.values()), place.scratch, told)
+        of_pairs, attribution = _terms(folders.values())
+        licence = student.licence(of_pairs)
         record = {
             "licence": licence,
             "attribution": attribution,
             "held_back": {name: sorted(subset.targets) for name, subset in judged.items()},
             "software_version": lidarpainter_models.__version__,
-            **result.record,
+            **trained,
+            **student.origin,
         }
-        provenance = _provenance(record, learnt.values())
-        if first is not None:
-            record["started_from"] = provenance["started_from"] = _origin(first)
-            provenance[TARGETS_KEY] = sorted({*provenance[TARGETS_KEY], *_learnt_by(first)})
-        save_weights(
-            result.network, place.output / WEIGHTS_FILE, licence=licence, provenance=provenance
+        provenance = _provenance(record, learnt.values()) | student.origin
+        provenance[TARGETS_KEY] = sorted({*provenance[TARGETS_KEY], *student.learnt})
+        student.save(
+            place.output / f"{student.name}{WEIGHTS_SUFFIX}", licence=licence, provenance=provenance
         )
-        write_json(place.output / RECORD_FILE, record)
+        write_json(place.output / f"{student.name}{RECORD_SUFFIX}", record)
         return {key: record[key] for key in ("num_pairs", "steps", "cpu_s")}
 
     inputs = {f"pairs {name}": subset.digest for name, subset in learnt.items()}
-    if first is not None:
-        inputs["first weights"] = training_digest({}, [], first.network)[:DIGEST_LENGTH]
     return run_stage(
         open_store(store_path),
         stage=stage,
         kind="painter",
-        inputs=inputs,
-        config={"training": config.to_dict(), "held_back": held_back},
+        inputs=inputs | student.inputs,
+        config={
+            "training": config.to_dict(),
+            "held_back": held_back,
+            "num_processes": num_processes,
+        },
         build=build,
     )
 
@@ -143,7 +134,7 @@ def publish_painter(
     manifest = store.artefacts.verified(trained)
     row = {
         "painter_id": digest_file(weights)[:DIGEST_LENGTH],
-        "name": PAINTER_NAME,
+        "name": weights.stem,
         "path": str(weights),
         "num_bytes": weights.stat().st_size,
         "record": canonical_json(training_record(trained, scores)),
@@ -155,39 +146,15 @@ def publish_painter(
 
 
 def weights_path(trained: ArtefactRef) -> Path:
-    """The weights of a trained painter."""
-    return trained.folder / WEIGHTS_FILE
+    """The weights of a trained painter, called after its kind."""
+    (path,) = trained.folder.glob(f"*{WEIGHTS_SUFFIX}")
+    return path
 
 
 def training_record(trained: ArtefactRef, scores: dict[str, Any] | None) -> dict[str, Any]:
     """How a painter was trained and what it reached on the pairs held back."""
-    record = read_json(trained.folder / RECORD_FILE)
+    record = read_json(weights_path(trained).with_suffix(RECORD_SUFFIX))
     return finite_or_none(record | {"held_back_scores": scores})
-
-
-def first_weights(start: Path) -> NanoPainter:
-    """The painter that a training goes on from.
-
-    Raises:
-        ConfigError: it learns nothing, or does not say what it has learnt.
-        WeightsError: there is no such painter, or its file cannot be used.
-    """
-    painter = load_painter(start)
-    if not isinstance(painter, NanoPainter) or trained_targets(painter.provenance) is None:
-        raise ConfigError(f"{start}: expected a trained painter that says what it has learnt")
-    return painter
-
-
-def _learnt_by(first: NanoPainter | None) -> frozenset[str]:
-    """The targets that the first weights know."""
-    known = None if first is None else trained_targets(first.provenance)
-    return known or frozenset()
-
-
-def _origin(first: NanoPainter) -> dict[str, Any]:
-    """Which weights a training went on from."""
-    kept = ("training_digest", "num_pairs", "steps", "cpu_s", "pairs", "licence", "started_from")
-    return {key: first.provenance[key] for key in kept if key in first.provenance}
 
 
 def _provenance(record: dict[str, Any], learnt: Iterable[PairSubset]) -> dict[str, Any]:

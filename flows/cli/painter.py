@@ -37,6 +37,20 @@ Features = Annotated[
 ]
 Budget = Annotated[float | None, typer.Option(help="CPU seconds of training.")]
 Steps = Annotated[int | None, typer.Option(help="Optimiser steps of training.")]
+Base = Annotated[
+    str | None,
+    typer.Option(
+        help="Train the one-step painter on this model: a folder in diffusers' layout or an id, "
+        "with a preset after a colon. Without it, the small painter."
+    ),
+]
+LpipsBackbone = Annotated[
+    Path | None,
+    typer.Option(help="torchvision's VGG-16, AlexNet or SqueezeNet 1.1, for the loss with --base."),
+]
+LpipsHeads = Annotated[
+    Path | None, typer.Option(help="LPIPS 0.1 heads of the same network, for the loss.")
+]
 
 
 @app.command("harvest")
@@ -72,12 +86,14 @@ def train(  # noqa: PLR0913 - the options of a command
     ] = None,
     budget: Budget = None,
     steps: Steps = None,
+    base: Base = None,
     start: Annotated[
         Path | None, typer.Option(help="Go on from these weights: nano, or a .safetensors file.")
     ] = None,
     inputs: Annotated[
-        str, typer.Option(help="What the painter may see, with commas between.")
-    ] = "render,lidar,warp",
+        str | None,
+        typer.Option(help="What the small painter may see, with commas between; by default all."),
+    ] = None,
     prompts: Annotated[
         str | None,
         typer.Option(help="clear, and styles to learn beside it: clear,foggy,night,rain."),
@@ -86,6 +102,11 @@ def train(  # noqa: PLR0913 - the options of a command
         float, typer.Option(help="Share of the true pictures kept from training, to judge by.")
     ] = 0.1,
     feature_weights: Features = None,
+    lpips_backbone: LpipsBackbone = None,
+    lpips_heads: LpipsHeads = None,
+    processes: Annotated[
+        int, typer.Option(min=1, help="Train with --base in so many processes, a GPU for each.")
+    ] = 1,
     out: Annotated[
         Path | None,
         typer.Option(help="Folder, or .safetensors file, for the weights and their record."),
@@ -93,23 +114,28 @@ def train(  # noqa: PLR0913 - the options of a command
     settings: Settings = None,
     as_json: AsJson = False,
 ) -> None:
-    """Train the small painter; a killed training goes on where it stopped."""
+    """Train the small painter, or with --base the one-step painter on a model.
+
+    A killed training goes on where it stopped.
+    """
     from flows.cli.ingest import parse_names
-    from flows.cli.training import run_training, train_parameters
-    from flows.overrides import with_overrides
+    from flows.cli.training import first_choices, run_training, train_parameters
+    from flows.overrides import with_changes, with_overrides
 
     parameters = train_parameters(
-        parse_seeds(seeds), scenes, split, cameras, parse_paths(pairs, "--pairs"), start
+        parse_seeds(seeds), scenes, split, cameras, parse_paths(pairs, "--pairs")
     )
+    changes = first_choices(base, start, lpips_backbone, lpips_heads)
+    changes |= {
+        "held_back": held_back,
+        "feature_weights": feature_weights,
+        "processes": processes,
+    }
+    parameters = with_changes(parameters, changes)
     training = with_length(
         parameters.training, parse_inputs(inputs), budget, steps, parse_names(prompts)
     )
-    changes = {
-        "training": training,
-        "held_back": held_back,
-        "feature_weights": feature_weights,
-    }
-    parameters = with_overrides(parameters.model_copy(update=changes), settings or [])
+    parameters = with_overrides(with_changes(parameters, {"training": training}), settings or [])
     result = run_training(parameters)
     if out is not None:
         result |= write_painter(Path(result["weights"]), result["record"], out)
@@ -185,7 +211,7 @@ def info(
 
 
 @app.command("ablate")
-def ablate(
+def ablate(  # noqa: PLR0913 - the options of a command
     pairs_train: Annotated[
         list[str], typer.Option(help="A folder of pairs to learn from. May be repeated.")
     ],
@@ -194,21 +220,27 @@ def ablate(
     ],
     budget: Budget = None,
     steps: Steps = None,
+    base: Base = None,
     feature_weights: Features = None,
+    lpips_backbone: LpipsBackbone = None,
+    lpips_heads: LpipsHeads = None,
     settings: Settings = None,
     as_json: AsJson = False,
 ) -> None:
-    """Train painters that see only some of the inputs, and judge all of them alike."""
-    from flows.cli.training import ablation_parameters, run_ablation
-    from flows.overrides import with_overrides
+    """Train small painters that see only some of the inputs, and judge all of them alike.
+
+    With --base, one-step painters that differ in one choice of their wiring, a table per choice.
+    """
+    from flows.cli.training import ablation_parameters, first_choices, run_ablation
+    from flows.overrides import with_changes, with_overrides
 
     parameters = ablation_parameters(
         parse_paths(pairs_train, "--pairs-train"), parse_paths(pairs_test, "--pairs-test")
     )
-    training = parameters.training
-    training = with_length(training, training.network.inputs, budget, steps)
-    changes = {"training": training, "feature_weights": feature_weights}
-    parameters = with_overrides(parameters.model_copy(update=changes), settings or [])
+    changes = first_choices(base, None, lpips_backbone, lpips_heads)
+    parameters = with_changes(parameters, changes | {"feature_weights": feature_weights})
+    training = with_length(parameters.training, None, budget, steps)
+    parameters = with_overrides(with_changes(parameters, {"training": training}), settings or [])
     result = run_ablation(parameters)
     if as_json:
         print_json(result)
@@ -240,6 +272,7 @@ def _show_training(result: dict[str, Any]) -> None:
         "pairs": result["record"]["num_pairs"],
         "training, CPU s": result["record"]["cpu_s"],
         "record": result.get("record_path"),
+        "sample pictures": result["samples"],
     }
     print_pairs("painter", pairs)
 
@@ -249,11 +282,14 @@ def _show_scores(found: dict[str, Any]) -> None:
 
     judged = {name: counts for name, counts in found["pairs"].items() if counts["num_judged"]}
     sources: list[str | None] = [*judged, None] if len(judged) > 1 else [None]
-    for source in sources:
-        count = sum(one["num_judged"] for name, one in judged.items() if source in (None, name))
-        rows = painting_rows(found["painters"], source)
-        note = PAINTING_NOTE if source is None else ""
-        print_table(f"{source or 'all'}: {count} pairs", PAINTING_COLUMNS, rows, note)
+    tables = found.get("tables") or {"": {label: label for label in found["painters"]}}
+    for choice, labels in tables.items():
+        shown = {value: found["painters"][label] for value, label in labels.items()}
+        for source in sources:
+            count = sum(one["num_judged"] for name, one in judged.items() if source in (None, name))
+            title = f"{choice}, {source or 'all'}: {count} pairs".removeprefix(", ")
+            note = PAINTING_NOTE if source is None else ""
+            print_table(title, PAINTING_COLUMNS, painting_rows(shown, source), note)
     for name, counts in found["pairs"].items():
         if counts["num_left_out"]:
             typer.echo(f"{name}: {counts['num_left_out']} pairs left out, a painter knows them")

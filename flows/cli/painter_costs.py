@@ -15,6 +15,9 @@ Size = Annotated[str, typer.Option(help="Size of a picture, WIDTHxHEIGHT.")]
 def benchmark(
     size: Size = "512x288",
     rounds: Annotated[int, typer.Option(min=1, help="Processes per wiring, in turn.")] = 2,
+    training: Annotated[
+        bool, typer.Option("--training", help="Time one training step instead; some minutes.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Time the one-step painter wired plainly, wired well, and with the tiny autoencoder.
@@ -24,6 +27,9 @@ def benchmark(
     from tasks.painter_benchmark import compare_wirings
 
     width_px, height_px = parse_size(size)
+    if training:
+        _time_training(height_px, width_px, as_json=as_json)
+        return
     found = compare_wirings(height_px, width_px, rounds)
     if as_json:
         print_json({"size_px": [width_px, height_px], "rounds": rounds, "wirings": found})
@@ -42,6 +48,25 @@ def benchmark(
     columns = ["wiring", "CPU s", "wall s", "peak memory", "times faster", "rgb difference"]
     note = "medians of a view; peak of the whole process; difference to plain over 16x16 pixels"
     print_table(f"one-step painter, {size}, bfloat16, random weights", columns, rows, note)
+
+
+def _time_training(height_px: int, width_px: int, *, as_json: bool) -> None:
+    from tasks.painter_benchmark import compare_training
+
+    found = compare_training(height_px, width_px)
+    if as_json:
+        print_json({"size_px": [width_px, height_px], "training_step": found})
+        return
+    rows = [
+        [preset, one["cpu_seconds"], one["seconds"], format_bytes(one["peak_bytes"])]
+        for preset, one in found.items()
+    ]
+    print_table(
+        f"a training step of the one-step painter, one view of {width_px}x{height_px}",
+        ["preset", "CPU s", "wall s", "peak memory"],
+        rows,
+        "random weights in bfloat16, activations computed anew, no LPIPS; peak of the process",
+    )
 
 
 def show_preset(painter: str | None, preset: str, size: str, *, as_json: bool) -> None:

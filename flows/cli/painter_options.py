@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from lidarpainter_models.errors import ConfigError
 
 if TYPE_CHECKING:
-    from lidarpainter_models.painter.nano.training import NanoTrainingConfig
+    from tasks.painter_students import PainterTraining
 
 WEIGHTS_SUFFIX = ".safetensors"
 _SIZE = re.compile(r"([1-9]\d{0,4})x([1-9]\d{0,4})")
@@ -52,14 +52,16 @@ def parse_size(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def parse_inputs(text: str) -> frozenset[str]:
-    """Names of inputs with commas between.
+def parse_inputs(text: str | None) -> frozenset[str] | None:
+    """Names of the small painter's inputs with commas between.
 
     Raises:
         ConfigError: the network cannot be built from them.
     """
     from lidarpainter_models.painter.nano.candidates import check_inputs
 
+    if text is None:
+        return None
     return check_inputs(part.strip() for part in text.split(","))
 
 
@@ -76,23 +78,34 @@ def parse_paths(texts: Sequence[str] | None, option: str) -> tuple[Path, ...]:
 
 
 def with_length(
-    training: "NanoTrainingConfig",
-    inputs: frozenset[str],
+    training: "PainterTraining",
+    inputs: frozenset[str] | None,
     budget_s: float | None,
     steps: int | None,
     prompts: tuple[str, ...] | None = None,
-) -> "NanoTrainingConfig":
-    """The settings with other inputs and prompts, and as long as asked for.
+) -> "PainterTraining":
+    """The settings with other inputs and prompts where given, and as long as asked for.
 
     Raises:
-        ConfigError: both lengths are given, one is not positive, or a prompt is no style.
+        ConfigError: both lengths are given, one is not positive, a prompt is no style, or inputs
+            are given for the one-step painter.
     """
+    from lidarpainter_models.painter.nano.training import NanoTrainingConfig
+
     if budget_s is not None and steps is not None:
         raise ConfigError("give --budget or --steps, not both")
-    network = replace(training.network, inputs=inputs, prompts=prompts or training.network.prompts)
-    if steps is None:
-        steps = training.steps
-    return replace(training, network=network, max_cpu_s=budget_s, steps=steps)
+    steps = training.steps if steps is None else steps
+    changes: dict[str, Any] = {"max_cpu_s": budget_s, "steps": steps}
+    if isinstance(training, NanoTrainingConfig):
+        old = training.network
+        network = replace(old, inputs=inputs or old.inputs, prompts=prompts or old.prompts)
+        return replace(training, network=network, **changes)
+    if inputs is not None:
+        raise ConfigError(
+            "--inputs is for the small painter: the preset after --base wires the other, or "
+            "--set training.network.inputs=render,lidar"
+        )
+    return replace(training, prompts=prompts or training.prompts, **changes)
 
 
 def write_painter(weights: Path, record: dict[str, Any], out: Path) -> dict[str, str]:

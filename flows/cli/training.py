@@ -19,7 +19,11 @@ from flows.train_painter import (
     train_painter,
 )
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.metrics.lpips import LpipsFiles
+from lidarpainter_models.painter import is_one_step
 from tasks.judge_painter import judge_painters, open_sets
+from tasks.painter_students import recipe_for, student_of
+from tasks.train_painter import WEIGHTS_SUFFIX
 
 PREFECT_LOG = Path("logs") / "prefect.log"
 
@@ -48,25 +52,43 @@ def train_parameters(
     split: str,
     cameras: str | None,
     pair_folders: tuple[Path, ...],
-    start: Path | None = None,
 ) -> TrainPainterParameters:
-    """What to train on; refused before any work begins.
-
-    Raises:
-        ConfigError: nothing, or what judges painters.
-        DataError: a folder holds no pairs.
-        WeightsError: the first weights cannot be used.
-    """
-    parameters = TrainPainterParameters(
+    """What to train on."""
+    return TrainPainterParameters(
         street_seeds=seeds,
         scenes=tuple(scenes or ()),
         split=split,
         cameras=parse_names(cameras),
         pair_folders=pair_folders,
-        start=start,
     )
-    check_sources(parameters)
-    return parameters
+
+
+def first_choices(
+    base: str | None, start: Path | None, lpips_backbone: Path | None, lpips_heads: Path | None
+) -> dict[str, Any]:
+    """What is trained and where it starts, as parameters; the small painter unless said.
+
+    Args:
+        base: a model for the one-step painter, with a preset after a colon.
+        start: weights to go on from, of either painter.
+        lpips_backbone: for the loss of the one-step painter.
+        lpips_heads: the other half of the same.
+
+    Raises:
+        ConfigError: both a model and weights, or no such preset.
+        WeightsError: the weights cannot be used.
+    """
+    if base is not None and start is not None:
+        raise ConfigError("give --base or --start, not both: weights name their model themselves")
+    model = base
+    if start is not None and is_one_step(str(start)):
+        model = str(start)
+    lpips = LpipsFiles(backbone=lpips_backbone, heads=lpips_heads)
+    if model is None:
+        if lpips != LpipsFiles():
+            raise ConfigError("--lpips-backbone and --lpips-heads are for training with --base")
+        return {} if start is None else {"start": start}
+    return {"base": model, "lpips": lpips, "training": recipe_for(model)}
 
 
 def ablation_parameters(
@@ -84,7 +106,8 @@ def run_harvest(parameters: HarvestParameters) -> dict[str, Any]:
 
 
 def run_training(parameters: TrainPainterParameters) -> dict[str, Any]:
-    """Train into the store."""
+    """Train into the store; what cannot be trained on is refused before any work begins."""
+    check_sources(parameters)
     store = open_store()
     with prefect_server(store.root / PREFECT_LOG), shown_progress():
         return train_painter(parameters, store.root)
@@ -92,6 +115,9 @@ def run_training(parameters: TrainPainterParameters) -> dict[str, Any]:
 
 def run_ablation(parameters: AblationParameters) -> dict[str, Any]:
     """Train and judge every variant."""
+    if parameters.base is not None and parameters.base.endswith(WEIGHTS_SUFFIX):
+        raise ConfigError("an ablation wires a model in many ways; a weights file has its own")
+    student_of(parameters.training, parameters.base, parameters.lpips)
     for folders in (parameters.train_folders, parameters.test_folders):
         open_sets(named_sets(folders))  # what is missing is told before an hour of training
     store = open_store()

@@ -126,11 +126,14 @@ def check_training_scene(dataset: str, sequence: str) -> None:
 
 
 def check_training_pairs(folder: PairFolder) -> None:
-    """Refuse to train on pairs of a street that judges.
+    """Refuse to train on no pairs, or on those of a street that judges.
 
     Raises:
+        DataError: the folder holds none.
         ConfigError: see `check_street_seed`.
     """
+    if not len(folder):
+        raise DataError(f"no training pairs in {folder.folder}: its index is empty")
     for index in range(len(folder)):
         provenance = folder.provenance(index)
         dataset, sequence = (str(provenance.get(key)) for key in ("dataset", "sequence"))

@@ -67,14 +67,24 @@ class Lpips(nn.Module):
                 f"LPIPS needs two pictures of one size, at least {LEAST_SIDE_PX} px, got "
                 f"{tuple(pictures.shape)} and {tuple(truths.shape)}"
             )
-        seen = [
-            self.backbone.compared_features(self._normalised(views)) for views in (pictures, truths)
-        ]
+        seen = [self.features(views) for views in (pictures, truths)]
         total = pictures.new_zeros(len(pictures))
         for index, (one, other) in enumerate(zip(*seen, strict=True)):
             weighed = (one - other).square() * self.get_buffer(f"head_{index}")
             total = total + weighed.sum(dim=1).mean(dim=(1, 2))
         return total
+
+    @property
+    def channels(self) -> tuple[int, ...]:
+        """Of the backbone's features at every compared depth."""
+        heads = [self.get_buffer(f"head_{index}") for index in range(self.num_heads)]
+        return tuple(len(head) for head in heads)
+
+    def features(
+        self, pictures: Float[Tensor, "batch 3 height width"]
+    ) -> list[Float[Tensor, "batch channels rows columns"]]:
+        """What the backbone sees in pictures with rgb in [0, 1], at every compared depth."""
+        return self.backbone.compared_features(self._normalised(pictures))
 
     def _normalised(
         self, views: Float[Tensor, "batch 3 height width"]

@@ -88,7 +88,7 @@ def paper_loss(
     Raises:
         ConfigError: a term counts that nothing is given for; none is left out unasked.
     """
-    known = torch.where(mask[:, None] > 0, picture, target)
+    known = known_picture(picture, target, mask)
     nothing = picture.new_zeros(())
     terms = {
         "lpips": nothing,
@@ -106,6 +106,15 @@ def paper_loss(
         terms["adversarial"] = generator_hinge_loss(discriminator(known))
     total = torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum()
     return PaperLoss(**terms, total=total)
+
+
+def known_picture(
+    picture: Float[Tensor, "batch 3 height width"],
+    target: Float[Tensor, "batch 3 height width"],
+    mask: Float[Tensor, "batch height width"],
+) -> Float[Tensor, "batch 3 height width"]:
+    """The picture where the target is known, the target elsewhere."""
+    return torch.where(mask[:, None] > 0, picture, target)
 
 
 def absolute_loss(
@@ -132,7 +141,7 @@ def structure_loss(
     mask: Float[Tensor, "batch height width"],
 ) -> Float[Tensor, ""]:
     """Mean of 1 - SSIM inside the mask; outside it the picture counts as equal to the target."""
-    known = torch.where(mask[:, None] > 0, picture, target)
+    known = known_picture(picture, target, mask)
     rows = zip(known.permute(0, 2, 3, 1), target.permute(0, 2, 3, 1), strict=True)
     similarity = torch.stack([ssim_map(ours, truth).mean(dim=-1) for ours, truth in rows])
     return masked_mean(1 - similarity, mask)

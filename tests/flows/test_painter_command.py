@@ -74,6 +74,16 @@ def test_seeds_may_be_listed_and_ranged():
         (["train", "--pairs", "/nowhere"], "no training pairs in /nowhere"),
         (["train", "--pairs", "/nowhere", "--start", "warp"], "expected a trained painter"),
         (["train", "--seeds", "1000", "--start", "gone.safetensors"], "no painter weights at"),
+        (
+            ["train", "--seeds", "1000", "--base", "/nowhere", "--set", "training.loss.lpips=0"],
+            "no painter '/nowhere'",
+        ),
+        (["train", "--seeds", "1000", "--base", "m", "--start", "nano"], "--base or --start"),
+        (["train", "--seeds", "1000", "--base", "m", "--inputs", "render"], "small painter"),
+        (["train", "--seeds", "1000", "--base", "m"], "the loss weighs LPIPS by 0.2"),
+        (["train", "--seeds", "1000", "--lpips-heads", "h.pth"], "are for training with --base"),
+        (["train", "--seeds", "1000", "--processes", "2"], "in one process"),
+        (["ablate", "--base", "a.safetensors", "--pairs-train", "a", "--pairs-test", "b"], "a.saf"),
         (["harvest"], "nothing to harvest"),
         (["harvest", "--scene", "toy/street", "--set", "harvest.wrong=1"], "no setting"),
         (["info", "--painter", "picasso"], "no painter 'picasso'"),
@@ -101,6 +111,14 @@ def test_pairs_of_a_street_that_judges_are_refused(make_pairs, capsys):
     folder = make_pairs("judging", [1], dataset="synthetic", sequence="street-0007")
     assert main(["painter", "train", "--pairs", folder]) == 2
     assert "street seed 7 is kept for" in capsys.readouterr().err
+
+
+def test_a_folder_without_any_pair_is_one_line(tmp_path, capsys):
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    (folder / "index.json").write_text('{"format": "lidarpainter-pair/1", "pairs": []}')
+    assert main(["painter", "train", "--pairs", str(folder)]) == 2
+    assert capsys.readouterr().err.count("no training pairs in") == 1
 
 
 def test_info_tells_parts_size_licence_and_origin(tmp_path, capsys):
@@ -230,6 +248,58 @@ def test_ablate_puts_all_variants_beside_the_rules(make_pairs):
     assert {one["total"]["num_pairs"] for one in found["painters"].values()} == {2}
     lidar_only = load_weights(Path(found["weights"]["lidar"]))
     assert lidar_only.network.config.inputs == {"lidar"}
+
+
+SMALL_ONE_STEP = [
+    "--set",
+    "training.loss.lpips=0",
+    "--set",
+    "training.loss.adversarial=0",
+    "--set",
+    "training.augmentation.crop_px=64",
+    "--set",
+    "training.accumulated_batches=1",
+    "--set",
+    "training.log_every_steps=1",
+]
+
+
+@pytest.mark.slow
+def test_a_one_step_painter_is_trained_on_a_model(make_pairs, tmp_path, own_store):
+    model = write_model(tmp_path / "small-turbo")
+    folder = make_pairs("a", range(4), height_px=64, width_px=80)
+    words = ["--base", f"{model}:fast", "--pairs", folder, "--steps", "2", "--held-back", "0.3"]
+    found = run_command("train", *words, "--out", str(tmp_path / "out"), *SMALL_ONE_STEP)
+    weights = tmp_path / "out" / "one-step.safetensors"
+    assert found["weights"] == str(weights)
+    assert Path(found["samples"]).is_file()
+    record = json.loads(weights.with_suffix(".json").read_text())
+    assert record["config"]["network"]["timestep"] == 199
+    assert own_store.tables.row("painters", found["painter_id"])["name"] == "one-step"
+    judged = run_command("evaluate", "--painter", str(weights), "--pairs", folder)
+    assert judged["pairs"]["a"]["num_judged"] == 2
+
+
+@pytest.mark.slow
+def test_ablate_trains_every_wiring_of_a_model(make_pairs, tmp_path):
+    model = write_model(tmp_path / "small-turbo")
+    learn = make_pairs("learn", range(2), height_px=64, width_px=80)
+    judge = make_pairs("judge", range(5, 6), height_px=64, width_px=80)
+    words = ["--base", str(model), "--pairs-train", learn, "--pairs-test", judge, "--steps", "1"]
+    found = run_command("ablate", *words, *SMALL_ONE_STEP)
+    assert list(found["tables"]) == [
+        "input guidance",
+        "t",
+        "step",
+        "skips",
+        "fusion",
+        "LiDAR picture",
+    ]
+    times = [label for label in found["tables"]["t"] if label.startswith("t: ")]
+    assert times == ["t: 999", "t: 200", "t: 199"]
+    for labels in found["tables"].values():
+        assert set(labels.values()) <= set(found["painters"])
+    assert set(found["weights"]) == set(found["painters"]) - {"none", "overlay", "warp"}
 
 
 @pytest.mark.slow

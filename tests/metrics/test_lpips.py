@@ -125,6 +125,13 @@ def test_a_batch_holds_the_distances_of_its_pictures():
     torch.testing.assert_close(together, alone)
 
 
+@pytest.mark.parametrize("backbone", BACKBONES, ids=lambda one: one.name)
+def test_features_have_the_channels_of_the_heads(backbone):
+    distance = Lpips(backbone.build(), random_heads(backbone))
+    seen = distance.features(torch.rand(2, 3, 64, 64))
+    assert tuple(one.shape[1] for one in seen) == distance.channels == backbone.channels
+
+
 @pytest.mark.parametrize("size", [((63, 80, 3), (63, 80, 3)), ((80, 80, 3), (80, 72, 3))])
 def test_pictures_it_cannot_compare_are_refused(size):
     distance = Lpips(SQUEEZENET.build(), random_heads(SQUEEZENET))

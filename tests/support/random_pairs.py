@@ -9,18 +9,18 @@ from lidarpainter_models.painter.protocol import PaintingConditions
 HEIGHT_PX, WIDTH_PX = 32, 48
 
 
-def random_pair(seed):
+def random_pair(seed, height_px=HEIGHT_PX, width_px=WIDTH_PX):
     """A random picture, a render of it with noise, and half of it in LiDAR and a warp."""
     generator = torch.Generator().manual_seed(seed)
 
     def draw(*shape):
         return torch.rand(*shape, generator=generator)
 
-    truth = draw(HEIGHT_PX, WIDTH_PX, 3)
-    hit, valid = draw(HEIGHT_PX, WIDTH_PX) < 0.5, draw(1, HEIGHT_PX, WIDTH_PX) < 0.5
-    everywhere = torch.ones(HEIGHT_PX, WIDTH_PX)
+    truth = draw(height_px, width_px, 3)
+    hit, valid = draw(height_px, width_px) < 0.5, draw(1, height_px, width_px) < 0.5
+    everywhere = torch.ones(height_px, width_px)
     conditions = PaintingConditions(
-        render_rgb=(truth + 0.4 * draw(HEIGHT_PX, WIDTH_PX, 3) - 0.2).clamp(0, 1),
+        render_rgb=(truth + 0.4 * draw(height_px, width_px, 3) - 0.2).clamp(0, 1),
         render_depth_m=10 * everywhere,
         render_alpha=everywhere,
         lidar_rgb=truth * hit[..., None],
@@ -32,9 +32,9 @@ def random_pair(seed):
     return PaintingPair(conditions=conditions, target_rgb=truth, target_valid=everywhere > 0)
 
 
-def write_pairs(folder, frames, dataset="pandaset", sequence="002"):
+def write_pairs(folder, frames, dataset="pandaset", sequence="002", **size_px):
     """Store a pair of each frame."""
     writer = PairWriter(folder)
     for frame in frames:
         provenance = {"dataset": dataset, "sequence": sequence, "target": [frame, "front"]}
-        writer.add(f"pair-{frame}", random_pair(frame), provenance)
+        writer.add(f"pair-{frame}", random_pair(frame, **size_px), provenance)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from killer import Killer
 from random_pairs import write_pairs
 
 from catalog.store import open_store
@@ -48,23 +49,6 @@ def store(tmp_path):
 def weights_of(result):
     network = load_weights(weights_path(result.ref)).network
     return torch.cat([parameter.flatten() for parameter in network.parameters()])
-
-
-class Killer:
-    """Ends the process, as seen from inside, when a stage is half done."""
-
-    def started(self, stage):
-        pass
-
-    def advanced(self, _stage, done, total, _note):
-        if done >= 0.5 * total:
-            raise KeyboardInterrupt
-
-    def waiting(self, stage, process_id):
-        pass
-
-    def finished(self, stage, seconds, *, is_new):
-        pass
 
 
 def test_training_is_done_once_and_says_what_it_saw(pairs, store):

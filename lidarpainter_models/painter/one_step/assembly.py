@@ -93,6 +93,15 @@ def trained_names(network: OneStepNetwork) -> list[str]:
     ]
 
 
+def trained_in_float32(network: OneStepNetwork) -> dict[str, nn.Parameter]:
+    """The weights that training changes, widened in place: small steps vanish in bfloat16."""
+    parameters = dict(network.named_parameters())
+    trained = {name: parameters[name] for name in trained_names(network)}
+    for parameter in trained.values():
+        parameter.data = parameter.data.float()
+    return trained
+
+
 def random_network(
     config: OneStepConfig,
     *,

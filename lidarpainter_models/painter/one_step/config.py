@@ -10,7 +10,8 @@ from lidarpainter_models.painter.one_step.schedule import Denoise, denoising_ste
 
 INPUTS = ("render", "lidar", "warp")
 """What can enter as a latent, in this order: the corrupted render, the LiDAR picture, and the
-recorded pictures carried into the view (the first valid one, the render where none is)."""
+recorded pictures carried into the view (the first valid one; where none is, the render, or black
+if the render is not to be seen)."""
 NUM_MASKS = 2
 """Share of LiDAR hits and of valid warps in each latent cell."""
 

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lidarpainter_models.painter.one_step.latent_fusion import LATENT_CHANNELS
+from lidarpainter_models.painter.one_step.latent_fusion import LATENT_CHANNELS, without_autocast
 
 FirstLayerStart = Literal["zero", "copy"]
 
@@ -26,10 +26,7 @@ class Float32Layer(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Run the layer on its input in float32."""
-        device = features.device.type
-        if not torch.amp.is_autocast_available(device):  # the meta device
-            return self.layer(features.float())
-        with torch.autocast(device, enabled=False):
+        with without_autocast(features.device):
             return self.layer(features.float())
 
 

@@ -5,8 +5,9 @@ Given more inputs than two, a softmax takes the place of the sigmoid. At first t
 right nearly everywhere, has a share of 0.92 of two inputs and 0.86 of three.
 """
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -39,7 +40,7 @@ class FusionConfig:
 
 
 class LatentFusion(nn.Module):
-    """Weighs two or more latents against each other, in float32."""
+    """Weighs two or more latents against each other, in float32, under autocast too."""
 
     def __init__(self, config: FusionConfig, num_inputs: int) -> None:
         super().__init__()
@@ -69,7 +70,8 @@ class LatentFusion(nn.Module):
     ) -> Float[Tensor, "inputs batch weights height width"]:
         """Shares of the inputs, summing to one."""
         stacked = latents.float().transpose(0, 1).flatten(1, 2)
-        logits = self.layers(stacked)
+        with without_autocast(stacked.device):
+            logits = self.layers(stacked)
         if self.num_inputs == 2:
             share = torch.sigmoid(logits)
             return torch.stack([share, 1 - share])
@@ -82,3 +84,10 @@ def mix(
 ) -> Float[Tensor, "batch channels height width"]:
     """The weighted sum over the inputs."""
     return (weights * pictures).sum(dim=0)
+
+
+def without_autocast(device: torch.device) -> AbstractContextManager[Any]:
+    """Layers run inside compute in the type of their weights."""
+    if not torch.amp.is_autocast_available(device.type):  # the meta device
+        return nullcontext()
+    return torch.autocast(device.type, enabled=False)

@@ -6,15 +6,20 @@ model itself; where that folder has moved, one of the same name beside the file 
 """
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from lidarpainter_models.errors import WeightsError
+from lidarpainter_models.errors import ConfigError, WeightsError
 from lidarpainter_models.painter.one_step.architectures import TEXT_TOKENS
-from lidarpainter_models.painter.one_step.assembly import assemble, made_lean
+from lidarpainter_models.painter.one_step.assembly import (
+    assemble,
+    made_lean,
+    trained_in_float32,
+)
 from lidarpainter_models.painter.one_step.base_models import (
     SD_TURBO,
     BaseModel,
@@ -24,6 +29,8 @@ from lidarpainter_models.painter.one_step.base_models import (
     model_files,
     open_base,
 )
+from lidarpainter_models.painter.one_step.config import OneStepConfig
+from lidarpainter_models.painter.one_step.network import OneStepNetwork
 from lidarpainter_models.painter.one_step.painter import OneStepPainter
 from lidarpainter_models.painter.one_step.presets import PRESETS, preset_named
 from lidarpainter_models.painter.one_step.prompts import PromptBook
@@ -91,6 +98,67 @@ def load_trained(
     return OneStepPainter(network, prompts, file.provenance | origin)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trainable:
+    """A network with its adapters, ready to be trained, and what its weights file has to say."""
+
+    network: OneStepNetwork
+    texts: dict[str, torch.Tensor]
+    """The encoded prompts."""
+    base: str
+    mark: list[float]
+    licence: str
+    """Of the model."""
+    provenance: dict[str, Any]
+    """Of the weights that the training goes on from; empty for a model."""
+
+
+def load_trainable(
+    name: str,
+    config: OneStepConfig,
+    *,
+    prompts: Sequence[str],
+    dtype: torch.dtype,
+    seed: int = 0,
+) -> Trainable:
+    """A network to train, on the CPU.
+
+    Args:
+        name: a model, or a weights file of ours to go on from.
+        config: the wiring; a weights file must have the same.
+        prompts: what it will be trained for.
+        dtype: of the weights that stay as they are; the others are float32.
+        seed: of the adapters and the fusion, where they are new.
+
+    Raises:
+        WeightsError: model or weights are missing, damaged, or do not belong together.
+        ConfigError: a weights file of another wiring.
+        MissingPackageError: the extra `diffusion` is not installed.
+    """
+    file = read_trained(Path(name)) if name.endswith(SUFFIX) else None
+    if file is not None and file.config != config:
+        raise ConfigError(
+            f"{name} is wired otherwise than the training: leave its network as it is"
+        )
+    base = open_base(split_preset(name)[0]) if file is None else _base_of(file)
+    book = _open_prompts(base, {} if file is None else file.prompts)
+    texts = {prompt: book.encode(prompt) for prompt in prompts}
+    parts = load_parts(base, config, dtype=dtype)
+    network = assemble(config, parts.unet, parts.autoencoder, has_adapters=True, seed=seed)
+    trained_in_float32(network)
+    if file is not None:
+        check_mark(file, parts)
+        apply_trained(network, file)
+    return Trainable(
+        network=network,
+        texts=texts,
+        base=base.name,
+        mark=parts.mark,
+        licence=base.licence,
+        provenance={} if file is None else file.provenance | {"licence": file.licence},
+    )
+
+
 def is_model_name(name: str) -> bool:
     """Whether a name may stand for a model: `sd-turbo`, a folder, an id of the hub."""
     model, _ = split_preset(name)
@@ -105,7 +173,7 @@ def painter_files(name: str) -> list[Path]:
     """
     if name.endswith(SUFFIX):
         file = read_trained(Path(name))
-        base = _base_of(file, may_download=False)
+        base = _base_of(file)
         return [file.path, *model_files(base, file.config.autoencoder)]
     model, preset = split_preset(name)
     return model_files(open_base(model), preset_named(preset).autoencoder)
@@ -133,7 +201,7 @@ def check_mark(file: TrainedFile, parts: BaseParts) -> None:
         )
 
 
-def _base_of(file: TrainedFile, *, may_download: bool) -> BaseModel:
+def _base_of(file: TrainedFile, *, may_download: bool = False) -> BaseModel:
     beside = file.path.parent / Path(file.base).name
     moved = not Path(file.base).is_dir() and beside.is_dir()
     try:

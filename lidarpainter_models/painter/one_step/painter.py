@@ -91,7 +91,7 @@ def painter_inputs(
     found = {
         "render": batch.render,
         "lidar": _lidar_picture(batch, config),
-        "warp": _first_valid_warp(batch),
+        "warp": _first_valid_warp(batch, batch.render if "render" in config.inputs else None),
     }
     pictures = torch.stack([_padded(found[name]) for name in config.inputs])
     if not config.masks:
@@ -127,9 +127,11 @@ def _lidar_picture(
     return torch.where(is_bright, batch.lidar, batch.render)
 
 
-def _first_valid_warp(batch: ConditionBatch) -> Float[Tensor, "batch 3 height width"]:
-    """The best recorded picture that is valid in each pixel, the render where none is."""
-    picture = batch.render
+def _first_valid_warp(
+    batch: ConditionBatch, elsewhere: Float[Tensor, "batch 3 height width"] | None
+) -> Float[Tensor, "batch 3 height width"]:
+    """The best recorded picture that is valid in each pixel; black by default where none is."""
+    picture = torch.zeros_like(batch.render) if elsewhere is None else elsewhere
     for source in reversed(range(batch.warp.shape[1])):
         is_valid = batch.warp_valid[:, source, None] > 0
         picture = torch.where(is_valid, batch.warp[:, source], picture)

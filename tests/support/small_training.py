@@ -1,0 +1,79 @@
+"""A short training of a small one-step network that processes of their own can run."""
+
+import os
+from dataclasses import replace
+
+import torch
+from quiet_augmentation import QUIET
+from tiny_diffusion import TEXT_WIDTH, TINY
+
+from lidarpainter_models.conditioning.pairs import PairFolder
+from lidarpainter_models.painter.adversarial import DiscriminatorConfig
+from lidarpainter_models.painter.losses import PaperLossWeights
+from lidarpainter_models.painter.one_step.assembly import random_network
+from lidarpainter_models.painter.one_step.training import (
+    OneStepTrainee,
+    OneStepTrainingConfig,
+    train_one_step,
+)
+from lidarpainter_models.painter.training.loop import ALONE
+from lidarpainter_models.painter.training.processes import AcceleratedProcesses
+
+CONTEST = OneStepTrainingConfig(
+    augmentation=replace(QUIET, crop_px=64),
+    loss=PaperLossWeights(lpips=0, adversarial=0.1),
+    discriminator=DiscriminatorConfig(width=4, num_scales=1),
+    penalty_every_steps=2,
+    recomputes=False,
+    half_precision=False,
+    steps=4,
+    accumulated_batches=1,
+    learning_rate=1e-3,
+    warm_up_steps=1,
+    average_decay=0.5,
+    log_every_steps=1,
+    checkpoint_every_s=0.0,
+)
+
+
+def small_trainee(config):
+    """A small network before its training."""
+    network = random_network(
+        config.network, architecture=TINY, dtype=torch.float32, has_adapters=True
+    )
+    text = torch.randn(77, TEXT_WIDTH, generator=torch.Generator().manual_seed(0))
+    return OneStepTrainee(network, {"clear": text}, config)
+
+
+def untrained_weights(config):
+    """What training starts from, by name."""
+    return {name: one.detach().clone() for name, one in small_trainee(config).trained.items()}
+
+
+def train_small(pairs, config, checkpoints=None, processes=ALONE):
+    """Train on a folder of pairs; returns the weights by name and the record."""
+    torch.set_num_threads(1)
+    trainee = small_trainee(config)
+    record = train_one_step(
+        trainee, [PairFolder(pairs)], checkpoint_folder=checkpoints, processes=processes
+    )
+    return {name: one.detach().clone() for name, one in trainee.trained.items()}, record
+
+
+def train_as_one_of_two(index, port, pairs, config, out):
+    """Train together with another process; writes the weights and the record."""
+    os.environ |= {
+        "RANK": str(index),
+        "LOCAL_RANK": str(index),
+        "WORLD_SIZE": "2",
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": str(port),
+        "ACCELERATE_USE_CPU": "true",
+    }
+    from accelerate import Accelerator
+
+    processes = AcceleratedProcesses(Accelerator(cpu=True))
+    weights, record = train_small(pairs, config, out, processes)
+    torch.save({"weights": weights, "history": record["history"]}, out / f"trained-{index}.pt")
+    processes.meet()
+    torch.distributed.destroy_process_group()
