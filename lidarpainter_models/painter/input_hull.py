@@ -4,10 +4,10 @@ A painter that mixes what is known has no reason to show a colour that none of i
 nearby; one that does has invented it.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 from jaxtyping import Float
 from torch import Tensor
 
@@ -28,17 +28,37 @@ class InputHull(NamedTuple):
 
 def input_hull(conditions: PaintingConditions, *, margin: float = HULL_MARGIN) -> InputHull:
     """The hull of render, LiDAR hits and valid warps around every pixel."""
-    shown = torch.stack([conditions.render_rgb, conditions.lidar_rgb, *conditions.warp_rgb])
-    everywhere = torch.ones_like(conditions.lidar_hit)
-    exists = torch.stack([everywhere, conditions.lidar_hit, *conditions.warp_valid])[..., None]
-    upper = _largest_nearby(torch.where(exists, shown, -torch.inf).amax(dim=0))
-    lower = -_largest_nearby(torch.where(exists, -shown, -torch.inf).amax(dim=0))
-    return InputHull(lower=lower - margin, upper=upper + margin)
+    lower = upper = conditions.render_rgb
+    shown = [conditions.lidar_rgb, *conditions.warp_rgb]
+    exists = [conditions.lidar_hit, *conditions.warp_valid]
+    for rgb, known in zip(shown, exists, strict=True):
+        # what does not exist neither widens nor narrows what the render shows
+        rgb_or_render = torch.where(known[..., None], rgb, conditions.render_rgb)
+        lower, upper = torch.minimum(lower, rgb_or_render), torch.maximum(upper, rgb_or_render)
+    return InputHull(
+        lower=_most_nearby(lower, torch.minimum, torch.inf) - margin,
+        upper=_most_nearby(upper, torch.maximum, -torch.inf) + margin,
+    )
 
 
-def _largest_nearby(values: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 3"]:
-    reach = HULL_SIDE_PX // 2
-    planes = values.permute(2, 0, 1)[None]
-    rows = F.max_pool2d(planes, (1, HULL_SIDE_PX), stride=1, padding=(0, reach))
-    both = F.max_pool2d(rows, (HULL_SIDE_PX, 1), stride=1, padding=(reach, 0))
-    return both[0].permute(1, 2, 0)
+def _most_nearby(
+    values: Float[Tensor, "height width 3"],
+    choose: Callable[[Tensor, Tensor], Tensor],
+    beyond: float,
+) -> Float[Tensor, "height width 3"]:
+    """The least or largest value in the square around every pixel, one direction at a time.
+
+    Runs of 1, 2, 4, 8 pixels are compared with themselves a run further on, then the longest with
+    itself at the end of the side: fewer and simpler passes than a pooling with windows.
+    """
+    for dim in (0, 1):
+        rim = torch.full_like(values.narrow(dim, 0, 1), beyond)
+        rim = rim.expand(*(HULL_SIDE_PX // 2 if d == dim else -1 for d in range(3)))
+        run, run_px = torch.cat([rim, values, rim], dim=dim), 1
+        while run_px < HULL_SIDE_PX:
+            step_px = min(run_px, HULL_SIDE_PX - run_px)
+            left = run.shape[dim] - step_px
+            run = choose(run.narrow(dim, 0, left), run.narrow(dim, step_px, left))
+            run_px += step_px
+        values = run
+    return values

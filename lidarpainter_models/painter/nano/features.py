@@ -23,9 +23,9 @@ def count_features(inputs: frozenset[str], num_sources: int) -> int:
 
 
 def painting_features(
-    conditions: ConditionBatch, inputs: frozenset[str]
+    conditions: ConditionBatch, inputs: frozenset[str], precision: torch.dtype = torch.float32
 ) -> tuple[Float[Tensor, "batch features height width"], Float[Tensor, "batch 3 height width"]]:
-    """The network's input channels, and the filled LiDAR picture they contain."""
+    """The network's input channels in a precision, and the filled LiDAR picture they contain."""
     channels: list[Tensor] = []
     lidar_filled = torch.zeros_like(conditions.lidar)
     if "render" in inputs:
@@ -41,7 +41,7 @@ def painting_features(
     if {"render", "lidar"} <= inputs:
         gap = _difference(conditions.render, conditions.lidar)
         channels.append(gap * conditions.lidar_hit)
-    return torch.cat(channels, dim=1), lidar_filled
+    return torch.cat([channel.to(precision) for channel in channels], dim=1), lidar_filled
 
 
 def _warp_features(conditions: ConditionBatch) -> list[Tensor]:

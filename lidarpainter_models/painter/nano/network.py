@@ -222,24 +222,24 @@ class NanoNetwork(nn.Module):
         Raises:
             ConfigError: the network was not trained for a prompt.
         """
-        features, lidar_filled = painting_features(conditions, self.config.inputs)
+        # halves what is moved until the first convolution, which would round to it anyway
+        precision = torch.bfloat16 if half_precision else torch.float32
+        features, lidar_filled = painting_features(conditions, self.config.inputs, precision)
         candidates = build_candidates(conditions, self.config.inputs, lidar_filled)
         rows = torch.tensor([self.prompt_index(prompt) for prompt in prompts]).to(features.device)
         embedding, style = self.prompt(rows), self._style(rows)
         if style is not None:
             candidates = with_flat_colour(candidates, TINT, style.colour.sigmoid(), rows > 0)
         with torch.autocast(features.device.type, torch.bfloat16, enabled=half_precision):
-            head = self._head(features, embedding, style).float()
+            head = self._head(features, embedding, style)
         num_candidates = len(candidates.names)
         logits = head[:, :num_candidates]
         if style is not None:
             logits = logits + style.logits[..., None, None]
-        logits = logits.masked_fill(candidates.exists == 0, -torch.inf)
-        weights = torch.softmax(logits, dim=1)
-        mixed = (weights[:, :, None] * candidates.pictures).sum(dim=1)
+        weights = torch.softmax(candidates.allowed(logits), dim=1)
         residual = torch.tanh(head[:, num_candidates : num_candidates + 3])
         return NanoOutput(
-            rgb=mixed + self.config.residual_limit * residual,
+            rgb=candidates.mixed(weights) + self.config.residual_limit * residual,
             base=candidates.base_picture,
             log_error=head[:, -1].clamp(-8, 1),
             weights=weights,
@@ -263,10 +263,8 @@ class NanoNetwork(nn.Module):
         height_px, width_px = features.shape[2:]
         step_px = CELL_PX * 4
         padding = (0, -width_px % step_px, 0, -height_px % step_px)
-        if torch.is_autocast_enabled(features.device.type):
-            features = features.bfloat16()  # halves what the next two lines move
         padded = F.pad(features, padding, mode="replicate") if any(padding) else features
-        fine = self.encode_fine(self.stem(F.pixel_unshuffle(padded, CELL_PX)))
+        fine = self.encode_fine(self._stemmed(padded))
         middle = self.encode_middle(self.down_middle(fine))
         coarse = self.down_coarse(middle) + embedding[..., None, None]
         coarse = self.encode_coarse(coarse)
@@ -276,7 +274,26 @@ class NanoNetwork(nn.Module):
         if style is not None:
             last = last * (1 + style.gain[..., None, None]) + style.shift[..., None, None]
         outputs = F.pixel_shuffle(self.head(F.silu(last)), CELL_PX)
-        return outputs[..., :height_px, :width_px]
+        # planes that lie together: what follows works on one output at a time
+        inside = outputs[..., :height_px, :width_px]
+        return inside.to(torch.float32, memory_format=torch.contiguous_format)
+
+    def _stemmed(
+        self, features: Float[Tensor, "batch features height width"]
+    ) -> Float[Tensor, "batch channels rows columns"]:
+        """The first convolution, over cells of pixels.
+
+        It equals `stem(pixel_unshuffle(features))`, but with the channels of a pixel side by side
+        on the way, so that whole rows of a cell are copied instead of single numbers.
+        """
+        size, channels, height_px, width_px = features.shape
+        rows, columns = height_px // CELL_PX, width_px // CELL_PX
+        pixels = features.permute(0, 2, 3, 1).contiguous()
+        places = pixels.view(size, rows, CELL_PX, columns, CELL_PX, channels).transpose(2, 3)
+        cells = places.reshape(size, rows, columns, -1).permute(0, 3, 1, 2)
+        by_feature = self.stem.weight.unflatten(1, (channels, CELL_PX**2))
+        weight = by_feature.transpose(1, 2).flatten(1, 2)
+        return F.conv2d(cells, weight, self.stem.bias, padding=1)
 
 
 def _blocks(width: int, number: int, config: NanoConfig) -> nn.Sequential:
