@@ -1,10 +1,10 @@
 """From scenes to a trained painter: harvest pairs, train, judge on pairs held back, publish.
 
-The ablation trains painters that see only some of the inputs, on the same pairs at the same
-budget, and judges all of them on the same other pairs.
+The ablation trains painters that see only some of the inputs or lack a part, on the same pairs at
+the same budget, and judges all of them on the same other pairs.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,8 @@ from lidarpainter_models.evaluation.held_back import (
     check_training_scene,
 )
 from lidarpainter_models.painter import OverlayPainter, UnpaintedPainter, WarpPainter
+from lidarpainter_models.painter.nano.ablations import REFERENCE, TABLE_NAMES, ablation_tables
+from lidarpainter_models.painter.nano.network import NanoConfig
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.scenes.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
 from tasks.harvest import (
@@ -38,6 +40,7 @@ from tasks.judge_painter import (
     judge_held_back,
     judge_painters,
     load_painting_scores,
+    open_sets,
 )
 from tasks.scenes import SplitSpec
 from tasks.stages import StageResult
@@ -51,14 +54,6 @@ from tasks.train_painter import (
 
 SYNTHETIC = "synthetic/"
 UNLEARNED = (UnpaintedPainter.name, OverlayPainter.name, WarpPainter.name)
-ABLATED_INPUTS = (
-    ("render",),
-    ("lidar",),
-    ("render", "lidar"),
-    ("render", "warp"),
-    ("render", "lidar", "warp"),
-)
-"""What the painters of an ablation may see: the paper's three rows, and what the warp adds."""
 
 
 class HarvestParameters(BaseModel):
@@ -97,12 +92,14 @@ class TrainPainterParameters(HarvestParameters):
 
 
 class AblationParameters(BaseModel):
-    """Painters with fewer inputs, trained alike and judged alike."""
+    """Painters with fewer inputs or parts, trained alike and judged alike."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     train_folders: tuple[Path, ...]
     test_folders: tuple[Path, ...]
+    tables: tuple[str, ...] = TABLE_NAMES
+    """Which comparisons are made; see `nano.ablations`."""
     training: NanoTrainingConfig = NanoTrainingConfig()
     feature_weights: Path | None = None
 
@@ -143,13 +140,12 @@ def train_painter(parameters: TrainPainterParameters, store_path: Path) -> dict[
 
 @flow(name="ablate_painter")
 def ablate_painter(parameters: AblationParameters, store_path: Path) -> dict[str, Any]:
-    """Train one painter per set of inputs and judge them beside those that learn nothing."""
+    """Train every variant once and judge it beside the painters that learn nothing."""
     learnt = named_sets(parameters.train_folders)
     painters = {name: name for name in UNLEARNED}
     costs = {}
-    for inputs in ABLATED_INPUTS:
-        label = "+".join(inputs)
-        network = replace(parameters.training.network, inputs=frozenset(inputs))
+    tables = ablation_tables(parameters.training.network, parameters.tables)
+    for label, network in _variants(tables).items():
         config = replace(parameters.training, network=network)
         trained = train(store_path, f"train {label}", learnt, config, 0.0)
         painters[label] = str(weights_path(trained.ref))
@@ -157,7 +153,36 @@ def ablate_painter(parameters: AblationParameters, store_path: Path) -> dict[str
     judged = judge_painters(
         painters, named_sets(parameters.test_folders), parameters.feature_weights
     )
-    return {**judged, "weights": {label: painters[label] for label in costs}, "training": costs}
+    return {
+        **judged,
+        "tables": {name: list(variants) for name, variants in tables.items()},
+        "weights": {label: painters[label] for label in costs},
+        "training": costs,
+    }
+
+
+def check_ablation(parameters: AblationParameters) -> None:
+    """Find what is missing before an hour of training.
+
+    Raises:
+        ConfigError: no such table, or pairs without the reference picture that a variant is shown.
+        DataError: a folder holds no pairs.
+    """
+    tables = ablation_tables(parameters.training.network, parameters.tables)
+    shown = [name for name, network in _variants(tables).items() if REFERENCE in network.inputs]
+    for folders in (parameters.train_folders, parameters.test_folders):
+        for name, folder in open_sets(named_sets(folders)).items():
+            bare = folder.first_without("reference_rgb") if shown else None
+            if bare is not None:
+                raise ConfigError(
+                    f"pairs {name!r}: {bare} holds no nearest recorded picture, which "
+                    f"{shown[0]} is shown: harvest it again, or choose another --table than inputs"
+                )
+
+
+def _variants(tables: Mapping[str, Mapping[str, NanoConfig]]) -> dict[str, NanoConfig]:
+    """The painters of all tables, each once."""
+    return {label: network for table in tables.values() for label, network in table.items()}
 
 
 def check_sources(parameters: TrainPainterParameters) -> None:

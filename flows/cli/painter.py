@@ -185,25 +185,32 @@ def info(
 
 
 @app.command("ablate")
-def ablate(
+def ablate(  # noqa: PLR0913 - the options of a command
     pairs_train: Annotated[
         list[str], typer.Option(help="A folder of pairs to learn from. May be repeated.")
     ],
     pairs_test: Annotated[
         list[str], typer.Option(help="A folder of pairs to judge by. May be repeated.")
     ],
+    tables: Annotated[
+        str | None,
+        typer.Option("--table", help="inputs, fusion, lidar, skips, with commas between; all."),
+    ] = None,
     budget: Budget = None,
     steps: Steps = None,
     feature_weights: Features = None,
     settings: Settings = None,
     as_json: AsJson = False,
 ) -> None:
-    """Train painters that see only some of the inputs, and judge all of them alike."""
+    """Train painters that see only some of the inputs or lack a part, and judge all alike."""
+    from flows.cli.ingest import parse_names
     from flows.cli.training import ablation_parameters, run_ablation
     from flows.overrides import with_overrides
 
     parameters = ablation_parameters(
-        parse_paths(pairs_train, "--pairs-train"), parse_paths(pairs_test, "--pairs-test")
+        parse_paths(pairs_train, "--pairs-train"),
+        parse_paths(pairs_test, "--pairs-test"),
+        parse_names(tables),
     )
     training = parameters.training
     training = with_length(training, training.network.inputs, budget, steps)
@@ -213,7 +220,10 @@ def ablate(
     if as_json:
         print_json(result)
     else:
-        _show_scores(result)
+        for name, labels in result["tables"].items():
+            rules = [label for label in result["painters"] if label not in result["weights"]]
+            chosen = {label: result["painters"][label] for label in (*rules, *labels)}
+            _show_scores(result | {"painters": chosen}, f"{name}: ")
 
 
 app.command("benchmark")(painter_costs.benchmark)
@@ -244,7 +254,7 @@ def _show_training(result: dict[str, Any]) -> None:
     print_pairs("painter", pairs)
 
 
-def _show_scores(found: dict[str, Any]) -> None:
+def _show_scores(found: dict[str, Any], title: str = "") -> None:
     from tasks.judge_painter import PAINTING_COLUMNS, PAINTING_NOTE, painting_rows
 
     judged = {name: counts for name, counts in found["pairs"].items() if counts["num_judged"]}
@@ -253,7 +263,7 @@ def _show_scores(found: dict[str, Any]) -> None:
         count = sum(one["num_judged"] for name, one in judged.items() if source in (None, name))
         rows = painting_rows(found["painters"], source)
         note = PAINTING_NOTE if source is None else ""
-        print_table(f"{source or 'all'}: {count} pairs", PAINTING_COLUMNS, rows, note)
+        print_table(f"{title}{source or 'all'}: {count} pairs", PAINTING_COLUMNS, rows, note)
     for name, counts in found["pairs"].items():
         if counts["num_left_out"]:
             typer.echo(f"{name}: {counts['num_left_out']} pairs left out, a painter knows them")

@@ -13,13 +13,15 @@ from flows.train_painter import (
     HarvestParameters,
     TrainPainterParameters,
     ablate_painter,
+    check_ablation,
     check_sources,
     harvest_pairs,
     named_sets,
     train_painter,
 )
 from lidarpainter_models.errors import ConfigError
-from tasks.judge_painter import judge_painters, open_sets
+from lidarpainter_models.painter.nano.ablations import TABLE_NAMES
+from tasks.judge_painter import judge_painters
 
 PREFECT_LOG = Path("logs") / "prefect.log"
 
@@ -70,10 +72,14 @@ def train_parameters(
 
 
 def ablation_parameters(
-    train_folders: tuple[Path, ...], test_folders: tuple[Path, ...]
+    train_folders: tuple[Path, ...],
+    test_folders: tuple[Path, ...],
+    tables: tuple[str, ...] | None = None,
 ) -> AblationParameters:
-    """What to learn from and what to judge by."""
-    return AblationParameters(train_folders=train_folders, test_folders=test_folders)
+    """What to learn from, what to judge by, and which tables are wanted; None makes all."""
+    return AblationParameters(
+        train_folders=train_folders, test_folders=test_folders, tables=tables or TABLE_NAMES
+    )
 
 
 def run_harvest(parameters: HarvestParameters) -> dict[str, Any]:
@@ -92,8 +98,7 @@ def run_training(parameters: TrainPainterParameters) -> dict[str, Any]:
 
 def run_ablation(parameters: AblationParameters) -> dict[str, Any]:
     """Train and judge every variant."""
-    for folders in (parameters.train_folders, parameters.test_folders):
-        open_sets(named_sets(folders))  # what is missing is told before an hour of training
+    check_ablation(parameters)
     store = open_store()
     with prefect_server(store.root / PREFECT_LOG), shown_progress():
         return ablate_painter(parameters, store.root)

@@ -4,17 +4,19 @@ A painter that mixes what is known has no reason to show a colour that none of i
 nearby; one that does has invented it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Set
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarpainter_models.painter.protocol import PaintingConditions
 
 HULL_SIDE_PX = 9
 """Side of the square that counts as nearby."""
+ALL_INPUTS = frozenset({"render", "lidar", "warp"})
+"""What stands in the view itself; the nearest recorded picture does not."""
 HULL_MARGIN = 0.05
 """Of rgb, beyond which a colour counts as outside."""
 
@@ -26,12 +28,21 @@ class InputHull(NamedTuple):
     upper: Float[Tensor, "height width 3"]
 
 
-def input_hull(conditions: PaintingConditions, *, margin: float = HULL_MARGIN) -> InputHull:
-    """The hull of render, LiDAR hits and valid warps around every pixel."""
+def input_hull(
+    conditions: PaintingConditions,
+    *,
+    inputs: Set[str] = ALL_INPUTS,
+    margin: float = HULL_MARGIN,
+) -> InputHull:
+    """The hull of render, LiDAR hits and valid warps around every pixel.
+
+    Args:
+        conditions: what is known about a view.
+        inputs: those that count beside the render, of `lidar`, `warp` and `reference`.
+        margin: added on both sides.
+    """
     lower = upper = conditions.render_rgb
-    shown = [conditions.lidar_rgb, *conditions.warp_rgb]
-    exists = [conditions.lidar_hit, *conditions.warp_valid]
-    for rgb, known in zip(shown, exists, strict=True):
+    for rgb, known in _shown_beside_the_render(conditions, inputs):
         # what does not exist neither widens nor narrows what the render shows
         rgb_or_render = torch.where(known[..., None], rgb, conditions.render_rgb)
         lower, upper = torch.minimum(lower, rgb_or_render), torch.maximum(upper, rgb_or_render)
@@ -39,6 +50,18 @@ def input_hull(conditions: PaintingConditions, *, margin: float = HULL_MARGIN) -
         lower=_most_nearby(lower, torch.minimum, torch.inf) - margin,
         upper=_most_nearby(upper, torch.maximum, -torch.inf) + margin,
     )
+
+
+def _shown_beside_the_render(
+    conditions: PaintingConditions, inputs: Set[str]
+) -> Iterator[tuple[Float[Tensor, "height width 3"], Bool[Tensor, "height width"]]]:
+    """Pictures and where they exist."""
+    if "lidar" in inputs:
+        yield conditions.lidar_rgb, conditions.lidar_hit
+    if "warp" in inputs:
+        yield from zip(conditions.warp_rgb, conditions.warp_valid, strict=True)
+    if "reference" in inputs and conditions.reference_rgb is not None:
+        yield conditions.reference_rgb, torch.ones_like(conditions.lidar_hit)
 
 
 def _most_nearby(

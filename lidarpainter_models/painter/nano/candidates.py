@@ -16,6 +16,8 @@ from lidarpainter_models.painter.batches import ConditionBatch
 from lidarpainter_models.painter.filters import blur, masked_blur
 
 PAINTING_INPUTS = frozenset({"render", "lidar", "warp"})
+KNOWN_INPUTS = PAINTING_INPUTS | {"reference"}
+"""The nearest recorded picture, not carried into the view, serves comparisons alone."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,8 +62,8 @@ def check_inputs(inputs: Iterable[str]) -> frozenset[str]:
         ConfigError: an unknown input, or warps without the render that fills their gaps.
     """
     chosen = frozenset(inputs)
-    if chosen - PAINTING_INPUTS:
-        raise ConfigError(f"inputs must be of {sorted(PAINTING_INPUTS)}, got {sorted(chosen)}")
+    if chosen - KNOWN_INPUTS:
+        raise ConfigError(f"inputs must be of {sorted(KNOWN_INPUTS)}, got {sorted(chosen)}")
     if not chosen & {"render", "lidar"} or ("warp" in chosen and "render" not in chosen):
         raise ConfigError(
             f"inputs need the render or the LiDAR, and warps the render, got {sorted(chosen)}"
@@ -79,6 +81,8 @@ def candidate_names(inputs: frozenset[str], num_sources: int) -> tuple[str, ...]
     if "warp" in inputs:
         names += [f"warp_{source + 1}" for source in range(num_sources)]
         names += ["mean", "warp_1_blurred"]
+    if "reference" in inputs:
+        names.append("reference")
     return tuple(names)
 
 
@@ -115,11 +119,27 @@ def build_candidates(
         )
         made["warp_1_blurred"] = masked_blur(conditions.warp[:, 0], conditions.warp_valid[:, :1])
         exists["warp_1_blurred"] = conditions.warp_valid[:, 0]
+    if "reference" in inputs:
+        made["reference"] = given_reference(conditions)
     base = base_candidate(inputs)
     exists.pop(base, None)
     names = candidate_names(inputs, num_sources)
     pictures = tuple(made[name] for name in names)
     return Candidates(names=names, pictures=pictures, exists=exists, base=base)
+
+
+def given_reference(conditions: ConditionBatch) -> Float[Tensor, "batch 3 height width"]:
+    """The nearest recorded pictures.
+
+    Raises:
+        ConfigError: not all views have one.
+    """
+    if conditions.reference is None:
+        raise ConfigError(
+            "this painter sees the nearest recorded picture, and a view has none: pairs harvested "
+            "before it was gathered lack it"
+        )
+    return conditions.reference
 
 
 def with_flat_colour(

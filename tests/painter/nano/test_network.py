@@ -12,6 +12,7 @@ from lidarpainter_models.painter.batches import stack_conditions
 from lidarpainter_models.painter.filters import blur, fill_push_pull, masked_blur
 from lidarpainter_models.painter.input_hull import HULL_MARGIN, input_hull
 from lidarpainter_models.painter.nano.candidates import build_candidates, candidate_names
+from lidarpainter_models.painter.nano.features import painting_features
 from lidarpainter_models.painter.nano.network import CELL_PX, NanoConfig, NanoNetwork, PixelNorm
 from lidarpainter_models.painter.nano.painter import NanoPainter
 
@@ -64,11 +65,13 @@ def test_what_does_not_exist_is_never_chosen(make_conditions):
 @pytest.mark.parametrize(
     ("inputs", "blind_to"),
     [
-        ({"render"}, {"lidar_rgb", "warp_rgb"}),
-        ({"lidar"}, {"render_rgb", "warp_rgb"}),
-        ({"render", "lidar"}, {"warp_rgb"}),
-        ({"render", "warp"}, {"lidar_rgb"}),
-        ({"render", "lidar", "warp"}, set()),
+        ({"render"}, {"lidar_rgb", "warp_rgb", "reference_rgb"}),
+        ({"lidar"}, {"render_rgb", "warp_rgb", "reference_rgb"}),
+        ({"render", "lidar"}, {"warp_rgb", "reference_rgb"}),
+        ({"render", "warp"}, {"lidar_rgb", "reference_rgb"}),
+        ({"render", "lidar", "warp"}, {"reference_rgb"}),
+        ({"render", "lidar", "reference"}, {"warp_rgb"}),
+        ({"lidar", "reference"}, {"render_rgb", "warp_rgb"}),
     ],
 )
 def test_ablated_network_ignores_what_it_may_not_see(inputs, blind_to, make_conditions):
@@ -76,7 +79,7 @@ def test_ablated_network_ignores_what_it_may_not_see(inputs, blind_to, make_cond
     painter = NanoPainter(network)
     conditions, other = make_conditions(seed=1), make_conditions(seed=2)
     before = painter.paint(conditions)
-    for name in ("render_rgb", "lidar_rgb", "warp_rgb"):
+    for name in ("render_rgb", "lidar_rgb", "warp_rgb", "reference_rgb"):
         changed = painter.paint(replace(conditions, **{name: getattr(other, name)}))
         is_same = torch.equal(changed.rgb, before.rgb)
         assert is_same == (name in blind_to), name
@@ -118,6 +121,47 @@ def test_residual_is_bounded(make_conditions):
     low, high = (pictures.amin(dim=0), pictures.amax(dim=0))
     low, high = low - config.residual_limit, high + config.residual_limit
     assert bool(((output.rgb >= low - 1e-6) & (output.rgb <= high + 1e-6)).all())
+
+
+def test_a_painter_of_a_reference_needs_one(make_conditions):
+    inputs = frozenset({"render", "reference"})
+    painter = NanoPainter(scrambled(NanoConfig(inputs=inputs, **SMALL)))
+    with pytest.raises(ConfigError, match="sees the nearest recorded picture"):
+        painter.paint(replace(make_conditions(), reference_rgb=None))
+
+
+def test_a_composite_shows_the_render_between_lidar_points(make_conditions):
+    batch = stack_conditions([make_conditions()], num_sources=2)
+    both = frozenset({"render", "lidar"})
+    _, filled = painting_features(batch, both, composite=True)
+    expected = torch.where(batch.lidar_hit > 0, batch.lidar, batch.render)
+    assert torch.equal(filled, expected)
+    with pytest.raises(ConfigError, match="composite"):
+        NanoConfig(inputs=frozenset({"lidar"}), composite=True)
+
+
+def test_without_a_mix_the_picture_itself_is_predicted(make_conditions):
+    batch = stack_conditions([make_conditions()], num_sources=2)
+    with torch.no_grad():
+        output = scrambled(NanoConfig(mix=False, **SMALL))(batch, ["clear"])
+    assert output.weights.shape == (1, 0, 24, 40)
+    assert 0 <= float(output.rgb.min()) < float(output.rgb.max()) <= 1
+    plain = NanoNetwork(NanoConfig(mix=False, **SMALL))(batch, ["clear"]).rgb
+    assert torch.equal(plain, torch.full_like(plain, 0.5))
+
+
+@pytest.mark.parametrize("skips", [True, False])
+def test_without_skips_all_passes_through_the_coarsest_level(skips, make_conditions):
+    network = scrambled(NanoConfig(skips=skips, inputs=frozenset({"render"}), **SMALL))
+    with torch.no_grad():
+        for parameter in network.up_fine.parameters():
+            parameter.zero_()
+        batch = stack_conditions([make_conditions(64, 64)], num_sources=2)
+        inner = network(batch, ["clear"]).weights[..., 16:-16, 16:-16]
+    by_place = inner.unflatten(-1, (-1, CELL_PX)).unflatten(-3, (-1, CELL_PX))
+    first_cell = by_place[:, :, :1, :, :1]
+    is_flat = bool((by_place - first_cell).abs().max() < 1e-6)
+    assert is_flat != skips
 
 
 def test_the_first_convolution_runs_over_cells_of_pixels():
