@@ -4,7 +4,7 @@ The ablation trains painters that see only some of the inputs or lack a part, on
 the same budget, and judges all of them on the same other pairs.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,6 @@ from lidarpainter_models.evaluation.held_back import (
 )
 from lidarpainter_models.painter import OverlayPainter, UnpaintedPainter, WarpPainter
 from lidarpainter_models.painter.nano.ablations import REFERENCE, TABLE_NAMES, ablation_tables
-from lidarpainter_models.painter.nano.network import NanoConfig
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.scenes.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
 from tasks.harvest import (
@@ -144,9 +143,7 @@ def ablate_painter(parameters: AblationParameters, store_path: Path) -> dict[str
     learnt = named_sets(parameters.train_folders)
     painters = {name: name for name in UNLEARNED}
     costs = {}
-    tables = ablation_tables(parameters.training.network, parameters.tables)
-    for label, network in _variants(tables).items():
-        config = replace(parameters.training, network=network)
+    for label, config in variants_of(parameters.training, parameters.tables).items():
         trained = train(store_path, f"train {label}", learnt, config, 0.0)
         painters[label] = str(weights_path(trained.ref))
         costs[label] = _cost(trained)
@@ -155,10 +152,29 @@ def ablate_painter(parameters: AblationParameters, store_path: Path) -> dict[str
     )
     return {
         **judged,
-        "tables": {name: list(variants) for name, variants in tables.items()},
+        "tables": tables_of(parameters.training, parameters.tables),
         "weights": {label: painters[label] for label in costs},
         "training": costs,
     }
+
+
+def variants_of(
+    training: NanoTrainingConfig, names: Iterable[str]
+) -> dict[str, NanoTrainingConfig]:
+    """What an ablation trains, by label; a painter of two tables is trained once."""
+    tables = ablation_tables(training.network, names)
+    return {
+        label: replace(training, network=network)
+        for variants in tables.values()
+        for label, network in variants.items()
+    }
+
+
+def tables_of(training: NanoTrainingConfig, names: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Labels of painters by the table and the row they stand in; rules come first."""
+    rules = {name: name for name in UNLEARNED}
+    tables = ablation_tables(training.network, names)
+    return {name: rules | {label: label for label in variants} for name, variants in tables.items()}
 
 
 def check_ablation(parameters: AblationParameters) -> None:
@@ -168,8 +184,8 @@ def check_ablation(parameters: AblationParameters) -> None:
         ConfigError: no such table, or pairs without the reference picture that a variant is shown.
         DataError: a folder holds no pairs.
     """
-    tables = ablation_tables(parameters.training.network, parameters.tables)
-    shown = [name for name, network in _variants(tables).items() if REFERENCE in network.inputs]
+    variants = variants_of(parameters.training, parameters.tables)
+    shown = [name for name, one in variants.items() if REFERENCE in one.network.inputs]
     for folders in (parameters.train_folders, parameters.test_folders):
         for name, folder in open_sets(named_sets(folders)).items():
             bare = folder.first_without("reference_rgb") if shown else None
@@ -178,11 +194,6 @@ def check_ablation(parameters: AblationParameters) -> None:
                     f"pairs {name!r}: {bare} holds no nearest recorded picture, which "
                     f"{shown[0]} is shown: harvest it again, or choose another --table than inputs"
                 )
-
-
-def _variants(tables: Mapping[str, Mapping[str, NanoConfig]]) -> dict[str, NanoConfig]:
-    """The painters of all tables, each once."""
-    return {label: network for table in tables.values() for label, network in table.items()}
 
 
 def check_sources(parameters: TrainPainterParameters) -> None:

@@ -220,10 +220,7 @@ def ablate(  # noqa: PLR0913 - the options of a command
     if as_json:
         print_json(result)
     else:
-        for name, labels in result["tables"].items():
-            rules = [label for label in result["painters"] if label not in result["weights"]]
-            chosen = {label: result["painters"][label] for label in (*rules, *labels)}
-            _show_scores(result | {"painters": chosen}, f"{name}: ")
+        _show_scores(result)
 
 
 app.command("benchmark")(painter_costs.benchmark)
@@ -254,16 +251,19 @@ def _show_training(result: dict[str, Any]) -> None:
     print_pairs("painter", pairs)
 
 
-def _show_scores(found: dict[str, Any], title: str = "") -> None:
+def _show_scores(found: dict[str, Any]) -> None:
     from tasks.judge_painter import PAINTING_COLUMNS, PAINTING_NOTE, painting_rows
 
     judged = {name: counts for name, counts in found["pairs"].items() if counts["num_judged"]}
     sources: list[str | None] = [*judged, None] if len(judged) > 1 else [None]
-    for source in sources:
-        count = sum(one["num_judged"] for name, one in judged.items() if source in (None, name))
-        rows = painting_rows(found["painters"], source)
-        note = PAINTING_NOTE if source is None else ""
-        print_table(f"{title}{source or 'all'}: {count} pairs", PAINTING_COLUMNS, rows, note)
+    tables = found.get("tables") or {"": {label: label for label in found["painters"]}}
+    for choice, labels in tables.items():
+        shown = {value: found["painters"][label] for value, label in labels.items()}
+        for source in sources:
+            count = sum(one["num_judged"] for name, one in judged.items() if source in (None, name))
+            title = f"{choice}, {source or 'all'}: {count} pairs".removeprefix(", ")
+            note = PAINTING_NOTE if source is None else ""
+            print_table(title, PAINTING_COLUMNS, painting_rows(shown, source), note)
     for name, counts in found["pairs"].items():
         if counts["num_left_out"]:
             typer.echo(f"{name}: {counts['num_left_out']} pairs left out, a painter knows them")
