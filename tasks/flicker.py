@@ -104,10 +104,8 @@ def evaluate_flicker(
     recorded, views = open_split(store, split)
 
     def build(place: Workplace) -> dict[str, Any]:
-        seen, scene = (
-            load_observations(store, fitted.observations),
-            load_scene(store, fitted.gaussians),
-        )
+        seen = load_observations(store, fitted.observations)
+        scene = load_scene(store, fitted.gaussians)
         camera_name = views.train[0].camera_name
         path = _Path(
             held_out=HeldOut(scene=recorded, test_views=(), observation=settings.observation),
