@@ -1,9 +1,4 @@
-"""From scenes to a trained painter: harvest pairs, train, judge on pairs held back, publish.
-
-The ablation trains painters that see only some of the inputs, or one-step painters that differ in
-one choice of their wiring, on the same pairs at the same budget, and judges all of them on the same
-other pairs.
-"""
+"""From scenes to a trained painter: harvest pairs, train, judge on pairs held back, publish."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -24,10 +19,7 @@ from lidarpainter_models.evaluation.held_back import (
     check_training_scene,
 )
 from lidarpainter_models.metrics.lpips import LpipsFiles
-from lidarpainter_models.painter import OverlayPainter, UnpaintedPainter, WarpPainter
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
-from lidarpainter_models.painter.one_step.training import OneStepTrainingConfig
-from lidarpainter_models.painter.one_step.variants import ablations, distinct
 from lidarpainter_models.scenes.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
 from tasks.harvest import (
     PairSet,
@@ -40,7 +32,6 @@ from tasks.harvest import (
 from tasks.judge_painter import (
     feature_distance_of,
     judge_held_back,
-    judge_painters,
     load_painting_scores,
     samples_path,
 )
@@ -55,15 +46,6 @@ from tasks.train_painter import (
 )
 
 SYNTHETIC = "synthetic/"
-UNLEARNED = (UnpaintedPainter.name, OverlayPainter.name, WarpPainter.name)
-ABLATED_INPUTS = (
-    ("render",),
-    ("lidar",),
-    ("render", "lidar"),
-    ("render", "warp"),
-    ("render", "lidar", "warp"),
-)
-"""What the painters of an ablation may see: the paper's three rows, and what the warp adds."""
 
 
 class HarvestParameters(BaseModel):
@@ -107,21 +89,6 @@ class TrainPainterParameters(HarvestParameters):
     """SqueezeNet 1.1 weights for the feature distance; None leaves it out."""
 
 
-class AblationParameters(BaseModel):
-    """Painters that differ in one thing, trained alike and judged alike."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    train_folders: tuple[Path, ...]
-    test_folders: tuple[Path, ...]
-    base: str | None = None
-    """Model that one-step painters are trained on; None trains small painters."""
-    training: PainterTraining = NanoTrainingConfig()
-    lpips: LpipsFiles = LpipsFiles()
-    """Weights for the loss of the one-step painter."""
-    feature_weights: Path | None = None
-
-
 @flow(name="harvest_pairs")
 def harvest_pairs(parameters: HarvestParameters, store_path: Path) -> dict[str, Any]:
     """Make training pairs from streets and logs; each scene gives a folder of them."""
@@ -158,58 +125,10 @@ def train_painter(parameters: TrainPainterParameters, store_path: Path) -> dict[
         "weights": row["path"],
         "num_bytes": row["num_bytes"],
         "pairs": [_described(*made) for made in harvested],
-        "training": _cost(trained),
+        "training": training_cost(trained),
         "held_back": scores,
         "samples": samples,
         "record": training_record(trained.ref, scores),
-    }
-
-
-@flow(name="ablate_painter")
-def ablate_painter(parameters: AblationParameters, store_path: Path) -> dict[str, Any]:
-    """Train one painter per variant and judge them beside those that learn nothing."""
-    learnt = named_sets(parameters.train_folders)
-    painters = {name: name for name in UNLEARNED}
-    costs = {}
-    for label, config in variants_of(parameters.training).items():
-        stage = f"train {label}"
-        trained = train(store_path, stage, learnt, config, 0.0, parameters.base, parameters.lpips)
-        painters[label] = str(weights_path(trained.ref))
-        costs[label] = _cost(trained)
-    judged = judge_painters(
-        painters, named_sets(parameters.test_folders), parameters.feature_weights
-    )
-    return {
-        **judged,
-        "tables": tables_of(parameters.training),
-        "weights": {label: painters[label] for label in costs},
-        "training": costs,
-    }
-
-
-def variants_of(training: PainterTraining) -> dict[str, PainterTraining]:
-    """What an ablation trains, by label."""
-    if isinstance(training, OneStepTrainingConfig):
-        wirings = distinct(ablations(training.network))
-        return {label: replace(training, network=wiring) for label, wiring in wirings.items()}
-    return {
-        "+".join(inputs): replace(
-            training, network=replace(training.network, inputs=frozenset(inputs))
-        )
-        for inputs in ABLATED_INPUTS
-    }
-
-
-def tables_of(training: PainterTraining) -> dict[str, dict[str, str]]:
-    """Labels of painters by the choice that is varied and the value it has; rules come first."""
-    rules = {name: name for name in UNLEARNED}
-    if not isinstance(training, OneStepTrainingConfig):
-        return {"inputs": rules | {label: label for label in variants_of(training)}}
-    tables = ablations(training.network)
-    labels = {wiring: label for label, wiring in distinct(tables).items()}
-    return {
-        choice: rules | {f"{choice}: {value}": labels[wiring] for value, wiring in wirings.items()}
-        for choice, wirings in tables.items()
     }
 
 
@@ -270,10 +189,11 @@ def _harvested(
 
 def _described(made: PairSet, result: StageResult) -> dict[str, Any]:
     counts = {key: result.summary[key] for key in ("num_pairs", "num_targets")}
-    return {"set": made.name, "folder": str(made.folder), **counts, **_cost(result)}
+    return {"set": made.name, "folder": str(made.folder), **counts, **training_cost(result)}
 
 
-def _cost(result: StageResult) -> dict[str, Any]:
+def training_cost(result: StageResult) -> dict[str, Any]:
+    """Seconds and memory of a stage, as JSON types."""
     return {
         "seconds": result.seconds,
         "cpu_seconds": result.cpu_seconds,

@@ -1,17 +1,17 @@
 """Render a finished run along a trajectory, painted at view time if asked for."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import torch
 from jaxtyping import Float
 from prefect import task
 from torch import Tensor
 
 from catalog.store import Store, open_store
 from lidarpainter_models.conditioning.conditions import ConditionBuilder, ConditionConfig
+from lidarpainter_models.conditioning.sequences import SequenceConfig, SequencePainter
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.export.pictures import write_png
 from lidarpainter_models.gaussians.observations import ObservationConfig, fit_camera
@@ -20,7 +20,7 @@ from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectories import road_directions, shift_pose
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
 from lidarpainter_models.painter import load_painter
-from lidarpainter_models.painter.protocol import DEFAULT_PROMPT, Painter
+from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
 from tasks.progress import listener
@@ -46,11 +46,15 @@ class RenderRequest:
     """Painter applied to every picture; None shows the scene as it is."""
     prompt: str = DEFAULT_PROMPT
     """What a painter that knows styles is asked for."""
+    sequence: SequenceConfig = field(default_factory=SequenceConfig)
+    """What becomes of the picture painted before."""
     observation: ObservationConfig
     conditions: ConditionConfig
 
     def __post_init__(self) -> None:
-        """Refuse a prompt that nobody is asked for."""
+        """Refuse a prompt that nobody is asked for, and a previous picture that nobody painted."""
+        if self.sequence.previous != "unused" and self.painter is None:
+            raise ConfigError("--previous needs a painter: --postpaint or --painter")
         if self.prompt != DEFAULT_PROMPT and self.painter is None:
             raise ConfigError(f"prompt {self.prompt!r} needs a painter: --postpaint or --painter")
 
@@ -65,7 +69,8 @@ class OpenedRun:
     views: Sequence[RecordedView]
     """The recorded moments to follow."""
     request: RenderRequest
-    painter: Painter | None
+    painter: SequencePainter | None
+    """To be asked for the moments in their order."""
 
     def camera(self, number: int) -> Camera:
         """Where the camera stands at the n-th of the moments."""
@@ -96,13 +101,27 @@ def open_views(store: Store, run: FinishedRun, request: RenderRequest) -> Opened
     views = recorded.views_of(camera_name)[request.frames or slice(None)]
     if not views:
         raise SceneError(f"{run.scene_id}: no frame of {camera_name} is left to render")
+    builder = ConditionBuilder(scene, seen.lidar_map, seen.views, config=request.conditions)
+    name = request.painter
     return OpenedRun(
         recorded=recorded,
-        builder=ConditionBuilder(scene, seen.lidar_map, seen.views, config=request.conditions),
+        builder=builder,
         camera_name=camera_name,
         views=views,
         request=request,
-        painter=None if request.painter is None else load_painter(request.painter),
+        painter=None if name is None else _path(builder, camera_name, name, request),
+    )
+
+
+def _path(
+    builder: ConditionBuilder, camera_name: str, painter: str, request: RenderRequest
+) -> SequencePainter:
+    return SequencePainter(
+        builder,
+        load_painter(painter),
+        config=request.sequence,
+        camera_name=camera_name,
+        prompt=request.prompt,
     )
 
 
@@ -152,14 +171,7 @@ def _picture(
     if opened.painter is None:
         shown = builder.scene.render(camera, view.timestamp_ns, camera_name=view.camera_name)
         return shown.rgb
-    conditions = builder.conditions(
-        camera,
-        view.timestamp_ns,
-        camera_name=view.camera_name,
-        prompt=opened.request.prompt,
-    )
-    with torch.inference_mode():
-        return opened.painter.paint(conditions).rgb
+    return opened.painter.paint(camera, view.timestamp_ns).painting.rgb
 
 
 def picture_record(path: Path, camera: Camera, view: RecordedView) -> dict[str, Any]:

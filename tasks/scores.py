@@ -8,6 +8,8 @@ from tasks.stored import read_json
 
 SCORES_FILE = "scores.json"
 DEPTH = "depth_within_5_percent"
+FLICKER = "flicker"
+"""Entry of an evaluation that compared neighbouring frames."""
 SCORE_COLUMNS = (
     "view",
     "unpainted PSNR",
@@ -35,8 +37,15 @@ def metric_values(
 ) -> list[tuple[str, str, str, float | None, str | None]]:
     """Every number as (protocol, trajectory, name, value, reason why there is none).
 
-    Scores of strips have neither recorded nor novel views, but judging cameras.
+    Scores of strips have neither recorded nor novel views, but judging cameras; those of flicker
+    have shifted paths alone.
     """
+    if FLICKER in scores:
+        return [
+            ("flicker", trajectory, name, value, None)
+            for trajectory, values in scores[FLICKER].items()
+            for name, value in _numbers(values)
+        ]
     if "recorded" not in scores:
         return [
             ("cross-camera", camera, name, value, values.get(f"{name}_reason"))

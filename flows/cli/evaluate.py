@@ -8,7 +8,8 @@ import typer
 from flows.cli.output import print_json, print_table
 from lidarpainter_models.errors import ConfigError
 
-PROTOCOLS = ("paper", "truth", "cross-camera")
+PROTOCOLS = ("paper", "truth", "cross-camera", "flicker")
+FLICKER = "flicker"
 
 
 def evaluate(  # noqa: PLR0913 - the options of a command
@@ -29,13 +30,16 @@ def evaluate(  # noqa: PLR0913 - the options of a command
     lpips_heads: Annotated[
         Path | None, typer.Option(help="LPIPS heads (version 0.1) of the same network.")
     ] = None,
+    previous: Annotated[
+        str | None,
+        typer.Option(help="For flicker: also lean on the frame before, mixed or shown (or both)."),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Judge a finished run on views it never saw."""
-    if protocol not in PROTOCOLS:
-        raise ConfigError(f"no protocol {protocol!r}, expected {', '.join(PROTOCOLS)}")
-
+    _check(protocol, previous)
     from catalog.store import open_store
+    from flows.cli.flicker import show_flicker
     from flows.cli.progress import shown_progress
     from flows.overrides import with_changes
     from flows.parameters import view_parameters
@@ -49,6 +53,9 @@ def evaluate(  # noqa: PLR0913 - the options of a command
     finished = open_run(store, run)
     parameters = view_parameters(finished)
     parameters = with_changes(parameters, _weights(feature_weights, lpips_backbone, lpips_heads))
+    if protocol == FLICKER:
+        show_flicker(store, finished, parameters, painter, previous, as_json=as_json)
+        return
     variants: dict[str, tuple[Any, str | None]] = {
         "unpainted": (finished.unpainted, None),
         "painted": (finished.final, None),
@@ -78,6 +85,18 @@ def evaluate(  # noqa: PLR0913 - the options of a command
         _show_strips(result, list(variants))
     else:
         _show(result, list(variants))
+
+
+def _check(protocol: str, previous: str | None) -> None:
+    """Refuse what cannot be judged before anything is loaded.
+
+    Raises:
+        ConfigError: no such protocol, or one that has no frames before.
+    """
+    if protocol not in PROTOCOLS:
+        raise ConfigError(f"no protocol {protocol!r}, expected {', '.join(PROTOCOLS)}")
+    if previous is not None and protocol != FLICKER:
+        raise ConfigError(f"--previous is judged by --protocol {FLICKER}, not by {protocol}")
 
 
 def _weights(features: Path | None, backbone: Path | None, heads: Path | None) -> dict[str, Any]:

@@ -218,6 +218,13 @@ def ablate(  # noqa: PLR0913 - the options of a command
     pairs_test: Annotated[
         list[str], typer.Option(help="A folder of pairs to judge by. May be repeated.")
     ],
+    tables: Annotated[
+        str | None,
+        typer.Option(
+            "--table",
+            help="inputs, fusion, lidar, skips, and with --base t, step; commas between.",
+        ),
+    ] = None,
     budget: Budget = None,
     steps: Steps = None,
     base: Base = None,
@@ -227,15 +234,18 @@ def ablate(  # noqa: PLR0913 - the options of a command
     settings: Settings = None,
     as_json: AsJson = False,
 ) -> None:
-    """Train small painters that see only some of the inputs, and judge all of them alike.
+    """Train painters that differ in one input or part, a table per choice, and judge all alike.
 
-    With --base, one-step painters that differ in one choice of their wiring, a table per choice.
+    Small ones, or with --base one-step painters wired in different ways.
     """
+    from flows.cli.ingest import parse_names
     from flows.cli.training import ablation_parameters, first_choices, run_ablation
     from flows.overrides import with_changes, with_overrides
 
     parameters = ablation_parameters(
-        parse_paths(pairs_train, "--pairs-train"), parse_paths(pairs_test, "--pairs-test")
+        parse_paths(pairs_train, "--pairs-train"),
+        parse_paths(pairs_test, "--pairs-test"),
+        parse_names(tables),
     )
     changes = first_choices(base, None, lpips_backbone, lpips_heads)
     parameters = with_changes(parameters, changes | {"feature_weights": feature_weights})

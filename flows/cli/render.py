@@ -30,13 +30,19 @@ def render(  # noqa: PLR0913 - the options of a command
     prompt: Annotated[
         str, typer.Option(help="What a painter that was trained for styles is asked for.")
     ] = "clear",
+    previous: Annotated[
+        str | None,
+        typer.Option(help="Lean on the picture painted before: mixed into the next, or shown."),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Render a finished run where nobody drove."""
     from catalog.store import open_store
+    from flows.cli.flicker import parse_previous
     from flows.cli.ingest import parse_frames
     from flows.cli.progress import shown_progress
     from flows.parameters import view_parameters
+    from lidarpainter_models.conditioning.sequences import SequenceConfig
     from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
     from tasks.render import RenderRequest
     from tasks.render import render as render_task
@@ -52,6 +58,7 @@ def render(  # noqa: PLR0913 - the options of a command
         frames=parse_frames(frames),
         painter=(painter or parameters.painter) if postpaint or painter else None,
         prompt=prompt,
+        sequence=SequenceConfig() if previous is None else parse_previous(previous)[0],
         observation=parameters.observation,
         conditions=parameters.conditions,
     )
@@ -62,6 +69,7 @@ def render(  # noqa: PLR0913 - the options of a command
         "trajectory": path.spec,
         "painter": request.painter,
         "prompt": request.prompt,
+        "previous": request.sequence.previous,
         **made,
     }
     if as_json:

@@ -5,14 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from catalog.store import open_store
+from flows.ablate_painter import AblationParameters, ablate_painter, check_ablation
 from flows.cli.ingest import parse_names
 from flows.cli.progress import shown_progress
 from flows.server import prefect_server
 from flows.train_painter import (
-    AblationParameters,
     HarvestParameters,
     TrainPainterParameters,
-    ablate_painter,
     check_sources,
     harvest_pairs,
     named_sets,
@@ -21,9 +20,8 @@ from flows.train_painter import (
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.metrics.lpips import LpipsFiles
 from lidarpainter_models.painter import is_one_step
-from tasks.judge_painter import judge_painters, open_sets
-from tasks.painter_students import recipe_for, student_of
-from tasks.train_painter import WEIGHTS_SUFFIX
+from tasks.judge_painter import judge_painters
+from tasks.painter_students import recipe_for
 
 PREFECT_LOG = Path("logs") / "prefect.log"
 
@@ -92,10 +90,12 @@ def first_choices(
 
 
 def ablation_parameters(
-    train_folders: tuple[Path, ...], test_folders: tuple[Path, ...]
+    train_folders: tuple[Path, ...],
+    test_folders: tuple[Path, ...],
+    tables: tuple[str, ...] | None = None,
 ) -> AblationParameters:
-    """What to learn from and what to judge by."""
-    return AblationParameters(train_folders=train_folders, test_folders=test_folders)
+    """What to learn from, what to judge by, and which tables are wanted; None makes all."""
+    return AblationParameters(train_folders=train_folders, test_folders=test_folders, tables=tables)
 
 
 def run_harvest(parameters: HarvestParameters) -> dict[str, Any]:
@@ -115,11 +115,7 @@ def run_training(parameters: TrainPainterParameters) -> dict[str, Any]:
 
 def run_ablation(parameters: AblationParameters) -> dict[str, Any]:
     """Train and judge every variant."""
-    if parameters.base is not None and parameters.base.endswith(WEIGHTS_SUFFIX):
-        raise ConfigError("an ablation wires a model in many ways; a weights file has its own")
-    student_of(parameters.training, parameters.base, parameters.lpips)
-    for folders in (parameters.train_folders, parameters.test_folders):
-        open_sets(named_sets(folders))  # what is missing is told before an hour of training
+    check_ablation(parameters)
     store = open_store()
     with prefect_server(store.root / PREFECT_LOG), shown_progress():
         return ablate_painter(parameters, store.root)

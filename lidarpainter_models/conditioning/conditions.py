@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
+import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 from jaxtyping import Float
 from torch import Tensor
 
@@ -151,6 +152,7 @@ class ConditionBuilder:
         render = self.scene.render(camera, timestamp_ns)
         lidar = self.lidar_image(camera, timestamp_ns)
         is_sky = (render.alpha < self.config.warp.sky_alpha) & (lidar.depth_m == 0)
+        sources = self.sources_for(camera, timestamp_ns, exclude=exclude)
         references = warped_references(
             WarpTarget(
                 camera,
@@ -158,13 +160,14 @@ class ConditionBuilder:
                 [self.surface_m(render, lidar, camera), lidar.depth_m],
                 is_sky,
             ),
-            self.sources_for(camera, timestamp_ns, exclude=exclude),
+            sources,
             self._boxes,
             count=self.config.num_references,
             config=self.config.warp,
         )
         expose = self.scene.exposure.apply
         references_rgb = torch.stack([expose(rgb, camera_name) for rgb in references.rgb])
+        nearest = _as_taken(expose(sources[0].rgb, camera_name), camera) if sources else None
         return PaintingConditions(
             render_rgb=expose(render.rgb, camera_name).clamp(0, 1),
             render_depth_m=render.depth_m,
@@ -174,6 +177,7 @@ class ConditionBuilder:
             lidar_hit=lidar.hit,
             warp_rgb=_masked(references_rgb, references.valid),
             warp_valid=references.valid,
+            reference_rgb=nearest,
             prompt=prompt,
         )
 
@@ -199,6 +203,17 @@ class ConditionBuilder:
             return rgb
         matrix = exposure.matrix[exposure.camera_names.index(camera_name)].detach()
         return (rgb - matrix[:, 3]) @ torch.linalg.inv(matrix[:, :3]).T
+
+
+def _as_taken(
+    rgb: Float[Tensor, "source_height source_width 3"], camera: Camera
+) -> Float[Tensor, "height width 3"]:
+    """A recorded picture with as many pixels as a view has, whatever either shows."""
+    size_px = (camera.height_px, camera.width_px)
+    planes = rgb.clamp(0, 1).permute(2, 0, 1)[None]
+    if planes.shape[2:] != size_px:
+        planes = F.interpolate(planes, size_px, mode="bilinear", antialias=True)
+    return planes[0].permute(1, 2, 0)
 
 
 def _masked(

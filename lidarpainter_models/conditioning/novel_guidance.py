@@ -21,6 +21,7 @@ from lidarpainter_models.conditioning.confidence import (
     guidance_gate,
     is_seen,
 )
+from lidarpainter_models.conditioning.sequences import SequenceConfig, SequencePainter
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.calibration import ViewKey
 from lidarpainter_models.gaussians.observations import GuidanceView, TrainingView
@@ -55,6 +56,8 @@ class NovelGuidanceConfig:
     max_points_in_room: int = 10
     """LiDAR points nearer than `room_m` that still count as noise."""
     confidence: ConfidenceConfig = field(default_factory=ConfidenceConfig)
+    sequence: SequenceConfig = field(default_factory=SequenceConfig)
+    """What becomes of the frame painted before along the same path."""
 
     def __post_init__(self) -> None:
         """Refuse to paint nothing."""
@@ -191,9 +194,14 @@ def paint_novel_views(
     """
     config = config or NovelGuidanceConfig()
     paintings = []
+    paths: dict[tuple[Shift, str], SequencePainter] = {}
     for done, novel in enumerate(cameras, start=1):
         if has_room(novel, builder.lidar_map, builder.tracks, config=config):
-            paintings.append(_paint(builder, painter, novel, config.confidence))
+            path = paths.setdefault(
+                (novel.shift, novel.key[1]),
+                SequencePainter(builder, painter, config=config.sequence),
+            )
+            paintings.append(_paint(builder, path, novel, config.confidence))
         if progress is not None:
             progress(done, len(cameras))
     return paintings
@@ -205,10 +213,9 @@ def guidance_views(paintings: Sequence[NovelPainting]) -> list[GuidanceView]:
 
 
 def _paint(
-    builder: ConditionBuilder, painter: Painter, novel: NovelCamera, config: ConfidenceConfig
+    builder: ConditionBuilder, path: SequencePainter, novel: NovelCamera, config: ConfidenceConfig
 ) -> NovelPainting:
-    conditions = builder.conditions(novel.camera, novel.timestamp_ns)
-    painting = painter.paint(conditions)
+    conditions, painting = path.paint(novel.camera, novel.timestamp_ns)
     gate = guidance_gate(painting, conditions, config=config)
     depth_m = torch.where(
         conditions.render_depth_m > 0, conditions.render_depth_m, conditions.lidar_depth_m

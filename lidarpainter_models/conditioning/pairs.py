@@ -77,6 +77,17 @@ class PairFolder:
         """
         return load_pair(self.folder / self._pairs[index]["file"], window)
 
+    def first_without(self, tensor_name: str) -> str | None:
+        """Name of the first pair that was stored without an optional tensor; None if all have it.
+
+        Raises:
+            DataError: a file is damaged.
+        """
+        for index, entry in enumerate(self._pairs):
+            if tensor_name not in _tensor_names(self.folder / entry["file"]):
+                return self.name(index)
+        return None
+
     def verify(self) -> None:
         """Check every byte against the index.
 
@@ -148,13 +159,22 @@ def load_pair(path: Path, window: Window | None = None) -> PaintingPair:
                 raise DataError(
                     f"{path} has format {header.get('format')!r}, expected {PAIR_FORMAT!r}"
                 )
-            stored = {name: _cut(file.get_slice(name), name, window) for name in _KINDS}
+            names = _KINDS.keys() - (_OPTIONAL - set(file.keys()))
+            stored = {name: _cut(file.get_slice(name), name, window) for name in names}
     except (SafetensorError, OSError, json.JSONDecodeError) as error:
         raise DataError(f"{path} is not a readable pair: {error}") from None
-    values = {name: _decode(stored[name], kind) for name, kind in _KINDS.items()}
+    values = {name: _decode(stored[name], _KINDS[name]) for name in stored}
     target_rgb, target_valid = values.pop("target_rgb"), values.pop("target_valid")
     conditions = PaintingConditions(**values, prompt=header["prompt"])
     return PaintingPair(conditions=conditions, target_rgb=target_rgb, target_valid=target_valid)
+
+
+def _tensor_names(path: Path) -> frozenset[str]:
+    try:
+        with safe_open(path, framework="pt") as file:
+            return frozenset(file.keys())
+    except (SafetensorError, OSError) as error:
+        raise DataError(f"{path} is not a readable pair: {error}") from None
 
 
 @runtime_checkable
@@ -175,14 +195,20 @@ _KINDS = {
     "warp_valid": "mask",
     "target_rgb": "byte",
     "target_valid": "mask",
+    "reference_rgb": "byte",
 }
+_OPTIONAL = {"reference_rgb"}
+"""Not in pairs that were harvested before it was gathered."""
 
 
 def _encode(pair: PaintingPair, provenance: dict[str, Any]) -> bytes:
     tensors: dict[str, Tensor] = {}
     for name, kind in _KINDS.items():
         owner = pair if name.startswith("target") else pair.conditions
-        value = getattr(owner, name).detach().cpu()
+        value = getattr(owner, name)
+        if value is None:
+            continue
+        value = value.detach().cpu()
         if kind == "byte":
             value = (value.clamp(0, 1) * 255).round().to(torch.uint8)
         elif kind == "depth":

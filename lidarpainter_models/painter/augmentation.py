@@ -181,6 +181,7 @@ def _change_light(
         render=(old.render * gain).clamp_max(1),
         lidar=(old.lidar * gain * lidar_gain).clamp_max(1),
         warp=(old.warp * gain[:, None] * warp_gain).clamp_max(1),
+        reference=None if old.reference is None else (old.reference * gain).clamp_max(1),
     )
     return batch._replace(conditions=conditions, target=(batch.target * gain).clamp_max(1))
 
@@ -240,12 +241,8 @@ def _flip(batch: TrainingBatch, flipped: Tensor) -> TrainingBatch:
         mirrored[flipped] = values[flipped].flip(-1)
         return mirrored
 
-    old = batch.conditions
-    conditions = ConditionBatch(
-        **{name: turn(getattr(old, name)) for name in ConditionBatch.__dataclass_fields__}
-    )
     return batch._replace(
-        conditions=conditions,
+        conditions=batch.conditions.map(turn),
         target=turn(batch.target),
         target_valid=turn(batch.target_valid),
     )

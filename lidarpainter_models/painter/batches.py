@@ -4,8 +4,9 @@ Pictures are (batch, channels, height, width), rgb in [0, 1]; depth is camera z 
 where there is none; masks are float, 1 where true. Warps beyond those a view has are invalid.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -27,10 +28,18 @@ class ConditionBatch:
     lidar_hit: Float[Tensor, "batch 1 height width"]
     warp: Float[Tensor, "batch sources 3 height width"]
     warp_valid: Float[Tensor, "batch sources height width"]
+    reference: Float[Tensor, "batch 3 height width"] | None = None
+    """None if any of the views lacks it."""
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> "ConditionBatch":
+        """Every picture and mask changed alike."""
+        found: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
+        changed = {name: change(value) for name, value in found.items() if value is not None}
+        return type(self)(**changed)
 
     def to(self, device: torch.device) -> "ConditionBatch":
         """The same batch on another device."""
-        return type(self)(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+        return self.map(lambda values: values.to(device))
 
 
 def stack_conditions(views: Sequence[PaintingConditions], *, num_sources: int) -> ConditionBatch:
@@ -43,6 +52,7 @@ def stack_conditions(views: Sequence[PaintingConditions], *, num_sources: int) -
     if len(sizes) != 1:
         raise ShapeError(f"a batch needs views of one size (height, width), got {sizes}")
     warps = [_first_sources(view, num_sources) for view in views]
+    references = [view.reference_rgb for view in views if view.reference_rgb is not None]
     return ConditionBatch(
         render=_stack_rgb([view.render_rgb for view in views]),
         render_depth_m=_stack_map([view.render_depth_m for view in views]),
@@ -52,6 +62,7 @@ def stack_conditions(views: Sequence[PaintingConditions], *, num_sources: int) -
         lidar_hit=_stack_map([view.lidar_hit for view in views]),
         warp=torch.stack([rgb for rgb, _ in warps]),
         warp_valid=torch.stack([valid for _, valid in warps]),
+        reference=_stack_rgb(references) if len(references) == len(views) else None,
     )
 
 

@@ -4,17 +4,19 @@ A painter that mixes what is known has no reason to show a colour that none of i
 nearby; one that does has invented it.
 """
 
+from collections.abc import Callable, Iterator, Set
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F  # noqa: N812 - the name everyone knows
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarpainter_models.painter.protocol import PaintingConditions
 
 HULL_SIDE_PX = 9
 """Side of the square that counts as nearby."""
+ALL_INPUTS = frozenset({"render", "lidar", "warp"})
+"""What stands in the view itself; the nearest recorded picture does not."""
 HULL_MARGIN = 0.05
 """Of rgb, beyond which a colour counts as outside."""
 
@@ -26,19 +28,60 @@ class InputHull(NamedTuple):
     upper: Float[Tensor, "height width 3"]
 
 
-def input_hull(conditions: PaintingConditions, *, margin: float = HULL_MARGIN) -> InputHull:
-    """The hull of render, LiDAR hits and valid warps around every pixel."""
-    shown = torch.stack([conditions.render_rgb, conditions.lidar_rgb, *conditions.warp_rgb])
-    everywhere = torch.ones_like(conditions.lidar_hit)
-    exists = torch.stack([everywhere, conditions.lidar_hit, *conditions.warp_valid])[..., None]
-    upper = _largest_nearby(torch.where(exists, shown, -torch.inf).amax(dim=0))
-    lower = -_largest_nearby(torch.where(exists, -shown, -torch.inf).amax(dim=0))
-    return InputHull(lower=lower - margin, upper=upper + margin)
+def input_hull(
+    conditions: PaintingConditions,
+    *,
+    inputs: Set[str] = ALL_INPUTS,
+    margin: float = HULL_MARGIN,
+) -> InputHull:
+    """The hull of render, LiDAR hits and valid warps around every pixel.
+
+    Args:
+        conditions: what is known about a view.
+        inputs: those that count beside the render, of `lidar`, `warp` and `reference`.
+        margin: added on both sides.
+    """
+    lower = upper = conditions.render_rgb
+    for rgb, known in _shown_beside_the_render(conditions, inputs):
+        # what does not exist neither widens nor narrows what the render shows
+        rgb_or_render = torch.where(known[..., None], rgb, conditions.render_rgb)
+        lower, upper = torch.minimum(lower, rgb_or_render), torch.maximum(upper, rgb_or_render)
+    return InputHull(
+        lower=_most_nearby(lower, torch.minimum, torch.inf) - margin,
+        upper=_most_nearby(upper, torch.maximum, -torch.inf) + margin,
+    )
 
 
-def _largest_nearby(values: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 3"]:
-    reach = HULL_SIDE_PX // 2
-    planes = values.permute(2, 0, 1)[None]
-    rows = F.max_pool2d(planes, (1, HULL_SIDE_PX), stride=1, padding=(0, reach))
-    both = F.max_pool2d(rows, (HULL_SIDE_PX, 1), stride=1, padding=(reach, 0))
-    return both[0].permute(1, 2, 0)
+def _shown_beside_the_render(
+    conditions: PaintingConditions, inputs: Set[str]
+) -> Iterator[tuple[Float[Tensor, "height width 3"], Bool[Tensor, "height width"]]]:
+    """Pictures and where they exist."""
+    if "lidar" in inputs:
+        yield conditions.lidar_rgb, conditions.lidar_hit
+    if "warp" in inputs:
+        yield from zip(conditions.warp_rgb, conditions.warp_valid, strict=True)
+    if "reference" in inputs and conditions.reference_rgb is not None:
+        yield conditions.reference_rgb, torch.ones_like(conditions.lidar_hit)
+
+
+def _most_nearby(
+    values: Float[Tensor, "height width 3"],
+    choose: Callable[[Tensor, Tensor], Tensor],
+    beyond: float,
+) -> Float[Tensor, "height width 3"]:
+    """The least or largest value in the square around every pixel, one direction at a time.
+
+    Runs of 1, 2, 4, 8 pixels are compared with themselves a run further on, then the longest with
+    itself at the end of the side: fewer and simpler passes than a pooling with windows.
+    """
+    for dim in (0, 1):
+        rim = torch.full_like(values.narrow(dim, 0, 1), beyond)
+        rim = rim.expand(*(HULL_SIDE_PX // 2 if d == dim else -1 for d in range(3)))
+        run, run_px = torch.cat([rim, values, rim], dim=dim), 1
+        while run_px < HULL_SIDE_PX:
+            step_px = min(run_px, HULL_SIDE_PX - run_px)
+            left = run.shape[dim] - step_px
+            run = choose(run.narrow(dim, 0, left), run.narrow(dim, step_px, left))
+            run_px += step_px
+        values = run
+    return values

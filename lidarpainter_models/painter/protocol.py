@@ -29,6 +29,9 @@ class PaintingConditions:
     warp_rgb: Float[Tensor, "sources height width 3"]
     """The nearest recorded training pictures carried here by depth, best first."""
     warp_valid: Bool[Tensor, "sources height width"]
+    reference_rgb: Float[Tensor, "height width 3"] | None = None
+    """The nearest recorded training picture as it was taken, not carried into the view: the
+    paper's reference. None where nobody gathered it."""
     prompt: str = DEFAULT_PROMPT
 
     @property
@@ -38,6 +41,7 @@ class PaintingConditions:
 
     def cropped(self, rows: slice, columns: slice) -> "PaintingConditions":
         """What is known inside a rectangle."""
+        reference = self.reference_rgb
         return PaintingConditions(
             render_rgb=self.render_rgb[rows, columns],
             render_depth_m=self.render_depth_m[rows, columns],
@@ -47,6 +51,7 @@ class PaintingConditions:
             lidar_hit=self.lidar_hit[rows, columns],
             warp_rgb=self.warp_rgb[:, rows, columns],
             warp_valid=self.warp_valid[:, rows, columns],
+            reference_rgb=None if reference is None else reference[rows, columns],
             prompt=self.prompt,
         )
 

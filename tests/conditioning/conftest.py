@@ -1,17 +1,31 @@
 """A tiny exact world: textured boards that face the road, with sky behind them."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
 
+from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.warping import SourcePicture
+from lidarpainter_models.gaussians.calibration import (
+    ActorCorrections,
+    CameraCorrections,
+    ExposureCorrections,
+)
+from lidarpainter_models.gaussians.gaussian_set import GaussianSet, sh_from_rgb
+from lidarpainter_models.gaussians.observations import TrainingView
+from lidarpainter_models.gaussians.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.sky import SkyConfig, SkyTexture, sky_layout
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_rotation, rotation_from_vector
 from lidarpainter_models.scenes.driving_scene import ActorTrack
+from lidarpainter_models.scenes.lidar_map import LidarMap
+from lidarpainter_models.scenes.map_points import MapPoints
 
 SECOND_NS = 1_000_000_000
+WALL_X_M = 12.0
+NUM_VIEWS = 5
 SKY_RGB = torch.tensor([0.5, 0.7, 0.9])
 # camera z looks along world x, camera x to the right (-y), camera y down (-z)
 FORWARD = torch.tensor([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]], dtype=torch.float64)
@@ -115,3 +129,79 @@ def moving_track() -> Callable[..., ActorTrack]:
         )
 
     return make
+
+
+def wall_points():
+    y_m, z_m = torch.meshgrid(
+        torch.arange(-14, 14, 0.25), torch.arange(-12, 4.0, 0.25), indexing="ij"
+    )
+    return torch.stack([torch.full_like(y_m, WALL_X_M), y_m, z_m], dim=-1).reshape(-1, 3)
+
+
+@pytest.fixture
+def views(camera_at, board, draw):
+    found = []
+    for frame in range(NUM_VIEWS):
+        camera = camera_at(0.4 * frame)
+        rgb, depth_m = draw(camera, [board(WALL_X_M, top_m=4.0)])
+        found.append(
+            TrainingView(
+                key=(2 * frame, "front"),
+                camera=camera,
+                timestamp_ns=frame * 100_000_000,
+                rgb_u8=(rgb * 255).round().to(torch.uint8),
+                sky_mask=depth_m == 0,
+                lidar_depth_m=depth_m,
+            )
+        )
+    return found
+
+
+@pytest.fixture
+def scene(views, board):
+    """A wall of opaque discs in the board's colours under a plain sky."""
+    points = wall_points()
+    count = len(points)
+    gaussians = GaussianSet(
+        means=points,
+        rotation_wxyz=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+        log_scale=torch.tensor([0.01, 0.2, 0.2]).log().repeat(count, 1),
+        opacity_logit=torch.full((count,), 4.0),
+        sh_dc=sh_from_rgb(board(WALL_X_M).colour(points[:, 1], points[:, 2])),
+        sh_rest=torch.zeros(count, 0, 3),
+        body_index=torch.zeros(count, dtype=torch.int64),
+    )
+    keys = [view.key for view in views]
+    times = torch.tensor([view.timestamp_ns for view in views])
+    poses = torch.stack([view.camera.world_from_camera for view in views])
+    layout = sky_layout([view.camera for view in views], SkyConfig())
+    return GaussianScene(
+        gaussians=gaussians,
+        recorded_tracks=(),
+        sky=SkyTexture.constant(layout, torch.tensor([0.5, 0.7, 0.9])),
+        cameras=CameraCorrections.none(keys, times, poses),
+        actors=ActorCorrections.none(0, times),
+        exposure=ExposureCorrections.none(["front"]),
+    )
+
+
+@pytest.fixture
+def lidar_map(board):
+    points = wall_points()[::2]
+    colour = board(WALL_X_M).colour(points[:, 1], points[:, 2])
+    street = replace(
+        MapPoints.uncoloured(
+            xyz_m=points,
+            frame_index=torch.zeros(len(points), dtype=torch.int64),
+            timestamp_ns=torch.full((len(points),), 200_000_000),
+            range_m=points.norm(dim=-1),
+        ),
+        rgb_u8=(colour * 255).to(torch.uint8),
+        has_colour=torch.ones(len(points), dtype=torch.bool),
+    )
+    return LidarMap(street=street, actors={})
+
+
+@pytest.fixture
+def builder(scene, lidar_map, views):
+    return ConditionBuilder(scene, lidar_map, views)

@@ -12,7 +12,7 @@ from lidarpainter_models.painter.examples import PaintingPair, PairSource, Windo
 from lidarpainter_models.painter.protocol import PaintingConditions
 
 
-def make_pair(height_px=12, width_px=20, num_sources=2, seed=0):
+def make_pair(height_px=12, width_px=20, num_sources=2, seed=0, with_reference=True):
     generator = torch.Generator().manual_seed(seed)
 
     def draw(*shape):
@@ -28,6 +28,7 @@ def make_pair(height_px=12, width_px=20, num_sources=2, seed=0):
         lidar_hit=draw(height_px, width_px) < 0.3,
         warp_rgb=draw(num_sources, height_px, width_px, 3) * valid[..., None],
         warp_valid=valid,
+        reference_rgb=draw(height_px, width_px, 3) if with_reference else None,
     )
     return PaintingPair(
         conditions=conditions,
@@ -47,8 +48,10 @@ def folder(tmp_path):
 def assert_close(pair, expected):
     for name in PaintingConditions.__dataclass_fields__:
         found, wanted = getattr(pair.conditions, name), getattr(expected.conditions, name)
-        if name == "prompt" or wanted.dtype == torch.bool:
-            assert found == wanted if name == "prompt" else torch.equal(found, wanted)
+        if not isinstance(wanted, torch.Tensor):
+            assert found == wanted
+        elif wanted.dtype == torch.bool:
+            assert torch.equal(found, wanted)
         elif "depth" in name:
             torch.testing.assert_close(found, wanted, rtol=1e-3, atol=1e-3)  # float16
         else:
@@ -70,6 +73,13 @@ def test_a_window_is_the_same_part_of_the_pair(folder):
     assert isinstance(pairs, PairSource)
     assert_close(pairs.read(1, window), pairs.read(1).cropped(window))
     assert pairs.read(1, window).conditions.height_width_px == (8, 9)
+
+
+def test_pairs_without_a_reference_are_still_read_and_named(folder):
+    assert PairFolder(folder).first_without("reference_rgb") is None
+    old = make_pair(with_reference=False)
+    assert_close(load_pair(PairWriter(folder).add("old", old, {})), old)
+    assert PairFolder(folder).first_without("reference_rgb") == "old"
 
 
 def test_the_index_tells_what_is_there(folder):

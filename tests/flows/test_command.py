@@ -48,6 +48,8 @@ def test_asking_for_help_is_no_error(command, capsys):
         (["ingest", "pandaset", "/nowhere", "002", "--frames", "5"], "expected A:B"),
         (["ingest", "pandaset", "/nowhere", "002", "--frames", "5:5"], "expected A < B"),
         (["ingest", "pandaset", "/nowhere", "002", "--cameras", "a,,b"], "names with commas"),
+        (["evaluate", "latest", "--protocol", "guess"], "no protocol 'guess'"),
+        (["evaluate", "latest", "--previous", "mixed"], "is judged by --protocol flicker"),
         (["--store", "/etc/passwd", "catalog", "list"], "is a file, expected a folder"),
     ],
 )

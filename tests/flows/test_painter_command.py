@@ -7,12 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from random_pairs import write_pairs
+from random_pairs import random_pair, write_pairs
 from tiny_diffusion import write_model
 
 from catalog.store import STORE_ENVIRONMENT, open_store
 from flows.cli.main import main
 from flows.cli.painter_options import parse_seeds, with_length
+from lidarpainter_models.conditioning.pairs import PairWriter
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.painter.nano.weights import load_weights, save_weights
@@ -96,6 +97,7 @@ def test_seeds_may_be_listed_and_ranged():
         (["evaluate", "--painter", "none", "--pairs", "/nowhere"], "no training pairs in /nowhere"),
         (["evaluate", "--painter", "none,none", "--pairs", "/nowhere"], "expected each once"),
         (["ablate", "--pairs-train", "/nowhere", "--pairs-test", "/else"], "no training pairs in"),
+        (["ablate", "--pairs-train", "/a", "--pairs-test", "/b", "--table", "x"], "no ablation"),
     ],
 )
 def test_bad_input_is_one_line_and_code_two(words, expected, capsys, own_store):
@@ -230,21 +232,39 @@ def test_train_writes_weights_record_and_catalog_row(make_pairs, tmp_path, own_s
     assert judged["pairs"]["a"]["num_judged"] == 2
 
 
+def test_pairs_without_a_reference_serve_only_tables_that_show_none(make_pairs, tmp_path, capsys):
+    bare = tmp_path / "bare"
+    pair = random_pair(5)
+    conditions = replace(pair.conditions, reference_rgb=None)
+    PairWriter(bare).add("old", replace(pair, conditions=conditions), {})
+    words = ["painter", "ablate", "--pairs-train", make_pairs("new", [1])]
+    assert main([*words, "--pairs-test", str(bare)]) == 2
+    told = capsys.readouterr().err
+    assert "old holds no nearest recorded picture" in told
+    assert told.count("\n") == 1
+
+
 @pytest.mark.slow
 def test_ablate_puts_all_variants_beside_the_rules(make_pairs):
     learn, judge = make_pairs("learn", range(3)), make_pairs("judge", range(5, 7))
     words = ["--pairs-train", learn, "--pairs-test", judge, "--steps", "2"]
     found = run_command("ablate", *words, *SMALL_TRAINING)
-    assert list(found["painters"]) == [
+    full = "render+lidar+warp"
+    assert list(found["tables"]["inputs"])[:8] == [
         "none",
         "overlay",
         "warp",
-        "render",
+        "lidar+reference",
         "lidar",
+        "render+reference",
+        "render",
         "render+lidar",
-        "render+warp",
-        "render+lidar+warp",
     ]
+    assert list(found["tables"]["fusion"])[3:] == [full, f"{full}, direct"]
+    assert list(found["tables"]["lidar"])[3:] == [full, f"{full}, composite"]
+    assert list(found["tables"]["skips"])[3:] == [full, f"{full}, no skips"]
+    shown = {label for rows in found["tables"].values() for label in rows.values()}
+    assert set(found["painters"]) == shown
     assert {one["total"]["num_pairs"] for one in found["painters"].values()} == {2}
     lidar_only = load_weights(Path(found["weights"]["lidar"]))
     assert lidar_only.network.config.inputs == {"lidar"}
@@ -288,12 +308,12 @@ def test_ablate_trains_every_wiring_of_a_model(make_pairs, tmp_path):
     words = ["--base", str(model), "--pairs-train", learn, "--pairs-test", judge, "--steps", "1"]
     found = run_command("ablate", *words, *SMALL_ONE_STEP)
     assert list(found["tables"]) == [
-        "input guidance",
+        "inputs",
         "t",
         "step",
         "skips",
         "fusion",
-        "LiDAR picture",
+        "lidar",
     ]
     times = [label for label in found["tables"]["t"] if label.startswith("t: ")]
     assert times == ["t: 999", "t: 200", "t: 199"]

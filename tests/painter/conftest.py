@@ -27,6 +27,7 @@ def random_conditions(height_px=24, width_px=40, num_sources=2, seed=0, prompt="
         lidar_hit=hit,
         warp_rgb=draw(num_sources, height_px, width_px, 3) * valid[..., None],
         warp_valid=valid,
+        reference_rgb=draw(height_px, width_px, 3),
         prompt=prompt,
     )
 
@@ -47,6 +48,7 @@ def smooth_pair(side_px=48, seed=0):
         lidar_hit=old.lidar_hit,
         warp_rgb=truth * old.warp_valid[..., None],
         warp_valid=old.warp_valid,
+        reference_rgb=old.reference_rgb,
     )
     everywhere = torch.ones(side_px, side_px, dtype=torch.bool)
     return PaintingPair(conditions=conditions, target_rgb=truth, target_valid=everywhere)

@@ -11,12 +11,16 @@ from toy_store import TOY_SCENE, small_parameters, write_toy_scene
 
 from catalog.errors import DamagedArtefactError
 from catalog.store import open_store
+from lidarpainter_models.conditioning.sequences import SequenceConfig
 from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.evaluation.scene_scores import ScoringConfig
+from lidarpainter_models.geometry.trajectories import Shift
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.metrics import lpips
 from lidarpainter_models.metrics.backbones import SQUEEZENET
 from tasks.evaluate import evaluate
 from tasks.fit import fit, refine
+from tasks.flicker import by_picture, evaluate_flicker
 from tasks.ingest import record_scene
 from tasks.paint import paint
 from tasks.painted_views import load_guidance
@@ -25,7 +29,7 @@ from tasks.publish import begin_run, complete_run, fail_run
 from tasks.render import RenderRequest, render
 from tasks.report import ReportInputs, report_path, write_report
 from tasks.runs import open_run
-from tasks.scores import load_scores
+from tasks.scores import load_scores, metric_values
 from tasks.stored import FittedRef, load_history, load_scene
 from tasks.stylize import StylizeRequest, stylize
 
@@ -177,6 +181,27 @@ def test_painting_at_view_time_is_judged_apart(stages):
     assert stages["evaluate-view-time"].ref != stages["evaluate"].ref
 
 
+def test_neighbouring_frames_are_compared_along_every_shift(store, parameters, final):
+    settings = replace(
+        parameters.judge_settings, scoring=ScoringConfig(shifts=(Shift(lateral_m=1.0),))
+    )
+    mixed = (SequenceConfig(previous="mixed"),)
+    judged = evaluate_flicker.fn(
+        store.root, "flicker", parameters.split_spec, final, settings, "warp", mixed
+    )
+    scores = load_scores(judged.ref)
+    found = scores["flicker"]["left-1m"]
+    assert set(found) == {"render", "painted", "painted, previous mixed"}
+    assert 0 < found["painted, previous mixed"]["flicker"] < found["painted"]["flicker"]
+    assert found["render"]["psnr"] is None  # nobody knows the truth there
+    assert 0 < found["render"]["valid_share"] < 1
+    by_name = {
+        picture: {name: value for _, _, name, value, _ in metric_values(values)}
+        for picture, values in by_picture(scores["flicker"]).items()
+    }
+    assert by_name["painted"]["flicker"] == found["painted"]["flicker"]
+
+
 def test_a_report_stands_alone(run):
     page = Path(run.result["report"]).read_text("utf-8")
     assert page.startswith("<!doctype html>")
@@ -262,6 +287,26 @@ def test_a_painter_is_asked_for_the_prompt(store, run, parameters, tmp_path):
         render.fn(store.root, run, request, tmp_path)
     with pytest.raises(ConfigError, match="prompt 'foggy' needs a painter"):
         replace(request, painter=None)
+
+
+def test_a_path_is_painted_with_the_previous_picture_mixed_in(store, run, parameters, tmp_path):
+    plain = RenderRequest(
+        trajectory=parse_trajectory("lateral:1"),
+        frames=slice(0, 3),
+        painter="warp",
+        observation=parameters.observation,
+        conditions=parameters.conditions,
+    )
+    mixed = replace(plain, sequence=SequenceConfig(previous="mixed"))
+    for name, request in (("plain", plain), ("mixed", mixed)):
+        render.fn(store.root, run, request, tmp_path / name)
+    same = [
+        (tmp_path / "plain" / name).read_bytes() == (tmp_path / "mixed" / name).read_bytes()
+        for name in ("0000.png", "0001.png", "0002.png")
+    ]
+    assert same == [True, False, False]
+    with pytest.raises(ConfigError, match="--previous needs a painter"):
+        replace(mixed, painter=None)
 
 
 def test_recorded_pictures_exist_only_where_somebody_stood(parameters):

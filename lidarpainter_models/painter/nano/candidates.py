@@ -16,6 +16,8 @@ from lidarpainter_models.painter.batches import ConditionBatch
 from lidarpainter_models.painter.filters import blur, masked_blur
 
 PAINTING_INPUTS = frozenset({"render", "lidar", "warp"})
+KNOWN_INPUTS = PAINTING_INPUTS | {"reference"}
+"""The nearest recorded picture, not carried into the view, serves comparisons alone."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -23,15 +25,34 @@ class Candidates:
     """Pictures to choose from in every pixel; `base` is the one that needs no learning."""
 
     names: tuple[str, ...]
-    pictures: Float[Tensor, "batch candidates 3 height width"]
-    exists: Float[Tensor, "batch candidates height width"]
-    """1 where the candidate may be chosen; the base exists everywhere."""
+    pictures: tuple[Float[Tensor, "batch 3 height width"], ...]
+    exists: dict[str, Float[Tensor, "batch height width"]]
+    """1 where a candidate may be chosen; those not named, as the base, exist everywhere."""
     base: str
 
     @property
     def base_picture(self) -> Float[Tensor, "batch 3 height width"]:
         """The candidate that an untrained painter gives back."""
-        return self.pictures[:, self.names.index(self.base)]
+        return self.pictures[self.names.index(self.base)]
+
+    def allowed(
+        self, logits: Float[Tensor, "batch candidates height width"]
+    ) -> Float[Tensor, "batch candidates height width"]:
+        """The logits, minus infinity where a candidate does not exist."""
+        planes = list(logits.unbind(dim=1))
+        for name, exists in self.exists.items():
+            number = self.names.index(name)
+            planes[number] = planes[number].masked_fill(exists == 0, -torch.inf)
+        return torch.stack(planes, dim=1)
+
+    def mixed(
+        self, weights: Float[Tensor, "batch candidates height width"]
+    ) -> Float[Tensor, "batch 3 height width"]:
+        """The pictures' mean under weights that sum to one."""
+        total = torch.zeros_like(self.pictures[0])
+        for weight, picture in zip(weights.split(1, dim=1), self.pictures, strict=True):
+            total = torch.addcmul(total, weight, picture)
+        return total
 
 
 def check_inputs(inputs: Iterable[str]) -> frozenset[str]:
@@ -41,8 +62,8 @@ def check_inputs(inputs: Iterable[str]) -> frozenset[str]:
         ConfigError: an unknown input, or warps without the render that fills their gaps.
     """
     chosen = frozenset(inputs)
-    if chosen - PAINTING_INPUTS:
-        raise ConfigError(f"inputs must be of {sorted(PAINTING_INPUTS)}, got {sorted(chosen)}")
+    if chosen - KNOWN_INPUTS:
+        raise ConfigError(f"inputs must be of {sorted(KNOWN_INPUTS)}, got {sorted(chosen)}")
     if not chosen & {"render", "lidar"} or ("warp" in chosen and "render" not in chosen):
         raise ConfigError(
             f"inputs need the render or the LiDAR, and warps the render, got {sorted(chosen)}"
@@ -60,6 +81,8 @@ def candidate_names(inputs: frozenset[str], num_sources: int) -> tuple[str, ...]
     if "warp" in inputs:
         names += [f"warp_{source + 1}" for source in range(num_sources)]
         names += ["mean", "warp_1_blurred"]
+    if "reference" in inputs:
+        names.append("reference")
     return tuple(names)
 
 
@@ -96,15 +119,27 @@ def build_candidates(
         )
         made["warp_1_blurred"] = masked_blur(conditions.warp[:, 0], conditions.warp_valid[:, :1])
         exists["warp_1_blurred"] = conditions.warp_valid[:, 0]
+    if "reference" in inputs:
+        made["reference"] = given_reference(conditions)
     base = base_candidate(inputs)
-    exists[base] = everywhere
+    exists.pop(base, None)
     names = candidate_names(inputs, num_sources)
-    return Candidates(
-        names=names,
-        pictures=torch.stack([made[name] for name in names], dim=1),
-        exists=torch.stack([exists.get(name, everywhere) for name in names], dim=1),
-        base=base,
-    )
+    pictures = tuple(made[name] for name in names)
+    return Candidates(names=names, pictures=pictures, exists=exists, base=base)
+
+
+def given_reference(conditions: ConditionBatch) -> Float[Tensor, "batch 3 height width"]:
+    """The nearest recorded pictures.
+
+    Raises:
+        ConfigError: not all views have one.
+    """
+    if conditions.reference is None:
+        raise ConfigError(
+            "this painter sees the nearest recorded picture, and a view has none: pairs harvested "
+            "before it was gathered lack it"
+        )
+    return conditions.reference
 
 
 def with_flat_colour(
@@ -114,12 +149,12 @@ def with_flat_colour(
     exists: Bool[Tensor, " batch"],
 ) -> Candidates:
     """One more candidate: a colour of its own for every view, or none for views without."""
-    flat = rgb[:, None, :, None, None].expand_as(candidates.pictures[:, :1])
-    everywhere = torch.ones_like(candidates.exists[:, :1]) * exists[:, None, None, None]
+    flat = rgb[..., None, None].expand_as(candidates.base_picture)
+    somewhere = torch.ones_like(flat[:, 0]) * exists[:, None, None]
     return Candidates(
         names=(*candidates.names, name),
-        pictures=torch.cat([candidates.pictures, flat], dim=1),
-        exists=torch.cat([candidates.exists, everywhere], dim=1),
+        pictures=(*candidates.pictures, flat),
+        exists=candidates.exists | {name: somewhere},
         base=candidates.base,
     )
 

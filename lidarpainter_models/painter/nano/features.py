@@ -10,6 +10,7 @@ from torch import Tensor
 
 from lidarpainter_models.painter.batches import ConditionBatch
 from lidarpainter_models.painter.filters import blur, fill_push_pull
+from lidarpainter_models.painter.nano.candidates import given_reference
 
 REFERENCE_DEPTH_M = 10.0  # log depth is centred here, mid-range of a street
 
@@ -19,13 +20,20 @@ def count_features(inputs: frozenset[str], num_sources: int) -> int:
     pairs = num_sources * (num_sources - 1) // 2
     count = 5 * ("render" in inputs) + 6 * ("lidar" in inputs)
     count += (5 * num_sources + pairs) * ("warp" in inputs)
-    return count + ({"render", "lidar"} <= inputs)
+    return count + ({"render", "lidar"} <= inputs) + 3 * ("reference" in inputs)
 
 
 def painting_features(
-    conditions: ConditionBatch, inputs: frozenset[str]
+    conditions: ConditionBatch,
+    inputs: frozenset[str],
+    precision: torch.dtype = torch.float32,
+    *,
+    composite: bool = False,
 ) -> tuple[Float[Tensor, "batch features height width"], Float[Tensor, "batch 3 height width"]]:
-    """The network's input channels, and the filled LiDAR picture they contain."""
+    """The network's input channels in a precision, and the filled LiDAR picture they contain.
+
+    A composite has the render where no point hits; otherwise the points themselves are spread.
+    """
     channels: list[Tensor] = []
     lidar_filled = torch.zeros_like(conditions.lidar)
     if "render" in inputs:
@@ -33,7 +41,10 @@ def painting_features(
         channels += [conditions.render - 0.5, conditions.render_alpha, depth]
     if "lidar" in inputs:
         hit = conditions.lidar_hit
-        lidar_filled = fill_push_pull(conditions.lidar, hit)
+        if composite:
+            lidar_filled = torch.where(hit > 0, conditions.lidar, conditions.render)
+        else:
+            lidar_filled = fill_push_pull(conditions.lidar, hit)
         depth = _log_depth(conditions.lidar_depth_m)
         channels += [lidar_filled - 0.5, hit, blur(hit, sigma_px=3.0), depth]
     if "warp" in inputs:
@@ -41,7 +52,9 @@ def painting_features(
     if {"render", "lidar"} <= inputs:
         gap = _difference(conditions.render, conditions.lidar)
         channels.append(gap * conditions.lidar_hit)
-    return torch.cat(channels, dim=1), lidar_filled
+    if "reference" in inputs:
+        channels.append(given_reference(conditions) - 0.5)
+    return torch.cat([channel.to(precision) for channel in channels], dim=1), lidar_filled
 
 
 def _warp_features(conditions: ConditionBatch) -> list[Tensor]:

@@ -19,6 +19,7 @@ from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.batches import ConditionBatch
 from lidarpainter_models.painter.nano.candidates import (
     PAINTING_INPUTS,
+    Candidates,
     base_candidate,
     build_candidates,
     candidate_names,
@@ -42,7 +43,16 @@ class NanoConfig:
     """The shape of the small painter."""
 
     inputs: frozenset[str] = PAINTING_INPUTS
-    """What it may see and mix: `render`, `lidar`, `warp`; fewer for ablations."""
+    """What it may see and mix: `render`, `lidar`, `warp`; fewer for ablations, and `reference`, the
+    nearest recorded picture as it was taken."""
+    composite: bool = False
+    """Show the render where no LiDAR point hits, in place of the points' own colours spread
+    there; an ablation."""
+    mix: bool = True
+    """Mix candidates by a softmax. Without it the picture itself is predicted, each colour by a
+    sigmoid; an ablation."""
+    skips: bool = True
+    """Add what each level saw on the way down to what comes up; off in an ablation."""
     widths: tuple[int, int, int] = (48, 96, 160)
     """Channels at 1/4, 1/8 and 1/16 of the resolution."""
     blocks: tuple[int, int, int] = (2, 2, 3)
@@ -72,12 +82,21 @@ class NanoConfig:
                 "nano needs three positive widths and blocks, a source and a prompt, got "
                 f"{self.widths}, {self.blocks}, {self.num_sources}, {self.prompts}"
             )
+        if self.composite and not {"render", "lidar"} <= self.inputs:
+            raise ConfigError(f"a composite is of render and LiDAR, got {sorted(self.inputs)}")
+        if not self.mix and len(self.prompts) > 1:
+            raise ConfigError("styles are learnt as a candidate of the mix: prompts need mix")
 
     @property
     def candidates(self) -> tuple[str, ...]:
         """The pictures it mixes, in channel order."""
         names = candidate_names(self.inputs, self.num_sources)
         return (*names, TINT) if len(self.prompts) > 1 else names
+
+    @property
+    def num_outputs(self) -> int:
+        """Logits of the candidates, three colours, and the expected error."""
+        return len(self.candidates) * self.mix + 4
 
     def to_dict(self) -> dict[str, Any]:
         """The settings as JSON types."""
@@ -109,7 +128,7 @@ class NanoOutput:
     log_error: Float[Tensor, "batch height width"]
     """Logarithm of the mean absolute error it expects."""
     weights: Float[Tensor, "batch candidates height width"]
-    """Shares of the candidates; they sum to one."""
+    """Shares of the candidates; they sum to one. Of no candidate where nothing is mixed."""
 
 
 class Style(NamedTuple):
@@ -177,7 +196,7 @@ class NanoNetwork(nn.Module):
         self.up_fine = nn.Conv2d(middle, fine * 4, 1)
         self.decode_fine = _blocks(fine, config.blocks[0], config)
         self.last = PixelNorm(fine) if config.normalise else nn.Identity()
-        self.head = nn.Conv2d(fine, (len(config.candidates) + 4) * CELL_PX**2, 3, padding=1)
+        self.head = nn.Conv2d(fine, config.num_outputs * CELL_PX**2, 3, padding=1)
         if TINT in config.candidates:
             # colour of the tint, logits of the candidates, gain and shift of the last features
             self.style = nn.Embedding(len(config.prompts), 3 + len(config.candidates) + 2 * fine)
@@ -190,8 +209,9 @@ class NanoNetwork(nn.Module):
         for parameter in (*self.head.parameters(), self.prompt.weight):
             nn.init.zeros_(parameter)
         bias = self.head.get_parameter("bias").view(-1, CELL_PX**2)
-        base = self.config.candidates.index(base_candidate(self.config.inputs))
-        bias[base] = self.config.base_logit
+        if self.config.mix:
+            base = self.config.candidates.index(base_candidate(self.config.inputs))
+            bias[base] = self.config.base_logit
         bias[-1] = -3.5
 
     def prompt_index(self, prompt: str) -> int:
@@ -222,28 +242,43 @@ class NanoNetwork(nn.Module):
         Raises:
             ConfigError: the network was not trained for a prompt.
         """
-        features, lidar_filled = painting_features(conditions, self.config.inputs)
+        # halves what is moved until the first convolution, which would round to it anyway
+        precision = torch.bfloat16 if half_precision else torch.float32
+        features, lidar_filled = painting_features(
+            conditions, self.config.inputs, precision, composite=self.config.composite
+        )
         candidates = build_candidates(conditions, self.config.inputs, lidar_filled)
         rows = torch.tensor([self.prompt_index(prompt) for prompt in prompts]).to(features.device)
         embedding, style = self.prompt(rows), self._style(rows)
         if style is not None:
             candidates = with_flat_colour(candidates, TINT, style.colour.sigmoid(), rows > 0)
         with torch.autocast(features.device.type, torch.bfloat16, enabled=half_precision):
-            head = self._head(features, embedding, style).float()
-        num_candidates = len(candidates.names)
-        logits = head[:, :num_candidates]
-        if style is not None:
-            logits = logits + style.logits[..., None, None]
-        logits = logits.masked_fill(candidates.exists == 0, -torch.inf)
-        weights = torch.softmax(logits, dim=1)
-        mixed = (weights[:, :, None] * candidates.pictures).sum(dim=1)
-        residual = torch.tanh(head[:, num_candidates : num_candidates + 3])
+            head = self._head(features, embedding, style)
+        rgb, weights = self._picture(head, candidates, style)
         return NanoOutput(
-            rgb=mixed + self.config.residual_limit * residual,
+            rgb=rgb,
             base=candidates.base_picture,
             log_error=head[:, -1].clamp(-8, 1),
             weights=weights,
         )
+
+    def _picture(
+        self,
+        head: Float[Tensor, "batch outputs height width"],
+        candidates: Candidates,
+        style: Style | None,
+    ) -> tuple[
+        Float[Tensor, "batch 3 height width"], Float[Tensor, "batch candidates height width"]
+    ]:
+        """Colours, and the shares of the candidates in them: of none without a mix."""
+        logits, residual = head[:, :-4], head[:, -4:-1]
+        if not self.config.mix:
+            return residual.sigmoid(), logits
+        if style is not None:
+            logits = logits + style.logits[..., None, None]
+        weights = torch.softmax(candidates.allowed(logits), dim=1)
+        change = self.config.residual_limit * torch.tanh(residual)
+        return candidates.mixed(weights) + change, weights
 
     def _style(self, rows: Int[Tensor, " batch"]) -> Style | None:
         """What was learnt for each view's prompt; None where there are no styles."""
@@ -263,20 +298,46 @@ class NanoNetwork(nn.Module):
         height_px, width_px = features.shape[2:]
         step_px = CELL_PX * 4
         padding = (0, -width_px % step_px, 0, -height_px % step_px)
-        if torch.is_autocast_enabled(features.device.type):
-            features = features.bfloat16()  # halves what the next two lines move
         padded = F.pad(features, padding, mode="replicate") if any(padding) else features
-        fine = self.encode_fine(self.stem(F.pixel_unshuffle(padded, CELL_PX)))
+        fine = self.encode_fine(self._stemmed(padded))
         middle = self.encode_middle(self.down_middle(fine))
         coarse = self.down_coarse(middle) + embedding[..., None, None]
         coarse = self.encode_coarse(coarse)
-        middle = self.decode_middle(middle + F.pixel_shuffle(self.up_middle(coarse), 2))
-        fine = self.decode_fine(fine + F.pixel_shuffle(self.up_fine(middle), 2))
+        middle = self.decode_middle(self._joined(middle, self.up_middle(coarse)))
+        fine = self.decode_fine(self._joined(fine, self.up_fine(middle)))
         last = self.last(fine)
         if style is not None:
             last = last * (1 + style.gain[..., None, None]) + style.shift[..., None, None]
         outputs = F.pixel_shuffle(self.head(F.silu(last)), CELL_PX)
-        return outputs[..., :height_px, :width_px]
+        # planes that lie together: what follows works on one output at a time
+        inside = outputs[..., :height_px, :width_px]
+        return inside.to(torch.float32, memory_format=torch.contiguous_format)
+
+    def _joined(
+        self,
+        skipped: Float[Tensor, "batch channels rows columns"],
+        coarser: Float[Tensor, "batch finer_channels coarser_rows coarser_columns"],
+    ) -> Float[Tensor, "batch channels rows columns"]:
+        """What comes up from a coarser level, and the finer one it skipped."""
+        raised = F.pixel_shuffle(coarser, 2)
+        return skipped + raised if self.config.skips else raised
+
+    def _stemmed(
+        self, features: Float[Tensor, "batch features height width"]
+    ) -> Float[Tensor, "batch channels rows columns"]:
+        """The first convolution, over cells of pixels.
+
+        It equals `stem(pixel_unshuffle(features))`, but with the channels of a pixel side by side
+        on the way, so that whole rows of a cell are copied instead of single numbers.
+        """
+        size, channels, height_px, width_px = features.shape
+        rows, columns = height_px // CELL_PX, width_px // CELL_PX
+        pixels = features.permute(0, 2, 3, 1).contiguous()
+        places = pixels.view(size, rows, CELL_PX, columns, CELL_PX, channels).transpose(2, 3)
+        cells = places.reshape(size, rows, columns, -1).permute(0, 3, 1, 2)
+        by_feature = self.stem.weight.unflatten(1, (channels, CELL_PX**2))
+        weight = by_feature.transpose(1, 2).flatten(1, 2)
+        return F.conv2d(cells, weight, self.stem.bias, padding=1)
 
 
 def _blocks(width: int, number: int, config: NanoConfig) -> nn.Sequential:

@@ -26,7 +26,8 @@ class NanoPainter:
     """Repairs a view by mixing what is known about it.
 
     For the prompt it restores with, no colour leaves the hull of what the inputs show nearby
-    (`input_hull`): the network's residual may sharpen, not invent.
+    (`input_hull`): the network's residual may sharpen, not invent. Only a painter that sees the
+    render is held to that; the LiDAR alone shows nothing in most places.
 
     Confidence: exp(-e / 0.05) with e the mean absolute error the network expects in the pixel
     (its scale is `NanoConfig.confidence_error`); for e, a tile that was not painted takes what is
@@ -103,7 +104,7 @@ class NanoPainter:
         confidence = torch.exp(-output.log_error[0].exp() / config.confidence_error)
         home = conditions.render_rgb.device
         rgb = output.rgb[0].permute(1, 2, 0).contiguous().to(home)
-        if conditions.prompt == DEFAULT_PROMPT:
-            hull = input_hull(conditions)
+        if conditions.prompt == DEFAULT_PROMPT and "render" in config.inputs:
+            hull = input_hull(conditions, inputs=config.inputs)
             rgb = torch.minimum(torch.maximum(rgb, hull.lower), hull.upper)
         return Painting(rgb=rgb.clamp(0, 1), confidence=confidence.to(home))

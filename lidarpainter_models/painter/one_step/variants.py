@@ -40,17 +40,17 @@ def ablations(config: OneStepConfig) -> dict[str, Wirings]:
     guidance = dict.fromkeys((*GUIDANCE, config.inputs))
     times = dict.fromkeys((*TIMESTEPS, config.timestep))
     tables: dict[str, Wirings] = {
-        "input guidance": {"+".join(seen): _with_inputs(config, seen) for seen in guidance},
+        "inputs": {"+".join(seen): _with_inputs(config, seen) for seen in guidance},
         "t": {str(time): replace(config, timestep=time) for time in times},
         "step": {kind: replace(config, denoise=kind) for kind in get_args(Denoise)},
         "skips": {kind: replace(config, skips=kind) for kind in _skip_sources(config)},
         "fusion": {"on": config, "off": _without_fusion(config)},
-        "LiDAR picture": {kind: replace(config, lidar=kind) for kind in get_args(LidarInput)},
+        "lidar": {kind: replace(config, lidar=kind) for kind in get_args(LidarInput)},
     }
     if config.fusion is None:
         del tables["fusion"]
     if "lidar" not in config.inputs:
-        del tables["LiDAR picture"]
+        del tables["lidar"]
     return {choice: wirings for choice, wirings in tables.items() if len(wirings) > 1}
 
 

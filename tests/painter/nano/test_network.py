@@ -4,14 +4,16 @@ from dataclasses import replace
 
 import pytest
 import torch
+import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 
 from lidarpainter_models.errors import ConfigError, ShapeError
 from lidarpainter_models.painter import load_painter
 from lidarpainter_models.painter.batches import stack_conditions
 from lidarpainter_models.painter.filters import blur, fill_push_pull, masked_blur
-from lidarpainter_models.painter.input_hull import HULL_MARGIN
+from lidarpainter_models.painter.input_hull import HULL_MARGIN, input_hull
 from lidarpainter_models.painter.nano.candidates import build_candidates, candidate_names
-from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork, PixelNorm
+from lidarpainter_models.painter.nano.features import painting_features
+from lidarpainter_models.painter.nano.network import CELL_PX, NanoConfig, NanoNetwork, PixelNorm
 from lidarpainter_models.painter.nano.painter import NanoPainter
 
 SMALL = {"widths": (8, 8, 8), "blocks": (1, 1, 1)}
@@ -63,11 +65,13 @@ def test_what_does_not_exist_is_never_chosen(make_conditions):
 @pytest.mark.parametrize(
     ("inputs", "blind_to"),
     [
-        ({"render"}, {"lidar_rgb", "warp_rgb"}),
-        ({"lidar"}, {"render_rgb", "warp_rgb"}),
-        ({"render", "lidar"}, {"warp_rgb"}),
-        ({"render", "warp"}, {"lidar_rgb"}),
-        ({"render", "lidar", "warp"}, set()),
+        ({"render"}, {"lidar_rgb", "warp_rgb", "reference_rgb"}),
+        ({"lidar"}, {"render_rgb", "warp_rgb", "reference_rgb"}),
+        ({"render", "lidar"}, {"warp_rgb", "reference_rgb"}),
+        ({"render", "warp"}, {"lidar_rgb", "reference_rgb"}),
+        ({"render", "lidar", "warp"}, {"reference_rgb"}),
+        ({"render", "lidar", "reference"}, {"warp_rgb"}),
+        ({"lidar", "reference"}, {"render_rgb", "warp_rgb"}),
     ],
 )
 def test_ablated_network_ignores_what_it_may_not_see(inputs, blind_to, make_conditions):
@@ -75,7 +79,7 @@ def test_ablated_network_ignores_what_it_may_not_see(inputs, blind_to, make_cond
     painter = NanoPainter(network)
     conditions, other = make_conditions(seed=1), make_conditions(seed=2)
     before = painter.paint(conditions)
-    for name in ("render_rgb", "lidar_rgb", "warp_rgb"):
+    for name in ("render_rgb", "lidar_rgb", "warp_rgb", "reference_rgb"):
         changed = painter.paint(replace(conditions, **{name: getattr(other, name)}))
         is_same = torch.equal(changed.rgb, before.rgb)
         assert is_same == (name in blind_to), name
@@ -113,9 +117,87 @@ def test_residual_is_bounded(make_conditions):
     candidates = build_candidates(
         batch, config.inputs, fill_push_pull(batch.lidar, batch.lidar_hit)
     )
-    low = candidates.pictures.amin(dim=1) - config.residual_limit
-    high = candidates.pictures.amax(dim=1) + config.residual_limit
+    pictures = torch.stack(candidates.pictures)
+    low, high = (pictures.amin(dim=0), pictures.amax(dim=0))
+    low, high = low - config.residual_limit, high + config.residual_limit
     assert bool(((output.rgb >= low - 1e-6) & (output.rgb <= high + 1e-6)).all())
+
+
+def test_a_painter_of_a_reference_needs_one(make_conditions):
+    inputs = frozenset({"render", "reference"})
+    painter = NanoPainter(scrambled(NanoConfig(inputs=inputs, **SMALL)))
+    with pytest.raises(ConfigError, match="sees the nearest recorded picture"):
+        painter.paint(replace(make_conditions(), reference_rgb=None))
+
+
+def test_a_composite_shows_the_render_between_lidar_points(make_conditions):
+    batch = stack_conditions([make_conditions()], num_sources=2)
+    both = frozenset({"render", "lidar"})
+    _, filled = painting_features(batch, both, composite=True)
+    expected = torch.where(batch.lidar_hit > 0, batch.lidar, batch.render)
+    assert torch.equal(filled, expected)
+    with pytest.raises(ConfigError, match="composite"):
+        NanoConfig(inputs=frozenset({"lidar"}), composite=True)
+
+
+def test_without_a_mix_the_picture_itself_is_predicted(make_conditions):
+    batch = stack_conditions([make_conditions()], num_sources=2)
+    with torch.no_grad():
+        output = scrambled(NanoConfig(mix=False, **SMALL))(batch, ["clear"])
+    assert output.weights.shape == (1, 0, 24, 40)
+    assert 0 <= float(output.rgb.min()) < float(output.rgb.max()) <= 1
+    plain = NanoNetwork(NanoConfig(mix=False, **SMALL))(batch, ["clear"]).rgb
+    assert torch.equal(plain, torch.full_like(plain, 0.5))
+
+
+@pytest.mark.parametrize("skips", [True, False])
+def test_without_skips_all_passes_through_the_coarsest_level(skips, make_conditions):
+    network = scrambled(NanoConfig(skips=skips, inputs=frozenset({"render"}), **SMALL))
+    with torch.no_grad():
+        for parameter in network.up_fine.parameters():
+            parameter.zero_()
+        batch = stack_conditions([make_conditions(64, 64)], num_sources=2)
+        inner = network(batch, ["clear"]).weights[..., 16:-16, 16:-16]
+    by_place = inner.unflatten(-1, (-1, CELL_PX)).unflatten(-3, (-1, CELL_PX))
+    first_cell = by_place[:, :, :1, :, :1]
+    is_flat = bool((by_place - first_cell).abs().max() < 1e-6)
+    assert is_flat != skips
+
+
+def test_the_first_convolution_runs_over_cells_of_pixels():
+    network = scrambled(NanoConfig(**SMALL))
+    features = torch.rand(2, 23, 32, 48, generator=torch.Generator().manual_seed(1))
+    expected = network.stem(F.pixel_unshuffle(features, CELL_PX))
+    # another order of float32 sums over 23 * 16 * 9 products
+    torch.testing.assert_close(network._stemmed(features), expected, rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("sigma_px", [1.5, 3.0])
+def test_a_blur_is_the_convolution_with_its_kernel(sigma_px):
+    picture = torch.rand(2, 3, 17, 30, generator=torch.Generator().manual_seed(2))
+    radius_px = round(2.5 * sigma_px)
+    offsets = torch.arange(-radius_px, radius_px + 1).float()
+    kernel = torch.exp(-0.5 * (offsets / sigma_px) ** 2)
+    kernel = torch.outer(kernel, kernel) / kernel.sum() ** 2
+    padded = F.pad(picture, (radius_px,) * 4, mode="replicate")
+    expected = F.conv2d(padded, kernel.expand(3, 1, -1, -1), groups=3)
+    torch.testing.assert_close(blur(picture, sigma_px=sigma_px), expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("height_px", "width_px"), [(1, 1), (3, 20), (24, 40)])
+def test_the_hull_is_the_range_within_nine_pixels(height_px, width_px, make_conditions):
+    conditions = make_conditions(height_px, width_px)
+    hull = input_hull(conditions, margin=0.0)
+    shown = torch.stack([conditions.render_rgb, conditions.lidar_rgb, *conditions.warp_rgb])
+    exists = torch.stack([conditions.lidar_hit, *conditions.warp_valid])
+    exists = torch.cat([torch.ones_like(exists[:1]), exists])
+    for row in range(height_px):
+        for column in range(width_px):
+            rows = slice(max(row - 4, 0), row + 5)
+            columns = slice(max(column - 4, 0), column + 5)
+            nearby = shown[:, rows, columns][exists[:, rows, columns]]
+            assert torch.equal(hull.lower[row, column], nearby.amin(dim=0))
+            assert torch.equal(hull.upper[row, column], nearby.amax(dim=0))
 
 
 def test_the_painter_shows_no_colour_that_no_input_shows_nearby(make_conditions):

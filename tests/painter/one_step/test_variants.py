@@ -22,7 +22,7 @@ def test_every_table_holds_the_wiring_itself_and_can_be_built(preset):
 def test_a_table_varies_one_choice():
     config = paper()
     tables = ablations(config)
-    fields = {"t": "timestep", "step": "denoise", "skips": "skips", "LiDAR picture": "lidar"}
+    fields = {"t": "timestep", "step": "denoise", "skips": "skips", "lidar": "lidar"}
     for choice, field in fields.items():
         for wiring in tables[choice].values():
             same = {**wiring.to_dict(), field: None}

@@ -1,0 +1,135 @@
+"""Paint the frames of a path in order, each leaning on the one painted before it.
+
+Nothing here is random, and without a frame before it a view is painted as if it stood alone: the
+first frame of a path is that painting, bit for bit. Every later frame is given the previous one,
+carried over by the rendered depth (`warping`): where both views show the same surface it is either
+mixed into the painting, or shown to the painter as the best of the warped pictures.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import torch
+
+from lidarpainter_models.conditioning.conditions import ConditionBuilder
+from lidarpainter_models.conditioning.warping import SourcePicture, warp_pictures
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.painter.protocol import (
+    DEFAULT_PROMPT,
+    Painter,
+    Painting,
+    PaintingConditions,
+)
+
+PreviousUse = Literal["unused", "mixed", "shown"]
+PREVIOUS_KEY = (-1, "previous")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SequenceConfig:
+    """What becomes of the frame painted before."""
+
+    previous: PreviousUse = "unused"
+    """`mixed`: into the painting, as far as both agree; `shown`: to the painter, before the other
+    warped pictures, of which it was trained to expect recorded ones only."""
+    share: float = 0.5
+    """Of the previous frame in a mixed pixel on which both agree."""
+    agreement: float = 0.05
+    """Mean absolute rgb difference of both at which that share has fallen to 1/e."""
+
+    def __post_init__(self) -> None:
+        """Refuse shares that forget the present."""
+        if not 0 <= self.share < 1 or not self.agreement > 0:
+            raise ConfigError(
+                "a mix needs 0 <= share < 1 and a positive agreement, got "
+                f"{self.share} and {self.agreement}"
+            )
+
+
+class PaintedFrame(NamedTuple):
+    """One view of a path."""
+
+    conditions: PaintingConditions
+    """Without the previous frame."""
+    painting: Painting
+
+
+class SequencePainter:
+    """Paints one path of one camera; keeps the last frame, so each path needs its own."""
+
+    def __init__(
+        self,
+        builder: ConditionBuilder,
+        painter: Painter,
+        *,
+        config: SequenceConfig | None = None,
+        camera_name: str | None = None,
+        prompt: str = DEFAULT_PROMPT,
+    ) -> None:
+        """Begin a path.
+
+        Args:
+            builder: gives the conditions of the scene.
+            painter: repairs the views.
+            config: what becomes of previous frames.
+            camera_name: whose exposure all pictures take.
+            prompt: what the painter is asked for.
+        """
+        self._builder = builder
+        self._painter = painter
+        self._config = config or SequenceConfig()
+        self._camera_name = camera_name
+        self._prompt = prompt
+        self._previous: SourcePicture | None = None
+
+    def paint(self, camera: Camera, timestamp_ns: int) -> PaintedFrame:
+        """Paint the next view of the path."""
+        conditions = self._builder.conditions(
+            camera, timestamp_ns, camera_name=self._camera_name, prompt=self._prompt
+        )
+        return PaintedFrame(conditions, self.paint_conditions(conditions, camera, timestamp_ns))
+
+    def paint_conditions(
+        self, conditions: PaintingConditions, camera: Camera, timestamp_ns: int
+    ) -> Painting:
+        """Paint the next view, whose conditions were gathered before."""
+        with torch.inference_mode():
+            painting = self._painted(conditions, camera, timestamp_ns)
+        if self._config.previous != "unused":
+            self._previous = SourcePicture(
+                key=PREVIOUS_KEY,
+                camera=camera,
+                timestamp_ns=timestamp_ns,
+                rgb=painting.rgb,
+                depth_m=conditions.render_depth_m,
+                alpha=conditions.render_alpha,
+            )
+        return painting
+
+    def _painted(
+        self, conditions: PaintingConditions, camera: Camera, timestamp_ns: int
+    ) -> Painting:
+        if self._previous is None:
+            return self._painter.paint(conditions)
+        carried, valid = warp_pictures(
+            camera,
+            timestamp_ns,
+            conditions.render_depth_m,
+            conditions.render_alpha,
+            [self._previous],
+            self._builder.tracks,
+            config=self._builder.config.warp,
+        )
+        if self._config.previous == "shown":
+            shown = replace(
+                conditions,
+                warp_rgb=torch.cat([carried, conditions.warp_rgb]),
+                warp_valid=torch.cat([valid, conditions.warp_valid]),
+            )
+            return self._painter.paint(shown)
+        painting = self._painter.paint(conditions)
+        difference = (carried[0] - painting.rgb).abs().mean(dim=-1)
+        agreed = torch.exp(-difference / self._config.agreement) * valid[0]
+        share = (self._config.share * agreed)[..., None]
+        return replace(painting, rgb=painting.rgb + share * (carried[0] - painting.rgb))

@@ -1,0 +1,140 @@
+"""How much pictures of a path change from frame to frame where they should not.
+
+The previous frame is carried into the next by rendered depth, actors with their boxes; pixels that
+both views show (depth agrees, or both see the sky) are compared. What changes there is flicker,
+resampling, light that depends on the view, and wrong depth; the true pictures of a synthetic
+street, compared under the same depth, say how much of it is not flicker.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from statistics import fmean
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidarpainter_models.conditioning.moving_boxes import BACKGROUND, MovingBoxes
+from lidarpainter_models.conditioning.warping import SourcePicture, WarpConfig, warp_pictures
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.metrics.pictures import psnr_from_error, squared_error
+from lidarpainter_models.scenes.tracks import ActorTrack
+
+TRUTH = "truth"
+"""Name of the true pictures among those of a frame."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FlickerFrame:
+    """One moment of a path: several pictures of it, and the surfaces they show."""
+
+    camera: Camera
+    timestamp_ns: int
+    depth_m: Float[Tensor, "height width"]
+    """Rendered camera z, 0 = none."""
+    alpha: Float[Tensor, "height width"]
+    pictures: Mapping[str, Float[Tensor, "height width 3"]]
+    """By the name of who made them, the same at every moment."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlickerScores:
+    """Figures of one kind of picture along one path."""
+
+    flicker: float | None
+    """Mean absolute rgb difference on valid pixels; None where there are none."""
+    moving_flicker: float | None
+    """The same on moving actors alone."""
+    valid_share: float
+    """Of all pixels of all pairs of neighbours."""
+    psnr: float | None
+    """Mean over the frames, against the truth; None where nobody knows it."""
+    num_pairs: int
+
+
+@dataclass
+class _PictureTally:
+    difference: float = 0.0
+    moving_difference: float = 0.0
+    psnr: list[float] = field(default_factory=list)
+
+
+class FlickerTally:
+    """Counts the frames of one path in their order."""
+
+    def __init__(self, tracks: Sequence[ActorTrack], config: WarpConfig | None = None) -> None:
+        """Take the moving actors, and when two views show the same surface."""
+        self._tracks = tracks
+        self._config = config or WarpConfig()
+        self._boxes = MovingBoxes(tracks, self._config.boxes)
+        self._pictures: dict[str, _PictureTally] = {}
+        self._previous: FlickerFrame | None = None
+        self._num_pixels = self._num_valid = self._num_moving = self._num_pairs = 0
+
+    def add(self, frame: FlickerFrame) -> None:
+        """Count the next moment."""
+        if not self._pictures:
+            self._pictures = {name: _PictureTally() for name in frame.pictures}
+        truth = frame.pictures.get(TRUTH)
+        for name, rgb in frame.pictures.items():
+            if truth is not None and name != TRUTH:
+                error = float(squared_error(rgb, truth).mean())
+                self._pictures[name].psnr.append(psnr_from_error(error))
+        if self._previous is not None:
+            self._compare(self._previous, frame)
+        self._previous = frame
+
+    def scores(self) -> dict[str, FlickerScores]:
+        """The figures of every kind of picture."""
+        return {
+            name: FlickerScores(
+                flicker=_mean(tally.difference, self._num_valid),
+                moving_flicker=_mean(tally.moving_difference, self._num_moving),
+                valid_share=self._num_valid / max(self._num_pixels, 1),
+                psnr=fmean(tally.psnr) if tally.psnr else None,
+                num_pairs=self._num_pairs,
+            )
+            for name, tally in self._pictures.items()
+        }
+
+    def _compare(self, before: FlickerFrame, now: FlickerFrame) -> None:
+        sources = [
+            SourcePicture(
+                key=(0, name),
+                camera=before.camera,
+                timestamp_ns=before.timestamp_ns,
+                rgb=rgb,
+                depth_m=before.depth_m,
+                alpha=before.alpha,
+            )
+            for name, rgb in before.pictures.items()
+        ]
+        carried, valid = warp_pictures(
+            now.camera,
+            now.timestamp_ns,
+            now.depth_m,
+            now.alpha,
+            sources,
+            self._tracks,
+            config=self._config,
+        )
+        compared = valid[0]  # of depth alone, so the same for all pictures
+        moving = compared & self._on_actors(now)
+        self._num_pairs += 1
+        self._num_pixels += compared.numel()
+        self._num_valid += int(compared.sum())
+        self._num_moving += int(moving.sum())
+        for rgb, (name, picture) in zip(carried, now.pictures.items(), strict=True):
+            difference = (rgb - picture).abs().mean(dim=-1).double()
+            self._pictures[name].difference += float(difference[compared].sum())
+            self._pictures[name].moving_difference += float(difference[moving].sum())
+
+    def _on_actors(self, frame: FlickerFrame) -> Bool[Tensor, "height width"]:
+        """Pixels whose surface lies in the box of a moving actor."""
+        points_world = frame.camera.unproject(frame.depth_m).reshape(-1, 3)
+        owners = self._boxes.owners(points_world, frame.timestamp_ns)
+        inside = (owners != BACKGROUND).reshape(frame.depth_m.shape)
+        return inside & (frame.depth_m > 0)
+
+
+def _mean(total: float, count: int) -> float | None:
+    return total / count if count else None
