@@ -307,14 +307,7 @@ def test_ablate_trains_every_wiring_of_a_model(make_pairs, tmp_path):
     judge = make_pairs("judge", range(5, 6), height_px=64, width_px=80)
     words = ["--base", str(model), "--pairs-train", learn, "--pairs-test", judge, "--steps", "1"]
     found = run_command("ablate", *words, *SMALL_ONE_STEP)
-    assert list(found["tables"]) == [
-        "inputs",
-        "t",
-        "step",
-        "skips",
-        "fusion",
-        "lidar",
-    ]
+    assert list(found["tables"]) == ["inputs", "t", "step", "skips", "fusion", "lidar"]
     times = [label for label in found["tables"]["t"] if label.startswith("t: ")]
     assert times == ["t: 999", "t: 200", "t: 199"]
     for labels in found["tables"].values():

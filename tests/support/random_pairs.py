@@ -28,7 +28,7 @@ def random_pair(seed, height_px=HEIGHT_PX, width_px=WIDTH_PX):
         lidar_hit=hit,
         warp_rgb=truth[None] * valid[..., None],
         warp_valid=valid,
-        reference_rgb=draw(HEIGHT_PX, WIDTH_PX, 3),
+        reference_rgb=draw(height_px, width_px, 3),
     )
     return PaintingPair(conditions=conditions, target_rgb=truth, target_valid=everywhere > 0)
 
