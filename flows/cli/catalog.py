@@ -6,10 +6,10 @@ from typing import Annotated, Any
 import typer
 
 from flows.cli.output import Cell, format_bytes, print_json, print_pairs, print_table
+from flows.cli.shared_options import AsJson
 
 app = typer.Typer(help="What the store holds.", no_args_is_help=True)
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 SHOWN_COLUMNS = {
     "scenes": ("scene_id", "num_frames", "num_views", "num_actors", "duration_s", "num_bytes"),
     "runs": ("run_id", "scene_id", "preset", "painter", "status", "seconds", "num_gaussians"),

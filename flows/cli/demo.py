@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from flows.cli.output import print_json
+from flows.cli.shared_options import AsJson
 
 REPORT_NAME = "report.html"
 
@@ -24,7 +25,7 @@ def demo(
         list[str] | None,
         typer.Option("--set", help="Any setting: fit.steps=500. May be repeated."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Run the built-in street through the whole pipeline; ends with report.html in --out."""
     from catalog.errors import storage_errors

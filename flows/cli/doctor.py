@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from flows.cli.output import print_json, print_table
+from flows.cli.shared_options import AsJson
 
 UNFIT = 2
 
@@ -21,7 +22,7 @@ def doctor(
     out: Annotated[
         Path | None, typer.Option(help="Where the overlay picture goes; beside the scene if absent")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Check the setup, a stored scene, or a dataset on disk."""
     from catalog.store import open_store

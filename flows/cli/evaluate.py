@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from flows.cli.output import print_json, print_table
+from flows.cli.shared_options import AsJson, RunName
 from lidarpainter_models.errors import ConfigError
 
 PROTOCOLS = ("paper", "truth", "cross-camera", "flicker")
@@ -13,7 +14,7 @@ FLICKER = "flicker"
 
 
 def evaluate(  # noqa: PLR0913 - the options of a command
-    run: Annotated[str, typer.Argument(help="A run id, a unique prefix of one, or latest.")],
+    run: RunName,
     protocol: Annotated[str, typer.Option(help=f"{', '.join(PROTOCOLS)}.")] = "paper",
     postpaint: Annotated[
         bool, typer.Option("--postpaint", help="Judge what is painted at view time as well.")
@@ -34,7 +35,7 @@ def evaluate(  # noqa: PLR0913 - the options of a command
         str | None,
         typer.Option(help="For flicker: also lean on the frame before, mixed or shown (or both)."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Judge a finished run on views it never saw."""
     _check(protocol, previous)

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from flows.cli.output import complain, format_bytes, print_json, print_table
+from flows.cli.shared_options import AsJson
 from lidarpainter_models.errors import ConfigError
 
 SOME_FAILED = 2
@@ -31,7 +32,7 @@ def ingest(  # noqa: PLR0913 - one per option
     again: Annotated[
         bool, typer.Option("--again", help="Read sequences anew that are in the store unchanged.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Bring sequences of a dataset into the store."""
     chosen_frames = parse_frames(frames)

@@ -14,10 +14,10 @@ from flows.cli.painter_options import (
     with_length,
     write_painter,
 )
+from flows.cli.shared_options import AsJson
 
 app = typer.Typer(help="Train painters, judge them, say what they are.", no_args_is_help=True)
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Settings = Annotated[
     list[str] | None,
     typer.Option("--set", help="Any other setting: training.batch_size=4. May be repeated."),

@@ -7,6 +7,7 @@ import typer
 
 from flows.cli.output import Cell, format_bytes, print_json, print_pairs, print_table
 from flows.cli.painter_options import parse_size
+from flows.cli.shared_options import AsJson
 from lidarpainter_models.errors import ConfigError
 
 Size = Annotated[str, typer.Option(help="Size of a picture, WIDTHxHEIGHT.")]
@@ -18,7 +19,7 @@ def benchmark(
     training: Annotated[
         bool, typer.Option("--training", help="Time one training step instead; some minutes.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Time the one-step painter wired plainly, wired well, and with the tiny autoencoder.
 

@@ -5,6 +5,7 @@ from typing import Annotated, Any
 import typer
 
 from flows.cli.output import Cell, format_bytes, print_json, print_pairs, print_table
+from flows.cli.shared_options import AsJson
 from lidarpainter_models.errors import ConfigError
 
 
@@ -30,7 +31,7 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
         list[str] | None,
         typer.Option("--set", help="Any other setting: fit.steps=500. May be repeated."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Turn a stored scene into a fitted, painted, judged and reported one."""
     from catalog.store import open_store

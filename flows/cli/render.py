@@ -6,21 +6,15 @@ from typing import Annotated
 import typer
 
 from flows.cli.output import print_json, print_pairs
+from flows.cli.shared_options import AsJson, FollowedCamera, FollowedFrames, RunName, TrajectorySpec
 
 
 def render(  # noqa: PLR0913 - the options of a command
-    run: Annotated[str, typer.Argument(help="A run id, a unique prefix of one, or latest.")],
-    trajectory: Annotated[
-        str,
-        typer.Option(help="recorded, lateral:2, up:1.5, yaw:15, lane-change:3.5; parts with +."),
-    ],
+    run: RunName,
+    trajectory: TrajectorySpec,
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")],
-    camera: Annotated[
-        str | None, typer.Option(help="Camera whose path is followed; the first if absent.")
-    ] = None,
-    frames: Annotated[
-        str | None, typer.Option(help="Recorded frames A:B to follow, B excluded.")
-    ] = None,
+    camera: FollowedCamera = None,
+    frames: FollowedFrames = None,
     postpaint: Annotated[
         bool, typer.Option("--postpaint", help="Paint every picture as well.")
     ] = False,
@@ -34,7 +28,7 @@ def render(  # noqa: PLR0913 - the options of a command
         str | None,
         typer.Option(help="Lean on the picture painted before: mixed into the next, or shown."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Render a finished run where nobody drove."""
     from catalog.store import open_store

@@ -6,25 +6,19 @@ from typing import Annotated, Any
 import typer
 
 from flows.cli.output import print_json, print_pairs
+from flows.cli.shared_options import AsJson, FollowedCamera, FollowedFrames, RunName, TrajectorySpec
 
 
 def stylize(  # noqa: PLR0913 - the options of a command
-    run: Annotated[str, typer.Argument(help="A run id, a unique prefix of one, or latest.")],
+    run: RunName,
     prompt: Annotated[str, typer.Option(help="clear, foggy, night or rain.")],
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")],
-    trajectory: Annotated[
-        str,
-        typer.Option(help="recorded, lateral:2, up:1.5, yaw:15, lane-change:3.5; parts with +."),
-    ] = "recorded",
+    trajectory: TrajectorySpec = "recorded",
     pictures: Annotated[
         str, typer.Option(help="rendered, or recorded: style what the camera saw.")
     ] = "rendered",
-    camera: Annotated[
-        str | None, typer.Option(help="Camera whose path is followed; the first if absent.")
-    ] = None,
-    frames: Annotated[
-        str | None, typer.Option(help="Recorded frames A:B to follow, B excluded.")
-    ] = None,
+    camera: FollowedCamera = None,
+    frames: FollowedFrames = None,
     width: Annotated[
         int | None, typer.Option(help="Width of the pictures in pixels; that of the fit if absent.")
     ] = None,
@@ -32,7 +26,7 @@ def stylize(  # noqa: PLR0913 - the options of a command
         str | None, typer.Option(help="Paint every picture with this before it is styled.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Decides lit windows, drops and noise.", min=0)] = 0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Show a finished run in another weather or at night, and how well its edges are kept."""
     from dataclasses import replace
