@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import torch
+
 from lidarpainter_models.errors import WeightsError
 from lidarpainter_models.painter.baselines import OverlayPainter, UnpaintedPainter, WarpPainter
 from lidarpainter_models.painter.nano.weights import load_weights
@@ -39,6 +41,8 @@ PAINTER_NAMES = (*_UNLEARNED, "nano", SD_TURBO)
 def load_painter(name_or_path: str | Path) -> Painter:
     """A painter by its name, from a `.safetensors` file, or from a model in diffusers' layout.
 
+    A one-step painter goes to the GPU if there is one; its paintings come back to their conditions.
+
     Raises:
         WeightsError: no such painter, or weights that cannot be used.
         MissingPackageError: a one-step painter without the extra `diffusion`.
@@ -49,7 +53,8 @@ def load_painter(name_or_path: str | Path) -> Painter:
     if name == "nano":
         return load_weights(BUNDLED_NANO)
     if is_one_step(name):
-        return load_one_step(name)
+        painter = load_one_step(name)
+        return painter.to(torch.device("cuda")) if torch.cuda.is_available() else painter
     if name.endswith(".safetensors"):
         return load_weights(Path(name))
     raise WeightsError(

@@ -15,6 +15,7 @@ from lidarpainter_models.errors import ConfigError, MissingPackageError, Weights
 from lidarpainter_models.painter import load_painter
 from lidarpainter_models.painter.one_step.assembly import trained_names
 from lidarpainter_models.painter.one_step.loading import load_one_step
+from lidarpainter_models.painter.one_step.painter import OneStepPainter
 from lidarpainter_models.painter.one_step.presets import PRESETS
 from lidarpainter_models.painter.one_step.weights import METADATA_KEY, read_header, save_trained
 
@@ -88,6 +89,16 @@ def test_every_preset_paints_with_a_folders_weights(preset, model_folder, make_c
     assert painting.rgb.shape == (70, 100, 3)
     types = {parameter.dtype for parameter in painter.network.autoencoder.parameters()}
     assert types == {torch.bfloat16}
+
+
+def test_painter_goes_to_the_gpu_if_there_is_one(model_folder, monkeypatch):
+    went = []
+    monkeypatch.setattr(OneStepPainter, "to", lambda _, device: went.append(device.type))
+    load_painter(str(model_folder))
+    assert went == []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    load_painter(str(model_folder))
+    assert went == ["cuda"]
 
 
 def test_trained_weights_come_back_bit_for_bit(trained, make_conditions):
