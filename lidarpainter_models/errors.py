@@ -6,7 +6,18 @@ is wrong, where, and what was expected.
 
 
 class LidarPainterError(Exception):
-    """Something given from outside cannot be used as it is."""
+    """Something given from outside cannot be used as it is.
+
+    Messages quote names and values from outside: as text, what is not printable in them is written
+    as an escape, so that one error is one line and a terminal obeys none of it.
+    """
+
+    def __str__(self) -> str:
+        """The message on one line."""
+        return "".join(
+            character if character.isprintable() else character.encode("unicode_escape").decode()
+            for character in super().__str__()
+        )
 
 
 class DataError(LidarPainterError, ValueError):
