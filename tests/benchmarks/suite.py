@@ -68,12 +68,12 @@ def measure(*, quick):
         figures = raster_figures(machine, QUICK_SCENE, 1) + reference_figures(QUICK_SCENE, 1)
         figures += growth_figures(1, gaussians=(1000, 2000), sizes=((80, 48), (160, 96)))
         return machine.figures() + figures + point_figures(machine, 1, counts=(1000, 2000))
-    figures = raster_figures(machine, SCENE, 7)
+    figures = raster_figures(machine, SCENE, 15)
     figures += (
-        thread_figures(SCENE, 7) + view_figures(SCENE, 5) + reference_figures(REFERENCE_SCENE, 7)
+        thread_figures(SCENE, 15) + view_figures(SCENE, 5) + reference_figures(REFERENCE_SCENE, 7)
     )
     figures += iteration_figures(machine, 15)
-    figures += point_figures(machine, 5)
+    figures += point_figures(machine, 9)
     figures += growth_figures(3) + frame_growth_figures(48) + memory_figures()
     return machine.figures() + figures
 
