@@ -27,6 +27,18 @@ def _multiply_add(rounds, factor, summand, lanes):
             lanes[k] = x
 
 
+@numba.njit(parallel=True, fastmath={"contract"}, error_model="numpy")
+def _multiply_add_in_halves(rounds, factor, summand, lanes):
+    for half in numba.prange(2):
+        _multiply_add(rounds, factor, summand, lanes[half])
+
+
+def multiply_adds():
+    """Work in two halves that share nothing and stay in registers: what two threads can halve."""
+    lanes = np.zeros((2, LANES), np.float32)
+    _multiply_add_in_halves(20_000, np.float32(0.999), np.float32(1e-3), lanes)
+
+
 def best_cpu_s(work, repeats):
     """Least CPU time of the process (all threads) over some runs: what others take does not count.
 
