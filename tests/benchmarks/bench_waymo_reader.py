@@ -63,11 +63,12 @@ def picture(rng):
 def range_images(shape, rng):
     """Two echoes with ranges that repeat in their upper bits, as a street's do."""
     images = np.full((2, *shape, 4), -1.0, dtype=np.float32)
+    missed = rng.random(shape) < 0.2
     for image in images:
         steps = rng.normal(0, 0.05, shape).cumsum(axis=1)
         image[..., 0] = np.round(np.abs(20 + steps) * 256) / 256 + 1
         image[..., 1] = np.round(rng.exponential(0.2, shape), 3)
-        image[rng.random(shape) < 0.2] = -1.0
+        image[missed] = -1.0
     return images
 
 
