@@ -133,8 +133,10 @@ def range_points(
     if sweep.pixel_poses is not None:
         if sweep.pixel_poses.shape[:2] != (num_rows, num_columns):
             raise DataError(f"{sweep.place}: the pixel poses are not one per pixel")
-        poses = sweep.pixel_poses[row, column].astype(np.float64)
-        xyz_m = _compensated(xyz_m, poses, global_from_vehicle, sweep.place)
+        poses = sweep.pixel_poses[row, column]
+        if not np.isfinite(poses).all():  # before it is cast, of which a signalling NaN complains
+            raise DataError(f"{sweep.place}: a pixel pose is not finite")
+        xyz_m = _compensated(xyz_m, poses.astype(np.float64), global_from_vehicle, sweep.place)
     return RangePoints(
         xyz_vehicle_m=xyz_m,
         intensity=values[:, 1],
@@ -183,8 +185,6 @@ def _compensated(
 
     A pose is roll, pitch and yaw (turns about x, then y, then z) and a position.
     """
-    if not np.isfinite(poses).all():
-        raise DataError(f"{where}: a pixel pose is not finite")
     frame = global_from_vehicle.to(torch.float64).numpy()
     moved_m = poses[:, 3:] - frame[:3, 3]
     if len(moved_m) and np.abs(moved_m).max() > _MAX_MOTION_M:
