@@ -148,6 +148,11 @@ def test_second_echoes_without_first_ones(refusal, messages):
     assert "later echoes have no earlier one" in line
 
 
+def test_range_image_of_a_second_echo_alone(refusal, messages):
+    line = refusal(with_frame(messages, [(LASERS, 0), FIRST, RANGES], lambda _: None))
+    assert "lasers[0] (TOP): a range image of the second echo, but none of the first" in line
+
+
 def test_lidar_without_calibration(refusal, messages):
     line = refusal(everywhere(messages, [CONTEXT, (LIDARS, 1)], lambda _: None))
     assert "lasers[1] (REAR): the LiDAR has no calibration" in line

@@ -217,6 +217,18 @@ def checked_image(
     )
 
 
+def echoes_present(images: Sequence[np.ndarray | None], place: str) -> tuple[np.ndarray, ...]:
+    """The range images of the echoes that a LiDAR has.
+
+    Raises:
+        DataError: a later echo without the first one.
+    """
+    found = tuple(image for image in images if image is not None)
+    if found and images[0] is None:
+        raise DataError(f"{place}: a range image of the second echo, but none of the first")
+    return found
+
+
 def checked_box(numbers: Sequence[float], place: str) -> UprightBox:
     """A box from its centre (3), length, width, height and heading.
 

@@ -9,8 +9,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.scenes.readers.waymo.calibration import (
     CAMERA_NAMES,
@@ -34,12 +32,14 @@ from lidarpainter_models.scenes.readers.waymo.log import (
     checked_box,
     checked_frame,
     checked_image,
+    echoes_present,
 )
 from lidarpainter_models.scenes.readers.waymo.messages import parse_message
 from lidarpainter_models.scenes.readers.waymo.range_images import unpack_matrix
 from lidarpainter_models.scenes.readers.waymo.tfrecord import TfrecordFile
 
 RANGE_CHANNELS, POSE_CHANNELS = 4, 6
+_ECHOES = ("ri_return1", "ri_return2")
 _VELOCITY = ("v_x", "v_y", "v_z", "w_x", "w_y", "w_z")
 _TIMES = ("pose_timestamp", "shutter", "camera_trigger_time", "camera_readout_done_time")
 _BOX = ("center_x", "center_y", "center_z", "length", "width", "height", "heading")
@@ -177,16 +177,15 @@ def _sweep(content: bytes, where: str) -> WaymoSweep:
     message = parse_message("Laser", content, where)
     name = sensor_name(message.name, LIDAR_NAMES, where)
     where = f"{where} ({name})"
-    returns: list[np.ndarray] = []
-    for field in ("ri_return1", "ri_return2"):
-        compressed = getattr(message, field).range_image_compressed
-        if compressed:
-            place = f"{where}, {field}"
-            returns.append(unpack_matrix(compressed, RANGE_CHANNELS, place))
+    packed = {name: getattr(message, name).range_image_compressed for name in _ECHOES}
+    returns = [
+        unpack_matrix(content, RANGE_CHANNELS, f"{where}, {name}") if content else None
+        for name, content in packed.items()
+    ]
     poses = message.ri_return1.range_image_pose_compressed
     return WaymoSweep(
         lidar_name=name,
-        returns=tuple(returns),
+        returns=echoes_present(returns, where),
         pixel_poses=unpack_matrix(poses, POSE_CHANNELS, f"{where}, pixel poses") if poses else None,
         place=where,
     )

@@ -37,6 +37,7 @@ from lidarpainter_models.scenes.readers.waymo.log import (
     checked_box,
     checked_frame,
     checked_image,
+    echoes_present,
 )
 from lidarpainter_models.scenes.readers.waymo.parquet_rows import (
     FrameStream,
@@ -264,12 +265,14 @@ class WaymoParquetSegment:
     def _sweep(self, row: ParquetRow, poses: dict[str, np.ndarray]) -> WaymoSweep:
         self._require_segment(row)
         name = sensor_name(self._sensor(row, LIDAR), LIDAR_NAMES, row.place)
-        returns = (self._matrix("lidar", row, echo, RANGE_CHANNELS) for echo in _ECHOES)
+        place = f"{row.place} ({name})"
+        images = (self._matrix("lidar", row, echo, RANGE_CHANNELS) for echo in _ECHOES)
+        returns = [image if image.size else None for image in images]
         return WaymoSweep(
             lidar_name=name,
-            returns=tuple(image for image in returns if image.size),
+            returns=echoes_present(returns, place),
             pixel_poses=poses.get(name),
-            place=f"{row.place} ({name})",
+            place=place,
         )
 
     def _matrix(self, component: str, row: ParquetRow, column: str, channels: int) -> np.ndarray:
