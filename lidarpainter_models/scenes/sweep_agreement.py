@@ -26,7 +26,7 @@ _NUM_REWEIGHTINGS = 10
 _LEAST_RESIDUAL_M = 0.01
 """Smaller ones weigh no more: the noise of a LiDAR."""
 _MOST_UNEXPLAINED = 0.67
-"""Of the residuals. Tried once on seven pairs: sound ones kept 0.82, moved by 0.2 m 0.58 at most."""
+"""Of the residuals. Tried once on seven pairs: sound ones kept 0.82, those moved by 0.2 m 0.58."""
 _LEAST_SHARE = 0.03
 """Of all planes that must pin down a way of moving: the rest is what corners make up."""
 
