@@ -95,6 +95,35 @@ def test_points_of_chance(pandaset, refusal):
     assert "lidar/01.pkl.gz: the points lie" in refusal()
 
 
+@pytest.fixture
+def raise_boxes(pandaset):
+    """Writes a longer log and lifts the boxes of some frames off the points."""
+
+    def lifted(frames, *, num_frames=6):
+        pandaset.num_frames = num_frames
+        pandaset.write_log()
+        for index in frames:
+            boxes = pandaset.boxes_at(pandaset.frame_times_s()[index])
+            raised = [{**box, "centre": box["centre"] + np.array([0, 0, 9.0])} for box in boxes]
+            pandaset.write_boxes(index, raised)
+
+    return lifted
+
+
+def test_moving_boxes_that_never_hold_points(raise_boxes, refusal):
+    raise_boxes(range(6))
+    line = refusal()
+    assert "002: none of 6 boxes of moving actors within 40 m holds a LiDAR point" in line
+
+
+@pytest.mark.parametrize(("frames", "num_frames"), [(range(5), 6), (range(4), 4)])
+def test_some_empty_boxes_are_left_to_the_doctor(
+    raise_boxes, pandaset, tmp_path, frames, num_frames
+):
+    raise_boxes(frames, num_frames=num_frames)
+    assert pandaset.ingest(tmp_path / "store").is_dir()
+
+
 def test_camera_that_sees_points_in_one_picture_is_taken(pandaset, tmp_path):
     def look_up_once(poses):
         poses[0]["heading"] = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}

@@ -6,7 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
-from fuzzing import fuzz, judge
+from fuzzing import MAX_MEMORY_BYTES, fuzz, judge, peak_bytes
 from mutations import damaged_bytes, damaged_json
 from pickled_tables import pickled_table
 
@@ -97,12 +97,14 @@ def test_damaged_scene_is_refused_or_sound(sound_scene, tmp_path):
 def test_ten_thousand_damaged_logs(sound_pandaset, tmp_path):
     outcomes = fuzz_pandaset(sound_pandaset.path, tmp_path, range(NUM_ALL))
     assert outcomes["refused"] + outcomes["accepted"] == NUM_ALL
+    assert peak_bytes() < MAX_MEMORY_BYTES
 
 
 @pytest.mark.slow
 def test_ten_thousand_damaged_scenes(sound_scene, tmp_path):
     outcomes = fuzz_canonical(sound_scene, tmp_path, range(NUM_ALL))
     assert outcomes["refused"] + outcomes["accepted"] == NUM_ALL
+    assert peak_bytes() < MAX_MEMORY_BYTES
 
 
 def refused_table(log, content, tmp_path):

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation
+from lidarpainter_models.scenes.actor_checks import NEAR_M
 from lidarpainter_models.scenes.doctor import (
     MAX_CAMERA_LAG_S,
     MAX_SPEED_MPS,
@@ -33,6 +34,8 @@ MAX_REACH_M = 1000.0
 """Of a LiDAR; those of PandaSet reach 310 m."""
 MAX_GAP_M = 1.0
 """Between consecutive sweeps near the car; PandaSet's lie 0.04 m apart, points of chance metres."""
+MIN_BOXES = 5
+"""Of moving actors near the car, before none of them holding a point tells anything."""
 _POINT_STRIDE = 3
 
 
@@ -46,6 +49,7 @@ class DriveChecks:
         self._last_exposure_ns: dict[str, int] = {}
         self._unseeing: dict[str, str] = {}
         self._seeing: set[str] = set()
+        self._num_boxes = self._num_held = 0
 
     def require_frame(self, content: FrameContent) -> None:
         """Refuse a frame that does not follow from the one before or hold together.
@@ -65,6 +69,7 @@ class DriveChecks:
             self._require_image(image, content)
         if self._last is not None and self._position in self._compared:
             _require_agreement(self._last, content)
+        self._count_boxes(content)
         self._last, self._position = content, self._position + 1
 
     def require_all_cameras(self) -> None:
@@ -78,6 +83,25 @@ class DriveChecks:
                 f"{source}: no LiDAR point falls into any picture of {name}, expected its pose "
                 "and lens to show what the LiDARs see"
             )
+
+    def require_points_in_boxes(self) -> None:
+        """Refuse a log whose moving actors are never where the LiDARs see anything.
+
+        Raises:
+            DataError: without a place; one wrong pose or mount spoils them all.
+        """
+        if self._num_boxes >= MIN_BOXES and self._num_held == 0:
+            raise DataError(
+                f"none of {self._num_boxes} boxes of moving actors within {NEAR_M:.0f} m holds a "
+                "LiDAR point, expected the poses of LiDARs and boxes to agree"
+            )
+
+    def _count_boxes(self, content: FrameContent) -> None:
+        for box in content.boxes:
+            away_m = box.world_from_box[:3, 3] - content.world_from_ego[:3, 3]
+            if box.is_moving and float(away_m.norm()) < NEAR_M:
+                self._num_boxes += 1
+                self._num_held += box.num_points > 0
 
     def _require_image(self, image: SourceImage, content: FrameContent) -> None:
         name, exposure_ns = image.record.camera_name, image.record.timestamp_ns

@@ -83,6 +83,7 @@ def write_log(
                 progress(done, num_frames)
         if checks is not None:
             checks.require_all_cameras()
+            checks.require_points_in_boxes()
         writer.set_provenance(log.provenance())
     return writer.path
 
