@@ -4,7 +4,6 @@ Every check takes `where`, the place to name in the error (dataset, sequence, fr
 raises a one-line `DataError` that says what is wrong there and what was expected.
 """
 
-import math
 from collections.abc import Mapping
 
 import cv2
@@ -26,6 +25,8 @@ _JPEG_END = b"\xff\xd9"
 _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 MAX_COORDINATE_M = 100_000.0
 """Farther from the first ego pose than this, float32 is no longer exact to a centimetre."""
+MAX_BOX_M = 1000.0
+"""Along a side; a train is shorter."""
 MAX_PICTURE_PIXELS = 64_000_000
 """A header that states more is refused before anything is decoded; cameras have up to 12 million.
 
@@ -135,10 +136,13 @@ def require_points(xyz_m: np.ndarray, where: str) -> None:
 
 
 def require_size(size_m: tuple[float, float, float], where: str) -> None:
-    """Refuse a box whose length, width or height is zero, negative or not finite."""
-    if not all(math.isfinite(size) and size > 0 for size in size_m):
+    """Refuse a box whose length, width or height is zero, negative, endless or not a number."""
+    if not all(0 < size <= MAX_BOX_M for size in size_m):
         shown = " x ".join(f"{size:g}" for size in size_m)
-        raise DataError(f"{where}: the box measures {shown} m, expected positive sizes")
+        raise DataError(
+            f"{where}: the box measures {shown} m, expected positive sizes, {MAX_BOX_M:.0f} m at "
+            "most"
+        )
 
 
 def require_jpeg(jpeg: bytes, *, width_px: int, height_px: int, where: str) -> None:

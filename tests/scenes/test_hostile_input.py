@@ -147,13 +147,14 @@ def test_classes_for_other_points(pandaset, store):
     assert "semseg/00.pkl.gz: 3 classes for 805 points" in refusal(pandaset, store)[1]
 
 
-def test_zero_size_box(pandaset, store, monkeypatch):
-    monkeypatch.setattr(f"{type(pandaset).__module__}.CAR_SIZE_M", (4.0, 0.0, 1.6))
+@pytest.mark.parametrize(("width_m", "shown"), [(0.0, "0"), (1e308, "1e+308")])
+def test_box_of_no_size(pandaset, store, monkeypatch, width_m, shown):
+    monkeypatch.setattr(f"{type(pandaset).__module__}.CAR_SIZE_M", (4.0, width_m, 1.6))
     boxes = [{"uuid": "flat", "stationary": True, "sensor": -1, "sibling": "-"}]
     pandaset.write_boxes(1, [{**box, "centre": np.array([110.0, -40.0, 7.0])} for box in boxes])
     kind, message = refusal(pandaset, store)
     assert kind is DataError
-    assert "cuboids/01.pkl.gz, Car flat: the box measures 4 x 0 x 1.6 m, expected" in message
+    assert f"01.pkl.gz, Car flat: the box measures 4 x {shown} x 1.6 m, expected" in message
 
 
 def test_box_at_no_place(pandaset, store):

@@ -26,6 +26,7 @@ def test_actor_whose_name_is_no_text(refusal, messages):
     [
         ([1, 1], float("nan"), "box: holds a number that is not finite"),
         ([1, 5], -4.0, "box: the box measures -4 x"),
+        ([1, 5], 1e308, "expected positive sizes, 1000 m at most"),
         ([1, 2], 1e12, "box: a box beyond 1000 m"),
         ([3], 9, "label type 9 is not known, expected 0 to 4"),
     ],

@@ -40,6 +40,14 @@ def test_picture_whose_pose_is_elsewhere(refusal, messages):
     assert "images[1] (SIDE_LEFT), pose: 4." in line
 
 
+@pytest.mark.parametrize(
+    ("field", "number"), [(1, 1e30), (3, -200.0), (4, 1e200), (5, 1e308), (6, -20.0)]
+)
+def test_picture_taken_at_no_speed_of_a_car(refusal, messages, field, number):
+    line = refusal(with_frame(messages, [IMAGES, 4, field], lambda _: number))
+    assert "images[0] (FRONT), velocity: faster than 100 m/s or" in line
+
+
 def test_unknown_camera(refusal, messages):
     line = refusal(with_frame(messages, [IMAGES, 1], lambda _: 77))
     assert "images[0]: sensor 77 is not known, expected FRONT, FRONT_LEFT" in line

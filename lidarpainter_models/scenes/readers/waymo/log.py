@@ -5,6 +5,7 @@ what is defined here and `reader.py` makes a scene of it. Lengths are metres, an
 seconds since the epoch (float64 holds them to 0.2 us) unless named otherwise.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -185,7 +186,8 @@ def checked_image(
         DataError: something is missing or senseless.
     """
     rates = finite_numbers(velocity, 6, f"{place}, velocity")
-    if np.linalg.norm(rates[:3]) > MAX_SPEED_MPS or np.linalg.norm(rates[3:]) > MAX_TURN_RADPS:
+    # a hypotenuse beyond float64 is infinite; numpy's norm would warn of it
+    if math.hypot(*rates[:3]) > MAX_SPEED_MPS or math.hypot(*rates[3:]) > MAX_TURN_RADPS:
         raise DataError(
             f"{place}, velocity: faster than {MAX_SPEED_MPS:.0f} m/s or {MAX_TURN_RADPS:.0f} rad/s"
         )
