@@ -5,10 +5,11 @@ where there is none; masks are float, 1 where true. Warps beyond those a view ha
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
+import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Float
 from torch import Tensor
 
@@ -40,6 +41,27 @@ class ConditionBatch:
     def to(self, device: torch.device) -> "ConditionBatch":
         """The same batch on another device."""
         return self.map(lambda values: values.to(device))
+
+
+def in_planes(conditions: PaintingConditions) -> PaintingConditions:
+    """The same view with the channels of every picture apart in memory.
+
+    A batch and a hull need them so; a view that is given to both is converted but once.
+    """
+    reference = conditions.reference_rgb
+    return replace(
+        conditions,
+        render_rgb=_apart(conditions.render_rgb),
+        lidar_rgb=_apart(conditions.lidar_rgb),
+        warp_rgb=_apart(conditions.warp_rgb),
+        reference_rgb=None if reference is None else _apart(reference),
+    )
+
+
+def _apart(
+    rgb: Float[Tensor, "*sources height width 3"],
+) -> Float[Tensor, "*sources height width 3"]:
+    return rgb.movedim(-1, -3).contiguous().movedim(-3, -1)
 
 
 def stack_conditions(views: Sequence[PaintingConditions], *, num_sources: int) -> ConditionBatch:
@@ -77,10 +99,7 @@ def _stack_map(maps: Sequence[Tensor]) -> Float[Tensor, "batch 1 height width"]:
 def _first_sources(
     view: PaintingConditions, num_sources: int
 ) -> tuple[Float[Tensor, "sources 3 height width"], Float[Tensor, "sources height width"]]:
-    height_px, width_px = view.height_width_px
-    rgb = view.render_rgb.new_zeros(num_sources, 3, height_px, width_px)
-    valid = view.render_rgb.new_zeros(num_sources, height_px, width_px)
-    kept = min(num_sources, len(view.warp_rgb))
-    rgb[:kept] = view.warp_rgb[:kept].permute(0, 3, 1, 2)
-    valid[:kept] = view.warp_valid[:kept].float()
-    return rgb * valid[:, None], valid
+    valid = view.warp_valid[:num_sources].to(view.render_rgb)
+    rgb = view.warp_rgb[:num_sources].permute(0, 3, 1, 2).contiguous() * valid[:, None]
+    missing = (0, num_sources - len(valid))
+    return F.pad(rgb, (0, 0) * 3 + missing), F.pad(valid, (0, 0) * 2 + missing)

@@ -55,15 +55,28 @@ def fill_push_pull(
 
     A picture without any known pixel becomes black.
     """
-    weighted = torch.cat([picture * known, known], dim=1)
-    pyramid = [weighted]
+    pyramid = [torch.cat([picture * known, known], dim=1)]
     while max(pyramid[-1].shape[2:]) > 1:
-        pyramid.append(F.avg_pool2d(pyramid[-1], 2, ceil_mode=True))
+        pyramid.append(_halved(pyramid[-1]))
     filled = pyramid[-1][:, :3] / pyramid[-1][:, 3:].clamp_min(1e-6)
     for level in reversed(pyramid[:-1]):
         coarse = F.interpolate(filled, size=level.shape[2:], mode="bilinear", align_corners=False)
         weight = level[:, 3:]
         # half covered cells lean on the coarser level, so that single points do not spread
         share = (2 * weight).clamp_max(1)
-        filled = share * level[:, :3] / weight.clamp_min(1e-6) + (1 - share) * coarse
+        filled = torch.lerp(coarse, level[:, :3] / weight.clamp_min(1e-6), share)
     return filled
+
+
+def _halved(
+    picture: Float[Tensor, "batch channels height width"],
+) -> Float[Tensor, "batch channels rows columns"]:
+    """Means of two by two pixels; of those that there are at an odd edge.
+
+    Sums of every other pixel: on a CPU much faster than pooling.
+    """
+    height_px, width_px = picture.shape[2:]
+    odd = (0, width_px % 2, 0, height_px % 2)
+    even = F.pad(picture, odd, mode="replicate") if any(odd) else picture
+    rows = even[:, :, ::2] + even[:, :, 1::2]
+    return (rows[..., ::2] + rows[..., 1::2]).mul_(0.25)

@@ -41,14 +41,15 @@ def input_hull(
         inputs: those that count beside the render, of `lidar`, `warp` and `reference`.
         margin: added on both sides.
     """
-    lower = upper = conditions.render_rgb
+    render = conditions.render_rgb.permute(2, 0, 1).contiguous()
+    lower = upper = render
     for rgb, known in _shown_beside_the_render(conditions, inputs):
         # what does not exist neither widens nor narrows what the render shows
-        rgb_or_render = torch.where(known[..., None], rgb, conditions.render_rgb)
+        rgb_or_render = torch.lerp(render, rgb.permute(2, 0, 1).contiguous(), known.to(render))
         lower, upper = torch.minimum(lower, rgb_or_render), torch.maximum(upper, rgb_or_render)
     return InputHull(
-        lower=_most_nearby(lower, torch.minimum, torch.inf) - margin,
-        upper=_most_nearby(upper, torch.maximum, -torch.inf) + margin,
+        lower=_most_nearby(lower, torch.minimum, torch.inf).sub_(margin).permute(1, 2, 0),
+        upper=_most_nearby(upper, torch.maximum, -torch.inf).add_(margin).permute(1, 2, 0),
     )
 
 
@@ -65,16 +66,16 @@ def _shown_beside_the_render(
 
 
 def _most_nearby(
-    values: Float[Tensor, "height width 3"],
+    values: Float[Tensor, "3 height width"],
     choose: Callable[[Tensor, Tensor], Tensor],
     beyond: float,
-) -> Float[Tensor, "height width 3"]:
+) -> Float[Tensor, "3 height width"]:
     """The least or largest value in the square around every pixel, one direction at a time.
 
     Runs of 1, 2, 4, 8 pixels are compared with themselves a run further on, then the longest with
     itself at the end of the side: fewer and simpler passes than a pooling with windows.
     """
-    for dim in (0, 1):
+    for dim in (1, 2):
         rim = torch.full_like(values.narrow(dim, 0, 1), beyond)
         rim = rim.expand(*(HULL_SIDE_PX // 2 if d == dim else -1 for d in range(3)))
         run, run_px = torch.cat([rim, values, rim], dim=dim), 1

@@ -39,11 +39,10 @@ class Candidates:
         self, logits: Float[Tensor, "batch candidates height width"]
     ) -> Float[Tensor, "batch candidates height width"]:
         """The logits, minus infinity where a candidate does not exist."""
-        planes = list(logits.unbind(dim=1))
+        allowed = logits.clone()
         for name, exists in self.exists.items():
-            number = self.names.index(name)
-            planes[number] = planes[number].masked_fill(exists == 0, -torch.inf)
-        return torch.stack(planes, dim=1)
+            allowed[:, self.names.index(name)].masked_fill_(exists == 0, -torch.inf)
+        return allowed
 
     def mixed(
         self, weights: Float[Tensor, "batch candidates height width"]
@@ -51,7 +50,7 @@ class Candidates:
         """The pictures' mean under weights that sum to one."""
         total = torch.zeros_like(self.pictures[0])
         for weight, picture in zip(weights.split(1, dim=1), self.pictures, strict=True):
-            total = torch.addcmul(total, weight, picture)
+            total.addcmul_(weight, picture)
         return total
 
 

@@ -4,6 +4,8 @@ Beside the pictures themselves it sees where they disagree: a render that no war
 best single hint of damage. Depth enters as a logarithm, 0 where there is none.
 """
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -54,7 +56,19 @@ def painting_features(
         channels.append(gap * conditions.lidar_hit)
     if "reference" in inputs:
         channels.append(given_reference(conditions) - 0.5)
-    return torch.cat([channel.to(precision) for channel in channels], dim=1), lidar_filled
+    return _joined(channels, precision), lidar_filled
+
+
+def _joined(
+    channels: Sequence[Float[Tensor, "batch _ height width"]], precision: torch.dtype
+) -> Float[Tensor, "batch features height width"]:
+    """All channels in a precision; converted where they come to lie."""
+    size, _, height_px, width_px = channels[0].shape
+    counts = [channel.shape[1] for channel in channels]
+    joined = channels[0].new_empty(size, sum(counts), height_px, width_px, dtype=precision)
+    for place, channel in zip(joined.split(counts, dim=1), channels, strict=True):
+        place.copy_(channel)
+    return joined
 
 
 def _warp_features(conditions: ConditionBatch) -> list[Tensor]:
@@ -63,7 +77,7 @@ def _warp_features(conditions: ConditionBatch) -> list[Tensor]:
     num_sources = conditions.warp.shape[1]
     for source in range(num_sources):
         valid = conditions.warp_valid[:, source, None]
-        shown = torch.where(valid > 0, conditions.warp[:, source], conditions.render)
+        shown = torch.lerp(conditions.render, conditions.warp[:, source], valid)  # 0 or 1
         gap = _difference(conditions.render, shown)
         channels += [shown - 0.5, valid, gap]
     for first in range(num_sources):

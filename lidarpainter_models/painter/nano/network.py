@@ -7,6 +7,7 @@ Because colours come from the inputs it cannot invent much; at first it returns 
 """
 
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.batches import ConditionBatch
+from lidarpainter_models.painter.nano.blocks import PixelNorm, residual_blocks
 from lidarpainter_models.painter.nano.candidates import (
     PAINTING_INPUTS,
     Candidates,
@@ -143,39 +145,6 @@ class Style(NamedTuple):
     """Of the features before the head, as in FiLM (Perez et al., 2018)."""
 
 
-class PixelNorm(nn.Module):
-    """Scales the channels of every pixel to a root mean square of one (Zhang and Sennrich, 2019).
-
-    It looks at one pixel alone, so a window and a whole picture are treated alike.
-    """
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.gain = nn.Parameter(torch.ones(width))
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Normalise and scale."""
-        mean_square = x.float().square().mean(dim=1, keepdim=True)
-        scale = torch.rsqrt(mean_square + 1e-4).to(x.dtype)
-        return x * scale * self.gain[:, None, None].to(x.dtype)
-
-
-class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions beside an identity; starts as the identity."""
-
-    def __init__(self, width: int, *, normalise: bool) -> None:
-        super().__init__()
-        self.before = PixelNorm(width) if normalise else nn.SiLU()
-        self.first = nn.Conv2d(width, width, 3, padding=1)
-        self.second = nn.Conv2d(width, width, 3, padding=1)
-        for parameter in self.second.parameters():
-            nn.init.zeros_(parameter)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Add the block's change to its input."""
-        return x + self.second(F.silu(self.first(self.before(x))))
-
-
 class NanoNetwork(nn.Module):
     """The fusion network of one `NanoConfig`; deterministic, free of normalisation by picture."""
 
@@ -185,16 +154,16 @@ class NanoNetwork(nn.Module):
         fine, middle, coarse = config.widths
         in_channels = count_features(config.inputs, config.num_sources) * CELL_PX**2
         self.stem = nn.Conv2d(in_channels, fine, 3, padding=1)
-        self.encode_fine = _blocks(fine, config.blocks[0], config)
+        self.encode_fine = residual_blocks(fine, config.blocks[0], normalise=config.normalise)
         self.down_middle = nn.Conv2d(fine, middle, 2, stride=2)
-        self.encode_middle = _blocks(middle, config.blocks[1], config)
+        self.encode_middle = residual_blocks(middle, config.blocks[1], normalise=config.normalise)
         self.down_coarse = nn.Conv2d(middle, coarse, 2, stride=2)
-        self.encode_coarse = _blocks(coarse, config.blocks[2], config)
+        self.encode_coarse = residual_blocks(coarse, config.blocks[2], normalise=config.normalise)
         self.prompt = nn.Embedding(len(config.prompts), coarse)
         self.up_middle = nn.Conv2d(coarse, middle * 4, 1)
-        self.decode_middle = _blocks(middle, config.blocks[1], config)
+        self.decode_middle = residual_blocks(middle, config.blocks[1], normalise=config.normalise)
         self.up_fine = nn.Conv2d(middle, fine * 4, 1)
-        self.decode_fine = _blocks(fine, config.blocks[0], config)
+        self.decode_fine = residual_blocks(fine, config.blocks[0], normalise=config.normalise)
         self.last = PixelNorm(fine) if config.normalise else nn.Identity()
         self.head = nn.Conv2d(fine, config.num_outputs * CELL_PX**2, 3, padding=1)
         if TINT in config.candidates:
@@ -225,6 +194,17 @@ class NanoNetwork(nn.Module):
             raise ConfigError(f"the nano painter knows no prompt {prompt!r}, only: {known}")
         return self.config.prompts.index(prompt)
 
+    def halved(self) -> "NanoNetwork":
+        """A copy whose U-Net lies in bfloat16: nothing is converted while it runs.
+
+        Training needs float32 weights and converts them in every step (`half_precision`).
+        """
+        halved = deepcopy(self)
+        for name, module in halved.named_children():
+            if name != "style":  # its colour is a picture's
+                module.to(torch.bfloat16)
+        return halved
+
     def forward(
         self,
         conditions: ConditionBatch,
@@ -237,13 +217,14 @@ class NanoNetwork(nn.Module):
         Args:
             conditions: the views.
             prompts: one per view.
-            half_precision: run the U-Net in bfloat16; the pictures stay in float32.
+            half_precision: run a U-Net of float32 weights in bfloat16; the pictures stay in
+                float32.
 
         Raises:
             ConfigError: the network was not trained for a prompt.
         """
         # halves what is moved until the first convolution, which would round to it anyway
-        precision = torch.bfloat16 if half_precision else torch.float32
+        precision = torch.bfloat16 if half_precision else self.stem.weight.dtype
         features, lidar_filled = painting_features(
             conditions, self.config.inputs, precision, composite=self.config.composite
         )
@@ -308,7 +289,8 @@ class NanoNetwork(nn.Module):
         last = self.last(fine)
         if style is not None:
             last = last * (1 + style.gain[..., None, None]) + style.shift[..., None, None]
-        outputs = F.pixel_shuffle(self.head(F.silu(last)), CELL_PX)
+        # a style is float32
+        outputs = F.pixel_shuffle(self.head(F.silu(last).to(features.dtype)), CELL_PX)
         # planes that lie together: what follows works on one output at a time
         inside = outputs[..., :height_px, :width_px]
         return inside.to(torch.float32, memory_format=torch.contiguous_format)
@@ -332,14 +314,9 @@ class NanoNetwork(nn.Module):
         """
         size, channels, height_px, width_px = features.shape
         rows, columns = height_px // CELL_PX, width_px // CELL_PX
-        pixels = features.permute(0, 2, 3, 1).contiguous()
-        places = pixels.view(size, rows, CELL_PX, columns, CELL_PX, channels).transpose(2, 3)
-        cells = places.reshape(size, rows, columns, -1).permute(0, 3, 1, 2)
+        places = features.view(size, channels, rows, CELL_PX, columns, CELL_PX)
+        pixels = places.permute(0, 2, 4, 3, 5, 1)
+        cells = pixels.reshape(size, rows, columns, -1).permute(0, 3, 1, 2)
         by_feature = self.stem.weight.unflatten(1, (channels, CELL_PX**2))
         weight = by_feature.transpose(1, 2).flatten(1, 2)
         return F.conv2d(cells, weight, self.stem.bias, padding=1)
-
-
-def _blocks(width: int, number: int, config: NanoConfig) -> nn.Sequential:
-    blocks = [ResidualBlock(width, normalise=config.normalise) for _ in range(number)]
-    return nn.Sequential(*blocks)

@@ -8,8 +8,8 @@ import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 
 from lidarpainter_models.errors import ConfigError, ShapeError
 from lidarpainter_models.painter import load_painter
-from lidarpainter_models.painter.batches import stack_conditions
-from lidarpainter_models.painter.filters import blur, fill_push_pull, masked_blur
+from lidarpainter_models.painter.batches import in_planes, stack_conditions
+from lidarpainter_models.painter.filters import _halved, blur, fill_push_pull, masked_blur
 from lidarpainter_models.painter.input_hull import HULL_MARGIN, input_hull
 from lidarpainter_models.painter.nano.candidates import build_candidates, candidate_names
 from lidarpainter_models.painter.nano.features import painting_features
@@ -103,10 +103,48 @@ def test_views_with_any_number_of_warps_are_painted(num_sources, make_conditions
     assert bool(painting.rgb.isfinite().all())
 
 
-def test_painting_twice_gives_the_same_bits(make_conditions):
+@pytest.mark.parametrize("threads", [1, 2])
+def test_painting_twice_gives_the_same_bits(threads, make_conditions):
+    torch.set_num_threads(threads)
     painter = NanoPainter(scrambled(NanoConfig(**SMALL)))
     conditions = make_conditions()
     assert torch.equal(painter.paint(conditions).rgb, painter.paint(conditions).rgb)
+
+
+@pytest.mark.parametrize("prompt", ["clear", "foggy"])
+def test_a_network_laid_out_in_bfloat16_paints_as_one_converted_on_the_way(prompt, make_conditions):
+    network = scrambled(NanoConfig(prompts=("clear", "foggy"), **SMALL))
+    batch = stack_conditions([make_conditions()], num_sources=2)
+    with torch.no_grad():
+        expected = network(batch, [prompt], half_precision=True)
+        actual = network.halved()(batch, [prompt])
+    # activations are rounded to eight bits at other places
+    assert float((actual.rgb - expected.rgb).abs().mean()) < 1e-3
+    assert float((actual.log_error - expected.log_error).abs().mean()) < 5e-3
+    assert {parameter.dtype for parameter in network.parameters()} == {torch.float32}
+
+
+def test_a_painter_leaves_its_network_in_float32(make_conditions):
+    network = scrambled(NanoConfig(**SMALL))
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    painter = NanoPainter(network)
+    painter.paint(make_conditions())
+    after = painter.network.state_dict()
+    assert all(torch.equal(after[name], value) for name, value in before.items())
+
+
+def test_the_order_of_channels_in_memory_does_not_change_a_batch_or_a_hull(make_conditions):
+    conditions = make_conditions(num_sources=3)
+    apart = in_planes(conditions)
+    assert torch.equal(apart.warp_rgb, conditions.warp_rgb)
+    assert apart.render_rgb[..., 0].is_contiguous()
+    for one, other in zip(input_hull(apart), input_hull(conditions), strict=True):
+        assert torch.equal(one, other)
+    expected = stack_conditions([conditions], num_sources=2)
+    actual = stack_conditions([apart], num_sources=2)
+    assert torch.equal(actual.render, expected.render)
+    assert torch.equal(actual.warp, expected.warp)
+    assert actual.warp.is_contiguous()
 
 
 def test_residual_is_bounded(make_conditions):
@@ -215,6 +253,15 @@ def test_the_painter_shows_no_colour_that_no_input_shows_nearby(make_conditions)
     assert float((painted - 0.5).abs().max()) <= HULL_MARGIN + 1e-6
 
 
+def test_pixel_norm_in_bfloat16_takes_its_mean_in_float32():
+    features = torch.randn(2, 48, 5, 7, generator=torch.Generator().manual_seed(0)).bfloat16()
+    norm = PixelNorm(48)
+    torch.nn.init.uniform_(norm.gain, 0.5, 2.0, generator=torch.Generator().manual_seed(1))
+    exact = norm(features.float())
+    # two roundings to eight bits
+    torch.testing.assert_close(norm(features).float(), exact, rtol=2**-7, atol=0)
+
+
 def test_pixel_norm_brings_every_pixel_to_one():
     features = 1e4 * torch.randn(2, 8, 5, 7, generator=torch.Generator().manual_seed(0))
     size = PixelNorm(8)(features).square().mean(dim=1)
@@ -286,6 +333,13 @@ def test_filling_keeps_known_pixels_and_reaches_everywhere():
     filled = fill_push_pull(picture, known)
     torch.testing.assert_close(filled, torch.full_like(filled, 0.75))
     assert float(fill_push_pull(picture, torch.zeros_like(known)).abs().max()) == 0
+
+
+@pytest.mark.parametrize("size_px", [(1, 2), (5, 8), (8, 5), (7, 7)])
+def test_a_pyramid_averages_the_pixels_that_there_are(size_px):
+    picture = torch.rand(2, 4, *size_px, generator=torch.Generator().manual_seed(0))
+    expected = F.avg_pool2d(picture, 2, ceil_mode=True)
+    torch.testing.assert_close(_halved(picture), expected, rtol=0, atol=1e-6)
 
 
 def test_filling_a_full_picture_changes_nothing():
