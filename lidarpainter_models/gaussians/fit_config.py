@@ -43,7 +43,7 @@ class GuidanceConfig:
 
     probability: float = 1.0
     """Of adding one painted view to a step (the paper's p_novel, 0.4). Against 0.5 the neighbouring
-    lanes gain 0.1 to 0.2 dB and the recorded views lose 0.06 (docs/benchmarks.md)."""
+    lanes of streets gain 0.1 dB, recorded views lose 0.05 to 0.1 (docs/benchmarks.md)."""
     weight: float = 1.0
     """Of its loss (the paper's lambda_novel, 0.2, changed nothing on short schedules)."""
     ssim: float = 0.1
