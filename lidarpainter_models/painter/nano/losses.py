@@ -39,6 +39,9 @@ class LossWeights:
     """Against changing what render and warps already agree on."""
     agreement: float = 0.03
     """Mean absolute rgb difference up to which render and warp agree."""
+    harm: float = 0.0
+    """Against a squared error above the render's: undamaged pixels are many and their errors small,
+    so the plain errors let them pay for damaged ones."""
 
     def __post_init__(self) -> None:
         """Refuse negative weights."""
@@ -55,6 +58,7 @@ class LossTerms:
     gradient: Float[Tensor, ""]
     expected_error: Float[Tensor, ""]
     keep: Float[Tensor, ""]
+    harm: Float[Tensor, ""]
     total: Float[Tensor, ""]
 
     def to_dict(self) -> dict[str, float]:
@@ -70,6 +74,7 @@ def painting_loss(
     weights: LossWeights,
     *,
     restyled: Bool[Tensor, " batch"] | None = None,
+    sees_render: bool = True,
 ) -> LossTerms:
     """All terms of a batch and `total`, the sum that is minimised.
 
@@ -80,10 +85,13 @@ def painting_loss(
         target_valid: where that is known.
         weights: how much each term counts.
         restyled: views whose target is in another style; they have nothing to keep.
+        sees_render: whether the network was shown the render; the base stands for it otherwise.
     """
-    agreeing = agreement_mask(conditions, weights.agreement) * target_valid
+    kept = target_valid
     if restyled is not None:
-        agreeing = agreeing * (~restyled)[:, None, None].to(agreeing)
+        kept = kept * (~restyled)[:, None, None].to(kept)
+    agreeing = agreement_mask(conditions, weights.agreement) * kept
+    before = conditions.render if sees_render else output.base
     terms = {
         "absolute": absolute_loss(output.rgb, target, target_valid),
         "squared": squared_loss(output.rgb, target, target_valid),
@@ -91,9 +99,21 @@ def painting_loss(
         "gradient": gradient_loss(output.rgb, target, target_valid),
         "expected_error": expected_error_loss(output, target, target_valid),
         "keep": absolute_loss(output.rgb, output.base, agreeing),
+        "harm": harm_loss(output.rgb, before, target, kept),
     }
     total = torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum()
     return LossTerms(**terms, total=total)
+
+
+def harm_loss(
+    picture: Float[Tensor, "batch 3 height width"],
+    before: Float[Tensor, "batch 3 height width"],
+    target: Float[Tensor, "batch 3 height width"],
+    mask: Float[Tensor, "batch height width"],
+) -> Float[Tensor, ""]:
+    """Mean rise of a pixel's squared error over that of the picture before; a fall counts as 0."""
+    error, error_before = ((each - target).square().mean(dim=1) for each in (picture, before))
+    return masked_mean((error - error_before).clamp_min(0), mask)
 
 
 def expected_error_loss(

@@ -90,6 +90,7 @@ class NanoTrainee:
             batch.target_valid,
             self.config.loss,
             restyled=batch.restyled,
+            sees_render="render" in self.config.network.inputs,
         )
         (share * terms.total).backward()
         return terms.to_dict() | {"spread": float(output.log_error.detach().std())}

@@ -10,6 +10,7 @@ from lidarpainter_models.painter.batches import stack_conditions
 from lidarpainter_models.painter.nano.losses import (
     LossWeights,
     expected_error_loss,
+    harm_loss,
     painting_loss,
 )
 from lidarpainter_models.painter.nano.network import NanoOutput
@@ -56,7 +57,9 @@ def test_total_is_the_weighted_sum_and_pulls_every_head(make_conditions):
     log_error = torch.zeros(2, 16, 20, requires_grad=True)
     output = replace(output_of(rgb), log_error=log_error, base=target)
     batch = stack_conditions([make_conditions(16, 20, seed=s) for s in (0, 1)], num_sources=2)
-    weights = LossWeights(absolute=1, squared=2, structure=3, gradient=4, expected_error=5, keep=6)
+    weights = LossWeights(
+        absolute=1, squared=2, structure=3, gradient=4, expected_error=5, keep=6, harm=7
+    )
     terms = painting_loss(output, batch, target, torch.ones(2, 16, 20), weights)
     values = terms.to_dict()
     expected = sum(
@@ -71,3 +74,36 @@ def test_total_is_the_weighted_sum_and_pulls_every_head(make_conditions):
 def test_negative_weights_are_refused():
     with pytest.raises(ConfigError, match="gradient"):
         LossWeights(gradient=-1)
+
+
+def test_harm_counts_pixels_that_got_worse_and_no_others():
+    target = torch.full((1, 3, 2, 2), 0.5)
+    before = target + 0.1
+    picture = target.clone()
+    picture[..., 0, 0] += 0.3  # worse than before
+    picture[..., 0, 1] += 0.05  # better
+    picture[..., 1, 0] += 0.3  # worse where nothing is known
+    mask = torch.ones(1, 2, 2)
+    mask[0, 1, 0] = 0
+    assert float(harm_loss(picture, before, target, mask)) == pytest.approx((0.09 - 0.01) / 3)
+
+
+def test_harm_is_measured_against_the_base_where_the_render_is_not_shown(make_conditions):
+    picture, target = pictures()
+    output = replace(output_of(picture), base=target)
+    batch = stack_conditions([make_conditions(16, 20, seed=s) for s in (0, 1)], num_sources=2)
+    known, weights = torch.ones(2, 16, 20), LossWeights(harm=1)
+    shown = painting_loss(output, batch, target, known, weights).harm
+    blind = painting_loss(output, batch, target, known, weights, sees_render=False).harm
+    assert float(shown) == pytest.approx(float(harm_loss(picture, batch.render, target, known)))
+    assert float(blind) == pytest.approx(float((picture - target).square().mean()))
+
+
+def test_a_restyled_view_cannot_be_harmed(make_conditions):
+    picture, target = pictures()
+    batch = stack_conditions([make_conditions(16, 20, seed=s) for s in (0, 1)], num_sources=2)
+    known, restyled = torch.ones(2, 16, 20), torch.ones(2, dtype=torch.bool)
+    terms = painting_loss(
+        output_of(picture), batch, target, known, LossWeights(), restyled=restyled
+    )
+    assert float(terms.harm) == 0
