@@ -1,4 +1,4 @@
-"""Judge painters on stored pairs that none of them was trained on."""
+"""Judge painters on stored pairs and held-out views that none of them was trained on."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,17 +10,17 @@ from catalog.artefacts import ArtefactRef, Workplace
 from catalog.digests import DIGEST_LENGTH, digest_file
 from catalog.store import open_store
 from lidarpainter_models.conditioning.pairs import PairFolder
-from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.evaluation.held_back import hold_back, trained_targets, unseen_pairs
-from lidarpainter_models.evaluation.painting import score_painter
+from lidarpainter_models.evaluation.painting import JudgingPairs, score_painter
 from lidarpainter_models.metrics.squeezenet import SqueezeNetDistance, load_squeezenet_distance
 from lidarpainter_models.painter import load_painter
-from lidarpainter_models.painter.examples import PairSource
 from lidarpainter_models.painter.nano.painter import NanoPainter
 from lidarpainter_models.painter.nano.tiles import TileConfig
 from lidarpainter_models.painter.one_step.painter import OneStepPainter
 from lidarpainter_models.painter.protocol import Painter
 from tasks.harvest import PairSet
+from tasks.judged_fits import JudgedFit, open_fits
 from tasks.measuring import measured
 from tasks.painting_samples import write_samples
 from tasks.progress import listener
@@ -57,6 +57,7 @@ def judge_painters(
     sets: Sequence[PairSet],
     feature_weights: Path | None = None,
     keep_below: float | None = None,
+    fits: Sequence[JudgedFit] = (),
 ) -> dict[str, Any]:
     """Scores of several painters on the same pairs, those left out that any was trained on.
 
@@ -66,6 +67,7 @@ def judge_painters(
         feature_weights: SqueezeNet 1.1, for the feature distance.
         keep_below: judge the small painter a second time, leaving tiles unpainted on which all that
             is known differs by less than this.
+        fits: runs whose held-out views are judged as pairs too.
 
     Returns:
         `painters`: scores by label; `pairs`: how many of every set were judged and left out;
@@ -73,18 +75,10 @@ def judge_painters(
     """
     tiles = None if keep_below is None else TileConfig(keep_below=keep_below)
     distance = feature_distance_of(feature_weights)
-    folders = open_sets(sets)
     # one at a time: several at full size do not fit into memory
     known = {label: _trained_targets(load_painter(name)) for label, name in painters.items()}
-    unseen = unseen_pairs(folders, [targets for targets in known.values() if targets is not None])
-    pairs = {
-        name: {
-            "folder": str(folder.folder),
-            "num_judged": len(unseen.get(name, ())),
-            "num_left_out": len(folder) - len(unseen.get(name, ())),
-        }
-        for name, folder in folders.items()
-    }
+    learnt = [targets for targets in known.values() if targets is not None]
+    unseen, pairs = _to_judge_by(sets, fits, learnt)
     scores: dict[str, Any] = {}
     sparing: dict[str, Any] = {}
     for label, name in painters.items():
@@ -99,6 +93,38 @@ def judge_painters(
         "pairs": pairs,
         "training_unknown": [label for label, targets in known.items() if targets is None],
     }
+
+
+def _to_judge_by(
+    sets: Sequence[PairSet], fits: Sequence[JudgedFit], learnt: Sequence[frozenset[str]]
+) -> tuple[dict[str, JudgingPairs], dict[str, Any]]:
+    """Pairs that no painter was trained on, and how many of every set those are.
+
+    Raises:
+        ConfigError: neither pairs nor runs.
+        DataError: a painter was trained on all of them.
+    """
+    sources: dict[str, JudgingPairs] = {}
+    counts: dict[str, Any] = {}
+    if sets or not fits:
+        folders = open_sets(sets)
+        unseen = unseen_pairs(folders, learnt)
+        sources |= unseen
+        for name, folder in folders.items():
+            judged = len(unseen.get(name, ()))
+            counts[name] = _counted(judged, len(folder) - judged, folder=str(folder.folder))
+    for fit in open_fits(fits, frozenset().union(*learnt)):
+        for name, views in fit.pairs.items():
+            counts[name] = _counted(len(views), fit.num_left_out, run_id=fit.run_id)
+            if len(views):
+                sources[name] = views
+    if not sources:
+        raise DataError(f"a painter was trained on every held-out view of {', '.join(counts)}")
+    return sources, counts
+
+
+def _counted(num_judged: int, num_left_out: int, **origin: str) -> dict[str, Any]:
+    return {**origin, "num_judged": num_judged, "num_left_out": num_left_out}
 
 
 @task(**STAGE_OPTIONS)
@@ -221,7 +247,7 @@ def painting_rows(
 
 def _told_scores(
     painter: Painter,
-    sources: Mapping[str, PairSource],
+    sources: Mapping[str, JudgingPairs],
     distance: SqueezeNetDistance | None,
     stage: str,
 ) -> dict[str, Any]:
@@ -235,7 +261,7 @@ def _told_scores(
 
 def _scores(
     painter: Painter,
-    sources: Mapping[str, PairSource],
+    sources: Mapping[str, JudgingPairs],
     distance: SqueezeNetDistance | None,
     stage: str,
 ) -> dict[str, Any]:

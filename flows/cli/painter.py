@@ -150,7 +150,17 @@ def evaluate(
     painters: Annotated[
         list[str], typer.Option("--painter", help="A name or a weights file. May be repeated.")
     ],
-    pairs: Annotated[list[str], typer.Option(help="A folder of pairs. May be repeated.")],
+    pairs: Annotated[
+        list[str] | None, typer.Option(help="A folder of pairs. May be repeated.")
+    ] = None,
+    runs: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--run",
+            help="A run (id, prefix or latest): its first fit is painted at held-out frames, or "
+            "beside the path of a synthetic street. May be repeated.",
+        ),
+    ] = None,
     feature_weights: Features = None,
     keep_below: Annotated[
         float | None,
@@ -161,7 +171,7 @@ def evaluate(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Judge painters on pairs that none of them was trained on."""
+    """Judge painters on pairs, or views of a finished run, that none of them was trained on."""
     from flows.cli.training import judge
 
     found = judge(
@@ -169,6 +179,7 @@ def evaluate(
         parse_paths(pairs, "--pairs"),
         feature_weights,
         keep_below,
+        runs or (),
     )
     if as_json:
         print_json(found)

@@ -8,6 +8,7 @@ from catalog.store import open_store
 from flows.ablate_painter import AblationParameters, ablate_painter, check_ablation
 from flows.cli.ingest import parse_names
 from flows.cli.progress import shown_progress
+from flows.parameters import view_parameters
 from flows.server import prefect_server
 from flows.train_painter import (
     HarvestParameters,
@@ -21,7 +22,9 @@ from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.metrics.lpips import LpipsFiles
 from lidarpainter_models.painter import is_one_step
 from tasks.judge_painter import judge_painters
+from tasks.judged_fits import JudgedFit
 from tasks.painter_students import recipe_for
+from tasks.runs import open_run
 
 PREFECT_LOG = Path("logs") / "prefect.log"
 
@@ -126,8 +129,36 @@ def judge(
     pair_folders: Sequence[Path],
     feature_weights: Path | None,
     keep_below: float | None = None,
+    runs: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Judge painters here and now; nothing is stored."""
+    """Judge painters here and now; nothing is stored.
+
+    Raises:
+        ConfigError: neither pairs nor runs to judge by.
+    """
+    if not pair_folders and not runs:
+        raise ConfigError("nothing to judge by: expected --pairs or --run")
     labels = {str(painter): str(painter) for painter in painters}
+    fits = [judged_fit(run) for run in runs]
     with shown_progress():
-        return judge_painters.fn(labels, named_sets(pair_folders), feature_weights, keep_below)
+        return judge_painters.fn(
+            labels, named_sets(pair_folders), feature_weights, keep_below, fits
+        )
+
+
+def judged_fit(run: str) -> JudgedFit:
+    """The first fit of a finished run, and the views that it was not fitted to.
+
+    Raises:
+        UnknownRecordError: there is no such run, or it did not complete.
+    """
+    store = open_store()
+    finished = open_run(store, run)
+    parameters = view_parameters(finished)
+    return JudgedFit(
+        store_path=store.root,
+        run_id=finished.run_id,
+        split=parameters.split_spec,
+        fitted=finished.unpainted,
+        settings=parameters.judge_settings,
+    )

@@ -86,6 +86,18 @@ def target_name(pair: str, provenance: Mapping[str, Any]) -> str:
     return f"{place} {_COPY.sub('', pair)}"
 
 
+def target_view(target: str) -> tuple[str, int, str] | None:
+    """Scene, frame and camera of a target, wherever the camera stood; None if it says none."""
+    scene_id, _, described = target.partition(" ")
+    try:
+        match json.loads(described):
+            case [int(frame), str(camera), *_]:
+                return scene_id, frame, camera
+    except ValueError:
+        pass
+    return None
+
+
 def trained_targets(provenance: Mapping[str, Any]) -> frozenset[str] | None:
     """The true pictures that weights were trained on, or None if they do not say.
 

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from statistics import fmean, median
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -21,7 +21,7 @@ from lidarpainter_models.kernels.ssim import ssim_map
 from lidarpainter_models.metrics.perceptual import PictureDistance
 from lidarpainter_models.metrics.pictures import psnr_from_error, squared_error
 from lidarpainter_models.painter.baselines import UnpaintedPainter, WarpPainter
-from lidarpainter_models.painter.examples import PaintingPair, PairSource
+from lidarpainter_models.painter.examples import PaintingPair
 from lidarpainter_models.painter.input_hull import input_hull
 from lidarpainter_models.painter.protocol import Painter, Painting, PaintingConditions
 
@@ -31,6 +31,19 @@ WRONG_ERROR = 0.05
 """A painted pixel is wrong where its error is above this: what the confidence should foretell."""
 CONFIDENCE_BINS = 1 << 16
 """Confidences that share a bin count as equal."""
+
+
+@runtime_checkable
+class JudgingPairs(Protocol):
+    """Pairs that are read whole, one after the other."""
+
+    def __len__(self) -> int:
+        """Number of pairs."""
+        ...
+
+    def read(self, index: int) -> PaintingPair:
+        """A pair."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,7 +112,7 @@ class PaintingScores:
 
 def score_painter(
     painter: Painter,
-    sources: Mapping[str, PairSource],
+    sources: Mapping[str, JudgingPairs],
     *,
     feature_distance: PictureDistance | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -244,7 +257,7 @@ class _SourceTally:
         )
 
 
-def _pairs_of(source: PairSource) -> Iterator[PaintingPair]:
+def _pairs_of(source: JudgingPairs) -> Iterator[PaintingPair]:
     for index in range(len(source)):
         yield source.read(index)
 

@@ -95,6 +95,8 @@ def test_seeds_may_be_listed_and_ranged():
         (["info", "--preset", "fast", "--painter", "/nowhere"], "no painter '/nowhere'"),
         (["benchmark", "--size", "0x5"], "expected such as 1024x576"),
         (["evaluate", "--painter", "none", "--pairs", "/nowhere"], "no training pairs in /nowhere"),
+        (["evaluate", "--painter", "none"], "nothing to judge by: expected --pairs or --run"),
+        (["evaluate", "--painter", "none", "--run", "latest"], "no complete run in"),
         (["evaluate", "--painter", "none,none", "--pairs", "/nowhere"], "expected each once"),
         (["ablate", "--pairs-train", "/nowhere", "--pairs-test", "/else"], "no training pairs in"),
         (["ablate", "--pairs-train", "/a", "--pairs-test", "/b", "--table", "x"], "no ablation"),

@@ -22,6 +22,8 @@ from tasks.evaluate import evaluate
 from tasks.fit import fit, refine
 from tasks.flicker import by_picture, evaluate_flicker
 from tasks.ingest import record_scene
+from tasks.judge_painter import judge_painters
+from tasks.judged_fits import JudgedFit
 from tasks.paint import paint
 from tasks.painted_views import load_guidance
 from tasks.prepare import prepare
@@ -179,6 +181,28 @@ def test_lpips_stands_in_the_scores_where_both_files_are_given(
 
 def test_painting_at_view_time_is_judged_apart(stages):
     assert stages["evaluate-view-time"].ref != stages["evaluate"].ref
+
+
+def test_painters_are_judged_by_the_held_out_views_of_a_first_fit(store, run, parameters):
+    fit_of_run = JudgedFit(
+        store_path=store.root,
+        run_id=run.run_id,
+        split=parameters.split_spec,
+        fitted=run.unpainted,
+        settings=parameters.judge_settings,
+    )
+    labels = {"none": "none", "warp": "warp"}
+    found = judge_painters.fn(labels, (), fits=[fit_of_run])
+    (name,) = found["pairs"]
+    assert name == f"{TOY_SCENE} recorded"
+    recorded = run.result["unpainted"]["recorded"]
+    assert found["pairs"][name]["num_judged"] == recorded["num_views"]
+    unpainted = found["painters"]["none"]["sources"][name]["painted"]["psnr"]
+    assert unpainted == pytest.approx(recorded["psnr"], abs=0.01)
+    with_warps = found["painters"]["warp"]["total"]
+    assert with_warps["painted"]["psnr"] == with_warps["warp_mean"]["psnr"] != unpainted
+    with pytest.raises(ConfigError, match=f"one run of each scene, got two of {TOY_SCENE}"):
+        judge_painters.fn(labels, (), fits=[fit_of_run, fit_of_run])
 
 
 def test_neighbouring_frames_are_compared_along_every_shift(store, parameters, final):
