@@ -67,7 +67,8 @@ class CatalogTables:
                 found = DeltaTable(self._uri(schema), storage_options=self.storage_options)
             except TableNotFoundError:
                 return schema.arrow.empty_table()
-            stored = found.to_pyarrow_table()
+            # pyarrow's threads may outlive the read and abort the interpreter as it ends
+            stored = found.to_pyarrow_dataset().to_table(use_threads=False)
         columns = [
             stored[field.name].cast(field.type)
             if field.name in stored.column_names

@@ -23,6 +23,11 @@ for number in range(4):
         {"metric_id": "shared", "name": "psnr", "value": 1.0},
     ])
 """
+READER = """
+import sys
+from catalog.tables import CatalogTables
+assert len(CatalogTables(sys.argv[1]).rows("metrics")) == 40
+"""
 
 
 @pytest.fixture
@@ -102,6 +107,15 @@ def test_four_processes_at_once_lose_nothing(tables):
     ids = [row["metric_id"] for row in tables.rows("metrics")]
     expected = sorted([f"{writer}-{number}" for writer in range(4) for number in range(4)])
     assert ids == [*expected, "shared"]
+
+
+def test_a_process_that_ends_right_after_a_read_ends_well(tables):
+    for number in range(40):
+        tables.merge("metrics", [{"metric_id": str(number)}])
+    readers = [
+        subprocess.Popen([sys.executable, "-c", READER, tables.root], cwd=ROOT) for _ in range(6)
+    ]
+    assert [reader.wait(timeout=60) for reader in readers] == [0] * 6
 
 
 def test_a_table_that_cannot_be_written_is_a_storage_error(tmp_path):
