@@ -3,6 +3,7 @@
 Pictures are (batch, 3, height, width); masks (batch, height, width), 1 where the target is known.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import torch
@@ -40,8 +41,8 @@ class LossWeights:
     agreement: float = 0.03
     """Mean absolute rgb difference up to which render and warp agree."""
     harm: float = 0.0
-    """Against a squared error above the render's: undamaged pixels are many and their errors small,
-    so the plain errors let them pay for damaged ones."""
+    """Against a squared error above that of the render or the base, whichever is less: undamaged
+    pixels are many and their errors small, so the plain errors let them pay for damaged ones."""
 
     def __post_init__(self) -> None:
         """Refuse negative weights."""
@@ -91,7 +92,7 @@ def painting_loss(
     if restyled is not None:
         kept = kept * (~restyled)[:, None, None].to(kept)
     agreeing = agreement_mask(conditions, weights.agreement) * kept
-    before = conditions.render if sees_render else output.base
+    before = (conditions.render, output.base) if sees_render else (output.base,)
     terms = {
         "absolute": absolute_loss(output.rgb, target, target_valid),
         "squared": squared_loss(output.rgb, target, target_valid),
@@ -107,13 +108,14 @@ def painting_loss(
 
 def harm_loss(
     picture: Float[Tensor, "batch 3 height width"],
-    before: Float[Tensor, "batch 3 height width"],
+    before: Sequence[Float[Tensor, "batch 3 height width"]],
     target: Float[Tensor, "batch 3 height width"],
     mask: Float[Tensor, "batch height width"],
 ) -> Float[Tensor, ""]:
-    """Mean rise of a pixel's squared error over that of the picture before; a fall counts as 0."""
-    error, error_before = ((each - target).square().mean(dim=1) for each in (picture, before))
-    return masked_mean((error - error_before).clamp_min(0), mask)
+    """Mean rise of a pixel's squared error over the least of those before; a fall counts as 0."""
+    error, *errors_before = ((each - target).square().mean(dim=1) for each in (picture, *before))
+    least = torch.stack(errors_before).amin(dim=0)
+    return masked_mean((error - least).clamp_min(0), mask)
 
 
 def expected_error_loss(

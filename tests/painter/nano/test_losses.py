@@ -76,27 +76,32 @@ def test_negative_weights_are_refused():
         LossWeights(gradient=-1)
 
 
-def test_harm_counts_pixels_that_got_worse_and_no_others():
+def test_harm_counts_pixels_worse_than_all_before_and_no_others():
     target = torch.full((1, 3, 2, 2), 0.5)
-    before = target + 0.1
+    render, mean = target + 0.1, target + 0.2
+    mean[..., 0, 0] = 0.5
     picture = target.clone()
-    picture[..., 0, 0] += 0.3  # worse than before
-    picture[..., 0, 1] += 0.05  # better
+    picture[..., 0, 0] += 0.1  # as the render, but the mean was right
+    picture[..., 0, 1] += 0.3  # worse than both
     picture[..., 1, 0] += 0.3  # worse where nothing is known
+    picture[..., 1, 1] += 0.05  # better than both
     mask = torch.ones(1, 2, 2)
     mask[0, 1, 0] = 0
-    assert float(harm_loss(picture, before, target, mask)) == pytest.approx((0.09 - 0.01) / 3)
+    expected = (0.01 + (0.09 - 0.01)) / 3
+    assert float(harm_loss(picture, [render, mean], target, mask)) == pytest.approx(expected)
 
 
-def test_harm_is_measured_against_the_base_where_the_render_is_not_shown(make_conditions):
+def test_harm_is_measured_against_the_base_alone_where_the_render_is_not_shown(make_conditions):
     picture, target = pictures()
-    output = replace(output_of(picture), base=target)
+    output = replace(output_of(picture), base=target + 0.1)
     batch = stack_conditions([make_conditions(16, 20, seed=s) for s in (0, 1)], num_sources=2)
     known, weights = torch.ones(2, 16, 20), LossWeights(harm=1)
     shown = painting_loss(output, batch, target, known, weights).harm
     blind = painting_loss(output, batch, target, known, weights, sees_render=False).harm
-    assert float(shown) == pytest.approx(float(harm_loss(picture, batch.render, target, known)))
-    assert float(blind) == pytest.approx(float((picture - target).square().mean()))
+    both = [batch.render, target + 0.1]
+    assert float(shown) == pytest.approx(float(harm_loss(picture, both, target, known)))
+    assert float(blind) == pytest.approx(float(harm_loss(picture, both[1:], target, known)))
+    assert float(shown) > float(blind)
 
 
 def test_a_restyled_view_cannot_be_harmed(make_conditions):
