@@ -40,7 +40,7 @@ class LossWeights:
     """Against changing what render and warps already agree on."""
     agreement: float = 0.03
     """Mean absolute rgb difference up to which render and warp agree."""
-    harm: float = 0.0
+    harm: float = 4.0
     """Against a squared error above that of the render or the base, whichever is less: undamaged
     pixels are many and their errors small, so the plain errors let them pay for damaged ones."""
 
