@@ -21,7 +21,7 @@ from lidarpainter_models.painter.protocol import Painter
 from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.scenes.synthetic.street import SyntheticStreet
 from tasks.evaluate import JudgeSettings
-from tasks.judging import GENERATOR_ENTRY
+from tasks.judging import known_street
 from tasks.painters import painter_digest
 from tasks.progress import listener
 from tasks.scenes import SplitSpec, open_split
@@ -110,9 +110,7 @@ def evaluate_flicker(
         path = _Path(
             held_out=HeldOut(scene=recorded, test_views=(), observation=settings.observation),
             builder=ConditionBuilder(scene, seen.lidar_map, seen.views, config=settings.conditions),
-            street=SyntheticStreet.from_manifest(recorded.manifest)
-            if GENERATOR_ENTRY in recorded.manifest
-            else None,
+            street=known_street(recorded),
             views=recorded.views_of(camera_name),
             camera_name=camera_name,
             painter=load_painter(painter),

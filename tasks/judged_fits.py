@@ -10,9 +10,8 @@ from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.judged_pairs import JudgedPairs, judged_pairs, unseen_views
-from lidarpainter_models.scenes.synthetic.street import SyntheticStreet
 from tasks.evaluate import JudgeSettings
-from tasks.judging import GENERATOR_ENTRY
+from tasks.judging import known_street
 from tasks.scenes import SplitSpec, open_split
 from tasks.stored import FittedRef, load_observations, load_scene
 
@@ -41,9 +40,7 @@ class JudgedFit:
         found = judged_pairs(
             ConditionBuilder(scene, seen.lidar_map, seen.views, config=self.settings.conditions),
             HeldOut(scene=recorded, test_views=unseen, observation=self.settings.observation),
-            SyntheticStreet.from_manifest(recorded.manifest)
-            if GENERATOR_ENTRY in recorded.manifest
-            else None,
+            known_street(recorded),
             self.settings.scoring.shifts,
         )
         return OpenedFit(

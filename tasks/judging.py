@@ -14,6 +14,7 @@ from lidarpainter_models.evaluation.scene_scores import (
 from lidarpainter_models.gaussians.scene_graph import GaussianScene
 from lidarpainter_models.geometry.trajectories import Shift
 from lidarpainter_models.metrics.perceptual import PerceptualDistances
+from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.synthetic.street import SyntheticStreet
 from tasks.scores import DEPTH, Scores
 
@@ -54,13 +55,20 @@ class Judgement:
         views = [view for view in self.held_out.test_views if view.camera_name == name]
         part, render = replace(self.held_out, test_views=views), self.render_as(name)
         recorded = score_recorded(render, part, self.fitted, distances=self.distances)
-        if GENERATOR_ENTRY not in part.scene.manifest:
+        street = known_street(part.scene)
+        if street is None:
             return recorded, {shift.name: _unknown(len(views)) for shift in self.shifts}
-        street = SyntheticStreet.from_manifest(part.scene.manifest)
         novel = score_synthetic(
             render, part, self.fitted, street, self.shifts, distances=self.distances
         )
         return recorded, novel
+
+
+def known_street(scene: DrivingScene) -> SyntheticStreet | None:
+    """The world that a scene was drawn from; None for a recorded one."""
+    if GENERATOR_ENTRY not in scene.manifest:
+        return None
+    return SyntheticStreet.from_manifest(scene.manifest)
 
 
 def _mean(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
