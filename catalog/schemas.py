@@ -63,7 +63,7 @@ SCENES = TableSchema(
         Column("licence", "text", "terms of the data"),
         Column("path", "text", "folder of the scene"),
         Column("num_frames", "integer", "frames"),
-        Column("num_views", "integer", "camera pictures"),
+        Column("num_views", "integer", "camera images"),
         Column("cameras", "texts", "names of the cameras"),
         Column("num_points", "integer", "LiDAR points of all sweeps"),
         Column("num_actors", "integer", "annotated tracks"),

@@ -16,9 +16,9 @@ from lidarpainter_models.painter.nano.ablations import REFERENCE, ablation_table
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.painter.one_step.training import OneStepTrainingConfig
 from lidarpainter_models.painter.one_step.variants import ablations, distinct
-from tasks.judge_painter import judge_painters, open_sets
-from tasks.painter_students import PainterTraining, student_of
-from tasks.train_painter import WEIGHTS_SUFFIX, train, weights_path
+from tasks.painter.judge import judge_painters, open_sets
+from tasks.painter.students import PainterTraining, student_of
+from tasks.painter.train import WEIGHTS_SUFFIX, train, weights_path
 
 _Table = TypeVar("_Table")
 UNLEARNED = (UnpaintedPainter.name, OverlayPainter.name, WarpPainter.name)
@@ -70,7 +70,7 @@ def check_ablation(parameters: AblationParameters) -> None:
 
     Raises:
         ConfigError: no such table, a weights file in place of a model, a loss that lacks what it
-            weighs, or pairs without the reference picture that a variant is shown.
+            weighs, or pairs without the reference image that a variant is shown.
         DataError: a folder holds no pairs.
         WeightsError: the model cannot be used.
     """
@@ -84,7 +84,7 @@ def check_ablation(parameters: AblationParameters) -> None:
             bare = folder.first_without("reference_rgb") if shown else None
             if bare is not None:
                 raise ConfigError(
-                    f"pairs {name!r}: {bare} holds no nearest recorded picture, which "
+                    f"pairs {name!r}: {bare} holds no nearest recorded image, which "
                     f"{shown[0]} is shown: harvest it again, or choose another --table than inputs"
                 )
 

@@ -9,8 +9,8 @@ from catalog.store import open_store
 from flows.parameters import ReconstructParameters
 from flows.presets import preview
 from flows.reconstruct import reconstruct
-from lidarpainter_models.scenes.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
-from tasks.harvest import keep_street, street_id
+from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
+from tasks.painter.harvest import keep_street, street_id
 
 DEMO_SEED = 1
 """Kept apart from the seeds that painters are trained and tested on."""

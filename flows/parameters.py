@@ -8,11 +8,11 @@ from lidarpainter_models.conditioning.conditions import ConditionConfig
 from lidarpainter_models.conditioning.novel_guidance import NovelGuidanceConfig
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.scene_scores import ScoringConfig
-from lidarpainter_models.gaussians.fit_config import FitConfig
-from lidarpainter_models.gaussians.observations import ObservationConfig
+from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.metrics.lpips import LpipsFiles
-from tasks.evaluate import JudgeSettings
-from tasks.paint import PaintSettings
+from lidarpainter_models.observations.observations import ObservationConfig
+from tasks.evaluation.scene import JudgeSettings
+from tasks.reconstruction.paint import PaintSettings
 from tasks.runs import FinishedRun
 from tasks.scenes import SplitSpec
 

@@ -16,16 +16,16 @@ from flows.parameters import ReconstructParameters
 from flows.presets import preset as preset_named
 from lidarpainter_models.metrics.perceptual import load_distances
 from lidarpainter_models.painter import load_painter
-from tasks.evaluate import evaluate
-from tasks.fit import fit, refine
-from tasks.paint import paint
-from tasks.painters import NO_PAINTER
-from tasks.prepare import prepare
-from tasks.publish import begin_run, complete_run, fail_run
-from tasks.report import ReportInputs, report_path, write_report
-from tasks.report_figures import GUIDANCE_COLUMNS
+from tasks.evaluation.scene import evaluate
+from tasks.evaluation.scores import Scores, load_scores
+from tasks.painter.painters import NO_PAINTER
+from tasks.reconstruction.fit import fit, refine
+from tasks.reconstruction.paint import paint
+from tasks.reconstruction.prepare import prepare
+from tasks.reconstruction.publish import begin_run, complete_run, fail_run
+from tasks.reconstruction.report import ReportInputs, report_path, write_report
+from tasks.reconstruction.report_figures import GUIDANCE_COLUMNS
 from tasks.scenes import open_split
-from tasks.scores import Scores, load_scores
 from tasks.stages import StageResult
 from tasks.stored import FittedRef
 

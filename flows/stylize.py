@@ -8,9 +8,9 @@ from prefect import flow
 from catalog.store import open_store
 from flows.parameters import view_parameters
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
-from tasks.render import RenderRequest
 from tasks.runs import open_run
-from tasks.stylize import StylizeRequest, stylize
+from tasks.views.render import RenderRequest
+from tasks.views.stylize import StylizeRequest, stylize
 
 
 @flow(name="stylize")
@@ -22,7 +22,7 @@ def stylize_run(
     Args:
         run: its id, a unique prefix of one, or `latest`.
         prompt: `clear`, `foggy`, `night` or `rain`.
-        out: folder for the pictures.
+        out: folder for the images.
         trajectory: where the camera goes, as for `render`.
         store: folder of the store; by default what `LIDARPAINTER_STORE` says on the worker.
     """

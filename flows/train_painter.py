@@ -9,8 +9,6 @@ from prefect import flow
 from pydantic import BaseModel, ConfigDict
 
 from catalog.store import split_scene_id
-from lidarpainter_models.conditioning.harvest import HarvestConfig
-from lidarpainter_models.conditioning.street_harvest import StreetPlan, default_street_plans
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.held_back import (
     FIRST_TRAINING_SEED,
@@ -20,8 +18,10 @@ from lidarpainter_models.evaluation.held_back import (
 )
 from lidarpainter_models.metrics.lpips import LpipsFiles
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
-from lidarpainter_models.scenes.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
-from tasks.harvest import (
+from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
+from lidarpainter_models.training_data.harvest import HarvestConfig
+from lidarpainter_models.training_data.street_harvest import StreetPlan, default_street_plans
+from tasks.painter.harvest import (
     PairSet,
     harvest_recorded,
     harvest_street,
@@ -29,21 +29,21 @@ from tasks.harvest import (
     pair_set,
     street_id,
 )
-from tasks.judge_painter import (
+from tasks.painter.judge import (
     feature_distance_of,
     judge_held_back,
     load_painting_scores,
     samples_path,
 )
-from tasks.painter_students import PainterTraining, student_of
-from tasks.scenes import SplitSpec
-from tasks.stages import StageResult
-from tasks.train_painter import (
+from tasks.painter.students import PainterTraining, student_of
+from tasks.painter.train import (
     publish_painter,
     train,
     training_record,
     weights_path,
 )
+from tasks.scenes import SplitSpec
+from tasks.stages import StageResult
 
 SYNTHETIC = "synthetic/"
 
@@ -84,7 +84,7 @@ class TrainPainterParameters(HarvestParameters):
     processes: int = 1
     """In which the one-step painter is trained, each on a GPU of its own."""
     held_back: float = 0.1
-    """Share of the true pictures that are kept from training, to judge by."""
+    """Share of the true images that are kept from training, to judge by."""
     feature_weights: Path | None = None
     """SqueezeNet 1.1 weights for the feature distance; None leaves it out."""
 

@@ -1,4 +1,4 @@
-"""Put pictures of one size side by side, row by row, into one JPEG.
+"""Put images of one size side by side, row by row, into one JPEG.
 
 `python scripts/picture_sheet.py sheet.jpg 3 a.png b.png c.png d.png e.png f.png` makes two rows
 of three.
@@ -14,10 +14,10 @@ GAP_PX = 4
 QUALITY = 88
 
 
-def sheet(pictures: list[np.ndarray], num_columns: int) -> np.ndarray:
-    """The pictures on white, with gaps between."""
-    height, width, _ = pictures[0].shape
-    num_rows = -(-len(pictures) // num_columns)
+def sheet(images: list[np.ndarray], num_columns: int) -> np.ndarray:
+    """The images on white, with gaps between."""
+    height, width, _ = images[0].shape
+    num_rows = -(-len(images) // num_columns)
     canvas = np.full(
         (
             num_rows * (height + GAP_PX) - GAP_PX,
@@ -27,23 +27,23 @@ def sheet(pictures: list[np.ndarray], num_columns: int) -> np.ndarray:
         255,
         np.uint8,
     )
-    for index, picture in enumerate(pictures):
+    for index, image in enumerate(images):
         row, column = divmod(index, num_columns)
         top, left = row * (height + GAP_PX), column * (width + GAP_PX)
-        canvas[top : top + height, left : left + width] = picture
+        canvas[top : top + height, left : left + width] = image
     return canvas
 
 
 def main(out: Path, num_columns: int, paths: list[Path]) -> None:
     """Read, arrange, write."""
-    pictures = [cv2.imread(str(path)) for path in paths]
-    for path, picture in zip(paths, pictures, strict=True):
-        if picture is None or picture.shape != pictures[0].shape:
-            sys.exit(f"{path}: expected a picture of the size of {paths[0]}")
-    cv2.imwrite(str(out), sheet(pictures, num_columns), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    images = [cv2.imread(str(path)) for path in paths]
+    for path, image in zip(paths, images, strict=True):
+        if image is None or image.shape != images[0].shape:
+            sys.exit(f"{path}: expected an image of the size of {paths[0]}")
+    cv2.imwrite(str(out), sheet(images, num_columns), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
 
 
 if __name__ == "__main__":
     if len(sys.argv) < 4:
-        sys.exit("usage: picture_sheet.py OUT.jpg COLUMNS PICTURE...")
+        sys.exit("usage: picture_sheet.py OUT.jpg COLUMNS IMAGE...")
     main(Path(sys.argv[1]), int(sys.argv[2]), [Path(path) for path in sys.argv[3:]])

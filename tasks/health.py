@@ -1,6 +1,6 @@
 """Whether this machine can do the work: packages, system libraries, devices, disk.
 
-`tasks.data_checks` looks at scenes and datasets.
+`tasks.ingest.data_checks` looks at scenes and datasets.
 """
 
 import os

@@ -27,7 +27,7 @@ from tasks.measuring import measured
 from tasks.progress import listener
 
 LIBRARY = Path(lidarpainter_models.__file__).parent
-BASE = ("errors.py", "geometry", "kernels", "scenes")
+BASE = ("errors.py", "geometry", "kernels", "scenes", "lidar", "observations")
 SOURCES: dict[str, tuple[str, ...]] = {
     "observations": (*BASE, "gaussians"),
     "gaussians": (*BASE, "gaussians"),
@@ -35,12 +35,12 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "evaluation": (*BASE, "gaussians", "painter", "conditioning", "metrics", "evaluation"),
     "strips": (*BASE, "gaussians", "painter", "conditioning", "metrics", "evaluation"),
     "report": (*BASE, "gaussians", "painter", "conditioning", "metrics", "evaluation", "export"),
-    "pairs": (*BASE, "gaussians", "painter", "conditioning"),
+    "pairs": (*BASE, "gaussians", "painter", "conditioning", "training_data"),
     "painter": (*BASE, "painter", "metrics"),
 }
 """Library packages by kind of artefact."""
 TASKS = Path(__file__).parent
-FILE_FORMATS = ("painted_views.py", "stored.py", "tensors.py")
+FILE_FORMATS = ("reconstruction/painted_views.py", "stored.py", "tensors.py")
 """Task modules that decide what lies in an artefact's files."""
 
 RETRIES = 2

@@ -11,8 +11,8 @@ from typing import Any
 from catalog.artefacts import ArtefactRef
 from catalog.digests import finite_or_none
 from catalog.store import Store
-from lidarpainter_models.gaussians.observations import SceneObservations
-from lidarpainter_models.gaussians.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
+from lidarpainter_models.observations.observations import SceneObservations
 from tasks.tensors import read_tensors, write_tensors
 
 OBSERVATIONS_FILE = "observations.safetensors"

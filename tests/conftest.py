@@ -35,6 +35,8 @@ def checked_modules() -> list[str]:
 
 install_import_hook(checked_modules(), "shape_checking.check")
 
+pytest_plugins = ["board_world", "small_pandaset"]  # fixtures that several rooms share
+
 
 @pytest.fixture(scope="session")
 def shared_folder() -> Path:

@@ -3,7 +3,7 @@
     python docs/examples/kitti_raw.py DATE_FOLDER DRIVE OUT
 
 `DATE_FOLDER` holds calib_*.txt and `DRIVE` (2011_09_26_drive_0001_sync) with oxts, velodyne_points
-and image_02. Pictures are PNG: they are stored as JPEG of quality 98. A sweep is compensated: each
+and image_02. Images are PNG: they are stored as JPEG of quality 98. A sweep is compensated: each
 point by the pose at its own time, which follows from its azimuth. Boxes are not read: without them
 moving cars would become part of the street, so mask them or choose a quiet drive.
 """
@@ -104,14 +104,14 @@ def write(date_folder: Path, drive: str, store: Path) -> Path:
     with SceneWriter(store, "kitti", drive, header) as writer:
         for index, (time_ns, pose) in enumerate(zip(times_ns, poses, strict=True)):
             writer.add_frame(index, timestamp_ns=time_ns, world_from_ego=pose)
-            picture = cv2.imread(str(folder / f"image_02/data/{index:010d}.png"))
+            image = cv2.imread(str(folder / f"image_02/data/{index:010d}.png"))
             camera = Camera(
                 world_from_camera=pose @ invert_rigid(camera_from_velo),
                 **{name: float(value) for name, value in lens.items()},
-                width_px=picture.shape[1],
-                height_px=picture.shape[0],
+                width_px=image.shape[1],
+                height_px=image.shape[0],
             )
-            jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes()
+            jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes()
             record = ImageRecord(camera_name="image_02", timestamp_ns=time_ns, camera=camera)
             writer.add_image(record, jpeg)
             scan = np.fromfile(folder / f"velodyne_points/data/{index:010d}.bin", "<f4")

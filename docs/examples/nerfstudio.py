@@ -2,7 +2,7 @@
 
     python docs/examples/nerfstudio.py FOLDER OUT
 
-The world must be metric with z up, pictures JPEG, their frames in the order of the drive; they get
+The world must be metric with z up, images JPEG, their frames in the order of the drive; they get
 times of a tenth of a second. `transform_matrix` is world_from_camera with OpenGL's axes (x right, y
 up, z back). The points, which belong to no moment, are dealt out to the frames, each once.
 """

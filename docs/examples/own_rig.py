@@ -43,9 +43,9 @@ def write(store: Path) -> Path:
             writer.add_frame(index, timestamp_ns=time_ns, world_from_ego=pose(x_m, 0, 0))
             eye = pose(x_m + 1.5, 0, 1.6, CAMERA_AXES)
             camera = Camera(world_from_camera=eye, **LENS, width_px=320, height_px=180)
-            picture = np.full((180, 320, 3), 127, np.uint8)  # yours: the camera's JPEG file
+            image = np.full((180, 320, 3), 127, np.uint8)  # yours: the camera's JPEG file
             record = ImageRecord(camera_name="front", timestamp_ns=time_ns, camera=camera)
-            writer.add_image(record, cv2.imencode(".jpg", picture)[1].tobytes())
+            writer.add_image(record, cv2.imencode(".jpg", image)[1].tobytes())
             lidar = pose(x_m + 1.0, 0, 1.9)
             writer.add_sweep("roof", sweep(x_m), timestamp_ns=time_ns, world_from_lidar=lidar)
             box = BoxRecord(

@@ -20,13 +20,14 @@ def doctor(
         Path | None, typer.Argument(help="With a dataset's name: its folder, as downloaded.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Where the overlay picture goes; beside the scene if absent")
+        Path | None, typer.Option(help="Where the overlay image goes; beside the scene if absent")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Check the setup, a stored scene, or a dataset on disk."""
     from catalog.store import open_store
-    from tasks import data_checks, health
+    from tasks import health
+    from tasks.ingest import data_checks
 
     store = open_store()
     if subject is None:

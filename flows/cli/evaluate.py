@@ -44,11 +44,11 @@ def evaluate(  # noqa: PLR0913 - the options of a command
     from flows.cli.progress import shown_progress
     from flows.overrides import with_changes
     from flows.parameters import view_parameters
-    from tasks.cross_camera import evaluate_strips
-    from tasks.evaluate import evaluate as evaluate_task
-    from tasks.publish import record_scores
+    from tasks.evaluation.cross_camera import evaluate_strips
+    from tasks.evaluation.scene import evaluate as evaluate_task
+    from tasks.evaluation.scores import load_scores
+    from tasks.reconstruction.publish import record_scores
     from tasks.runs import open_run
-    from tasks.scores import load_scores
 
     store = open_store()
     finished = open_run(store, run)
@@ -111,7 +111,7 @@ def _weights(features: Path | None, backbone: Path | None, heads: Path | None) -
 
 
 def _with_truth(scores: dict[str, Any], scene_id: str) -> dict[str, Any]:
-    """Only views whose true picture is known beside the path.
+    """Only views whose true image is known beside the path.
 
     Raises:
         ConfigError: the scene has no such truth.
@@ -119,13 +119,13 @@ def _with_truth(scores: dict[str, Any], scene_id: str) -> dict[str, Any]:
     known = {name: found for name, found in scores["novel"].items() if found.get("psnr")}
     if not known:
         raise ConfigError(
-            f"scene {scene_id} has no true pictures beside its path; only synthetic streets have"
+            f"scene {scene_id} has no true images beside its path; only synthetic streets have"
         )
     return {"novel": known}
 
 
 def _show(result: dict[str, Any], variants: list[str]) -> None:
-    from tasks.scores import metric_values
+    from tasks.evaluation.scores import metric_values
 
     numbers: dict[tuple[str, str, str], dict[str, float | None]] = {}
     for variant in variants:

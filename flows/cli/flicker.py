@@ -6,9 +6,9 @@ from flows.cli.output import print_json, print_table
 from flows.cli.progress import shown_progress
 from lidarpainter_models.conditioning.sequences import PreviousUse, SequenceConfig
 from lidarpainter_models.errors import ConfigError
-from tasks.flicker import by_picture, evaluate_flicker
-from tasks.publish import record_scores
-from tasks.scores import FLICKER, load_scores
+from tasks.evaluation.flicker import by_image, evaluate_flicker
+from tasks.evaluation.scores import FLICKER, load_scores
+from tasks.reconstruction.publish import record_scores
 
 if TYPE_CHECKING:
     from catalog.store import Store
@@ -41,18 +41,18 @@ def show_flicker(
             sequences,
         )
     found = load_scores(judged.ref)[FLICKER]
-    record_scores(store, run.run_id, run.scene_id, by_picture(found))
+    record_scores(store, run.run_id, run.scene_id, by_image(found))
     if as_json:
         about = {"run_id": run.run_id, "scene": run.scene_id, "protocol": FLICKER}
         print_json({**about, "painter": chosen, FLICKER: found})
         return
     rows = [
-        [shift, picture, *(scores[name] for name in COLUMNS)]
-        for shift, pictures in found.items()
-        for picture, scores in pictures.items()
+        [shift, image, *(scores[name] for name in COLUMNS)]
+        for shift, images in found.items()
+        for image, scores in images.items()
     ]
     title = f"{run.scene_id}, run {run.run_id}: mean rgb difference of neighbouring frames"
-    print_table(title, ["view", "picture", *COLUMNS], rows, num_text_columns=2)
+    print_table(title, ["view", "image", *COLUMNS], rows, num_text_columns=2)
 
 
 def parse_previous(text: str | None) -> tuple[SequenceConfig, ...]:

@@ -40,8 +40,8 @@ def ingest(  # noqa: PLR0913 - one per option
 
     from catalog.store import open_store
     from flows.cli.progress import shown_progress
-    from lidarpainter_models.scenes.readers import list_sequences
-    from tasks.ingest_jobs import IngestRequest, ingest_sequences
+    from lidarpainter_models.readers import list_sequences
+    from tasks.ingest.jobs import IngestRequest, ingest_sequences
 
     store = open_store()
     names = list(dict.fromkeys(sequences or list_sequences(dataset, root)))
@@ -52,7 +52,7 @@ def ingest(  # noqa: PLR0913 - one per option
     if as_json:
         print_json({"store": str(store.root), "scenes": rows, "failures": failures})
     else:
-        columns = ["scene", "frames", "pictures", "points", "actors", "moving", "size"]
+        columns = ["scene", "frames", "images", "points", "actors", "moving", "size"]
         cells = [
             [
                 row["scene_id"],

@@ -99,7 +99,7 @@ def train(  # noqa: PLR0913 - the options of a command
         typer.Option(help="clear, and styles to learn beside it: clear,foggy,night,rain."),
     ] = None,
     held_back: Annotated[
-        float, typer.Option(help="Share of the true pictures kept from training, to judge by.")
+        float, typer.Option(help="Share of the true images kept from training, to judge by.")
     ] = 0.1,
     feature_weights: Features = None,
     lpips_backbone: LpipsBackbone = None,
@@ -206,7 +206,7 @@ def info(
     painter = painter or "nano"
     from lidarpainter_models.painter import load_painter
     from lidarpainter_models.painter.description import describe_painter
-    from tasks.painters import files_of_painter, painter_digest
+    from tasks.painter.painters import files_of_painter, painter_digest
 
     found = describe_painter(load_painter(painter))
     result = {
@@ -275,12 +275,12 @@ app.command("benchmark")(painter_costs.benchmark)
 def _show_pairs(pairs: list[dict[str, Any]]) -> None:
     columns = ("set", "num_pairs", "num_targets", "cpu_seconds", "folder")
     rows = [[made[name] for name in columns] for made in pairs]
-    print_table("pairs", ["set", "pairs", "true pictures", "CPU s", "folder"], rows)
+    print_table("pairs", ["set", "pairs", "true images", "CPU s", "folder"], rows)
 
 
 def _show_training(result: dict[str, Any]) -> None:
     if result["held_back"] is not None:
-        from tasks.judge_painter import PAINTING_COLUMNS, PAINTING_NOTE, painting_rows
+        from tasks.painter.judge import PAINTING_COLUMNS, PAINTING_NOTE, painting_rows
 
         rows = painting_rows({"painted": result["held_back"]})
         count = result["held_back"]["total"]["num_pairs"]
@@ -293,13 +293,13 @@ def _show_training(result: dict[str, Any]) -> None:
         "pairs": result["record"]["num_pairs"],
         "training, CPU s": result["record"]["cpu_s"],
         "record": result.get("record_path"),
-        "sample pictures": result["samples"],
+        "sample images": result["samples"],
     }
     print_pairs("painter", pairs)
 
 
 def _show_scores(found: dict[str, Any]) -> None:
-    from tasks.judge_painter import PAINTING_COLUMNS, PAINTING_NOTE, painting_rows
+    from tasks.painter.judge import PAINTING_COLUMNS, PAINTING_NOTE, painting_rows
 
     judged = {name: counts for name, counts in found["pairs"].items() if counts["num_judged"]}
     sources: list[str | None] = [*judged, None] if len(judged) > 1 else [None]
@@ -328,7 +328,7 @@ def _show_info(result: dict[str, Any]) -> None:
     }
     for name, value in (*result["architecture"].items(), *result["provenance"].items()):
         if name == "trained_targets":
-            pairs["true pictures trained on"] = len(value)
+            pairs["true images trained on"] = len(value)
         elif name != "summary":
             pairs[name] = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
     print_pairs(f"painter {result['painter']}", pairs)

@@ -10,7 +10,7 @@ from flows.cli.painter_options import parse_size
 from flows.cli.shared_options import AsJson
 from lidarpainter_models.errors import ConfigError
 
-Size = Annotated[str, typer.Option(help="Size of a picture, WIDTHxHEIGHT.")]
+Size = Annotated[str, typer.Option(help="Size of an image, WIDTHxHEIGHT.")]
 
 
 def benchmark(
@@ -25,7 +25,7 @@ def benchmark(
 
     Random weights of the true size in bfloat16 on the CPU: half a minute of CPU time a round.
     """
-    from tasks.painter_benchmark import compare_wirings
+    from tasks.painter.benchmark import compare_wirings
 
     width_px, height_px = parse_size(size)
     if training:
@@ -52,7 +52,7 @@ def benchmark(
 
 
 def _time_training(height_px: int, width_px: int, *, as_json: bool) -> None:
-    from tasks.painter_benchmark import compare_training
+    from tasks.painter.benchmark import compare_training
 
     found = compare_training(height_px, width_px)
     if as_json:
@@ -76,7 +76,7 @@ def show_preset(painter: str | None, preset: str, size: str, *, as_json: bool) -
     Args:
         painter: a model in diffusers' layout whose licence is told; by default SD-Turbo as known.
         preset: name of the wiring.
-        size: of a picture, as text.
+        size: of an image, as text.
         as_json: print one JSON object.
 
     Raises:

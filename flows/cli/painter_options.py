@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from lidarpainter_models.errors import ConfigError
 
 if TYPE_CHECKING:
-    from tasks.painter_students import PainterTraining
+    from tasks.painter.students import PainterTraining
 
 WEIGHTS_SUFFIX = ".safetensors"
 _SIZE = re.compile(r"([1-9]\d{0,4})x([1-9]\d{0,4})")
@@ -41,7 +41,7 @@ def parse_seeds(text: str | None) -> tuple[int, ...]:
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Width and height of a picture: `1024x576`.
+    """Width and height of an image: `1024x576`.
 
     Raises:
         ConfigError: the text says something else.

@@ -74,7 +74,7 @@ def shifted(novel: Any, shift: str | None, up: str | None) -> Any:  # noqa: ANN4
 
 def show(result: dict[str, Any]) -> None:
     """The result as tables."""
-    from tasks.scores import SCORE_COLUMNS, SCORE_NOTE, score_rows
+    from tasks.evaluation.scores import SCORE_COLUMNS, SCORE_NOTE, score_rows
 
     title = f"{result['scene']}, painter {result['painter']}"
     print_table(title, SCORE_COLUMNS, score_rows(result), SCORE_NOTE)

@@ -1,4 +1,4 @@
-"""`lidarpainter render`: pictures of a run along a trajectory."""
+"""`lidarpainter render`: images of a run along a trajectory."""
 
 from pathlib import Path
 from typing import Annotated
@@ -12,11 +12,11 @@ from flows.cli.shared_options import AsJson, FollowedCamera, FollowedFrames, Run
 def render(  # noqa: PLR0913 - the options of a command
     run: RunName,
     trajectory: TrajectorySpec,
-    out: Annotated[Path, typer.Option(help="Folder for the pictures.")],
+    out: Annotated[Path, typer.Option(help="Folder for the images.")],
     camera: FollowedCamera = None,
     frames: FollowedFrames = None,
     postpaint: Annotated[
-        bool, typer.Option("--postpaint", help="Paint every picture as well.")
+        bool, typer.Option("--postpaint", help="Paint every image as well.")
     ] = False,
     painter: Annotated[
         str | None, typer.Option(help="Painter for --postpaint; the run's own if absent.")
@@ -26,7 +26,7 @@ def render(  # noqa: PLR0913 - the options of a command
     ] = "clear",
     previous: Annotated[
         str | None,
-        typer.Option(help="Lean on the picture painted before: mixed into the next, or shown."),
+        typer.Option(help="Lean on the image painted before: mixed into the next, or shown."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -38,9 +38,9 @@ def render(  # noqa: PLR0913 - the options of a command
     from flows.parameters import view_parameters
     from lidarpainter_models.conditioning.sequences import SequenceConfig
     from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
-    from tasks.render import RenderRequest
-    from tasks.render import render as render_task
     from tasks.runs import open_run
+    from tasks.views.render import RenderRequest
+    from tasks.views.render import render as render_task
 
     path = parse_trajectory(trajectory)
     store = open_store()
@@ -69,4 +69,4 @@ def render(  # noqa: PLR0913 - the options of a command
     if as_json:
         print_json(result)
     else:
-        print_pairs(f"pictures of {finished.scene_id}", result)
+        print_pairs(f"images of {finished.scene_id}", result)

@@ -1,4 +1,4 @@
-"""`lidarpainter stylize`: pictures of a run in fog, at night or in rain."""
+"""`lidarpainter stylize`: images of a run in fog, at night or in rain."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,18 +12,18 @@ from flows.cli.shared_options import AsJson, FollowedCamera, FollowedFrames, Run
 def stylize(  # noqa: PLR0913 - the options of a command
     run: RunName,
     prompt: Annotated[str, typer.Option(help="clear, foggy, night or rain.")],
-    out: Annotated[Path, typer.Option(help="Folder for the pictures.")],
+    out: Annotated[Path, typer.Option(help="Folder for the images.")],
     trajectory: TrajectorySpec = "recorded",
-    pictures: Annotated[
+    images: Annotated[
         str, typer.Option(help="rendered, or recorded: style what the camera saw.")
     ] = "rendered",
     camera: FollowedCamera = None,
     frames: FollowedFrames = None,
     width: Annotated[
-        int | None, typer.Option(help="Width of the pictures in pixels; that of the fit if absent.")
+        int | None, typer.Option(help="Width of the images in pixels; that of the fit if absent.")
     ] = None,
     painter: Annotated[
-        str | None, typer.Option(help="Paint every picture with this before it is styled.")
+        str | None, typer.Option(help="Paint every image with this before it is styled.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Decides lit windows, drops and noise.", min=0)] = 0,
     as_json: AsJson = False,
@@ -36,10 +36,10 @@ def stylize(  # noqa: PLR0913 - the options of a command
     from flows.cli.progress import shown_progress
     from flows.parameters import view_parameters
     from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
-    from tasks.render import RenderRequest
     from tasks.runs import open_run
-    from tasks.stylize import StylizeRequest
-    from tasks.stylize import stylize as stylize_task
+    from tasks.views.render import RenderRequest
+    from tasks.views.stylize import StylizeRequest
+    from tasks.views.stylize import stylize as stylize_task
 
     path = parse_trajectory(trajectory)
     store = open_store()
@@ -56,12 +56,12 @@ def stylize(  # noqa: PLR0913 - the options of a command
         observation=observation,
         conditions=parameters.conditions,
     )
-    asked: Any = pictures  # the request says which there are
-    request = StylizeRequest(prompt=prompt, view=view, pictures=asked, seed=seed)
+    asked: Any = images  # the request says which there are
+    request = StylizeRequest(prompt=prompt, view=view, images=asked, seed=seed)
     with shown_progress():
         made = stylize_task.fn(store.root, finished, request, out.absolute())
     result = {"run_id": finished.run_id, "prompt": prompt, "trajectory": path.spec, **made}
     if as_json:
         print_json(result)
     else:
-        print_pairs(f"{prompt} pictures of {finished.scene_id}", result)
+        print_pairs(f"{prompt} images of {finished.scene_id}", result)

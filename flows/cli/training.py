@@ -21,9 +21,9 @@ from flows.train_painter import (
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.metrics.lpips import LpipsFiles
 from lidarpainter_models.painter import is_one_step
-from tasks.judge_painter import judge_painters
-from tasks.judged_fits import JudgedFit
-from tasks.painter_students import recipe_for
+from tasks.painter.judge import judge_painters
+from tasks.painter.judged_fits import JudgedFit
+from tasks.painter.students import recipe_for
 from tasks.runs import open_run
 
 PREFECT_LOG = Path("logs") / "prefect.log"

@@ -1,6 +1,6 @@
 """Everything a painter is told about one view: render, LiDAR image and warped references.
 
-Pictures are on the view's own pixel grid, rgb in [0, 1], depth camera z in metres with 0 where
+Images are on the view's own pixel grid, rgb in [0, 1], depth camera z in metres with 0 where
 there is none. Colours are those of the scene before any camera's exposure, unless a camera is
 named whose exposure all of them then take.
 """
@@ -13,22 +13,22 @@ import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.conditioning.lidar_images import (
+from lidarpainter_models.conditioning.references import WarpTarget, warped_references
+from lidarpainter_models.conditioning.surface_depth import SurfaceDepthConfig, surface_depth
+from lidarpainter_models.conditioning.warping import SourceImage, WarpConfig, source_cost_m
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.gaussians.model.scene_graph import GaussianScene, SceneRender
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.lidar.lidar_images import (
     LidarImage,
     LidarImageConfig,
     render_lidar,
 )
-from lidarpainter_models.conditioning.moving_boxes import MovingBoxes
-from lidarpainter_models.conditioning.references import WarpTarget, warped_references
-from lidarpainter_models.conditioning.surface_depth import SurfaceDepthConfig, surface_depth
-from lidarpainter_models.conditioning.warping import SourcePicture, WarpConfig, source_cost_m
-from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.gaussians.calibration import ViewKey
-from lidarpainter_models.gaussians.observations import TrainingView
-from lidarpainter_models.gaussians.scene_graph import GaussianScene, SceneRender
-from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.lidar.lidar_map import LidarMap
+from lidarpainter_models.lidar.moving_boxes import MovingBoxes
+from lidarpainter_models.observations.observations import TrainingView
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT, PaintingConditions
-from lidarpainter_models.scenes.lidar_map import LidarMap
+from lidarpainter_models.scenes.records import ViewKey
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,7 +38,7 @@ class ConditionConfig:
     num_references: int = 2
     """Warped references given to the painter."""
     num_sources: int = 6
-    """Recorded pictures they are patched together from: the nearest, then ever sparser ones."""
+    """Recorded images they are patched together from: the nearest, then ever sparser ones."""
     lidar: LidarImageConfig = field(default_factory=LidarImageConfig)
     surface: SurfaceDepthConfig = field(default_factory=SurfaceDepthConfig)
     warp: WarpConfig = field(default_factory=WarpConfig)
@@ -82,22 +82,22 @@ class ConditionBuilder:
             )
             for view in training_views
         }
-        self._sources: dict[ViewKey, SourcePicture] = {}
+        self._sources: dict[ViewKey, SourceImage] = {}
 
     @property
     def recorded_cameras(self) -> tuple[Camera, ...]:
         """The training views' cameras at their refined poses."""
         return tuple(self._cameras.values())
 
-    def source(self, key: ViewKey) -> SourcePicture:
-        """A training picture with the surfaces it shows, colours before its exposure."""
+    def source(self, key: ViewKey) -> SourceImage:
+        """A training image with the surfaces it shows, colours before its exposure."""
         if key not in self._sources:
             view, camera = self._views[key], self._cameras[key]
             render = self.scene.render(camera, view.timestamp_ns)
             lidar = self.lidar_image(camera, view.timestamp_ns)
             # the sky mask knows better than the render where there is sky; what else is clear in
             # the render is drawn by the sky too, so it stands at infinity in both views
-            self._sources[key] = SourcePicture(
+            self._sources[key] = SourceImage(
                 key=key,
                 camera=camera,
                 timestamp_ns=view.timestamp_ns,
@@ -109,10 +109,10 @@ class ConditionBuilder:
 
     def sources_for(
         self, camera: Camera, timestamp_ns: int, *, exclude: frozenset[ViewKey] = frozenset()
-    ) -> tuple[SourcePicture, ...]:
-        """The pictures a view is patched from: nearest first, then spread over all others.
+    ) -> tuple[SourceImage, ...]:
+        """The images a view is patched from: nearest first, then spread over all others.
 
-        Neighbours of a slow drive show the same; pictures further off see round corners and
+        Neighbours of a slow drive show the same; images further off see round corners and
         past the edge of the frame.
         """
         allowed = [key for key in self._views if key not in exclude]
@@ -146,7 +146,7 @@ class ConditionBuilder:
             camera: Taken as it stands; correct it first if it was recorded.
             timestamp_ns: When the actors stand where they are drawn.
             exclude: Training views that must not serve as references.
-            camera_name: Give all pictures this camera's exposure.
+            camera_name: Give all images this camera's exposure.
             prompt: Passed on to the painter.
         """
         render = self.scene.render(camera, timestamp_ns)
@@ -197,7 +197,7 @@ class ConditionBuilder:
     def _without_exposure(
         self, rgb: Float[Tensor, "height width 3"], camera_name: str
     ) -> Float[Tensor, "height width 3"]:
-        """A recorded picture in the colours of the scene itself."""
+        """A recorded image in the colours of the scene itself."""
         exposure = self.scene.exposure
         if camera_name not in exposure.camera_names:
             return rgb
@@ -208,7 +208,7 @@ class ConditionBuilder:
 def _as_taken(
     rgb: Float[Tensor, "source_height source_width 3"], camera: Camera
 ) -> Float[Tensor, "height width 3"]:
-    """A recorded picture with as many pixels as a view has, whatever either shows."""
+    """A recorded image with as many pixels as a view has, whatever either shows."""
     size_px = (camera.height_px, camera.width_px)
     planes = rgb.clamp(0, 1).permute(2, 0, 1)[None]
     if planes.shape[2:] != size_px:

@@ -5,17 +5,17 @@ Geometry says where a painter had something to go by:
     support = 1 - (1 - w_warp V) (1 - w_lidar L) (1 - w_surface A)
     confidence = painter confidence * support * seen
 
-V is how well recorded pictures vouch for a pixel: 0 where none could be warped here, a fixed share
+V is how well recorded images vouch for a pixel: 0 where none could be warped here, a fixed share
 where a single one could, and exp(-excess / scale) where two could, with the excess of their
 difference over a slack. L = exp(-d / reach) with d the distance to the nearest pixel a LiDAR point
 coloured; A rises smoothly from 0 to 1 with the opacity of the render; `seen` is 1 where the
-surface fell into any training picture, hidden or not, and 0 outside all of them: nothing is known
+surface fell into any training image, hidden or not, and 0 outside all of them: nothing is known
 there. The weights follow errors measured at shifted views of a synthetic street: mean of render
-and warp 25.8 dB where two pictures are warped, 22.3 dB where one is; render 19 dB at LiDAR hits
+and warp 25.8 dB where two images are warped, 22.3 dB where one is; render 19 dB at LiDAR hits
 without warp, 18 to 15 dB without either, 13 dB in holes; from a difference of 0.16 between two
-warped pictures on, they are no better than the render.
+warped images on, they are no better than the render.
 
-The gate compares: where recorded pixels are known (warped pictures first, LiDAR colours
+The gate compares: where recorded pixels are known (warped images first, LiDAR colours
 elsewhere), a painting that departs from them by more than the plain render did is weighed down,
 locally and, if it does so on the whole, as a view; far beyond that it is refused.
 """
@@ -39,11 +39,11 @@ class ConfidenceConfig:
     """What each kind of evidence is worth, and when painting counts as harm."""
 
     warp_weight: float = 0.9
-    """Support of a pixel that two recorded pictures show alike."""
+    """Support of a pixel that two recorded images show alike."""
     single_warp_share: float = 0.7
-    """What a single recorded picture is worth, of two."""
+    """What a single recorded image is worth, of two."""
     warp_slack: float = 0.05
-    """Mean difference of two warped pictures that is put down to sampling."""
+    """Mean difference of two warped images that is put down to sampling."""
     warp_scale: float = 0.1
     """Further difference at which their worth has fallen to 1/e."""
     lidar_weight: float = 0.6
@@ -105,7 +105,7 @@ def is_seen(
     depth_m: Float[Tensor, "height width"],
     recorded_cameras: Iterable[Camera],
 ) -> Bool[Tensor, "height width"]:
-    """Whether the point in each pixel falls into any recorded picture, occluded or not.
+    """Whether the point in each pixel falls into any recorded image, occluded or not.
 
     Pixels without depth (0) are taken as sky: only their direction counts.
     """
@@ -182,7 +182,7 @@ def guidance_gate(
 def _evidence(
     conditions: PaintingConditions,
 ) -> tuple[Float[Tensor, "height width 3"], Bool[Tensor, "height width"]]:
-    """The best recorded colour known for each pixel: warped pictures, then LiDAR."""
+    """The best recorded colour known for each pixel: warped images, then LiDAR."""
     rgb, known = conditions.lidar_rgb, conditions.lidar_hit
     for source in reversed(range(len(conditions.warp_valid))):
         valid = conditions.warp_valid[source]
@@ -197,10 +197,10 @@ def _falloff(excess: float, config: ConfidenceConfig) -> float:
     return float(torch.exp(-beyond / config.gate_scale))
 
 
-def _box_sum(picture: Float[Tensor, "height width"], side_px: int) -> Float[Tensor, "height width"]:
-    """Sum over a square window around each pixel; outside the picture is 0."""
+def _box_sum(image: Float[Tensor, "height width"], side_px: int) -> Float[Tensor, "height width"]:
+    """Sum over a square window around each pixel; outside the image is 0."""
     mean = torch.nn.functional.avg_pool2d(
-        picture[None, None], side_px, stride=1, padding=side_px // 2
+        image[None, None], side_px, stride=1, padding=side_px // 2
     )
     return mean[0, 0] * side_px**2
 

@@ -1,4 +1,4 @@
-"""Painted pictures of views that nobody recorded, to guide the fit on.
+"""Painted images of views that nobody recorded, to guide the fit on.
 
 The recorded cameras are moved sideways and up relative to the road, what the scene shows there is
 painted, and every pixel gets a weight: painter confidence times geometric confidence times the
@@ -23,13 +23,13 @@ from lidarpainter_models.conditioning.confidence import (
 )
 from lidarpainter_models.conditioning.sequences import SequenceConfig, SequencePainter
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.gaussians.calibration import ViewKey
-from lidarpainter_models.gaussians.observations import GuidanceView, TrainingView
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectories import Shift, road_directions, shift_pose
+from lidarpainter_models.lidar.lidar_map import LidarMap
+from lidarpainter_models.observations.observations import GuidanceView, TrainingView
 from lidarpainter_models.painter.protocol import Painter, Painting, PaintingConditions
-from lidarpainter_models.scenes.lidar_map import LidarMap
+from lidarpainter_models.scenes.records import ViewKey
 from lidarpainter_models.scenes.tracks import ActorTrack
 
 DEFAULT_SHIFTS = (
@@ -87,13 +87,13 @@ class NovelCamera:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NovelPainting:
-    """One painted view: guidance for the fit and pictures for a report."""
+    """One painted view: guidance for the fit and images for a report."""
 
     novel: NovelCamera
     guidance: GuidanceView
     """Its weight is 0 everywhere if the gate refused the painting."""
     gate: GuidanceGate
-    pictures: dict[str, UInt8[Tensor, "height width 3"]]
+    images: dict[str, UInt8[Tensor, "height width 3"]]
     """By name: render, lidar, warp, painted, confidence."""
 
     @property
@@ -231,11 +231,11 @@ def _paint(
         lidar_depth_m=conditions.lidar_depth_m,
     )
     return NovelPainting(
-        novel=novel, guidance=guidance, gate=gate, pictures=_pictures(conditions, painting, weight)
+        novel=novel, guidance=guidance, gate=gate, images=_images(conditions, painting, weight)
     )
 
 
-def _pictures(
+def _images(
     conditions: PaintingConditions, painting: Painting, weight: Float[Tensor, "height width"]
 ) -> dict[str, UInt8[Tensor, "height width 3"]]:
     """What a report shows of one view."""

@@ -1,9 +1,9 @@
-"""The warped references of a view: per pixel, the best recorded pictures that show its surface.
+"""The warped references of a view: per pixel, the best recorded images that show its surface.
 
-Every pixel of the target is looked for in the recorded pictures, nearest first, until as many as
-wanted have shown it; so one reference is a patchwork of pictures and covers what any of them saw.
+Every pixel of the target is looked for in the recorded images, nearest first, until as many as
+wanted have shown it; so one reference is a patchwork of images and covers what any of them saw.
 A pixel may have several guesses of its depth (the render's, the LiDAR's): the next one is tried
-where no picture agreed with the one before.
+where no image agreed with the one before.
 """
 
 from collections.abc import Sequence
@@ -13,14 +13,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lidarpainter_models.conditioning.moving_boxes import MovingBoxes
 from lidarpainter_models.conditioning.warping import (
     SKY_DEPTH_M,
-    SourcePicture,
+    SourceImage,
     WarpConfig,
     sample_source,
 )
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 
 
 class WarpTarget(NamedTuple):
@@ -53,7 +53,7 @@ class _Search(NamedTuple):
 
 def warped_references(
     target: WarpTarget,
-    sources: Sequence[SourcePicture],
+    sources: Sequence[SourceImage],
     boxes: MovingBoxes,
     *,
     count: int,
@@ -86,7 +86,7 @@ def warped_references(
 def _look_up(
     search: _Search,
     timestamp_ns: int,
-    sources: Sequence[SourcePicture],
+    sources: Sequence[SourceImage],
     boxes: MovingBoxes,
     config: WarpConfig,
 ) -> None:

@@ -3,7 +3,7 @@
 Nothing here is random, and without a frame before it a view is painted as if it stood alone: the
 first frame of a path is that painting, bit for bit. Every later frame is given the previous one,
 carried over by the rendered depth (`warping`): where both views show the same surface it is either
-mixed into the painting, or shown to the painter as the best of the warped pictures.
+mixed into the painting, or shown to the painter as the best of the warped images.
 """
 
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 import torch
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
-from lidarpainter_models.conditioning.warping import SourcePicture, warp_pictures
+from lidarpainter_models.conditioning.warping import SourceImage, warp_images
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.painter.protocol import (
@@ -32,7 +32,7 @@ class SequenceConfig:
 
     previous: PreviousUse = "unused"
     """`mixed`: into the painting, as far as both agree; `shown`: to the painter, before the other
-    warped pictures, of which it was trained to expect recorded ones only."""
+    warped images, of which it was trained to expect recorded ones only."""
     share: float = 0.5
     """Of the previous frame in a mixed pixel on which both agree."""
     agreement: float = 0.05
@@ -73,7 +73,7 @@ class SequencePainter:
             builder: gives the conditions of the scene.
             painter: repairs the views.
             config: what becomes of previous frames.
-            camera_name: whose exposure all pictures take.
+            camera_name: whose exposure all images take.
             prompt: what the painter is asked for.
         """
         self._builder = builder
@@ -81,7 +81,7 @@ class SequencePainter:
         self._config = config or SequenceConfig()
         self._camera_name = camera_name
         self._prompt = prompt
-        self._previous: SourcePicture | None = None
+        self._previous: SourceImage | None = None
 
     def paint(self, camera: Camera, timestamp_ns: int) -> PaintedFrame:
         """Paint the next view of the path."""
@@ -97,7 +97,7 @@ class SequencePainter:
         with torch.inference_mode():
             painting = self._painted(conditions, camera, timestamp_ns)
         if self._config.previous != "unused":
-            self._previous = SourcePicture(
+            self._previous = SourceImage(
                 key=PREVIOUS_KEY,
                 camera=camera,
                 timestamp_ns=timestamp_ns,
@@ -112,7 +112,7 @@ class SequencePainter:
     ) -> Painting:
         if self._previous is None:
             return self._painter.paint(conditions)
-        carried, valid = warp_pictures(
+        carried, valid = warp_images(
             camera,
             timestamp_ns,
             conditions.render_depth_m,

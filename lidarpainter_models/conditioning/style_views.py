@@ -1,4 +1,4 @@
-"""What a style needs of a fitted scene: a picture of it, distance and sky in every pixel."""
+"""What a style needs of a fitted scene: an image of it, distance and sky in every pixel."""
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -12,17 +12,17 @@ def style_view(
     builder: ConditionBuilder,
     camera: Camera,
     timestamp_ns: int,
-    picture: Float[Tensor, "height width 3"],
+    image: Float[Tensor, "height width 3"],
     sky_mask: Bool[Tensor, "height width"] | None = None,
 ) -> tuple[StyleView, Float[Tensor, "height width"]]:
-    """A picture of the scene with what styles it, and the LiDAR depth that supports it.
+    """An image of the scene with what styles it, and the LiDAR depth that supports it.
 
     Args:
         builder: of the scene.
-        camera: where the picture was taken.
+        camera: where the image was taken.
         timestamp_ns: and when.
-        picture: rendered, painted or recorded there, in [0, 1].
-        sky_mask: of a recorded picture; by default what the Gaussians leave open is sky.
+        image: rendered, painted or recorded there, in [0, 1].
+        sky_mask: of a recorded image; by default what the Gaussians leave open is sky.
 
     Returns:
         The view, its depth that of the render corrected by LiDAR; and camera z in metres where the
@@ -32,7 +32,7 @@ def style_view(
     lidar = builder.lidar_image(camera, timestamp_ns)
     sky = 1 - render.alpha.clamp(0, 1) if sky_mask is None else sky_mask.float()
     view = StyleView(
-        rgb=picture,
+        rgb=image,
         depth_m=builder.surface_m(render, lidar, camera).detach(),
         sky=sky.detach(),
         camera=camera,

@@ -1,7 +1,7 @@
 """The depth of a view's surfaces from its render and its LiDAR image.
 
-A render's depth is a mean over soft Gaussians: good to a percent, which at ten metres carries a
-picture taken three metres aside to the wrong place by a pixel or two. LiDAR is three times as
+A render's depth is a mean over soft Gaussians: good to a percent, which at ten metres carries an
+image taken three metres aside to the wrong place by a pixel or two. LiDAR is three times as
 good (medians on a synthetic street) but has gaps; in these the render is scaled as LiDAR found it
 wrong around them. Depth is camera z in metres, 0 where there is none.
 """

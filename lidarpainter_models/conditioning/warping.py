@@ -1,4 +1,4 @@
-"""Carry recorded pictures into another view by depth.
+"""Carry recorded images into another view by depth.
 
 Backward warping: every pixel of the target is lifted to its world point, moved with its actor to
 the time of the source, projected into the source and sampled there, if the source saw the same
@@ -15,9 +15,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lidarpainter_models.conditioning.moving_boxes import BoxConfig, MovingBoxes
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.lidar.moving_boxes import BoxConfig, MovingBoxes
 from lidarpainter_models.scenes.driving_scene import ActorTrack
 
 SKY_DEPTH_M = 1e5
@@ -47,8 +47,8 @@ class WarpConfig:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SourcePicture:
-    """A recorded picture with the surfaces it shows."""
+class SourceImage:
+    """A recorded image with the surfaces it shows."""
 
     key: tuple[int, str]
     """(frame index, camera name)."""
@@ -75,12 +75,12 @@ def source_cost_m(
 def nearest_sources(
     target_camera: Camera,
     timestamp_ns: int,
-    sources: Sequence[SourcePicture],
+    sources: Sequence[SourceImage],
     *,
     count: int,
     exclude: frozenset[tuple[int, str]] = frozenset(),
     config: WarpConfig | None = None,
-) -> tuple[SourcePicture, ...]:
+) -> tuple[SourceImage, ...]:
     """The `count` sources nearest in place, direction and time; ties go to the earlier one."""
     config = config or WarpConfig()
     allowed = [source for source in sources if source.key not in exclude]
@@ -92,12 +92,12 @@ def nearest_sources(
     return tuple(allowed[:count])
 
 
-def warp_pictures(
+def warp_images(
     target_camera: Camera,
     target_timestamp_ns: int,
     target_depth_m: Float[Tensor, "height width"],
     target_alpha: Float[Tensor, "height width"],
-    sources: Sequence[SourcePicture],
+    sources: Sequence[SourceImage],
     tracks: Sequence[ActorTrack],
     *,
     config: WarpConfig | None = None,
@@ -105,7 +105,7 @@ def warp_pictures(
     """Every source as the target camera would see it, and where that is known.
 
     A pixel without depth is sky if its alpha is low, else nothing is known of it. `tracks` are
-    the moving actors. Pictures are 0 where they are not valid.
+    the moving actors. Images are 0 where they are not valid.
     """
     config = config or WarpConfig()
     height_px, width_px = target_depth_m.shape
@@ -116,23 +116,23 @@ def warp_pictures(
     known = (has_depth | is_sky).reshape(-1)
     boxes = MovingBoxes(tracks, config.boxes)
     owners = boxes.owners(points_world, target_timestamp_ns)
-    pictures, valids = [], []
+    images, valids = [], []
     for source in sources:
         points, present = boxes.moved(
             points_world, owners, from_ns=target_timestamp_ns, to_ns=source.timestamp_ns
         )
         rgb, seen = sample_source(source, points, is_sky.reshape(-1), config=config)
         valid = (seen & present & known).reshape(height_px, width_px)
-        pictures.append(torch.where(valid[..., None], rgb.reshape(height_px, width_px, 3), 0))
+        images.append(torch.where(valid[..., None], rgb.reshape(height_px, width_px, 3), 0))
         valids.append(valid)
-    if not pictures:
+    if not images:
         empty = target_depth_m.new_zeros(0, height_px, width_px)
         return empty[..., None].expand(-1, -1, -1, 3), empty.to(torch.bool)
-    return torch.stack(pictures), torch.stack(valids)
+    return torch.stack(images), torch.stack(valids)
 
 
 def sample_source(
-    source: SourcePicture,
+    source: SourceImage,
     points_world: Float[Tensor, "points 3"],
     is_sky: Bool[Tensor, " points"],
     *,
@@ -140,7 +140,7 @@ def sample_source(
 ) -> tuple[Float[Tensor, "points 3"], Bool[Tensor, " points"]]:
     """Colour of world points in a source, and whether the source saw just these points.
 
-    Inverse depth is interpolated, not depth: on a plane it is linear in the picture, so a surface
+    Inverse depth is interpolated, not depth: on a plane it is linear in the image, so a surface
     at a grazing angle passes the test, while a depth edge lies between both sides and fails it.
     """
     camera = source.camera

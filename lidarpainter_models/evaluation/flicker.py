@@ -1,8 +1,8 @@
-"""How much pictures of a path change from frame to frame where they should not.
+"""How much images of a path change from frame to frame where they should not.
 
 The previous frame is carried into the next by rendered depth, actors with their boxes; pixels that
 both views show (depth agrees, or both see the sky) are compared. What changes there is flicker,
-resampling, light that depends on the view, and wrong depth; the true pictures of a synthetic
+resampling, light that depends on the view, and wrong depth; the true images of a synthetic
 street, compared under the same depth, say how much of it is not flicker.
 """
 
@@ -13,32 +13,32 @@ from statistics import fmean
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lidarpainter_models.conditioning.moving_boxes import BACKGROUND, MovingBoxes
-from lidarpainter_models.conditioning.warping import SourcePicture, WarpConfig, warp_pictures
+from lidarpainter_models.conditioning.warping import SourceImage, WarpConfig, warp_images
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.metrics.pictures import psnr_from_error, squared_error
+from lidarpainter_models.lidar.moving_boxes import BACKGROUND, MovingBoxes
+from lidarpainter_models.metrics.images import psnr_from_error, squared_error
 from lidarpainter_models.scenes.tracks import ActorTrack
 
 TRUTH = "truth"
-"""Name of the true pictures among those of a frame."""
+"""Name of the true images among those of a frame."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FlickerFrame:
-    """One moment of a path: several pictures of it, and the surfaces they show."""
+    """One moment of a path: several images of it, and the surfaces they show."""
 
     camera: Camera
     timestamp_ns: int
     depth_m: Float[Tensor, "height width"]
     """Rendered camera z, 0 = none."""
     alpha: Float[Tensor, "height width"]
-    pictures: Mapping[str, Float[Tensor, "height width 3"]]
+    images: Mapping[str, Float[Tensor, "height width 3"]]
     """By the name of who made them, the same at every moment."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlickerScores:
-    """Figures of one kind of picture along one path."""
+    """Figures of one kind of image along one path."""
 
     flicker: float | None
     """Mean absolute rgb difference on valid pixels; None where there are none."""
@@ -52,7 +52,7 @@ class FlickerScores:
 
 
 @dataclass
-class _PictureTally:
+class _ImageTally:
     difference: float = 0.0
     moving_difference: float = 0.0
     psnr: list[float] = field(default_factory=list)
@@ -66,25 +66,25 @@ class FlickerTally:
         self._tracks = tracks
         self._config = config or WarpConfig()
         self._boxes = MovingBoxes(tracks, self._config.boxes)
-        self._pictures: dict[str, _PictureTally] = {}
+        self._images: dict[str, _ImageTally] = {}
         self._previous: FlickerFrame | None = None
         self._num_pixels = self._num_valid = self._num_moving = self._num_pairs = 0
 
     def add(self, frame: FlickerFrame) -> None:
         """Count the next moment."""
-        if not self._pictures:
-            self._pictures = {name: _PictureTally() for name in frame.pictures}
-        truth = frame.pictures.get(TRUTH)
-        for name, rgb in frame.pictures.items():
+        if not self._images:
+            self._images = {name: _ImageTally() for name in frame.images}
+        truth = frame.images.get(TRUTH)
+        for name, rgb in frame.images.items():
             if truth is not None and name != TRUTH:
                 error = float(squared_error(rgb, truth).mean())
-                self._pictures[name].psnr.append(psnr_from_error(error))
+                self._images[name].psnr.append(psnr_from_error(error))
         if self._previous is not None:
             self._compare(self._previous, frame)
         self._previous = frame
 
     def scores(self) -> dict[str, FlickerScores]:
-        """The figures of every kind of picture."""
+        """The figures of every kind of image."""
         return {
             name: FlickerScores(
                 flicker=_mean(tally.difference, self._num_valid),
@@ -93,12 +93,12 @@ class FlickerTally:
                 psnr=fmean(tally.psnr) if tally.psnr else None,
                 num_pairs=self._num_pairs,
             )
-            for name, tally in self._pictures.items()
+            for name, tally in self._images.items()
         }
 
     def _compare(self, before: FlickerFrame, now: FlickerFrame) -> None:
         sources = [
-            SourcePicture(
+            SourceImage(
                 key=(0, name),
                 camera=before.camera,
                 timestamp_ns=before.timestamp_ns,
@@ -106,9 +106,9 @@ class FlickerTally:
                 depth_m=before.depth_m,
                 alpha=before.alpha,
             )
-            for name, rgb in before.pictures.items()
+            for name, rgb in before.images.items()
         ]
-        carried, valid = warp_pictures(
+        carried, valid = warp_images(
             now.camera,
             now.timestamp_ns,
             now.depth_m,
@@ -117,16 +117,16 @@ class FlickerTally:
             self._tracks,
             config=self._config,
         )
-        compared = valid[0]  # of depth alone, so the same for all pictures
+        compared = valid[0]  # of depth alone, so the same for all images
         moving = compared & self._on_actors(now)
         self._num_pairs += 1
         self._num_pixels += compared.numel()
         self._num_valid += int(compared.sum())
         self._num_moving += int(moving.sum())
-        for rgb, (name, picture) in zip(carried, now.pictures.items(), strict=True):
-            difference = (rgb - picture).abs().mean(dim=-1).double()
-            self._pictures[name].difference += float(difference[compared].sum())
-            self._pictures[name].moving_difference += float(difference[moving].sum())
+        for rgb, (name, image) in zip(carried, now.images.items(), strict=True):
+            difference = (rgb - image).abs().mean(dim=-1).double()
+            self._images[name].difference += float(difference[compared].sum())
+            self._images[name].moving_difference += float(difference[moving].sum())
 
     def _on_actors(self, frame: FlickerFrame) -> Bool[Tensor, "height width"]:
         """Pixels whose surface lies in the box of a moving actor."""

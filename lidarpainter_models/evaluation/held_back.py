@@ -1,6 +1,6 @@
 """Keep what a painter learns from apart from what judges it.
 
-A pair aims at a true picture, its target; the same target can stand in many pairs (several fits,
+A pair aims at a true image, its target; the same target can stand in many pairs (several fits,
 damaged copies, several folders). So pairs are held back, and compared with a painter's training
 record, by target and never by file. Synthetic streets of low seeds are for judging only.
 """
@@ -12,9 +12,9 @@ import re
 from collections.abc import Iterable, Mapping, Sequence, Set
 from typing import Any
 
-from lidarpainter_models.conditioning.pairs import PairFolder
 from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.painter.examples import PaintingPair, Window
+from lidarpainter_models.training_data.pairs import PairFolder
 
 FIRST_TRAINING_SEED = 1000
 """Streets of lower seeds belong to the demo, the tests and the evaluation."""
@@ -44,7 +44,7 @@ class PairSubset:
 
     @property
     def targets(self) -> frozenset[str]:
-        """The true pictures that the pairs aim at."""
+        """The true images that the pairs aim at."""
         return frozenset(target_of(self.folder, index) for index in self.indices)
 
     def size_px(self, index: int) -> tuple[int, int]:
@@ -67,12 +67,12 @@ class PairSubset:
 
 
 def target_of(folder: PairFolder, index: int) -> str:
-    """The true picture of a pair: data set, sequence, and what was photographed from where."""
+    """The true image of a pair: data set, sequence, and what was photographed from where."""
     return target_name(folder.name(index), folder.provenance(index))
 
 
 def target_name(pair: str, provenance: Mapping[str, Any]) -> str:
-    """What a pair's true picture is called.
+    """What a pair's true image is called.
 
     A pair whose provenance does not say what it shows has a target of its own, shared with its
     damaged copies.
@@ -99,7 +99,7 @@ def target_view(target: str) -> tuple[str, int, str] | None:
 
 
 def trained_targets(provenance: Mapping[str, Any]) -> frozenset[str] | None:
-    """The true pictures that weights were trained on, or None if they do not say.
+    """The true images that weights were trained on, or None if they do not say.
 
     Weights say it by a list of targets, or by describing every pair of their sources.
     """

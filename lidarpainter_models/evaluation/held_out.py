@@ -1,7 +1,7 @@
 """Held-out views of a scene, at recorded poses, at interpolated poses, and beside the path.
 
-No picture and no sweep of a held-out frame was used for fitting. `interpolated` poses come from
-the refined training poses around the frame, so no test picture enters them; `recorded` poses are
+No image and no sweep of a held-out frame was used for fitting. `interpolated` poses come from
+the refined training poses around the frame, so no test image enters them; `recorded` poses are
 the log's own. The two are reported side by side and never mixed.
 """
 
@@ -14,17 +14,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.evaluation.judged_views import JudgedView, actor_mask
-from lidarpainter_models.gaussians.observations import (
-    ObservationConfig,
-    fit_camera,
-    shrink_picture,
-)
-from lidarpainter_models.gaussians.scene_graph import GaussianScene
-from lidarpainter_models.gaussians.sparse_depth import move_actor_points
+from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectories import Shift, road_directions, shift_pose
+from lidarpainter_models.lidar.sparse_depth import move_actor_points
+from lidarpainter_models.observations.observations import (
+    ObservationConfig,
+    fit_camera,
+    shrink_image,
+)
 from lidarpainter_models.scenes.driving_scene import DrivingScene, RecordedView
-from lidarpainter_models.scenes.synthetic.street import SyntheticStreet
+from lidarpainter_models.synthetic.street import SyntheticStreet
 
 Poses = Literal["interpolated", "recorded"]
 
@@ -54,11 +54,11 @@ class HeldOut:
         return camera.at(shift_pose(camera.world_from_camera, direction, shift))
 
     def recorded_views(self, fitted: GaussianScene, poses: Poses) -> list[JudgedView]:
-        """The held-out pictures."""
+        """The held-out images."""
         judged = []
         for view in self.test_views:
             camera = self.camera_of(fitted, view, poses)
-            picture = shrink_picture(
+            image = shrink_image(
                 self.scene.read_image(view), width_px=camera.width_px, height_px=camera.height_px
             )
             judged.append(
@@ -66,7 +66,7 @@ class HeldOut:
                     name=f"{view.camera_name}/{view.frame_index}",
                     camera=camera,
                     timestamp_ns=view.timestamp_ns,
-                    truth_rgb=picture.float() / 255,
+                    truth_rgb=image.float() / 255,
                     actor_mask=actor_mask(camera, self.scene.tracks, view.timestamp_ns),
                 )
             )
@@ -75,7 +75,7 @@ class HeldOut:
     def synthetic_views(
         self, fitted: GaussianScene, street: SyntheticStreet, shift: Shift
     ) -> list[JudgedView]:
-        """Exact pictures of the synthetic street beside the path, at the held-out times."""
+        """Exact images of the synthetic street beside the path, at the held-out times."""
         judged = []
         for view in self.test_views:
             camera = self.shifted_camera(fitted, view, shift)

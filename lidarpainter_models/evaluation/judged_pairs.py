@@ -1,7 +1,7 @@
 """Held-out views of a fitted scene as pairs: what a painter would be shown, and the truth.
 
 Recorded logs judge at the held-out frames, synthetic streets beside the path, where they know the
-exact picture.
+exact image.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from lidarpainter_models.evaluation.judged_views import JudgedView
 from lidarpainter_models.geometry.trajectories import Shift
 from lidarpainter_models.painter.examples import PaintingPair
 from lidarpainter_models.scenes.records import RecordedView
-from lidarpainter_models.scenes.synthetic.street import SyntheticStreet
+from lidarpainter_models.synthetic.street import SyntheticStreet
 
 RECORDED = "recorded"
 """Name of the held-out frames at interpolated poses."""
@@ -31,7 +31,7 @@ class JudgedPairs:
     """With the scene whose render is painted."""
     held_out: HeldOut
     beside: tuple[SyntheticStreet, Shift] | None = None
-    """The world and where in it; None for the recorded pictures."""
+    """The world and where in it; None for the recorded images."""
 
     def __len__(self) -> int:
         return len(self.held_out.test_views)
@@ -73,7 +73,7 @@ def judged_pairs(
 def unseen_views(
     views: Sequence[RecordedView], scene_id: str, trained: AbstractSet[str]
 ) -> list[RecordedView]:
-    """The views of a scene of which no painter was trained on a picture, from whatever place.
+    """The views of a scene of which no painter was trained on an image, from whatever place.
 
     Args:
         views: held-out views.

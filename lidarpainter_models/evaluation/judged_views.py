@@ -1,6 +1,6 @@
-"""Views with a known true picture, and what it takes to score a renderer on them.
+"""Views with a known true image, and what it takes to score a renderer on them.
 
-A renderer is any function from a camera and a time to a picture: the Gaussian scene itself, or
+A renderer is any function from a camera and a time to an image: the Gaussian scene itself, or
 the scene followed by a painter. So every figure exists painted and unpainted.
 """
 
@@ -16,12 +16,12 @@ from torch import Tensor
 from lidarpainter_models.geometry.boxes import box_corners
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import transform_points
+from lidarpainter_models.metrics.images import ImageScores, pooled_psnr, score_image
 from lidarpainter_models.metrics.perceptual import PerceptualDistances
-from lidarpainter_models.metrics.pictures import PictureScores, pooled_psnr, score_picture
 from lidarpainter_models.scenes.driving_scene import ActorTrack
 
 Renderer = Callable[[Camera, int], Float[Tensor, "height width 3"]]
-"""Picture of a camera (fit resolution) at a time in nanoseconds."""
+"""Image of a camera (fit resolution) at a time in nanoseconds."""
 
 NEAR_M = 0.5
 """Boxes with a corner nearer than this to the image plane are left out of actor masks."""
@@ -29,7 +29,7 @@ NEAR_M = 0.5
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JudgedView:
-    """A view whose true picture is known and was never used for fitting."""
+    """A view whose true image is known and was never used for fitting."""
 
     name: str
     camera: Camera
@@ -83,16 +83,16 @@ def score_views(
     """Render every view and average its scores; None without views."""
     if not views:
         return None
-    scores: list[PictureScores] = []
+    scores: list[ImageScores] = []
     features: list[float] = []
     lpips: list[float] = []
     for view in views:
-        picture = render(view.camera, view.timestamp_ns).clamp(0, 1)
-        scores.append(score_picture(picture, view.truth_rgb, view.actor_mask))
+        image = render(view.camera, view.timestamp_ns).clamp(0, 1)
+        scores.append(score_image(image, view.truth_rgb, view.actor_mask))
         if distances.features is not None:
-            features.append(float(distances.features(picture, view.truth_rgb)))
+            features.append(float(distances.features(image, view.truth_rgb)))
         if distances.lpips is not None:
-            lpips.append(float(distances.lpips(picture, view.truth_rgb)))
+            lpips.append(float(distances.lpips(image, view.truth_rgb)))
     return ViewScores(
         psnr=sum(score.psnr_db for score in scores) / len(scores),
         ssim=sum(score.ssim for score in scores) / len(scores),

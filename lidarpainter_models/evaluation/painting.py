@@ -1,4 +1,4 @@
-"""How well a painter repairs pairs whose true picture is known.
+"""How well a painter repairs pairs whose true image is known.
 
 Figures stand per source of pairs and over all of them. PSNR, SSIM and feature distance are means
 over pairs; damaged and undamaged PSNR, the share outside the hull and the confidence pool the
@@ -18,8 +18,8 @@ from torch import Tensor
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.kernels.ssim import ssim_map
-from lidarpainter_models.metrics.perceptual import PictureDistance
-from lidarpainter_models.metrics.pictures import psnr_from_error, squared_error
+from lidarpainter_models.metrics.images import psnr_from_error, squared_error
+from lidarpainter_models.metrics.perceptual import ImageDistance
 from lidarpainter_models.painter.baselines import UnpaintedPainter, WarpPainter
 from lidarpainter_models.painter.examples import PaintingPair
 from lidarpainter_models.painter.input_hull import input_hull
@@ -47,8 +47,8 @@ class JudgingPairs(Protocol):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PictureFigures:
-    """How close one kind of picture comes to the truth."""
+class ImageFigures:
+    """How close one kind of image comes to the truth."""
 
     psnr: float
     ssim: float
@@ -63,7 +63,7 @@ class PictureFigures:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaintingGains:
-    """PSNR of the painted picture over that of others; None where one of them has no pixels."""
+    """PSNR of the painted image over that of others; None where one of them has no pixels."""
 
     over_input: float
     over_warp_mean: float
@@ -76,16 +76,16 @@ class PaintingGains:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SourceScores:
-    """A painter's figures on one source of pairs, beside those of two pictures it starts from."""
+    """A painter's figures on one source of pairs, beside those of two images it starts from."""
 
     num_pairs: int
     damaged_share: float
     """Share of the pixels that are damaged in the input."""
-    input: PictureFigures
+    input: ImageFigures
     """The render as it is."""
-    warp_mean: PictureFigures
+    warp_mean: ImageFigures
     """The mean of the render and the valid warps."""
-    painted: PictureFigures
+    painted: ImageFigures
     confidence_auc: float | None
     """Chance that a right pixel has more confidence than a wrong one (area under the ROC curve,
     ties count half); None where all pixels are right, or all wrong."""
@@ -114,7 +114,7 @@ def score_painter(
     painter: Painter,
     sources: Mapping[str, JudgingPairs],
     *,
-    feature_distance: PictureDistance | None = None,
+    feature_distance: ImageDistance | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> PaintingScores:
     """Paint every pair and compare with the truth.
@@ -149,14 +149,14 @@ def score_painter(
 
 
 def outside_hull(
-    picture: Float[Tensor, "height width 3"], conditions: PaintingConditions
+    image: Float[Tensor, "height width 3"], conditions: PaintingConditions
 ) -> Bool[Tensor, "height width"]:
     """Pixels with a channel beyond what the inputs show nearby, by more than a margin.
 
     Nearby is a square of 9 pixels; inputs are the render, LiDAR hits and valid warps.
     """
     hull = input_hull(conditions)
-    return ((picture > hull.upper) | (picture < hull.lower)).any(dim=-1)
+    return ((image > hull.upper) | (image < hull.lower)).any(dim=-1)
 
 
 def confidence_auc(
@@ -171,8 +171,8 @@ def confidence_auc(
 
 
 @dataclass
-class _PictureTally:
-    """Sums for the figures of one kind of picture."""
+class _ImageTally:
+    """Sums for the figures of one kind of image."""
 
     psnr: list[float] = field(default_factory=list)
     ssim: list[float] = field(default_factory=list)
@@ -183,24 +183,24 @@ class _PictureTally:
 
     def add(
         self,
-        picture: Float[Tensor, "height width 3"],
+        image: Float[Tensor, "height width 3"],
         pair: PaintingPair,
         damaged: Bool[Tensor, "height width"],
-        feature_distance: PictureDistance | None,
+        feature_distance: ImageDistance | None,
     ) -> None:
         known, truth = pair.target_valid, pair.target_rgb
-        picture = torch.where(known[..., None], picture.clamp(0, 1), truth).contiguous()
-        error = squared_error(picture, truth).double()
+        image = torch.where(known[..., None], image.clamp(0, 1), truth).contiguous()
+        error = squared_error(image, truth).double()
         self.psnr.append(psnr_from_error(float(error[known].mean())))
-        self.ssim.append(float(ssim_map(picture, truth.contiguous()).mean(dim=-1)[known].mean()))
+        self.ssim.append(float(ssim_map(image, truth.contiguous()).mean(dim=-1)[known].mean()))
         self.damaged_error += float(error[known & damaged].sum())
         self.undamaged_error += float(error[known & ~damaged].sum())
-        self.num_outside += int((outside_hull(picture, pair.conditions) & known).sum())
+        self.num_outside += int((outside_hull(image, pair.conditions) & known).sum())
         if feature_distance is not None:
-            self.feature_distance.append(float(feature_distance(picture, truth)))
+            self.feature_distance.append(float(feature_distance(image, truth)))
 
-    def figures(self, num_known: int, num_damaged: int) -> PictureFigures:
-        return PictureFigures(
+    def figures(self, num_known: int, num_damaged: int) -> ImageFigures:
+        return ImageFigures(
             psnr=fmean(self.psnr),
             ssim=fmean(self.ssim),
             feature_distance=fmean(self.feature_distance) if self.feature_distance else None,
@@ -218,9 +218,9 @@ def _no_counts() -> Float[Tensor, " bins"]:
 class _SourceTally:
     """Everything counted over the pairs of one source."""
 
-    input: _PictureTally = field(default_factory=_PictureTally)
-    warp_mean: _PictureTally = field(default_factory=_PictureTally)
-    painted: _PictureTally = field(default_factory=_PictureTally)
+    input: _ImageTally = field(default_factory=_ImageTally)
+    warp_mean: _ImageTally = field(default_factory=_ImageTally)
+    painted: _ImageTally = field(default_factory=_ImageTally)
     num_known: int = 0
     num_damaged: int = 0
     num_right: Tensor = field(default_factory=_no_counts)
@@ -266,7 +266,7 @@ def _score_pair(
     painter: Painter,
     pair: PaintingPair,
     tally: _SourceTally,
-    feature_distance: PictureDistance | None,
+    feature_distance: ImageDistance | None,
 ) -> None:
     """Paint one pair and count it; one whose target is known nowhere does not count."""
     if not bool(pair.target_valid.any()):
@@ -280,21 +280,21 @@ def _score_pair(
     tally.num_known += int(pair.target_valid.sum())
     tally.num_damaged += int((damaged & pair.target_valid).sum())
     tally.add_confidence(painting, pair)
-    pictures = (
+    images = (
         (tally.input, UnpaintedPainter().paint(conditions).rgb),
         (tally.warp_mean, WarpPainter().paint(conditions).rgb),
         (tally.painted, painting.rgb),
     )
-    for one, picture in pictures:
-        one.add(picture, pair, damaged, feature_distance)
+    for one, image in images:
+        one.add(image, pair, damaged, feature_distance)
 
 
 def _joined(tallies: Sequence[_SourceTally]) -> _SourceTally:
     """One tally over the pairs of several sources."""
     return _SourceTally(
-        input=_joined_pictures([tally.input for tally in tallies]),
-        warp_mean=_joined_pictures([tally.warp_mean for tally in tallies]),
-        painted=_joined_pictures([tally.painted for tally in tallies]),
+        input=_joined_images([tally.input for tally in tallies]),
+        warp_mean=_joined_images([tally.warp_mean for tally in tallies]),
+        painted=_joined_images([tally.painted for tally in tallies]),
         num_known=sum(tally.num_known for tally in tallies),
         num_damaged=sum(tally.num_damaged for tally in tallies),
         num_right=torch.stack([tally.num_right for tally in tallies]).sum(dim=0),
@@ -304,8 +304,8 @@ def _joined(tallies: Sequence[_SourceTally]) -> _SourceTally:
     )
 
 
-def _joined_pictures(tallies: Sequence[_PictureTally]) -> _PictureTally:
-    return _PictureTally(
+def _joined_images(tallies: Sequence[_ImageTally]) -> _ImageTally:
+    return _ImageTally(
         psnr=[value for tally in tallies for value in tally.psnr],
         ssim=[value for tally in tallies for value in tally.ssim],
         feature_distance=[value for tally in tallies for value in tally.feature_distance],
@@ -316,9 +316,9 @@ def _joined_pictures(tallies: Sequence[_PictureTally]) -> _PictureTally:
 
 
 def _absolute_error(
-    picture: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]
+    image: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]
 ) -> Float[Tensor, "height width"]:
-    return (picture.clamp(0, 1) - truth).abs().mean(dim=-1)
+    return (image.clamp(0, 1) - truth).abs().mean(dim=-1)
 
 
 def _gain(after: float | None, before: float | None) -> float | None:

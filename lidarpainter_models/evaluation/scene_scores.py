@@ -10,7 +10,7 @@ from torch import Tensor
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.judged_views import Renderer, ViewScores, score_views
-from lidarpainter_models.gaussians.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectories import Shift
 from lidarpainter_models.metrics.depth import (
@@ -20,7 +20,7 @@ from lidarpainter_models.metrics.depth import (
 )
 from lidarpainter_models.metrics.perceptual import PerceptualDistances
 from lidarpainter_models.painter.protocol import Painter
-from lidarpainter_models.scenes.synthetic.street import SyntheticStreet
+from lidarpainter_models.synthetic.street import SyntheticStreet
 
 JUDGED_SHIFTS = (
     Shift(lateral_m=2.0),
@@ -78,7 +78,7 @@ def score_recorded(
     *,
     distances: PerceptualDistances,
 ) -> dict[str, Any]:
-    """Held-out pictures with interpolated poses, and beside them with recorded poses."""
+    """Held-out images with interpolated poses, and beside them with recorded poses."""
     interpolated = score_views(
         render,
         held_out.recorded_views(fitted, "interpolated"),

@@ -4,9 +4,9 @@ from collections.abc import Iterable, Sequence
 
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.strips import StripView
-from lidarpainter_models.gaussians.observations import fit_camera, shrink_picture
-from lidarpainter_models.gaussians.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
 from lidarpainter_models.geometry.transforms import invert_rigid
+from lidarpainter_models.observations.observations import fit_camera, shrink_image
 
 
 def judging_cameras(held_out: HeldOut, fitted_cameras: Sequence[str]) -> tuple[str, ...]:
@@ -22,7 +22,7 @@ def strip_views(
     fitted_camera: str,
     frames: Iterable[int],
 ) -> list[StripView]:
-    """One camera's pictures at some frames, beside the fitted camera of the same frames.
+    """One camera's images at some frames, beside the fitted camera of the same frames.
 
     The fitted camera stands where the fit found it: at its own pose in training frames, between
     its neighbours' in others. The judging camera, at fit size, rides on the same rig: it stands
@@ -44,14 +44,14 @@ def strip_views(
         found_from_logged = found.world_from_camera @ invert_rigid(logged.world_from_camera)
         camera = fit_camera(own, held_out.observation)
         camera = camera.at(found_from_logged @ camera.world_from_camera)
-        picture = shrink_picture(
+        image = shrink_image(
             scene.read_image(own), width_px=camera.width_px, height_px=camera.height_px
         )
         views.append(
             StripView(
                 camera=camera,
                 timestamp_ns=own.timestamp_ns,
-                truth_rgb=picture.float() / 255,
+                truth_rgb=image.float() / 255,
                 fitted_camera=found,
                 points_world=held_out.points_at(own),
             )

@@ -1,4 +1,4 @@
-"""Cross-camera strips: real pictures of a view that lies beside the fitted one.
+"""Cross-camera strips: real images of a view that lies beside the fitted one.
 
 A camera left out of training sees part of the same surfaces from elsewhere. Before it may judge,
 two constants per camera are fitted on *training* frames: a rotation (mounts are calibrated to
@@ -26,7 +26,7 @@ from lidarpainter_models.metrics.colour import (
     fit_affine_colour,
 )
 from lidarpainter_models.metrics.depth import visible_points
-from lidarpainter_models.metrics.pictures import psnr_from_error, squared_error
+from lidarpainter_models.metrics.images import psnr_from_error, squared_error
 
 GROW_PX = 1
 """The strip mask is grown by this much around its LiDAR pixels."""
@@ -35,14 +35,14 @@ SUPERSAMPLING = 2
 SAME_SURFACE = 0.05
 """A point is seen by the other camera when its z-buffer lies within 5 % of the point's depth."""
 DIFFERENCE_STEP_RAD = 5e-4
-"""Slopes are taken over about a quarter pixel: bilinear pictures are not smooth below that."""
+"""Slopes are taken over about a quarter pixel: bilinear images are not smooth below that."""
 MAX_ROTATION_RAD = 0.03
 """A fitted rotation at this bound means that the fit failed."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StripView:
-    """One picture of the judging camera, and the fitted camera of the same frame."""
+    """One image of the judging camera, and the fitted camera of the same frame."""
 
     camera: Camera
     timestamp_ns: int
@@ -112,11 +112,11 @@ def render_supersampled(
     fine = camera.resized(
         width_px=camera.width_px * SUPERSAMPLING, height_px=camera.height_px * SUPERSAMPLING
     )
-    picture = render(fine, view.timestamp_ns).clamp(0, 1).permute(2, 0, 1)[None]
-    return torch.nn.functional.avg_pool2d(picture, SUPERSAMPLING)[0].permute(1, 2, 0)
+    image = render(fine, view.timestamp_ns).clamp(0, 1).permute(2, 0, 1)[None]
+    return torch.nn.functional.avg_pool2d(image, SUPERSAMPLING)[0].permute(1, 2, 0)
 
 
-def rotate_picture(
+def rotate_image(
     rgb: Float[Tensor, "height width 3"], camera: Camera, rotation_rad: np.ndarray
 ) -> np.ndarray:
     """What the camera would show when turned: a pure rotation is a homography."""
@@ -143,7 +143,7 @@ def calibrate_strip(
     Raises:
         DataError: the two cameras share too few pixels, or no small rotation explains them.
     """
-    pictures = [render_supersampled(render, view) for view in views]
+    images = [render_supersampled(render, view) for view in views]
     masks = [strip_mask(view) for view in views]
     if sum(int(mask.sum()) for mask in masks) < MIN_PIXELS:
         raise DataError("the judging camera shares too few LiDAR surfaces with the fitted one")
@@ -151,8 +151,8 @@ def calibrate_strip(
 
     def turned_pixels(rotation_rad: np.ndarray) -> Tensor:
         turned = [
-            torch.from_numpy(rotate_picture(picture, view.camera, rotation_rad))[mask]
-            for picture, view, mask in zip(pictures, views, masks, strict=True)
+            torch.from_numpy(rotate_image(image, view.camera, rotation_rad))[mask]
+            for image, view, mask in zip(images, views, masks, strict=True)
         ]
         return torch.cat(turned)
 

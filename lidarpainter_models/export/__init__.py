@@ -1,1 +1,1 @@
-"""What leaves the system: reports and picture files."""
+"""What leaves the system: reports and image files."""

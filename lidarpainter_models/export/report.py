@@ -1,6 +1,6 @@
-"""One self-contained HTML page about a run: pictures, curves, tables, provenance.
+"""One self-contained HTML page about a run: images, curves, tables, provenance.
 
-Nothing is loaded from elsewhere: styles, script and pictures stand in the page. Every text is
+Nothing is loaded from elsewhere: styles, script and images stand in the page. Every text is
 escaped by the template, since names come from datasets.
 """
 
@@ -12,7 +12,7 @@ import jinja2
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.export.pictures import jpeg_data_url
+from lidarpainter_models.export.images import jpeg_data_url
 
 PLOT_WIDTH, PLOT_HEIGHT = 460, 240
 PLOT_MARGIN = 46
@@ -23,7 +23,7 @@ Cell = str | float | int | None
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Comparison:
-    """One view before and after, with the pictures it was made from."""
+    """One view before and after, with the images it was made from."""
 
     title: str
     before_label: str
@@ -31,7 +31,7 @@ class Comparison:
     after_label: str
     after_rgb: Float[Tensor, "height width 3"]
     inputs: Mapping[str, Tensor] = field(default_factory=dict)
-    """Label to rgb picture: LiDAR image, warped reference, confidence, truth."""
+    """Label to rgb image: LiDAR image, warped reference, confidence, truth."""
 
 
 @dataclass(frozen=True, kw_only=True)

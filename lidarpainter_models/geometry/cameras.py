@@ -1,7 +1,7 @@
 """Pinhole cameras.
 
 Camera frame: x right, y down, z forward. The top-left pixel has its centre at (0.5, 0.5), so a
-point projects to u = fx x / z + cx with cx measured from the picture's left edge.
+point projects to u = fx x / z + cx with cx measured from the image's left edge.
 """
 
 from dataclasses import dataclass, replace
@@ -89,7 +89,7 @@ class Camera:
         *,
         near_m: float = 0.1,
     ) -> Bool[Tensor, " points"]:
-        """Whether projected points fall into the picture, in front of `near_m`."""
+        """Whether projected points fall into the image, in front of `near_m`."""
         u, v = pixels_uv.unbind(-1)
         inside = (u >= 0) & (u < self.width_px) & (v >= 0) & (v < self.height_px)
         return inside & (depth_m > near_m)

@@ -1,1 +1,1 @@
-"""How good a picture, a depth map or a scene is."""
+"""How good an image, a depth map or a scene is."""

@@ -58,10 +58,10 @@ class FeatureStack(nn.Sequential):
         self.compared = compared
 
     def compared_features(
-        self, pictures: Float[Tensor, "batch 3 height width"]
+        self, images: Float[Tensor, "batch 3 height width"]
     ) -> list[Float[Tensor, "batch channels rows columns"]]:
         """What the compared layers say, scaled to a unit vector in every position."""
-        value, found = pictures, []
+        value, found = images, []
         for index, layer in enumerate(self):
             value = layer(value)
             if index in self.compared:

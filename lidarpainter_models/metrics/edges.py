@@ -1,9 +1,9 @@
-"""Whether a restyled picture keeps the structure of the clear one: agreement of their edges.
+"""Whether a restyled image keeps the structure of the clear one: agreement of their edges.
 
 An edge is a pixel whose gradient, relative to the gradients around it, belongs to the strongest
 share of the pixels judged, and is the largest across its own direction (the thinning of Canny,
-1986). Relative, because fog and lamps scale contrast smoothly over the picture and leave structure
-as it is; the same share in both pictures, because a threshold of grey values would mean something
+1986). Relative, because fog and lamps scale contrast smoothly over the image and leave structure
+as it is; the same share in both images, because a threshold of grey values would mean something
 else in each. Precision and recall allow for a small distance, as in the boundary benchmark of
 Martin et al. (2004). Only pixels near LiDAR hits are judged, where the depth that drove the style
 was measured.
@@ -34,7 +34,7 @@ class EdgeConfig:
     around_px: float = 12.0
     """Reach of the mean gradient that a pixel's own is compared with."""
     tolerance_px: int = 2
-    """An edge is found again if the other picture has one within this distance."""
+    """An edge is found again if the other image has one within this distance."""
     support_px: int = 3
     """Pixels within this distance of a LiDAR hit are judged."""
     farthest_m: float = 40.0
@@ -51,15 +51,15 @@ class EdgeConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EdgeScores:
-    """How well the edges of a restyled picture are those of the clear one."""
+    """How well the edges of a restyled image are those of the clear one."""
 
     f1: float
     precision: float
-    """Share of the restyled picture's edges that the clear one has."""
+    """Share of the restyled image's edges that the clear one has."""
     recall: float
-    """Share of the clear picture's edges that are kept."""
+    """Share of the clear image's edges that are kept."""
     judged_share: float
-    """Of the picture's pixels."""
+    """Of the image's pixels."""
 
 
 def edge_agreement(
@@ -68,21 +68,21 @@ def edge_agreement(
     lidar_depth_m: Float[Tensor, "rows columns"],
     config: EdgeConfig | None = None,
 ) -> EdgeScores | None:
-    """Compare edges near LiDAR hits; None where the clear picture has none to keep.
+    """Compare edges near LiDAR hits; None where the clear image has none to keep.
 
     Raises:
-        ShapeError: the pictures or the depth differ in size.
+        ShapeError: the images or the depth differ in size.
     """
     config = config or EdgeConfig()
     if styled.shape != clear.shape or lidar_depth_m.shape != clear.shape[:2]:
         raise ShapeError(
-            f"need pictures and depth of one size, got {tuple(styled.shape)}, "
+            f"need images and depth of one size, got {tuple(styled.shape)}, "
             f"{tuple(clear.shape)} and {tuple(lidar_depth_m.shape)}"
         )
     judged = supported_pixels(lidar_depth_m, config).numpy()
     if not judged.any():
         return None
-    found, wanted = (_edges(picture, judged, config) for picture in (styled, clear))
+    found, wanted = (_edges(image, judged, config) for image in (styled, clear))
     if not wanted.any():
         return None
     precision = _share_near(found, wanted, config.tolerance_px)
@@ -105,10 +105,10 @@ def supported_pixels(
 
 
 def _edges(
-    picture: Float[Tensor, "height width 3"], judged: np.ndarray, config: EdgeConfig
+    image: Float[Tensor, "height width 3"], judged: np.ndarray, config: EdgeConfig
 ) -> np.ndarray:
     """The thinned strongest edges among the pixels judged."""
-    grey = picture.detach().clamp(0, 1).numpy().astype(np.float32) @ _GREY
+    grey = image.detach().clamp(0, 1).numpy().astype(np.float32) @ _GREY
     smooth = cv2.GaussianBlur(grey, (0, 0), config.smoothing_px)
     across, down = (cv2.Sobel(smooth, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1)))
     strength = np.hypot(across, down)

@@ -1,6 +1,6 @@
 """LPIPS (Zhang et al., 2018), version 0.1, with weights that the user supplies in two files.
 
-A backbone (`backbones.py`) looks at both pictures; at each compared depth the squared differences
+A backbone (`backbones.py`) looks at both images; at each compared depth the squared differences
 of its unit features are weighed by a learned linear head, averaged over positions, and summed. A
 head belongs to the very weights it was learnt on: channels of another training run mean something
 else. So a backbone counts only if its SHA-256 is that of torchvision's file; no other network is
@@ -26,14 +26,14 @@ from lidarpainter_models.metrics.backbones import (
 
 SHIFT_RGB = (-0.030, -0.088, -0.188)
 SCALE_RGB = (0.458, 0.448, 0.450)
-"""Pictures in [-1, 1] are shifted and scaled by these before the backbone sees them."""
+"""Images in [-1, 1] are shifted and scaled by these before the backbone sees them."""
 LEAST_SIDE_PX = 64
-"""Smaller pictures vanish in the pooling of AlexNet and SqueezeNet."""
+"""Smaller images vanish in the pooling of AlexNet and SqueezeNet."""
 HEAD_KEY = "lin{}.model.1.weight"
 
 
 class Lpips(nn.Module):
-    """The distance of two pictures; differentiable in both."""
+    """The distance of two images; differentiable in both."""
 
     def __init__(self, backbone: FeatureStack, heads: list[Float[Tensor, " _"]]) -> None:
         """Take a frozen backbone and the weights of its channels at every compared depth."""
@@ -46,29 +46,29 @@ class Lpips(nn.Module):
         self.register_buffer("scale", torch.tensor(SCALE_RGB)[:, None, None])
 
     def forward(
-        self, picture: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]
+        self, image: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]
     ) -> Float[Tensor, ""]:
-        """The distance of one picture with rgb in [0, 1]; 0 for equal ones."""
-        one, other = (view.permute(2, 0, 1)[None] for view in (picture, truth))
+        """The distance of one image with rgb in [0, 1]; 0 for equal ones."""
+        one, other = (view.permute(2, 0, 1)[None] for view in (image, truth))
         return self.of_batch(one, other)[0]
 
     def of_batch(
         self,
-        pictures: Float[Tensor, "batch 3 height width"],
+        images: Float[Tensor, "batch 3 height width"],
         truths: Float[Tensor, "batch 3 _ _"],
     ) -> Float[Tensor, " batch"]:
         """The distances of a batch.
 
         Raises:
-            ShapeError: the pictures differ in size, or are smaller than 64 pixels.
+            ShapeError: the images differ in size, or are smaller than 64 pixels.
         """
-        if pictures.shape != truths.shape or min(pictures.shape[2:]) < LEAST_SIDE_PX:
+        if images.shape != truths.shape or min(images.shape[2:]) < LEAST_SIDE_PX:
             raise ShapeError(
-                f"LPIPS needs two pictures of one size, at least {LEAST_SIDE_PX} px, got "
-                f"{tuple(pictures.shape)} and {tuple(truths.shape)}"
+                f"LPIPS needs two images of one size, at least {LEAST_SIDE_PX} px, got "
+                f"{tuple(images.shape)} and {tuple(truths.shape)}"
             )
-        seen = [self.features(views) for views in (pictures, truths)]
-        total = pictures.new_zeros(len(pictures))
+        seen = [self.features(views) for views in (images, truths)]
+        total = images.new_zeros(len(images))
         for index, (one, other) in enumerate(zip(*seen, strict=True)):
             weighed = (one - other).square() * self.get_buffer(f"head_{index}")
             total = total + weighed.sum(dim=1).mean(dim=(1, 2))
@@ -81,15 +81,15 @@ class Lpips(nn.Module):
         return tuple(len(head) for head in heads)
 
     def features(
-        self, pictures: Float[Tensor, "batch 3 height width"]
+        self, images: Float[Tensor, "batch 3 height width"]
     ) -> list[Float[Tensor, "batch channels rows columns"]]:
-        """What the backbone sees in pictures with rgb in [0, 1], at every compared depth."""
-        return self.backbone.compared_features(self._normalised(pictures))
+        """What the backbone sees in images with rgb in [0, 1], at every compared depth."""
+        return self.backbone.compared_features(self._normalised(images))
 
     def _normalised(
         self, views: Float[Tensor, "batch 3 height width"]
     ) -> Float[Tensor, "batch 3 height width"]:
-        """Pictures as the backbone expects them."""
+        """Images as the backbone expects them."""
         return (2 * views - 1 - self.get_buffer("shift")) / self.get_buffer("scale")
 
 

@@ -10,19 +10,19 @@ from torch import Tensor
 from lidarpainter_models.metrics.lpips import LpipsFiles, load_lpips
 from lidarpainter_models.metrics.squeezenet import load_squeezenet_distance
 
-PictureDistance = Callable[
+ImageDistance = Callable[
     [Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]], Float[Tensor, ""]
 ]
-"""Of a picture to the truth, such as `SqueezeNetDistance` or `Lpips`."""
+"""Of an image to the truth, such as `SqueezeNetDistance` or `Lpips`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PerceptualDistances:
     """What can be said beside PSNR and SSIM."""
 
-    features: PictureDistance | None = None
+    features: ImageDistance | None = None
     """The SqueezeNet feature distance."""
-    lpips: PictureDistance | None = None
+    lpips: ImageDistance | None = None
     lpips_missing: str | None = LpipsFiles().missing
     """Why there is no LPIPS; None where there is."""
 

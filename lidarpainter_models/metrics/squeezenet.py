@@ -22,11 +22,11 @@ from lidarpainter_models.metrics.backbones import (
 )
 
 CHANNEL_MEAN_BGR = (103.939, 116.779, 123.68)
-"""Subtracted from BGR pictures in 0..255 before the first convolution."""
+"""Subtracted from BGR images in 0..255 before the first convolution."""
 
 
 class SqueezeNetDistance(nn.Module):
-    """Distance between two pictures in the feature spaces of SqueezeNet 1.1."""
+    """Distance between two images in the feature spaces of SqueezeNet 1.1."""
 
     def __init__(self, layers: FeatureStack | None = None) -> None:
         super().__init__()
@@ -40,10 +40,10 @@ class SqueezeNetDistance(nn.Module):
         return self.layers.compared_features(bgr.permute(2, 0, 1)[None])
 
     def forward(
-        self, picture: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]
+        self, image: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"]
     ) -> Float[Tensor, ""]:
-        """The distance; 0 for equal pictures."""
-        pairs = zip(self.features(picture), self.features(truth), strict=True)
+        """The distance; 0 for equal images."""
+        pairs = zip(self.features(image), self.features(truth), strict=True)
         return torch.stack([(a - b).square().sum(1).mean() for a, b in pairs]).sum()
 
 

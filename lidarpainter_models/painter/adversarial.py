@@ -1,10 +1,10 @@
-"""Discriminators that tell true pictures from painted ones, and the losses of both sides.
+"""Discriminators that tell true images from painted ones, and the losses of both sides.
 
 Where weights of a frozen network are at hand, small heads judge its features at several depths
 (Kumari et al., "Ensembling Off-the-shelf Models for GAN Training", 2022); otherwise patch
-discriminators look at the picture at several scales (Wang et al., pix2pixHD, 2018). Every layer is
+discriminators look at the image at several scales (Wang et al., pix2pixHD, 2018). Every layer is
 spectrally normalised (Miyato et al., 2018), the losses are hinges (Lim and Ye, 2017), and the
-gradient on true pictures is penalised (R1, Mescheder et al., 2018).
+gradient on true images is penalised (R1, Mescheder et al., 2018).
 """
 
 from collections.abc import Callable, Sequence
@@ -21,7 +21,7 @@ from lidarpainter_models.errors import ConfigError
 Discriminator = Callable[
     [Float[Tensor, "batch 3 height width"]], list[Float[Tensor, "batch 1 _ _"]]
 ]
-"""Logits per scale or depth: above 0 where a picture looks true."""
+"""Logits per scale or depth: above 0 where an image looks true."""
 
 LEAK = 0.2
 """Slope of the rectifiers below zero."""
@@ -36,7 +36,7 @@ class DiscriminatorConfig:
     num_layers: int = 3
     """Layers that halve the resolution at every scale; three see patches of 70 pixels."""
     num_scales: int = 2
-    """The picture itself, half of it, ..."""
+    """The image itself, half of it, ..."""
 
     def __post_init__(self) -> None:
         """Refuse shapes that cannot be built."""
@@ -50,23 +50,23 @@ class FrozenFeatures:
     """A network that is not trained, as a discriminator sees it."""
 
     extract: Callable[[Float[Tensor, "batch 3 height width"]], Sequence[Tensor]]
-    """Features at several depths of pictures with rgb in [0, 1]; gradients pass to the pictures."""
+    """Features at several depths of images with rgb in [0, 1]; gradients pass to the images."""
     channels: tuple[int, ...]
     """Of each depth."""
 
 
 class PatchDiscriminator(nn.Module):
-    """Judges overlapping patches of a picture at several scales."""
+    """Judges overlapping patches of an image at several scales."""
 
     def __init__(self, config: DiscriminatorConfig) -> None:
         super().__init__()
         self.scales = nn.ModuleList(_patch_layers(config) for _ in range(config.num_scales))
 
     def forward(
-        self, pictures: Float[Tensor, "batch 3 height width"]
+        self, images: Float[Tensor, "batch 3 height width"]
     ) -> list[Float[Tensor, "batch 1 _ _"]]:
         """A map of logits per scale."""
-        views, found = 2 * pictures - 1, []
+        views, found = 2 * images - 1, []
         for scale in self.scales:
             found.append(scale(views))
             views = functional.avg_pool2d(views, 2)
@@ -89,17 +89,17 @@ class FeatureDiscriminator(nn.Module):
         )
 
     def forward(
-        self, pictures: Float[Tensor, "batch 3 height width"]
+        self, images: Float[Tensor, "batch 3 height width"]
     ) -> list[Float[Tensor, "batch 1 _ _"]]:
         """A map of logits per depth."""
-        seen = self.features.extract(pictures)
+        seen = self.features.extract(images)
         return [head(values) for head, values in zip(self.heads, seen, strict=True)]
 
 
 def build_discriminator(
     config: DiscriminatorConfig, features: FrozenFeatures | None = None
 ) -> PatchDiscriminator | FeatureDiscriminator:
-    """Heads on frozen features where there are any, patches of the picture otherwise."""
+    """Heads on frozen features where there are any, patches of the image otherwise."""
     if features is None:
         return PatchDiscriminator(config)
     return FeatureDiscriminator(features, config)
@@ -125,7 +125,7 @@ def discriminator_loss(
 
     Args:
         discriminator: who judges.
-        true: true pictures.
+        true: true images.
         painted: painted ones.
         penalty_weight: gamma of R1, half of which counts; 0 saves its second backward pass.
     """
@@ -161,13 +161,13 @@ def generator_hinge_loss(
 def gradient_penalty(
     discriminator: Discriminator, true: Float[Tensor, "batch 3 height width"]
 ) -> Float[Tensor, ""]:
-    """R1: the squared length of the gradient of D at true pictures, averaged over the batch.
+    """R1: the squared length of the gradient of D at true images, averaged over the batch.
 
-    D of a picture is its mean logit, averaged over the scales.
+    D of an image is its mean logit, averaged over the scales.
     """
-    pictures = true.detach().requires_grad_(True)
-    verdicts = torch.stack([logits.flatten(1).mean(dim=1) for logits in discriminator(pictures)])
-    (gradient,) = torch.autograd.grad(verdicts.mean(dim=0).sum(), pictures, create_graph=True)
+    images = true.detach().requires_grad_(True)
+    verdicts = torch.stack([logits.flatten(1).mean(dim=1) for logits in discriminator(images)])
+    (gradient,) = torch.autograd.grad(verdicts.mean(dim=0).sum(), images, create_graph=True)
     return gradient.square().flatten(1).sum(dim=1).mean()
 
 

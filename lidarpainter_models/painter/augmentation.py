@@ -39,7 +39,7 @@ class AugmentationConfig:
     identity_share: float = 0.05
     """Samples whose render is already perfect: it has to stay as it is."""
     gain_range: float = 0.35
-    """Largest change of the logarithm of exposure, of all pictures of a sample alike."""
+    """Largest change of the logarithm of exposure, of all images of a sample alike."""
     tint_range: float = 0.1
     """The same for each channel by itself."""
     mismatch_range: float = 0.06
@@ -120,7 +120,7 @@ def _read(
 ) -> PaintingPair:
     """A window of a pair, its target in a style that is drawn if there are any.
 
-    Airlight, glow and lamps belong to the whole picture, so that is styled before it is cut.
+    Airlight, glow and lamps belong to the whole image, so that is styled before it is cut.
     """
     if len(prompts) == 1 or float(torch.rand((), generator=generator)) >= config.style_share:
         return source.read(index, window)
@@ -133,10 +133,10 @@ def _read(
 def random_window(
     size_px: tuple[int, int], config: AugmentationConfig, generator: Generator
 ) -> Window:
-    """A square window anywhere in a picture.
+    """A square window anywhere in an image.
 
     Raises:
-        ConfigError: the picture is smaller than the window.
+        ConfigError: the image is smaller than the window.
     """
     side = config.crop_px
     room = (size_px[0] - side, size_px[1] - side)

@@ -11,7 +11,7 @@ from torch import Tensor
 from lidarpainter_models.painter.protocol import Painting, PaintingConditions
 
 DISAGREEMENT_SCALE = 0.1
-"""Mean absolute rgb difference at which two pictures no longer support each other (1/e)."""
+"""Mean absolute rgb difference at which two images no longer support each other (1/e)."""
 
 
 class UnpaintedPainter:
@@ -44,7 +44,7 @@ class OverlayPainter:
 
 
 class WarpPainter:
-    """Averages the render with the recorded pictures warped into the view.
+    """Averages the render with the recorded images warped into the view.
 
     Confidence: exp(-d / 0.1) with d the mean absolute difference of render and valid warps; 0
     where no warp is valid, because nothing there speaks for the render.

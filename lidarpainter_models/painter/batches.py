@@ -1,6 +1,6 @@
 """Painting conditions stacked for a network: channels first, one row per view.
 
-Pictures are (batch, channels, height, width), rgb in [0, 1]; depth is camera z in metres with 0
+Images are (batch, channels, height, width), rgb in [0, 1]; depth is camera z in metres with 0
 where there is none; masks are float, 1 where true. Warps beyond those a view has are invalid.
 """
 
@@ -33,7 +33,7 @@ class ConditionBatch:
     """None if any of the views lacks it."""
 
     def map(self, change: Callable[[Tensor], Tensor]) -> "ConditionBatch":
-        """Every picture and mask changed alike."""
+        """Every image and mask changed alike."""
         found: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
         changed = {name: change(value) for name, value in found.items() if value is not None}
         return type(self)(**changed)
@@ -44,7 +44,7 @@ class ConditionBatch:
 
 
 def in_planes(conditions: PaintingConditions) -> PaintingConditions:
-    """The same view with the channels of every picture apart in memory.
+    """The same view with the channels of every image apart in memory.
 
     A batch and a hull need them so; a view that is given to both is converted but once.
     """
@@ -88,8 +88,8 @@ def stack_conditions(views: Sequence[PaintingConditions], *, num_sources: int) -
     )
 
 
-def _stack_rgb(pictures: Sequence[Tensor]) -> Float[Tensor, "batch 3 height width"]:
-    return torch.stack([picture.permute(2, 0, 1) for picture in pictures]).contiguous()
+def _stack_rgb(images: Sequence[Tensor]) -> Float[Tensor, "batch 3 height width"]:
+    return torch.stack([image.permute(2, 0, 1) for image in images]).contiguous()
 
 
 def _stack_map(maps: Sequence[Tensor]) -> Float[Tensor, "batch 1 height width"]:

@@ -20,7 +20,7 @@ def describe_painter(painter: Painter) -> dict[str, Any]:
     if isinstance(painter, NanoPainter):
         config = painter.network.config
         architecture = {
-            "summary": "residual U-Net that mixes candidate pictures, plus a bounded residual",
+            "summary": "residual U-Net that mixes candidate images, plus a bounded residual",
             **config.to_dict(),
             "candidates": list(config.candidates),
         }

@@ -1,4 +1,4 @@
-"""What a painter learns from: conditions beside the true picture, and where such pairs come from.
+"""What a painter learns from: conditions beside the true image, and where such pairs come from.
 
 Painters know the shape of a pair and how to ask for one; `conditioning.pairs` stores and makes
 them.

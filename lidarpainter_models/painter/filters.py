@@ -1,4 +1,4 @@
-"""Blurring pictures and filling their gaps.
+"""Blurring images and filling their gaps.
 
 The filling is the push-pull pyramid of Gortler et al., "The Lumigraph" (1996), section 3.4.
 """
@@ -15,21 +15,21 @@ BLUR_SIGMA_PX = 1.5  # about the size of a speckle at 480 pixels across
 
 
 def blur(
-    picture: Float[Tensor, "batch channels height width"], *, sigma_px: float = BLUR_SIGMA_PX
+    image: Float[Tensor, "batch channels height width"], *, sigma_px: float = BLUR_SIGMA_PX
 ) -> Float[Tensor, "batch channels height width"]:
     """A Gaussian blur that repeats the border."""
     radius_px = round(2.5 * sigma_px)
     shares = [math.exp(-0.5 * (offset / sigma_px) ** 2) for offset in range(radius_px + 1)]
     total = shares[0] + 2 * sum(shares[1:])
     shares = [share / total for share in shares]
-    padded = F.pad(picture, (radius_px, radius_px, radius_px, radius_px), mode="replicate")
+    padded = F.pad(image, (radius_px, radius_px, radius_px, radius_px), mode="replicate")
     return _weighted_shifts(_weighted_shifts(padded, shares, dim=3), shares, dim=2)
 
 
 def _weighted_shifts(padded: Tensor, shares: Sequence[float], *, dim: int) -> Tensor:
     """A symmetric filter along one dimension, which loses its padding.
 
-    Sums of shifted pictures: four times as fast on a CPU as a convolution channel by channel.
+    Sums of shifted images: four times as fast on a CPU as a convolution channel by channel.
     """
     radius_px = len(shares) - 1
     size_px = padded.shape[dim] - 2 * radius_px
@@ -41,21 +41,21 @@ def _weighted_shifts(padded: Tensor, shares: Sequence[float], *, dim: int) -> Te
 
 
 def masked_blur(
-    picture: Float[Tensor, "batch 3 height width"], valid: Float[Tensor, "batch 1 height width"]
+    image: Float[Tensor, "batch 3 height width"], valid: Float[Tensor, "batch 1 height width"]
 ) -> Float[Tensor, "batch 3 height width"]:
     """A Gaussian blur over the valid pixels alone; 0 where none is near."""
-    blurred = blur(torch.cat([picture * valid, valid], dim=1))
+    blurred = blur(torch.cat([image * valid, valid], dim=1))
     return blurred[:, :3] / blurred[:, 3:].clamp_min(1e-3)
 
 
 def fill_push_pull(
-    picture: Float[Tensor, "batch 3 height width"], known: Float[Tensor, "batch 1 height width"]
+    image: Float[Tensor, "batch 3 height width"], known: Float[Tensor, "batch 1 height width"]
 ) -> Float[Tensor, "batch 3 height width"]:
     """Keep the known pixels and fill the others from a pyramid of their averages.
 
-    A picture without any known pixel becomes black.
+    An image without any known pixel becomes black.
     """
-    pyramid = [torch.cat([picture * known, known], dim=1)]
+    pyramid = [torch.cat([image * known, known], dim=1)]
     while max(pyramid[-1].shape[2:]) > 1:
         pyramid.append(_halved(pyramid[-1]))
     filled = pyramid[-1][:, :3] / pyramid[-1][:, 3:].clamp_min(1e-6)
@@ -69,14 +69,14 @@ def fill_push_pull(
 
 
 def _halved(
-    picture: Float[Tensor, "batch channels height width"],
+    image: Float[Tensor, "batch channels height width"],
 ) -> Float[Tensor, "batch channels rows columns"]:
     """Means of two by two pixels; of those that there are at an odd edge.
 
     Sums of every other pixel: on a CPU much faster than pooling.
     """
-    height_px, width_px = picture.shape[2:]
+    height_px, width_px = image.shape[2:]
     odd = (0, width_px % 2, 0, height_px % 2)
-    even = F.pad(picture, odd, mode="replicate") if any(odd) else picture
+    even = F.pad(image, odd, mode="replicate") if any(odd) else image
     rows = even[:, :, ::2] + even[:, :, 1::2]
     return (rows[..., ::2] + rows[..., 1::2]).mul_(0.25)

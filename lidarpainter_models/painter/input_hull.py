@@ -16,7 +16,7 @@ from lidarpainter_models.painter.protocol import PaintingConditions
 HULL_SIDE_PX = 9
 """Side of the square that counts as nearby."""
 ALL_INPUTS = frozenset({"render", "lidar", "warp"})
-"""What stands in the view itself; the nearest recorded picture does not."""
+"""What stands in the view itself; the nearest recorded image does not."""
 HULL_MARGIN = 0.05
 """Of rgb, beyond which a colour counts as outside."""
 
@@ -56,7 +56,7 @@ def input_hull(
 def _shown_beside_the_render(
     conditions: PaintingConditions, inputs: Set[str]
 ) -> Iterator[tuple[Float[Tensor, "height width 3"], Bool[Tensor, "height width"]]]:
-    """Pictures and where they exist."""
+    """Images and where they exist."""
     if "lidar" in inputs:
         yield conditions.lidar_rgb, conditions.lidar_hit
     if "warp" in inputs:

@@ -1,6 +1,6 @@
 """What painters are trained to lower: terms that stand alone, and the sum of the paper.
 
-Pictures are (batch, 3, height, width); masks (batch, height, width), 1 where the target is known.
+Images are (batch, 3, height, width); masks (batch, height, width), 1 where the target is known.
 A term is averaged over the pixels of its mask; over no pixel it is 0.
 """
 
@@ -24,7 +24,7 @@ BatchDistance = Callable[
     [Float[Tensor, "batch 3 height width"], Float[Tensor, "batch 3 height width"]],
     Float[Tensor, " batch"],
 ]
-"""Of pictures to their targets, differentiable, such as `metrics.lpips.Lpips.of_batch`."""
+"""Of images to their targets, differentiable, such as `metrics.lpips.Lpips.of_batch`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +72,7 @@ def refuse_negative(weights: "DataclassInstance") -> None:
 
 
 def paper_loss(
-    picture: Float[Tensor, "batch 3 height width"],
+    image: Float[Tensor, "batch 3 height width"],
     target: Float[Tensor, "batch 3 height width"],
     mask: Float[Tensor, "batch height width"],
     weights: PaperLossWeights,
@@ -82,18 +82,18 @@ def paper_loss(
 ) -> PaperLoss:
     """The painter's loss of the paper.
 
-    LPIPS and the discriminator look at whole pictures, so where the target is unknown they see it
-    in place of the picture, and no gradient passes there.
+    LPIPS and the discriminator look at whole images, so where the target is unknown they see it
+    in place of the image, and no gradient passes there.
 
     Raises:
         ConfigError: a term counts that nothing is given for; none is left out unasked.
     """
-    known = known_picture(picture, target, mask)
-    nothing = picture.new_zeros(())
+    known = known_image(image, target, mask)
+    nothing = image.new_zeros(())
     terms = {
         "lpips": nothing,
-        "squared": squared_loss(picture, target, mask),
-        "structure": structure_loss(picture, target, mask),
+        "squared": squared_loss(image, target, mask),
+        "structure": structure_loss(image, target, mask),
         "adversarial": nothing,
     }
     if weights.lpips > 0:
@@ -108,52 +108,52 @@ def paper_loss(
     return PaperLoss(**terms, total=total)
 
 
-def known_picture(
-    picture: Float[Tensor, "batch 3 height width"],
+def known_image(
+    image: Float[Tensor, "batch 3 height width"],
     target: Float[Tensor, "batch 3 height width"],
     mask: Float[Tensor, "batch height width"],
 ) -> Float[Tensor, "batch 3 height width"]:
-    """The picture where the target is known, the target elsewhere."""
-    return torch.where(mask[:, None] > 0, picture, target)
+    """The image where the target is known, the target elsewhere."""
+    return torch.where(mask[:, None] > 0, image, target)
 
 
 def absolute_loss(
-    picture: Float[Tensor, "batch 3 height width"],
+    image: Float[Tensor, "batch 3 height width"],
     target: Float[Tensor, "batch 3 height width"],
     mask: Float[Tensor, "batch height width"],
 ) -> Float[Tensor, ""]:
     """Mean absolute difference inside the mask."""
-    return masked_mean((picture - target).abs().mean(dim=1), mask)
+    return masked_mean((image - target).abs().mean(dim=1), mask)
 
 
 def squared_loss(
-    picture: Float[Tensor, "batch 3 height width"],
+    image: Float[Tensor, "batch 3 height width"],
     target: Float[Tensor, "batch 3 height width"],
     mask: Float[Tensor, "batch height width"],
 ) -> Float[Tensor, ""]:
     """Mean squared difference inside the mask."""
-    return masked_mean((picture - target).square().mean(dim=1), mask)
+    return masked_mean((image - target).square().mean(dim=1), mask)
 
 
 def structure_loss(
-    picture: Float[Tensor, "batch 3 height width"],
+    image: Float[Tensor, "batch 3 height width"],
     target: Float[Tensor, "batch 3 height width"],
     mask: Float[Tensor, "batch height width"],
 ) -> Float[Tensor, ""]:
-    """Mean of 1 - SSIM inside the mask; outside it the picture counts as equal to the target."""
-    known = known_picture(picture, target, mask)
+    """Mean of 1 - SSIM inside the mask; outside it the image counts as equal to the target."""
+    known = known_image(image, target, mask)
     rows = zip(known.permute(0, 2, 3, 1), target.permute(0, 2, 3, 1), strict=True)
     similarity = torch.stack([ssim_map(ours, truth).mean(dim=-1) for ours, truth in rows])
     return masked_mean(1 - similarity, mask)
 
 
 def gradient_loss(
-    picture: Float[Tensor, "batch 3 height width"],
+    image: Float[Tensor, "batch 3 height width"],
     target: Float[Tensor, "batch 3 height width"],
     mask: Float[Tensor, "batch height width"],
 ) -> Float[Tensor, ""]:
     """Mean absolute difference of horizontal and vertical steps between known neighbours."""
-    gap = picture - target
+    gap = image - target
     across = (gap[..., 1:] - gap[..., :-1]).abs().mean(dim=1)
     down = (gap[..., 1:, :] - gap[..., :-1, :]).abs().mean(dim=1)
     horizontal = masked_mean(across, mask[..., 1:] * mask[..., :-1])

@@ -1,6 +1,6 @@
 """What a painter is given and what it gives back.
 
-All pictures of one request share the camera's pixel grid; rgb is float32 in [0, 1], depth is
+All images of one request share the camera's pixel grid; rgb is float32 in [0, 1], depth is
 camera z in metres with 0 where there is none.
 """
 
@@ -27,16 +27,16 @@ class PaintingConditions:
     lidar_depth_m: Float[Tensor, "height width"]
     lidar_hit: Bool[Tensor, "height width"]
     warp_rgb: Float[Tensor, "sources height width 3"]
-    """The nearest recorded training pictures carried here by depth, best first."""
+    """The nearest recorded training images carried here by depth, best first."""
     warp_valid: Bool[Tensor, "sources height width"]
     reference_rgb: Float[Tensor, "height width 3"] | None = None
-    """The nearest recorded training picture as it was taken, not carried into the view: the
+    """The nearest recorded training image as it was taken, not carried into the view: the
     paper's reference. None where nobody gathered it."""
     prompt: str = DEFAULT_PROMPT
 
     @property
     def height_width_px(self) -> tuple[int, int]:
-        """Rows and columns of every picture."""
+        """Rows and columns of every image."""
         return self.render_rgb.shape[0], self.render_rgb.shape[1]
 
     def cropped(self, rows: slice, columns: slice) -> "PaintingConditions":
@@ -64,12 +64,12 @@ class Painting:
     confidence: Float[Tensor, "height width"]
     """In [0, 1]: 1 where the painter expects no error."""
     kept_share: float = 0.0
-    """Of the picture that was not painted because there was nothing to gain."""
+    """Of the image that was not painted because there was nothing to gain."""
 
 
 @runtime_checkable
 class Painter(Protocol):
-    """Turns conditions into a picture; deterministic, keeps no state between views."""
+    """Turns conditions into an image; deterministic, keeps no state between views."""
 
     name: str
 

@@ -29,7 +29,7 @@ def damage_render(
 def random_blobs(
     height_px: int, width_px: int, share: float, generator: Generator
 ) -> Bool[Tensor, "height width"]:
-    """Smooth random blobs that cover about `share` of the picture."""
+    """Smooth random blobs that cover about `share` of the image."""
     rows, columns = max(height_px // 14, 2), max(width_px // 14, 2)
     coarse = torch.randn(1, 1, rows, columns, generator=generator)
     smooth = F.interpolate(coarse, size=(height_px, width_px), mode="bicubic")[0, 0]
@@ -50,7 +50,7 @@ def _speckle(
 def _slide(
     render: Float[Tensor, "3 height width"], generator: Generator
 ) -> Float[Tensor, "3 height width"]:
-    """Blobs that show the picture from a few pixels beside."""
+    """Blobs that show the image from a few pixels beside."""
     down, right = (_below(2 * LARGEST_SLIDE_PX + 1, generator) - LARGEST_SLIDE_PX for _ in "yx")
     moved = torch.roll(render, (down, right), dims=(1, 2))
     share = _between(0.4, 1.0, generator)
@@ -60,7 +60,7 @@ def _slide(
 def _dissolve(
     render: Float[Tensor, "3 height width"], generator: Generator
 ) -> Float[Tensor, "3 height width"]:
-    """Blobs through which one colour of the picture shows, as sky does through holes."""
+    """Blobs through which one colour of the image shows, as sky does through holes."""
     row, column = _below(render.shape[1], generator), _below(render.shape[2], generator)
     colour = render[:, row, column, None, None]
     share = _between(0.4, 1.0, generator)
@@ -78,7 +78,7 @@ def _soften(
 def _needles(
     render: Float[Tensor, "3 height width"], generator: Generator
 ) -> Float[Tensor, "3 height width"]:
-    """Thin streaks in colours of the picture, most of them along one direction."""
+    """Thin streaks in colours of the image, most of them along one direction."""
     _, height_px, width_px = render.shape
     rows = torch.arange(height_px)[:, None].float()
     columns = torch.arange(width_px)[None].float()

@@ -19,7 +19,7 @@ from lidarpainter_models.painter.styles import StyleConfig, StyleView, apply_sty
 def styled_pair(
     pair: PaintingPair, prompt: str, generator: Generator, config: StyleConfig | None = None
 ) -> PaintingPair:
-    """The pair with a styled target and the prompt that asks for it; whole pictures only.
+    """The pair with a styled target and the prompt that asks for it; whole images only.
 
     Raises:
         ConfigError: there is no such style.

@@ -1,7 +1,7 @@
 """A driving scene in its canonical form, whatever dataset it came from.
 
 World: x forward, y left, z up, origin at the first ego pose. A `DrivingScene` is a lazy handle: the
-tables are in memory, pictures and points are read when asked for.
+tables are in memory, images and points are read when asked for.
 """
 
 from pathlib import Path
@@ -41,7 +41,7 @@ def scene_path(store: Path, dataset: str, sequence: str) -> Path:
 
 
 class DrivingScene:
-    """One stored sequence: poses, pictures, sweeps and actor tracks."""
+    """One stored sequence: poses, images, sweeps and actor tracks."""
 
     def __init__(self, stored: StoredScene) -> None:
         """Take the tables into memory; `DrivingScene.open` is the usual way in."""
@@ -89,7 +89,7 @@ class DrivingScene:
             ) from None
 
     def views_of(self, camera_name: str) -> tuple[RecordedView, ...]:
-        """The pictures of one camera, frame by frame.
+        """The images of one camera, frame by frame.
 
         Raises:
             SceneError: the scene has no such camera.
@@ -101,24 +101,24 @@ class DrivingScene:
         return tuple(view for view in self.views if view.camera_name == camera_name)
 
     def view(self, frame_index: int, camera_name: str) -> RecordedView:
-        """One picture by frame and camera."""
+        """One image by frame and camera."""
         for view in self.views_of(camera_name):
             if view.frame_index == frame_index:
                 return view
         raise SceneError(f"{self.path}: camera {camera_name!r} has no frame {frame_index}")
 
     def read_image(self, view: RecordedView) -> UInt8[Tensor, "height width 3"]:
-        """The recorded picture as RGB bytes; a distorted lens is undone."""
+        """The recorded image as RGB bytes; a distorted lens is undone."""
         jpeg = self.read_jpeg(view)
-        picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), _AS_STORED)
-        if picture is None:
-            raise SceneError(f"{self.path}: the picture {view.key} cannot be decoded")
-        picture = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+        image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), _AS_STORED)
+        if image is None:
+            raise SceneError(f"{self.path}: the image {view.key} cannot be decoded")
+        image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
         lens, distortion = self._lenses[view.index]
-        return torch.from_numpy(undistort(picture, lens, distortion, view.camera))
+        return torch.from_numpy(undistort(image, lens, distortion, view.camera))
 
     def read_jpeg(self, view: RecordedView) -> bytes:
-        """The recorded picture as the camera's own JPEG bytes."""
+        """The recorded image as the camera's own JPEG bytes."""
         offset, num_bytes = self._image_ranges[view.index]
         return self._stored.read_rows("image_bytes", offset, num_bytes).tobytes()
 

@@ -1,4 +1,4 @@
-"""What a scene is made of, in memory: pictures, sweeps and boxes with their times and poses.
+"""What a scene is made of, in memory: images, sweeps and boxes with their times and poses.
 
 World: x forward, y left, z up. Poses are float64 at the time stated beside them; points are
 float32, already motion-compensated to the world.
@@ -13,6 +13,9 @@ from torch import Tensor
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.cameras import Camera
+
+ViewKey = tuple[int, str]
+"""Frame index and camera name."""
 
 _TERM_COUNTS: dict[str, tuple[int, ...]] = {"none": (0,), "brown": (4, 5, 8), "fisheye": (4,)}
 
@@ -50,12 +53,12 @@ class RollingShutter:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ImageRecord:
-    """One picture to be stored: which camera took it, when, where and through which lens."""
+    """One image to be stored: which camera took it, when, where and through which lens."""
 
     camera_name: str
     timestamp_ns: int
     camera: Camera
-    """At exposure, on the grid of the stored picture (distortion not yet undone)."""
+    """At exposure, on the grid of the stored image (distortion not yet undone)."""
     distortion: Distortion = field(default_factory=Distortion)
     rolling_shutter: RollingShutter | None = None
 
@@ -76,18 +79,18 @@ class BoxRecord:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RecordedView:
-    """One recorded picture; `DrivingScene.read_image` gives its pixels."""
+    """One recorded image; `DrivingScene.read_image` gives its pixels."""
 
     frame_index: int
     camera_name: str
     timestamp_ns: int
     camera: Camera
-    """At exposure and full size; where the lens is distorted, that of the undistorted picture."""
+    """At exposure and full size; where the lens is distorted, that of the undistorted image."""
     index: int
-    """Row in the table of pictures."""
+    """Row in the table of images."""
 
     @property
-    def key(self) -> tuple[int, str]:
+    def key(self) -> ViewKey:
         """Names the view within its scene."""
         return self.frame_index, self.camera_name
 

@@ -1,11 +1,11 @@
-"""Which recorded pictures a fit may see and which judge it.
+"""Which recorded images a fit may see and which judge it.
 
 A spec is one of
 - `alternate`: frames at even positions train, those at odd positions test (the paper's protocol);
 - `forward:N:M`: every second of the first N frames trains, the last M frames test, farther along;
 - `all`: every frame trains, nothing is held out.
 
-Frames are split and not pictures, so what a held-out picture shows was never seen by a neighbouring
+Frames are split and not images, so what a held-out image shows was never seen by a neighbouring
 camera at the same moment, and the LiDAR sweeps of test frames stay out as well.
 """
 
@@ -26,7 +26,7 @@ class ViewSplit:
     train: tuple[RecordedView, ...]
     test: tuple[RecordedView, ...]
     train_frames: tuple[int, ...]
-    """Frames whose pictures and sweeps may be used."""
+    """Frames whose images and sweeps may be used."""
     test_frames: tuple[int, ...]
 
 

@@ -25,7 +25,7 @@ def _matrix(camera: Camera) -> np.ndarray:
 
 
 def pinhole_of(lens: Camera, distortion: Distortion) -> Camera:
-    """The pinhole camera of the undistorted picture: same size, no empty border.
+    """The pinhole camera of the undistorted image: same size, no empty border.
 
     Raises:
         ConfigError: no such camera exists.
@@ -50,11 +50,11 @@ def pinhole_of(lens: Camera, distortion: Distortion) -> Camera:
 
 
 def undistort(
-    picture: np.ndarray, lens: Camera, distortion: Distortion, pinhole: Camera
+    image: np.ndarray, lens: Camera, distortion: Distortion, pinhole: Camera
 ) -> np.ndarray:
-    """The picture (height, width, 3) as the pinhole camera would have taken it."""
+    """The image (height, width, 3) as the pinhole camera would have taken it."""
     if distortion.model == "none":
-        return picture
+        return image
     size_px = (pinhole.width_px, pinhole.height_px)
     undistortion = (
         cv2.initUndistortRectifyMap
@@ -69,4 +69,4 @@ def undistort(
         size_px,
         cv2.CV_32FC1,
     )
-    return cv2.remap(picture, map_x, map_y, cv2.INTER_LINEAR)
+    return cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR)

@@ -27,7 +27,7 @@ MAX_COORDINATE_M = 100_000.0
 """Farther from the first ego pose than this, float32 is no longer exact to a centimetre."""
 MAX_BOX_M = 1000.0
 """Along a side; a train is shorter."""
-MAX_PICTURE_PIXELS = 64_000_000
+MAX_IMAGE_PIXELS = 64_000_000
 """A header that states more is refused before anything is decoded; cameras have up to 12 million.
 
 A progressive JPEG keeps six bytes per pixel while it is decoded.
@@ -146,46 +146,46 @@ def require_size(size_m: tuple[float, float, float], where: str) -> None:
 
 
 def require_jpeg(jpeg: bytes, *, width_px: int, height_px: int, where: str) -> None:
-    """Refuse bytes that are no complete JPEG picture of the stated size.
+    """Refuse bytes that are no complete JPEG image of the stated size.
 
-    A decoder fills a cut-off picture with grey and says nothing, so the end-of-image marker is
+    A decoder fills a cut-off image with grey and says nothing, so the end-of-image marker is
     looked for as well.
     """
     found_px = jpeg_header_size(jpeg, where)
     if found_px != (width_px, height_px):
         raise DataError(
-            f"{where}: the picture is {found_px[0]} x {found_px[1]} px, "
+            f"{where}: the image is {found_px[0]} x {found_px[1]} px, "
             f"expected {width_px} x {height_px}"
         )
     if not jpeg.rstrip(b"\x00").endswith(_JPEG_END):
-        raise DataError(f"{where}: the JPEG picture is cut off ({len(jpeg)} bytes, no end marker)")
+        raise DataError(f"{where}: the JPEG image is cut off ({len(jpeg)} bytes, no end marker)")
     # an eighth of the size: all entropy-coded data is read, the rest of the work is spared
     if cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_8) is None:
-        raise DataError(f"{where}: the JPEG picture cannot be decoded")
+        raise DataError(f"{where}: the JPEG image cannot be decoded")
 
 
 def jpeg_header_size(jpeg: bytes, where: str) -> tuple[int, int]:
-    """Width and height a JPEG's header states, read without decoding the picture.
+    """Width and height a JPEG's header states, read without decoding the image.
 
     Segments follow each other as marker, big-endian length, content (ITU-T T.81, annex B); the
     size stands in the start-of-frame segment.
     """
     if not jpeg.startswith(_JPEG_START):
-        raise DataError(f"{where}: not a JPEG picture")
+        raise DataError(f"{where}: not a JPEG image")
     position = len(_JPEG_START)
     while position + 9 <= len(jpeg) and jpeg[position] == 0xFF:
         marker = jpeg[position + 1]
         if marker in _START_OF_FRAME:
             height_px = int.from_bytes(jpeg[position + 5 : position + 7], "big")
             width_px = int.from_bytes(jpeg[position + 7 : position + 9], "big")
-            if not 0 < width_px * height_px <= MAX_PICTURE_PIXELS:
+            if not 0 < width_px * height_px <= MAX_IMAGE_PIXELS:
                 raise DataError(
-                    f"{where}: the JPEG picture states {width_px} x {height_px} px, expected at "
-                    f"most {MAX_PICTURE_PIXELS // 1_000_000} million"
+                    f"{where}: the JPEG image states {width_px} x {height_px} px, expected at "
+                    f"most {MAX_IMAGE_PIXELS // 1_000_000} million"
                 )
             return width_px, height_px
         if marker == 0xFF:  # padding before a marker
             position += 1
             continue
         position += 2 + int.from_bytes(jpeg[position + 2 : position + 4], "big")
-    raise DataError(f"{where}: not a JPEG picture with a readable header")
+    raise DataError(f"{where}: not a JPEG image with a readable header")

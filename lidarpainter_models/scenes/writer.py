@@ -58,7 +58,7 @@ class SceneHeader:
 class SceneWriter:
     """Context manager: leaving it normally publishes the scene, an exception leaves nothing.
 
-    Frames come in ascending order; pictures, sweeps and boxes belong to the frame added last.
+    Frames come in ascending order; images, sweeps and boxes belong to the frame added last.
     """
 
     def __init__(self, store: Path, dataset: str, sequence: str, header: SceneHeader) -> None:
@@ -143,7 +143,7 @@ class SceneWriter:
         )
 
     def add_image(self, record: ImageRecord, jpeg: bytes, *, source: str | None = None) -> None:
-        """Store one picture of the current frame as its original JPEG bytes.
+        """Store one image of the current frame as its original JPEG bytes.
 
         Errors in the bytes name `source`, the file they came from, if it is given.
         """
@@ -276,7 +276,7 @@ class SceneWriter:
         return frame_index, where
 
     def _require_complete(self) -> None:
-        for table, what in (("frames", "frames"), ("cameras", "pictures"), ("sweeps", "points")):
+        for table, what in (("frames", "frames"), ("cameras", "images"), ("sweeps", "points")):
             if not self._rows[table]:
                 raise DataError(f"{self._name}: zero {what}, expected at least one")
 

@@ -15,9 +15,9 @@ import tempfile
 import time
 from pathlib import Path
 
+from lidarpainter_models.readers import known_datasets, open_log
+from lidarpainter_models.readers.source_logs.log import NUM_AHEAD, write_log
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.readers import known_datasets, open_log
-from lidarpainter_models.scenes.readers.source_log import NUM_AHEAD, write_log
 from tasks.measuring import measured
 
 

@@ -18,23 +18,23 @@ from bench_records import Figure
 from bench_scenes import street_like_splats
 from bench_work import ADAM_BYTES, SSIM_BYTES_PER_VALUE, SSIM_FLOP_PER_VALUE
 
-from lidarpainter_models.gaussians.calibration import (
+from lidarpainter_models.gaussians.fitting.config import FitConfig
+from lidarpainter_models.gaussians.fitting.images import full_image
+from lidarpainter_models.gaussians.fitting.state import FitState
+from lidarpainter_models.gaussians.fitting.step import fit_step
+from lidarpainter_models.gaussians.model.corrections import (
     ActorCorrections,
     CameraCorrections,
     ExposureCorrections,
 )
-from lidarpainter_models.gaussians.fit_config import FitConfig
-from lidarpainter_models.gaussians.fit_pictures import full_picture
-from lidarpainter_models.gaussians.fit_state import FitState
-from lidarpainter_models.gaussians.fit_step import fit_step
-from lidarpainter_models.gaussians.gaussian_set import GaussianSet
-from lidarpainter_models.gaussians.observations import TrainingView
-from lidarpainter_models.gaussians.scene_graph import GaussianScene
-from lidarpainter_models.gaussians.sky import SkyConfig, SkyTexture, sky_layout
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.model.sky import SkyConfig, SkyTexture, sky_layout
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_rotation
 from lidarpainter_models.kernels.gaussian_raster import render_gaussians
 from lidarpainter_models.kernels.ssim import l1_ssim_loss
+from lidarpainter_models.observations.observations import TrainingView
 
 SIZE = (30_000, 480, 320)
 BLOCK_M = 1000.0
@@ -100,10 +100,10 @@ def _scene(gaussians, cameras):
     )
 
 
-def training_pictures(cameras):
-    """A grey picture with LiDAR depth in a tenth of the pixels for every camera."""
+def training_images(cameras):
+    """A grey image with LiDAR depth in a tenth of the pixels for every camera."""
     generator = torch.Generator().manual_seed(1)
-    pictures = []
+    images = []
     for frame, camera in enumerate(cameras):
         shape = (camera.height_px, camera.width_px)
         is_hit = torch.rand(shape, generator=generator) < 0.1
@@ -116,8 +116,8 @@ def training_pictures(cameras):
             sky_mask=torch.zeros(shape, dtype=torch.bool),
             lidar_depth_m=torch.where(is_hit, depth_m, 0.0),
         )
-        pictures.append(full_picture(view))
-    return pictures
+        images.append(full_image(view))
+    return images
 
 
 class Fit:
@@ -127,14 +127,14 @@ class Fit:
         scene, cameras = street_scene(count, width_px, height_px, blocks=blocks)
         self.config = FitConfig(steps=10_000)
         self.state = FitState.begin(scene, self.config)
-        self.pictures = training_pictures(cameras)
+        self.images = training_images(cameras)
         self.view = 0
 
     def step(self):
         """What every step of a fit does, on one recorded view after the other."""
-        fit_step(self.state, self.pictures[self.view], self.view, None, self.config, None)
+        fit_step(self.state, self.images[self.view], self.view, None, self.config, None)
         self.state.step += 1
-        self.view = (self.view + 1) % len(self.pictures)
+        self.view = (self.view + 1) % len(self.images)
 
 
 def iteration_figures(machine, repeats):
@@ -188,7 +188,7 @@ def iteration_figures(machine, repeats):
 
 
 def _loss(target, *, splats):
-    """The picture loss and its gradient, of a drawn picture or of a given one."""
+    """The image loss and its gradient, of a drawn image or of a given one."""
     if splats is None:
         rgb = (target * 0.9).requires_grad_()
     else:
@@ -200,9 +200,7 @@ def _adam_of(fit):
     """The optimiser's step on everything that the fit's one view shows."""
     scene = fit.state.scene
     camera = scene.cameras.world_from_camera(0), *scene.world_from_actors(0)
-    rows = fit.state.blocks.rows_in_view(
-        [(fit.pictures[0].camera, scene.camera_from_body(*camera))]
-    )
+    rows = fit.state.blocks.rows_in_view([(fit.images[0].camera, scene.camera_from_body(*camera))])
     seen = fit.state.gaussian_adam.seen(scene.gaussians, rows)
     for leaf in (seen.means, seen.rotation_wxyz, seen.log_scale, seen.opacity_logit, seen.sh):
         leaf.grad = leaf.detach().clone()
@@ -217,7 +215,7 @@ def frame_growth_figures(rounds, *, blocks=(1, 4, 16)):
     """
     fits = {count: Fit(*SIZE, blocks=count) for count in blocks}
     for fit in fits.values():
-        for _ in fit.pictures:  # every row is left once before it is seen again
+        for _ in fit.images:  # every row is left once before it is seen again
             fit.step()
     taken = dict.fromkeys(blocks, float("inf"))
     for _ in range(rounds):

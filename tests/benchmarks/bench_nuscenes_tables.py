@@ -18,7 +18,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from lidarpainter_models.scenes.readers.nuscenes.tables import NuscenesTable
+from lidarpainter_models.readers.nuscenes.tables import NuscenesTable
 
 ROWS_PER_SAMPLE = 77
 NUM_LOOKUPS = 1000

@@ -12,7 +12,7 @@ from bench_work import BACKWARD_LANE_FLOP, FORWARD_LANE_FLOP, count_lanes, raste
 
 from lidarpainter_models.kernels.gaussian_raster import cpu, render_gaussians, render_views
 from lidarpainter_models.kernels.gaussian_raster.binning import list_tiles
-from lidarpainter_models.kernels.gaussian_raster.blending import Pictures, blend
+from lidarpainter_models.kernels.gaussian_raster.blending import Images, blend
 from lidarpainter_models.kernels.gaussian_raster.blending_gradients import entry_sums
 from lidarpainter_models.kernels.gaussian_raster.projection import IS_VISIBLE, project
 from lidarpainter_models.kernels.gaussian_raster.projection_gradients import unproject
@@ -40,7 +40,7 @@ class Stages:
         self.lists = self.list_tiles()
         self.drawn = self.blend()
         generator = np.random.default_rng(0)
-        self.to_drawn = Pictures(
+        self.to_drawn = Images(
             *(generator.standard_normal(p.shape).astype(np.float32) for p in self.drawn)
         )
         self.slots = self.blend_gradients()
@@ -73,13 +73,13 @@ LEAST_TIMES_REFERENCE = 25.0
 
 
 def forward(splats):
-    """One picture, without what a backward pass needs."""
+    """One image, without what a backward pass needs."""
     with torch.no_grad():
         return render_gaussians(**splats, backend="cpu")
 
 
 def step(splats, backend="cpu"):
-    """One picture and all gradients, not added to earlier ones."""
+    """One image and all gradients, not added to earlier ones."""
     image = render_gaussians(**splats, backend=backend)
     torch.autograd.grad(_loss(image), [splats[name] for name in LEARNED])
 
@@ -149,7 +149,7 @@ def _stage_floors(stages, lanes, machine):
 
 
 def reference_figures(size, repeats):
-    """How many times faster a picture with its gradients is than by the plain reference."""
+    """How many times faster an image with its gradients is than by the plain reference."""
     numba.set_num_threads(1)
     splats = street_like_splats(*size)
     ours_s = best_cpu_s(lambda: step(splats), repeats)

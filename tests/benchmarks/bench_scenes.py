@@ -6,7 +6,7 @@ LEARNED = ("means", "rotation_wxyz", "scale_m", "opacity", "sh", "camera_from_bo
 
 
 def street_like_splats(count, width_px, height_px):
-    """Gaussians of degree 3 that fill the picture, near ones rarer, each about as wide on it."""
+    """Gaussians of degree 3 that fill the image, near ones rarer, each about as wide on it."""
     generator = torch.Generator().manual_seed(0)
 
     def uniform(*shape):

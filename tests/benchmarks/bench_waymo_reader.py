@@ -3,7 +3,7 @@
     PYTHONPATH=.:tests/support python tests/benchmarks/bench_waymo_reader.py [--frames 20]
         [--release v1]
 
-A frame has five 1920 x 1280 pictures, two echoes of five LiDARs (64 x 2650 pixels with poses for
+A frame has five 1920 x 1280 images, two echoes of five LiDARs (64 x 2650 pixels with poses for
 TOP, 116 x 150 for the others; eight of ten pixels hold an echo) and 75 labels, 40 of them
 camera-synced. Frames differ in their times alone. Both releases are written to a temporary folder,
 read once to warm up (imports, compilation, page cache), then read again and timed.
@@ -25,8 +25,8 @@ from waymo_components import component_tables_of
 from waymo_numbers import FrameNumbers
 from waymo_records import frame_message, tfrecord
 
+from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.readers import ingest_scene
 from tasks.measuring import measured
 
 WIDTH_PX, HEIGHT_PX = 1920, 1280
@@ -51,8 +51,8 @@ def turned(yaw_deg, position_m=(0.0, 0.0, 0.0)):
     return pose.reshape(16).tolist()
 
 
-def picture(rng):
-    """A JPEG of the size (about 400 kB) that the dataset's pictures have."""
+def random_jpeg(rng):
+    """A JPEG of the size (about 400 kB) that the dataset's images have."""
     coarse = rng.integers(0, 255, (160, 240, 3), dtype=np.uint8)
     smooth = cv2.resize(coarse, (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_CUBIC)
     grain = rng.normal(0, 6, smooth.shape)
@@ -80,7 +80,7 @@ def frame(rng):
     images = [
         {
             "name": name,
-            "jpeg": picture(rng),
+            "jpeg": random_jpeg(rng),
             "pose": here,
             "velocity": [0.0] * 6,
             "pose_time": START_US / 1e6 + offset_s,

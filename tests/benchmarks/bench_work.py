@@ -32,17 +32,17 @@ BACKWARD_LANE_FLOP = (
 )
 
 GAUSSIAN_FLOATS = 3 + 4 + 3 + 1 + 48 + 1 + 2  # as `Gaussians` lists them, degree 3, no features
-PICTURE_FLOATS = 3 + 1 + 1 + 1
+IMAGE_FLOATS = 3 + 1 + 1 + 1
 SUM_FLOATS = 12
 ENTRY_BYTES = 4 + 1 + 4
 SSIM_FLOP_PER_VALUE = 7 * 2 * 16 + 60  # seven blurs in two directions; the map and its slopes
-SSIM_BYTES_PER_VALUE = 4 * 3 + 2 * 4 * 7  # pictures and gradient; row blurs written and read
+SSIM_BYTES_PER_VALUE = 4 * 3 + 2 * 4 * 7  # images and gradient; row blurs written and read
 ADAM_FLOP, ADAM_BYTES = 14, 4 * 7  # per number: read four, write three
 
 
 @dataclass(frozen=True)
 class Lanes:
-    """Pixel lanes that drawing a picture evaluates, and how many of them blend something."""
+    """Pixel lanes that drawing an image evaluates, and how many of them blend something."""
 
     evaluated: int
     blended: int
@@ -93,8 +93,8 @@ def raster_bytes(count, visible, entries, pixels):
     return {
         "project": count * (4 * GAUSSIAN_FLOATS + record),
         "list_tiles": visible * record + 2 * entries * ENTRY_BYTES,
-        "blend": entries * (record + ENTRY_BYTES) + 4 * pixels * PICTURE_FLOATS,
+        "blend": entries * (record + ENTRY_BYTES) + 4 * pixels * IMAGE_FLOATS,
         "blend_gradients": entries * (record + ENTRY_BYTES + 4 * SUM_FLOATS)
-        + 8 * pixels * PICTURE_FLOATS,
+        + 8 * pixels * IMAGE_FLOATS,
         "unproject": count * 8 * GAUSSIAN_FLOATS + entries * (4 * SUM_FLOATS + ENTRY_BYTES),
     }

@@ -70,7 +70,7 @@ def test_lanes_counted_are_those_of_the_lists_and_hold_every_blend():
     assert (empty.evaluated, empty.blended) == (0, 0)
 
 
-def test_scenes_are_seeded_and_fill_the_picture():
+def test_scenes_are_seeded_and_fill_the_image():
     first, second = street_like_splats(50, 64, 48), street_like_splats(50, 64, 48)
     assert np.array_equal(first["means"].detach().numpy(), second["means"].detach().numpy())
     points = street_like_points(1000, 64, 48)

@@ -136,8 +136,8 @@ def test_painting_gives_guidance_that_trusts_what_was_recorded(builder, views, b
     trusted = first.guidance.weight > 0.8
     assert trusted.float().mean() > 0.5
     assert (first.guidance.rgb - truth)[trusted].abs().mean() < 0.02
-    assert set(first.pictures) == {"render", "lidar", "warp", "painted", "confidence"}
-    assert first.pictures["painted"].dtype == torch.uint8
+    assert set(first.images) == {"render", "lidar", "warp", "painted", "confidence"}
+    assert first.images["painted"].dtype == torch.uint8
 
 
 def test_a_painter_that_makes_things_worse_gives_no_guidance(builder, views):

@@ -76,7 +76,7 @@ def test_a_warped_pixel_is_trusted_more_than_a_bare_render_and_a_hole_not_at_all
     assert (hole == 0).all()
 
 
-def test_two_pictures_that_agree_count_more_than_one_or_two_that_differ():
+def test_two_images_that_agree_count_more_than_one_or_two_that_differ():
     truth = conditions().warp_rgb[0]
     one = torch.stack([EVERYWHERE, ~EVERYWHERE])
     agreeing = geometric_confidence(conditions(), camera(), EVERYWHERE)
@@ -89,7 +89,7 @@ def test_two_pictures_that_agree_count_more_than_one_or_two_that_differ():
     assert (differing[2:-2, 2:-2] < single[2:-2, 2:-2]).all()
 
 
-def test_nothing_outside_every_recorded_picture_is_trusted():
+def test_nothing_outside_every_recorded_image_is_trusted():
     depth_m = torch.full((HEIGHT, WIDTH), 10.0)
     seen = is_seen(camera(2.0), depth_m, [camera(), camera(-1.0)])
     assert seen[:, :50].all()  # 2 m at 10 m and 50 px focal length are 10 px

@@ -66,13 +66,13 @@ def test_a_sequence_is_painted_the_same_twice(builder, path):
     assert all(torch.equal(one, other) for one, other in zip(first, second, strict=True))
 
 
-def test_mixing_calms_noise_and_keeps_the_picture(builder, path):
+def test_mixing_calms_noise_and_keeps_the_image(builder, path):
     plain = paint_path(builder, FlickeringPainter(), SequenceConfig(), path)
     mixed = paint_path(builder, FlickeringPainter(), MIXED, path)
     clean = [builder.conditions(*view).render_rgb for view in path]
 
-    def error(pictures):
-        gaps = [(a - b).abs().mean() for a, b in zip(pictures, clean, strict=True)]
+    def error(images):
+        gaps = [(a - b).abs().mean() for a, b in zip(images, clean, strict=True)]
         return float(torch.stack(gaps[1:]).mean())
 
     assert error(mixed) < 0.85 * error(plain)

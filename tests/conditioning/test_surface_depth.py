@@ -1,4 +1,4 @@
-"""The depth that recorded pictures are carried by."""
+"""The depth that recorded images are carried by."""
 
 import pytest
 import torch

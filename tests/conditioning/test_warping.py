@@ -1,22 +1,20 @@
 import pytest
 import torch
 
-from lidarpainter_models.conditioning.moving_boxes import BACKGROUND, MovingBoxes
 from lidarpainter_models.conditioning.warping import (
     WarpConfig,
     nearest_sources,
-    warp_pictures,
+    warp_images,
 )
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.lidar.moving_boxes import BACKGROUND, MovingBoxes
 
 SECOND_NS = 1_000_000_000
 
 
 def warp_one(target, boards, source, draw, tracks=(), *, timestamp_ns=0):
     truth, depth_m = draw(target, boards)
-    rgb, valid = warp_pictures(
-        target, timestamp_ns, depth_m, (depth_m > 0).float(), [source], tracks
-    )
+    rgb, valid = warp_images(target, timestamp_ns, depth_m, (depth_m > 0).float(), [source], tracks)
     return truth, rgb[0], valid[0]
 
 
@@ -54,17 +52,17 @@ def test_what_an_occluder_hid_from_the_source_is_invalid(camera_at, board, draw,
 
 def test_a_surface_at_a_grazing_angle_passes_the_depth_test(camera_at, source_of):
     target, source_camera = camera_at(0, 0), camera_at(-0.5, 0.3)
-    picture = source_of(source_camera, [])
+    image = source_of(source_camera, [])
 
     def ground_depth(camera):
         down = camera.pixel_directions()[..., 1]
         return torch.where(down > 0.02, 1.5 / down.clamp(min=1e-6), 0.0)
 
-    source = type(picture)(
-        **{**vars(picture), "depth_m": ground_depth(source_camera), "alpha": torch.ones(48, 64)}
+    source = type(image)(
+        **{**vars(image), "depth_m": ground_depth(source_camera), "alpha": torch.ones(48, 64)}
     )
     depth_m = ground_depth(target)
-    _, valid = warp_pictures(target, 0, depth_m, torch.ones(48, 64), [source], [])
+    _, valid = warp_images(target, 0, depth_m, torch.ones(48, 64), [source], [])
     # the row at 34 m and those nearer: there one row already is 40 % of the depth
     assert valid[0, 27:, 4:60].all()
 
@@ -87,7 +85,7 @@ def test_sky_hidden_in_the_source_is_invalid(camera_at, board, draw, source_of):
 
 def test_a_hole_that_is_no_sky_stays_unknown(camera_at, source_of):
     source = source_of(camera_at(), [])
-    _, valid = warp_pictures(
+    _, valid = warp_images(
         camera_at(), 0, torch.zeros(48, 64), torch.full((48, 64), 0.9), [source], []
     )
     assert not valid.any()
@@ -104,11 +102,11 @@ def test_an_actor_is_carried_by_its_box(camera_at, board, draw, source_of, movin
     source = source_of(camera_at(), boards(2.0), timestamp_ns=then)
     target = camera_at()
     truth, depth_m = draw(target, boards(-1.0))
-    rgb, valid = warp_pictures(target, now, depth_m, torch.ones(48, 64), [source], [track])
+    rgb, valid = warp_images(target, now, depth_m, torch.ones(48, 64), [source], [track])
     on_car = (depth_m < 11) & (torch.arange(48)[:, None] < 30)
     assert valid[0][on_car].float().mean() > 0.75  # all but its rim
     assert (rgb[0] - truth)[valid[0]].abs().max() < 5e-3
-    _, as_street = warp_pictures(target, now, depth_m, torch.ones(48, 64), [source], [])
+    _, as_street = warp_images(target, now, depth_m, torch.ones(48, 64), [source], [])
     assert not as_street[0][on_car].any()
 
 
@@ -144,9 +142,9 @@ def test_nearest_sources_weigh_place_direction_and_time(camera_at, source_of):
     assert [source.key[0] for source in others] == [0, 3, 2]
 
 
-def test_no_sources_give_no_pictures(camera_at):
+def test_no_sources_give_no_images(camera_at):
     empty = torch.zeros(48, 64)
-    rgb, valid = warp_pictures(camera_at(), 0, empty, empty, [], [])
+    rgb, valid = warp_images(camera_at(), 0, empty, empty, [], [])
     assert rgb.shape == (0, 48, 64, 3)
     assert valid.shape == (0, 48, 64)
 

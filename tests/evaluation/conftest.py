@@ -31,7 +31,7 @@ class ListedPairs:
 
 
 def flat_pair(render_rgb, *, truth=0.5, warp=None, lidar=None):
-    """A picture of one colour; without a warp or LiDAR none is valid anywhere."""
+    """An image of one colour; without a warp or LiDAR none is valid anywhere."""
     flat = torch.full((SIDE_PX, SIDE_PX, 3), truth)
     nowhere = torch.zeros(SIDE_PX, SIDE_PX, dtype=torch.bool)
     conditions = PaintingConditions(

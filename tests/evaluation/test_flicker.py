@@ -41,7 +41,7 @@ def wall_frame(y_m, step=0, tint=0.0, moved_m=0.0):
         timestamp_ns=step * STEP_NS,
         depth_m=depth_m,
         alpha=torch.ones(SIZE_PX),
-        pictures={"steady": rgb, "tinted": rgb + tint, TRUTH: rgb},
+        images={"steady": rgb, "tinted": rgb + tint, TRUTH: rgb},
     )
 
 

@@ -1,11 +1,10 @@
-"""What trains and what judges stay apart, by true picture and by seed."""
+"""What trains and what judges stay apart, by true image and by seed."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 
-from lidarpainter_models.conditioning.pairs import PairFolder, PairWriter
 from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.evaluation.held_back import (
     TARGETS_KEY,
@@ -19,6 +18,7 @@ from lidarpainter_models.evaluation.held_back import (
     unseen_pairs,
 )
 from lidarpainter_models.painter.examples import PairSource
+from lidarpainter_models.training_data.pairs import PairFolder, PairWriter
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def targets_of(sets):
     return frozenset().union(*(subset.targets for subset in sets.values()))
 
 
-def test_no_true_picture_is_on_both_sides(make_folder):
+def test_no_true_image_is_on_both_sides(make_folder):
     folders = {"a": make_folder("a", range(10)), "b": make_folder("b", range(5, 15))}
     learnt, judged = hold_back(folders, 0.2)
     assert not targets_of(learnt) & targets_of(judged)

@@ -8,13 +8,13 @@ from lidarpainter_models.evaluation.held_back import target_view
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.judged_pairs import judged_pairs, unseen_views
 from lidarpainter_models.evaluation.judged_views import JudgedView
-from lidarpainter_models.gaussians.observations import ObservationConfig
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectories import Shift
+from lidarpainter_models.observations.observations import ObservationConfig
 from lidarpainter_models.painter.protocol import PaintingConditions
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
-from lidarpainter_models.scenes.synthetic.street import SyntheticStreet
+from lidarpainter_models.synthetic.street import SyntheticStreet
 
 SHIFTS = (Shift(lateral_m=2.0), Shift(up_m=1.5))
 LENS = {"fx_px": 6.0, "fy_px": 6.0, "cx_px": 3.0, "cy_px": 2.0}
@@ -73,7 +73,7 @@ class GreyBuilder(ConditionBuilder):
 
 @pytest.fixture
 def places(monkeypatch):
-    """Where pictures were looked for; those found are brighter than white, as drawn ones may be."""
+    """Where images were looked for; those found are brighter than white, as drawn ones may be."""
     looked = []
 
     def found(held_out, *place):
@@ -100,7 +100,7 @@ def held_out():
     return HeldOut(scene=scene, test_views=views, observation=ObservationConfig())
 
 
-def test_a_log_judges_at_its_held_out_pictures(places):
+def test_a_log_judges_at_its_held_out_images(places):
     builder = GreyBuilder()
     (pairs,) = judged_pairs(builder, held_out(), None, SHIFTS).values()
     assert len(pairs) == 2

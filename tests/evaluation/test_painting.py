@@ -25,13 +25,13 @@ def grey(value=0.5):
 
 def two_rows_off():
     """0.2 too bright in a tenth of the pixels: 10 log10(1 / (0.1 * 0.04)) = 23.98 dB."""
-    picture = grey()
-    picture[:2] += 0.2
-    return picture
+    image = grey()
+    image[:2] += 0.2
+    return image
 
 
 class FixedPainter:
-    """Gives the same picture and confidence to every view."""
+    """Gives the same image and confidence to every view."""
 
     name = "fixed"
 
@@ -78,7 +78,7 @@ def test_painting_nothing_scores_like_the_input(two_cases):
     assert scores.total.cpu_ms_per_frame >= 0
 
 
-def test_a_perfect_picture_has_no_error(two_cases):
+def test_a_perfect_image_has_no_error(two_cases):
     painter = FixedPainter(grey(), torch.ones(SIDE_PX, SIDE_PX))
     total = score_painter(painter, two_cases).total
     assert total.painted.psnr == math.inf
@@ -153,9 +153,9 @@ def test_the_area_under_the_curve_is_that_worked_out_by_hand():
     assert confidence_auc(right, wrong) == pytest.approx(4.5 / 6)
 
 
-def test_the_feature_distance_compares_all_three_pictures(two_cases):
-    def distance(picture, truth):
-        return (picture - truth).abs().mean()
+def test_the_feature_distance_compares_all_three_images(two_cases):
+    def distance(image, truth):
+        return (image - truth).abs().mean()
 
     total = score_painter(UnpaintedPainter(), two_cases, feature_distance=distance).total
     assert total.input.feature_distance == pytest.approx((0.02 + 0.05) / 2, abs=1e-6)

@@ -7,8 +7,8 @@ from toy_street import ToyStreet
 
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.strip_views import judging_cameras, strip_views
-from lidarpainter_models.gaussians.observations import ObservationConfig
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
+from lidarpainter_models.observations.observations import ObservationConfig
 
 SIDE = ("front", 1.0), ("side", 0.8)
 MOTION = torch.tensor([0.0, 0.02, 0.01, 0.1, 0.0, 0.05], dtype=torch.float64)

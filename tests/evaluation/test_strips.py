@@ -55,7 +55,7 @@ def wall_points() -> torch.Tensor:
 
 
 def judged_view() -> StripView:
-    """The judging camera's mount is turned and its picture is darker than the log says."""
+    """The judging camera's mount is turned and its image is darker than the log says."""
     turn = rigid_from_tangent(torch.tensor([*TRUE_ROTATION_RAD, 0, 0, 0], dtype=torch.float64))
     mounted = wall_camera(0.9)
     truth = render_wall(mounted.at(mounted.world_from_camera @ turn), 0) * 0.8 + 0.05
@@ -79,7 +79,7 @@ def test_rotation_and_exposure_are_recovered():
     view = judged_view()
     calibration = calibrate_strip(render_wall, [view])
     assert calibration.rotation_rad == pytest.approx(TRUE_ROTATION_RAD, abs=5e-4)
-    # the judged picture is box-averaged, its truth is not: contrast differs by a little
+    # the judged image is box-averaged, its truth is not: contrast differs by a little
     assert calibration.affine[0][0] == pytest.approx(0.8, abs=0.03)
     scores = score_strips(render_wall, [view], calibration)
     assert scores.uncalibrated_psnr < 25 < 35 < scores.psnr

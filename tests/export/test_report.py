@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lidarpainter_models.errors import StorageError
-from lidarpainter_models.export.pictures import colour_depth, to_bytes, write_png
+from lidarpainter_models.export.images import colour_depth, to_bytes, write_png
 from lidarpainter_models.export.report import (
     Comparison,
     Plot,
@@ -16,7 +16,7 @@ from lidarpainter_models.export.report import (
 
 
 def sample_report(title: str = "run") -> Report:
-    picture = torch.rand(8, 12, 3, generator=torch.Generator().manual_seed(0))
+    image = torch.rand(8, 12, 3, generator=torch.Generator().manual_seed(0))
     return Report(
         title=title,
         summary="a summary",
@@ -24,10 +24,10 @@ def sample_report(title: str = "run") -> Report:
             Comparison(
                 title="left-2m",
                 before_label="render",
-                before_rgb=picture,
+                before_rgb=image,
                 after_label="painted",
-                after_rgb=1 - picture,
-                inputs={"lidar": picture},
+                after_rgb=1 - image,
+                inputs={"lidar": image},
             )
         ],
         tables=[Table(title="scores", columns=["view", "psnr"], rows=[["a", 29.5], ["b", None]])],
@@ -72,4 +72,4 @@ def test_holes_in_a_depth_map_are_black():
 def test_unwritable_place_is_named(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(StorageError, match="cannot write"):
-        write_png(torch.zeros(2, 2, 3), tmp_path / "file" / "picture.png")
+        write_png(torch.zeros(2, 2, 3), tmp_path / "file" / "image.png")

@@ -13,10 +13,10 @@ from tiny_diffusion import write_model
 from catalog.store import STORE_ENVIRONMENT, open_store
 from flows.cli.main import main
 from flows.cli.painter_options import parse_seeds, with_length
-from lidarpainter_models.conditioning.pairs import PairWriter
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.painter.nano.weights import load_weights, save_weights
+from lidarpainter_models.training_data.pairs import PairWriter
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = NanoConfig(widths=(8, 8, 8), blocks=(1, 1, 1))
@@ -137,7 +137,7 @@ def test_info_tells_parts_size_licence_and_origin(tmp_path, capsys):
     assert (found["licence"], found["provenance"]) == ("MIT", provenance)
     assert found["architecture"]["inputs"] == ["lidar", "render", "warp"]
     assert main(["painter", "info", "--painter", str(path)]) == 0
-    assert "true pictures trained on" in capsys.readouterr().out
+    assert "true images trained on" in capsys.readouterr().out
 
 
 def test_info_of_a_rule_says_that_nothing_is_learnt(capsys):
@@ -242,7 +242,7 @@ def test_pairs_without_a_reference_serve_only_tables_that_show_none(make_pairs, 
     words = ["painter", "ablate", "--pairs-train", make_pairs("new", [1])]
     assert main([*words, "--pairs-test", str(bare)]) == 2
     told = capsys.readouterr().err
-    assert "old holds no nearest recorded picture" in told
+    assert "old holds no nearest recorded image" in told
     assert told.count("\n") == 1
 
 

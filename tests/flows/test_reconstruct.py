@@ -20,9 +20,9 @@ LONG_FIT = ("fit.steps=1500", "fit.half_resolution=0")
 # the command, with checkpoints as often as a short test needs them
 COMMAND = """
 import sys
-import tasks.fit
+import tasks.reconstruction.fit
 from flows.cli.main import main
-tasks.fit.CHECKPOINT_EVERY_S = 0.5
+tasks.reconstruction.fit.CHECKPOINT_EVERY_S = 0.5
 sys.exit(main(sys.argv[1:]))
 """
 

@@ -8,7 +8,7 @@ from lidarpainter_models.kernels.point_splat.cpu import PIECE
 
 
 def random_splat(num_points, seed, *, height_px=37, width_px=53, max_radius_px=3):
-    """Points in and around the picture, many at equal depth, some behind or not finite."""
+    """Points in and around the image, many at equal depth, some behind or not finite."""
     generator = torch.Generator().manual_seed(seed)
     u = torch.randint(-6, width_px + 6, (num_points,), generator=generator)
     v = torch.randint(-6, height_px + 6, (num_points,), generator=generator)
@@ -48,7 +48,7 @@ def test_points_of_different_pieces_compete_for_a_pixel():
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 @pytest.mark.parametrize(("radius_px", "covered"), [(0, 1), (1, 9), (2, 21), (3, 37)])
 def test_a_disc_covers_its_pixels(radius_px, covered, backend):
-    picture = splat_points(
+    image = splat_points(
         torch.tensor([[5, 4]]),
         torch.tensor([2.0]),
         height_px=10,
@@ -56,32 +56,32 @@ def test_a_disc_covers_its_pixels(radius_px, covered, backend):
         radius_px=radius_px,
         backend=backend,
     )
-    assert int((picture == 0).sum()) == covered
-    assert picture[4, 5] == 0
-    assert picture[4, 5 + radius_px] == 0
+    assert int((image == 0).sum()) == covered
+    assert image[4, 5] == 0
+    assert image[4, 5 + radius_px] == 0
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_the_nearest_point_wins_and_ties_go_to_the_lower_index(backend):
     pixels = torch.tensor([[1, 1], [1, 1], [1, 1], [0, 0], [0, 0]])
     depth_m = torch.tensor([3.0, 2.0, 2.0, 7.0, -1.0])
-    picture = splat_points(pixels, depth_m, height_px=2, width_px=2, backend=backend)
-    assert picture.tolist() == [[3, -1], [-1, 1]]
+    image = splat_points(pixels, depth_m, height_px=2, width_px=2, backend=backend)
+    assert image.tolist() == [[3, -1], [-1, 1]]
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_a_near_point_grows_over_its_neighbours(backend):
     pixels, depth_m = torch.tensor([[2, 2], [3, 2], [5, 2]]), torch.tensor([1.0, 5.0, 5.0])
     radius_px = torch.tensor([1, 0, 0])
-    picture = splat_points(
+    image = splat_points(
         pixels, depth_m, height_px=5, width_px=6, radius_px=radius_px, backend=backend
     )
-    assert picture[2].tolist() == [-1, 0, 0, 0, -1, 2]
+    assert image[2].tolist() == [-1, 0, 0, 0, -1, 2]
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
-def test_a_point_outside_still_reaches_into_the_picture(backend):
-    picture = splat_points(
+def test_a_point_outside_still_reaches_into_the_image(backend):
+    image = splat_points(
         torch.tensor([[-1, 1]]),
         torch.tensor([1.0]),
         height_px=3,
@@ -89,20 +89,20 @@ def test_a_point_outside_still_reaches_into_the_picture(backend):
         radius_px=1,
         backend=backend,
     )
-    assert picture.tolist() == [[0, -1, -1]] * 3
+    assert image.tolist() == [[0, -1, -1]] * 3
 
 
 def test_the_number_of_threads_changes_nothing():
     inputs = random_splat(5000, seed=4)
     threads = numba.get_num_threads()
     try:
-        pictures = []
+        images = []
         for num_threads in (1, min(2, numba.config.NUMBA_NUM_THREADS)):
             numba.set_num_threads(num_threads)
-            pictures.append(splat_points(**inputs, backend="cpu"))
+            images.append(splat_points(**inputs, backend="cpu"))
     finally:
         numba.set_num_threads(threads)
-    assert torch.equal(*pictures)
+    assert torch.equal(*images)
 
 
 def test_strided_and_float64_points_are_taken_as_they_are():
@@ -150,9 +150,9 @@ def test_several_cameras_see_what_each_sees_alone():
         name: torch.stack([view[name] for view in views])
         for name in ("pixels_uv", "depth_m", "radius_px")
     }
-    pictures = splat_views(**stacked, **size)
-    for picture, view in zip(pictures, views, strict=True):
-        assert torch.equal(picture, splat_points(**view))
+    images = splat_views(**stacked, **size)
+    for image, view in zip(images, views, strict=True):
+        assert torch.equal(image, splat_points(**view))
     without = splat_views(stacked["pixels_uv"][:0], stacked["depth_m"][:0], **size)
     assert without.shape == (0, size["height_px"], size["width_px"])
 

@@ -10,12 +10,12 @@ from lidarpainter_models.kernels.ssim.reference import window_weights
 
 # float32 against float64: rounding of the windowed sums; the reference in float32 reaches 2e-5
 GRADIENT_TOLERANCE = 1e-5
-# where the picture is flat a variance of 1e-7 is lost in rounding and stands beside c2 = 9e-4
+# where the image is flat a variance of 1e-7 is lost in rounding and stands beside c2 = 9e-4
 MAP_TOLERANCE = 1e-4
 SIZES = [(1, 1), (1, 40), (11, 3), (23, 64), (65, 97)]
 
 
-def picture(height, width, seed):
+def image(height, width, seed):
     """Smooth patches with a saturated and a black band: flat places are the hard ones."""
     generator = torch.Generator().manual_seed(seed)
     coarse = torch.rand(1, 3, 2 + height // 8, 2 + width // 8, generator=generator)
@@ -27,7 +27,7 @@ def picture(height, width, seed):
 
 
 def noisy_pair(height, width, noise=0.05):
-    target = picture(height, width, seed=1)
+    target = image(height, width, seed=1)
     generator = torch.Generator().manual_seed(2)
     return (target + noise * torch.randn(target.shape, generator=generator)).clamp(0, 1), target
 
@@ -44,8 +44,8 @@ def relative_error(actual, expected):
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
-def test_a_picture_is_fully_similar_to_itself(backend):
-    rgb = picture(20, 31, seed=0)
+def test_a_image_is_fully_similar_to_itself(backend):
+    rgb = image(20, 31, seed=0)
     similarity = ssim_map(rgb, rgb, backend=backend)
     torch.testing.assert_close(similarity, torch.ones_like(rgb), atol=1e-4, rtol=0)
     assert float(ssim(rgb, rgb, backend=backend)) == pytest.approx(1, abs=1e-5)
@@ -59,7 +59,7 @@ def test_window_is_the_normalised_gaussian_of_the_paper():
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
-def test_flat_pictures_differ_only_in_luminance(backend):
+def test_flat_images_differ_only_in_luminance(backend):
     first, second = torch.full((31, 31, 3), 0.8), torch.full((31, 31, 3), 0.4)
     expected = (2 * 0.8 * 0.4 + 1e-4) / (0.8**2 + 0.4**2 + 1e-4)
     centre = ssim_map(first, second, backend=backend)[15, 15, 0]
@@ -159,7 +159,7 @@ def test_one_and_two_threads_give_the_same_bits():
     assert torch.equal(results[0][1], results[1][1])
 
 
-def test_a_strided_picture_gives_the_same_as_its_copy():
+def test_a_strided_image_gives_the_same_as_its_copy():
     rendered, target = noisy_pair(20, 34)
     strided = rendered.permute(2, 0, 1).contiguous().permute(1, 2, 0)
     assert not strided.is_contiguous()
@@ -180,7 +180,7 @@ def test_auto_takes_the_reference_for_float64_and_the_numba_door_refuses_it():
         ssim(rendered, target, backend="cpu")
 
 
-def test_pictures_that_do_not_fit_are_refused():
+def test_images_that_do_not_fit_are_refused():
     with pytest.raises(ShapeError, match="one size"):
         ssim(torch.zeros(4, 5, 3), torch.zeros(5, 4, 3))
     with pytest.raises(ShapeError, match="one weight per pixel"):

@@ -24,7 +24,7 @@ def f1_of(styled, clear, depth_m=EVERYWHERE, **settings):
     return edge_agreement(styled, clear, depth_m, EdgeConfig(**settings)).f1
 
 
-def test_a_picture_agrees_with_itself():
+def test_a_image_agrees_with_itself():
     assert f1_of(blocks(), blocks()) == 1
 
 
@@ -33,7 +33,7 @@ def test_smooth_fading_keeps_the_structure():
     assert f1_of(blocks() * fade + 0.8 * (1 - fade), blocks()) > 0.9
 
 
-def test_another_picture_is_near_chance():
+def test_another_image_is_near_chance():
     other = torch.roll(blocks(5), (5, 5), (0, 1))
     assert f1_of(other, blocks(), tolerance_px=1) < 0.4
 
@@ -44,7 +44,7 @@ def test_edges_are_found_again_within_the_tolerance(shift_px, is_found):
     assert (f1_of(moved, blocks(), tolerance_px=2) > 0.9) is is_found
 
 
-def test_a_blank_picture_keeps_nothing():
+def test_a_blank_image_keeps_nothing():
     assert f1_of(torch.full((HEIGHT_PX, WIDTH_PX, 3), 0.5), blocks()) == 0
 
 

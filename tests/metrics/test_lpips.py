@@ -27,7 +27,7 @@ def backbone(request):
     return request.param
 
 
-def picture_of(seed, side_px=72):
+def image_of(seed, side_px=72):
     return torch.rand(side_px, side_px + 8, 3, generator=torch.Generator().manual_seed(seed))
 
 
@@ -86,7 +86,7 @@ def test_caffe_features_never_pass_for_the_backbone_of_lpips(shared_folder):
 def test_distance_is_the_weighted_sum_of_plain_loops(backbone, tmp_path, monkeypatch):
     trust_any_file(monkeypatch)
     distance = load_lpips(write_files(tmp_path, backbone))
-    ours, truth = picture_of(1), picture_of(2)
+    ours, truth = image_of(1), image_of(2)
     heads = random_heads(backbone)
     shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
     expected = 0.0
@@ -103,12 +103,12 @@ def test_distance_is_the_weighted_sum_of_plain_loops(backbone, tmp_path, monkeyp
     assert float(distance(ours, truth)) == pytest.approx(expected, rel=1e-4)  # sums in float32
 
 
-def test_equal_pictures_are_at_no_distance_and_others_pull(backbone, tmp_path, monkeypatch):
+def test_equal_images_are_at_no_distance_and_others_pull(backbone, tmp_path, monkeypatch):
     trust_any_file(monkeypatch)
     distance = load_lpips(write_files(tmp_path, backbone))
-    truth = picture_of(0)
+    truth = image_of(0)
     assert float(distance(truth, truth)) == 0
-    ours = (truth + 0.1 * (picture_of(1) - 0.5)).requires_grad_(True)
+    ours = (truth + 0.1 * (image_of(1) - 0.5)).requires_grad_(True)
     loss = distance(ours, truth)
     loss.backward()
     stepped = ours.detach() - 0.01 * ours.grad / ours.grad.norm()
@@ -116,10 +116,10 @@ def test_equal_pictures_are_at_no_distance_and_others_pull(backbone, tmp_path, m
     assert all(not parameter.requires_grad for parameter in distance.parameters())
 
 
-def test_a_batch_holds_the_distances_of_its_pictures():
+def test_a_batch_holds_the_distances_of_its_images():
     backbone = BACKBONES[1]
     distance = Lpips(backbone.build(), random_heads(backbone))
-    ours, truths = (torch.stack([picture_of(s), picture_of(s + 1)]) for s in (1, 5))
+    ours, truths = (torch.stack([image_of(s), image_of(s + 1)]) for s in (1, 5))
     together = distance.of_batch(ours.permute(0, 3, 1, 2), truths.permute(0, 3, 1, 2))
     alone = torch.stack([distance(a, b) for a, b in zip(ours, truths, strict=True)])
     torch.testing.assert_close(together, alone)
@@ -133,9 +133,9 @@ def test_features_have_the_channels_of_the_heads(backbone):
 
 
 @pytest.mark.parametrize("size", [((63, 80, 3), (63, 80, 3)), ((80, 80, 3), (80, 72, 3))])
-def test_pictures_it_cannot_compare_are_refused(size):
+def test_images_it_cannot_compare_are_refused(size):
     distance = Lpips(SQUEEZENET.build(), random_heads(SQUEEZENET))
-    with pytest.raises(ShapeError, match="two pictures of one size, at least 64 px"):
+    with pytest.raises(ShapeError, match="two images of one size, at least 64 px"):
         distance.of_batch(*(torch.zeros(1, 3, *shape[:2]) for shape in size))
 
 

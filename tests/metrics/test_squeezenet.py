@@ -1,4 +1,4 @@
-"""The feature distance is zero for equal pictures and refuses foreign weights."""
+"""The feature distance is zero for equal images and refuses foreign weights."""
 
 import pytest
 import torch
@@ -13,11 +13,11 @@ from lidarpainter_models.metrics.squeezenet import (
 def test_distance_grows_with_blur(shared_folder):
     path = shared_folder / "weights/squeezenet_keras/squeezenet1_1_caffe_features.pth"
     distance = load_squeezenet_distance(path)
-    picture = torch.rand(96, 128, 3, generator=torch.Generator().manual_seed(0))
-    pooled = torch.nn.functional.avg_pool2d(picture.permute(2, 0, 1)[None], 3, 1, 1)
+    image = torch.rand(96, 128, 3, generator=torch.Generator().manual_seed(0))
+    pooled = torch.nn.functional.avg_pool2d(image.permute(2, 0, 1)[None], 3, 1, 1)
     blurred = pooled[0].permute(1, 2, 0)
-    assert float(distance(picture, picture)) == 0
-    assert float(distance(blurred, picture)) > float(distance(0.9 * picture, picture)) > 0
+    assert float(distance(image, image)) == 0
+    assert float(distance(blurred, image)) > float(distance(0.9 * image, image)) > 0
 
 
 @pytest.mark.parametrize("fault", ["missing", "garbage", "foreign", "list"])
@@ -40,6 +40,6 @@ def test_own_weights_round_trip(tmp_path):
     path = tmp_path / "weights.pth"
     state = {key.removeprefix("layers."): value for key, value in network.state_dict().items()}
     torch.save(state, path)
-    picture = torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(3))
+    image = torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(3))
     loaded = load_squeezenet_distance(path)
-    assert torch.equal(loaded(picture, picture * 0.5), network(picture, picture * 0.5))
+    assert torch.equal(loaded(image, image * 0.5), network(image, image * 0.5))

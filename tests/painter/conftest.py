@@ -33,7 +33,7 @@ def random_conditions(height_px=24, width_px=40, num_sources=2, seed=0, prompt="
 
 
 def smooth_pair(side_px=48, seed=0):
-    """A smooth picture whose render is noisy and whose LiDAR and warps are true."""
+    """A smooth image whose render is noisy and whose LiDAR and warps are true."""
     generator = torch.Generator().manual_seed(seed)
     noise = torch.rand(1, 3, side_px, side_px, generator=generator)
     truth = (0.5 + 4 * (blur(noise, sigma_px=4.0)[0] - 0.5)).clamp(0, 1).permute(1, 2, 0)

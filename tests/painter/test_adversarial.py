@@ -27,8 +27,8 @@ def frozen_features():
     for layer in (first, second):
         layer.requires_grad_(False)
 
-    def extract(pictures):
-        fine = torch.relu(first(pictures))
+    def extract(images):
+        fine = torch.relu(first(images))
         return [fine, torch.relu(second(fine))]
 
     return FrozenFeatures(extract=extract, channels=FEATURE_CHANNELS)
@@ -70,14 +70,14 @@ def test_a_sure_discriminator_has_no_gradient_left_but_the_painter_has():
 def test_r1_of_a_linear_discriminator_is_the_square_of_its_weights():
     weight = torch.randn(3, 24, 32, generator=torch.Generator().manual_seed(1))
 
-    def linear(pictures):
-        return [(pictures * weight).sum(dim=(1, 2, 3)).view(-1, 1, 1, 1)]
+    def linear(images):
+        return [(images * weight).sum(dim=(1, 2, 3)).view(-1, 1, 1, 1)]
 
     expected = float(weight.square().sum())
     assert float(gradient_penalty(linear, noise(0))) == pytest.approx(expected, rel=1e-5)
 
-    def twice_and_half(pictures):  # the mean of two scales: 1.25 times as steep
-        return [2 * linear(pictures)[0], 0.5 * linear(pictures)[0]]
+    def twice_and_half(images):  # the mean of two scales: 1.25 times as steep
+        return [2 * linear(images)[0], 0.5 * linear(images)[0]]
 
     steep = float(gradient_penalty(twice_and_half, noise(0)))
     assert steep == pytest.approx(1.25**2 * expected, rel=1e-5)
@@ -86,8 +86,8 @@ def test_r1_of_a_linear_discriminator_is_the_square_of_its_weights():
 def test_r1_teaches_the_discriminator():
     slope = torch.tensor(3.0, requires_grad=True)
 
-    def linear(pictures):
-        return [slope * pictures.mean(dim=(1, 2, 3), keepdim=True)]
+    def linear(images):
+        return [slope * images.mean(dim=(1, 2, 3), keepdim=True)]
 
     gradient_penalty(linear, noise(0)).backward()
     # |slope / n|^2 summed over n numbers is slope^2 / n
@@ -142,7 +142,7 @@ def test_no_penalty_is_no_penalty(discriminator):
     assert float(loss.gradient_penalty) == 0
 
 
-def test_a_few_steps_on_bright_against_dark_pictures_lower_the_loss(discriminator):
+def test_a_few_steps_on_bright_against_dark_images_lower_the_loss(discriminator):
     optimiser = torch.optim.Adam(
         [p for p in discriminator.parameters() if p.requires_grad], lr=0.02
     )
@@ -155,7 +155,7 @@ def test_a_few_steps_on_bright_against_dark_pictures_lower_the_loss(discriminato
         optimiser.step()
         losses.append(float(loss.hinge.detach()))
     assert sum(losses[-3:]) < 0.9 * sum(losses[:3])
-    # and a painter that follows it makes its dark pictures brighter
+    # and a painter that follows it makes its dark images brighter
     painted = (0.5 * noise(7)).requires_grad_(True)
     generator_hinge_loss(discriminator(painted)).backward()
     assert float(painted.grad.mean()) < 0

@@ -22,7 +22,7 @@ TERMS = (absolute_loss, squared_loss, structure_loss, gradient_loss)
 WITHOUT_NETWORKS = PaperLossWeights(lpips=0, adversarial=0)
 
 
-def pictures(seed=0):
+def images(seed=0):
     generator = torch.Generator().manual_seed(seed)
     return torch.rand(2, 3, 16, 20, generator=generator), torch.rand(
         2, 3, 16, 20, generator=generator
@@ -30,46 +30,46 @@ def pictures(seed=0):
 
 
 def tenfold_difference(ours, truth):
-    """Stands for LPIPS: any distance per picture."""
+    """Stands for LPIPS: any distance per image."""
     return 10 * (ours - truth).abs().mean(dim=(1, 2, 3))
 
 
 @pytest.mark.parametrize("term", TERMS)
-def test_equal_pictures_cost_nothing(term):
-    picture, _ = pictures()
-    assert abs(float(term(picture, picture, torch.ones(2, 16, 20)))) < 1e-6
+def test_equal_images_cost_nothing(term):
+    image, _ = images()
+    assert abs(float(term(image, image, torch.ones(2, 16, 20)))) < 1e-6
 
 
 @pytest.mark.parametrize("term", TERMS)
 def test_unknown_pixels_neither_cost_nor_pull(term):
-    picture, target = pictures()
-    picture.requires_grad_(True)
+    image, target = images()
+    image.requires_grad_(True)
     mask = torch.ones(2, 16, 20)
     mask[:, :, 10:] = 0
-    loss = term(picture, target, mask)
+    loss = term(image, target, mask)
     loss.backward()
     assert float(loss.detach()) > 0
-    assert float(picture.grad[..., 10:].abs().max()) == 0
-    assert float(picture.grad[..., :10].abs().max()) > 0
-    changed = picture.detach().clone()
+    assert float(image.grad[..., 10:].abs().max()) == 0
+    assert float(image.grad[..., :10].abs().max()) > 0
+    changed = image.detach().clone()
     changed[..., 10:] = 0
     torch.testing.assert_close(term(changed, target, mask), loss.detach())
 
 
 @pytest.mark.parametrize("term", TERMS)
 def test_a_term_over_no_pixel_is_zero(term):
-    picture, target = pictures()
-    assert float(term(picture, target, torch.zeros(2, 16, 20))) == 0
+    image, target = images()
+    assert float(term(image, target, torch.zeros(2, 16, 20))) == 0
 
 
 def test_terms_match_hand_worked_answers():
-    picture, target = torch.zeros(1, 3, 2, 2), torch.zeros(1, 3, 2, 2)
-    picture[:, :, 0, 0] = 0.4
+    image, target = torch.zeros(1, 3, 2, 2), torch.zeros(1, 3, 2, 2)
+    image[:, :, 0, 0] = 0.4
     mask = torch.ones(1, 2, 2)
-    assert float(absolute_loss(picture, target, mask)) == pytest.approx(0.1)
-    assert float(squared_loss(picture, target, mask)) == pytest.approx(0.04)
+    assert float(absolute_loss(image, target, mask)) == pytest.approx(0.1)
+    assert float(squared_loss(image, target, mask)) == pytest.approx(0.04)
     # one of two horizontal and one of two vertical steps is off by 0.4
-    assert float(gradient_loss(picture, target, mask)) == pytest.approx(0.4)
+    assert float(gradient_loss(image, target, mask)) == pytest.approx(0.4)
 
 
 def test_agreement_needs_every_valid_warp(make_conditions):
@@ -93,7 +93,7 @@ def test_the_papers_weights_are_those_of_the_paper():
 
 
 def test_the_papers_loss_is_the_weighted_sum_of_its_terms():
-    picture, target = pictures()
+    image, target = images()
     mask = torch.ones(2, 16, 20)
 
     def flat_verdict(seen):
@@ -101,33 +101,33 @@ def test_the_papers_loss_is_the_weighted_sum_of_its_terms():
 
     weights = PaperLossWeights()
     loss = paper_loss(
-        picture, target, mask, weights, lpips=tenfold_difference, discriminator=flat_verdict
+        image, target, mask, weights, lpips=tenfold_difference, discriminator=flat_verdict
     )
-    assert float(loss.squared) == pytest.approx(float((picture - target).square().mean()))
-    assert float(loss.structure) == float(structure_loss(picture, target, mask))
-    assert float(loss.lpips) == pytest.approx(10 * float((picture - target).abs().mean()))
-    assert float(loss.adversarial) == pytest.approx(-(float(picture.mean()) + 0.5) / 2)
+    assert float(loss.squared) == pytest.approx(float((image - target).square().mean()))
+    assert float(loss.structure) == float(structure_loss(image, target, mask))
+    assert float(loss.lpips) == pytest.approx(10 * float((image - target).abs().mean()))
+    assert float(loss.adversarial) == pytest.approx(-(float(image.mean()) + 0.5) / 2)
     expected = 0.2 * loss.lpips + 0.6 * loss.squared + 0.4 * loss.structure + loss.adversarial
     assert float(loss.total) == pytest.approx(float(expected))
 
 
 def test_unknown_pixels_reach_neither_lpips_nor_discriminator():
-    picture, target = pictures()
-    picture.requires_grad_(True)
+    image, target = images()
+    image.requires_grad_(True)
     mask = torch.ones(2, 16, 20)
     mask[:, 8:] = 0
     torch.manual_seed(0)
     judge = PatchDiscriminator(DiscriminatorConfig(width=4, num_layers=1, num_scales=1))
     paper_loss(
-        picture,
+        image,
         target,
         mask,
         PaperLossWeights(),
         lpips=tenfold_difference,
         discriminator=judge,
     ).total.backward()
-    assert float(picture.grad[:, :, 8:].abs().max()) == 0
-    assert float(picture.grad[:, :, :8].abs().max()) > 0
+    assert float(image.grad[:, :, 8:].abs().max()) == 0
+    assert float(image.grad[:, :, :8].abs().max()) > 0
 
 
 @pytest.mark.parametrize(
@@ -135,11 +135,11 @@ def test_unknown_pixels_reach_neither_lpips_nor_discriminator():
     [(PaperLossWeights(), "LPIPS"), (PaperLossWeights(lpips=0), "discriminator")],
 )
 def test_a_term_that_counts_is_never_left_out_silently(weights, missing):
-    picture, target = pictures()
+    image, target = images()
     with pytest.raises(ConfigError, match=f"weighs (a )?{missing}") as caught:
-        paper_loss(picture, target, torch.ones(2, 16, 20), weights)
+        paper_loss(image, target, torch.ones(2, 16, 20), weights)
     assert "\n" not in str(caught.value)
-    paper_loss(picture, target, torch.ones(2, 16, 20), WITHOUT_NETWORKS)
+    paper_loss(image, target, torch.ones(2, 16, 20), WITHOUT_NETWORKS)
 
 
 def test_negative_weights_are_refused():

@@ -88,8 +88,8 @@ def test_a_share_of_the_samples_is_styled_and_their_conditions_stay_clear(make_p
     assert float(gaps[batch.restyled].min()) > 0.1
 
 
-def test_a_styled_window_is_cut_from_the_styled_picture(make_pair, memory_pairs):
-    """Airlight is that of the whole picture, so cutting first would give another one."""
+def test_a_styled_window_is_cut_from_the_styled_image(make_pair, memory_pairs):
+    """Airlight is that of the whole image, so cutting first would give another one."""
     pair = deep_pair(make_pair)
     window = Window(16, 8, 32, 32)
     whole = styled_pair(pair, "foggy", generator_of(0)).cropped(window)

@@ -94,7 +94,7 @@ def test_two_writers_at_once_do_not_meet(tmp_path):
 @pytest.mark.parametrize(
     ("model", "terms"), [("brown", (-0.3, 0.1, 0.001, -0.002, 0.0)), ("fisheye", (0.1, 0.0, 0, 0))]
 )
-def test_distorted_picture_comes_back_as_a_pinhole_sees_it(tmp_path, model, terms):
+def test_distorted_image_comes_back_as_a_pinhole_sees_it(tmp_path, model, terms):
     record = some_record(
         distortion=Distortion(model, terms),
         rolling_shutter=RollingShutter(duration_s=0.02, direction="down"),
@@ -107,8 +107,8 @@ def test_distorted_picture_comes_back_as_a_pinhole_sees_it(tmp_path, model, term
         add_sweep(writer, some_points())
     scene = DrivingScene.open(writer.path)
     view = scene.views[0]
-    picture = scene.read_image(view)
-    assert picture.shape == (24, 32, 3)
+    image = scene.read_image(view)
+    assert image.shape == (24, 32, 3)
     assert view.camera.fx_px != record.camera.fx_px
     # a pixel's grey tells the column it came from: ask OpenCV where a pinhole direction lands
     column, row = 22, 9
@@ -118,4 +118,4 @@ def test_distorted_picture_comes_back_as_a_pinhole_sees_it(tmp_path, model, term
     landed, _ = module.projectPoints(
         *(direction.reshape(1, 1, 3), np.zeros(3), np.zeros(3), matrix, np.array(terms))
     )
-    assert int(picture[row, column, 0]) == pytest.approx(255 * landed[0, 0, 0] / 31, abs=4)
+    assert int(image[row, column, 0]) == pytest.approx(255 * landed[0, 0, 0] / 31, abs=4)

@@ -56,8 +56,8 @@ def test_name_that_is_no_plain_folder_is_refused(tmp_path, name, position):
     assert files_below(tmp_path) == []
 
 
-@pytest.mark.parametrize("missing", ["frames", "pictures", "points"])
-def test_scene_without_frames_pictures_or_points_is_refused(tmp_path, missing):
+@pytest.mark.parametrize("missing", ["frames", "images", "points"])
+def test_scene_without_frames_images_or_points_is_refused(tmp_path, missing):
     def write(writer):
         if missing == "frames":
             return
@@ -112,10 +112,10 @@ BAD_THINGS = {
     "flat box": lambda writer: writer.add_box(some_box(size_m=(4.0, 0.0, 1.5))),
     "endless box": lambda writer: writer.add_box(some_box(size_m=(4.0, torch.inf, 1.5))),
     "nan box pose": lambda writer: writer.add_box(some_box(world_from_box=IDENTITY * torch.nan)),
-    "picture of another size": lambda writer: writer.add_image(some_record(), some_jpeg(16, 16)),
-    "cut-off picture": lambda writer: writer.add_image(some_record(), some_jpeg()[:-60]),
-    "no picture": lambda writer: writer.add_image(some_record(), b"GIF89a"),
-    "empty picture": lambda writer: writer.add_image(some_record(), b""),
+    "image of another size": lambda writer: writer.add_image(some_record(), some_jpeg(16, 16)),
+    "cut-off image": lambda writer: writer.add_image(some_record(), some_jpeg()[:-60]),
+    "no image": lambda writer: writer.add_image(some_record(), b"GIF89a"),
+    "empty image": lambda writer: writer.add_image(some_record(), b""),
     "camera name with a slash": lambda writer: writer.add_image(
         some_record(camera_name="../front"), some_jpeg()
     ),
@@ -164,7 +164,7 @@ def test_point_classes_of_another_number_are_refused(tmp_path):
         write(writer)
 
 
-def test_picture_before_any_frame_is_refused(tmp_path):
+def test_image_before_any_frame_is_refused(tmp_path):
     with (
         pytest.raises(SceneError, match="add_frame must come before camera front"),
         SceneWriter(tmp_path, "rig", "a", HEADER) as writer,

@@ -2,7 +2,7 @@
 
     python devkit_reading.py ROOT ANSWERS.npz
 
-Writes the pose and lens of every picture, the points of every sweep (farther than a metre from the
+Writes the pose and lens of every image, the points of every sweep (farther than a metre from the
 sensor) and the boxes at every sweep, all in the dataset's global frame.
 """
 
@@ -25,7 +25,7 @@ def global_from_sensor(kit, data):
     return global_from_ego @ matrix(kit.get("calibrated_sensor", data["calibrated_sensor_token"]))
 
 
-def picture_answers(kit, data):
+def image_answers(kit, data):
     _, _, lens = kit.get_sample_data(data["token"])
     key = f"{data['timestamp']}/{data['channel']}"
     return {
@@ -54,7 +54,7 @@ def main(root, path):
     answers = {}
     for data in kit.sample_data:
         if data["channel"].startswith("CAM"):
-            answers |= picture_answers(kit, data)
+            answers |= image_answers(kit, data)
     sweeps = [data for data in kit.sample_data if data["channel"] == "LIDAR_TOP"]
     sweeps.sort(key=lambda data: data["timestamp"])
     for position, data in enumerate(sweeps):

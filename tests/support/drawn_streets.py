@@ -7,7 +7,7 @@ path = record_street(street, folder)
 import copy
 from functools import cache
 
-from lidarpainter_models.scenes.synthetic import SyntheticStreet, SyntheticStreetConfig
+from lidarpainter_models.synthetic import SyntheticStreet, SyntheticStreetConfig
 
 
 def drawn_street(config):

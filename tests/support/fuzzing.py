@@ -23,8 +23,8 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarpainter_models.checks.doctor import check_scene
 from lidarpainter_models.errors import LidarPainterError
-from lidarpainter_models.scenes.doctor import check_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from tasks.measuring import measured
 

@@ -8,20 +8,20 @@ from dataclasses import dataclass
 
 import torch
 
-from lidarpainter_models.gaussians.calibration import (
+from lidarpainter_models.gaussians.model.corrections import (
     ActorCorrections,
     CameraCorrections,
     ExposureCorrections,
 )
-from lidarpainter_models.gaussians.gaussian_set import GaussianSet, sh_from_rgb
-from lidarpainter_models.gaussians.observations import SceneObservations, TrainingView
-from lidarpainter_models.gaussians.scene_graph import GaussianScene
-from lidarpainter_models.gaussians.sky import SkyConfig, SkyTexture, sky_layout
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
+from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.model.sky import SkyConfig, SkyTexture, sky_layout
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_rotation
+from lidarpainter_models.lidar.lidar_map import LidarMap
+from lidarpainter_models.lidar.map_points import MapPoints
+from lidarpainter_models.observations.observations import SceneObservations, TrainingView
 from lidarpainter_models.scenes.driving_scene import ActorTrack
-from lidarpainter_models.scenes.lidar_map import LidarMap
-from lidarpainter_models.scenes.map_points import MapPoints
 
 WIDTH_PX, HEIGHT_PX = 64, 48
 LOOK_FORWARD = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -127,7 +127,7 @@ class World:
 
 
 def observe(scene, cameras, wall, car):
-    """Pictures, depth and sky of a scene from its cameras, and its points as the LiDAR map."""
+    """Images, depth and sky of a scene from its cameras, and its points as the LiDAR map."""
     views = []
     for frame, camera in enumerate(cameras):
         render = scene.render(camera, frame * FRAME_NS)

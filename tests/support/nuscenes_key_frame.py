@@ -1,10 +1,10 @@
 """One real key frame of nuScenes as a v1.0 folder, from an info pickle of mmdetection3d.
 
 The pickle has matrices instead of the tables; its transforms from the LiDAR to each camera hold
-the car's motion between their times, so that the ego pose of every picture follows from them. The
+the car's motion between their times, so that the ego pose of every image follows from them. The
 pickle is read as inert data with an allow-list.
 
-    python tests/support/nuscenes_key_frame.py FOLDER PICTURE.jpg  # docs/pictures/overlay_nuscenes
+    python tests/support/nuscenes_key_frame.py FOLDER IMAGE.jpg  # docs/pictures/overlay_nuscenes
 """
 
 import json
@@ -18,15 +18,15 @@ import numpy as np
 import torch
 from nuscenes_log import token_of, written_pose
 
+from lidarpainter_models.checks.overlay import draw_overlay
 from lidarpainter_models.geometry.transforms import (
     invert_rigid,
     rigid_from_rotation,
     rotation_from_vector,
 )
+from lidarpainter_models.readers import ingest_scene
+from lidarpainter_models.readers.pandaset.pickle_tree import Made, Named, read_pickle_tree
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.overlay import draw_overlay
-from lidarpainter_models.scenes.readers import ingest_scene
-from lidarpainter_models.scenes.readers.pandaset.pickle_tree import Made, Named, read_pickle_tree
 
 SCENE_NAME = "scene-0061"
 ALLOWED = (
@@ -151,8 +151,8 @@ def draw_key_frame(folder, camera_name="CAM_FRONT"):
     with tempfile.TemporaryDirectory() as place:
         write_key_frame(folder, Path(place) / "log")
         path = ingest_scene("nuscenes", Path(place) / "log", SCENE_NAME, Path(place) / "store")
-        picture = draw_overlay(DrivingScene.open(path), 0, camera_name).numpy()
-    return cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+        overlay = draw_overlay(DrivingScene.open(path), 0, camera_name).numpy()
+    return cv2.cvtColor(overlay, cv2.COLOR_RGB2BGR)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Write a scene as nuScenes would have recorded it: tables of v1.0, pictures, `.pcd.bin` sweeps.
+"""Write a scene as nuScenes would have recorded it: tables of v1.0, images, `.pcd.bin` sweeps.
 
 Written from the dataset's published schema, not from the reader: what both agree on is the format.
 The nuScenes devkit opens the result.
@@ -28,7 +28,7 @@ from lidarpainter_models.geometry.transforms import (
     transform_points,
 )
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.synthetic import (
+from lidarpainter_models.synthetic import (
     RigCamera,
     RigLidar,
     SyntheticStreetConfig,

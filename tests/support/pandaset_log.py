@@ -3,7 +3,7 @@
 What the format cannot hold is lost: rings, echoes and box times. Its boxes turn about the vertical
 only: a scene whose boxes lean is refused, `set_boxes_upright` makes one that can be written, and
 the dataset's frame must share its z with the scene's world. Classes, point times, camera
-poses and pictures are kept to the last digit of float64 seconds and metres.
+poses and images are kept to the last digit of float64 seconds and metres.
 """
 
 import gzip

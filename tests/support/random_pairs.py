@@ -2,15 +2,15 @@
 
 import torch
 
-from lidarpainter_models.conditioning.pairs import PairWriter
 from lidarpainter_models.painter.examples import PaintingPair
 from lidarpainter_models.painter.protocol import PaintingConditions
+from lidarpainter_models.training_data.pairs import PairWriter
 
 HEIGHT_PX, WIDTH_PX = 32, 48
 
 
 def random_pair(seed, height_px=HEIGHT_PX, width_px=WIDTH_PX):
-    """A random picture, a render of it with noise, and half of it in LiDAR and a warp."""
+    """A random image, a render of it with noise, and half of it in LiDAR and a warp."""
     generator = torch.Generator().manual_seed(seed)
 
     def draw(*shape):

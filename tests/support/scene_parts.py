@@ -1,4 +1,4 @@
-"""Pictures, points, boxes and frames that a `SceneWriter` takes, each as small as can be."""
+"""Images, points, boxes and frames that a `SceneWriter` takes, each as small as can be."""
 
 from pathlib import Path
 
@@ -16,8 +16,8 @@ HEADER = SceneHeader(licence="test", global_from_world=IDENTITY)
 
 def some_jpeg(width_px=32, height_px=24, seed=0):
     rng = np.random.default_rng(seed)
-    picture = rng.integers(0, 255, (height_px, width_px, 3), dtype=np.uint8)
-    return cv2.imencode(".jpg", picture)[1].tobytes()
+    image = rng.integers(0, 255, (height_px, width_px, 3), dtype=np.uint8)
+    return cv2.imencode(".jpg", image)[1].tobytes()
 
 
 def some_points(num_points=50, seed=0):

@@ -7,7 +7,6 @@ import torch
 from quiet_augmentation import QUIET
 from tiny_diffusion import TEXT_WIDTH, TINY
 
-from lidarpainter_models.conditioning.pairs import PairFolder
 from lidarpainter_models.painter.adversarial import DiscriminatorConfig
 from lidarpainter_models.painter.losses import PaperLossWeights
 from lidarpainter_models.painter.one_step.assembly import random_network
@@ -18,6 +17,7 @@ from lidarpainter_models.painter.one_step.training import (
 )
 from lidarpainter_models.painter.training.loop import ALONE
 from lidarpainter_models.painter.training.processes import AcceleratedProcesses
+from lidarpainter_models.training_data.pairs import PairFolder
 
 CONTEST = OneStepTrainingConfig(
     augmentation=replace(QUIET, crop_px=64),

@@ -50,7 +50,7 @@ TINY = Architecture(
         "eos_token_id": 63,
     },
 )
-"""Four levels as the real one, so that pictures are halved six times and skips fit."""
+"""Four levels as the real one, so that images are halved six times and skips fit."""
 
 
 def write_model(folder, seed=0):

@@ -1,4 +1,4 @@
-"""A street of three surfaces with exact sweeps and pictures: what LiDAR maps are tested on.
+"""A street of three surfaces with exact sweeps and images: what LiDAR maps are tested on.
 
 Grey ground, a wall across (red to the left, blue to the right), and a green car that crosses from
 right to left at 10 m/s while each sweep takes a tenth of a second.

@@ -83,7 +83,7 @@ def lidar_numbers(truth, name):
 
 
 def _image(truth, view, timestamp_ns, global_from_ego):
-    """A picture whose pose is given at another moment than its exposure.
+    """An image whose pose is given at another moment than its exposure.
 
     The pose of FRONT is that of the frame, as in the dataset; the others are 3 ms too early.
     """

@@ -1,8 +1,8 @@
 """A real frame without range images, which is no scene, decoded and drawn all the same.
 
-    PYTHONPATH=.:tests/support python tests/support/waymo_real.py FRAME.tfrecord PICTURE.jpg
+    PYTHONPATH=.:tests/support python tests/support/waymo_real.py FRAME.tfrecord IMAGE.jpg
 
-draws the labels of the frame over its FRONT picture: that is how docs/pictures/overlay_waymo.jpg
+draws the labels of the frame over its FRONT image: that is how docs/pictures/overlay_waymo.jpg
 was made. The messages are also read here without the reader's schema, to check the one against
 the other.
 """
@@ -16,12 +16,12 @@ import cv2
 import numpy as np
 import torch
 
+from lidarpainter_models.checks.overlay import draw_boxes
 from lidarpainter_models.geometry.transforms import invert_rigid
-from lidarpainter_models.scenes.overlay import draw_boxes
-from lidarpainter_models.scenes.readers.waymo.boxes import FramePoints, box_records
-from lidarpainter_models.scenes.readers.waymo.cameras import exposure_s, image_record
-from lidarpainter_models.scenes.readers.waymo.log import WaymoFrame, WaymoImage
-from lidarpainter_models.scenes.readers.waymo.v1 import WaymoRecordSegment
+from lidarpainter_models.readers.waymo.boxes import FramePoints, box_records
+from lidarpainter_models.readers.waymo.cameras import exposure_s, image_record
+from lidarpainter_models.readers.waymo.log import WaymoFrame, WaymoImage
+from lidarpainter_models.readers.waymo.v1 import WaymoRecordSegment
 from lidarpainter_models.scenes.tracks import ActorTrack, tracks_from_boxes
 from lidarpainter_models.scenes.undistortion import pinhole_of, undistort
 
@@ -44,7 +44,7 @@ class RealFrame:
         return cls(segment, frame, {image.camera_name: image for image in sensors.images})
 
     def tracks(self) -> tuple[ActorTrack, ...]:
-        """One box per label, at the time of the FRONT picture: there are no points to ask."""
+        """One box per label, at the time of the FRONT image: there are no points to ask."""
         points = FramePoints(exposure_s(self.images["FRONT"]), np.zeros(3))
         points.add(np.zeros((1, 3)), np.zeros(1), is_top=True)
         records = box_records(
@@ -65,7 +65,7 @@ class RealFrame:
         return tracks_from_boxes(columns, torch.stack([box.world_from_box for box in records]))
 
     def record(self, camera_name):
-        """The picture's record, in the vehicle frame of the frame's pose."""
+        """The image's record, in the vehicle frame of the frame's pose."""
         return image_record(
             self.images[camera_name],
             self.segment.cameras[camera_name],
@@ -73,24 +73,24 @@ class RealFrame:
         )
 
     def overlay(self, camera_name) -> np.ndarray:
-        """The picture, undistorted, with the boxes over it."""
+        """The image, undistorted, with the boxes over it."""
         record = self.record(camera_name)
         jpeg = np.frombuffer(self.images[camera_name].jpeg, np.uint8)
         rgb = cv2.cvtColor(cv2.imdecode(jpeg, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
         pinhole = pinhole_of(record.camera, record.distortion)
-        picture = np.ascontiguousarray(undistort(rgb, record.camera, record.distortion, pinhole))
-        draw_boxes(picture, pinhole, self.tracks(), record.timestamp_ns)
-        return picture
+        image = np.ascontiguousarray(undistort(rgb, record.camera, record.distortion, pinhole))
+        draw_boxes(image, pinhole, self.tracks(), record.timestamp_ns)
+        return image
 
 
-def write_overlay(frame_path, picture_path, *, width_px=1280):
-    """Draw the FRONT picture of a frame into a JPEG file."""
-    picture = RealFrame.read(frame_path).overlay("FRONT")
-    height_px = round(picture.shape[0] * width_px / picture.shape[1])
-    small = cv2.resize(picture, (width_px, height_px), interpolation=cv2.INTER_AREA)
+def write_overlay(frame_path, image_path, *, width_px=1280):
+    """Draw the FRONT image of a frame into a JPEG file."""
+    image = RealFrame.read(frame_path).overlay("FRONT")
+    height_px = round(image.shape[0] * width_px / image.shape[1])
+    small = cv2.resize(image, (width_px, height_px), interpolation=cv2.INTER_AREA)
     quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
     jpeg = cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), quality)[1]
-    picture_path.write_bytes(jpeg.tobytes())
+    image_path.write_bytes(jpeg.tobytes())
 
 
 def record_content(path, index=0):

@@ -8,8 +8,8 @@ The truth is what the formats can express, so that a reader must give it back as
   they fall into, at most two a pixel; `num_lost` counts the others, which are in no truth.
 - Boxes stand upright in the vehicle frame (the street's follow its slope by a degree or so).
 - No point lies within a millimetre of a box's faces, where float32 could not tell its side.
-- Every camera takes its picture at its own moment, with the car's velocity carried that far, and
-  through a distorted lens. The pixels of the pictures are the street's, which nobody looks at.
+- Every camera takes its image at its own moment, with the car's velocity carried that far, and
+  through a distorted lens. The pixels of the images are the street's, which nobody looks at.
 """
 
 from collections import defaultdict
@@ -30,15 +30,15 @@ from lidarpainter_models.scenes.records import (
     RollingShutter,
     SweepPoints,
 )
-from lidarpainter_models.scenes.synthetic import (
+from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
+from lidarpainter_models.synthetic import (
     RigCamera,
     RigLidar,
     SyntheticStreet,
     SyntheticStreetConfig,
 )
-from lidarpainter_models.scenes.synthetic.lidar import beam_inclinations_rad
-from lidarpainter_models.scenes.synthetic.street import ego_from_camera
-from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
+from lidarpainter_models.synthetic.lidar_sensor import beam_inclinations_rad
+from lidarpainter_models.synthetic.street import ego_from_camera
 
 LENS_TERMS = (0.04, -0.03, 0.001, -0.0015, 0.002)
 NEAR_M = 15.0
@@ -49,7 +49,7 @@ TURN_S = 0.1
 
 @dataclass(frozen=True)
 class CameraSetup:
-    """Where a camera looks and when it takes its picture."""
+    """Where a camera looks and when it takes its image."""
 
     yaw_deg: float
     exposure_ms: float
@@ -221,7 +221,7 @@ def _write_frame(truth, frame_index, writer):
 
 
 def _write_image(truth, name, timestamp_ns, world_from_vehicle, writer):
-    """The picture is taken with the frame, but stored where the camera is at its exposure."""
+    """The image is taken with the frame, but stored where the camera is at its exposure."""
     setup, street = CAMERAS[name], truth.street
     camera = street.camera(name, timestamp_ns)
     rgb = street.render(camera, timestamp_ns).rgb.numpy()

@@ -18,22 +18,22 @@ from lidarpainter_models.geometry.trajectories import Shift
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.metrics import lpips
 from lidarpainter_models.metrics.backbones import SQUEEZENET
-from tasks.evaluate import evaluate
-from tasks.fit import fit, refine
-from tasks.flicker import by_picture, evaluate_flicker
-from tasks.ingest import record_scene
-from tasks.judge_painter import judge_painters
-from tasks.judged_fits import JudgedFit
-from tasks.paint import paint
-from tasks.painted_views import load_guidance
-from tasks.prepare import prepare
-from tasks.publish import begin_run, complete_run, fail_run
-from tasks.render import RenderRequest, render
-from tasks.report import ReportInputs, report_path, write_report
+from tasks.evaluation.flicker import by_image, evaluate_flicker
+from tasks.evaluation.scene import evaluate
+from tasks.evaluation.scores import load_scores, metric_values
+from tasks.ingest.ingest import record_scene
+from tasks.painter.judge import judge_painters
+from tasks.painter.judged_fits import JudgedFit
+from tasks.reconstruction.fit import fit, refine
+from tasks.reconstruction.paint import paint
+from tasks.reconstruction.painted_views import load_guidance
+from tasks.reconstruction.prepare import prepare
+from tasks.reconstruction.publish import begin_run, complete_run, fail_run
+from tasks.reconstruction.report import ReportInputs, report_path, write_report
 from tasks.runs import open_run
-from tasks.scores import load_scores, metric_values
 from tasks.stored import FittedRef, load_history, load_scene
-from tasks.stylize import StylizeRequest, stylize
+from tasks.views.render import RenderRequest, render
+from tasks.views.stylize import StylizeRequest, stylize
 
 
 @pytest.fixture(scope="module")
@@ -143,8 +143,8 @@ def test_painted_views_come_back_as_guidance(store, stages):
     for view in views:
         assert view.rgb.shape == (view.camera.height_px, view.camera.width_px, 3)
         assert 0 <= float(view.weight.min()) <= float(view.weight.max()) <= 1
-    pictures = stages["paint-1"].ref.folder / "pictures" / "left-2m"
-    assert {path.stem for path in pictures.iterdir()} >= {"render", "painted", "confidence"}
+    images = stages["paint-1"].ref.folder / "images" / "left-2m"
+    assert {path.stem for path in images.iterdir()} >= {"render", "painted", "confidence"}
 
 
 def test_scores_say_why_a_number_is_missing(stages):
@@ -153,7 +153,7 @@ def test_scores_say_why_a_number_is_missing(stages):
     assert scores["recorded"]["num_views"] == 2
     left = scores["novel"]["left-2m"]
     assert left["psnr"] is None
-    assert "nobody took pictures" in left["psnr_reason"]
+    assert "nobody took images" in left["psnr_reason"]
     assert 0 <= left["depth_within_5_percent"] <= 1
 
 
@@ -220,8 +220,8 @@ def test_neighbouring_frames_are_compared_along_every_shift(store, parameters, f
     assert found["render"]["psnr"] is None  # nobody knows the truth there
     assert 0 < found["render"]["valid_share"] < 1
     by_name = {
-        picture: {name: value for _, _, name, value, _ in metric_values(values)}
-        for picture, values in by_picture(scores["flicker"]).items()
+        image: {name: value for _, _, name, value, _ in metric_values(values)}
+        for image, values in by_image(scores["flicker"]).items()
     }
     assert by_name["painted"]["flicker"] == found["painted"]["flicker"]
 
@@ -252,8 +252,8 @@ def test_a_failed_run_says_why(store, parameters):
     other = parameters.model_copy(update={"preset": "balanced"})
     record = begin_run.fn(store.root, other, "cpu")
     assert store.tables.row("runs", record.run_id)["status"] == "running"
-    fail_run.fn(store.root, record, "SceneError: no picture")
-    assert store.tables.row("runs", record.run_id)["error"] == "SceneError: no picture"
+    fail_run.fn(store.root, record, "SceneError: no image")
+    assert store.tables.row("runs", record.run_id)["error"] == "SceneError: no image"
 
 
 @pytest.mark.parametrize("painter", [None, "warp"])
@@ -266,29 +266,27 @@ def test_a_run_is_rendered_where_nobody_drove(store, run, parameters, tmp_path, 
         conditions=parameters.conditions,
     )
     made = render.fn(store.root, run, request, tmp_path)
-    assert made["num_pictures"] == 2
+    assert made["num_images"] == 2
     described = json.loads((tmp_path / "trajectory.json").read_text())
-    assert [row["file"] for row in described["pictures"]] == ["0001.png", "0002.png"]
-    first, last = (row["world_from_camera"] for row in described["pictures"])
+    assert [row["file"] for row in described["images"]] == ["0001.png", "0002.png"]
+    first, last = (row["world_from_camera"] for row in described["images"])
     assert last[7] - first[7] == pytest.approx(2.0, abs=0.2)  # y is to the left
 
 
-@pytest.mark.parametrize("pictures", ["rendered", "recorded"])
-def test_a_run_is_shown_in_fog_beside_the_clear_pictures(
-    store, run, parameters, tmp_path, pictures
-):
+@pytest.mark.parametrize("images", ["rendered", "recorded"])
+def test_a_run_is_shown_in_fog_beside_the_clear_images(store, run, parameters, tmp_path, images):
     view = RenderRequest(
         trajectory=parse_trajectory("recorded"),
         frames=slice(1, 3),
         observation=parameters.observation,
         conditions=parameters.conditions,
     )
-    request = StylizeRequest(prompt="foggy", view=view, pictures=pictures)
+    request = StylizeRequest(prompt="foggy", view=view, images=images)
     made = stylize.fn(store.root, run, request, tmp_path / "a")
-    assert made["num_pictures"] == 2
+    assert made["num_images"] == 2
     assert 0.5 < made["edge_f1"] <= 1
     described = json.loads((tmp_path / "a" / "trajectory.json").read_text())
-    assert (described["prompt"], len(described["pictures"])) == ("foggy", 2)
+    assert (described["prompt"], len(described["images"])) == ("foggy", 2)
     foggy, clear = (
         cv2.imread(str(tmp_path / "a" / name)) for name in ("0001.png", "clear/0001.png")
     )
@@ -313,7 +311,7 @@ def test_a_painter_is_asked_for_the_prompt(store, run, parameters, tmp_path):
         replace(request, painter=None)
 
 
-def test_a_path_is_painted_with_the_previous_picture_mixed_in(store, run, parameters, tmp_path):
+def test_a_path_is_painted_with_the_previous_image_mixed_in(store, run, parameters, tmp_path):
     plain = RenderRequest(
         trajectory=parse_trajectory("lateral:1"),
         frames=slice(0, 3),
@@ -333,16 +331,16 @@ def test_a_path_is_painted_with_the_previous_picture_mixed_in(store, run, parame
         replace(mixed, painter=None)
 
 
-def test_recorded_pictures_exist_only_where_somebody_stood(parameters):
+def test_recorded_images_exist_only_where_somebody_stood(parameters):
     view = RenderRequest(
         trajectory=parse_trajectory("lateral:2"),
         observation=parameters.observation,
         conditions=parameters.conditions,
     )
     with pytest.raises(ConfigError, match="on the recorded trajectory"):
-        StylizeRequest(prompt="foggy", view=view, pictures="recorded")
-    with pytest.raises(ConfigError, match="no pictures 'drawn'"):
-        StylizeRequest(prompt="foggy", view=view, pictures="drawn")
+        StylizeRequest(prompt="foggy", view=view, images="recorded")
+    with pytest.raises(ConfigError, match="no images 'drawn'"):
+        StylizeRequest(prompt="foggy", view=view, images="drawn")
     with pytest.raises(ConfigError, match="no style 'snow'"):
         StylizeRequest(prompt="snow", view=view)
 

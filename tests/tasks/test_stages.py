@@ -104,10 +104,10 @@ def test_who_listens_hears_a_stage_from_start_to_end(tmp_path):
 def test_a_failing_stage_leaves_no_artefact_and_no_row(tmp_path):
     def fail(place):
         (place.output / "half.txt").write_text("1")
-        raise DataError("no such picture")
+        raise DataError("no such image")
 
     store = open_store(tmp_path)
-    with pytest.raises(DataError, match="no such picture"):
+    with pytest.raises(DataError, match="no such image"):
         run(store, build=fail)
     assert store.tables.rows("artefacts") == []
     assert list((tmp_path / "aside").iterdir()) == []

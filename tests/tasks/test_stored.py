@@ -8,8 +8,8 @@ from tiny_diffusion import write_model
 
 from catalog.errors import DamagedArtefactError
 from lidarpainter_models.errors import WeightsError
-from tasks.painters import painter_digest
-from tasks.scores import metric_values, score_rows
+from tasks.evaluation.scores import metric_values, score_rows
+from tasks.painter.painters import painter_digest
 from tasks.stored import read_json, write_json
 from tasks.tensors import read_tensors, write_tensors
 

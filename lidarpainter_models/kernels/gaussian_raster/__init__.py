@@ -1,4 +1,4 @@
-"""Draw 3D Gaussians into a picture and carry gradients back (Kerbl et al. 2023).
+"""Draw 3D Gaussians into an image and carry gradients back (Kerbl et al. 2023).
 
 Gaussians live in *bodies*: body 0 is the street (the world frame), the others are actors in their
 box frames; `camera_from_body` places each. The camera frame is x right, y down, z forward; lengths
@@ -33,7 +33,7 @@ class SplatImage:
     """What the blended Gaussians show, and what densification needs to know about them.
 
     With a_i the alpha of the i-th Gaussian from the front and T_i the light that reaches it, each
-    picture is a sum over Gaussians of a_i T_i times the Gaussian's own value.
+    image is a sum over Gaussians of a_i T_i times the Gaussian's own value.
     """
 
     rgb: Float[Tensor, "height width 3"]
@@ -90,10 +90,10 @@ def render_gaussians(  # noqa: PLR0913 - the one door to the kernel; the scalars
         camera_from_body: rigid transforms of this view.
         fx_px: focal length; with `fy_px`, `cx_px`, `cy_px` a pinhole camera.
         fy_px: see `fx_px`.
-        cx_px: principal point from the picture's left edge.
-        cy_px: principal point from the picture's top edge.
-        width_px: size of the picture.
-        height_px: size of the picture.
+        cx_px: principal point from the image's left edge.
+        cy_px: principal point from the image's top edge.
+        width_px: size of the image.
+        height_px: size of the image.
         features: further values to blend like colours.
         near_m: Gaussians with a smaller camera z are not drawn.
         blur_px2: added to the variance of every footprint, so that none is thinner than a pixel.
@@ -159,9 +159,9 @@ def render_views(  # noqa: PLR0913 - the Gaussians, and what differs from view t
     backend: Backend = "auto",
     packed: bool = True,
 ) -> list[SplatImage]:
-    """`render_gaussians` for several cameras in one call; pictures may differ in size.
+    """`render_gaussians` for several cameras in one call; images may differ in size.
 
-    Each picture is that of a call of its own bit for bit (on a CPU), and a gradient is the sum over
+    Each image is that of a call of its own bit for bit (on a CPU), and a gradient is the sum over
     the views in their order. The Gaussians are checked once and gradients gathered in place.
 
     Args:
@@ -233,7 +233,7 @@ def accumulate_pixel_error(
     *gaussians: Tensor,
     **camera: Any,  # noqa: ANN401 - passed on
 ) -> Float[Tensor, " gaussians"]:
-    """How much of a picture's error each Gaussian drew: the sum over pixels of a_i T_i error.
+    """How much of an image's error each Gaussian drew: the sum over pixels of a_i T_i error.
 
     Where it is large, the scene needs more Gaussians (Bulo et al. 2024, "Revising Densification
     in Gaussian Splatting"). It is the gradient of a blended feature, so a training step that
@@ -242,7 +242,7 @@ def accumulate_pixel_error(
     the loss.
 
     Args:
-        pixel_error: error of the drawn picture.
+        pixel_error: error of the drawn image.
         gaussians: positional arguments of `render_gaussians`.
         camera: keyword arguments of `render_gaussians` other than `features`.
     """

@@ -68,7 +68,7 @@ FAR = np.float32(-5.7)
 """Exponents are held above this, where `lane_exp` is accurate and alpha is under the cut."""
 
 
-class Pictures(NamedTuple):
+class Images(NamedTuple):
     """Blended sums per pixel, float32 (height, width[, channels])."""
 
     rgb: np.ndarray
@@ -80,14 +80,14 @@ class Pictures(NamedTuple):
 
 
 @numba.njit(**EXACT)
-def flat_pictures(pictures: Pictures) -> Pictures:
-    """The same pictures, one number after the other."""
-    return Pictures(
-        pictures.rgb.reshape(-1),
-        pictures.depth.reshape(-1),
-        pictures.alpha.reshape(-1),
-        pictures.features.reshape(-1),
-        pictures.light.reshape(-1),
+def flat_images(images: Images) -> Images:
+    """The same images, one number after the other."""
+    return Images(
+        images.rgb.reshape(-1),
+        images.depth.reshape(-1),
+        images.alpha.reshape(-1),
+        images.features.reshape(-1),
+        images.light.reshape(-1),
     )
 
 
@@ -201,13 +201,13 @@ def _blend_tile(
 
 @numba.njit(**EXACT)
 def _light_pixels(lanes: np.ndarray, rows: int, columns: int) -> None:
-    """Give every pixel of a tile that lies in the picture its full light; the rest stay dark."""
+    """Give every pixel of a tile that lies in the image its full light; the rest stay dark."""
     for row in range(rows):
         lanes[row * TILE_PX : row * TILE_PX + columns] = ONE
 
 
 @numba.njit(**EXACT)
-def _store_row(lanes: np.ndarray, row: int, place: int, flat: Pictures) -> None:
+def _store_row(lanes: np.ndarray, row: int, place: int, flat: Images) -> None:
     """Write a whole tile row to pixels from a place on."""
     pixel = row * TILE_PX
     left = magnitude(load(lanes, LIGHT + pixel))
@@ -219,9 +219,9 @@ def _store_row(lanes: np.ndarray, row: int, place: int, flat: Pictures) -> None:
 
 
 @numba.njit(**EXACT)
-def _store_tile(lanes: np.ndarray, corner: tuple[int, int], pictures: Pictures) -> None:
-    height, width, channels = pictures.features.shape
-    flat = flat_pictures(pictures)
+def _store_tile(lanes: np.ndarray, corner: tuple[int, int], images: Images) -> None:
+    height, width, channels = images.features.shape
+    flat = flat_images(images)
     columns = min(TILE_PX, width - corner[0])
     for row in range(min(TILE_PX, height - corner[1])):
         place = (corner[1] + row) * width + corner[0]
@@ -229,7 +229,7 @@ def _store_tile(lanes: np.ndarray, corner: tuple[int, int], pictures: Pictures) 
             _store_row(lanes, row, place, flat)
         else:
             _store_part_of_row(lanes, row, place, columns, flat)
-        features = pictures.features[corner[1] + row]
+        features = images.features[corner[1] + row]
         for channel in range(channels):
             start = FEATURES + channel * PIXELS + row * TILE_PX
             for column in range(columns):
@@ -237,10 +237,8 @@ def _store_tile(lanes: np.ndarray, corner: tuple[int, int], pictures: Pictures) 
 
 
 @numba.njit(**EXACT)
-def _store_part_of_row(
-    lanes: np.ndarray, row: int, place: int, columns: int, flat: Pictures
-) -> None:
-    """Write the first pixels of a tile row that the picture's edge cuts."""
+def _store_part_of_row(lanes: np.ndarray, row: int, place: int, columns: int, flat: Images) -> None:
+    """Write the first pixels of a tile row that the image's edge cuts."""
     for column in range(columns):
         pixel = row * TILE_PX + column
         left = abs(lanes[LIGHT + pixel])
@@ -253,23 +251,23 @@ def _store_part_of_row(
 
 @numba.njit(**EXACT)
 def _draw_tile(
-    records: np.ndarray, features: np.ndarray, lists: TileLists, tile: int, pictures: Pictures
+    records: np.ndarray, features: np.ndarray, lists: TileLists, tile: int, images: Images
 ) -> None:
     corner = (tile % lists.columns * TILE_PX, tile // lists.columns * TILE_PX)
-    height, width = pictures.depth.shape
+    height, width = images.depth.shape
     lanes = lane_array(FEATURES + features.shape[1] * PIXELS)
     lanes[:] = ZERO
     _light_pixels(lanes, min(TILE_PX, height - corner[1]), min(TILE_PX, width - corner[0]))
     _blend_tile(records, features, lists, tile, corner, lanes)
-    _store_tile(lanes, corner, pictures)
+    _store_tile(lanes, corner, images)
 
 
 @compiled_entry
 def blend(
     records: np.ndarray, features: np.ndarray, lists: TileLists, width: int, height: int
-) -> Pictures:
+) -> Images:
     """Draw all tiles."""
-    pictures = Pictures(
+    images = Images(
         np.empty((height, width, 3), np.float32),
         np.empty((height, width), np.float32),
         np.empty((height, width), np.float32),
@@ -279,5 +277,5 @@ def blend(
     tiles = lists.columns * lists.rows
     jump = jump_of(tiles)
     for place in numba.prange(tiles):
-        _draw_tile(records, features, lists, place * jump % tiles, pictures)
-    return pictures
+        _draw_tile(records, features, lists, place * jump % tiles, images)
+    return images

@@ -1,8 +1,8 @@
-"""Carry picture gradients back to the Gaussians of each tile: compiled code, float32 lanes.
+"""Carry image gradients back to the Gaussians of each tile: compiled code, float32 lanes.
 
 Tiles are walked front to back once more, with the same early stop as when drawing. What lies
 behind a Gaussian is the pixel's total minus what was passed so far, one number per pixel: the
-blended value dotted with the picture's gradient. Every (tile, Gaussian) entry writes its own sums;
+blended value dotted with the image's gradient. Every (tile, Gaussian) entry writes its own sums;
 `projection_gradients` adds up the entries of each Gaussian in a fixed order, so results do not
 depend on the threads.
 """
@@ -22,9 +22,9 @@ from lidarpainter_models.kernels.gaussian_raster.blending import (
     STOP,
     TOP,
     ZERO,
-    Pictures,
+    Images,
     fetch_records,
-    flat_pictures,
+    flat_images,
     has_light,
     local_centre,
 )
@@ -134,7 +134,7 @@ def _entry_sums(  # noqa: PLR0915 - one loop body; calls would be no clearer
 
 @numba.njit(**EXACT)
 def _feature_values(lanes: np.ndarray, rows: tuple[int, int], features: np.ndarray) -> None:
-    """Features of a Gaussian dotted with the picture's feature gradient, pixel by pixel."""
+    """Features of a Gaussian dotted with the image's feature gradient, pixel by pixel."""
     for pixel in range(rows[0] * TILE_PX, rows[1] * TILE_PX, TILE_PX):
         value = spread(ZERO)
         for channel in range(len(features)):
@@ -157,10 +157,8 @@ def _feature_sums(
 
 
 @numba.njit(**EXACT)
-def _load_row(
-    lanes: np.ndarray, row: int, place: int, drawn: Pictures, gradients: Pictures
-) -> None:
-    """Load a whole tile row from flat pictures, pixels from a place on."""
+def _load_row(lanes: np.ndarray, row: int, place: int, drawn: Images, gradients: Images) -> None:
+    """Load a whole tile row from flat images, pixels from a place on."""
     pixel = row * TILE_PX
     store(lanes, LIGHT + pixel, spread(ONE))
     to_red, to_green, to_blue = load_triples(gradients.rgb, 3 * place)
@@ -177,9 +175,9 @@ def _load_row(
 
 @numba.njit(**EXACT)
 def _load_part_of_row(
-    lanes: np.ndarray, row: int, place: int, columns: int, drawn: Pictures, gradients: Pictures
+    lanes: np.ndarray, row: int, place: int, columns: int, drawn: Images, gradients: Images
 ) -> None:
-    """Load the first pixels of a tile row that the picture's edge cuts."""
+    """Load the first pixels of a tile row that the image's edge cuts."""
     for column in range(columns):
         pixel, k = row * TILE_PX + column, place + column
         lanes[LIGHT + pixel] = ONE
@@ -207,12 +205,12 @@ def _load_features(
 
 @numba.njit(**EXACT)
 def _load_tile(
-    corner: tuple[int, int], drawn: Pictures, gradients: Pictures, lanes: np.ndarray
+    corner: tuple[int, int], drawn: Images, gradients: Images, lanes: np.ndarray
 ) -> None:
     """Pixel gradients, and the gradient-weighted total of what each pixel blended."""
     height, width, channels = drawn.features.shape
     columns = min(TILE_PX, width - corner[0])
-    flat, to_flat = flat_pictures(drawn), flat_pictures(gradients)
+    flat, to_flat = flat_images(drawn), flat_images(gradients)
     for row in range(min(TILE_PX, height - corner[1])):
         y = corner[1] + row
         place = y * width + corner[0]
@@ -263,8 +261,8 @@ def entry_sums(
     records: np.ndarray,
     features: np.ndarray,
     lists: TileLists,
-    drawn: Pictures,
-    gradients: Pictures,
+    drawn: Images,
+    gradients: Images,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sums over the pixels of each entry of the tile lists.
 
@@ -273,7 +271,7 @@ def entry_sums(
         features: of the Gaussians, float32.
         lists: from `binning.list_tiles`.
         drawn: from `blending.blend`.
-        gradients: of the loss with respect to each picture; that of `light` is not read.
+        gradients: of the loss with respect to each image; that of `light` is not read.
 
     Returns:
         Sums in the order of the constants above, `SUMS` numbers for each entry, and those

@@ -18,7 +18,7 @@ MIN_TRANSMITTANCE = 1e-4
 """A pixel stops before the Gaussian that would bring its transmittance under this."""
 
 TANGENT_MARGIN = 0.3
-"""How far outside the picture, in half field-of-view tangents, the projection stays linearised."""
+"""How far outside the image, in half field-of-view tangents, the projection stays linearised."""
 
 MIN_COMPENSATION = 1e-12
 """Floor of the squared antialiasing factor, where its square root still has a finite slope."""

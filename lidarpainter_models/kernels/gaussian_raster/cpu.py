@@ -1,6 +1,6 @@
 """The rasteriser on the CPU: numba kernels behind one autograd function for any number of views.
 
-Pictures and gradients are bitwise the same for any number of threads (numba's setting,
+Images and gradients are bitwise the same for any number of threads (numba's setting,
 `numba.set_num_threads`). Input is read as float32 (transforms as float64) and must lie on the CPU.
 """
 
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lidarpainter_models.errors import BackendError
 from lidarpainter_models.kernels.gaussian_raster.binning import TileLists, list_tiles
-from lidarpainter_models.kernels.gaussian_raster.blending import Pictures, blend
+from lidarpainter_models.kernels.gaussian_raster.blending import Images, blend
 from lidarpainter_models.kernels.gaussian_raster.blending_gradients import entry_sums
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import TANGENT_MARGIN
 from lidarpainter_models.kernels.gaussian_raster.projection import (
@@ -28,21 +28,21 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
 )
 from lidarpainter_models.kernels.gaussian_raster.projection_gradients import Gradients, unproject
 from lidarpainter_models.kernels.gaussian_raster.splat_inputs import (
-    DrawnPictures,
+    DrawnImages,
     SplatInputs,
     SplatView,
 )
 
-PICTURES = 6
-"""Tensors that a view gives: four pictures, visible and radius."""
+IMAGES = 6
+"""Tensors that a view gives: four images, visible and radius."""
 ONE_AT_A_TIME = threading.Lock()
 """numba's thread pools may not be entered by two Python threads at once."""
 
 
 def draw_views(
     inputs: SplatInputs, views: Sequence[SplatView], screen_gradients_out: Tensor | None
-) -> list[DrawnPictures]:
-    """Pictures as `SplatImage` lists them: rgb, depth, alpha, features, visible, radius.
+) -> list[DrawnImages]:
+    """Images as `SplatImage` lists them: rgb, depth, alpha, features, visible, radius.
 
     Raises:
         BackendError: the tensors are not on the CPU.
@@ -62,7 +62,7 @@ def draw_views(
         views,
         screen_gradients_out,
     )
-    return [drawn[first : first + PICTURES] for first in range(0, len(drawn), PICTURES)]
+    return [drawn[first : first + IMAGES] for first in range(0, len(drawn), IMAGES)]
 
 
 def _array(tensor: Tensor, dtype: torch.dtype = torch.float32) -> np.ndarray:
@@ -104,9 +104,9 @@ def _compiled_view(view: SplatView) -> View:
     )
 
 
-def _pictures(tensors: tuple[Tensor, ...], light: np.ndarray) -> Pictures:
+def _images(tensors: tuple[Tensor, ...], light: np.ndarray) -> Images:
     rgb, depth, alpha, features = map(_array, tensors)
-    return Pictures(rgb, depth, alpha, features, light)
+    return Images(rgb, depth, alpha, features, light)
 
 
 def _of_view(gaussians: Gaussians, place: int) -> Gaussians:
@@ -139,16 +139,16 @@ class _DrawViews(torch.autograd.Function):
                 compiled = _compiled_view(view)
                 records = project(_of_view(gaussians, place), compiled)
                 lists = list_tiles(records, view.width_px, view.height_px)
-                pictures = blend(records, gaussians.features, lists, view.width_px, view.height_px)
+                images = blend(records, gaussians.features, lists, view.width_px, view.height_px)
                 ctx.views.append(
-                    _DrawnView(view=compiled, records=records, lists=lists, light=pictures.light)
+                    _DrawnView(view=compiled, records=records, lists=lists, light=images.light)
                 )
-                drawn += [torch.from_numpy(picture) for picture in pictures[:4]]
+                drawn += [torch.from_numpy(image) for image in images[:4]]
                 drawn.append(torch.from_numpy(records[:, IS_VISIBLE] > 0.0))
                 drawn.append(torch.from_numpy(3.0 * records[:, SIGMA]))
-        floats = [drawn[k] for k in range(len(drawn)) if k % PICTURES < 4]
+        floats = [drawn[k] for k in range(len(drawn)) if k % IMAGES < 4]
         ctx.save_for_backward(*tensors, *floats)
-        ctx.mark_non_differentiable(*(drawn[k] for k in range(len(drawn)) if k % PICTURES >= 4))
+        ctx.mark_non_differentiable(*(drawn[k] for k in range(len(drawn)) if k % IMAGES >= 4))
         ctx.screen_gradients_out = screen_gradients_out
         return tuple(drawn)
 
@@ -156,18 +156,18 @@ class _DrawViews(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *output_gradients: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         count = len(ctx.saved_tensors) - 4 * len(ctx.views)
-        tensors, pictures = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
+        tensors, images = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
         gaussians = _gaussians(tensors)
         found = _room_for_gradients(gaussians)
         with ONE_AT_A_TIME:
             for place, drawn in enumerate(ctx.views):
-                given = output_gradients[PICTURES * place : PICTURES * place + 4]
+                given = output_gradients[IMAGES * place : IMAGES * place + 4]
                 slots = entry_sums(
                     drawn.records,
                     gaussians.features,
                     drawn.lists,
-                    _pictures(pictures[4 * place : 4 * place + 4], drawn.light),
-                    _pictures(given, drawn.light),
+                    _images(images[4 * place : 4 * place + 4], drawn.light),
+                    _images(given, drawn.light),
                 )
                 own = _gradients_of_view(found, place)
                 of_view = _of_view(gaussians, place)

@@ -4,7 +4,7 @@ Projection, bodies and colour are those of the reference, in torch on the GPU, s
 with respect to the transforms are exact; binning and blending are gsplat's kernels (Ye et al.
 2024, "gsplat: An Open-Source Library for Gaussian Splatting"). gsplat 1.5 clamps alpha at 0.999
 where the others clamp at 0.99, and its atomic sums make gradients differ in the last bits from run
-to run. Only what can reach a picture is handed over, so memory follows the visible Gaussians, and
+to run. Only what can reach an image is handed over, so memory follows the visible Gaussians, and
 views of one size go in one call in gsplat's packed form; antialiasing is in the opacity, depth is
 one of the blended values.
 """
@@ -26,7 +26,7 @@ from lidarpainter_models.kernels.gaussian_raster.reference import (
     screen_radii,
 )
 from lidarpainter_models.kernels.gaussian_raster.splat_inputs import (
-    DrawnPictures,
+    DrawnImages,
     SplatInputs,
     SplatView,
 )
@@ -38,8 +38,8 @@ def draw_views(
     screen_gradients_out: Tensor | None,
     *,
     packed: bool,
-) -> list[DrawnPictures]:
-    """Pictures as `SplatImage` lists them: rgb, depth, alpha, features, visible, radius.
+) -> list[DrawnImages]:
+    """Images as `SplatImage` lists them: rgb, depth, alpha, features, visible, radius.
 
     Raises:
         BackendError: gsplat or its kernels are missing, or the tensors are not on a CUDA device.
@@ -59,7 +59,7 @@ def draw_with(
     screen_gradients_out: Tensor | None,
     *,
     packed: bool,
-) -> list[DrawnPictures]:
+) -> list[DrawnImages]:
     """Draw with gsplat's functions on any device that they take."""
     if screen_gradients_out is not None:
         screen_gradients_out.zero_()
@@ -67,13 +67,13 @@ def draw_with(
     for place, view in enumerate(views):
         key = (view.width_px, view.height_px) if packed else (place,)
         groups.setdefault(key, []).append(place)
-    drawn: dict[int, DrawnPictures] = {}
+    drawn: dict[int, DrawnImages] = {}
     for places in groups.values():
         screens = [project_gaussians(inputs, place, views[place]) for place in places]
-        pictures = _rasterised(
+        images = _rasterised(
             gsplat, screens, views[places[0]], places, screen_gradients_out, packed=packed
         )
-        for place, screen, (values, alpha) in zip(places, screens, pictures, strict=True):
+        for place, screen, (values, alpha) in zip(places, screens, images, strict=True):
             seen = screen_radii(screen, len(inputs.means))
             drawn[place] = (values[..., :3], values[..., 3], alpha, values[..., 4:], *seen)
     return [drawn[place] for place in range(len(views))]
@@ -102,7 +102,7 @@ def _rasterised(
     if len(values) == 0:  # gsplat expects at least one
         nothing = sum(tensor.sum() for tensor in (values, conics, opacity, centre_px))
         blank = nothing + values.new_zeros((len(screens), *size, values.shape[1]))
-        return [(picture, picture[..., 0]) for picture in blank]
+        return [(image, image[..., 0]) for image in blank]
     if not packed:
         centre_px, conics, values, opacity = (
             tensor[None] for tensor in (centre_px, conics, values, opacity)
@@ -112,7 +112,7 @@ def _rasterised(
     if screen_gradients_out is not None and is_watched:
         _report_screen_gradient(centre_px, screens, places, screen_gradients_out)
     tile_first, gaussian = _tile_lists(gsplat, screens, centre_px.detach(), view, packed=packed)
-    pictures, alpha = gsplat.rasterize_to_pixels(
+    images, alpha = gsplat.rasterize_to_pixels(
         centre_px,
         conics,
         values,
@@ -125,7 +125,7 @@ def _rasterised(
         packed=packed,
         absgrad=is_watched,
     )
-    return list(zip(pictures, alpha[..., 0], strict=True))
+    return list(zip(images, alpha[..., 0], strict=True))
 
 
 def import_gsplat() -> ModuleType:

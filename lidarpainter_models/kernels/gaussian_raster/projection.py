@@ -30,7 +30,7 @@ RECORD_FLOATS = 16
 """A Gaussian's screen record fills one 64-byte cache line."""
 
 # Columns of a record. Centres are split into a whole and a fraction, so that float32 places them
-# to 1e-7 px at any picture size.
+# to 1e-7 px at any image size.
 MEAN_X, MEAN_X_FRACTION, MEAN_Y, MEAN_Y_FRACTION = 0, 1, 2, 3
 ACROSS, SHEAR, ALONG, LOG_OPACITY = 4, 5, 6, 7
 RED, GREEN, BLUE, DEPTH = 8, 9, 10, 11
@@ -240,7 +240,7 @@ def _write_place(
     view: View,
     record: np.ndarray,
 ) -> bool:
-    """Write where a Gaussian lies and how far it reaches; return whether that is in the picture."""
+    """Write where a Gaussian lies and how far it reaches; return whether that is in the image."""
     x, y, z = footprint.point
     x = view.fx * x * footprint.inverse_z + view.cx
     y = view.fy * y * footprint.inverse_z + view.cy

@@ -24,7 +24,7 @@ from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
 )
 from lidarpainter_models.kernels.gaussian_raster.reference_harmonics import harmonic_basis
 from lidarpainter_models.kernels.gaussian_raster.splat_inputs import (
-    DrawnPictures,
+    DrawnImages,
     SplatInputs,
     SplatView,
 )
@@ -47,8 +47,8 @@ class ScreenGaussians:
 
 def draw_views(
     inputs: SplatInputs, views: Sequence[SplatView], screen_gradients_out: Tensor | None
-) -> list[DrawnPictures]:
-    """Pictures as `SplatImage` lists them: rgb, depth, alpha, features, visible, radius."""
+) -> list[DrawnImages]:
+    """Images as `SplatImage` lists them: rgb, depth, alpha, features, visible, radius."""
     return [
         draw_view(
             inputs,
@@ -62,8 +62,8 @@ def draw_views(
 
 def draw_view(
     inputs: SplatInputs, place: int, view: SplatView, screen_gradient_out: Tensor | None
-) -> DrawnPictures:
-    """The pictures of one view, whose transforms and offsets lie at a place of the inputs."""
+) -> DrawnImages:
+    """The images of one view, whose transforms and offsets lie at a place of the inputs."""
     screen = project_gaussians(inputs, place, view)
     watch = None
     if screen_gradient_out is not None:
@@ -74,11 +74,11 @@ def draw_view(
             _draw_tile(screen, left, top, view, watch) for left in range(0, view.width_px, TILE_PX)
         ]
         rows.append(torch.cat(tiles, dim=1))
-    picture = torch.cat(rows, dim=0)
-    if watch is not None and picture.requires_grad:
-        picture.register_hook(watch.restart)
+    image = torch.cat(rows, dim=0)
+    if watch is not None and image.requires_grad:
+        image.register_hook(watch.restart)
     visible, radius_px = screen_radii(screen, len(inputs.means))
-    alpha, values = picture[..., 0], picture[..., 1:]
+    alpha, values = image[..., 0], image[..., 1:]
     return values[..., :3], values[..., 3], alpha, values[..., 4:], visible, radius_px
 
 
@@ -150,7 +150,7 @@ def _screen_covariance(
     rotation: Float[Tensor, "visible 3 3"],
     view: SplatView,
 ) -> Float[Tensor, "visible 2 2"]:
-    """J W S W^T J^T before blurring; J is taken at a tangent not far outside the picture."""
+    """J W S W^T J^T before blurring; J is taken at a tangent not far outside the image."""
     axes = rotation @ _rotation_matrices(inputs.rotation_wxyz[kept]) * inputs.scale_m[kept, None]
     z = point[:, 2]
     margin_x = TANGENT_MARGIN * 0.5 * view.width_px / view.fx_px
@@ -219,7 +219,7 @@ class ScreenGradientWatch:
         self._sums = out.new_zeros((len(index), 2))
 
     def restart(self, gradient: Tensor) -> None:
-        """Forget the last pass; called with the picture's gradient before any other."""
+        """Forget the last pass; called with the image's gradient before any other."""
         del gradient
         self._sums.zero_()
         self._out.zero_()

@@ -9,7 +9,7 @@ from torch import Tensor
 from lidarpainter_models.errors import ConfigError, ShapeError
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import BLUR_PX2, NEAR_M
 
-DrawnPictures = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+DrawnImages = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 """What a backend returns: rgb, depth, alpha, features, visible and radius, as in `SplatImage`."""
 
 SH_COEFFICIENTS = (1, 4, 9, 16)
@@ -18,7 +18,7 @@ SH_COEFFICIENTS = (1, 4, 9, 16)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SplatInputs:
-    """The tensors of some pictures; `render_views` says what each means and its shape.
+    """The tensors of some images; `render_views` says what each means and its shape.
 
     Raises:
         ShapeError: sizes or kinds of numbers do not belong together.
@@ -82,7 +82,7 @@ def _check_tensor(name: str, value: Tensor, shape: tuple[int, ...], means: Tenso
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SplatView:
-    """The pinhole camera of one picture and how it is drawn.
+    """The pinhole camera of one image and how it is drawn.
 
     Raises:
         ConfigError: a value cannot be drawn with.

@@ -1,7 +1,7 @@
-"""Blend the points that lie on a visible surface into a picture: the second pass of splatting.
+"""Blend the points that lie on a visible surface into an image: the second pass of splatting.
 
 A first pass finds the surface each pixel sees; this pass averages every point whose disc covers
-the pixel and whose depth agrees with that surface, so dense points give a smooth picture and no
+the pixel and whose depth agrees with that surface, so dense points give a smooth image and no
 point of another surface leaks in (surface splatting, Zwicker et al. 2001).
 """
 

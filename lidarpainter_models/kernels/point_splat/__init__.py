@@ -25,17 +25,17 @@ def splat_points(
     """Index (int64) of the nearest point in each pixel, or -1; ties go to the lower index.
 
     Args:
-        pixels_uv: Column and row of each point's pixel. A point outside the picture still covers
+        pixels_uv: Column and row of each point's pixel. A point outside the image still covers
             what its disc reaches of it.
         depth_m: Camera z. Points at or behind the camera (<= 0) and at no finite depth are skipped.
-        height_px: Rows of the picture.
-        width_px: Columns of the picture.
+        height_px: Rows of the image.
+        width_px: Columns of the image.
         radius_px: Radius of the discs, one for all or one per point, >= 0.
         backend: `auto` takes numba on the CPU and the torch reference on any other device; all
             keep the same points.
 
     Raises:
-        ShapeError: the points do not fit together, or a radius or the picture size is negative.
+        ShapeError: the points do not fit together, or a radius or the image size is negative.
         BackendError: the numba version was asked for and the points are not on the CPU.
     """
     points = depth_m.shape[0]
@@ -45,7 +45,7 @@ def splat_points(
             f"{tuple(depth_m.shape)}"
         )
     if min(height_px, width_px) < 0:
-        raise ShapeError(f"need a picture size >= 0, got {width_px} x {height_px} px")
+        raise ShapeError(f"need an image size >= 0, got {width_px} x {height_px} px")
     on_cpu = depth_m.device.type == "cpu"
     if backend == "cpu" and not on_cpu:
         raise BackendError(f"the numba point splatter runs on the CPU, got {depth_m.device}")

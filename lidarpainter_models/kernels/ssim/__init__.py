@@ -1,7 +1,7 @@
-"""Structural similarity (SSIM) of two pictures, and the picture loss of the fit.
+"""Structural similarity (SSIM) of two images, and the image loss of the fit.
 
-The window is 11 x 11, Gaussian, sigma 1.5 px, with zeros outside the picture; the dynamic range is
-1 (pictures in [0, 1]). This is the SSIM of Wang et al. (2004) on each colour channel.
+The window is 11 x 11, Gaussian, sigma 1.5 px, with zeros outside the image; the dynamic range is
+1 (images in [0, 1]). This is the SSIM of Wang et al. (2004) on each colour channel.
 """
 
 import torch
@@ -20,14 +20,14 @@ def ssim_map(
 ) -> Float[Tensor, "height width 3"]:
     """SSIM around every pixel for each channel, in [-1, 1].
 
-    Differentiable in the first picture; the second is taken as constant. `auto` takes numba for
+    Differentiable in the first image; the second is taken as constant. `auto` takes numba for
     float32 on the CPU and the torch reference for anything else (float64, a GPU).
 
     Raises:
-        ShapeError: the pictures differ in shape, or are not (height, width, 3).
-        BackendError: the numba version was asked for and the pictures are not float32 on the CPU.
+        ShapeError: the images differ in shape, or are not (height, width, 3).
+        BackendError: the numba version was asked for and the images are not float32 on the CPU.
     """
-    _check_pictures(first_rgb, second_rgb)
+    _check_images(first_rgb, second_rgb)
     chosen = _choose(first_rgb, backend)
     return implementation("ssim", "ssim_map", chosen, first_rgb.device)(
         first_rgb, second_rgb.detach()
@@ -40,7 +40,7 @@ def ssim(
     *,
     backend: Backend = "auto",
 ) -> Float[Tensor, ""]:
-    """Mean of `ssim_map` over pixels and channels; 1 for equal pictures."""
+    """Mean of `ssim_map` over pixels and channels; 1 for equal images."""
     return ssim_map(first_rgb, second_rgb, backend=backend).mean()
 
 
@@ -52,29 +52,29 @@ def l1_ssim_loss(
     pixel_weight: Float[Tensor, "height width"] | None = None,
     backend: Backend = "auto",
 ) -> Float[Tensor, ""]:
-    """Picture loss L1 + ssim_weight (1 - SSIM), weighted by pixel; gradient to `rendered` only.
+    """Image loss L1 + ssim_weight (1 - SSIM), weighted by pixel; gradient to `rendered` only.
 
     With w the pixel weights (1 where none are given; >= 0, usually a confidence in [0, 1]), x the
-    rendered picture and y the target,
+    rendered image and y the target,
 
         loss = 1 / (3 height width) * sum over pixels p and channels c of
                w_p ( |x'_pc - y_pc| + ssim_weight (1 - SSIM(x', y)_pc) ),
         x' = x where w > 0, y where w = 0.
 
-    The sum is divided by the number of pixels, not by the sum of the weights: a picture trusted by
+    The sum is divided by the number of pixels, not by the sum of the weights: an image trusted by
     half counts half, and one trusted nowhere gives 0. A pixel of weight 0 has no influence through
     x, not even inside the windows of its neighbours, and receives no gradient.
 
     Raises:
-        ShapeError: pictures or weights do not fit together.
-        BackendError: the numba version was asked for and the pictures are not float32 on the CPU.
+        ShapeError: images or weights do not fit together.
+        BackendError: the numba version was asked for and the images are not float32 on the CPU.
     """
-    _check_pictures(rendered, target)
+    _check_images(rendered, target)
     if pixel_weight is None:
         pixel_weight = torch.ones_like(rendered[..., 0])
     if pixel_weight.shape != rendered.shape[:2]:
         raise ShapeError(
-            f"need one weight per pixel, got {tuple(pixel_weight.shape)} for a picture of "
+            f"need one weight per pixel, got {tuple(pixel_weight.shape)} for an image of "
             f"{tuple(rendered.shape)}"
         )
     chosen = _choose(rendered, backend)
@@ -84,22 +84,22 @@ def l1_ssim_loss(
     )
 
 
-def _check_pictures(first: Tensor, second: Tensor) -> None:
+def _check_images(first: Tensor, second: Tensor) -> None:
     if first.shape != second.shape or first.ndim != 3 or first.shape[-1] != 3:
         raise ShapeError(
-            f"need two pictures (height, width, 3) of one size, got {tuple(first.shape)} and "
+            f"need two images (height, width, 3) of one size, got {tuple(first.shape)} and "
             f"{tuple(second.shape)}"
         )
     if first.dtype != second.dtype:
-        raise ShapeError(f"need pictures of one dtype, got {first.dtype} and {second.dtype}")
+        raise ShapeError(f"need images of one dtype, got {first.dtype} and {second.dtype}")
 
 
-def _choose(picture: Tensor, backend: Backend) -> Backend:
-    is_fast = picture.dtype == torch.float32 and picture.device.type == "cpu"
+def _choose(image: Tensor, backend: Backend) -> Backend:
+    is_fast = image.dtype == torch.float32 and image.device.type == "cpu"
     if backend == "auto":
         return "cpu" if is_fast else "reference"
     if backend == "cpu" and not is_fast:
         raise BackendError(
-            f"the numba SSIM takes float32 on the CPU, got {picture.dtype} on {picture.device}"
+            f"the numba SSIM takes float32 on the CPU, got {image.dtype} on {image.device}"
         )
     return backend

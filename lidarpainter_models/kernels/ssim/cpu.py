@@ -6,8 +6,8 @@ the squares DD, SS, the definition of Wang et al. (2004) becomes
     SSIM = (1 - D^2 / (M + c1)) (1 - (DD - D^2) / (V + c2)),
     M = ((S + 1)^2 + D^2) / 2,  V = (SS - S^2 + DD - D^2) / 2,
 
-which needs four blurs instead of five and keeps its digits where the two pictures agree (the 1
-keeps s small, so that SS - S^2 cancels less; outside the picture s is -1). The gradient needs
+which needs four blurs instead of five and keeps its digits where the two images agree (the 1
+keeps s small, so that SS - S^2 cancels less; outside the image s is -1). The gradient needs
 three more blurs: those of dSSIM/dD + dSSIM/dS, dSSIM/dDD and dSSIM/dSS. Every output row is
 computed by one thread in one order, so the number of threads changes no bit.
 """
@@ -32,13 +32,13 @@ PAD = RADIUS * CHANNELS
 W0, W1, W2, W3, W4, W5 = (np.float32(w) for w in window_weights()[RADIUS:])
 C1, C2 = np.float32(LUMINANCE_CONSTANT), np.float32(CONTRAST_CONSTANT)
 ZERO, HALF, ONE, TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
-# d, s and their squares where both pictures are zero
+# d, s and their squares where both images are zero
 OUTSIDE = np.array([0, -1, 0, 1], dtype=np.float32)
 _CONTRACT = {"contract"}  # fused multiply-add; sums keep their order
 
 
 def ssim_map(first_rgb: Tensor, second_rgb: Tensor) -> Tensor:
-    """SSIM around every pixel; differentiable in the first picture."""
+    """SSIM around every pixel; differentiable in the first image."""
     return _SsimMap.apply(first_rgb, second_rgb)
 
 
@@ -60,7 +60,7 @@ class _SsimMap(torch.autograd.Function):
     @staticmethod
     def backward(ctx: BackwardCFunction, *grad_outputs: Tensor) -> tuple[Tensor, None]:
         (gradient,) = grad_outputs
-        first, second = (_rows(picture) for picture in ctx.saved_tensors)
+        first, second = (_rows(image) for image in ctx.saved_tensors)
         _, partials = _partial_rows(_blurred_along_rows(first, second), _rows(gradient))
         gradient_first = _gradient_rows(first, second, partials)
         return torch.from_numpy(gradient_first).view(gradient.shape), None
@@ -96,9 +96,9 @@ class _L1SsimLoss(torch.autograd.Function):
         return gradient_of_unit * grad_outputs[0], None, None, None
 
 
-def _rows(picture: Tensor) -> np.ndarray:
-    """A picture (height, width, 3) as rows of interleaved channels; (height, width) as it is."""
-    return picture.detach().contiguous().flatten(1).numpy()
+def _rows(image: Tensor) -> np.ndarray:
+    """An image (height, width, 3) as rows of interleaved channels; (height, width) as it is."""
+    return image.detach().contiguous().flatten(1).numpy()
 
 
 @numba.njit(cache=True, parallel=True, fastmath=_CONTRACT)

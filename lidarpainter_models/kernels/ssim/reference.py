@@ -1,7 +1,7 @@
 """Structural similarity in plain torch: the law for the fast version, on any device and dtype.
 
 Wang, Bovik, Sheikh and Simoncelli, "Image quality assessment: from error visibility to structural
-similarity" (2004), with the 11 x 11 Gaussian window of that paper and zeros outside the picture.
+similarity" (2004), with the 11 x 11 Gaussian window of that paper and zeros outside the image.
 Gradients come from autograd.
 """
 
@@ -57,7 +57,7 @@ def l1_ssim_loss(
 
 
 def _blurred(channels: Float[Tensor, "3 height width"]) -> Float[Tensor, "3 height width"]:
-    """The windowed mean around every pixel, with zeros outside the picture."""
+    """The windowed mean around every pixel, with zeros outside the image."""
     weights = torch.tensor(window_weights(), dtype=channels.dtype, device=channels.device)
     rows = weights.view(1, 1, 1, -1)
     blurred = torch.nn.functional.conv2d(channels[:, None], rows, padding=(0, WINDOW_RADIUS_PX))

@@ -1,7 +1,7 @@
 """Variants of the small painter that are trained alike to see what each part of it is worth.
 
 The first table follows the paper's ablation of input guidance row by row, worst first; its
-reference is the nearest recorded picture, not carried into the view. The other tables change one
+reference is the nearest recorded image, not carried into the view. The other tables change one
 thing about the whole painter.
 """
 

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 class PixelNorm(nn.Module):
     """Scales the channels of every pixel to a root mean square of one (Zhang and Sennrich, 2019).
 
-    It looks at one pixel alone, so a window and a whole picture are treated alike.
+    It looks at one pixel alone, so a window and a whole image are treated alike.
     """
 
     def __init__(self, width: int) -> None:

@@ -1,6 +1,6 @@
-"""The pictures that the small painter mixes, each with the pixels where it exists.
+"""The images that the small painter mixes, each with the pixels where it exists.
 
-Candidates are the render, the filled LiDAR picture, the warped training pictures, the mean of
+Candidates are the render, the filled LiDAR image, the warped training images, the mean of
 render and warps, and blurred copies that trade detail for less noise.
 """
 
@@ -17,23 +17,23 @@ from lidarpainter_models.painter.filters import blur, masked_blur
 
 PAINTING_INPUTS = frozenset({"render", "lidar", "warp"})
 KNOWN_INPUTS = PAINTING_INPUTS | {"reference"}
-"""The nearest recorded picture, not carried into the view, serves comparisons alone."""
+"""The nearest recorded image, not carried into the view, serves comparisons alone."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Candidates:
-    """Pictures to choose from in every pixel; `base` is the one that needs no learning."""
+    """Images to choose from in every pixel; `base` is the one that needs no learning."""
 
     names: tuple[str, ...]
-    pictures: tuple[Float[Tensor, "batch 3 height width"], ...]
+    images: tuple[Float[Tensor, "batch 3 height width"], ...]
     exists: dict[str, Float[Tensor, "batch height width"]]
     """1 where a candidate may be chosen; those not named, as the base, exist everywhere."""
     base: str
 
     @property
-    def base_picture(self) -> Float[Tensor, "batch 3 height width"]:
+    def base_image(self) -> Float[Tensor, "batch 3 height width"]:
         """The candidate that an untrained painter gives back."""
-        return self.pictures[self.names.index(self.base)]
+        return self.images[self.names.index(self.base)]
 
     def allowed(
         self, logits: Float[Tensor, "batch candidates height width"]
@@ -47,10 +47,10 @@ class Candidates:
     def mixed(
         self, weights: Float[Tensor, "batch candidates height width"]
     ) -> Float[Tensor, "batch 3 height width"]:
-        """The pictures' mean under weights that sum to one."""
-        total = torch.zeros_like(self.pictures[0])
-        for weight, picture in zip(weights.split(1, dim=1), self.pictures, strict=True):
-            total.addcmul_(weight, picture)
+        """The images' mean under weights that sum to one."""
+        total = torch.zeros_like(self.images[0])
+        for weight, image in zip(weights.split(1, dim=1), self.images, strict=True):
+            total.addcmul_(weight, image)
         return total
 
 
@@ -97,7 +97,7 @@ def build_candidates(
     inputs: frozenset[str],
     lidar_filled: Float[Tensor, "batch 3 height width"],
 ) -> Candidates:
-    """Every candidate picture of a batch, in the order of `candidate_names`."""
+    """Every candidate image of a batch, in the order of `candidate_names`."""
     num_sources = conditions.warp.shape[1]
     made: dict[str, Tensor] = {}
     exists: dict[str, Tensor] = {}
@@ -123,19 +123,19 @@ def build_candidates(
     base = base_candidate(inputs)
     exists.pop(base, None)
     names = candidate_names(inputs, num_sources)
-    pictures = tuple(made[name] for name in names)
-    return Candidates(names=names, pictures=pictures, exists=exists, base=base)
+    images = tuple(made[name] for name in names)
+    return Candidates(names=names, images=images, exists=exists, base=base)
 
 
 def given_reference(conditions: ConditionBatch) -> Float[Tensor, "batch 3 height width"]:
-    """The nearest recorded pictures.
+    """The nearest recorded images.
 
     Raises:
         ConfigError: not all views have one.
     """
     if conditions.reference is None:
         raise ConfigError(
-            "this painter sees the nearest recorded picture, and a view has none: pairs harvested "
+            "this painter sees the nearest recorded image, and a view has none: pairs harvested "
             "before it was gathered lack it"
         )
     return conditions.reference
@@ -148,11 +148,11 @@ def with_flat_colour(
     exists: Bool[Tensor, " batch"],
 ) -> Candidates:
     """One more candidate: a colour of its own for every view, or none for views without."""
-    flat = rgb[..., None, None].expand_as(candidates.base_picture)
+    flat = rgb[..., None, None].expand_as(candidates.base_image)
     somewhere = torch.ones_like(flat[:, 0]) * exists[:, None, None]
     return Candidates(
         names=(*candidates.names, name),
-        pictures=(*candidates.pictures, flat),
+        images=(*candidates.images, flat),
         exists=candidates.exists | {name: somewhere},
         base=candidates.base,
     )

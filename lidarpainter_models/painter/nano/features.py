@@ -1,6 +1,6 @@
-"""What the fusion network is shown, as channels on the picture's own grid.
+"""What the fusion network is shown, as channels on the image's own grid.
 
-Beside the pictures themselves it sees where they disagree: a render that no warp confirms is the
+Beside the images themselves it sees where they disagree: a render that no warp confirms is the
 best single hint of damage. Depth enters as a logarithm, 0 where there is none.
 """
 
@@ -32,7 +32,7 @@ def painting_features(
     *,
     composite: bool = False,
 ) -> tuple[Float[Tensor, "batch features height width"], Float[Tensor, "batch 3 height width"]]:
-    """The network's input channels in a precision, and the filled LiDAR picture they contain.
+    """The network's input channels in a precision, and the filled LiDAR image they contain.
 
     A composite has the render where no point hits; otherwise the points themselves are spread.
     """

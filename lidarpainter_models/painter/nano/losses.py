@@ -1,6 +1,6 @@
 """What the small painter is trained to lower: its own sum of the terms of `painter.losses`.
 
-Pictures are (batch, 3, height, width); masks (batch, height, width), 1 where the target is known.
+Images are (batch, 3, height, width); masks (batch, height, width), 1 where the target is known.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ class LossWeights:
     gradient: float = 0.25
     """Edges; without it distant things come out soft."""
     expected_error: float = 0.02
-    """Laplace likelihood of the error head; small, because its picture is a side product."""
+    """Laplace likelihood of the error head; small, because its image is a side product."""
     keep: float = 0.1
     """Against changing what render and warps already agree on."""
     agreement: float = 0.03
@@ -107,13 +107,13 @@ def painting_loss(
 
 
 def harm_loss(
-    picture: Float[Tensor, "batch 3 height width"],
+    image: Float[Tensor, "batch 3 height width"],
     before: Sequence[Float[Tensor, "batch 3 height width"]],
     target: Float[Tensor, "batch 3 height width"],
     mask: Float[Tensor, "batch height width"],
 ) -> Float[Tensor, ""]:
     """Mean rise of a pixel's squared error over the least of those before; a fall counts as 0."""
-    error, *errors_before = ((each - target).square().mean(dim=1) for each in (picture, *before))
+    error, *errors_before = ((each - target).square().mean(dim=1) for each in (image, *before))
     least = torch.stack(errors_before).amin(dim=0)
     return masked_mean((error - least).clamp_min(0), mask)
 
@@ -125,7 +125,7 @@ def expected_error_loss(
 ) -> Float[Tensor, ""]:
     """Negative log likelihood of the error under a Laplace law of scale exp(log_error).
 
-    The error is taken as given, so this term never changes the picture.
+    The error is taken as given, so this term never changes the image.
     """
     error = (output.rgb.detach().clamp(0, 1) - target).abs().mean(dim=1)
     return masked_mean(error * torch.exp(-output.log_error) + output.log_error, mask)

@@ -1,7 +1,7 @@
-"""The small fusion network: chooses, per pixel, among pictures that already exist.
+"""The small fusion network: chooses, per pixel, among images that already exist.
 
 A residual U-Net (Ronneberger et al., 2015) at a quarter of the resolution gives a softmax over the
-candidate pictures of `candidates.py`, a bounded residual, and the log of the error it expects.
+candidate images of `candidates.py`, a bounded residual, and the log of the error it expects.
 Because colours come from the inputs it cannot invent much; at first it returns the base candidate
 (the mean of render and warps), so training only departs from it where that pays.
 """
@@ -34,7 +34,7 @@ from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
 CELL_PX = 4
 """Side of the pixel block that one position of the network stands for."""
 TINT = "tint"
-"""The candidate that is no picture but a flat colour, learnt for each style."""
+"""The candidate that is no image but a flat colour, learnt for each style."""
 STYLE_PACE = 10.0
 """Factor of what is learnt for each style: it has to go far while the rest of a trained network
 stays close to what it knows."""
@@ -46,12 +46,12 @@ class NanoConfig:
 
     inputs: frozenset[str] = PAINTING_INPUTS
     """What it may see and mix: `render`, `lidar`, `warp`; fewer for ablations, and `reference`, the
-    nearest recorded picture as it was taken."""
+    nearest recorded image as it was taken."""
     composite: bool = False
     """Show the render where no LiDAR point hits, in place of the points' own colours spread
     there; an ablation."""
     mix: bool = True
-    """Mix candidates by a softmax. Without it the picture itself is predicted, each colour by a
+    """Mix candidates by a softmax. Without it the image itself is predicted, each colour by a
     sigmoid; an ablation."""
     skips: bool = True
     """Add what each level saw on the way down to what comes up; off in an ablation."""
@@ -63,7 +63,7 @@ class NanoConfig:
     """Keep activations at one size. Without it a training at this learning rate can run away and
     leave a network that says the same everywhere; off in weights made before."""
     num_sources: int = 2
-    """Warped pictures it looks at; missing ones count as invalid, further ones are left out."""
+    """Warped images it looks at; missing ones count as invalid, further ones are left out."""
     residual_limit: float = 0.25
     """Largest change beyond the mix, in units of rgb: enough for a glint, too little to paint."""
     base_logit: float = 2.5
@@ -91,7 +91,7 @@ class NanoConfig:
 
     @property
     def candidates(self) -> tuple[str, ...]:
-        """The pictures it mixes, in channel order."""
+        """The images it mixes, in channel order."""
         names = candidate_names(self.inputs, self.num_sources)
         return (*names, TINT) if len(self.prompts) > 1 else names
 
@@ -146,7 +146,7 @@ class Style(NamedTuple):
 
 
 class NanoNetwork(nn.Module):
-    """The fusion network of one `NanoConfig`; deterministic, free of normalisation by picture."""
+    """The fusion network of one `NanoConfig`; deterministic, free of normalisation by image."""
 
     def __init__(self, config: NanoConfig) -> None:
         super().__init__()
@@ -201,7 +201,7 @@ class NanoNetwork(nn.Module):
         """
         halved = deepcopy(self)
         for name, module in halved.named_children():
-            if name != "style":  # its colour is a picture's
+            if name != "style":  # its colour is an image's
                 module.to(torch.bfloat16)
         return halved
 
@@ -217,7 +217,7 @@ class NanoNetwork(nn.Module):
         Args:
             conditions: the views.
             prompts: one per view.
-            half_precision: run a U-Net of float32 weights in bfloat16; the pictures stay in
+            half_precision: run a U-Net of float32 weights in bfloat16; the images stay in
                 float32.
 
         Raises:
@@ -235,15 +235,15 @@ class NanoNetwork(nn.Module):
             candidates = with_flat_colour(candidates, TINT, style.colour.sigmoid(), rows > 0)
         with torch.autocast(features.device.type, torch.bfloat16, enabled=half_precision):
             head = self._head(features, embedding, style)
-        rgb, weights = self._picture(head, candidates, style)
+        rgb, weights = self._image(head, candidates, style)
         return NanoOutput(
             rgb=rgb,
-            base=candidates.base_picture,
+            base=candidates.base_image,
             log_error=head[:, -1].clamp(-8, 1),
             weights=weights,
         )
 
-    def _picture(
+    def _image(
         self,
         head: Float[Tensor, "batch outputs height width"],
         candidates: Candidates,
@@ -275,7 +275,7 @@ class NanoNetwork(nn.Module):
         embedding: Float[Tensor, "batch channels"],
         style: Style | None,
     ) -> Float[Tensor, "batch outputs height width"]:
-        """Run the U-Net on a picture of any size, padded to whole cells by repeating the edge."""
+        """Run the U-Net on an image of any size, padded to whole cells by repeating the edge."""
         height_px, width_px = features.shape[2:]
         step_px = CELL_PX * 4
         padding = (0, -width_px % step_px, 0, -height_px % step_px)

@@ -1,7 +1,7 @@
 """The small painter as users meet it: one view in, one repaired view out.
 
 Runs on the device its network lies on. On a CPU the U-Net runs in bfloat16, about twice as fast as
-float32; pictures, mixing and confidence stay in float32.
+float32; images, mixing and confidence stay in float32.
 """
 
 from typing import Any
@@ -54,7 +54,7 @@ class NanoPainter:
                 precision, and a copy of it paints.
             provenance: where its weights come from, as stored beside them.
             half_precision: run the convolutions in bfloat16.
-            tiles: paint only tiles that need it; None paints the whole picture.
+            tiles: paint only tiles that need it; None paints the whole image.
         """
         frozen = network.eval().requires_grad_(False)
         # torch's stub lacks memory_format

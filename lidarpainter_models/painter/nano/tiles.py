@@ -1,9 +1,9 @@
 """Paint only what needs it: tiles on which everything known agrees keep the render, bit for bit.
 
-What is known of a pixel beside the render are the LiDAR colour and the warped pictures. Where they
+What is known of a pixel beside the render are the LiDAR colour and the warped images. Where they
 show what the render shows, painting has nothing to gain; where nothing is known it may gain
 something, so such pixels count as doubtful. The other tiles are painted in rectangles with a border
-around for the network to see, or, if that is less work, the whole picture at once.
+around for the network to see, or, if that is less work, the whole image at once.
 """
 
 from dataclasses import dataclass
@@ -77,7 +77,7 @@ def doubtful_tiles(
 def painted_parts(
     tiles: Bool[Tensor, "rows columns"], height_px: int, width_px: int, config: TileConfig
 ) -> list[PaintedPart]:
-    """Rectangles that hold every doubtful tile, or the whole picture where that is less work."""
+    """Rectangles that hold every doubtful tile, or the whole image where that is less work."""
     whole = Window(0, 0, height_px, width_px)
     boxes = _boxes(tiles.numpy())
     parts = []
@@ -92,7 +92,7 @@ def painted_parts(
 def grown_to_pixels(
     tiles: Bool[Tensor, "rows columns"], height_px: int, width_px: int, config: TileConfig
 ) -> Bool[Tensor, "height width"]:
-    """The tile mask on the picture's grid."""
+    """The tile mask on the image's grid."""
     side = config.side_px
     return tiles.repeat_interleave(side, 0).repeat_interleave(side, 1)[:height_px, :width_px]
 
@@ -115,7 +115,7 @@ def _boxes(tiles: np.ndarray) -> list[tuple[int, int, int, int]]:
 def _clipped(
     top: int, left: int, rows: int, columns: int, side_px: int, border_px: int, whole: Window
 ) -> Window:
-    """A box of tiles in pixels, with a border where the picture goes on."""
+    """A box of tiles in pixels, with a border where the image goes on."""
     first_row = max(0, top * side_px - border_px)
     first_column = max(0, left * side_px - border_px)
     last_row = min(whole.height_px, (top + rows) * side_px + border_px)

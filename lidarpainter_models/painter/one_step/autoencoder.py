@@ -1,6 +1,6 @@
 """The two autoencoders: Stable Diffusion's with skips from encoder to decoder, and the tiny TAESD.
 
-Pictures are (batch, 3, height, width) in [-1, 1], latents (batch, 4, height / 8, width / 8) in the
+Images are (batch, 3, height, width) in [-1, 1], latents (batch, 4, height / 8, width / 8) in the
 units of the noise schedule. Encoding takes the mode of the posterior, so nothing is random. What
 the encoder passes to the decoder is returned as values: no module keeps anything between calls.
 """
@@ -33,7 +33,7 @@ class SkipAutoencoder(nn.Module):
             skip_bias: give them a bias.
 
         Raises:
-            ConfigError: the autoencoder does not reduce pictures eightfold to four channels.
+            ConfigError: the autoencoder does not reduce images eightfold to four channels.
         """
         super().__init__()
         self.encoder: nn.Module = vae.encoder
@@ -47,11 +47,11 @@ class SkipAutoencoder(nn.Module):
         check_latents(len(vae.config.block_out_channels) - 1, vae.config.latent_channels)
 
     def encode(
-        self, pictures: Float[Tensor, "batch 3 height width"], *, num_skipped: int
+        self, images: Float[Tensor, "batch 3 height width"], *, num_skipped: int
     ) -> tuple[Float[Tensor, "batch 4 rows columns"], Skips]:
-        """Latents of all pictures, and the inputs of the encoder's levels for the first ones."""
+        """Latents of all images, and the inputs of the encoder's levels for the first ones."""
         encoder: Any = self.encoder
-        features = encoder.conv_in(pictures)
+        features = encoder.conv_in(images)
         skips: list[Tensor] = []
         for block in encoder.down_blocks:
             if num_skipped:
@@ -67,7 +67,7 @@ class SkipAutoencoder(nn.Module):
     def decode(
         self, latents: Float[Tensor, "batch 4 rows columns"], skips: Skips
     ) -> Float[Tensor, "batch 3 height width"]:
-        """Pictures of latents, not clamped."""
+        """Images of latents, not clamped."""
         features = self.post_quant_conv(latents / self.scaling_factor)
         return self.decoder(features, skips, is_checkpointed=self.is_checkpointed)
 
@@ -87,25 +87,25 @@ class TinyAutoencoder(nn.Module):
 
     def encode(
         self,
-        pictures: Float[Tensor, "batch 3 height width"],
+        images: Float[Tensor, "batch 3 height width"],
         *,
         num_skipped: int,
     ) -> tuple[Float[Tensor, "batch 4 rows columns"], Skips]:
-        """Latents of all pictures.
+        """Latents of all images.
 
         Raises:
             ConfigError: skips are asked for.
         """
         if num_skipped:
             raise ConfigError("the tiny autoencoder has no skips")
-        return self.encoder(pictures) * self.scaling_factor, ()
+        return self.encoder(images) * self.scaling_factor, ()
 
     def decode(
         self,
         latents: Float[Tensor, "batch 4 rows columns"],
         skips: Skips,  # noqa: ARG002 - the tiny decoder takes none
     ) -> Float[Tensor, "batch 3 height width"]:
-        """Pictures of latents, not clamped."""
+        """Images of latents, not clamped."""
         return self.decoder(latents / self.scaling_factor)
 
 
@@ -117,7 +117,7 @@ def check_latents(num_halvings: int, num_channels: int) -> None:
     """
     if 2**num_halvings != CELL_PX or num_channels != 4:
         raise ConfigError(
-            f"an autoencoder must reduce pictures {CELL_PX} times to 4 channels, this one reduces "
+            f"an autoencoder must reduce images {CELL_PX} times to 4 channels, this one reduces "
             f"them {2**num_halvings} times to {num_channels}"
         )
 

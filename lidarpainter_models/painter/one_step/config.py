@@ -9,8 +9,8 @@ from lidarpainter_models.painter.one_step.latent_fusion import LATENT_CHANNELS, 
 from lidarpainter_models.painter.one_step.schedule import Denoise, denoising_step
 
 INPUTS = ("render", "lidar", "warp")
-"""What can enter as a latent, in this order: the corrupted render, the LiDAR picture, and the
-recorded pictures carried into the view (the first valid one; where none is, the render, or black
+"""What can enter as a latent, in this order: the corrupted render, the LiDAR image, and the
+recorded images carried into the view (the first valid one; where none is, the render, or black
 if the render is not to be seen)."""
 NUM_MASKS = 2
 """Share of LiDAR hits and of valid warps in each latent cell."""
@@ -57,7 +57,7 @@ class OneStepConfig:
     """`pure`: black where no point hits; `over-render`: the render there; `bright-over-render`: the
     render also where LiDAR is darker than 0.2, as in the authors' program."""
     is_signed: bool = True
-    """Pictures enter in [-1, 1]; otherwise in [0, 1], as in pix2pix-turbo."""
+    """Images enter in [-1, 1]; otherwise in [0, 1], as in pix2pix-turbo."""
     unet_rank: int = 8
     """Rank of the U-Net's LoRA; 0 for none."""
     autoencoder_rank: int = 4

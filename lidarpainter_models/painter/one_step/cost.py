@@ -94,12 +94,12 @@ def count_tflop(
         raise ConfigError(f"a view needs pixels, got {width_px}x{height_px}")
     network = _shapes(config, architecture, has_adapters=False)
     rows, columns = (-(-size // STRIDE_PX) * STRIDE_PX // CELL_PX for size in (height_px, width_px))
-    pictures = torch.empty(len(config.inputs), 1, 3, rows * CELL_PX, columns * CELL_PX, device=META)
+    images = torch.empty(len(config.inputs), 1, 3, rows * CELL_PX, columns * CELL_PX, device=META)
     text = torch.empty(1, TEXT_TOKENS, architecture.text_width, device=META)
     masks = torch.empty(1, 2, rows, columns, device=META) if config.masks else None
     seen = torch.empty(1, config.first_layer_channels, rows, columns, device=META)
-    total = _tflop(lambda: network(pictures, text, masks))
-    encode = _tflop(lambda: network.autoencoder.encode(pictures.flatten(0, 1), num_skipped=0))
+    total = _tflop(lambda: network(images, text, masks))
+    encode = _tflop(lambda: network.autoencoder.encode(images.flatten(0, 1), num_skipped=0))
     denoise = _tflop(lambda: network.denoiser(seen, text))
     return {
         "encode": encode,

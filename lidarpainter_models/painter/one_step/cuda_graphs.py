@@ -1,7 +1,7 @@
 """The network replayed as a CUDA graph: one launch in place of about a thousand.
 
 With the tiny autoencoder a fast GPU waits for launches rather than for arithmetic. A graph holds
-for one shape of picture, so one is captured per shape. On other devices the network simply runs.
+for one shape of image, so one is captured per shape. On other devices the network simply runs.
 """
 
 import torch
@@ -25,17 +25,17 @@ class GraphedNetwork:
 
     def __call__(
         self,
-        pictures: Float[Tensor, "inputs batch 3 height width"],
+        images: Float[Tensor, "inputs batch 3 height width"],
         text: Float[Tensor, "batch tokens features"],
         masks: Float[Tensor, "batch masks rows columns"] | None = None,
     ) -> Float[Tensor, "batch 3 height width"]:
-        """The repaired pictures, not clamped."""
-        if pictures.device.type != "cuda":
-            return self._network(pictures, text, masks).rgb
-        shapes = tuple(tuple(one.shape) for one in (pictures, text, masks) if one is not None)
+        """The repaired images, not clamped."""
+        if images.device.type != "cuda":
+            return self._network(images, text, masks).rgb
+        shapes = tuple(tuple(one.shape) for one in (images, text, masks) if one is not None)
         if shapes not in self._graphs:
-            self._graphs[shapes] = _Captured(self._network, (pictures, text, masks))
-        return self._graphs[shapes].replay((pictures, text, masks))
+            self._graphs[shapes] = _Captured(self._network, (images, text, masks))
+        return self._graphs[shapes].replay((images, text, masks))
 
 
 class _Captured:

@@ -80,10 +80,10 @@ class LatentFusion(nn.Module):
 
 def mix(
     weights: Float[Tensor, "inputs batch weights height width"],
-    pictures: Float[Tensor, "inputs batch channels height width"],
+    images: Float[Tensor, "inputs batch channels height width"],
 ) -> Float[Tensor, "batch channels height width"]:
     """The weighted sum over the inputs."""
-    return (weights * pictures).sum(dim=0)
+    return (weights * images).sum(dim=0)
 
 
 def without_autocast(device: torch.device) -> AbstractContextManager[Any]:

@@ -55,7 +55,7 @@ class OneStepNetwork(nn.Module):
 
     def forward(
         self,
-        pictures: Float[Tensor, "inputs batch 3 height width"],
+        images: Float[Tensor, "inputs batch 3 height width"],
         text: Float[Tensor, "batch tokens features"],
         masks: Float[Tensor, "batch masks rows columns"] | None = None,
         *,
@@ -64,14 +64,14 @@ class OneStepNetwork(nn.Module):
         """Repair every view.
 
         Args:
-            pictures: the inputs in the configured order, rgb in [0, 1]; height and width are
+            images: the inputs in the configured order, rgb in [0, 1]; height and width are
                 multiples of 64.
             text: the encoded prompt of every view.
             masks: shares of hits per latent position, if the configuration has them.
             encodes_at_once: all inputs in one batch; otherwise one after the other, which needs
                 less memory and more time.
         """
-        latents, skips = self._encode(pictures, encodes_at_once=encodes_at_once)
+        latents, skips = self._encode(images, encodes_at_once=encodes_at_once)
         weights = self._weights(latents)
         fused = mix(weights, latents.float())
         seen = fused if self.config.denoiser_sees == "fused" else _side_by_side(latents)
@@ -85,11 +85,11 @@ class OneStepNetwork(nn.Module):
         return OneStepOutput(rgb=0.5 * decoded.float() + 0.5, latent=clean, weights=weights)
 
     def _encode(
-        self, pictures: Float[Tensor, "inputs batch 3 height width"], *, encodes_at_once: bool
+        self, images: Float[Tensor, "inputs batch 3 height width"], *, encodes_at_once: bool
     ) -> tuple[Float[Tensor, "inputs batch 4 rows columns"], Skips]:
         """Latents of all inputs; skips of the first input, or of one input after the other."""
         dtype = next(self.autoencoder.parameters()).dtype
-        flat = (2 * pictures - 1 if self.config.is_signed else pictures).to(dtype)
+        flat = (2 * images - 1 if self.config.is_signed else images).to(dtype)
         num_skipped = {"none": 0, "render": 1, "fused": len(flat)}[self.config.skips]
         if encodes_at_once:
             batch = flat.shape[1]

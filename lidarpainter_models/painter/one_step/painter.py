@@ -20,9 +20,9 @@ from lidarpainter_models.painter.one_step.prompts import PromptBook
 from lidarpainter_models.painter.protocol import Painting, PaintingConditions
 
 STRIDE_PX = 64
-"""Autoencoder and U-Net halve a picture six times."""
+"""Autoencoder and U-Net halve an image six times."""
 NUM_WARPS = 2
-"""Warped pictures that are looked at, best first."""
+"""Warped images that are looked at, best first."""
 BRIGHT = 0.2
 """A LiDAR pixel darker than this in every colour counts as empty in the authors' program."""
 
@@ -55,7 +55,7 @@ class OneStepPainter:
         self._graphed = GraphedNetwork(self.network)
 
     def to(self, device: torch.device) -> "OneStepPainter":
-        """Move the network; on CUDA it is then replayed as a graph for each size of picture."""
+        """Move the network; on CUDA it is then replayed as a graph for each size of image."""
         self.network.to(device)
         self._graphed = GraphedNetwork(self.network)
         return self
@@ -71,8 +71,8 @@ class OneStepPainter:
         home = conditions.render_rgb.device
         text = self.prompts.encode(conditions.prompt).to(device)[None]
         batch = stack_conditions([conditions], num_sources=NUM_WARPS).to(device)
-        pictures, masks = painter_inputs(batch, self.network.config)
-        rgb = self._graphed(pictures, text, masks)
+        images, masks = painter_inputs(batch, self.network.config)
+        rgb = self._graphed(images, text, masks)
         height_px, width_px = conditions.height_width_px
         rgb = rgb[..., :height_px, :width_px].clamp(0, 1)
         confidence = support(batch, rgb)[0]
@@ -87,18 +87,18 @@ def painter_inputs(
     Float[Tensor, "inputs batch 3 padded_height padded_width"],
     Float[Tensor, "batch masks rows columns"] | None,
 ]:
-    """The pictures and masks that a network of this configuration sees, padded."""
+    """The images and masks that a network of this configuration sees, padded."""
     found = {
         "render": batch.render,
-        "lidar": _lidar_picture(batch, config),
+        "lidar": _lidar_image(batch, config),
         "warp": _first_valid_warp(batch, batch.render if "render" in config.inputs else None),
     }
-    pictures = torch.stack([_padded(found[name]) for name in config.inputs])
+    images = torch.stack([_padded(found[name]) for name in config.inputs])
     if not config.masks:
-        return pictures, None
+        return images, None
     any_warp = batch.warp_valid.amax(dim=1, keepdim=True)
     shares = torch.cat([batch.lidar_hit, any_warp], dim=1)
-    return pictures, F.avg_pool2d(_padded(shares), CELL_PX)
+    return images, F.avg_pool2d(_padded(shares), CELL_PX)
 
 
 def support(
@@ -116,7 +116,7 @@ def _agreement(
     return torch.exp(-(rgb - other).abs().mean(dim=1) / DISAGREEMENT_SCALE)
 
 
-def _lidar_picture(
+def _lidar_image(
     batch: ConditionBatch, config: OneStepConfig
 ) -> Float[Tensor, "batch 3 height width"]:
     if config.lidar == "pure":
@@ -130,18 +130,18 @@ def _lidar_picture(
 def _first_valid_warp(
     batch: ConditionBatch, elsewhere: Float[Tensor, "batch 3 height width"] | None
 ) -> Float[Tensor, "batch 3 height width"]:
-    """The best recorded picture that is valid in each pixel; black by default where none is."""
-    picture = torch.zeros_like(batch.render) if elsewhere is None else elsewhere
+    """The best recorded image that is valid in each pixel; black by default where none is."""
+    image = torch.zeros_like(batch.render) if elsewhere is None else elsewhere
     for source in reversed(range(batch.warp.shape[1])):
         is_valid = batch.warp_valid[:, source, None] > 0
-        picture = torch.where(is_valid, batch.warp[:, source], picture)
-    return picture
+        image = torch.where(is_valid, batch.warp[:, source], image)
+    return image
 
 
 def _padded(
-    picture: Float[Tensor, "batch channels height width"],
+    image: Float[Tensor, "batch channels height width"],
 ) -> Float[Tensor, "batch channels padded_height padded_width"]:
     """Repeat the lower and right edge up to multiples of the stride."""
-    height_px, width_px = picture.shape[2:]
+    height_px, width_px = image.shape[2:]
     margins = (0, -width_px % STRIDE_PX, 0, -height_px % STRIDE_PX)
-    return F.pad(picture, margins, mode="replicate")
+    return F.pad(image, margins, mode="replicate")

@@ -1,7 +1,7 @@
 """Named wirings of the one-step painter.
 
 `paper` is what the paper says, `as-shipped` what its authors' program does (they differ in time,
-fusion, first layer, LiDAR picture and ranges), `fast` our own trade.
+fusion, first layer, LiDAR image and ranges), `fast` our own trade.
 """
 
 from collections.abc import Callable, Mapping
@@ -35,7 +35,7 @@ def fast() -> OneStepConfig:
 
 
 def with_reference() -> OneStepConfig:
-    """Ours: the warped recorded pictures as a third latent, three-way fusion, fused skips."""
+    """Ours: the warped recorded images as a third latent, three-way fusion, fused skips."""
     return OneStepConfig(inputs=("render", "lidar", "warp"), timestep=199, skips="fused")
 
 

@@ -19,9 +19,9 @@ from lidarpainter_models.painter.one_step.packages import diffusion_package
 STYLE_TEXTS = MappingProxyType(
     {
         "clear": "picture of urban street scene",
-        "foggy": "picture of urban street scene in dense fog",
-        "night": "picture of urban street scene at night, street lamps and headlights on",
-        "rain": "picture of urban street scene in the rain, wet road with reflections",
+        "foggy": "image of urban street scene in dense fog",
+        "night": "image of urban street scene at night, street lamps and headlights on",
+        "rain": "image of urban street scene in the rain, wet road with reflections",
     }
 )
 """What a style is called to the text encoder (the first is the authors' own prompt). Any other

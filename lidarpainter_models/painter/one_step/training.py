@@ -26,7 +26,7 @@ from lidarpainter_models.painter.examples import PairSource
 from lidarpainter_models.painter.losses import (
     BatchDistance,
     PaperLossWeights,
-    known_picture,
+    known_image,
     paper_loss,
 )
 from lidarpainter_models.painter.one_step.assembly import trained_in_float32
@@ -91,7 +91,7 @@ class Judges:
 
     lpips: BatchDistance | None = None
     features: FrozenFeatures | None = None
-    """For a discriminator on features; without, it looks at patches of the picture."""
+    """For a discriminator on features; without, it looks at patches of the image."""
 
     def check(self, weights: PaperLossWeights) -> None:
         """Refuse a loss that needs a network which is not there.
@@ -147,11 +147,11 @@ class OneStepTrainee:
 
         `gradient_penalty` counts for the steps that have none, so its mean is right.
         """
-        picture = self._painted(batch)
+        image = self._painted(batch)
         if self.opponent is not None:
             self.opponent.requires_grad_(False)
         terms = paper_loss(
-            picture,
+            image,
             batch.target,
             batch.target_valid,
             self.config.loss,
@@ -162,7 +162,7 @@ class OneStepTrainee:
         if self.opponent is None:
             return terms.to_dict()
         self.opponent.requires_grad_(True)
-        seen = known_picture(picture.detach(), batch.target, batch.target_valid)
+        seen = known_image(image.detach(), batch.target, batch.target_valid)
         every = self.config.penalty_every_steps
         weight = 0.0 if step % every else every * self.config.penalty_weight
         verdict = discriminator_loss(self.opponent, batch.target, seen, penalty_weight=weight)
@@ -173,12 +173,12 @@ class OneStepTrainee:
         }
 
     def _painted(self, batch: TrainingBatch) -> Float[Tensor, "batch 3 height width"]:
-        pictures, masks = painter_inputs(batch.conditions, self.config.network)
+        images, masks = painter_inputs(batch.conditions, self.config.network)
         text = torch.stack([self.texts[prompt] for prompt in batch.prompts])
         with torch.autocast(
             self.device.type, dtype=torch.bfloat16, enabled=self.config.half_precision
         ):
-            return self.network(pictures, text, masks).rgb
+            return self.network(images, text, masks).rgb
 
     def check(self, step: int, means: Mapping[str, float]) -> None:
         """A frozen model cannot die; that the loss is a number is checked at every step."""

@@ -1,4 +1,4 @@
-"""Doubling a picture's size and convolving it, in 16 multiplications where there were 36.
+"""Doubling an image's size and convolving it, in 16 multiplications where there were 36.
 
 Autoencoder and U-Net double their features by repeating every value and run a 3x3 convolution over
 the result. Of its nine weights several then meet the same value: an output in an even row sees two

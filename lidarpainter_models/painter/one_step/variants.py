@@ -26,7 +26,7 @@ GUIDANCE = (
     ("render", "lidar"),
     INPUTS,
 )
-"""What the painter sees; the paper's rows, with the warped picture for its reference."""
+"""What the painter sees; the paper's rows, with the warped image for its reference."""
 
 Wirings = dict[str, OneStepConfig]
 

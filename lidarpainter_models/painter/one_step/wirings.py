@@ -39,7 +39,7 @@ Paint = Callable[
 
 
 def build_wiring(wiring: Wiring, architecture: Architecture = SD_TURBO) -> Paint:
-    """A function that paints pictures in [0, 1] whose sides are multiples of 64."""
+    """A function that paints images in [0, 1] whose sides are multiples of 64."""
     if wiring == "plain":
         return _plain(architecture)
     # the tiny autoencoder has no adapters; time and fusion are those of `paper` in all three
@@ -52,10 +52,10 @@ def build_wiring(wiring: Wiring, architecture: Architecture = SD_TURBO) -> Paint
     text = _text(_text_encoder(architecture, torch.bfloat16))
 
     def paint(
-        pictures: Float[Tensor, "inputs batch 3 height width"],
+        images: Float[Tensor, "inputs batch 3 height width"],
     ) -> Float[Tensor, "batch 3 height width"]:
         with torch.inference_mode():
-            return network(pictures, text).rgb
+            return network(images, text).rgb
 
     return paint
 
@@ -70,10 +70,10 @@ def _plain(architecture: Architecture) -> Paint:
     encoder = nn.Module.to(_text_encoder(architecture, torch.float32), torch.bfloat16)
 
     def paint(
-        pictures: Float[Tensor, "inputs batch 3 height width"],
+        images: Float[Tensor, "inputs batch 3 height width"],
     ) -> Float[Tensor, "batch 3 height width"]:
         with torch.no_grad():
-            return network(pictures, _text(encoder), encodes_at_once=False).rgb
+            return network(images, _text(encoder), encodes_at_once=False).rgb
 
     return paint
 

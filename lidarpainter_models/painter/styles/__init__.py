@@ -1,4 +1,4 @@
-"""Weather and time of day for a picture whose depth is known, without another learned model."""
+"""Weather and time of day for an image whose depth is known, without another learned model."""
 
 from dataclasses import dataclass, field
 

@@ -2,7 +2,7 @@
 
 Light from a surface at distance d arrives as L t + A (1 - t), with transmittance t = exp(-beta d)
 and airlight A. The visibility V is where a black object keeps 2 % contrast against the horizon:
-beta = ln(50) / V = 3.912 / V. The airlight is that of the picture's own horizon: fog droplets are
+beta = ln(50) / V = 3.912 / V. The airlight is that of the image's own horizon: fog droplets are
 large against the wavelength and scatter all colours alike, so it is nearly grey.
 """
 
@@ -26,7 +26,7 @@ class FogConfig:
     """A bank of fog on the ground."""
 
     visibility_m: float = 120.0
-    """Where contrast has fallen to 2 %; below 1000 m it is called fog. Infinity leaves the picture
+    """Where contrast has fallen to 2 %; below 1000 m it is called fog. Infinity leaves the image
     as it is."""
     layer_m: float = 120.0
     """Height of the fog above the camera: sky at elevation e is seen through layer / sin e of it,
@@ -34,7 +34,7 @@ class FogConfig:
     greyness: float = 0.85
     """How far the airlight's colour goes from that of the sky to grey."""
     brightness: float = 0.8
-    """Airlight against the light of the horizon in the clear picture."""
+    """Airlight against the light of the horizon in the clear image."""
 
     def __post_init__(self) -> None:
         """Refuse fog that is no fog."""
@@ -103,5 +103,5 @@ def airlight(view: StyleView, *, greyness: float) -> Float[Tensor, "3"]:
 
 
 def _quantile(values: Float[Tensor, " pixels"], share: float) -> Float[Tensor, ""]:
-    """A value that so large a share does not reach; `torch.quantile` takes no large pictures."""
+    """A value that so large a share does not reach; `torch.quantile` takes no large images."""
     return values.kthvalue(max(1, round(share * len(values)))).values

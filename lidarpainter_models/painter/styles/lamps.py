@@ -1,4 +1,4 @@
-"""Lamps found in a daylight picture: what would shine at night.
+"""Lamps found in a daylight image: what would shine at night.
 
 Three kinds are looked for, each by its look in daylight and, where the camera is known, by its size
 and its height above the ground:
@@ -7,7 +7,7 @@ and its height above the ground:
 * window: dark upright rectangles in facades, of which a share drawn at random is lit;
 * street: the outer ends of upright thin structures, five to ten metres up, against the sky.
 
-Without depth or ground only signals are found. A lamp is a patch of the picture, so that light
+Without depth or ground only signals are found. A lamp is a patch of the image, so that light
 comes from where something was seen; nothing is invented elsewhere.
 """
 
@@ -49,7 +49,7 @@ FARTHEST_M = 140.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lamp:
-    """A patch of the picture that shines."""
+    """A patch of the image that shines."""
 
     kind: LampKind
     top_px: int
@@ -75,7 +75,7 @@ class Place:
     """What lamps are looked for in."""
 
     light: Float[Tensor, "height width 3"]
-    """The daylight picture, linear."""
+    """The daylight image, linear."""
     display: Float[Tensor, "height width 3"]
     distance_m: Float[Tensor, "height width"]
     height_m: Float[Tensor, "height width"] | None

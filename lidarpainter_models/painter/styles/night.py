@@ -1,8 +1,8 @@
 """Night by relighting: daylight is taken out, lamps are put in.
 
-The picture's brightness relative to its sunlit surfaces stands for reflectance. It is lit anew by a
+The image's brightness relative to its sunlit surfaces stands for reflectance. It is lit anew by a
 dark blue sky, whose colour shift follows the night tonal reproduction of Jensen et al. (2000), by a
-low beam of the car that looks on, and by the lamps found in the picture (`lamps.py`), each with the
+low beam of the car that looks on, and by the lamps found in the image (`lamps.py`), each with the
 inverse square of the distance. Around lamps light scatters in lens and air: the point spread is a
 sum of Gaussians (after Spencer et al., "Physically-based glare effects", 1995). The sensor adds
 shot and read noise. Shadows of the sun stay where they are, only weaker: nothing tells reflectance
@@ -65,7 +65,7 @@ class NightConfig:
     """A clear night in a town."""
 
     strength: float = 1.0
-    """0 is day and leaves the picture as it is; between, day and night light are mixed."""
+    """0 is day and leaves the image as it is; between, day and night light are mixed."""
     ambient: float = 0.055
     """Skylight against daylight; a camera at night is exposed far longer than the eye."""
     sky_glow: float = 0.022
@@ -159,7 +159,7 @@ def _reflectance(
 
 
 def _night_sky(view: StyleView, config: NightConfig) -> Float[Tensor, "height width 3"]:
-    """Glow that fades upwards over a dark blue; without a camera the picture's rows stand in."""
+    """Glow that fades upwards over a dark blue; without a camera the image's rows stand in."""
     if view.camera is None:
         rows = torch.linspace(0.6, 0.0, len(view.rgb))[:, None]
         elevation = rows.expand(view.rgb.shape[:2])

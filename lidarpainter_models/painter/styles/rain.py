@@ -60,11 +60,11 @@ class RainConfig:
     """Steady rain by day."""
 
     strength: float = 1.0
-    """0 leaves the picture as it is; between, dry and wet light are mixed."""
+    """0 leaves the image as it is; between, dry and wet light are mixed."""
     rain_mm_per_h: float = 25.0
     """Heavy rain; veil and number of streaks follow it."""
     overcast: float = 0.62
-    """Daylight under rain clouds against that of the picture."""
+    """Daylight under rain clouds against that of the image."""
     wetness: float = 0.8
     """How far surfaces darken like wet ones; the road wholly, walls half as much."""
     puddle_share: float = 0.35

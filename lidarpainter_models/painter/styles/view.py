@@ -1,4 +1,4 @@
-"""A picture with what a style must know of the place: distance, sky, ground, and up."""
+"""An image with what a style must know of the place: distance, sky, ground, and up."""
 
 from dataclasses import dataclass
 
@@ -51,7 +51,7 @@ class StyleView:
         if camera is not None:
             sizes.add((camera.height_px, camera.width_px))
         if len(sizes) != 1:
-            raise ShapeError(f"picture, depth, sky and camera need one size, got {sorted(sizes)}")
+            raise ShapeError(f"image, depth, sky and camera need one size, got {sorted(sizes)}")
 
     @property
     def surface(self) -> Bool[Tensor, "height width"]:
@@ -68,7 +68,7 @@ def distances(view: StyleView) -> Float[Tensor, "height width"]:
     """Metres along the ray to the surface of every pixel; gaps are filled from around them.
 
     The filling is that of inverse depth, in which planes are smooth. Sky counts as infinitely far;
-    a picture without any depth is treated as nothing but sky.
+    an image without any depth is treated as nothing but sky.
     """
     known = (view.depth_m > 0) & view.surface
     inverse = torch.where(known, 1 / view.depth_m.clamp_min(1e-3), 0)

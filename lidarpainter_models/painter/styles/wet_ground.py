@@ -3,8 +3,8 @@
 Water between the grains of asphalt sends light back inside, so wet surfaces are darker and more
 strongly coloured (Lekner and Dorf, 1988). The film on top mirrors its surroundings as much as
 Fresnel's equations say of water (n = 1.33; Schlick's form, 1994). What it mirrors is found by
-following the mirrored ray through the picture's own depth (screen-space reflection), and where it
-leaves the picture or hits nothing, the overcast sky stands in.
+following the mirrored ray through the image's own depth (screen-space reflection), and where it
+leaves the image or hits nothing, the overcast sky stands in.
 """
 
 import math
@@ -82,9 +82,9 @@ def mirrored(
     """What each ground pixel mirrors, blurred along the column as by a rough film.
 
     Args:
-        light: the picture, linear.
-        sky_light: stands in where the picture does not show what is mirrored.
-        camera: of the picture, world z up.
+        light: the image, linear.
+        sky_light: stands in where the image does not show what is mirrored.
+        camera: of the image, world z up.
         points_m: metres from its centre; sky at infinity.
         on_ground: pixels to follow.
     """
@@ -107,9 +107,9 @@ def mirrored(
         hit &= inside & waiting
         found[hit] = light[row[hit], column[hit]]
         waiting &= ~hit
-    picture = torch.zeros_like(light)
-    picture[on_ground] = found
-    return _smeared(picture, on_ground, camera)
+    image = torch.zeros_like(light)
+    image[on_ground] = found
+    return _smeared(image, on_ground, camera)
 
 
 def _pixel(camera: Camera, ray: Float[Tensor, "rays 3"]) -> tuple[Tensor, Tensor, Tensor]:
@@ -123,10 +123,10 @@ def _pixel(camera: Camera, ray: Float[Tensor, "rays 3"]) -> tuple[Tensor, Tensor
 
 
 def _smeared(
-    picture: Float[Tensor, "height width 3"], known: Bool[Tensor, "height width"], camera: Camera
+    image: Float[Tensor, "height width 3"], known: Bool[Tensor, "height width"], camera: Camera
 ) -> Float[Tensor, "height width 3"]:
     sigma_px = max(FILM_ROUGHNESS_RAD * camera.fy_px, 0.5)
     weight = known.numpy().astype(np.float32)
-    blurred = cv2.GaussianBlur(picture.numpy(), (0, 0), sigma_px / 4, sigmaY=sigma_px)
+    blurred = cv2.GaussianBlur(image.numpy(), (0, 0), sigma_px / 4, sigmaY=sigma_px)
     share = cv2.GaussianBlur(weight, (0, 0), sigma_px / 4, sigmaY=sigma_px)
     return torch.from_numpy(blurred / np.maximum(share, 1e-3)[..., None])

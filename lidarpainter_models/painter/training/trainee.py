@@ -28,7 +28,7 @@ class Trainee(Protocol):
 
     @property
     def num_warps(self) -> int:
-        """Warped pictures that a sample has."""
+        """Warped images that a sample has."""
         ...
 
     @property

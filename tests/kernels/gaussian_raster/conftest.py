@@ -22,7 +22,7 @@ DIFFERENTIABLE = (
 
 @dataclass(frozen=True, kw_only=True)
 class DrawnSplats:
-    """A picture and the gradients of a fixed random loss on it, all float64."""
+    """An image and the gradients of a fixed random loss on it, all float64."""
 
     image: SplatImage
     gradients: dict[str, Tensor]
@@ -40,7 +40,7 @@ def random_splats(
     num_bodies=3,
     size_px=4.0,
 ):
-    """Keyword arguments of `render_gaussians`; some Gaussians lie outside the picture or behind."""
+    """Keyword arguments of `render_gaussians`; some Gaussians lie outside the image or behind."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape):
@@ -94,7 +94,7 @@ def _rotations(wxyz):
 
 
 def draw_and_go_back(splats, *, backend, dtype, **settings):
-    """Draw and differentiate a weighted sum of every picture; the weights are seeded."""
+    """Draw and differentiate a weighted sum of every image; the weights are seeded."""
     splats = dict(splats)
     for name in DIFFERENTIABLE:
         splats[name] = splats[name].to(dtype, copy=True).requires_grad_()
@@ -102,9 +102,9 @@ def draw_and_go_back(splats, *, backend, dtype, **settings):
     image = render_gaussians(**splats, **settings, backend=backend, screen_gradient_out=absolute)
     generator = torch.Generator().manual_seed(99)
     loss = image.rgb.new_zeros(())
-    for picture in (image.rgb, 0.05 * image.depth_m, image.alpha, image.features):
-        weight = torch.randn(picture.shape, generator=generator, dtype=torch.float64)
-        loss = loss + (picture * weight.to(picture)).sum()
+    for channels in (image.rgb, 0.05 * image.depth_m, image.alpha, image.features):
+        weight = torch.randn(channels.shape, generator=generator, dtype=torch.float64)
+        loss = loss + (channels * weight.to(channels)).sum()
     loss.backward()
     gradients = {name: splats[name].grad.double() for name in DIFFERENTIABLE}
     return DrawnSplats(image=image, gradients=gradients, absolute_gradient=absolute.double())

@@ -1,6 +1,6 @@
 """A thousand scenes nobody would draw: the numba backend agrees with float64 autograd or is zero.
 
-Small pictures and few Gaussians, each of an extreme kind, so that a thousand of them take seconds.
+Small images and few Gaussians, each of an extreme kind, so that a thousand of them take seconds.
 A pixel that sits on a threshold (the alpha cut, the stop, the clamp, two Gaussians at one depth)
 may fall on either side in float32: what such a flip can move is granted, and nothing more.
 """
@@ -17,7 +17,7 @@ KINDS = ("plain", "needle", "huge", "behind", "near plane", "clear", "solid", "t
 LEARNED = ("means", "rotation_wxyz", "scale_m", "opacity", "sh")
 NEAR_M = 0.1
 # float32 against float64; needles turn by float32 rounding times their length
-PICTURE_ERROR = 2e-5
+IMAGE_ERROR = 2e-5
 GRADIENT_ERROR = 2e-3
 MOST_FLIPS = 3
 """Scenes of the thousand that may hold a pixel on a threshold; none was seen to."""
@@ -68,7 +68,7 @@ def scene_of(kinds, seed, size_px, antialias):
 
 
 def drawn(scene, backend, dtype):
-    """Pictures and gradients of a fixed loss, as float64."""
+    """Images and gradients of a fixed loss, as float64."""
     scene = dict(scene)
     for name in (*LEARNED, "camera_from_body"):
         scene[name] = scene[name].to(dtype, copy=True).requires_grad_()
@@ -88,8 +88,8 @@ def drawn(scene, backend, dtype):
 def disagreement(scene):
     """Why the numba backend is wrong about a scene; None where it is right."""
     image, gradients = drawn(scene, "cpu", torch.float32)
-    pictures = {name: getattr(image, name).detach() for name in ("rgb", "depth_m", "alpha")}
-    for name, value in (pictures | gradients).items():
+    images = {name: getattr(image, name).detach() for name in ("rgb", "depth_m", "alpha")}
+    for name, value in (images | gradients).items():
         assert bool(torch.isfinite(value).all()), f"{name} is not finite"
     hidden = ~image.visible
     for name in LEARNED:
@@ -97,9 +97,9 @@ def disagreement(scene):
     truth, true_gradients = drawn(scene, "reference", torch.float64)
     if not torch.equal(image.visible, truth.visible):
         return "visible"
-    for name, value in pictures.items():
+    for name, value in images.items():
         error = (value.double() - getattr(truth, name).detach()).abs().max()
-        if error > PICTURE_ERROR * (1.0 + getattr(truth, name).detach().abs().max()):
+        if error > IMAGE_ERROR * (1.0 + getattr(truth, name).detach().abs().max()):
             return name
     for name, gradient in gradients.items():
         scale = true_gradients[name].norm()

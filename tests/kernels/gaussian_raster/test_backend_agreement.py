@@ -63,7 +63,7 @@ def agreeing(splats, draw, backend, *, settings=None, **build):
 @pytest.mark.parametrize("backend", FAST)
 @pytest.mark.parametrize("antialias", [False, True])
 @pytest.mark.parametrize("features", [0, 1, 3])
-def test_pictures_agree(splats, draw, backend, antialias, features):
+def test_images_agree(splats, draw, backend, antialias, features):
     settings = {"antialias": antialias}
     actual, expected = agreeing(
         splats, draw, backend, count=300, features=features, settings=settings

@@ -13,19 +13,19 @@ from lidarpainter_models.kernels.gaussian_raster import render_gaussians
 # float32 lanes: polynomial exponential 7e-7, rounding 6e-8 times what a pixel blends. The seeds
 # below hold no Gaussian that one side just cuts and the other just keeps: one such pixel in twenty
 # scenes moves a gradient by 1e-4.
-PICTURE_ERROR = 1e-6
+IMAGE_ERROR = 1e-6
 GRADIENT_ERROR = 3e-6
 OPAQUE_GRADIENT_ERROR = 6e-6
-"""Where alphas come near their clamp, 0.99. What lies behind a Gaussian is the picture minus what
+"""Where alphas come near their clamp, 0.99. What lies behind a Gaussian is the image minus what
 was passed, and counts by alpha / (1 - alpha), a hundredfold: 5.2e-6 in the rotations. Put into
-float64 one by one, the running sums of the drawn picture make 5.6e-6 of it in opacity, those of
-what was passed 3.3e-6, the exponential 7e-7, rounding of the finished picture 7e-7. Compensated
-sums of what was passed gave 4.9e-6 for a tenth of the time of going back; of the picture they would
+float64 one by one, the running sums of the drawn image make 5.6e-6 of it in opacity, those of
+what was passed 3.3e-6, the exponential 7e-7, rounding of the finished image 7e-7. Compensated
+sums of what was passed gave 4.9e-6 for a tenth of the time of going back; of the image they would
 take four more sums a lane in drawing.
 """
 
 
-def picture_errors(actual, expected):
+def image_errors(actual, expected):
     scale = {"rgb": 1.0, "depth_m": 20.0, "alpha": 1.0, "features": 3.0}
     return {
         name: (getattr(actual, name) - getattr(expected, name)).detach().abs().mean().item() / size
@@ -61,14 +61,14 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_picture_and_gradients_match_float64_autograd(splats, draw, case):
+def test_image_and_gradients_match_float64_autograd(splats, draw, case):
     build, options = CASES[case]
     inputs = splats(**build)
     expected = draw(inputs, backend="reference", dtype=torch.float64, **options)
     actual = draw(inputs, backend="cpu", dtype=torch.float32, **options)
     assert torch.equal(actual.image.visible, expected.image.visible)
     assert torch.allclose(actual.image.radius_px.double(), expected.image.radius_px, rtol=1e-5)
-    assert max(picture_errors(actual.image, expected.image).values()) < PICTURE_ERROR
+    assert max(image_errors(actual.image, expected.image).values()) < IMAGE_ERROR
     errors = relative_errors(actual.gradients, expected.gradients)
     most = OPAQUE_GRADIENT_ERROR if case == "large and opaque" else GRADIENT_ERROR
     assert max(errors.values()) < most, errors
@@ -117,7 +117,7 @@ def test_two_python_threads_may_draw_at_once(splats, draw):
             assert torch.equal(drawn.gradients["means"], expected.gradients["means"])
 
 
-def test_features_leave_the_other_pictures_as_they_are(splats, draw):
+def test_features_leave_the_other_images_as_they_are(splats, draw):
     inputs = splats(200, features=3)
     bare = inputs | {"features": torch.zeros(200, 0)}
     first = draw(inputs, backend="cpu", dtype=torch.float32).image
@@ -162,7 +162,7 @@ def test_second_backward_pass_gives_the_same_gradient(splats):
     stretch=st.floats(-4.0, 4.0),
     antialias=st.booleans(),
 )
-def test_any_shape_in_any_picture_is_drawn_as_the_reference_does(
+def test_any_shape_in_any_image_is_drawn_as_the_reference_does(
     seed, count, width_px, height_px, stretch, antialias
 ):
     # fixtures and hypothesis do not mix: the scene is built here
@@ -186,7 +186,7 @@ def test_any_shape_in_any_picture_is_drawn_as_the_reference_does(
     double = {k: v.double() if v.is_floating_point() else v for k, v in inputs.items()}
     expected = render_gaussians(**double, **camera, backend="reference")
     assert torch.equal(actual.visible, expected.visible)
-    # one flip of the alpha cut in a picture of a few pixels weighs 1/255 / pixels
+    # one flip of the alpha cut in an image of a few pixels weighs 1/255 / pixels
     flip = 2.0 / 255.0 / (width_px * height_px)
-    errors = picture_errors(actual, expected)
+    errors = image_errors(actual, expected)
     assert max(errors.values()) < 5e-6 + flip, errors

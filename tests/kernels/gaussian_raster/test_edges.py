@@ -18,7 +18,7 @@ def assert_finite(drawn):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_no_gaussians_give_black_pictures(splats, draw, backend):
+def test_no_gaussians_give_black_images(splats, draw, backend):
     drawn = draw(splats(0, features=2), backend=backend, dtype=torch.float32)
     assert drawn.image.rgb.shape == (50, 70, 3)
     assert drawn.image.features.shape == (50, 70, 2)
@@ -27,7 +27,7 @@ def test_no_gaussians_give_black_pictures(splats, draw, backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_gaussians_behind_the_camera_give_black_pictures_and_no_gradient(splats, draw, backend):
+def test_gaussians_behind_the_camera_give_black_images_and_no_gradient(splats, draw, backend):
     inputs = splats(20)
     inputs["means"][:, 2] = -inputs["means"][:, 2].abs() - 2.0
     drawn = draw(inputs, backend=backend, dtype=torch.float32)
@@ -38,7 +38,7 @@ def test_gaussians_behind_the_camera_give_black_pictures_and_no_gradient(splats,
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("size_px", [(1, 1), (1, 40), (17, 15), (16, 16), (33, 1)])
-def test_any_picture_size_is_drawn(splats, draw, backend, size_px):
+def test_any_image_size_is_drawn(splats, draw, backend, size_px):
     width_px, height_px = size_px
     inputs = splats(40, width_px=width_px, height_px=height_px, features=1)
     drawn = draw(inputs, backend=backend, dtype=torch.float32)

@@ -16,7 +16,7 @@ from lidarpainter_models.kernels.gaussian_raster import (
 
 CAMERA = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
 SHARED = ("means", "rotation_wxyz", "scale_m", "opacity", "sh", "features")
-PICTURES = ("rgb", "depth_m", "alpha", "features")
+IMAGES = ("rgb", "depth_m", "alpha", "features")
 BACKENDS = ["reference", "cpu"]
 
 
@@ -54,9 +54,9 @@ def leaves_of(street):
 def loss_of(image, seed):
     generator = torch.Generator().manual_seed(seed)
     total = image.rgb.new_zeros(())
-    for name in PICTURES:
-        picture = getattr(image, name)
-        total = total + (picture * torch.randn(picture.shape, generator=generator)).sum()
+    for name in IMAGES:
+        drawn = getattr(image, name)
+        total = total + (drawn * torch.randn(drawn.shape, generator=generator)).sum()
     return total
 
 
@@ -93,8 +93,8 @@ def together(street, backend, **options):
     return images, {name: gaussians[name].grad for name in SHARED}, transforms.grad, absolute
 
 
-def assert_same_pictures(image: SplatImage, expected: SplatImage):
-    for name in (*PICTURES, "visible", "radius_px"):
+def assert_same_images(image: SplatImage, expected: SplatImage):
+    for name in (*IMAGES, "visible", "radius_px"):
         assert torch.equal(getattr(image, name), getattr(expected, name)), name
 
 
@@ -105,7 +105,7 @@ def test_each_view_is_that_of_a_call_of_its_own(splats, backend):
     sums = {name: torch.zeros_like(value) for name, value in gradients.items()}
     for place in range(3):
         image, own, to_own_transforms, own_absolute = alone(street, place, backend)
-        assert_same_pictures(images[place], image)
+        assert_same_images(images[place], image)
         assert torch.equal(absolute[place], own_absolute)
         assert torch.equal(to_transforms[place], to_own_transforms[place])
         for name, gradient in own.items():
@@ -143,7 +143,7 @@ def test_threads_change_no_bit_of_several_views(splats):
     finally:
         numba.set_num_threads(before)
     for first, second in zip(drawn[0][0], drawn[1][0], strict=True):
-        assert_same_pictures(first, second)
+        assert_same_images(first, second)
     assert all(torch.equal(drawn[0][1][name], drawn[1][1][name]) for name in SHARED)
 
 
@@ -162,7 +162,7 @@ def test_offsets_belong_to_their_view(splats):
     assert float(offsets.grad[[0, 2]].abs().max()) == 0
 
 
-def test_no_view_gives_no_picture(splats):
+def test_no_view_gives_no_image(splats):
     street = street_before(splats)
     assert render_views(**street.gaussians, camera_from_body=street.transforms[:0], views=[]) == []
 

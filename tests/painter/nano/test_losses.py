@@ -16,7 +16,7 @@ from lidarpainter_models.painter.nano.losses import (
 from lidarpainter_models.painter.nano.network import NanoOutput
 
 
-def pictures(seed=0):
+def images(seed=0):
     generator = torch.Generator().manual_seed(seed)
     return torch.rand(2, 3, 16, 20, generator=generator), torch.rand(
         2, 3, 16, 20, generator=generator
@@ -42,7 +42,7 @@ def test_expected_error_is_lowest_at_the_true_error():
     assert min(costs, key=costs.get) == -2.302585
 
 
-def test_expected_error_never_changes_the_picture():
+def test_expected_error_never_changes_the_image():
     rgb = torch.full((1, 3, 8, 8), 0.7, requires_grad=True)
     log_error = torch.zeros(1, 8, 8, requires_grad=True)
     output = replace(output_of(rgb), log_error=log_error)
@@ -52,8 +52,8 @@ def test_expected_error_never_changes_the_picture():
 
 
 def test_total_is_the_weighted_sum_and_pulls_every_head(make_conditions):
-    picture, target = pictures()
-    rgb = picture.requires_grad_(True)
+    image, target = images()
+    rgb = image.requires_grad_(True)
     log_error = torch.zeros(2, 16, 20, requires_grad=True)
     output = replace(output_of(rgb), log_error=log_error, base=target)
     batch = stack_conditions([make_conditions(16, 20, seed=s) for s in (0, 1)], num_sources=2)
@@ -80,35 +80,33 @@ def test_harm_counts_pixels_worse_than_all_before_and_no_others():
     target = torch.full((1, 3, 2, 2), 0.5)
     render, mean = target + 0.1, target + 0.2
     mean[..., 0, 0] = 0.5
-    picture = target.clone()
-    picture[..., 0, 0] += 0.1  # as the render, but the mean was right
-    picture[..., 0, 1] += 0.3  # worse than both
-    picture[..., 1, 0] += 0.3  # worse where nothing is known
-    picture[..., 1, 1] += 0.05  # better than both
+    image = target.clone()
+    image[..., 0, 0] += 0.1  # as the render, but the mean was right
+    image[..., 0, 1] += 0.3  # worse than both
+    image[..., 1, 0] += 0.3  # worse where nothing is known
+    image[..., 1, 1] += 0.05  # better than both
     mask = torch.ones(1, 2, 2)
     mask[0, 1, 0] = 0
     expected = (0.01 + (0.09 - 0.01)) / 3
-    assert float(harm_loss(picture, [render, mean], target, mask)) == pytest.approx(expected)
+    assert float(harm_loss(image, [render, mean], target, mask)) == pytest.approx(expected)
 
 
 def test_harm_is_measured_against_the_base_alone_where_the_render_is_not_shown(make_conditions):
-    picture, target = pictures()
-    output = replace(output_of(picture), base=target + 0.1)
+    image, target = images()
+    output = replace(output_of(image), base=target + 0.1)
     batch = stack_conditions([make_conditions(16, 20, seed=s) for s in (0, 1)], num_sources=2)
     known, weights = torch.ones(2, 16, 20), LossWeights(harm=1)
     shown = painting_loss(output, batch, target, known, weights).harm
     blind = painting_loss(output, batch, target, known, weights, sees_render=False).harm
     both = [batch.render, target + 0.1]
-    assert float(shown) == pytest.approx(float(harm_loss(picture, both, target, known)))
-    assert float(blind) == pytest.approx(float(harm_loss(picture, both[1:], target, known)))
+    assert float(shown) == pytest.approx(float(harm_loss(image, both, target, known)))
+    assert float(blind) == pytest.approx(float(harm_loss(image, both[1:], target, known)))
     assert float(shown) > float(blind)
 
 
 def test_a_restyled_view_cannot_be_harmed(make_conditions):
-    picture, target = pictures()
+    image, target = images()
     batch = stack_conditions([make_conditions(16, 20, seed=s) for s in (0, 1)], num_sources=2)
     known, restyled = torch.ones(2, 16, 20), torch.ones(2, dtype=torch.bool)
-    terms = painting_loss(
-        output_of(picture), batch, target, known, LossWeights(), restyled=restyled
-    )
+    terms = painting_loss(output_of(image), batch, target, known, LossWeights(), restyled=restyled)
     assert float(terms.harm) == 0

@@ -16,11 +16,11 @@ from lidarpainter_models.painter.protocol import PaintingConditions
 
 torch.set_num_threads(1)
 height_px, width_px = 320, 480
-picture, plane = torch.rand(height_px, width_px, 3), torch.ones(height_px, width_px)
+image, plane = torch.rand(height_px, width_px, 3), torch.ones(height_px, width_px)
 conditions = PaintingConditions(
-    render_rgb=picture, render_depth_m=plane, render_alpha=plane,
-    lidar_rgb=picture, lidar_depth_m=plane, lidar_hit=plane > 0,
-    warp_rgb=torch.stack([picture] * 2), warp_valid=torch.stack([plane > 0] * 2),
+    render_rgb=image, render_depth_m=plane, render_alpha=plane,
+    lidar_rgb=image, lidar_depth_m=plane, lidar_hit=plane > 0,
+    warp_rgb=torch.stack([image] * 2), warp_valid=torch.stack([plane > 0] * 2),
 )
 painter = NanoPainter(NanoNetwork(NanoConfig(widths=(8, 8, 8), blocks=(1, 1, 1))))
 faults = []

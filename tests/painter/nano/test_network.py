@@ -86,7 +86,7 @@ def test_ablated_network_ignores_what_it_may_not_see(inputs, blind_to, make_cond
 
 
 @pytest.mark.parametrize("size_px", [(1, 1), (5, 3), (16, 16), (17, 31), (48, 33)])
-def test_padding_does_not_change_the_picture_size(size_px, make_conditions):
+def test_padding_does_not_change_the_image_size(size_px, make_conditions):
     painting = NanoPainter(scrambled(NanoConfig(**SMALL))).paint(make_conditions(*size_px))
     assert painting.rgb.shape == (*size_px, 3)
     assert painting.confidence.shape == size_px
@@ -155,8 +155,8 @@ def test_residual_is_bounded(make_conditions):
     candidates = build_candidates(
         batch, config.inputs, fill_push_pull(batch.lidar, batch.lidar_hit)
     )
-    pictures = torch.stack(candidates.pictures)
-    low, high = (pictures.amin(dim=0), pictures.amax(dim=0))
+    images = torch.stack(candidates.images)
+    low, high = (images.amin(dim=0), images.amax(dim=0))
     low, high = low - config.residual_limit, high + config.residual_limit
     assert bool(((output.rgb >= low - 1e-6) & (output.rgb <= high + 1e-6)).all())
 
@@ -164,7 +164,7 @@ def test_residual_is_bounded(make_conditions):
 def test_a_painter_of_a_reference_needs_one(make_conditions):
     inputs = frozenset({"render", "reference"})
     painter = NanoPainter(scrambled(NanoConfig(inputs=inputs, **SMALL)))
-    with pytest.raises(ConfigError, match="sees the nearest recorded picture"):
+    with pytest.raises(ConfigError, match="sees the nearest recorded image"):
         painter.paint(replace(make_conditions(), reference_rgb=None))
 
 
@@ -178,7 +178,7 @@ def test_a_composite_shows_the_render_between_lidar_points(make_conditions):
         NanoConfig(inputs=frozenset({"lidar"}), composite=True)
 
 
-def test_without_a_mix_the_picture_itself_is_predicted(make_conditions):
+def test_without_a_mix_the_image_itself_is_predicted(make_conditions):
     batch = stack_conditions([make_conditions()], num_sources=2)
     with torch.no_grad():
         output = scrambled(NanoConfig(mix=False, **SMALL))(batch, ["clear"])
@@ -212,14 +212,14 @@ def test_the_first_convolution_runs_over_cells_of_pixels():
 
 @pytest.mark.parametrize("sigma_px", [1.5, 3.0])
 def test_a_blur_is_the_convolution_with_its_kernel(sigma_px):
-    picture = torch.rand(2, 3, 17, 30, generator=torch.Generator().manual_seed(2))
+    image = torch.rand(2, 3, 17, 30, generator=torch.Generator().manual_seed(2))
     radius_px = round(2.5 * sigma_px)
     offsets = torch.arange(-radius_px, radius_px + 1).float()
     kernel = torch.exp(-0.5 * (offsets / sigma_px) ** 2)
     kernel = torch.outer(kernel, kernel) / kernel.sum() ** 2
-    padded = F.pad(picture, (radius_px,) * 4, mode="replicate")
+    padded = F.pad(image, (radius_px,) * 4, mode="replicate")
     expected = F.conv2d(padded, kernel.expand(3, 1, -1, -1), groups=3)
-    torch.testing.assert_close(blur(picture, sigma_px=sigma_px), expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(blur(image, sigma_px=sigma_px), expected, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize(("height_px", "width_px"), [(1, 1), (3, 20), (24, 40)])
@@ -327,25 +327,25 @@ def test_views_of_different_sizes_do_not_stack(make_conditions):
 
 
 def test_filling_keeps_known_pixels_and_reaches_everywhere():
-    picture = torch.zeros(1, 3, 13, 21)
+    image = torch.zeros(1, 3, 13, 21)
     known = torch.zeros(1, 1, 13, 21)
-    picture[0, :, 2, 3], known[0, 0, 2, 3] = 0.75, 1
-    filled = fill_push_pull(picture, known)
+    image[0, :, 2, 3], known[0, 0, 2, 3] = 0.75, 1
+    filled = fill_push_pull(image, known)
     torch.testing.assert_close(filled, torch.full_like(filled, 0.75))
-    assert float(fill_push_pull(picture, torch.zeros_like(known)).abs().max()) == 0
+    assert float(fill_push_pull(image, torch.zeros_like(known)).abs().max()) == 0
 
 
 @pytest.mark.parametrize("size_px", [(1, 2), (5, 8), (8, 5), (7, 7)])
 def test_a_pyramid_averages_the_pixels_that_there_are(size_px):
-    picture = torch.rand(2, 4, *size_px, generator=torch.Generator().manual_seed(0))
-    expected = F.avg_pool2d(picture, 2, ceil_mode=True)
-    torch.testing.assert_close(_halved(picture), expected, rtol=0, atol=1e-6)
+    image = torch.rand(2, 4, *size_px, generator=torch.Generator().manual_seed(0))
+    expected = F.avg_pool2d(image, 2, ceil_mode=True)
+    torch.testing.assert_close(_halved(image), expected, rtol=0, atol=1e-6)
 
 
-def test_filling_a_full_picture_changes_nothing():
-    picture = torch.rand(2, 3, 9, 11, generator=torch.Generator().manual_seed(0))
-    filled = fill_push_pull(picture, torch.ones(2, 1, 9, 11))
-    torch.testing.assert_close(filled, picture)
+def test_filling_a_full_image_changes_nothing():
+    image = torch.rand(2, 3, 9, 11, generator=torch.Generator().manual_seed(0))
+    filled = fill_push_pull(image, torch.ones(2, 1, 9, 11))
+    torch.testing.assert_close(filled, image)
 
 
 def test_blur_keeps_constants_and_masked_blur_ignores_the_unknown():

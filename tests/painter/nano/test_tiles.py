@@ -88,7 +88,7 @@ def test_what_agrees_everywhere_is_not_painted_at_all(network, one_doubt):
     assert painting.kept_share == 1
 
 
-def test_a_part_has_a_border_that_ends_at_the_picture():
+def test_a_part_has_a_border_that_ends_at_the_image():
     tiles = torch.zeros(6, 10, dtype=torch.bool)
     tiles[0, 0] = tiles[5, 9] = True
     parts = painted_parts(tiles, 90, 160, TILES)
@@ -107,7 +107,7 @@ def test_pieces_whose_boxes_overlap_become_one():
     ]
 
 
-def test_many_parts_cost_more_than_the_whole_picture():
+def test_many_parts_cost_more_than_the_whole_image():
     tiles = torch.zeros(6, 6, dtype=torch.bool)
     tiles[::2, ::2] = True
     assert painted_parts(tiles, 96, 96, TILES) == [(Window(0, 0, 96, 96), Window(0, 0, 96, 96))]

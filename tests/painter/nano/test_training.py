@@ -181,7 +181,7 @@ def test_shares_choose_the_source(make_pair, memory_pairs):
     assert float(batch.target.max()) == 0
 
 
-def test_pictures_smaller_than_the_window_are_refused(make_pair, memory_pairs):
+def test_images_smaller_than_the_window_are_refused(make_pair, memory_pairs):
     with pytest.raises(ConfigError, match="smaller than crop_px"):
         train_nano([memory_pairs([make_pair(24)])], SHORT)
 
@@ -208,7 +208,7 @@ def test_quiet_augmentation_only_flips(make_pair):
         torch.testing.assert_close(flipped.conditions.warp[index], expected)
 
 
-def test_light_changes_every_picture_of_a_sample_alike(make_pair):
+def test_light_changes_every_image_of_a_sample_alike(make_pair):
     batch = batch_pairs([make_pair(32)], 2)
     bright = replace(QUIET, gain_range=0.5)
     changed = augment(batch, bright, generator_of(1))
@@ -219,7 +219,7 @@ def test_light_changes_every_picture_of_a_sample_alike(make_pair):
     assert float(apart[hits].max()) < 1e-5
 
 
-def test_dropout_takes_pictures_and_masks_away_together(make_pair):
+def test_dropout_takes_images_and_masks_away_together(make_pair):
     batch = batch_pairs([make_pair(32)], 2)
     bare = replace(QUIET, lidar_dropout_share=1, warp_dropout_share=1)
     conditions = augment(batch, bare, generator_of(0)).conditions
@@ -241,7 +241,7 @@ def test_identity_samples_show_the_truth(make_pair):
     assert torch.equal(shown.conditions.render, shown.target)
 
 
-def test_damage_stays_in_range_and_leaves_most_of_the_picture():
+def test_damage_stays_in_range_and_leaves_most_of_the_image():
     render = torch.rand(3, 48, 64, generator=generator_of(0))
     for seed in range(20):
         damaged = damage_render(render, generator_of(seed))

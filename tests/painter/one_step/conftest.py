@@ -19,12 +19,12 @@ def make_network():
 
 @pytest.fixture
 def make_inputs():
-    """Random pictures and an encoded prompt."""
+    """Random images and an encoded prompt."""
 
     def make(num_inputs=2, batch=1, height_px=64, width_px=128, seed=0):
         generator = torch.Generator().manual_seed(seed)
-        pictures = torch.rand(num_inputs, batch, 3, height_px, width_px, generator=generator)
-        return pictures, torch.randn(batch, 77, TEXT_WIDTH, generator=generator)
+        images = torch.rand(num_inputs, batch, 3, height_px, width_px, generator=generator)
+        return images, torch.randn(batch, 77, TEXT_WIDTH, generator=generator)
 
     return make
 

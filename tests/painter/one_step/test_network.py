@@ -15,11 +15,11 @@ from lidarpainter_models.painter.one_step.presets import PRESETS, paper, with_re
 SKIPS = ("skip_conv_1", "skip_conv_2", "skip_conv_3", "skip_conv_4")
 
 
-def pix2pix_turbo(network, picture, text, timestep):
-    """The plain wiring, written out: one picture, its latent in place of the noise."""
+def pix2pix_turbo(network, image, text, timestep):
+    """The plain wiring, written out: one image, its latent in place of the noise."""
     autoencoder, unet = network.autoencoder, network.denoiser.unet
     encoder, decoder = autoencoder.encoder, autoencoder.decoder.base
-    sample = encoder.conv_in(2 * picture - 1)
+    sample = encoder.conv_in(2 * image - 1)
     levels = []
     for block in encoder.down_blocks:
         levels.append(sample)
@@ -58,13 +58,13 @@ def test_trusting_the_render_alone_is_pix2pix_turbo_bit_for_bit(
     network = make_network(config)
     network.denoiser.unet.conv_in.weight[:, 4:] = 0
     network.fusion.layers[-1].bias.fill_(1000.0)  # a share of exactly one
-    pictures, text = make_inputs()
-    # one picture at a time: a batch of two may be summed in another order
-    output = network(pictures, text, encodes_at_once=False)
+    images, text = make_inputs()
+    # one image at a time: a batch of two may be summed in another order
+    output = network(images, text, encodes_at_once=False)
     assert bool((output.weights[0] == 1).all())
     actual = output.rgb
     narrowed(network)
-    expected = pix2pix_turbo(network, pictures[0], text, timestep)
+    expected = pix2pix_turbo(network, images[0], text, timestep)
     assert torch.equal(actual, expected)
 
 
@@ -72,14 +72,14 @@ def test_trusting_the_render_alone_is_pix2pix_turbo_bit_for_bit(
 @torch.no_grad()
 def test_nothing_random_is_drawn(preset, make_network, make_inputs):
     network = make_network(PRESETS[preset](), has_adapters=True)
-    pictures, text = make_inputs(len(network.config.inputs))
+    images, text = make_inputs(len(network.config.inputs))
     generator = torch.Generator().manual_seed(3)
     before, own = torch.get_rng_state(), generator.get_state()
-    first = network(pictures, text).rgb
+    first = network(images, text).rgb
     assert torch.equal(torch.get_rng_state(), before)
     assert torch.equal(generator.get_state(), own)
-    assert torch.equal(network(pictures, text).rgb, first)
-    assert first.shape == pictures.shape[1:]
+    assert torch.equal(network(images, text).rgb, first)
+    assert first.shape == images.shape[1:]
     assert bool(first.isfinite().all())
 
 
@@ -96,13 +96,13 @@ def test_building_a_network_leaves_the_random_state_alone(make_network):
 @torch.no_grad()
 def test_merged_adapters_do_the_same_in_fewer_layers(make_network, make_inputs):
     network = make_network(paper(), has_adapters=True)
-    pictures, text = make_inputs()
-    expected = network(pictures, text)
-    plain = make_network(paper())(pictures, text)
+    images, text = make_inputs()
+    expected = network(images, text)
+    plain = make_network(paper())(images, text)
     assert not torch.allclose(expected.rgb, plain.rgb, atol=1e-2)  # they do something
     num_layers = len(list(network.modules()))
     merge_lora(network)
-    actual = network(pictures, text)
+    actual = network(images, text)
     assert not any(is_adapted(module) for module in network.modules())
     assert len(list(network.modules())) < num_layers / 2
     assert not any("lora" in name for name, _ in network.named_parameters())
@@ -118,38 +118,38 @@ def test_encoding_at_once_and_one_by_one_agree(skips, make_network, make_inputs)
     if skips != "none":
         for conv in network.autoencoder.decoder.skip_convs:
             conv.weight.normal_(std=0.1, generator=torch.Generator().manual_seed(0))
-    pictures, text = make_inputs(3, batch=2)
-    at_once = network(pictures, text).rgb
-    one_by_one = network(pictures, text, encodes_at_once=False).rgb
+    images, text = make_inputs(3, batch=2)
+    at_once = network(images, text).rgb
+    one_by_one = network(images, text, encodes_at_once=False).rgb
     torch.testing.assert_close(at_once, one_by_one, rtol=1e-4, atol=1e-4)
     # views of a batch do not see each other
-    alone = network(pictures[:, 1:], text[1:]).rgb
+    alone = network(images[:, 1:], text[1:]).rgb
     torch.testing.assert_close(at_once[1:], alone, rtol=1e-4, atol=1e-4)
 
 
 @torch.no_grad()
 def test_fused_skips_with_the_whole_share_are_the_renders(make_network, make_inputs):
-    pictures, text = make_inputs()
+    images, text = make_inputs()
     found = []
     for skips in ("render", "fused"):
         network = make_network(dataclasses.replace(paper(), skips=skips))
         network.fusion.layers[-1].bias.fill_(1000.0)
         for conv in network.autoencoder.decoder.skip_convs:
             conv.weight.normal_(std=0.1, generator=torch.Generator().manual_seed(0))
-        found.append(network(pictures, text).rgb)
+        found.append(network(images, text).rgb)
     torch.testing.assert_close(found[0], found[1], rtol=1e-5, atol=1e-5)
 
 
 @torch.no_grad()
-def test_lidar_changes_the_picture_only_through_fusion_at_the_start(make_network, make_inputs):
+def test_lidar_changes_the_image_only_through_fusion_at_the_start(make_network, make_inputs):
     """With random first-layer weights the U-Net sees LiDAR; with zeros and no fusion it cannot."""
-    pictures, text = make_inputs()
-    other = pictures.clone()
+    images, text = make_inputs()
+    other = images.clone()
     other[1] = 1 - other[1]
     network = make_network(dataclasses.replace(paper(), fusion=None))
-    assert not torch.equal(network(pictures, text).rgb, network(other, text).rgb)
+    assert not torch.equal(network(images, text).rgb, network(other, text).rgb)
     network.denoiser.unet.conv_in.weight[:, 4:] = 0
-    assert torch.equal(network(pictures, text).rgb, network(other, text).rgb)
+    assert torch.equal(network(images, text).rgb, network(other, text).rgb)
 
 
 @pytest.mark.parametrize("inputs", [("render",), ("lidar",), ("render", "warp")])
@@ -158,16 +158,16 @@ def test_ablations_of_the_inputs_run(inputs, make_network, make_inputs):
     fusion = FusionConfig() if len(inputs) > 1 else None
     network = make_network(OneStepConfig(inputs=inputs, fusion=fusion))
     assert network.denoiser.unet.conv_in.in_channels == 4 * len(inputs)
-    pictures, text = make_inputs(len(inputs))
-    assert network(pictures, text).rgb.shape == pictures[0].shape
+    images, text = make_inputs(len(inputs))
+    assert network(images, text).rgb.shape == images[0].shape
 
 
 @torch.no_grad()
 def test_a_denoiser_that_sees_the_mix_has_four_channels(make_network, make_inputs):
     network = make_network(dataclasses.replace(paper(), denoiser_sees="fused"))
     assert network.denoiser.unet.conv_in.in_channels == 4
-    pictures, text = make_inputs()
-    assert network(pictures, text).rgb.shape == pictures[0].shape
+    images, text = make_inputs()
+    assert network(images, text).rgb.shape == images[0].shape
 
 
 @pytest.mark.parametrize(("inputs", "channels"), [(2, 10), (3, 14)])
@@ -176,9 +176,9 @@ def test_masks_are_two_more_channels(inputs, channels, make_network, make_inputs
     names = ("render", "lidar", "warp")[:inputs]
     network = make_network(OneStepConfig(inputs=names, masks=True))
     assert network.denoiser.unet.conv_in.in_channels == channels
-    pictures, text = make_inputs(inputs)
+    images, text = make_inputs(inputs)
     empty, full = torch.zeros(1, 2, 8, 16), torch.ones(1, 2, 8, 16)
-    found = [network(pictures, text, masks).rgb for masks in (empty, full)]
+    found = [network(images, text, masks).rgb for masks in (empty, full)]
     assert not torch.equal(*found)
 
 
@@ -188,9 +188,9 @@ def test_the_last_layer_and_the_step_stay_in_float32(make_inputs):
     from lidarpainter_models.painter.one_step.assembly import random_network
 
     network = random_network(paper(), architecture=TINY, has_adapters=True)
-    pictures, text = make_inputs()
+    images, text = make_inputs()
     with torch.no_grad(), torch.autocast("cpu", dtype=torch.bfloat16):
-        output = network(pictures, text)
+        output = network(images, text)
     types = {parameter.dtype for parameter in network.denoiser.unet.conv_out.parameters()}
     assert types == {torch.float32}
     assert network.denoiser.unet.conv_in.weight.dtype == torch.bfloat16

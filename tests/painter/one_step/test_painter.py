@@ -33,12 +33,12 @@ def test_a_view_of_any_size_keeps_it(painter, size, num_sources, make_conditions
 
 def test_edges_are_repeated_below_and_to_the_right(make_conditions):
     batch = stack_conditions([make_conditions(70, 130)], num_sources=2)
-    pictures, masks = painter_inputs(batch, paper())
+    images, masks = painter_inputs(batch, paper())
     assert masks is None
-    assert pictures.shape == (2, 1, 3, 128, 192)
-    assert torch.equal(pictures[0, ..., :70, :130], batch.render)
-    assert torch.equal(pictures[0, ..., 100, :130], batch.render[..., 69, :])
-    assert torch.equal(pictures[0, ..., :70, 180], batch.render[..., 129])
+    assert images.shape == (2, 1, 3, 128, 192)
+    assert torch.equal(images[0, ..., :70, :130], batch.render)
+    assert torch.equal(images[0, ..., 100, :130], batch.render[..., 69, :])
+    assert torch.equal(images[0, ..., :70, 180], batch.render[..., 129])
 
 
 def test_lidar_enters_pure_or_over_the_render(make_conditions):
@@ -92,17 +92,17 @@ def test_confidence_asks_what_supports_the_colour(make_conditions):
     assert float(invented[~hit].mean()) < float(kept[~hit].mean())
 
 
-def test_prompts_are_encoded_once_and_change_the_picture(painter, make_conditions, monkeypatch):
+def test_prompts_are_encoded_once_and_change_the_image(painter, make_conditions, monkeypatch):
     clear, night = (make_conditions(64, 64, prompt=prompt) for prompt in ("clear", "night"))
-    pictures = [painter.paint(conditions).rgb for conditions in (clear, night)]
-    assert not torch.equal(*pictures)
+    images = [painter.paint(conditions).rgb for conditions in (clear, night)]
+    assert not torch.equal(*images)
     import lidarpainter_models.painter.one_step.prompts as prompts
 
     def unwanted(*_):
         raise AssertionError("encoded twice")
 
     monkeypatch.setattr(prompts, "encode_text", unwanted)
-    assert torch.equal(painter.paint(night).rgb, pictures[1])
+    assert torch.equal(painter.paint(night).rgb, images[1])
     assert set(painter.prompts.encoded) == {"clear", "night"}
 
 

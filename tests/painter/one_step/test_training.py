@@ -131,8 +131,8 @@ def test_lpips_is_never_left_out_unasked(train, source):
     with pytest.raises(ConfigError, match=r"weighs LPIPS by 0\.2 but has no weights for it"):
         train(config, [source])
 
-    def distance(pictures, targets):
-        return (pictures - targets).abs().mean(dim=(1, 2, 3))
+    def distance(images, targets):
+        return (images - targets).abs().mean(dim=(1, 2, 3))
 
     _, record = train(config, [source], Judges(lpips=distance))
     (entry,) = record["history"]
@@ -142,7 +142,7 @@ def test_lpips_is_never_left_out_unasked(train, source):
 
 
 def test_a_discriminator_looks_through_features_where_there_are_any(train, source):
-    features = FrozenFeatures(extract=lambda pictures: [pictures], channels=(3,))
+    features = FrozenFeatures(extract=lambda images: [images], channels=(3,))
     config = replace(CONTEST, network=fast(), steps=1)
     _, record = train(config, [source], Judges(features=features))
     assert record["discriminator"] == "FeatureDiscriminator"

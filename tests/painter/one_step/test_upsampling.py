@@ -43,9 +43,9 @@ def test_another_size_than_double_is_refused():
 @torch.no_grad()
 def test_a_lean_network_paints_the_same(preset, make_network, make_inputs):
     network = make_network(preset(), has_adapters=True)
-    pictures, text = make_inputs()
-    expected = network(pictures, text)
-    actual = made_lean(network)(pictures, text)
+    images, text = make_inputs()
+    expected = network(images, text)
+    actual = made_lean(network)(images, text)
     num_phased = sum(isinstance(module, PhasedUpsampling) for module in network.modules())
     assert num_phased == (6 if preset is paper else 3)  # TAESD has its own way of doubling
     scale = 1 / network.step.signal

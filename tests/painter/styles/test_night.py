@@ -136,7 +136,7 @@ def test_glare_spreads_light_and_keeps_its_sum():
     light = torch.zeros(101, 101, 3)
     light[50, 50] = 30.0
     found = add_glare(light, focal_px=100.0)
-    assert float(found.sum()) == pytest.approx(90.0, rel=2e-3)  # the widest tail leaves the picture
+    assert float(found.sum()) == pytest.approx(90.0, rel=2e-3)  # the widest tail leaves the image
     assert float(found[50, 50, 0]) < 29.0
     assert float(found[50, 55, 0]) > 0
     dim = torch.full((20, 20, 3), 0.4)

@@ -1,20 +1,24 @@
-"""Fog and night keep the structure of a real picture whose depth is its own sweep's."""
+"""Fog and night keep the structure of a real image whose depth is its own sweep's."""
 
 import pytest
 import torch
 
-from lidarpainter_models.gaussians.observations import ObservationConfig, fit_camera, shrink_picture
-from lidarpainter_models.gaussians.sparse_depth import SparseDepthConfig, sparse_lidar_depth
+from lidarpainter_models.lidar.sky_masks import sky_mask
+from lidarpainter_models.lidar.sparse_depth import SparseDepthConfig, sparse_lidar_depth
 from lidarpainter_models.metrics.edges import edge_agreement
+from lidarpainter_models.observations.observations import (
+    ObservationConfig,
+    fit_camera,
+    shrink_image,
+)
 from lidarpainter_models.painter.styles import StyleView, apply_style
+from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.readers import ingest_scene
-from lidarpainter_models.scenes.sky_masks import sky_mask
 
 
 @pytest.fixture(scope="module")
 def recorded(shared_folder, tmp_path_factory):
-    """A front picture of PandaSet 002 at 960 pixels, and the depth of its sweep."""
+    """A front image of PandaSet 002 at 960 pixels, and the depth of its sweep."""
     store, root = tmp_path_factory.mktemp("store"), shared_folder / "data" / "pandaset"
     path = ingest_scene("pandaset", root, "002", store, frames=slice(20, 21))
     scene = DrivingScene.open(path)
@@ -23,7 +27,7 @@ def recorded(shared_folder, tmp_path_factory):
     size = {"width_px": camera.width_px, "height_px": camera.height_px}
     points = scene.read_points(moment.frame_index).xyz_m
     return StyleView(
-        rgb=shrink_picture(scene.read_image(moment), **size).float() / 255,
+        rgb=shrink_image(scene.read_image(moment), **size).float() / 255,
         depth_m=sparse_lidar_depth(points, camera, config=SparseDepthConfig()),
         sky=sky_mask(scene, moment, camera).float(),
         camera=camera,
@@ -32,7 +36,7 @@ def recorded(shared_folder, tmp_path_factory):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("prompt", ["foggy", "night"])
-def test_edges_near_lidar_hits_agree_with_the_clear_picture(recorded, prompt):
+def test_edges_near_lidar_hits_agree_with_the_clear_image(recorded, prompt):
     styled = apply_style(recorded, prompt, torch.Generator().manual_seed(0))
     found = edge_agreement(styled, recorded.rgb, recorded.depth_m)
     # 0.78 and 0.91: single sweeps leak past edges, which the depth of a fitted scene does not

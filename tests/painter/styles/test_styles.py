@@ -1,4 +1,4 @@
-"""What holds for every style: identity at no strength, one picture per seed, displayable light."""
+"""What holds for every style: identity at no strength, one image per seed, displayable light."""
 
 from math import inf
 
@@ -43,7 +43,7 @@ def test_a_style_without_strength_changes_nothing(street, prompt):
 
 
 @pytest.mark.parametrize("prompt", STYLES)
-def test_a_style_changes_the_picture_and_stays_displayable(street, prompt):
+def test_a_style_changes_the_image_and_stays_displayable(street, prompt):
     styled = apply_style(street, prompt, generator_of(0))
     assert styled.shape == street.rgb.shape
     assert bool(((styled >= 0) & (styled <= 1)).all())  # which NaN is not
@@ -51,7 +51,7 @@ def test_a_style_changes_the_picture_and_stays_displayable(street, prompt):
 
 
 @pytest.mark.parametrize("prompt", STYLES)
-def test_a_seed_decides_the_picture(street, prompt):
+def test_a_seed_decides_the_image(street, prompt):
     first, again, other = (apply_style(street, prompt, generator_of(s)) for s in (1, 1, 2))
     assert torch.equal(first, again)
     assert torch.equal(first, other) is (prompt == "foggy")  # fog draws nothing

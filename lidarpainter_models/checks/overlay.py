@@ -1,0 +1,95 @@
+"""Draw what the LiDAR and the boxes say over what a camera saw: the quickest check of a scene."""
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from lidarpainter_models.geometry.boxes import box_corners
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.tracks import ActorTrack
+
+_NEAREST_M, _FARTHEST_M = 3.0, 90.0
+_NEAR_PLANE_M = 0.3
+_MOVING_RGB, _PARKED_RGB = (80, 255, 80), (255, 255, 255)
+# corners differ in one axis along an edge; box_corners counts x slowest, z fastest
+_EDGES = tuple((i, i + step) for step in (1, 2, 4) for i in range(8) if not i & step)
+
+
+def draw_overlay(
+    scene: DrivingScene, frame_index: int, camera_name: str
+) -> UInt8[Tensor, "height width 3"]:
+    """The recorded image with the frame's points coloured by depth and all boxes in view.
+
+    Boxes stand where they are at the moment of the exposure: green moves, white is parked, the
+    cross marks the front of the actor.
+    """
+    view = scene.view(frame_index, camera_name)
+    image = np.ascontiguousarray(scene.read_image(view).numpy())
+    _draw_points(image, view.camera, scene.read_points(frame_index).xyz_m)
+    draw_boxes(image, view.camera, scene.tracks, view.timestamp_ns)
+    return torch.from_numpy(image)
+
+
+def draw_boxes(
+    image: np.ndarray, camera: Camera, tracks: tuple[ActorTrack, ...], timestamp_ns: int
+) -> None:
+    """Draw the actors that are there at a time over an image (height, width, 3; bytes)."""
+    for track in tracks:
+        if track.is_present(timestamp_ns):
+            _draw_box(image, camera, track, timestamp_ns)
+
+
+def _draw_points(image: np.ndarray, camera: Camera, xyz_m: Tensor) -> None:
+    pixels_uv, depth_m = camera.project(xyz_m)
+    seen = camera.contains(pixels_uv, depth_m)
+    uv, depth = pixels_uv[seen].numpy(), depth_m[seen].numpy()
+    scaled = np.log(depth / _NEAREST_M) / np.log(_FARTHEST_M / _NEAREST_M)
+    shades = np.clip(255 * scaled, 0, 255).astype(np.uint8)[:, None]
+    colours_bgr = cv2.applyColorMap(shades, cv2.COLORMAP_TURBO)[:, 0] if len(shades) else shades
+    radius_px = max(1, camera.width_px // 960)
+    for row in np.argsort(-depth):
+        centre = int(uv[row, 0]), int(uv[row, 1])
+        cv2.circle(image, centre, radius_px, colours_bgr[row, ::-1].tolist(), thickness=-1)
+
+
+def _draw_box(image: np.ndarray, camera: Camera, track: ActorTrack, timestamp_ns: int) -> None:
+    world_from_box = track.pose_at(timestamp_ns)
+    camera_from_box = invert_rigid(camera.world_from_camera) @ world_from_box
+    corners = transform_points(camera_from_box, box_corners(track.size_m.double())).numpy()
+    colour = _MOVING_RGB if track.is_moving else _PARKED_RGB
+    crossed = ((4, 7), (5, 6))  # the diagonals of the face at +x
+    for first, second in (*_EDGES, *crossed):
+        _draw_line(image, camera, corners[first], corners[second], colour)
+
+
+def _draw_line(
+    image: np.ndarray,
+    camera: Camera,
+    start_m: np.ndarray,
+    end_m: np.ndarray,
+    colour: tuple[int, int, int],
+) -> None:
+    """Draw the part of a camera-frame segment that lies in front of the camera."""
+    if start_m[2] < end_m[2]:
+        start_m, end_m = end_m, start_m
+    if start_m[2] <= _NEAR_PLANE_M:
+        return
+    if end_m[2] < _NEAR_PLANE_M:
+        share = (start_m[2] - _NEAR_PLANE_M) / (start_m[2] - end_m[2])
+        end_m = start_m + share * (end_m - start_m)
+    pixels = [
+        (
+            round(camera.fx_px * point[0] / point[2] + camera.cx_px),
+            round(camera.fy_px * point[1] / point[2] + camera.cy_px),
+        )
+        for point in (start_m, end_m)
+    ]
+    is_visible, first, second = cv2.clipLine(
+        (0, 0, camera.width_px, camera.height_px), pixels[0], pixels[1]
+    )
+    if is_visible:
+        cv2.line(image, first, second, colour, max(1, camera.width_px // 960), cv2.LINE_AA)

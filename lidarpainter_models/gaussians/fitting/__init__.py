@@ -1,0 +1,1 @@
+"""Move Gaussians until they show what was recorded: losses, optimisers, growth, steps."""

@@ -1,0 +1,110 @@
+"""Every setting of a fit, each with its reason."""
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.gaussians.fitting.densification import DensificationConfig
+from lidarpainter_models.gaussians.fitting.losses import LossWeights
+from lidarpainter_models.gaussians.fitting.optimiser import LearningRates
+from lidarpainter_models.gaussians.fitting.shape_limits import ShapeLimits
+from lidarpainter_models.gaussians.initialisation.scene import InitialisationConfig
+
+GuidanceFreedom = Literal["all", "appearance"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RefinementConfig:
+    """Which poses and colours of the recording may be corrected."""
+
+    cameras: bool = True
+    """Refine the pose of every training view (+0.9 dB on a real log)."""
+    extrinsics: bool = True
+    """Let a camera's corrections have a mean: its mounting angles are off as a rule."""
+    actors: bool = True
+    """Refine the pose of every actor over time (+1.2 dB inside boxes)."""
+    exposure: bool = False
+    """Fit a colour matrix per camera even if there is one camera only."""
+    start_step: int = 100
+    """Before this the image is too coarse to align anything."""
+    camera_noise_rad: float = 2e-3
+    """Expected error of a recorded camera angle."""
+    camera_noise_m: float = 0.03
+    """Expected error of a recorded camera position."""
+    actor_noise_rad: float = 0.03
+    """Expected error of a box's angle."""
+    actor_noise_m: float = 0.2
+    """Expected error of a box's position."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GuidanceConfig:
+    """How painted views take part."""
+
+    probability: float = 1.0
+    """Of adding one painted view to a step (the paper's p_novel, 0.4). Against 0.5 the neighbouring
+    lanes of streets gain 0.1 dB, recorded views lose 0.05 to 0.1 (docs/benchmarks.md)."""
+    weight: float = 1.0
+    """Of its loss (the paper's lambda_novel, 0.2, changed nothing on short schedules)."""
+    ssim: float = 0.1
+    """Of 1 - SSIM in its loss, as in the paper."""
+    freedom: GuidanceFreedom = "all"
+    """What painted views may change: everything, or only colour and opacity. A painted guess in a
+    hole would otherwise pull surfaces off their LiDAR depth."""
+    depth: float = 0.01
+    """Of the LiDAR depth term on painted views; without meaning when freedom is `appearance`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitConfig:
+    """How a Gaussian scene is fitted; the defaults suit one front camera and two CPU cores."""
+
+    steps: int = 1500
+    """Optimiser steps, one recorded view each. More of them sharpen the recorded views and cost the
+    neighbouring lanes (docs/benchmarks.md)."""
+    half_resolution: float = 0.3
+    """First part of the steps at half the image size: a quarter of the pixels."""
+    seed: int = 0
+    """Of the order of views."""
+    initialisation: InitialisationConfig = field(default_factory=InitialisationConfig)
+    densification: DensificationConfig = field(default_factory=DensificationConfig)
+    learning_rates: LearningRates = field(default_factory=LearningRates)
+    losses: LossWeights = field(default_factory=LossWeights)
+    refinement: RefinementConfig = field(default_factory=RefinementConfig)
+    shapes: ShapeLimits = field(default_factory=ShapeLimits)
+    guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
+    sky_in_mask_only: bool = True
+    """The sky texture learns only inside the sky masks: what is far but solid (towers beyond the
+    LiDAR's reach) is then left to the Gaussians and not split between the two."""
+    log_every: int = 50
+    """Steps between two entries of the history."""
+
+    def __post_init__(self) -> None:
+        """Refuse settings that make no fit."""
+        if self.steps < 1 or self.log_every < 1:
+            raise ConfigError(
+                f"steps and log_every must be positive, got {self.steps} and {self.log_every}"
+            )
+        if not 0 <= self.half_resolution <= 1:
+            raise ConfigError(f"half_resolution must be in [0, 1], got {self.half_resolution}")
+        if not 0 <= self.guidance.probability <= 1:
+            raise ConfigError(
+                f"guidance.probability must be in [0, 1], got {self.guidance.probability}"
+            )
+
+
+def continuation(
+    config: FitConfig, *, steps: int, guidance: GuidanceConfig | None = None
+) -> FitConfig:
+    """Settings for going on from a fitted scene, usually with painted views.
+
+    Full images and free poses from the first step; growth and rates as in the first fit. Rates
+    started lower held nothing better and took in a fifth less of what was painted.
+    """
+    return replace(
+        config,
+        steps=steps,
+        half_resolution=0.0,
+        refinement=replace(config.refinement, start_step=0),
+        guidance=guidance or config.guidance,
+    )

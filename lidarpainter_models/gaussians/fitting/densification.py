@@ -1,0 +1,158 @@
+"""Put Gaussians where the image is wrong, take them from where they do nothing.
+
+Every Gaussian collects the absolute screen gradient of its centre (Ye et al. 2024, "AbsGS"), in
+pixels of the full fit size. At intervals the faint ones and those that left their actor's box are
+dropped, and the ones with the largest mean gradient are split in two along their longest axis. The
+number never exceeds the budget.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.geometry.transforms import rotation_from_quaternion
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DensificationConfig:
+    """When and how far the number of Gaussians changes."""
+
+    budget: int = 80_000
+    """Never more than this; beyond it the gain per CPU second is small on one front camera."""
+    start: float = 0.1
+    """Fraction of the fit after which splitting begins: gradients must mean something."""
+    stop: float = 0.6
+    """Fraction of the fit after which it ends: new Gaussians need time to settle."""
+    every: int = 100
+    """Steps between two rounds; several passes over the views of a short log."""
+    min_opacity: float = 0.02
+    """Fainter Gaussians are dropped."""
+    box_margin: float = 1.1
+    """An actor's Gaussian may lie this far out, in half sizes of its box."""
+    box_margin_m: float = 0.1
+    """And this much further: mirrors and antennas."""
+
+    def __post_init__(self) -> None:
+        """Refuse a schedule that runs backwards."""
+        if not 0 <= self.start <= self.stop <= 1 or self.every < 1 or self.budget < 1:
+            raise ConfigError(
+                f"densification needs 0 <= start <= stop <= 1, every >= 1 and a positive budget, "
+                f"got start {self.start}, stop {self.stop}, every {self.every}, "
+                f"budget {self.budget}"
+            )
+
+
+@dataclass(eq=False, kw_only=True)
+class GradientTally:
+    """Screen gradients collected since the last round."""
+
+    total: Float[Tensor, " gaussians"]
+    visits: Float[Tensor, " gaussians"]
+
+    @classmethod
+    def zeros(cls, count: int) -> "GradientTally":
+        """Nothing collected."""
+        return cls(total=torch.zeros(count), visits=torch.zeros(count))
+
+    def add(
+        self,
+        rows: Int[Tensor, " seen"],
+        gradient: Float[Tensor, " seen"],
+        visible: Bool[Tensor, " seen"],
+    ) -> None:
+        """Collect one view's gradients of some rows, in place."""
+        self.total[rows] += torch.where(visible, gradient, torch.zeros_like(gradient))
+        self.visits[rows] += visible.float()
+
+    @property
+    def mean(self) -> Float[Tensor, " gaussians"]:
+        """Mean over the views in which each was visible."""
+        return self.total / self.visits.clamp(min=1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SetChange:
+    """A changed set: rows of the old one that stay, in order, then fresh rows."""
+
+    gaussians: GaussianSet
+    kept: Int[Tensor, " kept"]
+    num_added: int
+
+
+def densify(
+    gaussians: GaussianSet,
+    tally: GradientTally,
+    box_sizes_m: Sequence[Float[Tensor, "3"]],
+    config: DensificationConfig,
+    *,
+    target: int,
+) -> SetChange:
+    """Drop the useless, then split the most wanted until there are `target` or the budget."""
+    stays = keeps_its_place(gaussians, box_sizes_m, config)
+    room = min(target, config.budget) - int(stays.sum())
+    score = torch.where(stays & (tally.visits > 0), tally.mean, torch.zeros_like(tally.mean))
+    num_split = max(min(room, int((score > 0).sum())), 0)
+    # a stable sort, so that equal scores never depend on the machine
+    chosen = torch.argsort(score, descending=True, stable=True)[:num_split]
+    is_split = torch.zeros_like(stays)
+    is_split[chosen] = True
+    kept = (stays & ~is_split).nonzero()[:, 0]
+    children = split_along_longest_axis(gaussians.select(is_split.nonzero()[:, 0]))
+    return SetChange(
+        gaussians=gaussians.select(kept).append(children), kept=kept, num_added=len(children)
+    )
+
+
+def prune(
+    gaussians: GaussianSet,
+    box_sizes_m: Sequence[Float[Tensor, "3"]],
+    config: DensificationConfig,
+) -> SetChange:
+    """Drop the useless and nothing else."""
+    kept = keeps_its_place(gaussians, box_sizes_m, config).nonzero()[:, 0]
+    return SetChange(gaussians=gaussians.select(kept), kept=kept, num_added=0)
+
+
+def keeps_its_place(
+    gaussians: GaussianSet,
+    box_sizes_m: Sequence[Float[Tensor, "3"]],
+    config: DensificationConfig,
+) -> Bool[Tensor, " gaussians"]:
+    """Which Gaussians are finite, not faint and, on an actor, still in its box."""
+    columns = gaussians.columns()
+    stays = columns["opacity_logit"].sigmoid() >= config.min_opacity
+    for name in ("means", "log_scale"):
+        stays &= columns[name].isfinite().all(dim=1)
+    if box_sizes_m:
+        half_m = torch.stack([size.float() for size in box_sizes_m]) / 2
+        half_m = half_m * config.box_margin + config.box_margin_m
+        half_m = torch.cat([torch.full((1, 3), torch.inf), half_m]).to(stays.device)
+        stays &= (columns["means"].abs() <= half_m[columns["body_index"].long()]).all(dim=1)
+    return stays
+
+
+def split_along_longest_axis(parents: GaussianSet) -> GaussianSet:
+    """Two halves for each Gaussian, side by side along its longest axis.
+
+    With centres at +-0.75 sigma and 0.66 sigma wide the pair has the parent's spread.
+    """
+    columns = parents.columns()
+    longest = columns["log_scale"].argmax(dim=1)
+    rows = torch.arange(len(parents))
+    axes = rotation_from_quaternion(columns["rotation_wxyz"])
+    direction = axes[rows, :, longest]
+    offset_m = 0.75 * columns["log_scale"][rows, longest].exp()[:, None] * direction
+    log_scale = columns["log_scale"].clone()
+    log_scale[rows, longest] += torch.log(torch.tensor(0.66))
+    halves = []
+    for sign in (1.0, -1.0):
+        half = {name: value.clone() for name, value in columns.items()}
+        half["means"] = columns["means"] + sign * offset_m
+        half["log_scale"] = log_scale.clone()
+        halves.append(GaussianSet(**half))
+    return halves[0].append(halves[1])

@@ -1,0 +1,181 @@
+"""Fit a dynamic Gaussian scene to its observations, and go on fitting it with painted views.
+
+Each step draws one recorded view, compares it with its image (L1 + 0.2 (1 - SSIM), optionally a
+perceptual distance) and LiDAR depth, and moves Gaussians, sky and pose corrections; some steps add
+a painted view. Equal inputs give bitwise equal scenes, interrupted or not.
+"""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
+from lidarpainter_models.gaussians.fitting.config import FitConfig
+from lidarpainter_models.gaussians.fitting.densification import densify, prune
+from lidarpainter_models.gaussians.fitting.images import FitImage, full_image, half_image
+from lidarpainter_models.gaussians.fitting.shape_limits import limit_shapes, viewing_rays
+from lidarpainter_models.gaussians.fitting.state import FitState
+from lidarpainter_models.gaussians.fitting.step import Perceptual, fit_step
+from lidarpainter_models.gaussians.initialisation.scene import initialise_scene
+from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.model.sky import seen_as_sky
+from lidarpainter_models.observations.observations import GuidanceView, SceneObservations
+
+Progress = Callable[[int, int, dict[str, float]], None]
+"""Told the steps done, the steps in all and the newest entry of the history."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FitResult:
+    """A fitted scene and how it came about."""
+
+    scene: GaussianScene
+    history: list[dict[str, float]]
+    """Every so many steps: step, loss, psnr (training views), num_gaussians, cpu_s."""
+
+
+def fit_gaussians(  # noqa: PLR0913 - the one door to the fit
+    observations: SceneObservations,
+    config: FitConfig,
+    *,
+    start: GaussianScene | None = None,
+    guidance: Sequence[GuidanceView] = (),
+    checkpoints: CheckpointFolder | None = None,
+    progress: Progress | None = None,
+    perceptual: Perceptual | None = None,
+    stop_after_cpu_s: float | None = None,
+) -> FitResult:
+    """Fit a scene.
+
+    Args:
+        observations: what was recorded.
+        config: see there.
+        start: the scene to go on from; without it one is made from the LiDAR map.
+        guidance: painted views.
+        checkpoints: where to keep the running fit; an existing checkpoint is taken up.
+        progress: told about every entry of the history.
+        perceptual: distance of a rendered and a recorded image, weighted by the config.
+        stop_after_cpu_s: end early after so many process CPU seconds (the result then depends on
+            the machine's speed).
+
+    Raises:
+        ConfigError: the start belongs to other training views, or a weight lacks its function.
+    """
+    _check(observations, config, start, perceptual)
+    kept = checkpoints.load() if checkpoints is not None else None
+    cpu_before_s = time.process_time()
+    if kept is not None:
+        state = FitState.resume(*kept, config)
+    else:
+        scene = initialise_scene(observations, config.initialisation) if start is None else start
+        state = FitState.begin(scene, config)
+    cpu_before_s -= state.cpu_s
+    full, half = _images(observations, state.scene, config)
+    while state.step < config.steps:
+        is_half = state.step < config.half_resolution * config.steps
+        _advance(state, half if is_half else full, guidance, config, perceptual)
+        state.cpu_s = time.process_time() - cpu_before_s
+        is_out_of_time = stop_after_cpu_s is not None and state.cpu_s >= stop_after_cpu_s
+        is_last = is_out_of_time or state.step == config.steps
+        if state.step % config.log_every == 0 or is_last:
+            _log(state, config, progress)
+        if checkpoints is not None and (is_out_of_time or checkpoints.is_due(state.step)):
+            checkpoints.save(*state.keep())
+        if is_out_of_time:
+            break
+    return FitResult(scene=_finished(state, config), history=state.history)
+
+
+def _images(
+    observations: SceneObservations, scene: GaussianScene, config: FitConfig
+) -> tuple[list[FitImage], list[FitImage]]:
+    """The training images, and those at half size if they are wanted."""
+    views = observations.views
+    cameras, masks = [view.camera for view in views], [view.sky_mask for view in views]
+    pairs = list(zip(views, seen_as_sky(scene.sky.layout, cameras, masks), strict=True))
+    full = [full_image(view, may_be_sky) for view, may_be_sky in pairs]
+    return full, [half_image(*pair) for pair in pairs] if config.half_resolution else []
+
+
+def _advance(
+    state: FitState,
+    images: Sequence[FitImage],
+    guidance: Sequence[GuidanceView],
+    config: FitConfig,
+    perceptual: Perceptual | None,
+) -> None:
+    """One step: gradients, optimisers, and at their times the rounds that change the set."""
+    row = state.next_view(len(images))
+    painted = None
+    if guidance and state.random() < config.guidance.probability:
+        painted = guidance[int(torch.randint(len(guidance), (), generator=state.generator))]
+    told = fit_step(state, images[row], row, painted, config, perceptual)
+    state.step += 1
+    state.recent.append(told)
+    _change_set(state, config)
+    if state.step % config.shapes.every == 0:
+        scene = state.caught_up()
+        limit_shapes(scene.gaussians, viewing_rays(scene), config.shapes)
+        state.blocks.refresh(scene.gaussians)
+
+
+def _change_set(state: FitState, config: FitConfig) -> None:
+    """Split and prune when it is time."""
+    settings, fraction = config.densification, state.step / config.steps
+    if state.step % settings.every or fraction < settings.start or state.step == config.steps:
+        return
+    sizes = [track.size_m for track in state.scene.recorded_tracks]
+    gaussians = state.caught_up().gaussians
+    if fraction > settings.stop:
+        state.apply(prune(gaussians, sizes, settings))
+        return
+    first = min(len(gaussians), settings.budget)
+    progress = (fraction - settings.start) / max(settings.stop - settings.start, 1e-9)
+    rounds_left = max((1 - progress) * (settings.stop - settings.start), 0) * config.steps
+    rounds_left = 1 + rounds_left // settings.every
+    target = first + math.ceil((settings.budget - first) / rounds_left)
+    state.apply(densify(gaussians, state.tally, sizes, settings, target=target))
+
+
+def _log(state: FitState, config: FitConfig, progress: Progress | None) -> None:
+    """Add an entry to the history."""
+    losses, errors = zip(*state.recent, strict=True) if state.recent else ((0.0,), (1.0,))
+    entry = {
+        "step": float(state.step),
+        "loss": sum(losses) / len(losses),
+        "psnr": sum(-10 * math.log10(max(error, 1e-10)) for error in errors) / len(errors),
+        "num_gaussians": float(state.scene.num_gaussians),
+        "cpu_s": state.cpu_s,
+    }
+    state.recent = []
+    state.history.append(entry)
+    if progress is not None:
+        progress(state.step, config.steps, entry)
+
+
+def _finished(state: FitState, config: FitConfig) -> GaussianScene:
+    """The scene without gradients, useless Gaussians or unseen sky."""
+    scene = state.caught_up().copy()
+    sizes = [track.size_m for track in scene.recorded_tracks]
+    change = prune(scene.gaussians, sizes, config.densification)
+    return replace(scene, gaussians=change.gaussians, sky=scene.sky.filled())
+
+
+def _check(
+    observations: SceneObservations,
+    config: FitConfig,
+    start: GaussianScene | None,
+    perceptual: Perceptual | None,
+) -> None:
+    keys = tuple(view.key for view in observations.views)
+    if start is not None and start.cameras.keys != keys:
+        raise ConfigError(
+            f"the start was fitted to {len(start.cameras.keys)} other training views than the "
+            f"{len(keys)} given"
+        )
+    if config.losses.perceptual > 0 and perceptual is None:
+        raise ConfigError("losses.perceptual is positive, but no perceptual distance is given")

@@ -1,0 +1,105 @@
+"""Training images at full and half size, ready for a step of the fit."""
+
+from dataclasses import dataclass
+
+import cv2
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidarpainter_models.gaussians.fitting.pixel_terms import NOTHING, OPEN, SKY, SOLID, PixelFacts
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.observations.observations import TrainingView, shrink_image
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FitImage:
+    """One training view at one size."""
+
+    camera: Camera
+    """As recorded."""
+    timestamp_ns: int
+    camera_name: str
+    facts: PixelFacts
+
+    @property
+    def is_open(self) -> Bool[Tensor, "height width"]:
+        """Pixels that may be sky without being in its mask."""
+        return self.facts.kind == OPEN
+
+
+def full_image(
+    view: TrainingView, may_be_sky: Bool[Tensor, "height width"] | None = None
+) -> FitImage:
+    """The view as it is; only pixels that may be sky can be OPEN, by default all."""
+    return FitImage(
+        camera=view.camera,
+        timestamp_ns=view.timestamp_ns,
+        camera_name=view.key[1],
+        facts=_facts(view.camera, view.rgb, view.sky_mask, view.lidar_depth_m, may_be_sky),
+    )
+
+
+def half_image(
+    view: TrainingView, may_be_sky: Bool[Tensor, "height width"] | None = None
+) -> FitImage:
+    """The view at half size: area-averaged colours, mostly-sky masks, nearest depths."""
+    size = {
+        "width_px": max(view.camera.width_px // 2, 1),
+        "height_px": max(view.camera.height_px // 2, 1),
+    }
+    camera = view.camera.resized(**size)
+    rgb = shrink_image(view.rgb_u8, **size).float() / 255
+    depth_m = shrink_depth(view.lidar_depth_m, **size)
+    sky_mask = _shrink_mask(view.sky_mask, **size)
+    may_be_sky = None if may_be_sky is None else _shrink_mask(may_be_sky, **size)
+    return FitImage(
+        camera=camera,
+        timestamp_ns=view.timestamp_ns,
+        camera_name=view.key[1],
+        facts=_facts(camera, rgb, sky_mask, depth_m, may_be_sky),
+    )
+
+
+def shrink_depth(
+    depth_m: Float[Tensor, "height width"], *, width_px: int, height_px: int
+) -> Float[Tensor, "rows columns"]:
+    """A sparse depth image on a coarser grid; the nearest depth of each cell wins."""
+    rows, columns = depth_m.nonzero(as_tuple=True)
+    cells = (rows * height_px // depth_m.shape[0]) * width_px
+    cells = cells + columns * width_px // depth_m.shape[1]
+    nearest = torch.full((height_px * width_px,), torch.inf)
+    nearest.scatter_reduce_(0, cells, depth_m[rows, columns], reduce="amin")
+    nearest = torch.where(nearest.isfinite(), nearest, torch.zeros_like(nearest))
+    return nearest.view(height_px, width_px)
+
+
+def above_horizon(camera: Camera) -> Bool[Tensor, "height width"]:
+    """Pixels whose rays rise, world z being up."""
+    up = camera.world_from_camera[2, :3].float()
+    return (camera.pixel_directions() @ up) > 0
+
+
+def _shrink_mask(
+    mask: Bool[Tensor, "height width"], *, width_px: int, height_px: int
+) -> Bool[Tensor, "rows columns"]:
+    """True where most of a cell of the coarser grid is."""
+    share = cv2.resize(mask.float().numpy(), (width_px, height_px), interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(share) > 0.5
+
+
+def _facts(
+    camera: Camera,
+    rgb: Float[Tensor, "height width 3"],
+    sky_mask: Bool[Tensor, "height width"],
+    lidar_depth_m: Float[Tensor, "height width"],
+    may_be_sky: Bool[Tensor, "height width"] | None,
+) -> PixelFacts:
+    """Tell the pixels apart; solid ones are at most one pixel away from a LiDAR return."""
+    beside = torch.nn.functional.max_pool2d((lidar_depth_m > 0).float()[None], 3, 1, 1)[0] > 0
+    kind = torch.full(sky_mask.shape, NOTHING, dtype=torch.uint8)
+    is_above = above_horizon(camera)
+    kind[is_above if may_be_sky is None else is_above & may_be_sky] = OPEN
+    kind[beside] = SOLID
+    kind[sky_mask] = SKY
+    return PixelFacts(rgb=rgb.contiguous(), kind=kind, lidar_depth_m=lidar_depth_m.contiguous())

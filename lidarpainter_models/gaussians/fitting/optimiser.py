@@ -1,0 +1,84 @@
+"""The step sizes of everything that a fit changes, and Adam for its pose corrections.
+
+Centres move in units of their Gaussian's own size: one learning rate then suits a pebble and a
+far tower (`gaussian_adam`). Pose corrections step only when their view is drawn (a dense Adam would
+let them drift on momentum for the dozen steps in between). Rates fall exponentially over the fit.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LearningRates:
+    """First and last step sizes; each falls exponentially from the one to the other."""
+
+    means: tuple[float, float] = (0.03, 0.002)
+    """In standard deviations of the Gaussian (mean of its two longer axes)."""
+    rotation_wxyz: tuple[float, float] = (2e-3, 4e-4)
+    """Quaternion units."""
+    log_scale: tuple[float, float] = (1e-2, 2e-3)
+    """Logarithm of metres."""
+    opacity_logit: tuple[float, float] = (3e-2, 1e-2)
+    """Logits."""
+    sh_dc: tuple[float, float] = (6e-3, 1e-3)
+    """Harmonics; a colour changes by 0.28 of it."""
+    sh_rest: tuple[float, float] = (6e-4, 2e-4)
+    """Harmonics of degree 1 and more."""
+    camera_rotation_rad: tuple[float, float] = (3e-4, 3e-5)
+    """A pixel of a 480-pixel image is about 2e-3 rad."""
+    camera_translation_m: tuple[float, float] = (3e-3, 3e-4)
+    """Recorded positions are good to centimetres."""
+    actor_rotation_rad: tuple[float, float] = (2e-3, 2e-4)
+    """Boxes are drawn by hand: a degree off is common."""
+    actor_translation_m: tuple[float, float] = (1e-2, 1e-3)
+    """Boxes are drawn by hand: a decimetre off is common."""
+    exposure: tuple[float, float] = (2e-3, 2e-4)
+    """Entries of a camera's colour matrix."""
+
+    def at(self, name: str, fraction: float) -> float:
+        """The rate of one kind after a fraction of the fit."""
+        first, last = getattr(self, name)
+        return first * (last / first) ** min(max(fraction, 0.0), 1.0)
+
+
+class RowAdam:
+    """Adam (Kingma and Ba, 2015) on a table whose rows have their own step sizes and counts.
+
+    A row whose gradient is exactly zero is left alone: value, moments and count.
+    """
+
+    def __init__(self, table: Tensor, *, betas: tuple[float, float] = (0.9, 0.99)) -> None:
+        """Start with empty moments; rows are the first dimension (or the first two, flattened)."""
+        self.betas = betas
+        self.first = torch.zeros_like(table)
+        self.second = torch.zeros_like(table)
+        self.count = torch.zeros(table.shape[0], dtype=torch.int64)
+
+    def step(self, table: Tensor, gradient: Tensor, rate: Float[Tensor, "columns"]) -> None:
+        """One step in place on the rows with a gradient; `rate` is per column."""
+        beta1, beta2 = self.betas
+        rows = gradient.abs().sum(dim=1).nonzero()[:, 0]
+        if rows.numel() == 0:
+            return
+        g = gradient[rows]
+        self.count[rows] += 1
+        count = self.count[rows, None].to(g.dtype)
+        first = beta1 * self.first[rows] + (1 - beta1) * g
+        second = beta2 * self.second[rows] + (1 - beta2) * g * g
+        self.first[rows], self.second[rows] = first, second
+        spread = (second / (1 - beta2**count)).sqrt() + 1e-15
+        with torch.no_grad():
+            table[rows] -= rate * (first / (1 - beta1**count)) / spread
+
+    def tensors(self) -> dict[str, Tensor]:
+        """State to be kept in a checkpoint."""
+        return {"first": self.first, "second": self.second, "count": self.count}
+
+    def load(self, tensors: dict[str, Tensor]) -> None:
+        """Take over kept state."""
+        self.first, self.second = tensors["first"].clone(), tensors["second"].clone()
+        self.count = tensors["count"].clone()

@@ -1,0 +1,105 @@
+"""Keep Gaussians from growing into needles along rays, films and giants.
+
+A recorded view sees nothing of a Gaussian's extent along its ray; there the fit is free to draw
+needles, which show as fans of streaks from anywhere else. Lengths are metres, in body frames.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
+from lidarpainter_models.geometry.transforms import (
+    invert_rigid,
+    rotation_from_quaternion,
+)
+
+_ALONG = math.cos(math.radians(45))
+_MOST_CAMERAS = 16
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShapeLimits:
+    """Which shapes a Gaussian may take."""
+
+    every: int = 50
+    """Steps between two checks."""
+    most_elongation: float = 12.0
+    """Longest over middle axis: poles and wires need needles."""
+    most_elongation_along_ray: float = 2.0
+    """The same for an axis within 45 degrees of the viewing ray."""
+    steady_ray: float = 0.985
+    """Rays that differ more than about 10 degrees over the log pin a Gaussian's depth themselves:
+    below this length of the mean unit ray the stricter limit is off."""
+    least_sigma_m: float = 0.003
+    """Thinnest axis; the low-pass of a pixel is wider anyway."""
+    most_sigma: float = 0.1
+    """Longest axis in units of the distance to the nearest camera."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ViewingRays:
+    """How the training cameras saw each Gaussian, in its body frame."""
+
+    mean_direction: Float[Tensor, "gaussians 3"]
+    """Mean of the unit rays: short where they differ."""
+    distance_m: Float[Tensor, " gaussians"]
+    """To the nearest camera."""
+
+
+def viewing_rays(scene: GaussianScene, camera_rows: Sequence[int] | None = None) -> ViewingRays:
+    """Directions and distances from the training cameras in whose front a Gaussian lies."""
+    means = scene.gaussians.means.detach()
+    body = scene.gaussians.body_index.long()
+    num_views = len(scene.cameras.keys)
+    stride = math.ceil(num_views / _MOST_CAMERAS)
+    rows = range(0, num_views, stride) if camera_rows is None else camera_rows
+    total = torch.zeros_like(means)
+    count = torch.zeros(len(scene.gaussians))
+    distance_m = torch.full((len(scene.gaussians),), torch.inf)
+    with torch.no_grad():
+        for row in rows:
+            timestamp_ns = int(scene.cameras.timestamps_ns[row])
+            camera_from_body = scene.camera_from_body(
+                scene.cameras.world_from_camera(row), *scene.world_from_actors(timestamp_ns)
+            )
+            body_from_camera = invert_rigid(camera_from_body)
+            offset = means - body_from_camera[body, :3, 3]
+            forward = body_from_camera[body, :3, 2]
+            length = offset.norm(dim=1).clamp(min=1e-3)
+            is_ahead = (offset * forward).sum(dim=1) > 0.5
+            total += torch.where(is_ahead[:, None], offset / length[:, None], 0.0)
+            count += is_ahead
+            distance_m = torch.where(is_ahead, torch.minimum(distance_m, length), distance_m)
+    return ViewingRays(
+        mean_direction=total / count.clamp(min=1)[:, None],
+        distance_m=torch.where(count > 0, distance_m, 50.0),
+    )
+
+
+def limit_shapes(gaussians: GaussianSet, rays: ViewingRays, limits: ShapeLimits) -> None:
+    """Shorten needles, thicken films and shrink giants, in place (`log_scale`)."""
+    with torch.no_grad():
+        ordered, order = gaussians.log_scale.sort(dim=1)
+        direction = _axis(gaussians.rotation_wxyz, order[:, 2])
+        length = rays.mean_direction.norm(dim=1)
+        along = (direction * rays.mean_direction).sum(dim=1).abs() / length.clamp(min=1e-3)
+        is_needle = (along > _ALONG) & (length > limits.steady_ray)
+        most = torch.where(is_needle, limits.most_elongation_along_ray, limits.most_elongation)
+        limit = ordered[:, 1] + most.log()
+        limit = torch.minimum(limit, (rays.distance_m * limits.most_sigma).log())
+        capped = torch.minimum(gaussians.log_scale, limit[:, None])
+        gaussians.log_scale.copy_(capped.clamp(min=math.log(limits.least_sigma_m)))
+
+
+def _axis(
+    rotation_wxyz: Float[Tensor, "gaussians 4"], axis: Int[Tensor, " gaussians"]
+) -> Float[Tensor, "gaussians 3"]:
+    """The given column of each rotation matrix."""
+    rotation = rotation_from_quaternion(rotation_wxyz)
+    return rotation.gather(2, axis[:, None, None].expand(-1, 3, 1))[..., 0]

@@ -1,0 +1,157 @@
+"""All that a running fit is made of, and how it is kept and taken up again bit for bit.
+
+Gaussians out of view lag behind (`gaussian_adam`). They are kept as they lag, together with their
+blocks: catching up for a checkpoint would split their way differently from an undisturbed run's.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lidarpainter_models.gaussians.fitting.checkpoint import (
+    generator_from,
+    group_tensors,
+    ungroup_tensors,
+)
+from lidarpainter_models.gaussians.fitting.config import FitConfig
+from lidarpainter_models.gaussians.fitting.densification import GradientTally, SetChange
+from lidarpainter_models.gaussians.fitting.gaussian_adam import GaussianAdam
+from lidarpainter_models.gaussians.fitting.optimiser import RowAdam
+from lidarpainter_models.gaussians.fitting.spatial_blocks import SpatialBlocks, View
+from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
+from lidarpainter_models.kernels.sparse_adam.cpu import MOST_STEP
+
+
+@dataclass(eq=False, kw_only=True)
+class FitState:
+    """The scene with its optimisers, tallies, random state and history."""
+
+    scene: GaussianScene
+    """Its Gaussians out of view lag behind until `caught_up`."""
+    gaussian_adam: GaussianAdam
+    blocks: SpatialBlocks
+    camera_adam: RowAdam
+    actor_adam: RowAdam
+    exposure_adam: RowAdam
+    tally: GradientTally
+    generator: torch.Generator
+    waiting: list[int] = field(default_factory=list)
+    """Views still to be drawn in this pass."""
+    step: int = 0
+    cpu_s: float = 0.0
+    """Process CPU seconds spent so far, earlier runs included."""
+    history: list[dict[str, float]] = field(default_factory=list)
+    recent: list[tuple[float, float]] = field(default_factory=list)
+    """Loss and squared error of the steps since the last entry of the history."""
+
+    @classmethod
+    def begin(cls, scene: GaussianScene, config: FitConfig) -> "FitState":
+        """A fit before its first step; takes its own copy of the scene."""
+        scene = _as_leaves(scene.copy())
+        generator = torch.Generator()
+        generator.manual_seed(config.seed)
+        return cls(
+            scene=scene,
+            gaussian_adam=GaussianAdam(scene.gaussians, config.learning_rates),
+            blocks=SpatialBlocks.of(scene.gaussians, config.learning_rates),
+            camera_adam=RowAdam(scene.cameras.view_tangent),
+            actor_adam=RowAdam(scene.actors.tangent.flatten(0, 1)),
+            exposure_adam=RowAdam(scene.exposure.matrix.flatten(1)),
+            tally=GradientTally.zeros(scene.num_gaussians),
+            generator=generator,
+        )
+
+    def next_view(self, num_views: int) -> int:
+        """The next view of a random order that shows every view once before any twice."""
+        if not self.waiting:
+            self.waiting = torch.randperm(num_views, generator=self.generator).tolist()
+        return self.waiting.pop()
+
+    def random(self) -> float:
+        """A uniform number in [0, 1)."""
+        return float(torch.rand((), generator=self.generator))
+
+    def seen(self, views: Sequence[View]) -> SeenGaussians:
+        """All Gaussians that any of these views can show, as leaves for one step.
+
+        Views after the first are drawn when the actors' poses have been stepped.
+        """
+        rates, most = self.gaussian_adam.rates, math.sqrt(3.0) * MOST_STEP
+        slack = (most * max(rates.actor_translation_m), most * max(rates.actor_rotation_rad))
+        rows = self.blocks.rows_in_view(views, actor_slack=slack if len(views) > 1 else (0.0, 0.0))
+        return self.gaussian_adam.seen(self.scene.gaussians, rows)
+
+    def step_gaussians(self, seen: SeenGaussians, fraction: float) -> None:
+        """Move the Gaussians that collected gradients, after a fraction of the fit."""
+        self.gaussian_adam.step(self.scene.gaussians, seen, fraction)
+        self.blocks.refresh(self.scene.gaussians, seen.rows)
+
+    def caught_up(self) -> GaussianScene:
+        """The scene with every Gaussian where the steps so far put it."""
+        self.gaussian_adam.catch_up(self.scene.gaussians)
+        return self.scene
+
+    def apply(self, change: SetChange) -> None:
+        """Take over a changed set of Gaussians, made from `caught_up`; tallies start again."""
+        self.scene = self.scene.with_gaussians(change.gaussians.as_leaves())
+        self.gaussian_adam.rebuild(change.kept, change.num_added)
+        self.blocks = SpatialBlocks.of(self.scene.gaussians, self.gaussian_adam.rates)
+        self.tally = GradientTally.zeros(len(change.gaussians))
+
+    def keep(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Tensors and JSON-able numbers of the whole state."""
+        scene_arrays, scene_metadata = self.scene.to_arrays()
+        tensors = group_tensors(
+            {
+                "scene": scene_arrays,
+                "gaussian_adam": self.gaussian_adam.tensors(),
+                "blocks": {"block_of_row": self.blocks.block_of_row},
+                "camera_adam": self.camera_adam.tensors(),
+                "actor_adam": self.actor_adam.tensors(),
+                "exposure_adam": self.exposure_adam.tensors(),
+                "tally": {"total": self.tally.total, "visits": self.tally.visits},
+                "random": {"state": self.generator.get_state()},
+            }
+        )
+        numbers = {
+            "scene": scene_metadata,
+            "waiting": self.waiting,
+            "step": self.step,
+            "cpu_s": self.cpu_s,
+            "history": self.history,
+            "recent": self.recent,
+        }
+        return tensors, numbers
+
+    @classmethod
+    def resume(
+        cls, tensors: dict[str, Tensor], numbers: dict[str, Any], config: FitConfig
+    ) -> "FitState":
+        """The state that `keep` described."""
+        scene = GaussianScene.from_arrays(ungroup_tensors(tensors, "scene"), numbers["scene"])
+        state = cls.begin(scene, config)
+        for name in ("gaussian_adam", "camera_adam", "actor_adam", "exposure_adam"):
+            getattr(state, name).load(ungroup_tensors(tensors, name))
+        state.blocks = SpatialBlocks.with_rows_in(
+            tensors["blocks/block_of_row"], state.scene.gaussians, config.learning_rates
+        )
+        state.tally = GradientTally(**ungroup_tensors(tensors, "tally"))
+        state.generator = generator_from(tensors["random/state"])
+        state.waiting = list(numbers["waiting"])
+        state.step, state.cpu_s = numbers["step"], numbers["cpu_s"]
+        state.history = list(numbers["history"])
+        state.recent = [tuple(pair) for pair in numbers["recent"]]
+        return state
+
+
+def _as_leaves(scene: GaussianScene) -> GaussianScene:
+    """Let everything that a fit changes collect gradients (the sky has its own optimiser)."""
+    scene.gaussians = scene.gaussians.as_leaves()
+    for table in (scene.cameras.view_tangent, scene.actors.tangent, scene.exposure.matrix):
+        table.requires_grad_(True)
+    return scene

@@ -1,0 +1,1 @@
+"""Where Gaussians start: on LiDAR surfaces, and behind what no LiDAR reached."""

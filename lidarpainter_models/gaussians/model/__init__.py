@@ -1,0 +1,1 @@
+"""What a fitted scene is: Gaussians, moving actors, sky, corrections of what was recorded."""

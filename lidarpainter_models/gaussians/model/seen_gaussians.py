@@ -1,0 +1,73 @@
+"""The Gaussians that one step of a fit may see, as leaves that collect its gradients."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+
+LEAVES = ("means", "rotation_wxyz", "log_scale", "opacity_logit", "sh")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SeenGaussians:
+    """Some rows of a Gaussian set, in order; all harmonics in one leaf, constant first."""
+
+    rows: Int[Tensor, " seen"]
+    """Where they stand in the set."""
+    means: Float[Tensor, "seen 3"]
+    rotation_wxyz: Float[Tensor, "seen 4"]
+    log_scale: Float[Tensor, "seen 3"]
+    opacity_logit: Float[Tensor, " seen"]
+    sh: Float[Tensor, "seen coefficients 3"]
+    body_index: Int[Tensor, " seen"]
+
+    @classmethod
+    def room(cls, gaussians: GaussianSet, rows: Int[Tensor, " seen"]) -> "SeenGaussians":
+        """Leaves for the given rows of a set; their values are still to be written."""
+        count = len(rows)
+        return cls(
+            rows=rows,
+            means=torch.empty(count, 3, requires_grad=True),
+            rotation_wxyz=torch.empty(count, 4, requires_grad=True),
+            log_scale=torch.empty(count, 3, requires_grad=True),
+            opacity_logit=torch.empty(count, requires_grad=True),
+            sh=torch.empty(count, 1 + gaussians.sh_rest.shape[1], 3, requires_grad=True),
+            body_index=gaussians.body_index[rows],
+        )
+
+    def __len__(self) -> int:
+        return self.rows.shape[0]
+
+    @property
+    def scale_m(self) -> Float[Tensor, "seen 3"]:
+        """Standard deviations along the Gaussian's own axes."""
+        return self.log_scale.exp()
+
+    @property
+    def opacity(self) -> Float[Tensor, " seen"]:
+        """In (0, 1)."""
+        return self.opacity_logit.sigmoid()
+
+    def with_fixed_geometry(self) -> "SeenGaussians":
+        """The same Gaussians, of which only colour and opacity collect gradients."""
+        return replace(
+            self,
+            means=self.means.detach(),
+            rotation_wxyz=self.rotation_wxyz.detach(),
+            log_scale=self.log_scale.detach(),
+        )
+
+    def values(self) -> dict[str, Tensor]:
+        """The leaves by name, detached."""
+        return {name: getattr(self, name).detach() for name in LEAVES}
+
+    def gradients(self) -> dict[str, Tensor]:
+        """What the leaves collected, by name; zeros where nothing came."""
+        leaves = {name: getattr(self, name) for name in LEAVES}
+        return {
+            name: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
+            for name, leaf in leaves.items()
+        }

@@ -1,0 +1,242 @@
+"""The sky: a texture of colours by direction, behind everything else.
+
+What LiDAR never reaches is taken to be infinitely far. A texel learns only from pixels that the
+Gaussians leave clear (transmittance above a gate): seen through a nearly opaque surface, Adam's
+normalisation would drive it to any colour (rainbow speckle in every disocclusion). Texels that no
+image shows are filled in from their neighbours by push and pull (Gortler et al., 1996).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lidarpainter_models.gaussians.model.sky_sampling import (
+    SkyLayout,
+    SkyRays,
+    sample_sky,
+    scatter_gradient,
+    sky_rays,
+)
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.kernels.sky_texture import cpu as sky_kernels
+
+_FULL_TURN_FROM_RAD = math.radians(270)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SkyConfig:
+    """How the sky texture is laid out and fitted."""
+
+    texel_px: float = 1.0
+    """Texel size in pixels of the sharpest training camera: finer could not be seen."""
+    lowest_rad: float = math.radians(-8)
+    """Elevation of the lowest row; below it, the lowest row's colour goes on."""
+    margin_rad: float = math.radians(6)
+    """Room left and right of the training views before the edge colour goes on."""
+    max_texels: int = 2_000_000
+    """The texture is coarsened to stay below this (a full turn of sharp cameras is 8 million)."""
+    min_transmittance: float = 0.2
+    """A texel learns only through pixels clearer than this."""
+    learning_rate: float = 0.01
+    """First Adam step, in colour units."""
+    final_learning_rate: float = 0.001
+    """Last Adam step."""
+
+
+@dataclass(eq=False, kw_only=True)
+class SkyTexture:
+    """Colours by world direction, with the state of their optimiser."""
+
+    layout: SkyLayout
+    rgb: Float[Tensor, "rows columns 3"]
+    weight: Float[Tensor, "rows columns"]
+    """How much clear image each texel has seen; 0 where the colour is a guess."""
+    first_moment: Float[Tensor, "rows columns 3"]
+    second_moment: Float[Tensor, "rows columns 3"]
+    visits: Int[Tensor, "rows columns"]
+
+    @classmethod
+    def constant(cls, layout: SkyLayout, rgb: Float[Tensor, "3"]) -> "SkyTexture":
+        """One colour everywhere, nothing seen yet."""
+        size = (layout.rows, layout.columns)
+        return cls(
+            layout=layout,
+            rgb=rgb.float().expand(*size, 3).clone(),
+            weight=torch.zeros(size),
+            first_moment=torch.zeros(*size, 3),
+            second_moment=torch.zeros(*size, 3),
+            visits=torch.zeros(size, dtype=torch.int32),
+        )
+
+    def rays(self, camera: Camera, wanted: Bool[Tensor, "height width"] | None = None) -> SkyRays:
+        """Where the camera's rays (of the wanted pixels) meet the texture."""
+        return sky_rays(camera, self.layout, wanted)
+
+    def sample(self, rays: SkyRays) -> Float[Tensor, "height width 3"]:
+        """Colour along the rays, without gradient."""
+        return sample_sky(self.rgb, rays, self.layout)
+
+    def observe(
+        self,
+        gradient: Float[Tensor, "height width 3"],
+        clear: Float[Tensor, "height width"],
+        rays: SkyRays,
+        learning_rate: float,
+    ) -> None:
+        """One optimiser step on the texels seen through pixels of positive `clear`, in place."""
+        texel_gradient, texel_weight = scatter_gradient(gradient, clear, rays, self.layout)
+        self.weight += texel_weight
+        if self.rgb.device.type == "cpu":
+            sky_kernels.adam(
+                self.rgb.numpy(),
+                self.first_moment.numpy(),
+                self.second_moment.numpy(),
+                self.visits.numpy(),
+                texel_gradient.numpy(),
+                texel_weight.numpy(),
+                learning_rate,
+            )
+        else:
+            adam_reference(self, texel_gradient, texel_weight, learning_rate)
+
+    def filled(self) -> "SkyTexture":
+        """The same sky with every unseen texel filled in from seen ones."""
+        known = self.weight.clamp(max=1.0)
+        return replace(self, rgb=push_pull(self.rgb, known, wraps=self.layout.wraps))
+
+    def clone(self) -> "SkyTexture":
+        """A copy that shares no memory."""
+        tensors = {name: value.clone() for name, value in self.tensors().items()}
+        return SkyTexture(layout=self.layout, **tensors)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything a checkpoint must keep besides the layout."""
+        names = ("rgb", "weight", "first_moment", "second_moment", "visits")
+        return {name: getattr(self, name) for name in names}
+
+
+def adam_reference(
+    sky: SkyTexture,
+    gradient: Float[Tensor, "rows columns 3"],
+    weight: Float[Tensor, "rows columns"],
+    learning_rate: float,
+) -> None:
+    """Plain torch twin of the fast Adam step on the touched texels, in place."""
+    touched = weight > 0
+    sky.visits[touched] += 1
+    count = sky.visits[touched].clamp(max=1000).float()[:, None]
+    g = gradient[touched]
+    sky.first_moment[touched] = 0.9 * sky.first_moment[touched] + 0.1 * g
+    sky.second_moment[touched] = 0.99 * sky.second_moment[touched] + 0.01 * g * g
+    mean = sky.first_moment[touched] / (1 - 0.9**count)
+    spread = (sky.second_moment[touched] / (1 - 0.99**count)).sqrt() + 1e-12
+    sky.rgb[touched] = (sky.rgb[touched] - learning_rate * mean / spread).clamp(0, 1)
+
+
+def sky_layout(cameras: Sequence[Camera], config: SkyConfig) -> SkyLayout:
+    """The patch of sky that the cameras can see, or all of it where they look all round."""
+    azimuth, elevation = _border_directions(cameras)
+    middle = torch.atan2(azimuth.sin().mean(), azimuth.cos().mean())
+    offset = torch.remainder(azimuth - middle + math.pi, 2 * math.pi) - math.pi
+    left, right = float(offset.max()) + config.margin_rad, float(-offset.min()) + config.margin_rad
+    top = min(float(elevation.max()) + config.margin_rad, math.pi / 2)
+    top = max(top, config.lowest_rad + 0.1)
+    texel = config.texel_px / max(camera.fx_px for camera in cameras)
+    is_full = left + right > _FULL_TURN_FROM_RAD
+    width = 2 * math.pi if is_full else left + right
+    texel *= max(1.0, math.sqrt(width * (top - config.lowest_rad) / texel**2 / config.max_texels))
+    columns = max(math.ceil(width / texel), 2)
+    if is_full:
+        texel = 2 * math.pi / columns
+    return SkyLayout(
+        azimuth_left_rad=math.pi if is_full else float(middle) + left,
+        elevation_top_rad=top,
+        texel_rad=texel,
+        columns=columns,
+        rows=max(math.ceil((top - config.lowest_rad) / texel), 2),
+    )
+
+
+def sky_from_images(
+    layout: SkyLayout,
+    cameras: Sequence[Camera],
+    images: Sequence[Float[Tensor, "height width 3"]],
+    masks: Sequence[Bool[Tensor, "height width"]],
+) -> SkyTexture:
+    """The mean colour of the images' sky pixels by direction, filled in where there is none."""
+    total = torch.zeros(layout.rows, layout.columns, 3)
+    weight = torch.zeros(layout.rows, layout.columns)
+    for camera, image, mask in zip(cameras, images, masks, strict=True):
+        part, part_weight = scatter_gradient(
+            image, mask.float(), sky_rays(camera, layout, mask), layout
+        )
+        total += part
+        weight += part_weight
+    if not bool((weight > 0).any()):
+        return SkyTexture.constant(layout, torch.full((3,), 0.7))
+    mean = total / weight.clamp(min=1e-6)[..., None]
+    sky = SkyTexture.constant(layout, torch.zeros(3))
+    return replace(sky, rgb=push_pull(mean, weight.clamp(max=1.0), wraps=layout.wraps))
+
+
+def seen_as_sky(
+    layout: SkyLayout,
+    cameras: Sequence[Camera],
+    masks: Sequence[Bool[Tensor, "height width"]],
+) -> list[Bool[Tensor, "height width"]]:
+    """Each camera's pixels whose direction lies in the mask of any of the cameras."""
+    weight = torch.zeros(layout.rows, layout.columns)
+    for camera, mask in zip(cameras, masks, strict=True):
+        nothing = torch.zeros(*mask.shape, 3)
+        rays = sky_rays(camera, layout, mask)
+        weight += scatter_gradient(nothing, mask.float(), rays, layout)[1]
+    seen = (weight > 0).float()[..., None].expand(-1, -1, 3).contiguous()
+    return [sample_sky(seen, sky_rays(camera, layout), layout)[..., 0] > 0.5 for camera in cameras]
+
+
+def push_pull(
+    rgb: Float[Tensor, "rows columns 3"],
+    known: Float[Tensor, "rows columns"],
+    *,
+    wraps: bool = False,
+) -> Float[Tensor, "rows columns 3"]:
+    """Keep known texels (1), replace unknown ones (0) by a smooth continuation of the known."""
+    rows, columns = known.shape
+    if rows <= 1 and columns <= 1:
+        return rgb
+    colour = (rgb * known[..., None]).permute(2, 0, 1)[None]
+    mode = "circular" if wraps else "replicate"
+    pad_columns = columns % 2
+    colour = torch.nn.functional.pad(colour, (0, pad_columns, 0, 0), mode=mode)
+    weight = torch.nn.functional.pad(known[None, None], (0, pad_columns, 0, 0), mode=mode)
+    colour = torch.nn.functional.pad(colour, (0, 0, 0, rows % 2), mode="replicate")
+    weight = torch.nn.functional.pad(weight, (0, 0, 0, rows % 2), mode="replicate")
+    coarse = torch.nn.functional.avg_pool2d(colour, 2)
+    coarse_weight = torch.nn.functional.avg_pool2d(weight, 2)
+    coarse_rgb = (coarse / coarse_weight.clamp(min=1e-8))[0].permute(1, 2, 0)
+    coarse_known = (coarse_weight[0, 0] * 4).clamp(max=1.0)
+    below = push_pull(coarse_rgb, coarse_known, wraps=wraps).permute(2, 0, 1)[None]
+    guess = torch.nn.functional.interpolate(
+        below, size=colour.shape[-2:], mode="bilinear", align_corners=False
+    )[0, :, :rows, :columns].permute(1, 2, 0)
+    return known[..., None] * rgb + (1 - known[..., None]) * guess
+
+
+def _border_directions(
+    cameras: Sequence[Camera],
+) -> tuple[Float[Tensor, " rays"], Float[Tensor, " rays"]]:
+    """Azimuth and elevation of a sparse grid of rays of every camera, border included."""
+    found = []
+    for camera in cameras:
+        u = torch.linspace(0, camera.width_px, 9, dtype=torch.float64)
+        v = torch.linspace(0, camera.height_px, 9, dtype=torch.float64)
+        x = ((u - camera.cx_px) / camera.fx_px)[None, :].expand(9, 9)
+        y = ((v - camera.cy_px) / camera.fy_px)[:, None].expand(9, 9)
+        rays = torch.stack([x, y, torch.ones_like(x)], dim=-1).flatten(0, 1)
+        found.append(rays @ camera.world_from_camera[:3, :3].double().T)
+    x, y, z = torch.cat(found).unbind(-1)
+    return torch.atan2(y, x), torch.atan2(z, torch.hypot(x, y))

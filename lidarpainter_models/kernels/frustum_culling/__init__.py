@@ -1,0 +1,1 @@
+"""Which Gaussians a view can show, by blocks of them."""

@@ -1,0 +1,1 @@
+"""Loss terms of every pixel and their gradients in one pass."""

@@ -1,0 +1,1 @@
+"""Look up and move the texels of the sky."""

@@ -1,0 +1,1 @@
+"""Adam for the Gaussians that a step has seen (Kingma and Ba 2015)."""

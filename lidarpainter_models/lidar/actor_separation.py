@@ -1,0 +1,182 @@
+"""Which points of a sweep lie in or beside moving actors, and where in their boxes.
+
+A LiDAR takes a tenth of a second to turn, and a box holds at one moment of it: each point is
+looked at in the box as it stood at the point's own time. Box frame: x along the length, y left,
+z up, origin at the centre; metres.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.geometry.transforms import interpolate_rigid
+from lidarpainter_models.lidar.ground_heights import GroundHeights
+from lidarpainter_models.scenes.tracks import ActorTrack
+
+_TICK_NS = 1_000_000
+"""Points of one millisecond share a pose: at 40 m/s it is 2 cm wrong."""
+_LONGEST_EXTRAPOLATION_S = 0.1
+"""One sweep: a point may be measured before the first or after the last box of its actor."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeparationConfig:
+    """Where an actor ends and the street begins."""
+
+    actor_margin_m: float = 0.1
+    """Points up to this far outside the box still belong to the actor: mirrors, tight boxes."""
+    street_margin_m: float = 0.3
+    """Points up to this far outside the box are kept out of the street."""
+    lag_s: float = 0.02
+    """Box times may be off by so much: lengthwise the street margin grows by it times the speed."""
+    road_height_m: float = 0.08
+    """What is lower than this above the ground is road, also below an actor."""
+    clearance_m: float = 0.15
+    """What is lower than this above the ground is no part of an actor."""
+    most_ground_offset_m: float = 0.6
+    """Ground further from the bottom of the box than this is not believed; the bottom is."""
+
+    def __post_init__(self) -> None:
+        """Refuse margins that contradict one another."""
+        if not 0 <= self.actor_margin_m <= self.street_margin_m:
+            raise ConfigError(
+                "margins must satisfy 0 <= actor_margin_m <= street_margin_m, got "
+                f"{self.actor_margin_m} and {self.street_margin_m}"
+            )
+        if self.road_height_m > self.clearance_m:
+            raise ConfigError(
+                f"road_height_m {self.road_height_m} must not exceed clearance_m {self.clearance_m}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NearActors:
+    """Points in or beside boxes, each with the box it is nearest to."""
+
+    rows: Int[Tensor, " near"]
+    """Position among the points of the sweep."""
+    track: Int[Tensor, " near"]
+    """Position among the tracks."""
+    xyz_box_m: Float[Tensor, "near 3"]
+    """In the box frame, float32."""
+    outside_m: Float[Tensor, " near"]
+    """How far outside the box, along the axis where it is furthest; <= 0 is inside."""
+    bottom_m: Float[Tensor, " near"]
+    """World z of the bottom of the box."""
+
+
+def near_actors(
+    xyz_m: Float[Tensor, "points 3"],
+    timestamp_ns: Int[Tensor, " points"],
+    tracks: Sequence[ActorTrack],
+    config: SeparationConfig,
+) -> NearActors:
+    """Find the points that moving actors keep out of the street."""
+    parts = [
+        part
+        for index, track in enumerate(tracks)
+        if (part := _near_one(xyz_m, timestamp_ns, index, track, config)) is not None
+    ]
+    if not parts:
+        none, zero = torch.zeros(0, dtype=torch.int64), torch.zeros(0)
+        return NearActors(
+            rows=none, track=none, xyz_box_m=torch.zeros(0, 3), outside_m=zero, bottom_m=zero
+        )
+    rows = torch.cat([part.rows for part in parts])
+    outside_m = torch.cat([part.outside_m for part in parts])
+    # a point beside two boxes goes to the one it is deeper in: that row comes first
+    order = torch.argsort(outside_m, stable=True)
+    order = order[torch.argsort(rows[order], stable=True)]
+    is_first = torch.ones_like(rows, dtype=torch.bool)
+    is_first[1:] = rows[order][1:] != rows[order][:-1]
+    chosen = order[is_first]
+    return NearActors(
+        rows=rows[chosen],
+        track=torch.cat([part.track for part in parts])[chosen],
+        xyz_box_m=torch.cat([part.xyz_box_m for part in parts])[chosen],
+        outside_m=outside_m[chosen],
+        bottom_m=torch.cat([part.bottom_m for part in parts])[chosen],
+    )
+
+
+def height_above_ground(
+    xyz_m: Float[Tensor, "near 3"],
+    bottom_m: Float[Tensor, " near"],
+    ground: GroundHeights,
+    config: SeparationConfig,
+) -> Float[Tensor, " near"]:
+    """Height of points near actors above the ground, or above the box where that is unknown."""
+    ground_m = ground.at(xyz_m[:, :2])
+    is_believed = (ground_m - bottom_m).abs() <= config.most_ground_offset_m  # False for NaN
+    return xyz_m[:, 2] - torch.where(is_believed, ground_m, bottom_m)
+
+
+def poses_at(
+    track: ActorTrack, timestamp_ns: Int[Tensor, " points"]
+) -> Float[Tensor, "points 4 4"]:
+    """`world_from_box` at many times (float64).
+
+    Up to a sweep beyond the ends of the track its first or last motion goes on.
+    """
+    times_ns = track.timestamps_ns
+    if len(times_ns) == 1:
+        return track.world_from_box.expand(len(timestamp_ns), 4, 4)
+    reach_ns = round(_LONGEST_EXTRAPOLATION_S * 1e9)
+    wanted_ns = timestamp_ns.clamp(int(times_ns[0]) - reach_ns, int(times_ns[-1]) + reach_ns)
+    before = (torch.searchsorted(times_ns, wanted_ns, right=True) - 1).clamp(0, len(times_ns) - 2)
+    span_ns = (times_ns[before + 1] - times_ns[before]).double()
+    fraction = (wanted_ns - times_ns[before]).double() / span_ns
+    return interpolate_rigid(
+        track.world_from_box[before], track.world_from_box[before + 1], fraction
+    )
+
+
+def _near_one(
+    xyz_m: Float[Tensor, "points 3"],
+    timestamp_ns: Int[Tensor, " points"],
+    index: int,
+    track: ActorTrack,
+    config: SeparationConfig,
+) -> NearActors | None:
+    """The points in or beside one actor, None where there are none."""
+    if xyz_m.shape[0] == 0:
+        return None
+    middle_ns = (int(timestamp_ns.min()) + int(timestamp_ns.max())) // 2
+    if not track.is_present(middle_ns, margin_ns=round(_LONGEST_EXTRAPOLATION_S * 1e9)):
+        return None
+    speed_mps = _speed(track, middle_ns)
+    margin_m = torch.full((3,), config.street_margin_m)
+    margin_m[0] += config.lag_s * speed_mps
+    half_m = track.size_m / 2
+    reach_m = float((half_m + margin_m).norm()) + _LONGEST_EXTRAPOLATION_S * speed_mps
+    centre = track.pose_at(middle_ns)[:3, 3].to(xyz_m)
+    is_close = ((xyz_m - centre).abs() <= reach_m).all(dim=-1)
+    rows = is_close.nonzero()[:, 0]
+    if len(rows) == 0:
+        return None
+    times_ns, own_time = torch.unique(timestamp_ns[rows] // _TICK_NS, return_inverse=True)
+    world_from_box = poses_at(track, times_ns * _TICK_NS + _TICK_NS // 2)[own_time]
+    away = xyz_m[rows].double() - world_from_box[:, :3, 3]
+    xyz_box_m = torch.einsum("nij,ni->nj", world_from_box[:, :3, :3], away).float()
+    beyond_m = xyz_box_m.abs() - half_m
+    is_near = (beyond_m <= margin_m).all(dim=-1)
+    if not bool(is_near.any()):
+        return None
+    return NearActors(
+        rows=rows[is_near],
+        track=torch.full((int(is_near.sum()),), index),
+        xyz_box_m=xyz_box_m[is_near],
+        outside_m=beyond_m[is_near].amax(dim=-1),
+        bottom_m=(world_from_box[is_near, 2, 3] - half_m[2]).float(),
+    )
+
+
+def _speed(track: ActorTrack, timestamp_ns: int) -> float:
+    """Metres per second around a time, from its poses a sweep apart."""
+    around = torch.tensor([-50_000_000, 50_000_000]) + timestamp_ns
+    positions = poses_at(track, around)[:, :3, 3]
+    return float((positions[1] - positions[0]).norm()) / 0.1

@@ -1,0 +1,204 @@
+"""Numba loops of the colouring: project points, take samples from an image, combine them.
+
+Every point is handled by one thread alone, so the number of threads changes no bit.
+"""
+
+import numba
+import numpy as np
+
+SLOTS = 4
+"""Best samples that a point keeps."""
+AGREEMENT = 32.0
+"""Samples further than this (of 255, in any channel) from the typical one are outliers."""
+
+
+@numba.njit(cache=True)
+def project_inside(
+    xyz_m: np.ndarray,
+    pixels_from_points: np.ndarray,
+    width_px: int,
+    height_px: int,
+    near_m: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows, continuous pixels (rows, 2) and depth of the points that fall into an image."""
+    m = pixels_from_points.astype(np.float32)
+    near = np.float32(near_m)
+    width, height = np.float32(width_px), np.float32(height_px)
+    rows = np.empty(xyz_m.shape[0], dtype=np.int64)
+    pixels_uv = np.empty((xyz_m.shape[0], 2), dtype=np.float32)
+    depth_m = np.empty(xyz_m.shape[0], dtype=np.float32)
+    count = 0
+    for i in range(xyz_m.shape[0]):
+        x, y, z = xyz_m[i, 0], xyz_m[i, 1], xyz_m[i, 2]
+        depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+        if depth < near:
+            continue
+        u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth
+        v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth
+        if u >= 0 and v >= 0 and u < width and v < height:
+            rows[count] = i
+            pixels_uv[count, 0], pixels_uv[count, 1] = u, v
+            depth_m[count] = depth
+            count += 1
+    return rows[:count].copy(), pixels_uv[:count].copy(), depth_m[:count].copy()
+
+
+@numba.njit(cache=True, parallel=True)
+def insert_samples(
+    rows: np.ndarray,
+    weight: np.ndarray,
+    rgb: np.ndarray,
+    view: int,
+    slot_weight: np.ndarray,
+    slot_rgb: np.ndarray,
+    slot_view: np.ndarray,
+) -> None:
+    """Put one image's samples among the best of their points, heaviest first, in place."""
+    for i in numba.prange(rows.shape[0]):
+        row, w = rows[i], weight[i]
+        slot = SLOTS
+        while slot > 0 and w > slot_weight[row, slot - 1]:
+            slot -= 1
+        if slot == SLOTS:
+            continue
+        for k in range(SLOTS - 1, slot, -1):
+            slot_weight[row, k] = slot_weight[row, k - 1]
+            slot_view[row, k] = slot_view[row, k - 1]
+            for c in range(3):
+                slot_rgb[row, k, c] = slot_rgb[row, k - 1, c]
+        slot_weight[row, slot] = w
+        slot_view[row, slot] = view
+        for c in range(3):
+            slot_rgb[row, slot, c] = rgb[i, c]
+
+
+@numba.njit(cache=True, parallel=True)
+def steps_inside(
+    cells_uv: np.ndarray,
+    depth_m: np.ndarray,
+    inner_m: np.ndarray,
+    reach: int,
+    tolerance: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """For points on a rim, the step (columns, rows) to the nearest inner cell of their surface.
+
+    Where none lies within reach the step is zero and the flag false.
+    """
+    steps = np.zeros((depth_m.shape[0], 2), dtype=np.float32)
+    is_found = np.zeros(depth_m.shape[0], dtype=np.bool_)
+    for i in numba.prange(depth_m.shape[0]):
+        column, row, z = cells_uv[i, 0], cells_uv[i, 1], depth_m[i]
+        best = reach * reach + 1
+        for r in range(max(row - reach, 0), min(row + reach + 1, inner_m.shape[0])):
+            for c in range(max(column - reach, 0), min(column + reach + 1, inner_m.shape[1])):
+                distance = (r - row) * (r - row) + (c - column) * (c - column)
+                if distance < best and abs(inner_m[r, c] - z) <= tolerance * z:
+                    best = distance
+                    steps[i, 0], steps[i, 1] = c - column, r - row
+                    is_found[i] = True
+    return steps, is_found
+
+
+@numba.njit(cache=True, parallel=True)
+def sample_levels(
+    pixels_uv: np.ndarray,
+    level: np.ndarray,
+    finest: np.ndarray,
+    middle: np.ndarray,
+    coarsest: np.ndarray,
+) -> np.ndarray:
+    """Bilinear colours (rows, 3) uint8 from the level of a pyramid that each row names.
+
+    Each level has half the pixels of the one before; positions are those of the finest.
+    """
+    rgb = np.empty((pixels_uv.shape[0], 3), dtype=np.uint8)
+    for i in numba.prange(pixels_uv.shape[0]):
+        u, v = pixels_uv[i, 0], pixels_uv[i, 1]
+        if level[i] == 0:
+            _bilinear(finest, u, v, rgb[i])
+        elif level[i] == 1:
+            _bilinear(middle, u * 0.5, v * 0.5, rgb[i])
+        else:
+            _bilinear(coarsest, u * 0.25, v * 0.25, rgb[i])
+    return rgb
+
+
+@numba.njit(cache=True)
+def _bilinear(image: np.ndarray, u: float, v: float, rgb: np.ndarray) -> None:
+    """Mix of the four pixels around a position (pixel centres at halves), edges repeated."""
+    height, width = image.shape[0], image.shape[1]
+    u = min(max(u - 0.5, 0.0), width - 1.0)
+    v = min(max(v - 0.5, 0.0), height - 1.0)
+    column, row = int(u), int(v)
+    right, below = min(column + 1, width - 1), min(row + 1, height - 1)
+    fu, fv = u - column, v - row
+    for c in range(3):
+        top = (1 - fu) * image[row, column, c] + fu * image[row, right, c]
+        bottom = (1 - fu) * image[below, column, c] + fu * image[below, right, c]
+        rgb[c] = np.uint8((1 - fv) * top + fv * bottom + 0.5)
+
+
+@numba.njit(cache=True, parallel=True)
+def combine_samples(
+    slot_weight: np.ndarray, slot_rgb: np.ndarray, slot_view: np.ndarray, view_gain: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """One colour (uint8) per point from its samples, and whether it has any.
+
+    Samples are brought to one exposure by the gain of their view. The weighted median in
+    brightness is the typical one; the colour is the mean, weighted by the square of the weights,
+    of the samples that agree with it.
+    """
+    points = slot_weight.shape[0]
+    rgb = np.zeros((points, 3), dtype=np.uint8)
+    has_colour = np.zeros(points, dtype=np.bool_)
+    for i in numba.prange(points):
+        count = 0
+        while count < SLOTS and slot_weight[i, count] > 0:
+            count += 1
+        if count == 0:
+            continue
+        has_colour[i] = True
+        matched = np.empty((SLOTS, 3), dtype=np.float32)
+        for k in range(count):
+            for c in range(3):
+                matched[k, c] = slot_rgb[i, k, c] * view_gain[slot_view[i, k], c]
+        _agreed_colour(matched, slot_weight[i], count, rgb[i])
+    return rgb, has_colour
+
+
+@numba.njit(cache=True)
+def _median_slot(matched: np.ndarray, weight: np.ndarray, count: int) -> int:
+    """The slot whose brightness is the weighted median; the lower slot of equals."""
+    half = 0.0
+    for k in range(count):
+        half += 0.5 * weight[k]
+    for k in range(count):
+        below, upto = 0.0, 0.0
+        own = matched[k, 0] + matched[k, 1] + matched[k, 2]
+        for j in range(count):
+            other = matched[j, 0] + matched[j, 1] + matched[j, 2]
+            if other < own:
+                below += weight[j]
+            if other <= own:
+                upto += weight[j]
+        if below <= half and upto >= half:
+            return k
+    return 0
+
+
+@numba.njit(cache=True)
+def _agreed_colour(matched: np.ndarray, weight: np.ndarray, count: int, rgb: np.ndarray) -> None:
+    """Mean of the samples that agree with the typical one, into `rgb`."""
+    typical = _median_slot(matched, weight, count)
+    total, sums = 0.0, np.zeros(3)
+    for k in range(count):
+        distance = 0.0
+        for c in range(3):
+            distance = max(distance, abs(matched[k, c] - matched[typical, c]))
+        if distance <= AGREEMENT:
+            w = weight[k] ** 2
+            total += w
+            for c in range(3):
+                sums[c] += w * matched[k, c]
+    for c in range(3):
+        rgb[c] = np.uint8(min(max(sums[c] / total + 0.5, 0.0), 255.0))

@@ -1,0 +1,314 @@
+"""Turn coloured LiDAR points into the sparse image the painter starts from.
+
+Street points of a window of frames stand in the world; actor points of the whole sequence are
+carried by the pose of their track. Frames: world x forward, y left, z up; camera x right, y down,
+z forward; depth is camera z in metres.
+
+Visibility takes three steps. A z-buffer of discs as large as the beams are apart gives a closed
+surface. A point is hidden when nearer surface surrounds it in most directions around its pixel
+(after Pintus et al. 2011, who open a cone instead), which culls background between the scan lines
+of a foreground yet keeps a road seen at a grazing angle. The points left are blended where they
+meet the nearest direct hit of a pixel, so silhouettes stay sharp and discs do not show.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Shaped, UInt8
+from torch import Tensor
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.kernels.point_blend import blend_points
+from lidarpainter_models.lidar.lidar_map import LidarMap
+from lidarpainter_models.lidar.map_points import MapPoints
+from lidarpainter_models.lidar.point_surfaces import (
+    DIRECTIONS,
+    curtain,
+    disc_surface,
+    spread,
+    surface_gaps,
+)
+from lidarpainter_models.scenes.driving_scene import ActorTrack
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LidarImageConfig:
+    """How LiDAR points become an image. Angles make every length follow the resolution."""
+
+    window_s: float = 1.0
+    """Street points measured this long before or after the image are drawn first; where no
+    sweep is so near in time, counted from the nearest."""
+    reach_s: float = 10.0
+    """Street points up to this much older or newer fill what the window leaves open: the street
+    stands still, but what moved through it unboxed does not."""
+    recency_s: float = 0.4
+    """A point this much older weighs e times less in the blend."""
+    beam_spacing_rad: float = 0.004
+    """Angle between neighbouring returns; times the range of a point, its footprint."""
+    max_radius_rad: float = 0.006
+    """No disc is wider than this angle to each side: 3 px at 500 px focal length."""
+    min_radius_px: float = 0.75
+    """Just over half a diagonal, so that a point always covers the pixel it falls into."""
+    hidden_reach_rad: float = 0.012
+    """How far around a pixel nearer surface is looked for: 6 px at 500 px focal length."""
+    hidden_directions: int = 8
+    """Of the 8 directions, how many must meet nearer surface to hide a point."""
+    hidden_tolerance: float = 0.1
+    """Nearer means by more than this share of the depth."""
+    surface_tolerance: float = 0.06
+    """A point is blended where it meets the surface of a pixel within this share of its depth."""
+    gap_widening: float = 2.5
+    """Discs grow by this factor where covered pixels surround a gap, and only there."""
+    gap_directions: int = 6
+    """Of the 8 directions, how many must meet covered pixels to make a gap."""
+    gap_depth_range: float = 0.15
+    """The pixels met around a gap differ in depth by at most this share: one surface."""
+    near_m: float = 0.5
+    """Points nearer to the camera plane than this are dropped."""
+
+    def __post_init__(self) -> None:
+        """Refuse settings that no image can be made with."""
+        for name in (
+            "window_s",
+            "reach_s",
+            "recency_s",
+            "beam_spacing_rad",
+            "max_radius_rad",
+            "near_m",
+        ):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
+        if self.min_radius_px < 0.71:
+            raise ConfigError(f"min_radius_px must be at least 0.71, got {self.min_radius_px}")
+        if not 1 <= self.hidden_directions <= len(DIRECTIONS):
+            raise ConfigError(f"hidden_directions must be 1 to 8, got {self.hidden_directions}")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LidarImage:
+    """LiDAR seen by a camera."""
+
+    rgb: Float[Tensor, "height width 3"]
+    """0 where no coloured point hits."""
+    depth_m: Float[Tensor, "height width"]
+    """Camera z of the surface hit, coloured or not; 0 = none."""
+    hit: Bool[Tensor, "height width"]
+    """Where a coloured point gave `rgb`."""
+    age_s: Float[Tensor, "height width"]
+    """Mean time between the image and the points in a pixel; 0 where none hits."""
+
+
+class ViewPoints(NamedTuple):
+    """Points in one view: continuous pixels, depth, and what they carry."""
+
+    positions_uv: Float[Tensor, "points 2"]
+    depth_m: Float[Tensor, " points"]
+    radius_px: Float[Tensor, " points"]
+    rgb_u8: UInt8[Tensor, "points 3"]
+    has_colour: Bool[Tensor, " points"]
+    age_s: Float[Tensor, " points"]
+    is_recent: Bool[Tensor, " points"]
+
+    def keep(self, kept: Bool[Tensor, " points"]) -> "ViewPoints":
+        """The points that are marked."""
+        rows = kept.nonzero()[:, 0]
+        return ViewPoints(*(field.index_select(0, rows) for field in self))
+
+
+def render_lidar(
+    lidar_map: LidarMap,
+    tracks: Sequence[ActorTrack],
+    camera: Camera,
+    timestamp_ns: int,
+    *,
+    config: LidarImageConfig | None = None,
+) -> LidarImage:
+    """Splat the street around a time and the actors present then into a camera.
+
+    Only tracks whose actor has points in the map and that are present at `timestamp_ns` are drawn.
+    """
+    config = config or LidarImageConfig()
+    # what stands just outside the image hides and covers pixels inside
+    margin_px = max(2, round(config.hidden_reach_rad * camera.fx_px))
+    wide = replace(
+        camera,
+        width_px=camera.width_px + 2 * margin_px,
+        height_px=camera.height_px + 2 * margin_px,
+        cx_px=camera.cx_px + margin_px,
+        cy_px=camera.cy_px + margin_px,
+    )
+    points = view_points(lidar_map, tracks, wide, timestamp_ns, config)
+    image = _image(points, wide, margin_px, config)
+    image = image[margin_px:-margin_px, margin_px:-margin_px]
+    hit = image[..., 3] > 0
+    return LidarImage(
+        rgb=torch.where(hit[..., None], image[..., :3] / image[..., 3:4], 0),
+        depth_m=image[..., 4],
+        hit=hit,
+        age_s=image[..., 5],
+    )
+
+
+def _image(
+    points: ViewPoints, camera: Camera, reach_px: int, config: LidarImageConfig
+) -> Float[Tensor, "height width 6"]:
+    """Recent points first, older ones where those leave the image open, then gaps closed."""
+    recent, older = points.keep(points.is_recent), points.keep(~points.is_recent)
+    surface = _surface(recent, camera, recent.radius_px.round())
+    recent = recent.keep(~_hidden(recent, surface, reach_px, config))
+    everywhere = torch.ones(camera.height_px, camera.width_px, dtype=torch.bool)
+    image = _blend(recent, everywhere, camera, config)
+    is_open = image[..., 4] == 0
+    older = older.keep(_at(spread(is_open, reach_px), older))
+    surface = torch.minimum(surface, _surface(older, camera, older.radius_px.round()))
+    older = older.keep(~_hidden(older, surface, reach_px, config))
+    image = image + _blend(older, is_open, camera, config)
+    seen = ViewPoints(*(torch.cat(pair) for pair in zip(recent, older, strict=True)))
+    return image + _fill_gaps(image[..., 4], seen, camera, config)
+
+
+def view_points(
+    lidar_map: LidarMap,
+    tracks: Sequence[ActorTrack],
+    camera: Camera,
+    timestamp_ns: int,
+    config: LidarImageConfig,
+) -> ViewPoints:
+    """Every map point within reach of the time that falls into the image, hidden or not.
+
+    Recent are street points within the window of the newest sweep at that time, and all actors'.
+    """
+    street = lidar_map.street
+    age_ns = (street.timestamp_ns - timestamp_ns).abs()
+    newest_ns = int(age_ns.min()) if len(age_ns) else 0
+    used = age_ns <= newest_ns + round(config.reach_s * 1e9)
+    identity = torch.eye(4, dtype=torch.float64)
+    placed = _project(street, used, identity, camera, timestamp_ns, config)
+    parts = [placed._replace(is_recent=placed.age_s <= newest_ns * 1e-9 + config.window_s)]
+    for track in tracks:
+        points = lidar_map.actors.get(track.actor_id)
+        if points is None or not track.is_present(timestamp_ns):
+            continue
+        everything = torch.ones_like(points.has_colour)
+        world_from_box = track.pose_at(timestamp_ns)
+        parts.append(_project(points, everything, world_from_box, camera, timestamp_ns, config))
+    return ViewPoints(*(torch.cat(fields) for fields in zip(*parts, strict=True)))
+
+
+def _project(
+    points: MapPoints,
+    used: Bool[Tensor, " points"],
+    world_from_points: Float[Tensor, "4 4"],
+    camera: Camera,
+    timestamp_ns: int,
+    config: LidarImageConfig,
+) -> ViewPoints:
+    """Bring points into the image; those outside it are dropped."""
+    camera_from_points = camera.camera_from_world @ world_from_points.to(torch.float64)
+    lens = torch.tensor(
+        [[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]],
+        dtype=torch.float64,
+    )
+    pixels_from_points = (lens @ camera_from_points[:3]).to(points.xyz_m)
+    columns = torch.addmm(pixels_from_points[:, 3:], pixels_from_points[:, :3], points.xyz_m.T)
+    u_depth, v_depth, depth_m = columns
+    inside = used & (depth_m > config.near_m) & (u_depth >= 0) & (v_depth >= 0)
+    inside &= (u_depth < camera.width_px * depth_m) & (v_depth < camera.height_px * depth_m)
+    chosen = inside.nonzero()[:, 0]
+    depth_m = depth_m[chosen]
+    positions_uv = torch.stack([u_depth[chosen], v_depth[chosen]], dim=-1) / depth_m[:, None]
+    # rounding in the division may reach the far edge
+    positions_uv[:, 0].clamp_(max=camera.width_px - 1e-3)
+    positions_uv[:, 1].clamp_(max=camera.height_px - 1e-3)
+    focal_px = (camera.fx_px + camera.fy_px) / 2
+    footprint_px = points.range_m[chosen] * config.beam_spacing_rad * focal_px / depth_m
+    max_radius_px = max(config.max_radius_rad * focal_px, config.min_radius_px)
+    return ViewPoints(
+        positions_uv=positions_uv,
+        depth_m=depth_m,
+        radius_px=(footprint_px / 2).clamp(config.min_radius_px, max_radius_px),
+        rgb_u8=points.rgb_u8.index_select(0, chosen),
+        has_colour=points.has_colour[chosen],
+        age_s=(points.timestamp_ns[chosen] - timestamp_ns).abs().to(torch.float32) * 1e-9,
+        is_recent=torch.ones_like(chosen, dtype=torch.bool),
+    )
+
+
+def _hidden(
+    points: ViewPoints,
+    surface: Float[Tensor, "height width"],
+    reach_px: int,
+    config: LidarImageConfig,
+) -> Bool[Tensor, " points"]:
+    """Whether nearer surface surrounds a point in its neighbourhood."""
+    behind = curtain(surface, reach_px, config.hidden_directions)
+    return _at(behind, points) < points.depth_m * (1 - config.hidden_tolerance)
+
+
+def _blend(
+    points: ViewPoints,
+    wanted: Bool[Tensor, "height width"],
+    camera: Camera,
+    config: LidarImageConfig,
+) -> Float[Tensor, "height width 6"]:
+    """Mean of the points on the surface of each wanted pixel: the columns of `_means_on`."""
+    direct = _surface(points, camera, torch.zeros_like(points.radius_px))
+    covered = _surface(points, camera, points.radius_px.ceil())
+    surface = torch.where(direct.isfinite(), direct, covered)
+    return _means_on(torch.where(wanted & surface.isfinite(), surface, 0), points, config)
+
+
+def _fill_gaps(
+    depth_m: Float[Tensor, "height width"],
+    points: ViewPoints,
+    camera: Camera,
+    config: LidarImageConfig,
+) -> Float[Tensor, "height width 6"]:
+    """What wider discs give in the gaps of a surface; 0 elsewhere."""
+    reach_px = math.ceil(config.gap_widening * config.max_radius_rad * camera.fx_px)
+    gaps = surface_gaps(
+        depth_m, reach_px, config.gap_directions, depth_range=config.gap_depth_range
+    )
+    wide = points.keep(_at(spread(gaps, reach_px), points))
+    wide = wide._replace(radius_px=wide.radius_px * config.gap_widening)
+    surface = _surface(wide, camera, wide.radius_px.ceil())
+    return _means_on(torch.where(gaps & surface.isfinite(), surface, 0), wide, config)
+
+
+def _surface(
+    points: ViewPoints, camera: Camera, radius_px: Float[Tensor, " points"]
+) -> Float[Tensor, "height width"]:
+    """Depth of the nearest disc in each pixel, infinity where there is none."""
+    size = {"height_px": camera.height_px, "width_px": camera.width_px}
+    return disc_surface(points.positions_uv, points.depth_m, radius_px.to(torch.int64), **size)
+
+
+def _at(image: Shaped[Tensor, "height width"], points: ViewPoints) -> Shaped[Tensor, " points"]:
+    """The values of an image in the pixels of the points."""
+    column, row = points.positions_uv.floor().long().unbind(-1)
+    return image[row, column]
+
+
+def _means_on(
+    surface_depth_m: Float[Tensor, "height width"], points: ViewPoints, config: LidarImageConfig
+) -> Float[Tensor, "height width 6"]:
+    """Means of coloured rgb, share of coloured points, depth and age on a surface; 0 off it."""
+    newest_s = points.age_s.min() if len(points.age_s) else 0.0
+    recent = torch.exp(-(points.age_s - newest_s) / config.recency_s).clamp(min=1e-6)
+    coloured = points.has_colour.to(torch.float32)[:, None]
+    rgb = points.rgb_u8.to(torch.float32) / 255 * coloured
+    columns = [rgb, coloured, points.depth_m[:, None], points.age_s[:, None]]
+    image, _ = blend_points(
+        points.positions_uv,
+        points.depth_m,
+        torch.cat(columns, dim=-1),
+        surface_depth_m,
+        weight=recent,
+        radius_px=points.radius_px,
+        tolerance=config.surface_tolerance,
+    )
+    return image

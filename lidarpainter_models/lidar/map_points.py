@@ -1,0 +1,90 @@
+"""LiDAR points of many sweeps in one frame, with their colours and when they were measured."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+from lidarpainter_models.errors import SceneError
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MapPoints:
+    """Points of the street (world frame) or of one actor (its box frame)."""
+
+    xyz_m: Float[Tensor, "points 3"]
+    """float32."""
+    rgb_u8: UInt8[Tensor, "points 3"]
+    """0 where the point has no colour; exposure as the first camera's."""
+    has_colour: Bool[Tensor, " points"]
+    """Whether an image saw the point."""
+    frame_index: Int[Tensor, " points"]
+    """Of the sweep it was measured in."""
+    timestamp_ns: Int[Tensor, " points"]
+    """When it was measured."""
+    range_m: Float[Tensor, " points"]
+    """Distance from the LiDAR that measured it: how coarsely its surface was sampled."""
+
+    def __len__(self) -> int:
+        """How many points there are."""
+        return self.xyz_m.shape[0]
+
+    def keep(self, kept: Tensor) -> "MapPoints":
+        """The points marked or listed."""
+        return type(self)(**{field.name: getattr(self, field.name)[kept] for field in fields(self)})
+
+    def to_arrays(self) -> dict[str, Tensor]:
+        """Columns by name, for storage."""
+        return {field.name: getattr(self, field.name).contiguous() for field in fields(self)}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, Tensor]) -> "MapPoints":
+        """Undo `to_arrays`.
+
+        Raises:
+            SceneError: a column is missing or its length differs.
+        """
+        names = [field.name for field in fields(cls)]
+        missing = [name for name in names if name not in arrays]
+        if missing:
+            raise SceneError(f"stored map points lack the columns {', '.join(missing)}")
+        if len({arrays[name].shape[0] for name in names}) > 1:
+            raise SceneError("stored map points have columns of different lengths")
+        return cls(**{name: arrays[name] for name in names})
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["MapPoints"]) -> "MapPoints":
+        """All points of several parts, in their order; none give no points."""
+        if not parts:
+            return cls.uncoloured(
+                xyz_m=torch.zeros(0, 3),
+                frame_index=torch.zeros(0, dtype=torch.int64),
+                timestamp_ns=torch.zeros(0, dtype=torch.int64),
+                range_m=torch.zeros(0),
+            )
+        columns = {
+            field.name: torch.cat([getattr(part, field.name) for part in parts])
+            for field in fields(cls)
+        }
+        return cls(**columns)
+
+    @classmethod
+    def uncoloured(
+        cls,
+        *,
+        xyz_m: Float[Tensor, "points 3"],
+        frame_index: Int[Tensor, " points"],
+        timestamp_ns: Int[Tensor, " points"],
+        range_m: Float[Tensor, " points"],
+    ) -> "MapPoints":
+        """Points that no image has been asked about yet."""
+        return cls(
+            xyz_m=xyz_m,
+            rgb_u8=torch.zeros(xyz_m.shape, dtype=torch.uint8),
+            has_colour=torch.zeros(xyz_m.shape[0], dtype=torch.bool),
+            frame_index=frame_index,
+            timestamp_ns=timestamp_ns,
+            range_m=range_m,
+        )

@@ -1,0 +1,157 @@
+"""What a camera can see of a cloud of points: surfaces, what hides behind them, and edges.
+
+All images of this module lie on a coarse grid over the camera's image; depth is camera z in
+metres. A cloud is full of gaps between scan lines, so a plain z-buffer lets the background shine
+through. A point counts as hidden when nearer surface stands on both sides of it, left and right
+or above and below; a road seen at a grazing angle has nearer surface below it alone and stays.
+Dark and glass bodies return few points: boxes of actors hide what lies behind them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lidarpainter_models.geometry.boxes import box_corners
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.transforms import transform_points
+from lidarpainter_models.kernels.point_splat import splat_points
+
+_FAR_M = 1e6
+_BOX_NEAR_M = 0.3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Visibility:
+    """What stands before and around each cell of the grid."""
+
+    hidden_from_m: Float[Tensor, "rows columns"]
+    """Beyond this depth a point has nearer surface on both sides."""
+    nearest_m: Float[Tensor, "rows columns"]
+    """Nearest surface in the neighbourhood."""
+    furthest_m: Float[Tensor, "rows columns"]
+    """Furthest surface in the neighbourhood, very far where part of it is open."""
+    box_m: Float[Tensor, "rows columns"]
+    """Far end of the nearest actor box that covers the cell."""
+    inner_m: Float[Tensor, "rows columns"]
+    """Depth of the surface where it goes on all around the cell, 0 at its rims and beyond."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Neighbourhood:
+    """How far around a cell surfaces are looked at, in cells."""
+
+    gap_px: int
+    """To each side, for nearer surface that hides a point."""
+    edge_px: int
+    """All around, for nearer surface that a point is just beside."""
+    rim_px: int
+    """All around, for the end of the surface that a point is on."""
+    edge_tolerance: float
+    """A neighbour nearer or further by this share of the depth makes an edge."""
+
+
+def surface_visibility(
+    cells_uv: Int[Tensor, "points 2"],
+    depth_m: Float[Tensor, " points"],
+    radius_px: Int[Tensor, " points"],
+    grid: Camera,
+    around: Neighbourhood,
+    box_m: Float[Tensor, "rows columns"],
+) -> Visibility:
+    """What a cloud of discs and boxes lets a camera see.
+
+    Args:
+        cells_uv: column and row of each point.
+        depth_m: camera z.
+        radius_px: radius of each point's disc.
+        grid: its pixels are the cells.
+        around: see there.
+        box_m: as `box_far_ends` gives it.
+    """
+    seen = splat_points(
+        cells_uv,
+        depth_m,
+        height_px=grid.height_px,
+        width_px=grid.width_px,
+        radius_px=radius_px,
+    )
+    is_surface = (seen >= 0).numpy()
+    depth = np.where(is_surface, depth_m.numpy()[seen.clamp(min=0).numpy()], np.float32(_FAR_M))
+    steps = ((1, 0), (-1, 0), (0, 1), (0, -1))
+    sides = [_nearest_towards(depth, around.gap_px, *step) for step in steps]
+    hidden = np.minimum(np.maximum(sides[0], sides[1]), np.maximum(sides[2], sides[3]))
+    square = np.ones((2 * around.edge_px + 1,) * 2, np.uint8)
+    nearest = cv2.erode(depth, square, borderType=cv2.BORDER_REPLICATE)
+    wide = np.ones((2 * around.rim_px + 1,) * 2, np.uint8)
+    known = np.where(is_surface, depth, np.float32(0))
+    furthest = cv2.dilate(known, wide, borderType=cv2.BORDER_REPLICATE)
+    gaps = np.ones((2 * around.gap_px + 1,) * 2, np.uint8)
+    closed = cv2.morphologyEx(is_surface.astype(np.uint8), cv2.MORPH_CLOSE, gaps)
+    is_closed = cv2.erode(closed, wide) > 0
+    is_inner = is_surface & is_closed & (nearest >= depth * (1 - around.edge_tolerance))
+    is_inner &= furthest <= depth * (1 + around.edge_tolerance)
+    return Visibility(
+        hidden_from_m=torch.from_numpy(hidden),
+        nearest_m=torch.from_numpy(nearest),
+        furthest_m=torch.from_numpy(np.where(is_closed, furthest, np.float32(_FAR_M))),
+        box_m=box_m,
+        inner_m=torch.from_numpy(np.where(is_inner, depth, np.float32(0))),
+    )
+
+
+def box_far_ends(
+    boxes: Sequence[tuple[Float[Tensor, "4 4"], Float[Tensor, "3"]]], camera: Camera
+) -> Float[Tensor, "rows columns"]:
+    """Depth of the far end of the nearest box over each pixel, very far where there is none.
+
+    Args:
+        boxes: `world_from_box` and size of each.
+        camera: its pixels are the cells.
+    """
+    far_ends = np.full((camera.height_px, camera.width_px), _FAR_M, np.float32)
+    for world_from_box, size_m in boxes:
+        corners = transform_points(world_from_box.double(), box_corners(size_m.double()))
+        corners = transform_points(camera.camera_from_world, corners)
+        z = corners[:, 2]
+        if float(z.max()) <= _BOX_NEAR_M:
+            continue
+        # a box that reaches behind the camera is drawn from just before it
+        u = corners[:, 0] / z.clamp(min=_BOX_NEAR_M) * camera.fx_px + camera.cx_px
+        v = corners[:, 1] / z.clamp(min=_BOX_NEAR_M) * camera.fy_px + camera.cy_px
+        outline = torch.stack([u, v], dim=-1).clamp(-1e4, 1e4).floor().int().numpy()
+        mask = np.zeros(far_ends.shape, np.uint8)
+        cv2.fillConvexPoly(mask, cv2.convexHull(outline), 1)
+        np.minimum(far_ends, np.float32(z.max()), out=far_ends, where=mask > 0)
+    return torch.from_numpy(far_ends)
+
+
+def visible_points(
+    cells_uv: Int[Tensor, "points 2"],
+    depth_m: Float[Tensor, " points"],
+    visibility: Visibility,
+    *,
+    tolerance: float,
+) -> Bool[Tensor, " points"]:
+    """Whether nothing known stands before each point."""
+    column, row = cells_uv.long().unbind(-1)
+    is_open = depth_m * (1 - tolerance) <= visibility.hidden_from_m[row, column]
+    return is_open & (depth_m <= visibility.box_m[row, column])
+
+
+def _nearest_towards(depth_m: np.ndarray, reach_px: int, step_u: int, step_v: int) -> np.ndarray:
+    """Smallest depth in the cell and up to `reach_px` from it in one direction."""
+    shape = (1, reach_px + 1) if step_u else (reach_px + 1, 1)
+    end = 0 if step_u + step_v > 0 else reach_px
+    anchor = (end, 0) if step_u else (0, end)
+    return cv2.erode(
+        depth_m,
+        np.ones(shape, np.uint8),
+        anchor=anchor,
+        borderType=cv2.BORDER_CONSTANT,
+        borderValue=_FAR_M,
+    )

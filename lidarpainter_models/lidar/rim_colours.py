@@ -1,0 +1,101 @@
+"""Colours at the rims of surfaces, where a small error of pose shows what is beside them."""
+
+from dataclasses import dataclass
+
+import cv2
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from lidarpainter_models.lidar.colour_sampling import sample_levels, steps_inside
+from lidarpainter_models.lidar.point_visibility import Visibility
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RimConfig:
+    """When the colour at a rim is not believed. Colour distances are Euclidean, of 255."""
+
+    edge_tolerance: float = 0.15
+    """A neighbour nearer or further by this share of the depth makes an edge."""
+    behind_edge_weight: float = 0.2
+    """Weight of a sample beside a nearer surface."""
+    rim_weight: float = 0.4
+    """Weight of a sample on the rim of a surface."""
+    foreign_likeness: float = 30.0
+    """A rim's colour is foreign when nearer than this (RGB distance of 255) to that beyond..."""
+    foreign_contrast: float = 60.0
+    """... and further than this from that inside."""
+    inner_reach: int = 6
+    """How many cells away the inner part of a surface is looked for from its rim."""
+
+
+class ImageLevels:
+    """An image at three sizes, and at which of them each point is sampled."""
+
+    def __init__(
+        self, image: UInt8[Tensor, "height width 3"], footprint_px: Float[Tensor, " points"]
+    ) -> None:
+        height_px, width_px = image.shape[:2]
+        self._images = [image.numpy()]
+        for shrink in (2, 4):
+            size = (max(1, width_px // shrink), max(1, height_px // shrink))
+            self._images.append(cv2.resize(image.numpy(), size, interpolation=cv2.INTER_AREA))
+        self._level = (footprint_px >= 1.5).int() + (footprint_px >= 3.0).int()
+
+    def sample(
+        self, pixels_uv: Float[Tensor, "rows 2"], rows: Int[Tensor, " rows"] | None = None
+    ) -> UInt8[Tensor, "rows 3"]:
+        """Colours at positions; `rows` says which points they belong to if not all."""
+        level = self._level if rows is None else self._level[rows]
+        return torch.from_numpy(
+            sample_levels(pixels_uv.contiguous().numpy(), level.numpy(), *self._images)
+        )
+
+
+def rim_samples(
+    levels: ImageLevels,
+    pixels_uv: Float[Tensor, "kept 2"],
+    cells_uv: Int[Tensor, "kept 2"],
+    depth_m: Float[Tensor, " kept"],
+    visibility: Visibility,
+    cells_per_pixel: Float[Tensor, "2"],
+    config: RimConfig,
+) -> tuple[UInt8[Tensor, "kept 3"], Float[Tensor, " kept"]]:
+    """Colours of visible samples, and how far the place of each is to be trusted.
+
+    On the rim of a surface a small error of pose takes the colour of what is beside it. Where the
+    colour there is more like that beyond the rim than like that of the nearest inner cell, the
+    inner one is taken.
+
+    Args:
+        levels: the image.
+        pixels_uv: continuous positions.
+        cells_uv: column and row on the grid of `visibility`.
+        depth_m: camera z.
+        visibility: what stands around.
+        cells_per_pixel: of the grid, in u and v.
+        config: see there.
+    """
+    rgb = levels.sample(pixels_uv)
+    trust = torch.ones_like(depth_m)
+    column, row = cells_uv.unbind(-1)
+    is_behind = visibility.nearest_m[row, column] < depth_m * (1 - config.edge_tolerance)
+    is_before = visibility.furthest_m[row, column] > depth_m * (1 + config.edge_tolerance)
+    trust[is_behind] = config.behind_edge_weight
+    on_rim = is_before.nonzero()[:, 0]
+    trust[on_rim] *= config.rim_weight
+    steps, has_inner = map(
+        torch.from_numpy,
+        steps_inside(
+            *(cells_uv[on_rim].numpy(), depth_m[on_rim].numpy(), visibility.inner_m.numpy()),
+            *(config.inner_reach, config.edge_tolerance),
+        ),
+    )
+    moved, steps = on_rim[has_inner], steps[has_inner] / cells_per_pixel
+    own = rgb[moved].float()
+    inner = levels.sample(pixels_uv[moved] + steps, moved)
+    beyond = levels.sample(pixels_uv[moved] - steps, moved)
+    to_inner, to_beyond = (own - inner.float()).norm(dim=-1), (own - beyond.float()).norm(dim=-1)
+    is_foreign = (to_beyond < config.foreign_likeness) & (to_inner > config.foreign_contrast)
+    rgb[moved[is_foreign]] = inner[is_foreign]
+    return rgb, trust

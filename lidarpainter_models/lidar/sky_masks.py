@@ -1,0 +1,230 @@
+"""Which pixels of a recorded image are sky, from LiDAR returns, colour and geometry.
+
+The sky returns no beam, lies above the horizon, and looks like nothing that returns beams. The
+second half matters: the upper floors of a house return none either (they are above the topmost
+beam), but their colours are those of the floors below. So colours are compared by how often they
+occur where beams return and where none does; what is frequent only without returns, and smooth, is
+sure sky, if it is one piece or its other pieces look like the largest: a tower too far for any beam
+is smooth and without returns too. From there the mask grows to pixels that have the colour of the
+sure sky around them.
+Doubt is settled as not sky: wires, foliage, far towers, and overcast skies behind white walls.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, UInt8
+from torch import Tensor
+
+from lidarpainter_models.errors import ConfigError, ShapeError
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.records import RecordedView
+
+_GROWTH_ROUNDS = 3
+_SMALL_PIECE_PX = 30
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SkyConfig:
+    """When a pixel is believed to be sky. Colours are of 255; angles follow the resolution."""
+
+    least_elevation_rad: float = 0.0
+    """Sky is above the horizon."""
+    clear_rad: float = 0.008
+    """Sure sky has no return nearer than this angle."""
+    least_log_ratio: float = 1.5
+    """Sure sky has a colour that is e to this times more frequent without returns than with."""
+    most_texture: float = 6.0
+    """Largest standard deviation of a colour channel in a neighbourhood of sure sky."""
+    least_area: float = 0.002
+    """Smallest connected piece of sure sky, as a share of the image."""
+    piece_tolerance: float = 25.0
+    """A piece of sure sky may differ so much from the largest one, in any channel."""
+    colour_tolerance: float = 10.0
+    """A pixel may differ so much from the sure sky around it, in any channel."""
+    around_rad: float = 0.06
+    """How far around a pixel the sure sky is averaged."""
+
+    def __post_init__(self) -> None:
+        """Refuse angles without extent."""
+        for name in ("clear_rad", "around_rad", "least_area"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
+
+
+def sky_mask(
+    scene: DrivingScene, view: RecordedView, camera: Camera, *, config: SkyConfig | None = None
+) -> Bool[Tensor, "height width"]:
+    """Sky in a recorded image.
+
+    Args:
+        scene: gives the image and the points of the same frame.
+        view: which image.
+        camera: the view's camera on the pixel grid wanted.
+        config: see there.
+    """
+    image = scene.read_image(view).numpy()
+    size = (camera.width_px, camera.height_px)
+    if image.shape[:2] != size[::-1]:
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    pixels_uv, depth_m = camera.project(scene.read_points(view.frame_index).xyz_m)
+    column, row = pixels_uv[camera.contains(pixels_uv, depth_m)].long().unbind(-1)
+    has_return = torch.zeros(camera.height_px, camera.width_px, dtype=torch.bool)
+    has_return[row, column] = True
+    return sky_from_returns(torch.from_numpy(image), has_return, camera, config=config)
+
+
+def sky_from_returns(
+    rgb_u8: UInt8[Tensor, "height width 3"],
+    has_return: Bool[Tensor, "height width"],
+    camera: Camera,
+    *,
+    config: SkyConfig | None = None,
+) -> Bool[Tensor, "height width"]:
+    """Sky in an image whose LiDAR returns are known.
+
+    Args:
+        rgb_u8: the image.
+        has_return: pixels that a LiDAR point falls into.
+        camera: on the same grid; the world's z is up.
+        config: see there.
+
+    Raises:
+        ShapeError: image, returns and camera differ in size.
+    """
+    config = config or SkyConfig()
+    size = (camera.height_px, camera.width_px)
+    if tuple(rgb_u8.shape) != (*size, 3) or tuple(has_return.shape) != size:
+        raise ShapeError(
+            f"need image and returns of {size}, got {tuple(rgb_u8.shape)} and "
+            f"{tuple(has_return.shape)}"
+        )
+    image, returns = rgb_u8.numpy(), has_return.numpy().astype(np.uint8)
+    above = _elevation(camera) > config.least_elevation_rad
+    clear_px = max(1, round(config.clear_rad * camera.fx_px))
+    open_sky = above & (_grown(returns, clear_px) == 0)
+    surface = _grown(returns, 2) > 0
+    sure = open_sky & (_log_ratio(image, open_sky, surface) > config.least_log_ratio)
+    sure &= _texture(image) < config.most_texture
+    around_px = config.around_rad * camera.fx_px
+    pieces = _large_pieces(sure, config.least_area * sure.size)
+    sky = _like_the_largest(image, pieces, around_px, config.piece_tolerance)
+    candidates = above & (_grown(returns, 1) == 0)
+    for _ in range(_GROWTH_ROUNDS):
+        if not sky.any():
+            break
+        differs = _differs(image, sky, around_px)
+        like_sky = sky | (candidates & (differs < config.colour_tolerance))
+        # small pieces between wires and branches count once the large ones say what sky looks like
+        seeds = _large_pieces(like_sky & (sure | sky), _SMALL_PIECE_PX)
+        sky = _connected_to(like_sky, seeds)
+    return torch.from_numpy(sky | _bright_holes(image, sky, returns))
+
+
+def _elevation(camera: Camera) -> np.ndarray:
+    """Angle of each pixel's ray above the horizon."""
+    rotation = camera.world_from_camera[:3, :3].float()
+    directions = torch.nn.functional.normalize(camera.pixel_directions(), dim=-1)
+    return torch.asin((directions @ rotation[2]).clamp(-1, 1)).numpy()
+
+
+def _grown(mask: np.ndarray, radius_px: int) -> np.ndarray:
+    size = 2 * radius_px + 1
+    return cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
+
+
+def _log_ratio(image: np.ndarray, without: np.ndarray, with_returns: np.ndarray) -> np.ndarray:
+    """Log of how many pixels of each pixel's colour have no return, over how many have one."""
+    lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB).astype(np.int64)
+    bins = np.stack([lab[..., 0] // 16, lab[..., 1] // 4, lab[..., 2] // 4], axis=-1)
+    cells = (bins[..., 0] * 64 + bins[..., 1]) * 64 + bins[..., 2]
+    counts = [
+        _smoothed(np.bincount(cells[chosen], minlength=16 * 64 * 64).reshape(16, 64, 64) + 1.0)
+        for chosen in (without, with_returns)
+    ]
+    return np.log(counts[0] / counts[1]).reshape(-1)[cells]
+
+
+def _smoothed(counts: np.ndarray) -> np.ndarray:
+    """Blur a colour histogram by about a cell along each axis."""
+    for axis in range(3):
+        before, after = np.roll(counts, 1, axis), np.roll(counts, -1, axis)
+        counts = 0.25 * before + 0.5 * counts + 0.25 * after
+    return counts
+
+
+def _texture(image: np.ndarray) -> np.ndarray:
+    """Largest standard deviation of a colour channel in 5 x 5 pixels."""
+    rgb = image.astype(np.float32)
+    mean, square = cv2.blur(rgb, (5, 5)), cv2.blur(rgb * rgb, (5, 5))
+    return np.sqrt(np.maximum(square - mean * mean, 0)).max(axis=-1)
+
+
+def _large_pieces(mask: np.ndarray, least_px: float) -> np.ndarray:
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    is_large = stats[:, cv2.CC_STAT_AREA] >= max(least_px, 1)
+    is_large[0] = False
+    return is_large[labels] if count > 1 else np.zeros_like(mask)
+
+
+def _like_the_largest(
+    image: np.ndarray, pieces: np.ndarray, sigma_px: float, tolerance: float
+) -> np.ndarray:
+    """The largest connected piece, and those whose median colour continues it."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(pieces.astype(np.uint8))
+    if count <= 2:
+        return pieces
+    largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
+    differs = _differs(image, labels == largest, sigma_px)
+    alike = [np.median(differs[labels == label]) < tolerance for label in range(1, count)]
+    alike[largest - 1] = True
+    return np.array([False, *alike])[labels]
+
+
+def _differs(image: np.ndarray, sky: np.ndarray, sigma_px: float) -> np.ndarray:
+    """Largest channel difference from the sky around, averaged near and, failing that, far.
+
+    The averages are smooth, so they are taken on a quarter of the grid.
+    """
+    height, width = sky.shape
+    size = (max(1, width // 4), max(1, height // 4))
+    share = cv2.resize(sky.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    rgb = image.astype(np.float32)
+    masked = cv2.resize(rgb * sky[..., None], size, interpolation=cv2.INTER_AREA)
+    mean = rgb[sky].mean(axis=0)
+    for sigma in (sigma_px, sigma_px / 4, sigma_px / 16):
+        near_share = cv2.GaussianBlur(share, (0, 0), sigma)[..., None]
+        near = cv2.GaussianBlur(masked, (0, 0), sigma)
+        mean = (near + 1e-3 * mean) / (near_share + 1e-3)
+    mean = cv2.resize(mean, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.abs(rgb - mean).max(axis=-1)
+
+
+def _connected_to(mask: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """The connected pieces of a mask that hold a seed."""
+    _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+    held = np.unique(labels[seeds])
+    return np.isin(labels, held[held > 0])
+
+
+def _bright_holes(image: np.ndarray, sky: np.ndarray, returns: np.ndarray) -> np.ndarray:
+    """Holes of the sky that return no beam and are not darker than it: clouds and their rims."""
+    holes = np.zeros_like(sky)
+    if not sky.any():
+        return holes
+    height, width = sky.shape
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats((~sky).astype(np.uint8))
+    for label, (left, top, wide, high, _) in enumerate(stats[1:], start=1):
+        if left == 0 or top == 0 or left + wide == width or top + high == height:
+            continue
+        window = slice(top - 1, top + high + 1), slice(left - 1, left + wide + 1)
+        hole = labels[window] == label
+        around = sky[window] & (_grown(hole.astype(np.uint8), 1) > 0)
+        is_bright = grey[window][hole].mean() > np.percentile(grey[window][around], 25)
+        if is_bright and not returns[window][hole].any():
+            holes[window] |= hole
+    return holes

@@ -1,0 +1,76 @@
+"""LiDAR depth of one sweep as a camera saw it: sparse, occlusion-checked, actors in place.
+
+Depth is camera z in metres, 0 where no point falls. The LiDAR stands higher than the camera and
+sees over roofs and behind posts; a point with nearer returns above or beside its pixel is dropped.
+Nearer returns below it hide nothing: that is how a road looks.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.geometry.boxes import is_inside_box
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
+from lidarpainter_models.scenes.driving_scene import ActorTrack
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SparseDepthConfig:
+    """How sweeps become depth images."""
+
+    min_depth_m: float = 1.0
+    """Nearer returns are the car itself or noise."""
+    max_depth_m: float = 250.0
+    """Beyond the reach of the sensors in use."""
+    occlusion_window_px: int = 5
+    """Gaps between beams are a few pixels wide: look for nearer returns in the upper half of a
+    window of this width."""
+    occlusion_margin: float = 0.05
+    """A point further behind than this part of its depth is hidden ..."""
+    occlusion_margin_m: float = 0.3
+    """... plus this much, so that walls seen at a grazing angle survive."""
+
+
+def sparse_lidar_depth(
+    points_world: Float[Tensor, "points 3"],
+    camera: Camera,
+    *,
+    config: SparseDepthConfig,
+) -> Float[Tensor, "height width"]:
+    """Nearest visible LiDAR depth of every pixel, 0 where there is none."""
+    pixels_uv, depth_m = camera.project(points_world)
+    inside = camera.contains(pixels_uv, depth_m, near_m=config.min_depth_m)
+    inside &= depth_m < config.max_depth_m
+    column, row = pixels_uv[inside].long().unbind(-1)
+    nearest = torch.full((camera.height_px * camera.width_px,), torch.inf)
+    nearest.scatter_reduce_(0, row * camera.width_px + column, depth_m[inside], reduce="amin")
+    nearest = nearest.view(camera.height_px, camera.width_px)
+    reach = config.occlusion_window_px // 2
+    padded = torch.nn.functional.pad(-nearest[None], (reach, reach, reach, 0), value=-torch.inf)
+    front = -torch.nn.functional.max_pool2d(padded, (reach + 1, 2 * reach + 1), 1)[0]
+    is_visible = nearest <= front * (1 + config.occlusion_margin) + config.occlusion_margin_m
+    return torch.where(is_visible & nearest.isfinite(), nearest, torch.zeros_like(nearest))
+
+
+def move_actor_points(
+    points_world: Float[Tensor, "points 3"],
+    tracks: Sequence[ActorTrack],
+    *,
+    from_ns: int,
+    to_ns: int,
+    margin_m: float = 0.15,
+) -> Float[Tensor, "points 3"]:
+    """Carry the points inside moving boxes from where they were scanned to another time."""
+    moved = points_world.clone()
+    for track in tracks:
+        if not (track.is_present(from_ns, 0) and track.is_moving):
+            continue
+        world_from_box = track.pose_at(from_ns).double()
+        inside = is_inside_box(points_world, world_from_box, track.size_m, margin_m=margin_m)
+        step = track.pose_at(to_ns).double() @ invert_rigid(world_from_box)
+        moved[inside] = transform_points(step, points_world[inside].double()).float()
+    return moved

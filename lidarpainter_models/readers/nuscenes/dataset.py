@@ -1,0 +1,121 @@
+"""The tables of a nuScenes download: versions, scenes, samples; each table is read once a process.
+
+Below the root lie the versions (`v1.0-trainval`, `v1.0-test`, `v1.0-mini`), each a folder of JSON
+tables, beside `samples/` and `sweeps/`. A scene of several versions (mini is a part of trainval) is
+taken from the first of them in the order above; other versions follow by name.
+"""
+
+import stat
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+from lidarpainter_models.errors import DataError
+from lidarpainter_models.readers.nuscenes.rows import TableRow, shown
+from lidarpainter_models.readers.nuscenes.tables import NuscenesTable
+
+_FIRST_VERSIONS = ("v1.0-trainval", "v1.0-test", "v1.0-mini")
+_KEYS = {
+    "scene": "name",
+    "sample": "scene_token",
+    "sample_data": "sample_token",
+    "sample_annotation": "sample_token",
+    "ego_pose": "token",
+    "calibrated_sensor": "token",
+    "sensor": "token",
+    "instance": "token",
+    "category": "token",
+}
+"""The tables that are read and the column each is looked up by."""
+
+
+class _Stamp(NamedTuple):
+    """Tells a table from one that has taken its place."""
+
+    size: int
+    changed_ns: int
+    inode: int
+
+
+class NuscenesTables:
+    """The tables of one version, each read when first asked for."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __getitem__(self, name: str) -> NuscenesTable:
+        path = self.folder / f"{name}.json"
+        try:
+            status = path.stat()
+        except OSError:
+            raise DataError(f"{path}: the table is missing") from None
+        if not stat.S_ISREG(status.st_mode):  # a pipe would be waited for without end
+            raise DataError(f"{path}: not a file")
+        stamp = _Stamp(status.st_size, status.st_mtime_ns, status.st_ino)
+        return _read_table(path, _KEYS[name], stamp)
+
+    def digests(self) -> dict[str, str]:
+        """SHA-256 of every table."""
+        return {name: self[name].sha256 for name in _KEYS}
+
+
+@lru_cache(maxsize=3 * len(_KEYS))
+def _read_table(path: Path, key: str, stamp: _Stamp) -> NuscenesTable:  # noqa: ARG001
+    """One table, kept for the next sequence; `stamp` makes a changed file be read anew."""
+    return NuscenesTable(path, key)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sample:
+    """One key frame."""
+
+    token: str
+    timestamp_ns: int
+
+
+def open_versions(root: Path) -> list[NuscenesTables]:
+    """The versions below a root, the fullest first."""
+    folders = [file.parent for file in Path(root).glob("v1.0-*/scene.json")]
+    order = {name: position for position, name in enumerate(_FIRST_VERSIONS)}
+    folders.sort(key=lambda folder: (order.get(folder.name, len(order)), folder.name))
+    return [NuscenesTables(folder) for folder in folders]
+
+
+def find_scene(root: Path, name: str) -> tuple[NuscenesTables, TableRow]:
+    """The row of a scene and the version it is in.
+
+    Raises:
+        DataError: no version has that scene, or one has it twice.
+    """
+    versions = open_versions(root)
+    if not versions:
+        raise DataError(f"{root}: no folder v1.0-* with a scene.json, expected nuScenes' tables")
+    for tables in versions:
+        if tables["scene"].rows_with(name):
+            return tables, tables["scene"].row(name, str(root))
+    folders = ", ".join(tables.folder.name for tables in versions)
+    raise DataError(f"{root}: no scene {shown(name)} in {folders}")
+
+
+def read_samples(tables: NuscenesTables, scene: TableRow) -> list[Sample]:
+    """The key frames of a scene by time.
+
+    Raises:
+        DataError: there are not as many as the scene states, or two have one token or time.
+    """
+    rows = tables["sample"].rows_with(scene.text("token"))
+    stated = scene.count("nbr_samples")
+    if len(rows) != stated or not rows:
+        raise DataError(
+            f"{scene.where}: states {stated} samples, {tables['sample'].path} has {len(rows)}"
+        )
+    samples: list[Sample] = []
+    for row in sorted(rows, key=TableRow.timestamp_ns):
+        sample = Sample(token=row.text("token"), timestamp_ns=row.timestamp_ns())
+        if samples and sample.timestamp_ns == samples[-1].timestamp_ns:
+            raise DataError(f"{row.where}: another sample of the scene has the same time")
+        samples.append(sample)
+    if len({sample.token for sample in samples}) != len(samples):
+        raise DataError(f"{scene.where}: two samples of the scene have the same token")
+    return samples

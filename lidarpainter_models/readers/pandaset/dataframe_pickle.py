@@ -1,0 +1,216 @@
+"""Read pickled pandas tables (PandaSet's files) without pandas and without running the pickle.
+
+`pickle_tree` turns the file into inert data; this module knows how pandas arranges a table in it:
+a `BlockManager` holds blocks, each a 2-D array (columns, rows) with the positions of its columns,
+and two indexes, the first of which has the column names. Understood are the states of
+pandas 0.25 to 2 (and 3 where texts are plain objects); contents are flags, numbers and texts.
+"""
+
+import operator
+import re
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidarpainter_models.errors import DataError, UnsafePickleError
+from lidarpainter_models.readers.pandaset.pickle_tree import Made, Named, read_pickle_tree
+from lidarpainter_models.scenes.validation import shown
+
+MAX_TABLE_BYTES = 64 * 1024 * 1024
+"""A table that unpacks to more is refused; the largest of PandaSet has 9 MB."""
+MAX_TABLE_ROWS = 1_000_000
+"""A frame of PandaSet has 170,000 points."""
+_GZIP_WINDOW_BITS = 31
+"""For zlib: a gzip header, its checksum and the largest window."""
+
+Table = dict[str, np.ndarray]
+"""Columns by name, all of one length."""
+
+_FRAMES = frozenset({Named("pandas.core.frame", "DataFrame"), Named("pandas", "DataFrame")})
+_MANAGERS = frozenset(
+    {
+        Named("pandas.core.internals.managers", "BlockManager"),
+        Named("pandas.core.internals", "BlockManager"),
+    }
+)
+_NEW_INDEX = Named("pandas.core.indexes.base", "_new_Index")
+_INDEX_KINDS = frozenset(
+    {
+        Named("pandas.core.indexes.base", "Index"),
+        Named("pandas", "Index"),
+        Named("pandas.core.indexes.range", "RangeIndex"),
+        Named("pandas", "RangeIndex"),
+        Named("pandas.core.indexes.numeric", "Int64Index"),
+    }
+)
+_BLOCKS = frozenset(
+    {
+        Named("pandas._libs.internals", "_unpickle_block"),
+        Named("pandas.core.internals.blocks", "new_block"),
+    }
+)
+_SLICES = frozenset({Named("builtins", "slice"), Named("__builtin__", "slice")})
+_ENCODE = Named("_codecs", "encode")
+_DTYPE = Named("numpy", "dtype")
+_RECONSTRUCT = frozenset(
+    Named(f"numpy.{core}.multiarray", "_reconstruct") for core in ("core", "_core")
+)
+_FROM_BUFFER = frozenset(
+    Named(f"numpy.{core}.numeric", "_frombuffer") for core in ("core", "_core")
+)
+ALLOWED_NAMES = frozenset(
+    {*_FRAMES, *_MANAGERS, *_INDEX_KINDS, *_BLOCKS, *_SLICES, *_RECONSTRUCT, *_FROM_BUFFER}
+    | {_NEW_INDEX, _ENCODE, _DTYPE, Named("numpy", "ndarray")}
+)
+_NUMBER_CODE = re.compile(r"b1|[iu][1248]|f[248]")
+_BYTE_ORDERS = ("<", ">", "=", "|")
+
+
+def read_table_bytes(
+    content: bytes,
+    path: Path,
+    *,
+    max_bytes: int = MAX_TABLE_BYTES,
+    max_rows: int = MAX_TABLE_ROWS,
+) -> Table:
+    """The columns of one pickled pandas table, gzipped if the name of its `path` says so.
+
+    Raises:
+        DataError: the content is cut off, too large or no table.
+        UnsafePickleError: the pickle names a class that no table needs.
+    """
+    try:
+        if path.suffix == ".gz":
+            content = _unzip(content, max_bytes)
+        return _table(read_pickle_tree(content, ALLOWED_NAMES), max_rows)
+    except UnsafePickleError as error:
+        raise UnsafePickleError(f"{path}: {error}") from None
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from None
+
+
+def _unzip(content: bytes, max_bytes: int) -> bytes:
+    """The content of a gzip file, which may have several members; no more than `max_bytes`."""
+    parts, left = [], max_bytes + 1
+    while content:
+        member = zlib.decompressobj(_GZIP_WINDOW_BITS)
+        try:
+            parts.append(member.decompress(content, left))
+        except zlib.error as error:
+            raise DataError(f"the gzip file is cut off or damaged ({error})") from None
+        left -= len(parts[-1])
+        if left <= 0:
+            raise DataError(f"unpacks to more than {max_bytes} bytes, expected a table")
+        if not member.eof:
+            raise DataError("the gzip file is cut off or damaged (it has no end)")
+        content = member.unused_data.lstrip(b"\x00")
+    return b"".join(parts)
+
+
+def _table(tree: object, max_rows: int) -> Table:
+    if not (isinstance(tree, Made) and tree.by in _FRAMES and isinstance(tree.state, dict)):
+        raise DataError("the pickle holds no pandas table")
+    manager = tree.state.get("_mgr", tree.state.get("_data"))
+    if not (isinstance(manager, Made) and manager.by in _MANAGERS):
+        raise DataError("the pandas table has a layout that is not understood")
+    try:
+        names, placed = _blocks(manager)
+        columns: list[np.ndarray | None] = [None] * len(names)
+        for values, positions in placed:
+            for row, position in enumerate(positions):
+                columns[position] = values[row]
+    except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(f"the pandas table is damaged ({shown(str(error))})") from None
+    return dict(zip(names, _of_one_length(columns, max_rows), strict=True))
+
+
+def _of_one_length(columns: list[np.ndarray | None], max_rows: int) -> list[np.ndarray]:
+    found = [column for column in columns if column is not None]
+    lengths = {len(column) for column in found}
+    if len(found) != len(columns) or len(lengths) != 1:
+        raise DataError("the pandas table is damaged (columns are missing or differ in length)")
+    if max(lengths) > max_rows:
+        raise DataError(f"the table has {max(lengths)} rows, expected at most {max_rows}")
+    return found
+
+
+def _blocks(manager: Made) -> tuple[list[str], list[tuple[np.ndarray, list[int]]]]:
+    """Column names, and per block its (columns, rows) array and the positions of its columns."""
+    if isinstance(manager.state, tuple):  # pandas 0.25 to 1.2: everything in the state
+        layout = manager.state[3]["0.14.1"]
+        axes, blocks = layout["axes"], layout["blocks"]
+        pairs = [(block["values"], block["mgr_locs"]) for block in blocks]
+    else:  # pandas 1.3 and later: BlockManager(blocks, axes)
+        blocks, axes = manager.arguments
+        pairs = [block.arguments[:2] for block in blocks if block.by in _BLOCKS]
+        if len(pairs) != len(blocks):
+            raise DataError("the pandas table has a block that is not understood")
+    names = [str(name) for name in _index_values(axes[0])]
+    return names, [
+        (np.atleast_2d(_array(values)), _positions(placement, len(names)))
+        for values, placement in pairs
+    ]
+
+
+def _index_values(index: Made) -> list[Any]:
+    if index.by != _NEW_INDEX or len(index.arguments) != 2:
+        raise DataError("the column names of the pandas table are not understood")
+    return list(_array(index.arguments[1]["data"]))
+
+
+def _positions(placement: Made, count: int) -> list[int]:
+    if placement.by in _SLICES:
+        start, stop, step = placement.arguments
+        return list(range(count))[slice(start, stop, step)]
+    return [int(position) for position in _array(placement)]
+
+
+def _array(made: Made) -> np.ndarray:
+    """The array of a numpy pickle, from its raw bytes and a type we name ourselves."""
+    if made.by in _RECONSTRUCT:
+        _version, shape, dtype, is_fortran, content = made.state
+        order = "F" if is_fortran else "C"
+    elif made.by in _FROM_BUFFER:
+        content, dtype, shape, order = made.arguments
+    else:
+        raise DataError(f"an array is made by {made.by}, which is not understood")
+    if isinstance(content, Made) and content.by == _ENCODE:
+        content = content.arguments[0]
+    sizes = tuple(operator.index(size) for size in shape)
+    if not 1 <= len(sizes) <= 2 or min(sizes) < 0:
+        raise DataError("an array is neither a column nor a block of columns")
+    return _flat_array(content, _dtype(dtype)).reshape(sizes, order="F" if order == "F" else "C")
+
+
+def _flat_array(content: object, kind: np.dtype) -> np.ndarray:
+    if kind.hasobject:
+        if not isinstance(content, list):
+            raise DataError("a column of texts holds something else")
+        flat = np.empty(len(content), dtype=object)
+        flat[:] = [_plain_value(item) for item in content]
+        return flat
+    raw = content.encode("latin1") if isinstance(content, str) else content
+    if not isinstance(raw, bytes | bytearray):
+        raise DataError("a column of numbers holds something else")
+    return np.frombuffer(raw, dtype=kind)
+
+
+def _dtype(dtype: Made) -> np.dtype:
+    text = dtype.arguments[0]
+    code = text.lstrip("<>|=") if isinstance(text, str) else ""
+    if dtype.by != _DTYPE or (code[:1] != "O" and not _NUMBER_CODE.fullmatch(code)):
+        raise DataError(f"column type {code!r:.50} is not a number, a flag or a text")
+    if code[:1] == "O":
+        return np.dtype(object)
+    byte_order = dtype.state[1] if dtype.state else "="
+    return np.dtype((byte_order if byte_order in _BYTE_ORDERS else "=") + code)
+
+
+def _plain_value(item: object) -> object:
+    if item is None or isinstance(item, str | int | float | bool):
+        return item
+    raise DataError("a column of texts holds something else")

@@ -1,0 +1,224 @@
+"""Read PandaSet (Hesai and Scale AI, CC BY 4.0) in its native layout.
+
+`<root>/<sequence>/` holds `lidar/NN.pkl.gz` (points already in the dataset's world, with their
+times), `lidar/poses.json`, `camera/<name>/NN.jpg` with poses at exposure, intrinsics and times,
+`annotations/cuboids/NN.pkl.gz` and, for most sequences, `annotations/semseg/NN.pkl.gz`.
+
+Frames. The pose in `lidar/poses.json` is that of a frame on the vehicle 0.3 m above the road with
+x right, y forward, z up, at the stated time (the end of the sweep: the front camera, taken 50 ms
+earlier, trails it by just that at every speed). Ego is the same frame with x forward and y left.
+The scene's world has its origin at the first ego pose read and its x along that heading; its z is
+the dataset's up and not the vehicle's, which leans 2 degrees: the road is level in the former.
+"""
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.errors import DataError
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
+from lidarpainter_models.readers.pandaset.boxes import merge_boxes, read_boxes
+from lidarpainter_models.readers.pandaset.calibration import (
+    CAMERA_NAMES,
+    read_camera,
+    read_poses,
+    read_timestamps,
+)
+from lidarpainter_models.readers.pandaset.points import (
+    LIDAR_NAMES,
+    PandasetPoints,
+    read_classes,
+    read_points,
+)
+from lidarpainter_models.readers.source_logs.drive_poses import (
+    NS_PER_S,
+    level_frame,
+    nanoseconds,
+    pose_at,
+    turned_about_up,
+)
+from lidarpainter_models.readers.source_logs.folder import SourceFolder
+from lidarpainter_models.readers.source_logs.frame_content import (
+    FrameContent,
+    SourceImage,
+    SourceSweep,
+)
+from lidarpainter_models.readers.source_logs.selection import chosen_cameras, chosen_frames
+from lidarpainter_models.readers.source_logs.swept_boxes import SweepTimes, moving_actors
+from lidarpainter_models.scenes.records import BoxRecord, ImageRecord
+from lidarpainter_models.scenes.validation import jpeg_header_size, require_classes
+from lidarpainter_models.scenes.writer import SceneHeader
+
+DATASET = "pandaset"
+LICENCE = "CC BY 4.0, PandaSet by Hesai and Scale AI"
+
+# x forward, y left, z up seen from x right, y forward, z up
+_VEHICLE_FROM_EGO = torch.tensor(
+    [[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=torch.float64
+)
+_EGO_FROM_LIDAR_M = ((0.81, 0.0, 1.85), (1.42, 0.0, 1.55))
+"""Where the two LiDARs sit on the vehicle.
+
+From the published calibration relative to the front camera; the elevations of the 64 beams fit the
+sensor's data sheet best around (0.79, 0.00, 1.865), and the forward LiDAR's rays cross near (1.4,
+0.0, 1.6).
+"""
+
+
+def list_pandaset_sequences(root: Path) -> tuple[str, ...]:
+    """Names of the sequences below a root, sorted."""
+    return tuple(sorted(file.parent.parent.name for file in Path(root).glob("*/lidar/poses.json")))
+
+
+class PandasetLog:
+    """One sequence; what is needed before its first frame can be written is read at once."""
+
+    dataset = DATASET
+    is_drive = True
+
+    def __init__(
+        self, root: Path, sequence: str, frames: slice | None, cameras: tuple[str, ...] | None
+    ) -> None:
+        """Open a sequence.
+
+        Args:
+            root: the folder that holds the sequences.
+            sequence: a folder name below the root.
+            frames: which frames to take, by position; all of them if None.
+            cameras: which cameras to take, by name; all of them if None.
+
+        Raises:
+            DataError: something in the log is missing, damaged or makes no sense.
+        """
+        folder = root / sequence
+        self.place, self.sequence = str(folder), sequence
+        if not folder.is_dir():
+            raise DataError(f"{folder}: no such sequence folder")
+        self.source = SourceFolder(folder)
+        self.timestamps_ns = read_timestamps(self.source, "lidar")
+        num_frames = len(self.timestamps_ns)
+        if any(later <= earlier for earlier, later in pairwise(self.timestamps_ns)):
+            raise DataError(f"{folder / 'lidar/timestamps.json'}: the times do not ascend")
+        self.frame_indices = chosen_frames(num_frames, frames, folder)
+        self.global_from_ego = read_poses(self.source, "lidar", num_frames) @ _VEHICLE_FROM_EGO
+        self.global_from_world = level_frame(self.global_from_ego[self.frame_indices[0]])
+        self.world_from_global = invert_rigid(self.global_from_world)
+        self.cameras = {
+            name: read_camera(self.source, name, num_frames)
+            for name in chosen_cameras(cameras, CAMERA_NAMES, folder)
+        }
+        self.semantic_classes = _semantic_classes(self.source)
+        self.header = SceneHeader(
+            licence=LICENCE,
+            global_from_world=self.global_from_world,
+            semantic_classes=self.semantic_classes,
+        )
+        boxes = {index: read_boxes(self.source, index) for index in self.frame_indices}
+        self.boxes = merge_boxes(boxes)
+        self.moving = moving_actors(
+            self.boxes, {index: self.timestamps_ns[index] / NS_PER_S for index in boxes}
+        )
+
+    def provenance(self) -> dict[str, object]:
+        """Where the log lies and what was read of it."""
+        return {"root": str(self.source.root.parent), **self.source.provenance()}
+
+    def read_frame(self, frame_index: int) -> FrameContent:
+        """Everything of one frame, as the writer takes it."""
+        points = read_points(self.source, frame_index)
+        classes = (
+            read_classes(self.source, frame_index, len(points.xyz_m))
+            if self.semantic_classes
+            else None
+        )
+        return FrameContent(
+            frame_index=frame_index,
+            place=f"{self.place}, frame {frame_index}",
+            timestamp_ns=self.timestamps_ns[frame_index],
+            world_from_ego=self.world_from_global @ self.global_from_ego[frame_index],
+            images=[self._read_image(frame_index, name) for name in self.cameras],
+            sweeps=self._sweeps(points, classes),
+            boxes=self._boxes(frame_index, points),
+        )
+
+    def _read_image(self, frame_index: int, name: str) -> SourceImage:
+        file = f"camera/{name}/{frame_index:02d}.jpg"
+        jpeg = self.source.read_bytes(file)
+        where = str(self.source.root / file)
+        width_px, height_px = jpeg_header_size(jpeg, where)
+        recorded = self.cameras[name]
+        camera = Camera(
+            world_from_camera=self.world_from_global @ recorded.global_from_camera[frame_index],
+            **recorded.intrinsics,
+            width_px=width_px,
+            height_px=height_px,
+        )
+        record = ImageRecord(
+            camera_name=name, timestamp_ns=recorded.timestamps_ns[frame_index], camera=camera
+        )
+        return SourceImage(record=record, jpeg=jpeg, source=where)
+
+    def _sweeps(self, points: PandasetPoints, classes: np.ndarray | None) -> list[SourceSweep]:
+        xyz_world_m = transform_points(self.world_from_global, torch.from_numpy(points.xyz_m))
+        xyz_world_m = xyz_world_m.to(torch.float32)
+        sweeps = []
+        for sensor, lidar_name in enumerate(LIDAR_NAMES):
+            rows = np.flatnonzero(points.sensor == sensor)
+            if len(rows) == 0:
+                continue
+            middle_ns = nanoseconds(float(np.median(points.time_s[rows])))
+            sweeps.append(
+                SourceSweep(
+                    lidar_name=lidar_name,
+                    points=points.sweep(rows, xyz_world_m, middle_ns),
+                    timestamp_ns=middle_ns,
+                    world_from_lidar=self.world_from_global
+                    @ self._global_from_lidar(middle_ns, sensor),
+                    semantics=None if classes is None else torch.from_numpy(classes[rows]),
+                    source=points.where,
+                )
+            )
+        return sweeps
+
+    def _boxes(self, frame_index: int, points: PandasetPoints) -> list[BoxRecord]:
+        lidar_m = self._global_from_lidar(self.timestamps_ns[frame_index], 0)[:3, 3].numpy()
+        times = SweepTimes(points.xyz_m, points.time_s, points.sensor, lidar_m)
+        records = []
+        for box in self.boxes[frame_index]:
+            global_from_box = turned_about_up(box.yaw_rad, torch.from_numpy(box.centre_m))
+            rows = times.inside(box)
+            records.append(
+                BoxRecord(
+                    actor_id=box.actor_id,
+                    category=box.category,
+                    timestamp_ns=nanoseconds(times.time_of(box, rows)),
+                    world_from_box=self.world_from_global @ global_from_box,
+                    size_m=box.size_m,
+                    is_moving=box.actor_id in self.moving,
+                    num_points=len(rows),
+                )
+            )
+        return records
+
+    def _global_from_lidar(self, timestamp_ns: int, sensor: int) -> Float[Tensor, "4 4"]:
+        """Pose of a LiDAR between the ego poses; before the first the motion is continued."""
+        global_from_ego = pose_at(self.global_from_ego, self.timestamps_ns, timestamp_ns)
+        ego_from_lidar = torch.eye(4, dtype=torch.float64)
+        ego_from_lidar[:3, 3] = torch.tensor(_EGO_FROM_LIDAR_M[sensor], dtype=torch.float64)
+        return global_from_ego @ ego_from_lidar
+
+
+def _semantic_classes(source: SourceFolder) -> dict[int, str]:
+    """Names of the point classes by number; empty where the log has none."""
+    if not (source.root / "annotations/semseg").is_dir():
+        return {}
+    file = "annotations/semseg/classes.json"
+    classes = source.read_json(file, dict)
+    if not classes:
+        raise DataError(f"{source.root / file}: expected names by class number")
+    return require_classes(classes, str(source.root / file))

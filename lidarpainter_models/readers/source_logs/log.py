@@ -1,0 +1,137 @@
+"""What a reader makes of a log, and the one loop that writes it into the store.
+
+Unpacking, hashing and sorting release the interpreter, so a thread prepares the next frame while
+the last one is written. Frames are read in order by that one thread: a log may be a stream, what
+is stored does not depend on it, and never more than `num_ahead` + 1 frames are in memory.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Protocol, TypeVar, runtime_checkable
+
+from lidarpainter_models.errors import DataError, LidarPainterError, StorageError
+from lidarpainter_models.readers.source_logs.drive_checks import DriveChecks
+from lidarpainter_models.readers.source_logs.frame_content import FrameContent
+from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
+
+NUM_AHEAD = 1
+"""Beside the threads that check and write: on two cores more only wait for the others."""
+
+Progress = Callable[[int, int], None]
+"""Told frames done and frames in all."""
+Content = TypeVar("Content")
+
+
+@runtime_checkable
+class SourceLog(Protocol):
+    """One sequence of a dataset; what the first frame needs is read when it is opened."""
+
+    place: str
+    """File or folder, to name in errors."""
+    dataset: str
+    sequence: str
+    header: SceneHeader
+    frame_indices: list[int]
+    """The frames asked for, ascending."""
+    is_drive: bool
+    """Whether it must be what a car recorded (drive_checks.py); any rig may be in a scene."""
+
+    def read_frame(self, frame_index: int) -> FrameContent:
+        """Everything of one frame; frames are asked for in the order of `frame_indices`."""
+        ...
+
+    def provenance(self) -> dict[str, object]:
+        """What was read, with digests; asked for after the last frame."""
+        ...
+
+
+def write_log(
+    log: SourceLog,
+    store: Path,
+    *,
+    progress: Progress | None = None,
+    num_ahead: int = NUM_AHEAD,
+) -> Path:
+    """Write a log into the store as a canonical scene; gives the scene's path.
+
+    Args:
+        log: the opened log.
+        store: where scenes live.
+        progress: told after every frame.
+        num_ahead: how many frames are prepared before they are due.
+
+    Raises:
+        DataError: something in the log is missing, damaged or makes no sense.
+        StorageError: the store cannot be written.
+    """
+    num_frames = len(log.frame_indices)
+    checks = DriveChecks(num_frames) if log.is_drive else None
+    with (
+        naming(log.place),
+        SceneWriter(store, log.dataset, log.sequence, log.header) as writer,
+        read_ahead(log.read_frame, log.frame_indices, num_ahead=num_ahead) as contents,
+    ):
+        for done, content in enumerate(contents, start=1):
+            with naming(content.place, within=log.place):
+                if checks is not None:
+                    checks.require_frame(content)
+                content.write(writer)
+            if progress is not None:
+                progress(done, num_frames)
+        if checks is not None:
+            checks.require_all_cameras()
+            checks.require_points_in_boxes()
+        writer.set_provenance(log.provenance())
+    return writer.path
+
+
+@contextmanager
+def naming(place: str, *, within: str | None = None) -> Iterator[None]:
+    """Put a place in front of errors without one: the writer knows only the scene.
+
+    Errors that name the place, or one within the larger place `within`, stay as they are.
+    """
+    try:
+        yield
+    except StorageError:
+        raise
+    except LidarPainterError as error:
+        if (within or place) in str(error):
+            raise
+        raise DataError(f"{place}: {error}") from None
+
+
+@contextmanager
+def read_ahead(
+    read: Callable[[int], Content], frame_indices: Sequence[int], *, num_ahead: int
+) -> Iterator[Iterator[Content]]:
+    """What `read` gives for each frame, in order; an error is raised when its frame is due.
+
+    With none ahead each frame is read when it is asked for. Leaving the block ends the thread.
+    """
+    if num_ahead == 0:
+        yield map(read, frame_indices)
+        return
+    pool = ThreadPoolExecutor(1, thread_name_prefix="frame")
+    try:
+        yield _in_order(pool, read, frame_indices, num_ahead)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _in_order(
+    pool: ThreadPoolExecutor,
+    read: Callable[[int], Content],
+    frame_indices: Sequence[int],
+    num_ahead: int,
+) -> Iterator[Content]:
+    waiting: deque[Future[Content]] = deque()
+    for frame_index in frame_indices:
+        waiting.append(pool.submit(read, frame_index))
+        if len(waiting) > num_ahead:
+            yield waiting.popleft().result()
+    while waiting:
+        yield waiting.popleft().result()

@@ -1,0 +1,1 @@
+"""Rays through the street: cameras, LiDARs and light, compiled with numba."""

@@ -1,0 +1,1 @@
+"""What surfaces of the street look like."""

@@ -1,0 +1,161 @@
+"""Build everything of a street from its seed: geometry, surfaces, light, actors, the ego's way."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarpainter_models.synthetic.plan.ego_motion import EgoMotion, draw_ego_motion
+from lidarpainter_models.synthetic.plan.layout import KERB_HEIGHT_M, StreetPlan, draw_plan
+from lidarpainter_models.synthetic.raytracing.scene_arrays import KIND_CUT_OUT, SceneArrays
+from lidarpainter_models.synthetic.textures.noise import as_rgba
+from lidarpainter_models.synthetic.textures.surfaces import StreetClass, Surface, SurfaceSet
+from lidarpainter_models.synthetic.world.buildings import (
+    Lot,
+    add_buildings,
+    add_skyline,
+    draw_lots,
+)
+from lidarpainter_models.synthetic.world.furniture import StreetFurniture
+from lidarpainter_models.synthetic.world.ground import add_ground
+from lidarpainter_models.synthetic.world.meshes import Mesh, MeshBuilder
+from lidarpainter_models.synthetic.world.packing import MovingMesh, pack_scene
+from lidarpainter_models.synthetic.world.sky import draw_light
+from lidarpainter_models.synthetic.world.traffic import StreetActor, Traffic
+from lidarpainter_models.synthetic.world.vegetation import (
+    SPECIES,
+    LeafSurfaces,
+    add_hedge,
+    add_species,
+    add_tree,
+    bark_surface,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class City:
+    """All of a street."""
+
+    plan: StreetPlan
+    ego: EgoMotion
+    actors: tuple[StreetActor, ...]
+    """Moving ones first."""
+    arrays: SceneArrays
+    roots: np.ndarray
+    """int32 (moving actors): root nodes of their trees."""
+    radius_m: np.ndarray
+    """float64 (moving actors)."""
+
+
+def build_city(seed: int) -> City:
+    """Draw a street; each part has its own stream of random numbers."""
+    streams = np.random.SeedSequence([seed, 20_261]).spawn(9)
+    plan_rng, ground_rng, house_rng, green_rng, thing_rng, car_rng, sky_rng, ego_rng, lot_rng = (
+        np.random.default_rng(stream) for stream in streams
+    )
+    plan = draw_plan(plan_rng)
+    surfaces, builder = SurfaceSet(), MeshBuilder()
+    add_ground(builder, surfaces, plan, ground_rng)
+    lots = draw_lots(plan, lot_rng)
+    add_buildings(builder, surfaces, plan, lots, house_rng)
+    add_skyline(builder, surfaces, plan, house_rng)
+    _add_greenery(builder, surfaces, plan, lots, green_rng)
+    StreetFurniture(builder, surfaces, plan, thing_rng).add_all()
+    ego = draw_ego_motion(plan.line, ego_rng)
+    actors = tuple(Traffic(plan, ego, surfaces, car_rng).draw())
+    light = draw_light(surfaces, plan, sky_rng)
+    street, owner = _standing(builder.build(), plan, actors)
+    moving = [
+        MovingMesh(actor.mesh, index) for index, actor in enumerate(actors) if actor.is_moving
+    ]
+    arrays, roots, radius_m = pack_scene(street, owner, moving, surfaces, light)
+    return City(plan, ego, actors, arrays, roots, radius_m)
+
+
+def _standing(
+    street: Mesh, plan: StreetPlan, actors: tuple[StreetActor, ...]
+) -> tuple[Mesh, np.ndarray]:
+    """The street with everything parked in it, and the actor index of each primitive."""
+    meshes, owners = [street], [np.full(len(street.surface), -1)]
+    for index, actor in enumerate(actors):
+        if not actor.is_moving:
+            pose = actor.world_from_box(plan.line, np.zeros(1))[0]
+            meshes.append(actor.mesh.transformed(pose))
+            owners.append(np.full(len(actor.mesh.surface), index))
+    return Mesh.joined(meshes), np.concatenate(owners)
+
+
+def _add_greenery(
+    builder: MeshBuilder,
+    surfaces: SurfaceSet,
+    plan: StreetPlan,
+    lots: list[Lot],
+    rng: np.random.Generator,
+) -> None:
+    """Street trees on both sides, and hedges, trees or fences in the gaps."""
+    chosen = rng.choice(len(SPECIES), 2, replace=False)
+    species = [add_species(surfaces, rng, SPECIES[int(index)]) for index in chosen]
+    bark = bark_surface(surfaces, rng)
+    density = rng.uniform(0.35, 0.8)
+    for side, kerb in ((-1, plan.right_kerb_m), (1, plan.left_kerb_m)):
+        for s in np.arange(-96.0, 210.0, 9.0):
+            s = float(s) + rng.uniform(-1.5, 1.5)
+            near_crossing = plan.cross_start_m - 3.5 < s < plan.cross_end_m + 3.5
+            if near_crossing or rng.random() > density:
+                continue
+            foot = plan.line.place(s, kerb + side * 0.9, KERB_HEIGHT_M)
+            leaves = species[int(rng.integers(2))]
+            detail = 1.0 if -15 < s < 70 else 0.3
+            add_tree(builder, foot, leaves, bark, rng, detail=detail)
+    fence = _fence_surface(surfaces)
+    for lot in lots:
+        if lot.is_gap and lot.start_m < 160:
+            _fill_gap(builder, plan, lot, (species, bark, fence), rng)
+
+
+def _fill_gap(
+    builder: MeshBuilder,
+    plan: StreetPlan,
+    lot: Lot,
+    stock: tuple[list[LeafSurfaces], int, int],
+    rng: np.random.Generator,
+) -> None:
+    """A lot between buildings: a fence or a hedge in front, a tree or two behind."""
+    species, bark, fence = stock
+    leaves = species[int(rng.integers(len(species)))]
+    start, end = lot.start_m + 0.3, lot.end_m - 0.3
+    front = lot.front_d_m + lot.side * 0.15
+    if rng.random() < 0.5:
+        for low, high in zip(
+            np.linspace(start, end, 4)[:-1], np.linspace(start, end, 4)[1:], strict=True
+        ):
+            first = plan.line.place(low, front, KERB_HEIGHT_M)
+            second = plan.line.place(high, front, KERB_HEIGHT_M)
+            length = float(np.linalg.norm(second - first))
+            uv = ((0, 0), (length / 1.2, 0), (0, 1.0))
+            top = first + np.array([0, 0, 1.9])
+            builder.quad(top, second - first, [0, 0, -1.9], fence, uv=uv)
+    else:
+        first = plan.line.place(start, front + lot.side * 0.6, KERB_HEIGHT_M)
+        second = plan.line.place(end, front + lot.side * 0.6, KERB_HEIGHT_M)
+        add_hedge(builder, first, second, leaves, rng)
+    for _ in range(int(rng.integers(1, 4))):
+        place = plan.line.place(
+            rng.uniform(start + 2, end - 2), front + lot.side * rng.uniform(4, 18), KERB_HEIGHT_M
+        )
+        add_tree(builder, place, leaves, bark, rng, detail=0.6)
+
+
+def _fence_surface(surfaces: SurfaceSet) -> int:
+    """Iron bars 12 cm apart between two rails, repeating every 1.2 m, 1.9 m high."""
+    rows, columns = 152, 96
+    opacity = np.zeros((rows, columns), np.float32)
+    for bar in range(10):
+        start = round(bar * columns / 10)
+        opacity[:, start : start + 3] = 1
+    opacity[:, :5] = 1
+    opacity[8:13], opacity[-22:-17] = 1, 1
+    colour = np.full((rows, columns, 3), 30.0)
+    texture = surfaces.add_texture(as_rgba(colour, opacity), repeats=True)
+    return surfaces.add(
+        Surface(semantics=StreetClass.FURNITURE, texture=texture, kind=KIND_CUT_OUT)
+    )

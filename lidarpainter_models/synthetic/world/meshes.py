@@ -1,0 +1,150 @@
+"""Build meshes out of parallelograms and triangles, with surfaces and texture coordinates.
+
+A mesh lives in its own frame, metres; normals may differ at the corners for smooth shading.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lidarpainter_models.synthetic.raytracing.scene_arrays import (
+    GEOMETRY_COLUMNS,
+    IS_PARALLELOGRAM,
+    SHADING_COLUMNS,
+    UV_CORNER,
+)
+
+Vector = Sequence[float] | np.ndarray
+
+
+@dataclass(eq=False)
+class Mesh:
+    """Primitives as rows: a corner, two edges, what lies there."""
+
+    geometry: np.ndarray
+    """float64 (primitives, GEOMETRY_COLUMNS), see scene_arrays.py; cut-outs are marked later."""
+    shading: np.ndarray
+    """float64 (primitives, SHADING_COLUMNS)."""
+    surface: np.ndarray
+    """int32 (primitives)."""
+
+    def transformed(self, target_from_mesh: np.ndarray) -> "Mesh":
+        """The mesh under a 4x4 transform: a rotation, perhaps scaled, and a translation."""
+        linear, offset = target_from_mesh[:3, :3], target_from_mesh[:3, 3]
+        geometry, shading = self.geometry.copy(), self.shading.copy()
+        geometry[:, 0:3] = geometry[:, 0:3] @ linear.T + offset
+        for start in (3, 6):
+            geometry[:, start : start + 3] = geometry[:, start : start + 3] @ linear.T
+        for start in (0, 3, 6):
+            shading[:, start : start + 3] = shading[:, start : start + 3] @ linear.T
+        return Mesh(geometry, shading, self.surface)
+
+    @classmethod
+    def joined(cls, meshes: Sequence["Mesh"]) -> "Mesh":
+        """All primitives of several meshes, in order."""
+        if not meshes:
+            return cls(
+                np.zeros((0, GEOMETRY_COLUMNS)),
+                np.zeros((0, SHADING_COLUMNS)),
+                np.zeros(0, np.int32),
+            )
+        return cls(
+            np.concatenate([mesh.geometry for mesh in meshes]),
+            np.concatenate([mesh.shading for mesh in meshes]),
+            np.concatenate([mesh.surface for mesh in meshes]),
+        )
+
+    def corners(self) -> np.ndarray:
+        """(primitives, 4, 3): the corners; of a triangle the last one comes twice."""
+        corner, first, second = self.geometry[:, 0:3], self.geometry[:, 3:6], self.geometry[:, 6:9]
+        both = np.where(self.geometry[:, IS_PARALLELOGRAM, None] > 0, first + second, second)
+        return np.stack([corner, corner + first, corner + second, corner + both], axis=1)
+
+
+UNIT_UV = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
+
+
+@dataclass(eq=False)
+class MeshBuilder:
+    """Collects primitives; `build` gives the mesh."""
+
+    parts: list[Mesh] = field(default_factory=list)
+
+    def build(self) -> Mesh:
+        """All that was added."""
+        return Mesh.joined(self.parts)
+
+    def add(self, mesh: Mesh) -> None:
+        """Append another mesh of the same frame."""
+        self.parts.append(mesh)
+
+    def quad(
+        self,
+        corner: Vector,
+        first: Vector,
+        second: Vector,
+        surface: int,
+        *,
+        uv: Sequence[Sequence[float]] = UNIT_UV,
+    ) -> None:
+        """A parallelogram; `uv` at the corner, past the first edge, past the second edge."""
+        corners = np.array([corner, np.add(corner, first), np.add(corner, second)], float)
+        self.primitives(corners[None], np.array(uv, float)[None], surface, is_parallelogram=True)
+
+    def primitives(
+        self,
+        corners: np.ndarray,
+        uv: np.ndarray,
+        surface: int | np.ndarray,
+        *,
+        normals: np.ndarray | None = None,
+        is_parallelogram: bool = False,
+    ) -> None:
+        """Many primitives by three corners each.
+
+        Args:
+            corners: (primitives, 3, 3): the corner, past the first edge, past the second edge.
+            uv: (primitives, 3, 2), alike.
+            surface: one for all, or one each.
+            normals: (primitives, 3, 3), alike; flat where absent.
+            is_parallelogram: whether the fourth corner is spanned too.
+        """
+        count = corners.shape[0]
+        geometry = np.zeros((count, GEOMETRY_COLUMNS))
+        geometry[:, 0:3] = corners[:, 0]
+        geometry[:, 3:6] = corners[:, 1] - corners[:, 0]
+        geometry[:, 6:9] = corners[:, 2] - corners[:, 0]
+        geometry[:, IS_PARALLELOGRAM] = float(is_parallelogram)
+        if normals is None:
+            flat = np.cross(geometry[:, 3:6], geometry[:, 6:9])
+            flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
+            normals = np.repeat(flat[:, None], 3, axis=1)
+        shading = np.zeros((count, SHADING_COLUMNS))
+        shading[:, 0:3] = normals[:, 0]
+        shading[:, 3:6] = normals[:, 1] - normals[:, 0]
+        shading[:, 6:9] = normals[:, 2] - normals[:, 0]
+        shading[:, UV_CORNER : UV_CORNER + 2] = uv[:, 0]
+        shading[:, UV_CORNER + 2 : UV_CORNER + 4] = uv[:, 1] - uv[:, 0]
+        shading[:, UV_CORNER + 4 : UV_CORNER + 6] = uv[:, 2] - uv[:, 0]
+        surfaces = np.broadcast_to(np.asarray(surface, np.int32), (count,)).copy()
+        self.parts.append(Mesh(geometry, shading, surfaces))
+
+    def grid(
+        self, points: np.ndarray, uv: np.ndarray, surface: int, *, is_smooth: bool = False
+    ) -> None:
+        """A sheet through points (rows, columns, 3) with uv (rows, columns, 2), as triangles."""
+        quads = [points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]]
+        uvs = [uv[:-1, :-1], uv[:-1, 1:], uv[1:, 1:], uv[1:, :-1]]
+        normals = None
+        if is_smooth:
+            along = np.cross(np.gradient(points, axis=0), np.gradient(points, axis=1))
+            along /= np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-12)
+            normals = [along[:-1, :-1], along[:-1, 1:], along[1:, 1:], along[1:, :-1]]
+        for order in ((0, 1, 3), (2, 3, 1)):
+            corners = np.stack([quads[i] for i in order], axis=2).reshape(-1, 3, 3)
+            place = np.stack([uvs[i] for i in order], axis=2).reshape(-1, 3, 2)
+            chosen = None
+            if normals is not None:
+                chosen = np.stack([normals[i] for i in order], axis=2).reshape(-1, 3, 3)
+            self.primitives(corners, place, surface, normals=chosen)

@@ -1,0 +1,133 @@
+"""Pack meshes, surfaces and light into the arrays that are traced."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarpainter_models.synthetic.raytracing import scene_arrays as layout
+from lidarpainter_models.synthetic.raytracing.bvh import build_tree
+from lidarpainter_models.synthetic.textures.surfaces import (
+    SurfaceSet,
+    linear_from_srgb,
+    srgb_from_linear,
+)
+from lidarpainter_models.synthetic.world.meshes import Mesh
+
+
+@dataclass(frozen=True, kw_only=True)
+class Light:
+    """Sun, sky and air; colours are linear."""
+
+    sun_direction: tuple[float, float, float]
+    sun_rgb: tuple[float, float, float] = (2.5, 2.3, 1.95)
+    zenith_rgb: tuple[float, float, float] = (0.30, 0.45, 0.74)
+    horizon_rgb: tuple[float, float, float] = (0.74, 0.80, 0.88)
+    ground_rgb: tuple[float, float, float] = (0.26, 0.24, 0.21)
+    haze_per_m: float = 1 / 1400
+    cloud_texture: int = 0
+    cloud_offset: tuple[float, float] = (0.0, 0.0)
+    exposure: float = 0.86
+
+
+@dataclass(frozen=True, eq=False)
+class MovingMesh:
+    """A mesh in its box frame, drawn wherever its box is."""
+
+    mesh: Mesh
+    actor: int
+
+
+def pack_scene(
+    street: Mesh,
+    street_actor: np.ndarray,
+    moving: list[MovingMesh],
+    surfaces: SurfaceSet,
+    light: Light,
+) -> tuple[layout.SceneArrays, np.ndarray, np.ndarray]:
+    """Everything a ray needs.
+
+    Args:
+        street: all that stands still, in the world.
+        street_actor: (primitives) actor index of each of its primitives, -1 for none.
+        moving: what moves.
+        surfaces: that the meshes name.
+        light: of the day.
+
+    Returns:
+        The arrays, and the root node (int32) and radius (metres) of every moving mesh.
+    """
+    value, index = surfaces.surface_arrays()
+    texels, texture_index = surfaces.texture_arrays()
+    meshes = [(street, street_actor)]
+    meshes += [(part.mesh, np.full(len(part.mesh.surface), part.actor)) for part in moving]
+    trees, roots, num_nodes, num_prims = [], [], 0, 0
+    for mesh, actor in meshes:
+        tree = _pack_tree(mesh, actor, index, num_nodes, num_prims)
+        trees.append(tree)
+        roots.append(num_nodes)
+        num_nodes += tree[0].shape[0]
+        num_prims += tree[2].shape[0]
+    bounds, children, geometry, shading, owner = map(np.concatenate, zip(*trees, strict=True))
+    arrays = layout.SceneArrays(
+        node_bounds=bounds,
+        node_children=children,
+        prim_geometry=geometry,
+        prim_shading=shading,
+        prim_index=owner,
+        surface_value=value,
+        surface_index=index,
+        texels=texels,
+        texture_index=texture_index,
+        light=_light_array(light),
+        to_linear=linear_from_srgb(np.arange(256) / 255).astype(np.float32),
+        to_display=_tone_curve(),
+    )
+    radii = [np.linalg.norm(part.mesh.corners(), axis=-1).max() + 0.01 for part in moving]
+    return arrays, np.array(roots[1:], np.int32), np.array(radii, np.float64)
+
+
+def _pack_tree(
+    mesh: Mesh, actor: np.ndarray, surface_index: np.ndarray, num_nodes: int, num_prims: int
+) -> tuple[np.ndarray, ...]:
+    """Nodes and primitives of one mesh, numbered on from what is there."""
+    corners = mesh.corners()
+    margin = 1e-4
+    bounds, children, order = build_tree(
+        (corners.min(1) - margin).astype(np.float32), (corners.max(1) + margin).astype(np.float32)
+    )
+    is_leaf = children < 0
+    leaf = -children - 1
+    moved = -(leaf + num_prims * 8) - 1
+    children = np.where(is_leaf, np.where(leaf & 7, moved, -1), children + num_nodes)
+    geometry = mesh.geometry[order].astype(np.float32)
+    kinds = surface_index[mesh.surface[order], layout.KIND]
+    geometry[:, layout.IS_CUT_OUT] = kinds == layout.KIND_CUT_OUT
+    owner = np.stack([mesh.surface[order], actor[order]], axis=1).astype(np.int32)
+    shading = mesh.shading[order].astype(np.float32)
+    return bounds, children.astype(np.int32), geometry, shading, owner
+
+
+def _light_array(light: Light) -> np.ndarray:
+    array = np.zeros(layout.LIGHT_COLUMNS)
+    for start, colour in (
+        (layout.SUN_DIRECTION, light.sun_direction),
+        (layout.SUN_RGB, light.sun_rgb),
+        (layout.ZENITH_RGB, light.zenith_rgb),
+        (layout.HORIZON_RGB, light.horizon_rgb),
+        (layout.GROUND_RGB, light.ground_rgb),
+    ):
+        array[start : start + 3] = colour
+    array[layout.HAZE_PER_M] = light.haze_per_m
+    array[layout.CLOUD_TEXTURE] = light.cloud_texture
+    array[layout.EXPOSURE] = light.exposure
+    array[layout.CLOUD_OFFSET : layout.CLOUD_OFFSET + 2] = light.cloud_offset
+    return array
+
+
+def _tone_curve() -> np.ndarray:
+    """Image value of exposed light: sRGB with a shoulder above 0.6 that ends at 1."""
+    light = np.linspace(0, layout.DISPLAY_LIMIT, 4096)
+    knee = 0.6
+    over = np.maximum(light - knee, 0)
+    compressed = np.where(light < knee, light, knee + (1 - knee) * (1 - np.exp(-over / (1 - knee))))
+    return srgb_from_linear(compressed).astype(np.float32)

@@ -1,0 +1,127 @@
+"""Simple solids added to a mesh: boxes, tubes, rounded posts."""
+
+import numpy as np
+
+from lidarpainter_models.synthetic.world.meshes import MeshBuilder, Vector
+
+FACES = ("front", "back", "left", "right", "top", "bottom")
+
+
+def add_box(
+    builder: MeshBuilder,
+    centre: Vector,
+    size: Vector,
+    surface: int,
+    *,
+    yaw_rad: float = 0.0,
+    faces: dict[str, int] | None = None,
+    uv_per_m: float | None = None,
+) -> None:
+    """An upright box; `faces` gives single faces another surface (-1: leave it out).
+
+    Front looks along +x, left along +y. Each face shows its whole texture upright, or
+    `uv_per_m` repeats of it per metre.
+    """
+    cosine, sine = np.cos(yaw_rad), np.sin(yaw_rad)
+    axis_x = np.array([cosine, sine, 0.0]) * size[0]
+    axis_y = np.array([-sine, cosine, 0.0]) * size[1]
+    axis_z = np.array([0.0, 0.0, 1.0]) * size[2]
+    half = (axis_x + axis_y + axis_z) / 2
+    low, high = np.asarray(centre) - half, np.asarray(centre) + half
+    # corner at the upper left as seen from outside, then along the texture's rows, then down
+    layout = {
+        "front": (low + axis_x + axis_z, axis_y, -axis_z, (size[1], size[2])),
+        "back": (low + axis_y + axis_z, -axis_y, -axis_z, (size[1], size[2])),
+        "left": (high, -axis_x, -axis_z, (size[0], size[2])),
+        "right": (low + axis_z, axis_x, -axis_z, (size[0], size[2])),
+        "top": (low + axis_y + axis_z, -axis_y, axis_x, (size[1], size[0])),
+        "bottom": (low, axis_x, axis_y, (size[0], size[1])),
+    }
+    for face in FACES:
+        chosen = (faces or {}).get(face, surface)
+        if chosen < 0:
+            continue
+        corner, first, second, extent = layout[face]
+        across = extent[0] * uv_per_m if uv_per_m else 1.0
+        down = extent[1] * uv_per_m if uv_per_m else 1.0
+        builder.quad(corner, first, second, chosen, uv=((0, 0), (across, 0), (0, down)))
+
+
+def add_tube(
+    builder: MeshBuilder,
+    start: Vector,
+    end: Vector,
+    radii: tuple[float, float],
+    surface: int,
+    *,
+    sides: int = 10,
+    has_caps: bool = False,
+) -> None:
+    """A round tube (or cone) between two points, smooth around; texture v runs from its end."""
+    start, end = np.asarray(start, float), np.asarray(end, float)
+    axis = end - start
+    axis = axis / np.linalg.norm(axis)
+    helper = np.array([1.0, 0, 0]) if abs(axis[2]) > 0.9 else np.array([0, 0, 1.0])
+    first = np.cross(helper, axis)
+    first /= np.linalg.norm(first)
+    second = np.cross(axis, first)
+    angles = np.linspace(0, 2 * np.pi, sides + 1)
+    ring = np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * second
+    low, high = start + radii[0] * ring, end + radii[1] * ring
+    turn = np.linspace(0, 1, sides + 1)
+    zeros, ones = np.zeros_like(turn), np.ones_like(turn)
+    uv_low, uv_high = np.stack([turn, ones], -1), np.stack([turn, zeros], -1)
+    sheets = (
+        ((low[:-1], low[1:], high[:-1]), (ring[:-1], ring[1:], ring[:-1]), (0, 1, 2)),
+        ((high[1:], high[:-1], low[1:]), (ring[1:], ring[:-1], ring[1:]), (3, 2, 1)),
+    )
+    places = (uv_low[:-1], uv_low[1:], uv_high[:-1], uv_high[1:])
+    for corners, normals, order in sheets:
+        builder.primitives(
+            np.stack(corners, axis=1),
+            np.stack([places[i] for i in order], axis=1),
+            surface,
+            normals=np.stack(normals, axis=1),
+        )
+    if has_caps:
+        _add_cap(builder, end, high, surface)
+        _add_cap(builder, start, low, surface)
+
+
+def _add_cap(builder: MeshBuilder, centre: np.ndarray, rim: np.ndarray, surface: int) -> None:
+    """A disc as a fan of triangles."""
+    count = rim.shape[0] - 1
+    corners = np.stack([np.repeat(centre[None], count, 0), rim[:-1], rim[1:]], axis=1)
+    builder.primitives(corners, np.full((count, 3, 2), 0.5), surface)
+
+
+def add_ball(
+    builder: MeshBuilder,
+    centre: Vector,
+    radii: Vector,
+    surface: int,
+    *,
+    rows: int = 6,
+    columns: int = 10,
+) -> None:
+    """An ellipsoid."""
+    lines = np.linspace(0, np.pi, rows + 1)[:, None]
+    turns = np.linspace(0, 2 * np.pi, columns + 1)[None, :]
+    unit = np.stack(
+        [np.sin(lines) * np.cos(turns), np.sin(lines) * np.sin(turns), np.cos(lines) + 0 * turns],
+        axis=-1,
+    )
+    points = np.asarray(centre) + unit * np.asarray(radii)
+    normals = unit / np.asarray(radii)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    uv = np.stack(np.broadcast_arrays(turns / (2 * np.pi), lines / np.pi), axis=-1)
+    corner = [points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]]
+    normal = [normals[:-1, :-1], normals[:-1, 1:], normals[1:, 1:], normals[1:, :-1]]
+    place = [uv[:-1, :-1], uv[:-1, 1:], uv[1:, 1:], uv[1:, :-1]]
+    for order in ((0, 1, 3), (2, 3, 1)):
+        builder.primitives(
+            np.stack([corner[i] for i in order], axis=2).reshape(-1, 3, 3),
+            np.stack([place[i] for i in order], axis=2).reshape(-1, 3, 2),
+            surface,
+            normals=np.stack([normal[i] for i in order], axis=2).reshape(-1, 3, 3),
+        )

@@ -1,0 +1,216 @@
+"""Everything with a box: moving cars, parked cars, people; what they look like and where they go.
+
+No moving car ever comes beside the ego car in a neighbouring lane, so that cameras shifted by 3 m
+stay outside of all cars.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lidarpainter_models.synthetic.plan.car_kinds import SHAPES
+from lidarpainter_models.synthetic.plan.ego_motion import EgoMotion, Pace
+from lidarpainter_models.synthetic.plan.layout import (
+    KERB_HEIGHT_M,
+    LANE_M,
+    PARKING_M,
+    SIDEWALK_M,
+    StreetPlan,
+)
+from lidarpainter_models.synthetic.plan.street_line import StreetLine
+from lidarpainter_models.synthetic.textures.cars import CarAtlas, add_car_surfaces
+from lidarpainter_models.synthetic.textures.surfaces import SurfaceSet
+from lidarpainter_models.synthetic.world.car_shapes import build_car
+from lidarpainter_models.synthetic.world.meshes import Mesh
+from lidarpainter_models.synthetic.world.pedestrians import build_pedestrian
+
+KINDS = ("sedan", "sedan", "hatch", "suv", "suv", "pickup", "van")
+NUM_PAINTED = 14
+NEAR_M = 70.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StreetActor:
+    """One boxed thing and its way along the street."""
+
+    actor_id: str
+    category: str
+    size_m: np.ndarray
+    """Tight length, width, height."""
+    mesh: Mesh
+    """In the box frame."""
+    start_s_m: float
+    d_m: float
+    pace: Pace | None = None
+    """Along +s, none for what stands; negative comes towards the ego car."""
+    yaw_rad: float = 0.0
+    """Relative to the street."""
+    ground_m: float = 0.0
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether it ever leaves its place."""
+        return self.pace is not None
+
+    def world_from_box(self, line: StreetLine, time_s: np.ndarray | float) -> np.ndarray:
+        """(n, 4, 4) at times after the first frame."""
+        along = 0.0 if self.pace is None else self.pace.travelled_m(time_s)
+        poses = line.poses(self.start_s_m + along + 0 * time_s, self.d_m, self.yaw_rad)
+        lift = self.ground_m + self.size_m[2] / 2
+        poses[:, :3, 3] += lift * poses[:, :3, 2]
+        return poses
+
+
+@dataclass(eq=False)
+class Traffic:
+    """Draws all actors of a street."""
+
+    plan: StreetPlan
+    ego: EgoMotion
+    surfaces: SurfaceSet
+    rng: np.random.Generator
+    actors: list[StreetActor] = field(default_factory=list)
+    _painted: list[tuple[str, CarAtlas]] = field(default_factory=list)
+    _meshes: dict[tuple[int, bool], tuple[Mesh, np.ndarray]] = field(default_factory=dict)
+
+    def draw(self) -> list[StreetActor]:
+        """Moving ones first."""
+        self._add_same_direction()
+        self._add_oncoming()
+        self._add_walkers()
+        for _ in range(NUM_PAINTED):
+            kind = KINDS[int(self.rng.integers(len(KINDS)))]
+            atlas = add_car_surfaces(self.surfaces, SHAPES[kind], self.rng)
+            self._painted.append((kind, atlas))
+        for side in (0, 1):
+            self._park_row(side)
+        self._add_waiting()
+        return self.actors
+
+    def _add_car(self, kind: str, pace: Pace, **way: float) -> None:
+        """A moving car of its own paint."""
+        atlas = add_car_surfaces(self.surfaces, SHAPES[kind], self.rng)
+        mesh, size = build_car(SHAPES[kind], atlas)
+        name = f"car-{len(self.actors):03d}"
+        self.actors.append(
+            StreetActor(
+                actor_id=name,
+                category=SHAPES[kind].category,
+                size_m=size,
+                mesh=mesh,
+                pace=pace,
+                **way,
+            )
+        )
+
+    def _add_same_direction(self) -> None:
+        """Cars ahead in the ego lane and, where it is a lane, in the one to its left."""
+        rng, ego = self.rng, self.ego
+        ahead, factors = rng.uniform(12.5, 17.0), np.sort(rng.uniform(1.0, 1.15, 2))
+        for factor in factors:  # the faster one is in front
+            self._add_car(
+                KINDS[int(rng.integers(5))],
+                ego.pace.times(float(factor)),
+                start_s_m=ahead,
+                d_m=rng.uniform(-0.15, 0.15),
+            )
+            ahead += rng.uniform(11, 18)
+        if self.plan.left_side == "turn":
+            return
+        place, factors = rng.uniform(9.5, 15.0), np.sort(rng.uniform(1.02, 1.35, 2))
+        for factor in factors:
+            self._add_car(
+                KINDS[int(rng.integers(len(KINDS)))],
+                ego.pace.times(float(factor)),
+                start_s_m=place,
+                d_m=LANE_M + rng.uniform(-0.15, 0.15),
+            )
+            place += rng.uniform(13, 22)
+
+    def _add_oncoming(self) -> None:
+        """Cars that come towards the ego car beyond the double yellow line."""
+        rng = self.rng
+        for lane in self.plan.oncoming_d_m:
+            place = rng.uniform(14, 30)
+            speed = rng.uniform(7, 11)
+            while place < 110:
+                self._add_car(
+                    KINDS[int(rng.integers(len(KINDS)))],
+                    Pace(-speed, -speed),
+                    start_s_m=place,
+                    d_m=lane + rng.uniform(-0.15, 0.15),
+                    yaw_rad=np.pi,
+                )
+                place += rng.uniform(17, 42) * (1.0 if place < 60 else 1.6)
+
+    def _add_walkers(self) -> None:
+        """People on both sidewalks, some of them standing."""
+        rng = self.rng
+        for index in range(int(rng.integers(5, 9))):
+            side = -1 if index % 2 else 1
+            kerb = self.plan.left_kerb_m if side > 0 else self.plan.right_kerb_m
+            mesh, size = build_pedestrian(self.surfaces, rng)
+            speed = float(rng.choice([-1.0, 1.0])) * rng.uniform(1.0, 1.6)
+            self.actors.append(
+                StreetActor(
+                    actor_id=f"person-{len(self.actors):03d}",
+                    category="pedestrian",
+                    size_m=size,
+                    mesh=mesh,
+                    start_s_m=rng.uniform(7, 44),
+                    d_m=kerb + side * rng.uniform(1.1, SIDEWALK_M - 0.7),
+                    pace=Pace(speed, speed),
+                    yaw_rad=0.0 if speed > 0 else np.pi,
+                    ground_m=KERB_HEIGHT_M,
+                )
+            )
+
+    def _parked_mesh(self, index: int, *, is_near: bool) -> tuple[Mesh, np.ndarray]:
+        if (index, is_near) not in self._meshes:
+            kind, atlas = self._painted[index]
+            stations = 34 if is_near else 12
+            self._meshes[index, is_near] = build_car(SHAPES[kind], atlas, stations)
+        return self._meshes[index, is_near]
+
+    def _park(self, s_m: float, d_m: float, yaw_rad: float) -> None:
+        rng = self.rng
+        index = int(rng.integers(NUM_PAINTED))
+        mesh, size = self._parked_mesh(index, is_near=-20 < s_m < NEAR_M)
+        category = SHAPES[self._painted[index][0]].category
+        self.actors.append(
+            StreetActor(
+                actor_id=f"parked-{len(self.actors):03d}",
+                category=category,
+                size_m=size,
+                mesh=mesh,
+                start_s_m=s_m,
+                d_m=d_m,
+                yaw_rad=yaw_rad,
+            )
+        )
+
+    def _park_row(self, side: int) -> None:
+        """Parked cars along one kerb, most places taken."""
+        rng, plan = self.rng, self.plan
+        for s in np.arange(-75.0 + 3.0, 150.0, 6.0):
+            is_blocked = plan.cross_start_m - 9 < s < plan.cross_end_m + 8
+            if is_blocked or rng.random() > 0.74:
+                continue
+            yaw = (0.0 if side == 0 else np.pi) + rng.normal(0, 0.02)
+            d = plan.parking_d_m[side] + rng.normal(0, 0.06)
+            self._park(float(s) + rng.uniform(-0.25, 0.25), d, yaw)
+
+    def _add_waiting(self) -> None:
+        """Cars in the cross street that wait for green."""
+        plan, rng = self.plan, self.rng
+        middle = (plan.cross_start_m + plan.cross_end_m) / 2
+        for side, kerb, yaw in (
+            (-1, plan.right_kerb_m, np.pi / 2),
+            (1, plan.left_kerb_m, -np.pi / 2),
+        ):
+            reach = 6.5
+            for _ in range(int(rng.integers(1, 3))):
+                offset = 0.25 * (plan.cross_end_m - plan.cross_start_m)
+                lane = middle - side * -offset
+                self._park(lane, kerb + side * (reach + PARKING_M), yaw + rng.normal(0, 0.02))
+                reach += rng.uniform(6.3, 7.5)

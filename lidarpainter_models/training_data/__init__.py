@@ -1,0 +1,1 @@
+"""Pairs that painters learn from: harvested, made from streets, corrupted, stored."""

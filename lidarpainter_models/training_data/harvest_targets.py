@@ -1,0 +1,167 @@
+"""Turn views of a fit whose true images are known into stored training pairs.
+
+Each view gives one pair as the fit left it and further ones with damaged Gaussians. The fits come
+from `harvest.py` (recorded logs) and `street_harvest.py` (synthetic streets).
+"""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.conditioning.conditions import ConditionBuilder, ConditionConfig
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.gaussians.fitting.config import FitConfig, RefinementConfig
+from lidarpainter_models.gaussians.fitting.densification import DensificationConfig
+from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.observations.observations import ObservationConfig, SceneObservations
+from lidarpainter_models.painter.examples import PaintingPair
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.training_data.corruptions import CorruptionConfig, corrupt_gaussians
+from lidarpainter_models.training_data.pairs import PairWriter
+
+HarvestProgress = Callable[[int, int], None]
+"""Told after each fit how many of how many are done."""
+
+AS_GIVEN = RefinementConfig(cameras=False, extrinsics=False, actors=False)
+"""Poses are not refined: those given are the best known, and the truth stands in their frame."""
+
+
+def weak_fit(steps: int = 250, *, budget: int = 50_000) -> FitConfig:
+    """A fit stopped early, on poses that are taken as they are."""
+    return FitConfig(
+        steps=steps,
+        refinement=AS_GIVEN,
+        densification=DensificationConfig(budget=budget),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HarvestConfig:
+    """How pairs are made from a fit."""
+
+    observations: ObservationConfig = field(default_factory=ObservationConfig)
+    conditions: ConditionConfig = field(default_factory=ConditionConfig)
+    corruption: CorruptionConfig = field(default_factory=CorruptionConfig)
+    corrupted_per_view: int = 1
+    """Pairs with damaged Gaussians beside the one that is as the fit left it."""
+    reference_fit: FitConfig = field(default_factory=lambda: FitConfig(steps=1200))
+    """The long fit to all training views whose refined poses the weak ones are judged at."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse a negative number of pairs."""
+        if self.corrupted_per_view < 0:
+            raise ConfigError(f"corrupted_per_view must be >= 0, got {self.corrupted_per_view}")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Target:
+    """A view whose true image is known."""
+
+    name: str
+    """Unique within its fit; part of the pair's file name."""
+    camera: Camera
+    timestamp_ns: int
+    camera_name: str | None
+    """Whose exposure the true image has; None for that of the scene itself."""
+    true_rgb: Float[Tensor, "height width 3"]
+    provenance: dict[str, Any]
+
+
+def harvest_label(
+    scene: DrivingScene,
+    plan: object,
+    config: HarvestConfig,
+) -> str:
+    """First part of the names of a plan's pairs; another plan or config gives another one."""
+    settings = hashlib.sha256(repr((plan, config, scene.content_digest)).encode()).hexdigest()
+    return f"{scene.dataset}-{scene.sequence}-{settings[:8]}"
+
+
+def is_harvested(names: Sequence[str], writer: PairWriter, config: HarvestConfig) -> bool:
+    """Whether every pair of these targets is stored."""
+    return all(
+        pair_name(name, copy) in writer
+        for name in names
+        for copy in range(1 + config.corrupted_per_view)
+    )
+
+
+def pair_name(target_name: str, copy: int) -> str:
+    """Name of a target's pair: copy 0 is as the fit left it, the others are damaged."""
+    return f"{target_name}-{'fit' if copy == 0 else f'damaged{copy}'}"
+
+
+def harvest_targets(
+    scene: GaussianScene,
+    observations: SceneObservations,
+    targets: Sequence[Target],
+    writer: PairWriter,
+    config: HarvestConfig,
+) -> int:
+    """Store the pairs of some views of one fit; those already stored are passed over.
+
+    Returns:
+        Number of pairs added.
+    """
+    added = 0
+    pristine = ConditionBuilder(
+        scene, observations.lidar_map, observations.views, config=config.conditions
+    )
+    for target in targets:
+        for copy in range(1 + config.corrupted_per_view):
+            name = pair_name(target.name, copy)
+            if name in writer:
+                continue
+            builder, seed = pristine, None
+            if copy:
+                seed = _seed_of(name, config.seed)
+                builder = _damaged_builder(scene, observations, target, seed, config)
+            provenance = target.provenance | {"corruption_seed": seed}
+            writer.add(name, make_pair(builder, target), provenance)
+            added += 1
+    return added
+
+
+def make_pair(builder: ConditionBuilder, target: Target) -> PaintingPair:
+    """The conditions at a target beside its true image."""
+    conditions = builder.conditions(
+        target.camera, target.timestamp_ns, camera_name=target.camera_name
+    )
+    return PaintingPair(
+        conditions=conditions,
+        target_rgb=target.true_rgb,
+        target_valid=torch.ones(conditions.height_width_px, dtype=torch.bool),
+    )
+
+
+def _damaged_builder(
+    scene: GaussianScene,
+    observations: SceneObservations,
+    target: Target,
+    seed: int,
+    config: HarvestConfig,
+) -> ConditionBuilder:
+    damaged = corrupt_gaussians(
+        scene.gaussians,
+        target.camera.centre_world.float(),
+        seed=seed,
+        config=config.corruption,
+    )
+    return ConditionBuilder(
+        scene.with_gaussians(damaged),
+        observations.lidar_map,
+        observations.views,
+        config=config.conditions,
+    )
+
+
+def _seed_of(name: str, seed: int) -> int:
+    """A number that follows from a pair's name, so that a continued harvest repeats it."""
+    return int.from_bytes(hashlib.sha256(f"{seed} {name}".encode()).digest()[:6], "big")

@@ -1,0 +1,231 @@
+"""Training pairs from synthetic streets: shifted views of a fit beside the exact truth.
+
+No recorded log shows what a camera sees a lane aside; a synthetic street does. Its streets must
+have other seeds than those of the demo and of the tests. World frame, z up; metres.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Generator
+
+from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.gaussians.fitting.config import FitConfig
+from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.trajectories import Shift, road_directions, shift_pose
+from lidarpainter_models.observations.observations import fit_camera, prepare_observations
+from lidarpainter_models.scenes.driving_scene import DrivingScene, RecordedView
+from lidarpainter_models.scenes.splits import ViewSplit, split_views
+from lidarpainter_models.synthetic.street import SyntheticStreet
+from lidarpainter_models.training_data.harvest_targets import (
+    HarvestConfig,
+    HarvestProgress,
+    Target,
+    harvest_label,
+    harvest_targets,
+    is_harvested,
+    weak_fit,
+)
+from lidarpainter_models.training_data.pairs import PairWriter
+
+MOST_DRAWS = 20
+"""Shifts tried per view before it is given up: the camera may stand in a wall every time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShiftDraw:
+    """From where a street is looked at; ranges are uniform, sides equally likely."""
+
+    lateral_m: tuple[float, float] = (1.0, 3.5)
+    up_m: tuple[float, float] = (0.5, 2.0)
+    yaw_rad: float = 0.12
+    """Largest turn of a view that is turned."""
+    lateral_share: float = 0.7
+    """Views moved sideways; the shares are independent, so some are moved in both ways or none."""
+    up_share: float = 0.35
+    yaw_share: float = 0.25
+    clear_m: float = 1.2
+    """A view is drawn again if more than `crowded_share` of its pixels are nearer than this."""
+    crowded_share: float = 0.03
+
+    def __post_init__(self) -> None:
+        """Refuse ranges that run backwards."""
+        for low, high in (self.lateral_m, self.up_m):
+            if not 0 <= low <= high:
+                raise ConfigError(f"shifts must rise from 0 or more, got {low} to {high} m")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreetPlan:
+    """One fit to a street, and how many views of it become pairs."""
+
+    fit: FitConfig = field(default_factory=weak_fit)
+    split: str = "alternate"
+    """Its training frames are fitted."""
+    cameras: tuple[str, ...] = ("front_camera",)
+    """Cameras fitted; the first is the one that is shifted."""
+    num_views: int = 20
+    shifts: ShiftDraw = field(default_factory=ShiftDraw)
+
+    def __post_init__(self) -> None:
+        """Refuse a plan without a camera or a view."""
+        if not self.cameras or self.num_views < 1:
+            raise ConfigError("a street plan needs a camera and at least one view")
+
+
+def default_street_plans() -> tuple[StreetPlan, ...]:
+    """A fit stopped early, one nearly done, and one that has to look ahead of what it saw."""
+    return (
+        StreetPlan(fit=weak_fit(300), num_views=14),
+        StreetPlan(fit=weak_fit(1200, budget=80_000), num_views=36),
+        StreetPlan(fit=weak_fit(700, budget=70_000), split="forward:17:8", num_views=16),
+    )
+
+
+def harvest_shifted_street(
+    street: SyntheticStreet,
+    scene: DrivingScene,
+    plans: Sequence[StreetPlan],
+    writer: PairWriter,
+    *,
+    config: HarvestConfig | None = None,
+    progress: HarvestProgress | None = None,
+) -> int:
+    """Fit a street several times and pair shifted renders with the truth.
+
+    A harvest that was killed goes on where it stopped: a fit whose pairs are all stored is not
+    repeated.
+
+    Args:
+        street: the world itself, free of noise.
+        scene: its recording, as `write_street` stored it.
+        plans: the fits.
+        writer: where pairs go.
+        config: see there; its reference fit is not used, a street's poses are known.
+        progress: told after every fit.
+
+    Returns:
+        Number of pairs added.
+
+    Raises:
+        SceneError: the scene is no recording of this street, or all views stand inside things.
+    """
+    config = config or HarvestConfig()
+    _check_recording(street, scene)
+    added = 0
+    for number, plan in enumerate(plans):
+        split = split_views(scene, plan.split, plan.cameras)
+        targets = _draw_targets(street, scene, split, plan, config)
+        if not is_harvested([target.name for target in targets], writer, config):
+            observations = prepare_observations(scene, split, config.observations)
+            fitted = fit_gaussians(observations, plan.fit).scene
+            added += harvest_targets(fitted, observations, targets, writer, config)
+        if progress is not None:
+            progress(number + 1, len(plans))
+    return added
+
+
+def draw_shift(draw: ShiftDraw, generator: Generator) -> Shift:
+    """A random shift; the recorded pose itself if no kind of shift was drawn."""
+    lateral, up, yaw, side, amount, height, angle = torch.rand(7, generator=generator).tolist()
+    low, high = draw.lateral_m
+    lateral_m = (low + (high - low) * amount) * (1 if side < 0.5 else -1)
+    low, high = draw.up_m
+    return Shift(
+        lateral_m=lateral_m if lateral < draw.lateral_share else 0.0,
+        up_m=low + (high - low) * height if up < draw.up_share else 0.0,
+        yaw_rad=draw.yaw_rad * (2 * angle - 1) if yaw < draw.yaw_share else 0.0,
+    )
+
+
+def _draw_targets(
+    street: SyntheticStreet,
+    scene: DrivingScene,
+    split: ViewSplit,
+    plan: StreetPlan,
+    config: HarvestConfig,
+) -> list[Target]:
+    """Views of the shifted camera, spread over all frames of the split, with their truth."""
+    label = harvest_label(scene, plan, config)
+    generator = torch.Generator().manual_seed(int(label.rsplit("-", 1)[1], 16))
+    directions = road_directions(scene.world_from_ego)
+    recorded = [view for view in (*split.train, *split.test) if view.camera_name == plan.cameras[0]]
+    order = torch.randperm(len(recorded), generator=generator).tolist()
+    targets: list[Target] = []
+    for index in range(plan.num_views):
+        view = recorded[order[index % len(order)]]
+        row = scene.frame_indices.index(view.frame_index)
+        found = _clear_view(street, view, directions[row], plan.shifts, generator, config)
+        if found is not None:
+            targets.append(_target(found, view, scene, plan, f"{label}-{index:03d}"))
+    if not targets:
+        raise SceneError(f"{scene.path}: every shifted view stands inside things")
+    return targets
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _ClearView:
+    camera: Camera
+    shift: Shift
+    true_rgb: torch.Tensor
+
+
+def _clear_view(
+    street: SyntheticStreet,
+    view: RecordedView,
+    road_direction: torch.Tensor,
+    draw: ShiftDraw,
+    generator: Generator,
+    config: HarvestConfig,
+) -> _ClearView | None:
+    """A shifted view that does not stand inside something, or None."""
+    recorded = fit_camera(view, config.observations)
+    for _ in range(MOST_DRAWS):
+        shift = draw_shift(draw, generator)
+        camera = recorded.at(shift_pose(recorded.world_from_camera, road_direction, shift))
+        truth = street.render(camera, view.timestamp_ns)
+        near = (truth.depth_m > 0) & (truth.depth_m < draw.clear_m)
+        if float(near.float().mean()) <= draw.crowded_share:
+            return _ClearView(camera=camera, shift=shift, true_rgb=truth.rgb.clamp(0, 1))
+    return None
+
+
+def _target(
+    found: _ClearView, view: RecordedView, scene: DrivingScene, plan: StreetPlan, name: str
+) -> Target:
+    provenance: dict[str, Any] = {
+        "kind": "shifted street",
+        "dataset": scene.dataset,
+        "sequence": scene.sequence,
+        "scene_digest": scene.content_digest,
+        "frame": view.frame_index,
+        "shift": found.shift.name,
+        "split": plan.split,
+        "cameras": list(plan.cameras),
+        "fit_steps": plan.fit.steps,
+    }
+    return Target(
+        name=name,
+        camera=found.camera,
+        timestamp_ns=view.timestamp_ns,
+        camera_name=view.camera_name,
+        true_rgb=found.true_rgb,
+        provenance=provenance,
+    )
+
+
+def _check_recording(street: SyntheticStreet, scene: DrivingScene) -> None:
+    generator = scene.manifest.get("generator") or {}
+    if generator.get("config", {}).get("seed") != street.config.seed:
+        raise SceneError(
+            f"{scene.path} is no recording of the street with seed {street.config.seed}"
+        )
+    for name, value in (("pose_noise_m", 0), ("pose_noise_rad", 0), ("camera_delay_s", 0)):
+        if getattr(street.config, name) != value:
+            raise SceneError(
+                f"{scene.path}: a street gives pairs only with {name} = 0, so that the truth lies "
+                "exactly over the render"
+            )

@@ -1,0 +1,81 @@
+"""Whether a stored scene makes sense, and whether a dataset on disk can be read."""
+
+import json
+import tempfile
+from dataclasses import asdict
+from pathlib import Path
+
+from catalog.errors import CatalogError
+from catalog.store import Store
+from lidarpainter_models.checks.doctor import check_scene, draw_overlay
+from lidarpainter_models.errors import LidarPainterError
+from lidarpainter_models.export.images import write_png
+from lidarpainter_models.readers import ingest_scene, list_sequences
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from tasks.health import Finding
+from tasks.scenes import open_scene
+
+TRIAL_FRAMES = slice(0, 6)
+"""A dataset is tried on this much of each sequence: enough to tell how its cameras are turned."""
+
+
+def check_stored_scene(store: Store, scene_id: str, out: Path | None) -> list[Finding]:
+    """Check a scene of the store; writes an overlay image and all findings as JSON.
+
+    Args:
+        store: where the scene is.
+        scene_id: `<dataset>/<sequence>`.
+        out: file or folder of the overlay image; by default in the store's folder `doctor`. The
+            JSON lies beside it under the same name.
+    """
+    scene = open_scene(store, scene_id)
+    path = out or store.root / "doctor" / scene.dataset / f"{scene.sequence}.png"
+    if path.suffix != ".png":
+        path = path / "overlay.png"
+    return _examined(scene, path)
+
+
+def check_dataset(store: Store, dataset: str, root: Path, out: Path | None) -> list[Finding]:
+    """Check the first frames of every sequence of a dataset, read into a folder then removed.
+
+    Args:
+        store: the overlay images and JSON files go to its folder `doctor`.
+        dataset: name of the reader.
+        root: the dataset's folder, as downloaded.
+        out: another folder for them.
+    """
+    findings = []
+    for sequence in list_sequences(dataset, root):
+        with tempfile.TemporaryDirectory(prefix="lidarpainter-doctor-") as trial:
+            try:
+                path = ingest_scene(dataset, root, sequence, Path(trial), frames=TRIAL_FRAMES)
+                image = (out or store.root / "doctor" / dataset) / f"{sequence}.png"
+                found = _examined(DrivingScene.open(path), image)
+            except (LidarPainterError, CatalogError) as error:
+                found = [Finding("reading", "fail", str(error))]
+        findings += [Finding(f"{sequence}: {f.name}", f.verdict, f.detail) for f in found]
+    return findings
+
+
+def _examined(scene: DrivingScene, image: Path) -> list[Finding]:
+    """All findings about a scene, after writing its overlay image and the JSON beside it."""
+    findings = [*_findings(scene), Finding("overlay", "ok", str(_write_overlay(scene, image)))]
+    report = {
+        "scene": f"{scene.dataset}/{scene.sequence}",
+        "content_digest": scene.content_digest,
+        "is_fit": all(finding.verdict != "fail" for finding in findings),
+        "findings": [asdict(finding) for finding in findings],
+    }
+    file = image.with_suffix(".json")
+    file.write_text(json.dumps(report, indent=2) + "\n", "utf-8")
+    return [*findings, Finding("report", "ok", str(file))]
+
+
+def _findings(scene: DrivingScene) -> list[Finding]:
+    return [Finding(check.name, check.verdict, check.detail) for check in check_scene(scene)]
+
+
+def _write_overlay(scene: DrivingScene, path: Path) -> Path:
+    frame_index = scene.frame_indices[len(scene.frame_indices) // 2]
+    rgb_u8 = draw_overlay(scene, frame_index, scene.camera_names[0])
+    return write_png(rgb_u8.float() / 255, path)

@@ -1,0 +1,95 @@
+"""Bring a sequence of a dataset, or the synthetic street, into the store and the catalog."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from prefect import task
+
+import lidarpainter_models
+from catalog.records import SceneRecord
+from catalog.store import Store, open_store
+from lidarpainter_models.readers import ingest_scene
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street
+from tasks.measuring import measured
+from tasks.progress import listener
+from tasks.stages import STAGE_OPTIONS
+
+STAGE = "ingest"
+NS_PER_S = 1e9
+
+
+@task(**STAGE_OPTIONS)
+def ingest_sequence(
+    store_path: Path,
+    dataset: str,
+    root: Path,
+    sequence: str,
+    frames: slice | None = None,
+    cameras: tuple[str, ...] | None = None,
+) -> dict[str, Any]:
+    """Read one sequence of a dataset into the store; returns its row in `scenes`."""
+    store = open_store(store_path)
+    with _writing(store, f"{dataset}/{sequence}"):
+        path = ingest_scene(
+            dataset,
+            root,
+            sequence,
+            store.root,
+            frames=frames,
+            cameras=cameras,
+            progress=lambda done, total: listener().advanced(STAGE, done, total, ""),
+        )
+        return record_scene(store, path)
+
+
+@task(**STAGE_OPTIONS)
+def ingest_street(store_path: Path, config: SyntheticStreetConfig) -> dict[str, Any]:
+    """Render a synthetic street into the store; returns its row in `scenes`."""
+    store = open_store(store_path)
+    with _writing(store, f"synthetic/street-{config.seed:04d}"):
+        path = write_street(
+            config,
+            store.root,
+            progress=lambda done, total: listener().advanced(STAGE, done, total, ""),
+        )
+        return record_scene(store, path)
+
+
+@contextmanager
+def _writing(store: Store, scene_id: str) -> Iterator[None]:
+    """Tell the listener, and keep other writers of the scene out."""
+    listener().started(STAGE)
+    with measured() as cost:
+        waiting = partial(listener().waiting, STAGE)
+        with store.scene_lock(scene_id, on_wait=waiting):
+            yield
+    listener().finished(STAGE, cost.seconds, is_new=True)
+
+
+def record_scene(store: Store, path: Path) -> dict[str, Any]:
+    """Enter a stored scene into the catalog; returns its row."""
+    scene = DrivingScene.open(path)
+    times_ns = scene.frame_timestamps_ns
+    row = SceneRecord(
+        scene_id=f"{scene.dataset}/{scene.sequence}",
+        dataset=scene.dataset,
+        sequence=scene.sequence,
+        content_digest=scene.content_digest,
+        licence=scene.manifest["licence"],
+        path=str(path),
+        num_frames=len(scene.frame_indices),
+        num_views=len(scene.views),
+        cameras=scene.camera_names,
+        num_points=sum(sweep.num_points for sweep in scene.sweeps),
+        num_actors=len(scene.tracks),
+        num_moving_actors=sum(track.is_moving for track in scene.tracks),
+        duration_s=float(times_ns[-1] - times_ns[0]) / NS_PER_S,
+        num_bytes=sum(scene.manifest["files"].values()),
+        software_version=lidarpainter_models.__version__,
+    ).row()
+    store.tables.merge("scenes", [row])
+    return row

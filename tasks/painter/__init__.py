@@ -1,0 +1,1 @@
+"""Stages that harvest pairs, train painters and judge them."""

@@ -1,0 +1,73 @@
+"""Finished runs whose held-out views judge painters."""
+
+from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass
+from pathlib import Path
+
+from catalog.store import open_store
+from lidarpainter_models.conditioning.conditions import ConditionBuilder
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.evaluation.held_out import HeldOut
+from lidarpainter_models.evaluation.judged_pairs import JudgedPairs, judged_pairs, unseen_views
+from tasks.evaluation.judging import known_street
+from tasks.evaluation.scene import JudgeSettings
+from tasks.scenes import SplitSpec, open_split
+from tasks.stored import FittedRef, load_observations, load_scene
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JudgedFit:
+    """The first fit of a run: what a painter is shown before anything was painted."""
+
+    store_path: Path
+    run_id: str
+    split: SplitSpec
+    fitted: FittedRef
+    settings: JudgeSettings
+
+    def open(self, trained: AbstractSet[str]) -> "OpenedFit":
+        """Its pairs, by scene and trajectory, without frames that painters were trained on.
+
+        Args:
+            trained: targets that painters were trained on.
+        """
+        store = open_store(self.store_path)
+        recorded, views = open_split(store, self.split)
+        unseen = unseen_views(views.test, self.split.scene_id, trained)
+        seen = load_observations(store, self.fitted.observations)
+        scene = load_scene(store, self.fitted.gaussians)
+        found = judged_pairs(
+            ConditionBuilder(scene, seen.lidar_map, seen.views, config=self.settings.conditions),
+            HeldOut(scene=recorded, test_views=unseen, observation=self.settings.observation),
+            known_street(recorded),
+            self.settings.scoring.shifts,
+        )
+        return OpenedFit(
+            run_id=self.run_id,
+            pairs={f"{self.split.scene_id} {name}": pairs for name, pairs in found.items()},
+            num_left_out=len(views.test) - len(unseen),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OpenedFit:
+    """Pairs of a run that judge."""
+
+    run_id: str
+    pairs: dict[str, JudgedPairs]
+    num_left_out: int
+    """Held-out views of each trajectory that a painter was trained on."""
+
+
+def open_fits(fits: Sequence[JudgedFit], trained: AbstractSet[str]) -> list[OpenedFit]:
+    """Every fit, each of a scene of its own.
+
+    Raises:
+        ConfigError: two runs of one scene, whose figures would bear one name.
+    """
+    scenes = [fit.split.scene_id for fit in fits]
+    twice = sorted({scene for scene in scenes if scenes.count(scene) > 1})
+    if twice:
+        raise ConfigError(f"judge by one run of each scene, got two of {', '.join(twice)}")
+    return [fit.open(trained) for fit in fits]

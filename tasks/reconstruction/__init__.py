@@ -1,0 +1,1 @@
+"""Stages of one reconstruction, from a stored scene to its report."""

@@ -1,0 +1,1 @@
+"""Stages that show a finished run: renders along trajectories, styles."""

@@ -1,0 +1,97 @@
+"""A camera that looks a degree aside is found, on a street and on the real log; sound ones pass."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from drawn_streets import drawn_street
+
+from lidarpainter_models.checks.calibration import check_calibration
+from lidarpainter_models.checks.doctor import check_licence
+from lidarpainter_models.geometry.transforms import rigid_from_tangent
+from lidarpainter_models.readers import ingest_scene
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.synthetic import SyntheticStreetConfig, record_street
+
+PITCH, YAW, ROLL = 0, 1, 2
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory):
+    config = SyntheticStreetConfig(seed=7, num_frames=4, width_px=320, height_px=180)
+    return record_street(drawn_street(config), tmp_path_factory.mktemp("street"))
+
+
+@pytest.fixture(scope="module")
+def real_log(shared_folder, tmp_path_factory):
+    store = tmp_path_factory.mktemp("real")
+    return ingest_scene("pandaset", shared_folder / "data/pandaset", "002", store)
+
+
+def turned(path, camera_name, axis, angle_deg):
+    """The scene with one camera's stated rotation off about an axis of the camera."""
+    scene = DrivingScene.open(path)
+    tangent = torch.zeros(6, dtype=torch.float64)
+    tangent[axis] = torch.deg2rad(torch.tensor(angle_deg))
+    scene.views = tuple(
+        replace(
+            view, camera=view.camera.at(view.camera.world_from_camera @ rigid_from_tangent(tangent))
+        )
+        if view.camera_name == camera_name
+        else view
+        for view in scene.views
+    )
+    return scene
+
+
+def test_sound_cameras_of_a_street_pass(street):
+    verdict, detail = check_calibration(DrivingScene.open(street))
+    assert verdict == "ok", detail
+
+
+@pytest.mark.parametrize("axis", [PITCH, YAW, ROLL])
+@pytest.mark.parametrize("angle_deg", [-1.0, 1.0])
+def test_camera_of_a_street_turned_by_a_degree_is_found(street, axis, angle_deg):
+    verdict, detail = check_calibration(turned(street, "front_left_camera", axis, angle_deg))
+    assert verdict == "fail"
+    assert detail.startswith("front_left_camera turned on its mount")
+
+
+def test_camera_turned_beyond_the_search_is_not_called_sound(street):
+    verdict, _ = check_calibration(turned(street, "front_camera", YAW, 8.0))
+    assert verdict != "ok"
+
+
+def test_small_images_cannot_tell(small_scene):
+    verdict, detail = check_calibration(small_scene)
+    assert verdict == "ok"
+    assert "front_camera cannot be told" in detail
+
+
+@pytest.mark.slow
+def test_sound_cameras_of_the_real_log_pass(real_log):
+    verdict, detail = check_calibration(DrivingScene.open(real_log))
+    assert verdict == "ok", detail
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", ["front_camera", "left_camera", "right_camera", "back_camera"])
+@pytest.mark.parametrize(
+    ("axis", "angle_deg"), [(PITCH, 1.0), (YAW, -1.0), (YAW, 1.0), (ROLL, 1.0)]
+)
+def test_camera_of_the_real_log_turned_by_a_degree_is_found(real_log, camera, axis, angle_deg):
+    verdict, detail = check_calibration(turned(real_log, camera, axis, angle_deg))
+    assert verdict == "fail"
+    assert detail.startswith(f"{camera} turned on its mount")
+
+
+@pytest.mark.parametrize(
+    ("licence", "verdict"),
+    [("  ", "fail"), ("CC BY 4.0, somebody", "ok"), ("CC BY-NC-SA 4.0", "ok")],
+)
+def test_missing_licence_is_found(small_scene, licence, verdict):
+    scene = DrivingScene.open(small_scene.path)
+    scene.manifest["licence"] = licence
+    found, detail = check_licence(scene)
+    assert found == verdict
+    assert ("no commercial use" in detail) == ("NC" in licence)

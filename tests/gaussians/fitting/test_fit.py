@@ -1,0 +1,224 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from gaussian_world import FRAME_NS, HEIGHT_PX, WIDTH_PX, scene_of
+
+from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
+from lidarpainter_models.gaussians.fitting.config import (
+    FitConfig,
+    GuidanceConfig,
+    RefinementConfig,
+    continuation,
+)
+from lidarpainter_models.gaussians.fitting.densification import DensificationConfig
+from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
+from lidarpainter_models.gaussians.fitting.optimiser import LearningRates
+from lidarpainter_models.gaussians.fitting.state import FitState
+from lidarpainter_models.gaussians.fitting.step import add_guidance_gradients
+from lidarpainter_models.gaussians.initialisation.scene import (
+    InitialisationConfig,
+    initialise_scene,
+)
+from lidarpainter_models.geometry.transforms import rigid_from_tangent
+from lidarpainter_models.observations.observations import GuidanceView
+
+STEPS = 40
+
+
+def short_fit(**changes):
+    config = FitConfig(
+        steps=STEPS,
+        half_resolution=0.25,
+        initialisation=InitialisationConfig(num_gaussians=700, street_voxel_m=0.2),
+        densification=DensificationConfig(budget=900, start=0.2, stop=0.8, every=8),
+        refinement=RefinementConfig(start_step=5),
+        log_every=1,
+    )
+    return replace(config, **changes)
+
+
+def painted_view(world, *, weight=1.0):
+    camera = world.observations.views[1].camera
+    return GuidanceView(
+        camera=camera,
+        timestamp_ns=FRAME_NS,
+        rgb=torch.full((HEIGHT_PX, WIDTH_PX, 3), 0.2),
+        weight=torch.full((HEIGHT_PX, WIDTH_PX), weight),
+        lidar_depth_m=torch.zeros(HEIGHT_PX, WIDTH_PX),
+    )
+
+
+def assert_same_scene(first, second):
+    first_arrays, first_numbers = first.to_arrays()
+    second_arrays, second_numbers = second.to_arrays()
+    assert first_numbers == second_numbers
+    assert first_arrays.keys() == second_arrays.keys()
+    for name, value in first_arrays.items():
+        assert torch.equal(value, second_arrays[name]), name
+
+
+class KilledError(Exception):
+    pass
+
+
+def kill_at(step):
+    def progress(done, _total, _entry):
+        if done == step:
+            raise KilledError
+
+    return progress
+
+
+@pytest.fixture(scope="module")
+def undisturbed(world):
+    return fit_gaussians(world.observations, short_fit())
+
+
+def image_error(world, scene):
+    errors = [
+        (scene.render(view.camera, view.timestamp_ns, view_key=view.key).rgb - view.rgb).abs()
+        for view in world.observations.views
+    ]
+    return float(torch.stack(errors).mean())
+
+
+def test_fit_gets_closer_to_the_images(world, undisturbed):
+    start = initialise_scene(world.observations, short_fit().initialisation)
+    assert image_error(world, undisturbed.scene) < 0.95 * image_error(world, start)
+    assert undisturbed.history[-1]["step"] == STEPS
+
+
+def test_budget_is_never_exceeded(undisturbed):
+    numbers = [entry["num_gaussians"] for entry in undisturbed.history]
+    assert max(numbers) <= 900
+    assert max(numbers) > numbers[0]
+
+
+def test_equal_fits_are_equal_bit_for_bit(world, undisturbed):
+    assert_same_scene(fit_gaussians(world.observations, short_fit()).scene, undisturbed.scene)
+
+
+@pytest.mark.parametrize("killed_at", [6, 15, 30])
+def test_resumed_fit_is_the_undisturbed_one_bit_for_bit(world, undisturbed, tmp_path, killed_at):
+    folder = CheckpointFolder(path=tmp_path, every_steps=5, every_seconds=None)
+    with pytest.raises(KilledError):
+        fit_gaussians(
+            world.observations, short_fit(), checkpoints=folder, progress=kill_at(killed_at)
+        )
+    resumed = fit_gaussians(world.observations, short_fit(), checkpoints=folder)
+    assert_same_scene(resumed.scene, undisturbed.scene)
+    assert [e["step"] for e in resumed.history] == [e["step"] for e in undisturbed.history]
+
+
+def test_checkpoint_of_another_fit_is_refused(world, tmp_path):
+    mine = CheckpointFolder(path=tmp_path, identity="mine", every_steps=2, every_seconds=None)
+    with pytest.raises(KilledError):
+        fit_gaussians(world.observations, short_fit(), checkpoints=mine, progress=kill_at(4))
+    other = replace(mine, identity="other")
+    with pytest.raises(SceneError, match="another fit"):
+        fit_gaussians(world.observations, short_fit(), checkpoints=other)
+
+
+def test_fit_stopped_by_time_says_where_it_is(world):
+    result = fit_gaussians(world.observations, short_fit(), stop_after_cpu_s=1e-6)
+    assert result.history[-1]["step"] == 1
+    assert result.scene.num_gaussians > 0
+
+
+def test_pose_refinement_recovers_a_known_rotation(world):
+    twist = torch.tensor([0.006, -0.008, 0.004, 0.0, 0.0, 0.0]).double()
+    views = list(world.observations.views)
+    tilted = views[2].camera.world_from_camera @ rigid_from_tangent(twist)
+    views[2] = replace(views[2], camera=views[2].camera.at(tilted))
+    observations = replace(world.observations, views=tuple(views))
+    start = scene_of(
+        world.scene.gaussians, [view.camera for view in views], world.observations.tracks
+    )
+    frozen = (1e-9, 1e-9)
+    config = short_fit(
+        steps=240,
+        half_resolution=0.0,
+        densification=DensificationConfig(budget=5000, start=0.0, stop=0.0),
+        refinement=RefinementConfig(start_step=0, actors=False),
+        learning_rates=LearningRates(
+            means=frozen,
+            rotation_wxyz=frozen,
+            log_scale=frozen,
+            opacity_logit=frozen,
+            sh_dc=frozen,
+            sh_rest=frozen,
+            camera_rotation_rad=(1e-3, 5e-5),
+            camera_translation_m=(1e-6, 1e-6),
+        ),
+    )
+    fitted = fit_gaussians(observations, config, start=start).scene
+    corrected = fitted.corrected_camera(
+        views[2].camera, timestamp_ns=2 * FRAME_NS, camera_name="front", key=(2, "front")
+    )
+    true = world.observations.views[2].camera.world_from_camera
+    left_over = true[:3, :3].T @ corrected.world_from_camera[:3, :3]
+    angle_rad = float((left_over - torch.eye(3).double()).norm()) / 2**0.5
+    assert angle_rad < 0.1 * float(twist.norm())
+
+
+def with_guidance_gradients(world, view, config):
+    """A state and its leaves after the gradients of one painted view."""
+    state = FitState.begin(world.scene, config)
+    poses = state.scene.world_from_actors(view.timestamp_ns)
+    bodies = state.scene.camera_from_body(view.camera.world_from_camera, *poses)
+    seen = state.seen([(view.camera, bodies)])
+    add_guidance_gradients(state, seen, view, config)
+    return state, seen
+
+
+def test_painted_views_with_freedom_appearance_leave_geometry_alone(world):
+    config = short_fit(guidance=GuidanceConfig(freedom="appearance"))
+    state, seen = with_guidance_gradients(world, painted_view(world), config)
+    before = state.scene.gaussians.means.detach().clone()
+    assert seen.means.grad is None
+    assert seen.log_scale.grad is None
+    assert seen.rotation_wxyz.grad is None
+    assert float(seen.sh.grad.abs().sum()) > 0
+    state.step_gaussians(seen, 0.0)
+    assert torch.equal(state.caught_up().gaussians.means.detach(), before)
+
+
+def test_painted_views_with_freedom_all_move_geometry(world):
+    config = short_fit(guidance=GuidanceConfig(freedom="all"))
+    _, seen = with_guidance_gradients(world, painted_view(world), config)
+    assert float(seen.means.grad.abs().sum()) > 0
+
+
+def test_painted_views_pull_the_scene_towards_them(world):
+    guided = continuation(
+        short_fit(), steps=60, guidance=GuidanceConfig(probability=1.0, weight=3.0)
+    )
+    start = world.scene
+    painted = painted_view(world)
+    with_guidance = fit_gaussians(world.observations, guided, start=start, guidance=[painted]).scene
+    without = fit_gaussians(world.observations, guided, start=start).scene
+    errors = [
+        float((scene.render(painted.camera, FRAME_NS).rgb - painted.rgb).abs().mean())
+        for scene in (with_guidance, without)
+    ]
+    assert errors[0] < errors[1] - 0.02
+
+
+def test_untrusted_painted_view_changes_nothing(world):
+    config = short_fit(guidance=GuidanceConfig(depth=0.0))
+    _, seen = with_guidance_gradients(world, painted_view(world, weight=0.0), config)
+    assert float(seen.sh.grad.abs().sum()) == 0
+
+
+def test_start_of_other_views_is_refused(world):
+    start = scene_of(world.scene.gaussians, [world.observations.views[0].camera])
+    with pytest.raises(ConfigError, match="other training views"):
+        fit_gaussians(world.observations, short_fit(), start=start)
+
+
+def test_perceptual_weight_without_a_distance_is_refused(world):
+    config = short_fit(losses=replace(short_fit().losses, perceptual=0.1))
+    with pytest.raises(ConfigError, match="perceptual"):
+        fit_gaussians(world.observations, config)

@@ -1,0 +1,133 @@
+"""What is left out by blocks is what the rasteriser would have left out."""
+
+import pytest
+import torch
+from gaussian_world import camera_at, car_track, round_gaussians, scene_of
+
+from lidarpainter_models.gaussians.fitting.optimiser import LearningRates
+from lidarpainter_models.gaussians.fitting.spatial_blocks import SpatialBlocks
+from lidarpainter_models.geometry.transforms import rigid_from_tangent
+from lidarpainter_models.kernels.sparse_adam.cpu import MOST_UNITS
+
+RATES = LearningRates()
+
+
+def scattered(count, seed):
+    """Specks and giants all around the cameras, some of them in a car."""
+    generator = torch.Generator().manual_seed(seed)
+    means = 40.0 * torch.randn(count, 3, generator=generator)
+    gaussians = round_gaussians(means, torch.rand(count, 3, generator=generator), sigma_m=0.1)
+    gaussians.log_scale += 1.3 * torch.randn(count, 3, generator=generator)
+    gaussians.rotation_wxyz.copy_(torch.randn(count, 4, generator=generator))
+    gaussians.body_index[: count // 10] = 1
+    gaussians.means[: count // 10] *= 0.02
+    return gaussians
+
+
+def view_at(scene, seed):
+    """A camera that looks anywhere, and the bodies at the first frame."""
+    twist = torch.randn(6, generator=torch.Generator().manual_seed(seed)).double()
+    camera = camera_at(0.0)
+    camera = camera.at(camera.world_from_camera @ rigid_from_tangent(twist))
+    bodies = scene.camera_from_body(camera.world_from_camera, *scene.actor_poses(0))
+    return camera, bodies
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_every_gaussian_that_is_drawn_is_in_view(seed):
+    scene = scene_of(scattered(2000, seed), [camera_at(0.0)], [car_track(2)])
+    blocks = SpatialBlocks.of(scene.gaussians, RATES)
+    camera, bodies = view_at(scene, seed)
+    drawn = scene.splat(camera, bodies).visible
+    rows = blocks.rows_in_view([(camera, bodies)])
+    is_in_view = torch.zeros_like(drawn)
+    is_in_view[rows] = True
+    assert bool((is_in_view | ~drawn).all())
+    assert len(rows) < 0.8 * 2000
+    assert torch.equal(rows, rows.sort().values)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_bounds_hold_what_momentum_can_do(seed):
+    """The farthest that any row can drift and grow, towards the camera."""
+    scene = scene_of(scattered(2000, seed), [camera_at(0.0)])
+    scene.gaussians.body_index.zero_()
+    blocks = SpatialBlocks.of(scene.gaussians, RATES)
+    camera, bodies = view_at(scene, seed)
+    rows = blocks.rows_in_view([(camera, bodies)])
+    ahead = camera.world_from_camera[:3, :3].float() @ torch.tensor([0.0, 0.0, 10.0])
+    towards = camera.centre_world.float() + ahead - scene.gaussians.means
+    largest = scene.gaussians.log_scale.amax(dim=1, keepdim=True).exp()
+    unit = towards / towards.norm(dim=1, keepdim=True)
+    drift_m = MOST_UNITS * max(RATES.means) * largest * unit
+    scene.gaussians.means += torch.minimum(drift_m.abs(), towards.abs()) * drift_m.sign()
+    scene.gaussians.log_scale += MOST_UNITS * max(RATES.log_scale)
+    scene.gaussians.opacity_logit += 100.0
+    is_in_view = torch.zeros(2000, dtype=torch.bool)
+    is_in_view[rows] = True
+    assert bool((is_in_view | ~scene.splat(camera, bodies).visible).all())
+
+
+def test_most_units_bound_what_moments_can_still_do():
+    """The worst gradients that Cauchy and Schwarz allow come close to the bound."""
+    first = second = 0.0
+    for step in range(400):
+        gradient = (0.9 / 0.99) ** (399 - step)
+        first, second = 0.9 * first + 0.1 * gradient, 0.99 * second + 0.01 * gradient**2
+    moved = sum(first * 0.9**k / (second * 0.99**k) ** 0.5 for k in range(1, 400))
+    assert 0.99 * MOST_UNITS < moved <= MOST_UNITS * (1 + 1e-9)
+
+
+def test_several_views_see_the_union():
+    scene = scene_of(scattered(2000, 3), [camera_at(0.0)], [car_track(2)])
+    blocks = SpatialBlocks.of(scene.gaussians, RATES)
+    views = [view_at(scene, seed) for seed in (1, 2)]
+    both = {row for view in views for row in blocks.rows_in_view([view]).tolist()}
+    assert blocks.rows_in_view(views).tolist() == sorted(both)
+
+
+def test_moved_gaussian_is_found_after_a_refresh():
+    gaussians = round_gaussians(torch.tensor([[-30.0, 0.0, 1.0]]), torch.rand(1, 3), sigma_m=0.1)
+    scene = scene_of(gaussians, [camera_at(0.0)])
+    blocks = SpatialBlocks.of(scene.gaussians, RATES)
+    view = (
+        camera_at(0.0),
+        scene.camera_from_body(camera_at(0.0).world_from_camera, *scene.actor_poses(0)),
+    )
+    assert len(blocks.rows_in_view([view])) == 0
+    gaussians.means[0, 0] = 30.0
+    blocks.refresh(gaussians, torch.tensor([0]))
+    assert blocks.rows_in_view([view]).tolist() == [0]
+
+
+def test_gaussians_that_are_not_finite_spoil_no_block():
+    gaussians = scattered(200, 5)
+    gaussians.means[3], gaussians.log_scale[4] = torch.nan, torch.inf
+    gaussians.means[5] = torch.inf
+    scene = scene_of(gaussians, [camera_at(0.0)], [car_track(2)])
+    blocks = SpatialBlocks.of(gaussians, RATES)
+    view = view_at(scene, 1)
+    drawn = scene.splat(*view).visible.nonzero()[:, 0].tolist()
+    assert set(drawn) <= set(blocks.rows_in_view([view]).tolist())
+
+
+def test_absent_actor_is_out_of_view():
+    scene = scene_of(scattered(500, 6), [camera_at(0.0)], [car_track(2)])
+    camera = camera_at(0.0)
+    poses, present = scene.actor_poses(0)
+    bodies = scene.camera_from_body(camera.world_from_camera, poses, torch.zeros_like(present))
+    rows = SpatialBlocks.of(scene.gaussians, RATES).rows_in_view([(camera, bodies)])
+    assert bool((scene.gaussians.body_index[rows] == 0).all())
+
+
+def test_slack_takes_in_an_actor_that_may_move_into_view():
+    scene = scene_of(scattered(500, 7), [camera_at(0.0)], [car_track(2)])
+    blocks, camera = SpatialBlocks.of(scene.gaussians, RATES), camera_at(0.0)
+    poses, present = scene.actor_poses(0)
+    poses[0, 1, 3] = 40.0  # far to the left
+    view = (camera, scene.camera_from_body(camera.world_from_camera, poses, present))
+    of_actor = [
+        int((scene.gaussians.body_index[blocks.rows_in_view([view], actor_slack=slack)] > 0).sum())
+        for slack in ((0.0, 0.0), (40.0, 0.0))
+    ]
+    assert of_actor == [0, 50]

@@ -1,0 +1,70 @@
+"""A long street, most of it out of view at every step."""
+
+import copy
+
+import pytest
+import torch
+from bench_iteration import Fit
+
+from lidarpainter_models.gaussians.fitting.state import FitState
+
+BLOCKS, PASSES = 4, 6
+
+
+def steps_of(fit, count):
+    for _ in range(count):
+        fit.step()
+    return fit
+
+
+def street_fit(count=400):
+    return Fit(count, 48, 32, blocks=BLOCKS)
+
+
+def parameters_of(fit):
+    return fit.state.caught_up().gaussians.columns()
+
+
+def test_a_step_sees_its_own_part_of_the_street():
+    fit = street_fit()
+    scene, blocks = fit.state.scene, fit.state.blocks
+    for row, image in enumerate(fit.images):
+        pose = scene.cameras.world_from_camera(row).detach()
+        bodies = scene.camera_from_body(pose, *scene.world_from_actors(0))
+        rows = blocks.rows_in_view([(image.camera.at(pose), bodies)])
+        assert set((rows // 400).tolist()) == {row}
+
+
+def test_what_is_out_of_view_changes_nothing_beyond_rounding(monkeypatch):
+    """Against a fit whose every step looks at everything."""
+    fit = steps_of(street_fit(), BLOCKS * PASSES)
+    everything = street_fit()
+    monkeypatch.setattr(
+        type(everything.state.blocks),
+        "rows_in_view",
+        lambda blocks, _views, **_slack: torch.arange(len(blocks.order)),
+    )
+    steps_of(everything, BLOCKS * PASSES)
+    truth = parameters_of(everything)
+    for name, value in parameters_of(fit).items():
+        assert torch.allclose(value, truth[name], rtol=1e-5, atol=1e-5), name
+    # rounding of the pose gradients, summed in other groups
+    tangent, expected = (f.state.scene.cameras.view_tangent for f in (fit, everything))
+    assert torch.allclose(tangent, expected, rtol=1e-6, atol=1e-12)
+    assert torch.equal(fit.state.tally.visits, everything.state.tally.visits)
+
+
+@pytest.mark.parametrize("kept_at", [1, 5, 11])
+def test_kept_state_goes_on_bit_for_bit(kept_at):
+    fit = steps_of(street_fit(), kept_at)
+    tensors, numbers = copy.deepcopy(fit.state.keep())
+    assert int(tensors["gaussian_adam/last"].min()) < kept_at  # some lag behind
+    resumed = street_fit()
+    resumed.state, resumed.view = FitState.resume(tensors, numbers, fit.config), fit.view
+    steps_of(fit, 9), steps_of(resumed, 9)
+    expected = parameters_of(fit)
+    for name, value in parameters_of(resumed).items():
+        assert torch.equal(value, expected[name]), name
+    assert torch.equal(
+        fit.state.scene.cameras.view_tangent, resumed.state.scene.cameras.view_tangent
+    )

@@ -1,0 +1,139 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from gaussian_world import camera_at, map_points
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.gaussians.initialisation.adaptive_voxels import (
+    adaptive_voxels,
+    mean_by_voxel,
+)
+from lidarpainter_models.gaussians.initialisation.scene import (
+    InitialisationConfig,
+    initialise_scene,
+    pixel_footprint,
+)
+from lidarpainter_models.gaussians.initialisation.surfels import (
+    SurfelConfig,
+    fill_colours,
+    surfels_from_points,
+)
+from lidarpainter_models.geometry.transforms import rotation_from_quaternion
+from lidarpainter_models.lidar.lidar_map import LidarMap
+
+
+def plane(count=400, seed=0):
+    """Points on z = 0."""
+    xy = torch.rand(count, 2, generator=torch.Generator().manual_seed(seed)) * 4
+    return torch.cat([xy, torch.zeros(count, 1)], dim=1)
+
+
+def test_points_of_one_voxel_become_their_mean():
+    xyz_m = torch.tensor([[0.01, 0.0, 0.0], [0.03, 0.0, 0.0], [0.15, 0.0, 0.0]])
+    rgb = torch.tensor([[1.0, 0, 0], [0.0, 1.0, 0], [0, 0, 1.0]])
+    has_colour = torch.tensor([True, False, True])
+    voxels = mean_by_voxel(xyz_m, rgb, has_colour, torch.full((3,), 0.1))
+    order = voxels.xyz_m[:, 0].argsort()
+    assert torch.allclose(voxels.xyz_m[order][:, 0], torch.tensor([0.02, 0.15]))
+    assert torch.allclose(voxels.rgb[order], torch.tensor([[1.0, 0, 0], [0, 0, 1.0]]))
+    assert voxels.num_points[order].tolist() == [2, 1]
+
+
+@pytest.mark.parametrize("budget", [1, 50, 300, 10_000])
+def test_voxel_budget_is_kept(budget):
+    xyz_m = plane(2000)
+    voxels = adaptive_voxels(
+        xyz_m,
+        torch.rand(2000, 3),
+        torch.ones(2000, dtype=torch.bool),
+        torch.full((2000,), 0.01),
+        budget=budget,
+        most_m=8.0,
+    )
+    assert 1 <= len(voxels.xyz_m) <= budget
+
+
+def test_far_points_get_larger_voxels():
+    near, far = plane(3000), plane(3000) + torch.tensor([100.0, 0, 0])
+    footprint = torch.cat([torch.full((3000,), 0.01), torch.full((3000,), 0.08)])
+    voxels = adaptive_voxels(
+        torch.cat([near, far]),
+        torch.rand(6000, 3),
+        torch.ones(6000, dtype=torch.bool),
+        footprint,
+        budget=1500,
+    )
+    is_far = voxels.xyz_m[:, 0] > 50
+    assert float(voxels.size_m[is_far].mean()) > 4 * float(voxels.size_m[~is_far].mean())
+
+
+def test_surfels_lie_in_their_surface():
+    gaussians = surfels_from_points(plane(), torch.rand(400, 3), SurfelConfig())
+    normal = rotation_from_quaternion(gaussians.rotation_wxyz)[:, :, 0]
+    assert float(normal[:, 2].abs().min()) > 0.999
+    scale_m = gaussians.scale_m
+    assert torch.allclose(scale_m[:, 0], 0.15 * scale_m[:, 1], rtol=1e-4)
+    assert torch.equal(scale_m[:, 1], scale_m[:, 2])
+    assert abs(float(scale_m[:, 1].median()) - 0.6 * 0.15) < 0.05
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3])
+def test_a_handful_of_points_is_enough(count):
+    gaussians = surfels_from_points(plane(count), torch.rand(count, 3), SurfelConfig())
+    assert len(gaussians) == count
+    assert bool(gaussians.log_scale.isfinite().all())
+    assert bool(gaussians.rotation_wxyz.isfinite().all())
+
+
+def test_surfel_shows_its_colour():
+    rgb = torch.rand(50, 3)
+    gaussians = surfels_from_points(plane(50), rgb, SurfelConfig())
+    assert torch.allclose(gaussians.base_rgb, rgb, atol=1e-6)
+
+
+def test_points_without_colour_take_that_of_their_neighbours():
+    xyz_m = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [0.9, 0, 0]])
+    rgb = torch.tensor([[1.0, 0, 0], [0, 1.0, 0], [9.0, 9, 9]])
+    has_colour = torch.tensor([True, True, False])
+    filled = fill_colours(xyz_m, rgb, has_colour, neighbours=1)
+    assert filled[2].tolist() == [0.0, 1.0, 0.0]
+    grey = fill_colours(xyz_m, rgb, torch.zeros(3, dtype=torch.bool))
+    assert torch.equal(grey, torch.full((3, 3), 0.5))
+
+
+def test_footprint_knows_in_beside_and_out_of_the_image():
+    camera = camera_at(0.0)
+    points = torch.tensor([[8.0, 0, 1.0], [8.0, 7.0, 1.0], [8.0, 30.0, 1.0], [-5.0, 0, 1.0]])
+    footprint, in_image = pixel_footprint(points, [camera], aside_m=3.5)
+    assert in_image.tolist() == [True, False, False, False]
+    assert footprint.isfinite().tolist() == [True, True, False, False]
+    assert abs(float(footprint[0]) - 8.0 / camera.fx_px) < 1e-6
+
+
+def test_first_scene_keeps_its_size_and_bodies(world):
+    config = InitialisationConfig(num_gaussians=500, street_voxel_m=0.1)
+    scene = initialise_scene(world.observations, config)
+    assert 300 < scene.num_gaussians <= 500
+    assert set(scene.gaussians.body_index.tolist()) == {0, 1}
+    view = world.observations.views[0]
+    error = (scene.render(view.camera, view.timestamp_ns).rgb - view.rgb).abs().mean()
+    plain = (torch.full_like(view.rgb, 0.5) - view.rgb).abs().mean()
+    assert float(error) < float(plain)
+
+
+def test_actor_never_near_a_image_is_not_modelled(world):
+    config = InitialisationConfig(num_gaussians=500, street_voxel_m=0.1)
+    track = world.observations.tracks[0]
+    behind = track.world_from_box.clone()
+    behind[:, 0, 3] = -50.0
+    away = replace(world.observations, tracks=(replace(track, world_from_box=behind),))
+    scene = initialise_scene(away, config)
+    assert int((scene.gaussians.body_index > 0).sum()) == 0
+
+
+def test_map_out_of_sight_is_one_clear_error(world):
+    nothing = map_points(torch.full((5, 3), -99.0), torch.zeros(5, 3))
+    blind = replace(world.observations, lidar_map=LidarMap(street=nothing, actors={}), tracks=())
+    with pytest.raises(ConfigError, match="no LiDAR point"):
+        initialise_scene(blind, InitialisationConfig(num_gaussians=100))

@@ -1,0 +1,142 @@
+from dataclasses import replace
+
+import torch
+from gaussian_world import FRAME_NS, camera_at, round_gaussians, scene_of
+
+from lidarpainter_models.gaussians.initialisation.plane_sweep import (
+    choose_depth,
+    sweep_cost,
+    sweep_depths,
+)
+from lidarpainter_models.gaussians.initialisation.unreached import (
+    UnreachedConfig,
+    depth_from_below,
+    unreached_gaussians,
+)
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.observations.observations import TrainingView
+
+
+def sideways_cameras():
+    """Three cameras 0.5 m apart, across their viewing direction."""
+    base = camera_at(0.0, width_px=96, height_px=64)
+    poses = []
+    for step in range(3):
+        pose = base.world_from_camera.clone()
+        pose[1, 3] = 0.5 * step
+        poses.append(base.at(pose))
+    return poses
+
+
+def image_of_wall(camera: Camera, wall_x_m: float):
+    """A wall with a smooth pattern, seen exactly."""
+    directions = camera.pixel_directions() @ camera.world_from_camera[:3, :3].float().T
+    centre = camera.centre_world.float()
+    points = centre + directions * ((wall_x_m - centre[0]) / directions[..., :1])
+    y, z = points[..., 1], points[..., 2]
+    return torch.stack([torch.sin(3 * y), torch.sin(4 * z + y), torch.cos(2 * y - z)], -1) / 2 + 0.5
+
+
+def test_sweep_finds_the_depth_of_a_wall():
+    cameras = sideways_cameras()
+    images = [image_of_wall(camera, 10.0) for camera in cameras]
+    depths_m = sweep_depths(4.0, 100.0, 25)
+    others = list(zip(cameras[1:], images[1:], strict=True))
+    cost = sweep_cost(cameras[0], images[0], others, depths_m)
+    unknown = torch.full(images[0].shape[:2], 100.0)
+    found = choose_depth(cost, depths_m, unknown, prior=0.0)[16:-16, 16:-32]
+    nearest = depths_m[(depths_m - 10.0).abs().argmin()]
+    assert float((found == nearest).float().mean()) > 0.9
+
+
+def test_without_texture_the_surroundings_decide():
+    cameras = sideways_cameras()
+    plain = torch.full((64, 96, 3), 0.5)
+    depths_m = sweep_depths(4.0, 100.0, 25)
+    cost = sweep_cost(cameras[0], plain, [(cameras[1], plain)], depths_m)
+    expected_m = torch.full((64, 96), 20.0)
+    found = choose_depth(cost, depths_m, expected_m, prior=0.03)[20:-20, 30:-30]
+    assert float((found - 20.0).abs().max()) < 3.0
+
+
+def test_depth_goes_straight_up_over_gaps():
+    depth_m = torch.tensor([[0.0, 0.0], [0.0, 7.0], [5.0, 0.0], [0.0, 0.0]])
+    filled = depth_from_below(depth_m, fallback_m=99.0)
+    assert filled.tolist() == [[5.0, 7.0], [5.0, 7.0], [5.0, 99.0], [99.0, 99.0]]
+
+
+def views_of_wall(cameras):
+    return [
+        TrainingView(
+            key=(frame, "front"),
+            camera=camera,
+            timestamp_ns=frame * FRAME_NS,
+            rgb_u8=(image_of_wall(camera, 10.0) * 255).to(torch.uint8),
+            sky_mask=torch.zeros(64, 96, dtype=torch.bool),
+            lidar_depth_m=torch.zeros(64, 96),
+        )
+        for frame, camera in enumerate(cameras)
+    ]
+
+
+def test_places_without_lidar_are_filled_at_their_depth():
+    cameras = sideways_cameras()
+    views = views_of_wall(cameras)
+    scene = scene_of(GaussianSet.empty(), cameras)
+    config = UnreachedConfig(nearest_m=4.0, farthest_m=100.0, views_per_camera=3)
+    seeds = unreached_gaussians(scene, views, config, budget=900)
+    assert 200 < len(seeds) <= 900
+    assert abs(float(seeds.means[:, 0].median()) - 10.0) < 1.0
+    closed = scene.with_gaussians(seeds).render(cameras[1], FRAME_NS)
+    assert float((closed.alpha > 0.5).float().mean()) > 0.9
+    again = unreached_gaussians(scene.with_gaussians(seeds), views, config, budget=900)
+    assert len(again) < 0.1 * len(seeds)
+
+
+def test_sky_and_covered_places_ask_for_nothing():
+    cameras = sideways_cameras()
+    views = views_of_wall(cameras)
+    sky = [replace(view, sky_mask=torch.ones(64, 96, dtype=torch.bool)) for view in views]
+    scene = scene_of(GaussianSet.empty(), cameras)
+    assert len(unreached_gaussians(scene, sky, UnreachedConfig(), budget=100)) == 0
+    y, z = torch.meshgrid(torch.linspace(-9, 9, 60), torch.linspace(-5, 7, 40), indexing="ij")
+    wall_m = torch.stack([torch.full_like(y, 10.0), y, z], -1).flatten(0, 1)
+    wall = round_gaussians(wall_m, torch.rand(2400, 3), sigma_m=0.3)
+    covered = scene_of(wall, cameras)
+    assert len(unreached_gaussians(covered, views, UnreachedConfig(), budget=100)) == 0
+
+
+def test_nothing_is_put_under_the_ground():
+    """A gap in the road is clear and no sky; what is seen through it would be far below."""
+    camera = camera_at(0.0, width_px=96, height_px=64)
+    x, y = torch.meshgrid(torch.arange(2.0, 40, 0.5), torch.arange(-12.0, 12, 0.5), indexing="ij")
+    road = torch.stack([x, y, torch.zeros_like(x)], dim=-1).reshape(-1, 3)
+    road = road[(road[:, 0] < 3) | (road[:, 0] > 12)]  # the gap
+    gaussians = round_gaussians(road, torch.full_like(road, 0.4), sigma_m=0.3)
+    cameras = [camera.at(pose) for pose in _poses_ahead(camera, 3)]
+    images = [torch.full((64, 96, 3), 0.4) for _ in cameras]
+    views = [
+        TrainingView(
+            key=(index, "front"),
+            camera=one,
+            timestamp_ns=index * FRAME_NS,
+            rgb_u8=(image * 255).to(torch.uint8),
+            sky_mask=torch.arange(64)[:, None].expand(64, 96) < 34,
+            lidar_depth_m=torch.zeros(64, 96),
+        )
+        for index, (one, image) in enumerate(zip(cameras, images, strict=True))
+    ]
+    scene = scene_of(gaussians, cameras)
+    put = unreached_gaussians(scene, views, UnreachedConfig(), budget=500)
+    all_put = unreached_gaussians(
+        scene, views, UnreachedConfig(most_below_ground_m=1e6), budget=500
+    )
+    assert float(all_put.means[:, 2].min()) < -1.5
+    assert len(put) == 0 or float(put.means[:, 2].min()) > -1.2
+
+
+def _poses_ahead(camera, count):
+    poses = camera.world_from_camera.repeat(count, 1, 1)
+    poses[:, 0, 3] += 0.3 * torch.arange(count)
+    return poses

@@ -1,0 +1,97 @@
+import numpy as np
+import pytest
+import torch
+from toy_street import BLUE, CAR_X_M, GREEN, GROUND, RED, WALL_X_M, ToyStreet
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.lidar.colouring import ColouringConfig
+from lidarpainter_models.lidar.exposure_matching import match_exposure
+from lidarpainter_models.lidar.lidar_map import build_lidar_map
+
+FRAMES = (0, 1, 2, 3)
+
+
+@pytest.fixture(scope="module")
+def coloured():
+    street = ToyStreet()
+    return build_lidar_map(street, split_frames=FRAMES, colour_views=street.views)
+
+
+def distance(rgb_u8, colour):
+    return (rgb_u8.float() - torch.tensor(colour)).abs().amax(dim=-1)
+
+
+def test_every_surface_takes_its_colour(coloured):
+    street = coloured.street
+    assert float(street.has_colour.float().mean()) > 0.9
+    seen = street.keep(street.has_colour)
+    x, y, z = seen.xyz_m.unbind(-1)
+    is_wall = (x - WALL_X_M).abs() < 0.01
+    inner = is_wall & (z > 0.5) & (z < 5.5)
+    assert float((distance(seen.rgb_u8[inner & (y > 0.3)], RED) < 12).float().mean()) > 0.97
+    assert float((distance(seen.rgb_u8[inner & (y < -0.3)], BLUE) < 12).float().mean()) > 0.97
+    assert float((distance(seen.rgb_u8[~is_wall & (x < 19)], GROUND) < 12).float().mean()) > 0.97
+
+
+def test_a_car_does_not_colour_what_is_behind_it(coloured):
+    seen = coloured.street.keep(coloured.street.has_colour)
+    behind = seen.xyz_m[:, 0] > CAR_X_M
+    assert float((distance(seen.rgb_u8[behind], GREEN) < 40).float().mean()) < 0.002
+
+
+def test_a_moving_car_takes_its_own_colour(coloured):
+    car = coloured.actors["car"]
+    seen = car.keep(car.has_colour)
+    assert len(seen) > 0.9 * len(car)
+    assert float((distance(seen.rgb_u8, GREEN) < 12).float().mean()) > 0.95
+
+
+def test_only_the_given_images_give_colours():
+    street = ToyStreet()
+    bare = build_lidar_map(street, split_frames=FRAMES, colour_views=())
+    assert not bare.street.has_colour.any()
+    assert not bare.street.rgb_u8.any()
+    read = []
+    street.read_image = lambda view: read.append(view.key) or ToyStreet.read_image(street, view)
+    build_lidar_map(street, split_frames=FRAMES, colour_views=street.views[1:2])
+    assert read == [(1, "front")]
+
+
+def test_cameras_are_brought_to_the_exposure_of_the_first():
+    street = ToyStreet(camera_gains=(("front", 1.0), ("dim", 0.7)))
+    # the dim camera alone sees frames 2 and 3
+    views = [v for v in street.views if v.camera_name == "dim" or v.frame_index < 2]
+    views.sort(key=lambda view: view.camera_name == "dim")
+    points = build_lidar_map(street, split_frames=FRAMES, colour_views=views).street
+    ground = points.has_colour & (points.xyz_m[:, 0] < 9) & (points.frame_index == 3)
+    assert int(ground.sum()) > 100
+    assert float(distance(points.rgb_u8[ground], GROUND).median()) < 4
+
+
+def test_an_exposure_jump_of_one_view_is_found():
+    generator = np.random.default_rng(0)
+    points, gains = 2000, np.array([1.0, 1.0, 0.8, 1.0])
+    true = generator.uniform(60, 180, (points, 1, 3))
+    view = np.stack([generator.permutation(4)[:3] for _ in range(points)])
+    noisy = true * gains[view][..., None] * generator.normal(1, 0.03, (points, 3, 3))
+    noisy[::11] = 230  # outliers
+    found = match_exposure(
+        np.ones((points, 3), np.float32), noisy.astype(np.uint8), view, np.zeros(4, int)
+    )
+    np.testing.assert_allclose(found[2], 1.25, rtol=0.03)
+    np.testing.assert_allclose(found[[0, 1, 3]], 1.0, rtol=0.01)
+
+
+def test_a_camera_without_shared_points_keeps_its_exposure():
+    weight = np.ones((500, 2), np.float32)
+    rgb = np.full((500, 2, 3), 100, np.uint8)
+    view = np.repeat(np.array([[0, 1], [2, 3]]), 250, axis=0)
+    gains = match_exposure(weight, rgb, view, np.array([0, 0, 1, 1]))
+    np.testing.assert_array_equal(gains, 1)
+
+
+def test_settings_that_make_no_image_are_refused():
+    with pytest.raises(ConfigError, match="width_px"):
+        ColouringConfig(width_px=4)
+    with pytest.raises(ConfigError, match="recency_s"):
+        ColouringConfig(recency_s=0)

@@ -1,0 +1,132 @@
+"""A log that no car recorded is refused with the file of what cannot be; nothing is stored."""
+
+import json
+
+import numpy as np
+import pytest
+
+from lidarpainter_models.errors import DataError
+
+
+def edit_json(log, name, change):
+    value = json.loads((log.path / name).read_text())
+    (log.path / name).write_text(json.dumps(change(value) or value))
+
+
+def edit_points(log, index, change):
+    name = f"lidar/{index:02d}.pkl.gz"
+    table = log.read_table(name)
+    xyz_m = change(np.stack([table[axis] for axis in "xyz"], axis=1))
+    log.write_table(name, {**table, **dict(zip("xyz", xyz_m.T, strict=True))})
+
+
+@pytest.fixture
+def refusal(pandaset, tmp_path):
+    """The one line with which the small log is refused once a test has changed it."""
+
+    def refused():
+        with pytest.raises(DataError) as raised:
+            pandaset.ingest(tmp_path / "store")
+        assert [path for path in (tmp_path / "store").rglob("*") if path.is_file()] == []
+        message = str(raised.value)
+        assert message.count(str(pandaset.path)) == 1, message
+        return message
+
+    return refused
+
+
+def test_jump_of_the_car(pandaset, refusal):
+    edit_json(pandaset, "lidar/poses.json", lambda poses: poses[2]["position"].update(x=110.0))
+    assert "frame 2, pose: the vehicle has moved" in refusal()
+
+
+def test_car_that_spins(pandaset, refusal):
+    turned = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
+    edit_json(pandaset, "lidar/poses.json", lambda poses: poses[1]["heading"].update(turned))
+    assert "frame 1, pose: the vehicle has moved 1.0 m and turned 0.79 rad in 0.100 s" in refusal()
+
+
+def test_images_of_another_time(pandaset, refusal):
+    name = "camera/left_camera/timestamps.json"
+    edit_json(pandaset, name, lambda times_s: [time_s + 0.5 for time_s in times_s])
+    assert "left_camera/00.jpg: taken +0.5" in refusal()
+
+
+def test_images_whose_times_stand_still(pandaset, refusal):
+    name = "camera/left_camera/timestamps.json"
+    edit_json(pandaset, name, lambda times_s: [times_s[0] + 0.05] * len(times_s))
+    assert "left_camera/01.jpg: taken at" in refusal()
+
+
+def test_camera_beside_the_car(pandaset, refusal):
+    name = "camera/back_camera/poses.json"
+    edit_json(pandaset, name, lambda poses: poses[1]["position"].update(x=140.0))
+    assert "back_camera/01.jpg: the sensor is 3" in refusal()
+
+
+def test_camera_that_looks_into_the_sky(pandaset, refusal):
+    def look_up(poses):
+        for pose in poses:
+            pose["heading"] = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
+
+    edit_json(pandaset, "camera/right_camera/poses.json", look_up)
+    line = refusal()
+    assert "right_camera/00.jpg: no LiDAR point falls into any image of right_camera" in line
+
+
+def test_lens_that_looks_past_its_image(pandaset, refusal):
+    name = "camera/front_camera/intrinsics.json"
+    edit_json(pandaset, name, lambda lens: lens.update(cx=1e5))
+    assert "front_camera/00.jpg: no LiDAR point falls into any image" in refusal()
+
+
+def test_point_beyond_the_reach_of_a_lidar(pandaset, refusal):
+    def throw(xyz_m):
+        xyz_m[7, 2] += 5000.0
+        return xyz_m
+
+    edit_points(pandaset, 1, throw)
+    assert "lidar/01.pkl.gz: a point is 4998 m from its LiDAR, expected 1000 m" in refusal()
+
+
+def test_points_of_chance(pandaset, refusal):
+    rng = np.random.default_rng(0)
+    edit_points(pandaset, 1, lambda xyz_m: xyz_m + rng.uniform(-50, 50, xyz_m.shape))
+    assert "lidar/01.pkl.gz: the points lie" in refusal()
+
+
+@pytest.fixture
+def raise_boxes(pandaset):
+    """Writes a longer log and lifts the boxes of some frames off the points."""
+
+    def lifted(frames, *, num_frames=6):
+        pandaset.num_frames = num_frames
+        pandaset.write_log()
+        for index in frames:
+            boxes = pandaset.boxes_at(pandaset.frame_times_s()[index])
+            raised = [{**box, "centre": box["centre"] + np.array([0, 0, 9.0])} for box in boxes]
+            pandaset.write_boxes(index, raised)
+
+    return lifted
+
+
+def test_moving_boxes_that_never_hold_points(raise_boxes, refusal):
+    raise_boxes(range(6))
+    line = refusal()
+    assert "002: none of 6 boxes of moving actors within 40 m holds a LiDAR point" in line
+
+
+@pytest.mark.parametrize(("frames", "num_frames"), [(range(5), 6), (range(4), 4)])
+def test_some_empty_boxes_are_left_to_the_doctor(
+    raise_boxes, pandaset, tmp_path, frames, num_frames
+):
+    raise_boxes(frames, num_frames=num_frames)
+    assert pandaset.ingest(tmp_path / "store").is_dir()
+
+
+def test_camera_that_sees_points_in_one_image_is_taken(pandaset, tmp_path):
+    def look_up_once(poses):
+        poses[0]["heading"] = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
+
+    edit_json(pandaset, "camera/right_camera/poses.json", look_up_once)
+    assert pandaset.ingest(tmp_path / "store").is_dir()

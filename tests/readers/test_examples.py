@@ -1,0 +1,125 @@
+"""The examples of the format's documentation do what they say."""
+
+import importlib.util
+import json
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from lidarpainter_models.checks.doctor import check_scene
+from lidarpainter_models.readers import ingest_scene
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "docs/examples"
+
+
+def example(name):
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def failed(scene):
+    return [check for check in check_scene(scene) if check.verdict == "fail"]
+
+
+def test_scene_of_ones_own_rig_passes_the_doctor_and_comes_into_the_store(tmp_path):
+    path = example("own_rig").write(tmp_path / "out")
+    assert path == tmp_path / "out/scenes/my-rig/drive-1"
+    stored = ingest_scene("canonical", path.parent, "drive-1", tmp_path / "store")
+    scene = DrivingScene.open(stored)
+    assert failed(scene) == []
+    assert len(scene.frame_indices) == 10
+    assert scene.tracks[0].actor_id == "car-1"
+    points = scene.read_points(0).xyz_m
+    inside = (points[:, 1] > 3.0) & (points[:, 2] > 0.1)
+    assert int(inside.sum()) == int(scene.tracks[0].num_points[0])
+
+
+def test_example_stands_whole_in_the_description_of_the_format():
+    page = (EXAMPLES.parent / "canonical-format.md").read_text()
+    (shown,) = re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    assert shown == (EXAMPLES / "own_rig.py").read_text()
+
+
+def write_kitti(folder, num_frames=4):
+    """A drive straight east at 10 m/s; a post stands 20 m ahead of the start, 5 m to the left."""
+    drive = folder / "2011_09_26_drive_0001_sync"
+    axes = "0 -1 0 0 0 -1 1 0 0"  # camera right, down, forward from LiDAR forward, left, up
+    (folder / "calib_cam_to_cam.txt").parent.mkdir(parents=True)
+    (folder / "calib_cam_to_cam.txt").write_text(
+        "calib_time: 09-Jan-2012 13:57:47\n"
+        "R_rect_00: 1 0 0 0 1 0 0 0 1\n"
+        "P_rect_02: 100 0 31.5 6 0 100 23.5 0 0 0 1 0\n"
+    )
+    (folder / "calib_velo_to_cam.txt").write_text(f"R: {axes}\nT: 0 -0.1 -0.3\n")
+    (folder / "calib_imu_to_velo.txt").write_text("R: 1 0 0 0 1 0 0 0 1\nT: -0.8 0.3 -0.8\n")
+    for name in ("oxts/data", "image_02/data", "velodyne_points/data"):
+        (drive / name).mkdir(parents=True)
+    lines = []
+    for index in range(num_frames):
+        longitude = 8.4 + np.degrees(1.0 * index / 6378137.0) / np.cos(np.radians(49.0))
+        (drive / f"oxts/data/{index:010d}.txt").write_text(
+            f"49.0 {float(longitude)!r} 116.0 0 0 0 10 0"
+        )
+        lines.append(f"2011-09-26 13:02:25.{index}94360375")
+        image = np.full((48, 64, 3), 40 * index, np.uint8)
+        cv2.imwrite(str(drive / f"image_02/data/{index:010d}.png"), image)
+        post = np.tile([20.0 - index, 5.0, 0.0, 0.5], (10, 1))
+        post[:, 0] += 0.5 - np.pi**-1 / 2 * (np.pi - np.arctan2(5.0, 20.0 - index))  # still moving
+        post.astype("<f4").tofile(drive / f"velodyne_points/data/{index:010d}.bin")
+    (drive / "oxts/timestamps.txt").write_text("\n".join(lines))
+    return drive.name
+
+
+def test_kitti_drive_becomes_a_scene_in_which_a_post_stands_still(tmp_path):
+    drive = write_kitti(tmp_path / "2011_09_26")
+    path = example("kitti_raw").write(tmp_path / "2011_09_26", drive, tmp_path / "out")
+    scene = DrivingScene.open(ingest_scene("canonical", path.parent, drive, tmp_path / "store"))
+    travelled_m = scene.world_from_ego[:, 0, 3]
+    assert torch.allclose(travelled_m, torch.arange(4).double(), atol=1e-3)
+    for frame_index in (1, 2):  # the first and the last have a neighbour on one side only
+        post_m = scene.read_points(frame_index).xyz_m.mean(dim=0)
+        assert torch.allclose(post_m, torch.tensor([20.0, 5.0, 0.0]), atol=0.05)
+    camera = scene.views[0].camera
+    assert (camera.fx_px, camera.cx_px) == (100.0, 32.0)
+    # 6 cm beside camera 0, which is 0.3 m ahead of the LiDAR
+    assert torch.allclose(
+        camera.centre_world, torch.tensor([0.3, 0.06, -0.1]).double(), atol=1e-9
+    ), camera.centre_world
+
+
+def test_nerfstudio_folder_becomes_a_scene_with_all_its_points(tmp_path):
+    folder = tmp_path / "shop"
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    points = rng.uniform((0, 5, -3), (10, 15, 7), (100, 3))
+    header = "ply\nformat ascii 1.0\nelement vertex 100\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+    (folder / "points.ply").write_text(
+        header + "\n".join(" ".join(f"{x:.4f}" for x in row) for row in points)
+    )
+    frames = []
+    for index in range(3):
+        pose = np.eye(4)  # OpenGL: looks along world y from x right, z up
+        pose[:3, :3] = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+        pose[:3, 3] = (1.0, 2.0 + index, 1.5)
+        frames.append({"file_path": f"{index}.jpg", "transform_matrix": pose.tolist()})
+        image = np.full((48, 64, 3), 90, np.uint8)
+        cv2.imwrite(str(folder / f"{index}.jpg"), image)
+    lens = {"fl_x": 50.0, "fl_y": 51.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48}
+    transforms = {**lens, "ply_file_path": "points.ply", "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(transforms))
+    path = example("nerfstudio").write(folder, tmp_path / "out", "CC0")
+    scene = DrivingScene.open(ingest_scene("canonical", path.parent, "shop", tmp_path / "store"))
+    found = np.concatenate([scene.read_points(frame).xyz_m for frame in scene.frame_indices])
+    offset_m = scene.global_from_world[:3, 3].numpy()
+    assert np.allclose(np.sort(found + offset_m, axis=0), np.sort(points, axis=0), atol=1e-3)
+    forward = scene.views[0].camera.world_from_camera[:3, 2]
+    assert torch.allclose(forward, torch.tensor([0.0, 1.0, 0.0]).double())
+    assert torch.allclose(scene.world_from_ego[2, :3, 0], forward)
+    assert torch.allclose(scene.world_from_ego[2, :3, 3], torch.tensor([0.0, 2.0, 0.0]).double())

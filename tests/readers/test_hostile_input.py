@@ -1,0 +1,281 @@
+"""A bad log gets one clear line, nothing of it is run, and no half-written scene is left."""
+
+import errno
+import gzip
+import json
+import pickle
+import shutil
+
+import numpy as np
+import pytest
+
+from lidarpainter_models.errors import DataError, LidarPainterError, StorageError, UnsafePickleError
+from lidarpainter_models.readers import ingest_scene
+from lidarpainter_models.readers.pandaset import dataframe_pickle
+from lidarpainter_models.readers.pandaset.dataframe_pickle import read_table_bytes
+from lidarpainter_models.scenes import array_writer
+
+
+def refusal(log, store, **options):
+    """The one line a log is refused with, after checking that nothing was left in the store."""
+    with pytest.raises(LidarPainterError) as raised:
+        log.ingest(store, **options)
+    assert [path for path in store.rglob("*") if path.is_file()] == []
+    message = str(raised.value)
+    assert "\n" not in message
+    return type(raised.value), message
+
+
+@pytest.fixture
+def store(tmp_path):
+    return tmp_path / "store"
+
+
+def edit_json(log, name, change):
+    value = json.loads((log.path / name).read_text())
+    change(value)
+    (log.path / name).write_text(json.dumps(value))
+
+
+def test_missing_camera_folder(pandaset, store):
+    shutil.rmtree(pandaset.path / "camera/left_camera")
+    kind, message = refusal(pandaset, store)
+    assert kind is DataError
+    assert message.endswith("camera/left_camera: the camera folder is missing")
+
+
+def test_missing_image(pandaset, store):
+    (pandaset.path / "camera/back_camera/02.jpg").unlink()
+    assert refusal(pandaset, store)[1].endswith("back_camera/02.jpg: the file is missing")
+
+
+@pytest.mark.parametrize("kept", [0, 2, 100, -2])
+def test_truncated_image(pandaset, store, kept):
+    file = pandaset.path / "camera/front_camera/01.jpg"
+    file.write_bytes(file.read_bytes()[:kept])
+    kind, message = refusal(pandaset, store)
+    assert kind is DataError
+    assert "front_camera/01.jpg: " in message
+    assert "JPEG" in message
+
+
+def test_unknown_camera_names_the_known_ones(pandaset, store):
+    kind, message = refusal(pandaset, store, cameras=("front_camera", "roof_camera"))
+    assert kind is DataError
+    assert "no camera 'roof_camera', expected some of front_camera, front_left_camera" in message
+
+
+@pytest.mark.parametrize("sequence", ["../002", "..", "/etc", "002/../002", ""])
+def test_sequence_that_leaves_the_store(pandaset, store, sequence):
+    pandaset.sequence = sequence
+    kind, message = refusal(pandaset, store)
+    assert kind is DataError
+    assert message.startswith(f"sequence name {sequence!r} cannot be used")
+
+
+def test_sequence_that_does_not_exist(pandaset, store):
+    pandaset.sequence = "003"
+    assert refusal(pandaset, store)[1].endswith("003: no such sequence folder")
+
+
+@pytest.mark.parametrize("folder", ["lidar", "camera/right_camera"])
+def test_nan_pose(pandaset, store, folder):
+    edit_json(pandaset, f"{folder}/poses.json", lambda p: p[1]["position"].update(x=float("nan")))
+    kind, message = refusal(pandaset, store)
+    assert kind is DataError
+    assert f"{folder}/poses.json, frame 1: x is nan, expected a finite number" in message
+
+
+def test_pose_without_a_unit_quaternion(pandaset, store):
+    edit_json(pandaset, "lidar/poses.json", lambda p: p[2]["heading"].update(w=7.0))
+    assert "frame 2: the heading is no unit quaternion" in refusal(pandaset, store)[1]
+
+
+def test_fewer_poses_than_frames(pandaset, store):
+    edit_json(pandaset, "camera/back_camera/poses.json", lambda poses: poses.pop())
+    assert "2 entries, expected 3, one per frame" in refusal(pandaset, store)[1]
+
+
+def test_negative_focal_length(pandaset, store):
+    edit_json(pandaset, "camera/back_camera/intrinsics.json", lambda lens: lens.update(fx=-1))
+    assert "focal lengths must be positive" in refusal(pandaset, store)[1]
+
+
+def test_json_of_another_shape(pandaset, store):
+    pandaset.write("lidar/poses.json", {"not": "a list"})
+    assert refusal(pandaset, store)[1].endswith("lidar/poses.json: holds no list")
+
+
+def test_json_cut_off(pandaset, store):
+    pandaset.write("lidar/poses.json", b'[{"position"')
+    assert "lidar/poses.json: not a JSON file" in refusal(pandaset, store)[1]
+
+
+def empty_points(num_points=0):
+    columns = {axis: np.zeros(num_points) for axis in "xyzit"}
+    return {**columns, "d": np.zeros(num_points, dtype=np.int64)}
+
+
+def test_zero_points(pandaset, store):
+    pandaset.write_table("lidar/01.pkl.gz", empty_points())
+    kind, message = refusal(pandaset, store)
+    assert kind is DataError
+    assert "lidar/01.pkl.gz: zero points of a known LiDAR, expected at least one" in message
+
+
+def test_points_that_are_not_finite(pandaset, store):
+    columns = {**empty_points(5), "y": np.full(5, np.inf)}
+    pandaset.write_table("lidar/01.pkl.gz", columns)
+    assert "01.pkl.gz: points or their times are not finite" in refusal(pandaset, store)[1]
+
+
+def test_table_without_a_column(pandaset, store):
+    columns = empty_points(5)
+    del columns["t"]
+    pandaset.write_table("lidar/01.pkl.gz", columns)
+    assert "01.pkl.gz: no column t; it has x, y, z, i, d" in refusal(pandaset, store)[1]
+
+
+def test_column_of_texts_where_numbers_belong(pandaset, store):
+    columns = {**empty_points(2), "y": np.array(["a", "b"], dtype=object)}
+    pandaset.write_table("lidar/01.pkl.gz", columns)
+    assert "column y: holds something other than numbers" in refusal(pandaset, store)[1]
+
+
+def test_classes_for_other_points(pandaset, store):
+    pandaset.write_table("annotations/semseg/00.pkl.gz", {"class": np.zeros(3, dtype=np.int64)})
+    assert "semseg/00.pkl.gz: 3 classes for 805 points" in refusal(pandaset, store)[1]
+
+
+@pytest.mark.parametrize(("width_m", "shown"), [(0.0, "0"), (1e308, "1e+308")])
+def test_box_of_no_size(pandaset, store, monkeypatch, width_m, shown):
+    monkeypatch.setattr(f"{type(pandaset).__module__}.CAR_SIZE_M", (4.0, width_m, 1.6))
+    boxes = [{"uuid": "flat", "stationary": True, "sensor": -1, "sibling": "-"}]
+    pandaset.write_boxes(1, [{**box, "centre": np.array([110.0, -40.0, 7.0])} for box in boxes])
+    kind, message = refusal(pandaset, store)
+    assert kind is DataError
+    assert f"01.pkl.gz, Car flat: the box measures 4 x {shown} x 1.6 m, expected" in message
+
+
+def test_box_at_no_place(pandaset, store):
+    box = {"uuid": "lost", "stationary": True, "sensor": -1, "sibling": "-"}
+    pandaset.write_boxes(1, [{**box, "centre": np.array([np.nan, 0.0, 0.0])}])
+    assert "01.pkl.gz, Car lost: the pose is not finite" in refusal(pandaset, store)[1]
+
+
+def test_frames_that_select_nothing(pandaset, store):
+    message = refusal(pandaset, store, frames=slice(7, 9))[1]
+    assert message.endswith("the frames asked for select none of its 3 frames")
+
+
+def test_truncated_gzip(pandaset, store):
+    file = pandaset.path / "lidar/02.pkl.gz"
+    file.write_bytes(file.read_bytes()[:-300])
+    kind, message = refusal(pandaset, store)
+    assert kind is DataError
+    assert "lidar/02.pkl.gz: the gzip file is cut off or damaged" in message
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.999])
+def test_truncated_pickle(pandaset, store, share):
+    file = pandaset.path / "annotations/cuboids/00.pkl.gz"
+    content = gzip.decompress(file.read_bytes())
+    file.write_bytes(gzip.compress(content[: int(share * len(content))]))
+    kind, message = refusal(pandaset, store)
+    assert kind is DataError
+    assert "cuboids/00.pkl.gz: the pickle is damaged" in message
+
+
+def test_table_that_unpacks_without_end(tmp_path):
+    bomb = gzip.compress(b"\x00" * 10_000_000)
+    with pytest.raises(DataError, match="unpacks to more than 1000 bytes"):
+        read_table_bytes(bomb, tmp_path / "bomb.pkl.gz", max_bytes=1000)
+    assert dataframe_pickle.MAX_TABLE_BYTES < 2**30
+
+
+class Runs:
+    """Would leave a file behind if it were unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+def test_pickle_with_a_foreign_class_is_refused_and_not_run(pandaset, store, tmp_path):
+    trace = tmp_path / "was-run"
+    pandaset.write("lidar/00.pkl.gz", gzip.compress(pickle.dumps(Runs(trace))))
+    kind, message = refusal(pandaset, store)
+    assert kind is UnsafePickleError
+    assert "lidar/00.pkl.gz: the pickle names" in message
+    assert "open, which no table needs; nothing of it was run" in message
+    assert not trace.exists()
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        b"cos\nsystem\n(S'true'\ntR.",
+        b"\x80\x04\x8c\x05posix\x8c\x06system\x93\x8c\x04true\x85R.",
+        b"(S'true'\nios\nsystem\n.",
+        b"(cos\nsystem\nS'true'\no.",
+        b"Pid\n.",
+        b"\x82\x01.",
+        b"cnumpy\nload\n.",
+        b"cpandas.core.frame\nDataFrame.__init__.__globals__\n.",
+    ],
+)
+def test_no_opcode_reaches_a_foreign_name(program, tmp_path):
+    with pytest.raises(UnsafePickleError):
+        read_table_bytes(program, tmp_path / "table.pkl")
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        b"",
+        b".",
+        b"N.",
+        b"}.",
+        b"R.",
+        b"t.",
+        b"(t.",
+        b"h\x05.",
+        b"r\xff\xff\xff\xff.",
+        b"B\xff\xff\xff\xffab.",
+        b"\x80\x09N.",
+        b"cpandas.core.frame\nDataFrame\n)\x81}b.",
+        b"cpandas.core.frame\nDataFrame\n.",
+        b"cpandas.core.frame\nDataFrame\n}(X\x01\x00\x00\x00aKub.",
+    ],
+)
+def test_senseless_pickle_is_one_line(program, tmp_path):
+    with pytest.raises(DataError) as raised:
+        read_table_bytes(program, tmp_path / "table.pkl")
+    assert "\n" not in str(raised.value)
+
+
+def test_full_disk(pandaset, store, monkeypatch):
+    def refuse(*_arguments):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(array_writer.ArrayAppender, "_flush", refuse)
+    kind, message = refusal(pandaset, store)
+    assert kind is StorageError
+    assert "002: cannot be written: No space left on device; free some space" in message
+
+
+def test_failed_ingest_leaves_an_earlier_scene_as_it_was(pandaset, store):
+    path = pandaset.ingest(store)
+    before = (path / "manifest.json").read_bytes()
+    (pandaset.path / "camera/front_camera/02.jpg").write_bytes(b"\xff\xd8\xff")
+    with pytest.raises(DataError):
+        pandaset.ingest(store)
+    assert (path / "manifest.json").read_bytes() == before
+    assert [found.name for found in path.parent.iterdir()] == ["002"]
+
+
+def test_unknown_dataset(tmp_path):
+    with pytest.raises(DataError, match="dataset 'nothing' is not known"):
+        ingest_scene("nothing", tmp_path, "002", tmp_path)

@@ -1,0 +1,96 @@
+"""A bad Parquet file of Waymo gets one clear line with file, row and column."""
+
+import re
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from waymo_edits import (
+    refused_line,
+    with_value,
+)
+from waymo_numbers import SEGMENT
+
+
+def component_refusal(components, store, component, change):
+    path = components.root / component / f"{SEGMENT}.parquet"
+    pq.write_table(change(pq.read_table(path)), path)
+    return refused_line(components, store, f"{component}/{SEGMENT}.parquet")
+
+
+@pytest.mark.parametrize("component", ["lidar_pose", "camera_image", "lidar_box"])
+def test_component_that_is_missing(components, tmp_path, component):
+    path = components.root / component / f"{SEGMENT}.parquet"
+    path.unlink()
+    line = refused_line(components, tmp_path / "store", str(path))
+    assert line.endswith("the file is missing")
+
+
+def test_column_that_is_missing(components, tmp_path):
+    name = "[LiDARComponent].range_image_return1.shape"
+    line = component_refusal(
+        components, tmp_path / "store", "lidar", lambda table: table.drop_columns([name])
+    )
+    assert line.endswith(f"no column {name}")
+
+
+def test_rows_that_are_not_in_the_order_of_time(components, tmp_path):
+    line = component_refusal(
+        components,
+        tmp_path / "store",
+        "camera_image",
+        lambda table: table.take(pa.array([0, 2, 1, 3])),
+    )
+    assert "row 2, key.frame_timestamp_micros: not in the order of time" in line
+
+
+@pytest.mark.parametrize(
+    ("component", "column", "value", "complaint"),
+    [
+        ("lidar_box", "key.segment_context_name", "../x", "expected '1005081002024129653_5313"),
+        ("camera_image", "key.segment_context_name", "other", "row 1, key.segment_context_name"),
+        ("camera_image", "[CameraImageComponent].image", None, "row 1, .*image: is empty"),
+        ("camera_image", "[CameraImageComponent].image", b"GIF", "not a JPEG image"),
+        ("camera_image", "key.camera_name", 99, "sensor 99 is not known"),
+        ("lidar", "key.laser_name", 0, "sensor 0 is not known"),
+        ("lidar", "[LiDARComponent].range_image_return1.shape", [9, 9, 9], "expected at most"),
+        ("lidar", "[LiDARComponent].range_image_return2.values", [1.0], "4 bytes, expected"),
+        ("lidar_pose", "[LiDARPoseComponent].range_image_return1.shape", None, "shape"),
+        ("vehicle_pose", "key.frame_timestamp_micros", -5, "expected a time since the epoch"),
+        ("lidar_box", "[LiDARBoxComponent].box.heading", float("nan"), "is not finite"),
+        ("lidar_box", "key.laser_object_id", "../../x", "actor name"),
+        ("camera_calibration", "[CameraCalibrationComponent].width", None, "width: is empty"),
+        ("lidar_calibration", "[LiDARCalibrationComponent].beam_inclination.min", 9.0, "ascend|90"),
+    ],
+)
+def test_senseless_value(components, tmp_path, component, column, value, complaint):
+    change = with_value(column, 1 if component != "vehicle_pose" else 0, value)
+    line = component_refusal(components, tmp_path / "store", component, change)
+    assert re.search(complaint, line), line
+
+
+def test_frame_that_stands_twice(components, tmp_path):
+    line = component_refusal(
+        components,
+        tmp_path / "store",
+        "vehicle_pose",
+        lambda table: table.take(pa.array([0, 1, 1])),
+    )
+    assert line.endswith("stands twice, expected once")
+
+
+def test_file_that_is_no_parquet(components, tmp_path):
+    path = components.root / "lidar" / f"{SEGMENT}.parquet"
+    path.write_bytes(path.read_bytes()[:-3])
+    line = refused_line(components, tmp_path / "store", str(path))
+    assert "cannot be read as Parquet" in line
+
+
+def test_frame_of_countless_rows(components, tmp_path):
+    line = component_refusal(
+        components,
+        tmp_path / "store",
+        "camera_image",
+        lambda table: table.take(pa.array([0] * 100 + [1, 2, 3])),
+    )
+    assert "row 64: one row too many, expected 64 a frame at most" in line

@@ -1,0 +1,73 @@
+"""Bad labels of Waymo, and names that are not there or lead elsewhere, get one clear line."""
+
+import pytest
+from waymo_damage import joined, split
+from waymo_edits import LABELS, with_frame
+from waymo_records import double, message, text
+
+from lidarpainter_models.errors import DataError
+from lidarpainter_models.readers import ingest_scene
+
+
+@pytest.mark.parametrize("name", ["../../x", "/etc/passwd", "", "a b", "x\ny", "\u202e", ".."])
+def test_actor_that_is_named_for_a_place(refusal, messages, name):
+    line = refusal(with_frame(messages, [(LABELS, 2), 4], lambda _: name.encode()))
+    assert "laser_labels[2]" in line
+    assert "actor name" in line
+
+
+def test_actor_whose_name_is_no_text(refusal, messages):
+    line = refusal(with_frame(messages, [LABELS, 4], lambda _: b"\xff\xfe\x00"))
+    assert "laser_labels[0]" in line
+
+
+@pytest.mark.parametrize(
+    ("field", "number", "complaint"),
+    [
+        ([1, 1], float("nan"), "box: holds a number that is not finite"),
+        ([1, 5], -4.0, "box: the box measures -4 x"),
+        ([1, 5], 1e308, "expected positive sizes, 1000 m at most"),
+        ([1, 2], 1e12, "box: a box beyond 1000 m"),
+        ([3], 9, "label type 9 is not known, expected 0 to 4"),
+    ],
+)
+def test_senseless_label(refusal, messages, field, number, complaint):
+    line = refusal(with_frame(messages, [LABELS, *field], lambda _: number))
+    assert "laser_labels[0]" in line
+    assert complaint in line
+
+
+def test_label_without_a_box(refusal, messages):
+    line = refusal(with_frame(messages, [LABELS, 1], lambda _: None))
+    assert "box: the box measures 0 x 0 x 0 m, expected positive sizes" in line
+
+
+def test_label_that_is_synced_with_no_camera(refusal, messages):
+    synced = message(12, double(1, 5.0)) + text(11, "ROOF")
+    line = refusal(with_frame(messages, [LABELS], lambda label: label + synced))
+    assert "camera_synced_box: sensor 'ROOF' is not known" in line
+
+
+def test_actor_that_stands_twice_in_a_frame(refusal, messages):
+    first = next(field for field in split(messages[1]) if field[0] == LABELS)
+    line = refusal([messages[0], messages[1] + joined([first])])
+    assert "record 1 at byte" in line
+    assert "given twice, expected once a frame" in line
+
+
+@pytest.mark.parametrize("sequence", ["../x", "..", "/etc", "", "a/b"])
+def test_segment_name_that_leaves_the_store(records, tmp_path, sequence):
+    with pytest.raises(DataError, match="cannot be used"):
+        ingest_scene("waymo", records.root, sequence, tmp_path / "store")
+
+
+def test_segment_that_is_not_there(records, tmp_path):
+    with pytest.raises(DataError, match="no segment other, expected a TFRecord or Parquet file"):
+        ingest_scene("waymo", records.root, "other", tmp_path / "store")
+
+
+def test_cameras_and_frames_that_are_not_there(records, tmp_path):
+    with pytest.raises(DataError, match="no camera 'ROOF', expected some of FRONT, FRONT_LEFT"):
+        records.ingest(tmp_path / "store", cameras=("ROOF",))
+    with pytest.raises(DataError, match="the frames asked for select none of its 2 frames"):
+        records.ingest(tmp_path / "store", frames=slice(5, 9))

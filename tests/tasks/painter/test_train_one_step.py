@@ -1,0 +1,181 @@
+"""Training the one-step painter as a stage: what it refuses, keeps and leaves."""
+
+import json
+import multiprocessing
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from killer import Killer
+from quiet_augmentation import QUIET
+from random_pairs import write_pairs
+from tiny_diffusion import write_model
+
+from catalog.store import open_store
+from lidarpainter_models.errors import ConfigError, DataError, TrainingError, WeightsError
+from lidarpainter_models.metrics.backbones import SQUEEZENET
+from lidarpainter_models.metrics.lpips import Lpips, LpipsFiles
+from lidarpainter_models.painter import load_painter
+from lidarpainter_models.painter.losses import PaperLossWeights
+from lidarpainter_models.painter.nano.training import NanoTrainingConfig
+from lidarpainter_models.painter.one_step.presets import fast
+from lidarpainter_models.painter.one_step.training import OneStepTrainingConfig
+from lidarpainter_models.painter.one_step.weights import read_trained
+from tasks.painter.harvest import PairSet
+from tasks.painter.judge import judge_held_back, load_painting_scores, samples_path
+from tasks.painter.students import recipe_for, student_of
+from tasks.painter.train import publish_painter, train, training_record, weights_path
+from tasks.progress import listening
+
+CONFIG = OneStepTrainingConfig(
+    network=fast(),
+    augmentation=replace(QUIET, crop_px=64),
+    loss=PaperLossWeights(lpips=0, adversarial=0),
+    steps=2,
+    accumulated_batches=1,
+    log_every_steps=1,
+    checkpoint_every_s=0.0,
+)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    return str(write_model(tmp_path_factory.mktemp("models") / "small-turbo"))
+
+
+@pytest.fixture
+def pairs(tmp_path):
+    write_pairs(tmp_path / "pairs", range(4), height_px=64, width_px=80)
+    return (PairSet(name="log", folder=tmp_path / "pairs"),)
+
+
+@pytest.fixture
+def store(tmp_path):
+    return open_store(tmp_path / "store")
+
+
+def test_a_one_step_painter_is_trained_judged_published_and_trained_on(pairs, store, model):
+    trained = train.fn(store.root, "train", pairs, CONFIG, 0.3, model)
+    weights = weights_path(trained.ref)
+    assert weights.name == "one-step.safetensors"
+    painter = load_painter(weights)
+    assert painter.provenance["licence"].startswith("that of the model underneath (unknown), and")
+    assert painter.provenance["base"] == model
+    assert len(painter.provenance["trained_targets"]) == 2
+    record = training_record(trained.ref, None)
+    assert record["base_licence"] == "unknown"
+    assert record["config"]["network"]["autoencoder"] == "taesd"
+    assert [entry["step"] for entry in record["history"]] == [1, 2]
+    assert set(record["pairs"][0]["pairs"]) <= {f"pair-{frame}" for frame in range(4)}
+
+    judged = judge_held_back.fn(store.root, "judge", weights, pairs, 0.3)
+    assert load_painting_scores(judged.ref)["total"]["num_pairs"] == 2
+    assert samples_path(judged.ref).stat().st_size > 1000
+    row = publish_painter.fn(store.root, trained.ref, None)
+    assert row["name"] == "one-step"
+    assert json.loads(row["record"])["training_digest"] == record["training_digest"]
+
+    on = recipe_for(str(weights))
+    assert on.network == fast()
+    further = replace(CONFIG, steps=1)
+    then = train.fn(store.root, "train", pairs, further, 0.3, weights)
+    told = load_painter(weights_path(then.ref)).provenance
+    assert told["started_from"]["steps"] == 2
+    assert told["base"] == model
+
+
+def tensors_of(trained):
+    return read_trained(weights_path(trained.ref)).tensors
+
+
+def test_a_killed_training_goes_on_and_ends_bit_for_bit(pairs, store, model, tmp_path):
+    with listening(Killer()), pytest.raises(KeyboardInterrupt):
+        train.fn(store.root, "train", pairs, CONFIG, 0.3, model)
+    resumed = train.fn(store.root, "train", pairs, CONFIG, 0.3, model)
+    straight = tensors_of(train.fn(tmp_path / "other", "train", pairs, CONFIG, 0.3, model))
+    for name, tensor in tensors_of(resumed).items():
+        assert torch.equal(tensor, straight[name])
+    assert not list((store.root / "work").glob("*"))
+
+
+def test_a_changed_pair_stops_the_training(pairs, store, model):
+    path = next(pairs[0].folder.glob("pair-*.safetensors"))
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(DataError, match="has SHA-256"):
+        train.fn(store.root, "train", pairs, CONFIG, 0.3, model)
+
+
+@pytest.mark.parametrize(
+    ("changes", "start", "options", "expected"),
+    [
+        ({"loss": PaperLossWeights(adversarial=0)}, "MODEL", {}, "weighs LPIPS by"),
+        ({}, "MODEL", {"lpips": LpipsFiles(heads=Path("h.pth"))}, "a backbone not given"),
+        ({}, None, {}, "is trained on a model"),
+        ({}, "/nowhere/model", {}, "no such folder"),
+        ({}, "gone.safetensors", {}, "no weights at gone.safetensors"),
+        ({"max_cpu_s": 5.0}, "MODEL", {"num_processes": 2}, "cannot share a budget"),
+        ({}, "MODEL", {"num_processes": 0}, "cannot share a budget"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_at_once(model, changes, start, options, expected):
+    start = model if start == "MODEL" else start
+    with pytest.raises((ConfigError, WeightsError), match=expected) as caught:
+        student_of(replace(CONFIG, **changes), start, **options)
+    assert "\n" not in str(caught.value)
+
+
+def test_lpips_enters_the_loss_and_lends_its_features(pairs, store, model, tmp_path, monkeypatch):
+    heads = [torch.rand(channels) for channels in SQUEEZENET.channels]
+    lpips = Lpips(SQUEEZENET.build(), heads).requires_grad_(False)
+    monkeypatch.setattr("tasks.painter.training_processes.load_lpips", lambda _files: lpips)
+    files = LpipsFiles(backbone=tmp_path / "backbone", heads=tmp_path / "heads")
+    for path in (files.backbone, files.heads):
+        path.write_bytes(b"stands for weights")
+    config = replace(CONFIG, steps=1, loss=PaperLossWeights())
+    trained = train.fn(store.root, "train", pairs, config, 0.0, model, files)
+    record = training_record(trained.ref, None)
+    assert record["discriminator"] == "FeatureDiscriminator"
+    assert record["history"][0]["lpips"] > 0
+    assert {"lpips backbone", "lpips heads"} <= set(record)
+
+
+def test_the_small_painter_is_trained_alone():
+    with pytest.raises(ConfigError, match="one process"):
+        student_of(NanoTrainingConfig(), None, num_processes=2)
+
+
+@pytest.mark.slow
+def test_two_processes_train_one_painter(pairs, store, model):
+    config = replace(CONFIG, half_precision=False)
+    two = train.fn(store.root, "train", pairs, config, 0.0, model, num_processes=2)
+    one = replace(config, accumulated_batches=2)
+    alone = train.fn(store.root, "train", pairs, one, 0.0, model)
+    records = [training_record(made.ref, None) for made in (two, alone)]
+    assert [record["processes"] for record in records] == [2, 1]
+    for ours, theirs in zip(*(record["history"] for record in records), strict=True):
+        assert ours["total"] == pytest.approx(theirs["total"], rel=1e-4)
+
+
+class ChildKiller(Killer):
+    """Kills every process that this one has started."""
+
+    def advanced(self, _stage, _done, _total, _note):
+        for child in multiprocessing.active_children():
+            os.kill(child.pid, signal.SIGKILL)
+
+
+@pytest.mark.slow
+def test_a_lost_process_ends_the_training_with_one_line(pairs, store, model):
+    config = replace(CONFIG, steps=50)
+    with (
+        listening(ChildKiller()),
+        pytest.raises(TrainingError, match="in several processes broke off") as caught,
+    ):
+        train.fn(store.root, "train", pairs, config, 0.0, model, num_processes=2)
+    assert "\n" not in str(caught.value)
+    assert list((store.root / "work").glob("*/training.pt"))
