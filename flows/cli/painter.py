@@ -204,15 +204,15 @@ def info(
         painter_costs.show_preset(painter, preset, size, as_json=as_json)
         return
     painter = painter or "nano"
-    from lidarpainter_models.painter import load_painter
+    from lidarpainter_models.painter import PainterChoice, load_painter
     from lidarpainter_models.painter.description import describe_painter
-    from tasks.painter.painters import files_of_painter, painter_digest
 
+    choice = PainterChoice.of(painter)
     found = describe_painter(load_painter(painter))
     result = {
         "painter": painter,
-        "digest": painter_digest(painter),
-        "num_bytes": sum(path.stat().st_size for path in files_of_painter(painter)),
+        "digest": choice.digest,
+        "num_bytes": sum(path.stat().st_size for path in choice.files),
         **found,
     }
     if as_json:

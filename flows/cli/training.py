@@ -20,7 +20,7 @@ from flows.train_painter import (
 )
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.metrics.lpips import LpipsFiles
-from lidarpainter_models.painter import is_one_step
+from lidarpainter_models.painter import PainterChoice
 from tasks.painter.judge import judge_painters
 from tasks.painter.judged_fits import JudgedFit
 from tasks.painter.students import recipe_for
@@ -82,7 +82,7 @@ def first_choices(
     if base is not None and start is not None:
         raise ConfigError("give --base or --start, not both: weights name their model themselves")
     model = base
-    if start is not None and is_one_step(str(start)):
+    if start is not None and PainterChoice.of(start).is_one_step:
         model = str(start)
     lpips = LpipsFiles(backbone=lpips_backbone, heads=lpips_heads)
     if model is None:

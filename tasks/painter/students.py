@@ -12,7 +12,7 @@ from catalog.digests import DIGEST_LENGTH, digest_file
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.held_back import trained_targets
 from lidarpainter_models.metrics.lpips import LpipsFiles
-from lidarpainter_models.painter import is_one_step, load_painter
+from lidarpainter_models.painter import PainterChoice, load_painter
 from lidarpainter_models.painter.examples import PairSource
 from lidarpainter_models.painter.nano.painter import NanoPainter
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig, train_nano
@@ -124,7 +124,7 @@ def first_weights(start: Path) -> NanoPainter:
         ConfigError: it learns nothing, or does not say what it has learnt.
         WeightsError: there is no such painter, or its file cannot be used.
     """
-    painter = None if is_one_step(str(start)) else load_painter(start)
+    painter = None if PainterChoice.of(start).is_one_step else load_painter(start)
     if not isinstance(painter, NanoPainter) or trained_targets(painter.provenance) is None:
         raise ConfigError(f"{start}: expected a trained painter that says what it has learnt")
     return painter

@@ -4,6 +4,7 @@ import hashlib
 
 import pytest
 import torch
+from tiny_diffusion import write_model
 
 from lidarpainter_models.painter.examples import PaintingPair
 from lidarpainter_models.painter.filters import blur
@@ -97,3 +98,9 @@ def make_pair():
 @pytest.fixture
 def memory_pairs():
     return MemoryPairs
+
+
+@pytest.fixture(scope="session")
+def model_folder(tmp_path_factory):
+    """A whole small model as a user would bring it; not to be changed."""
+    return write_model(tmp_path_factory.mktemp("models") / "small-turbo")

@@ -4,12 +4,9 @@ import math
 
 import pytest
 import torch
-from tiny_diffusion import write_model
 
 from catalog.errors import DamagedArtefactError
-from lidarpainter_models.errors import WeightsError
 from tasks.evaluation.scores import metric_values, score_rows
-from tasks.painter.painters import painter_digest
 from tasks.stored import read_json, write_json
 from tasks.tensors import read_tensors, write_tensors
 
@@ -43,31 +40,6 @@ def test_a_file_of_something_else_is_damaged(tmp_path, content):
 def test_json_has_no_infinity(tmp_path):
     write_json(tmp_path / "x.json", {"psnr": math.inf, "all": [math.nan, 1.5]})
     assert read_json(tmp_path / "x.json") == {"psnr": None, "all": [None, 1.5]}
-
-
-def test_rules_are_named_and_weights_are_hashed(tmp_path):
-    assert painter_digest("warp") == "warp"
-    weights = tmp_path / "own.safetensors"
-    weights.write_bytes(b"1")
-    first = painter_digest(str(weights))
-    weights.write_bytes(b"2")
-    assert painter_digest(str(weights)) != first
-
-
-def test_a_models_digest_follows_its_files_and_wiring(tmp_path):
-    folder = write_model(tmp_path / "small-turbo")
-    first = painter_digest(str(folder))
-    assert painter_digest(f"{folder}:paper") == first
-    assert painter_digest(f"{folder}:fast") != first
-    path = folder / "tokenizer" / "merges.txt"
-    path.write_text(path.read_text() + "a b\n")
-    assert painter_digest(str(folder)) != first
-
-
-@pytest.mark.parametrize("name", ["picasso", "missing.safetensors", "weights.pt"])
-def test_a_painter_that_does_not_exist_is_named(tmp_path, name):
-    with pytest.raises(WeightsError, match="no painter"):
-        painter_digest(str(tmp_path / name))
 
 
 SCORES = {

@@ -19,6 +19,7 @@ from lidarpainter_models.painter.nano.painter import NanoPainter
 from lidarpainter_models.painter.whole_files import write_whole
 
 WEIGHTS_FORMAT = "lidarpainter-nano/1"
+CPU = torch.device("cpu")
 LARGEST_FLOAT16 = torch.finfo(torch.float16).max
 
 
@@ -47,8 +48,8 @@ def save_weights(
     write_whole(path, save(tensors, metadata))
 
 
-def load_weights(path: Path) -> NanoPainter:
-    """Read a painter from its weights file, on the CPU.
+def load_weights(path: Path, *, device: torch.device = CPU) -> NanoPainter:
+    """Read a painter from its weights file.
 
     Raises:
         WeightsError: the file is missing, damaged, or holds another network.
@@ -67,7 +68,9 @@ def load_weights(path: Path) -> NanoPainter:
     if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
         raise WeightsError(f"weights file {path} holds values that are not finite")
     network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
-    return NanoPainter(network, provenance=header["provenance"] | {"licence": header["licence"]})
+    return NanoPainter(
+        network.to(device), provenance=header["provenance"] | {"licence": header["licence"]}
+    )
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from tiny_diffusion import TEXT_WIDTH, TINY, write_model
+from tiny_diffusion import TEXT_WIDTH, TINY
 
 from lidarpainter_models.painter.one_step.assembly import random_network
 
@@ -27,9 +27,3 @@ def make_inputs():
         return images, torch.randn(batch, 77, TEXT_WIDTH, generator=generator)
 
     return make
-
-
-@pytest.fixture(scope="session")
-def model_folder(tmp_path_factory):
-    """A whole small model as a user would bring it; not to be changed."""
-    return write_model(tmp_path_factory.mktemp("models") / "small-turbo")
