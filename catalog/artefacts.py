@@ -1,8 +1,8 @@
 """Content-addressed artefacts: what a stage made, stored under what it was made from.
 
 `<store>/artefacts/<kind>/<digest>/` holds the files of one artefact and a `manifest.json`. The
-digest covers the kind, the digests of the inputs, the configuration and the source of the library
-code that runs, so equal recipes meet and a changed one never finds an old result. A folder is
+digest covers the kind, the digests of the inputs, the configuration and the code that runs (see
+`code_closure`), so equal recipes meet and a changed one never finds an old result. A folder is
 written aside and renamed whole, with the manifest in it: what has a name is complete.
 `<store>/work/<digest>/` is scratch that survives a killed process (checkpoints) and goes when the
 artefact is there.
@@ -10,26 +10,33 @@ artefact is there.
 
 import json
 import os
+import platform
 import shutil
 import time
 import uuid
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from catalog.code_closure import Code
 from catalog.digests import canonical_json, digest_file, digest_text, plain
-from catalog.errors import DamagedArtefactError, UnknownRecordError, storage_errors
+from catalog.errors import CatalogError, DamagedArtefactError, UnknownRecordError, storage_errors
 from catalog.locks import held_lock
 
 MANIFEST_NAME = "manifest.json"
-MANIFEST_VERSION = 1
+MANIFEST_VERSION = 2
+"""See `schemas` for what becomes of older ones."""
+PACKAGES = ("numpy", "torch", "numba")
+"""Whose versions stand in a manifest."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class ArtefactRef:
-    """A name for a stored artefact: small enough to pass between processes."""
+    """A name for a stored artefact, wherever the store lies: the store knows its folder."""
 
     kind: str
     digest: str
@@ -56,15 +63,15 @@ class Recipe:
     """Digest of every input, by the part it plays."""
     config: Any
     """Any value with a canonical JSON form (see `digests.canonical_json`)."""
-    source_digest: str
-    """Digest of the source of the library code that runs."""
+    code: Code
+    """What runs."""
     software_version: str = ""
-    """For the record only: not part of the digest, the source is."""
+    """For the record only: not part of the digest, the code is."""
 
     @property
     def digest(self) -> str:
         """The name of what this recipe makes."""
-        parts = [self.kind, dict(self.inputs), plain(self.config), self.source_digest]
+        parts = [self.kind, dict(self.inputs), plain(self.config), self.code.digest]
         return digest_text(canonical_json(parts))
 
 
@@ -87,6 +94,7 @@ class Manifest:
     inputs: dict[str, str]
     config: Any
     source_digest: str
+    """Digest of the code that ran."""
     software_version: str
     created_at: str
     """ISO 8601, UTC."""
@@ -96,6 +104,14 @@ class Manifest:
     """Per file name: `num_bytes` and `sha256`."""
     summary: dict[str, Any] = field(default_factory=dict)
     """What the stage wants to have said about its result, such as the number of Gaussians."""
+    starts: list[str] = field(default_factory=list)
+    """Where the code that ran starts, `module:name`."""
+    code: dict[str, str] = field(default_factory=dict)
+    """Digest of what it reaches in each module."""
+    versions: dict[str, str] = field(default_factory=dict)
+    """Python and the packages that compute; a record, not part of the digest."""
+    host: str = ""
+    """Machine it was made on."""
     manifest_version: int = MANIFEST_VERSION
 
     @property
@@ -118,6 +134,10 @@ class ArtefactStore:
         """The name of an artefact, whether it exists or not."""
         return ArtefactRef(kind, digest, str(self.root / "artefacts" / kind / digest))
 
+    def folder(self, ref: ArtefactRef) -> Path:
+        """Where the files of an artefact lie."""
+        return self.root / "artefacts" / ref.kind / ref.digest
+
     def find(self, recipe: Recipe) -> ArtefactRef | None:
         """What was made from this recipe before, or None; damaged folders count as absent."""
         ref = self.ref(recipe.kind, recipe.digest)
@@ -125,7 +145,7 @@ class ArtefactStore:
             manifest = self.manifest(ref)
         except (UnknownRecordError, DamagedArtefactError):
             return None
-        return ref if _sizes_agree(ref, manifest) else None
+        return ref if _sizes_agree(self.folder(ref), manifest) else None
 
     def produce(
         self, recipe: Recipe, build: Build, *, on_wait: Callable[[str], None] | None = None
@@ -161,13 +181,15 @@ class ArtefactStore:
             UnknownRecordError: there is no such artefact.
             DamagedArtefactError: its manifest cannot be read.
         """
-        path = ref.folder / MANIFEST_NAME
+        path = self.folder(ref) / MANIFEST_NAME
         try:
             content = json.loads(path.read_text("utf-8"))
+            if content["manifest_version"] > MANIFEST_VERSION:
+                raise CatalogError(f"{path} was written by a newer lidarpainter: update this one")
             return Manifest(**content)
         except (FileNotFoundError, NotADirectoryError):
-            raise UnknownRecordError(f"no {ref.kind} artefact at {ref.folder}") from None
-        except (ValueError, TypeError) as error:
+            raise UnknownRecordError(f"no {ref.kind} artefact at {path.parent}") from None
+        except (ValueError, TypeError, KeyError) as error:
             raise DamagedArtefactError(f"unreadable manifest {path}: {error}") from None
 
     def verified(self, ref: ArtefactRef) -> Manifest:
@@ -177,14 +199,14 @@ class ArtefactStore:
             UnknownRecordError: there is no such artefact.
             DamagedArtefactError: a file is missing or is not what was written.
         """
-        manifest = self.manifest(ref)
+        manifest, folder = self.manifest(ref), self.folder(ref)
         for name, known in manifest.files.items():
-            path = ref.folder / name
+            path = folder / name
             if not path.is_file():
-                raise DamagedArtefactError(f"{path} is missing; delete {ref.folder} and run again")
+                raise DamagedArtefactError(f"{path} is missing; delete {folder} and run again")
             if digest_file(path) != known["sha256"]:
                 raise DamagedArtefactError(
-                    f"{path} is not what was written; delete {ref.folder} and run again"
+                    f"{path} is not what was written; delete {folder} and run again"
                 )
         return manifest
 
@@ -203,7 +225,7 @@ class ArtefactStore:
             try:
                 summary = build(Workplace(output=output, scratch=scratch))
                 _write_manifest(output, recipe, summary or {}, time.perf_counter() - started)
-                _put_in_place(output, ref.folder)
+                _put_in_place(output, self.folder(ref))
             finally:
                 shutil.rmtree(output, ignore_errors=True)
         shutil.rmtree(scratch, ignore_errors=True)
@@ -227,7 +249,11 @@ def _write_manifest(
         "digest": recipe.digest,
         "inputs": dict(recipe.inputs),
         "config": plain(recipe.config),
-        "source_digest": recipe.source_digest,
+        "source_digest": recipe.code.digest,
+        "starts": recipe.code.starts,
+        "code": dict(recipe.code.modules),
+        "versions": _versions(),
+        "host": platform.node(),
         "software_version": recipe.software_version,
         "created_at": datetime.now(UTC).isoformat(timespec="milliseconds"),
         "seconds": round(seconds, 3),
@@ -236,6 +262,15 @@ def _write_manifest(
     }
     text = json.dumps(content, indent=1, sort_keys=True, allow_nan=False)
     (output / MANIFEST_NAME).write_text(text + "\n", "utf-8")
+
+
+def _versions() -> dict[str, str]:
+    """The versions of Python and of the packages that are installed."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
 
 
 def _put_in_place(output: Path, folder: Path) -> None:
@@ -257,10 +292,10 @@ def _flush(path: Path) -> None:
         os.close(descriptor)
 
 
-def _sizes_agree(ref: ArtefactRef, manifest: Manifest) -> bool:
+def _sizes_agree(folder: Path, manifest: Manifest) -> bool:
     """Whether every file is there at its size: cheap, finds cut files, not flipped bits."""
     for name, known in manifest.files.items():
-        path = ref.folder / name
+        path = folder / name
         if not path.is_file() or path.stat().st_size != known["num_bytes"]:
             return False
     return True

@@ -7,7 +7,7 @@ one canonical JSON form; what has no such form is refused, never hashed by its a
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from pathlib import Path
@@ -31,29 +31,6 @@ def digest_file(path: Path) -> str:
         while block := file.read(_BLOCK_BYTES):
             sha.update(block)
     return sha.hexdigest()
-
-
-def digest_source(root: Path, parts: Iterable[str]) -> str:
-    """Digest of the Python source below `root`: names and bytes of every module of the parts.
-
-    Args:
-        root: folder of a package.
-        parts: sub-packages (folders) or modules (`errors.py`) below it.
-
-    Raises:
-        IdentityError: a part does not exist, so a stage would be keyed on nothing.
-    """
-    sha = hashlib.sha256()
-    for part in sorted(set(parts)):
-        place = root / part
-        modules = [place] if place.is_file() else sorted(place.rglob("*.py"))
-        if not modules:
-            raise IdentityError(f"no Python source at {place}")
-        for module in modules:
-            content = module.read_bytes()
-            sha.update(f"{module.relative_to(root).as_posix()}\0{len(content)}\0".encode())
-            sha.update(content)
-    return sha.hexdigest()[:DIGEST_LENGTH]
 
 
 def canonical_json(value: Any) -> str:  # noqa: ANN401 - any configuration
@@ -84,17 +61,6 @@ def plain(value: Any, where: str = "value") -> Any:  # noqa: ANN401 - any config
     if isinstance(value, Path):
         return value.as_posix()
     return _plain_container(value, where)
-
-
-def finite_or_none(value: Any) -> Any:  # noqa: ANN401 - any JSON-like value
-    """The same value with infinite and not-a-number floats as None: JSON has neither."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {str(key): finite_or_none(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [finite_or_none(item) for item in value]
-    return value
 
 
 def _plain_container(value: Any, where: str) -> Any:  # noqa: ANN401 - any configuration

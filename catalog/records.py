@@ -14,7 +14,7 @@ RUN_ID_LENGTH = 16
 
 
 def run_id_of(scene_digest: str, parameters: Any, source_digest: str) -> str:  # noqa: ANN401
-    """The id of a run: the same scene content, parameters and library make the same run."""
+    """The id of a run: the same scene content, parameters and code make the same run."""
     return digest_text(canonical_json([scene_digest, parameters, source_digest]))[:RUN_ID_LENGTH]
 
 

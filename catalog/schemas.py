@@ -76,9 +76,9 @@ SCENES = TableSchema(
 
 RUNS = TableSchema(
     "runs",
-    "Reconstructions: one row for one scene content, parameters and source of the library.",
+    "Reconstructions: one row for one scene content, parameters and code.",
     (
-        Column("run_id", "text", "digest of scene content, parameters and library source"),
+        Column("run_id", "text", "digest of scene content, parameters and code"),
         Column("scene_id", "text", "dataset/sequence"),
         Column("scene_digest", "text", "content digest of the scene it was run on"),
         Column("preset", "text", "name of the preset it started from"),
@@ -98,7 +98,7 @@ RUNS = TableSchema(
         Column("result", "text", "what `reconstruct --json` printed, JSON"),
         Column("report", "text", "path of the report"),
         Column("software_version", "text", "version of lidarpainter"),
-        Column("source_digest", "text", "digest of the library source"),
+        Column("source_digest", "text", "digest of the code of its stages"),
     ),
 )
 
@@ -108,10 +108,10 @@ ARTEFACTS = TableSchema(
     (
         Column("artefact_id", "text", "kind/digest"),
         Column("kind", "text", "which stage made it"),
-        Column("digest", "text", "digest of inputs, configuration and source"),
+        Column("digest", "text", "digest of inputs, configuration and code"),
         Column("inputs", "text", "digest of every input by its part, JSON"),
         Column("config", "text", "configuration of the stage, canonical JSON"),
-        Column("source_digest", "text", "digest of the library source it was made with"),
+        Column("source_digest", "text", "digest of the code that made it"),
         Column("path", "text", "folder of the artefact"),
         Column("num_bytes", "integer", "size of its files", "byte"),
         Column("seconds", "number", "wall time of the process that finished it", "s"),

@@ -1,15 +1,13 @@
 """What all stages share: their identity, their measurement, their retries.
 
-A stage's artefact is keyed on its inputs, its configuration, the source of the library packages it
-runs (`SOURCES`) and of the task module that writes it. Prefect's own cache is off: its key would
+A stage's artefact is keyed on its inputs, its configuration and the code that its build function
+runs, found from the source (see `catalog.code_closure`). Prefect's own cache is off: its key would
 see the thin task only, and what is done is written in the store.
 """
 
-import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 from prefect import Task
@@ -18,30 +16,13 @@ from prefect.client.schemas.objects import State, TaskRun
 
 import lidarpainter_models
 from catalog.artefacts import ArtefactRef, Recipe, Workplace
-from catalog.digests import digest_file, digest_source, digest_text
+from catalog.code_closure import SourceTree
 from catalog.errors import CatalogError, ConflictError
 from catalog.records import artefact_row
 from catalog.store import Store
 from lidarpainter_models.errors import LidarPainterError
 from tasks.measuring import measured
 from tasks.progress import listener
-
-LIBRARY = Path(lidarpainter_models.__file__).parent
-BASE = ("errors.py", "geometry", "kernels", "scenes", "lidar", "observations")
-SOURCES: dict[str, tuple[str, ...]] = {
-    "observations": (*BASE, "gaussians"),
-    "gaussians": (*BASE, "gaussians"),
-    "guidance": (*BASE, "gaussians", "painter", "conditioning"),
-    "evaluation": (*BASE, "gaussians", "painter", "conditioning", "metrics", "evaluation"),
-    "strips": (*BASE, "gaussians", "painter", "conditioning", "metrics", "evaluation"),
-    "report": (*BASE, "gaussians", "painter", "conditioning", "metrics", "evaluation", "export"),
-    "pairs": (*BASE, "gaussians", "painter", "conditioning", "training_data"),
-    "painter": (*BASE, "painter", "metrics"),
-}
-"""Library packages by kind of artefact."""
-TASKS = Path(__file__).parent
-FILE_FORMATS = ("reconstruction/painted_views.py", "stored.py", "tensors.py")
-"""Task modules that decide what lies in an artefact's files."""
 
 RETRIES = 2
 RETRY_DELAY_S = 3
@@ -63,20 +44,14 @@ class StageResult:
 
 
 @cache
-def library_digest(kind: str | None = None) -> str:
-    """Digest of the library source behind a kind of artefact, or of all of it.
-
-    Taken once per process: the modules in memory are those that were read at its start.
-    """
-    if kind is None:
-        return digest_source(LIBRARY, [path.name for path in _all_parts()])
-    return digest_source(LIBRARY, SOURCES[kind])
+def project_source() -> SourceTree:
+    """The source of the packages whose code decides what lies in an artefact."""
+    return SourceTree.of_packages("tasks", "lidarpainter_models")
 
 
-def stage_digest(kind: str, build: Callable[..., Any]) -> str:
-    """Digest of all source behind an artefact: the library's, and how a task writes it."""
-    own = digest_file(Path(inspect.getfile(build)))
-    return digest_text(library_digest(kind) + own + digest_source(TASKS, FILE_FORMATS))
+def code_digest(*builds: Callable[..., Any]) -> str:
+    """Digest of all code that some builds run, such as those of a run."""
+    return project_source().code(*builds).digest
 
 
 def run_stage(
@@ -88,12 +63,24 @@ def run_stage(
     config: Any,  # noqa: ANN401 - any configuration with a canonical form
     build: Callable[[Workplace], Mapping[str, Any]],
 ) -> StageResult:
-    """Produce the artefact of a stage, or take the one that is there, and catalogue it."""
+    """Produce the artefact of a stage, or take the one that is there, and catalogue it.
+
+    Args:
+        store: where it is kept.
+        stage: its name for the listener.
+        kind: its kind for the catalog.
+        inputs: digest of every input, by the part it plays.
+        config: every setting that its content depends on.
+        build: a function of a module, or a `partial` of one, that writes the files.
+
+    Raises:
+        IdentityError: the code that `build` runs cannot be found from the source.
+    """
     recipe = Recipe(
         kind=kind,
         inputs=inputs,
         config=config,
-        source_digest=stage_digest(kind, build),
+        code=project_source().code(build),
         software_version=lidarpainter_models.__version__,
     )
 
@@ -142,11 +129,3 @@ STAGE_OPTIONS: dict[str, Any] = {
     "persist_result": False,
 }
 """Options of every stage's task."""
-
-
-def _all_parts() -> list[Path]:
-    return [
-        path
-        for path in LIBRARY.iterdir()
-        if path.suffix == ".py" or (path.is_dir() and any(path.rglob("*.py")))
-    ]

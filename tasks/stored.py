@@ -3,16 +3,14 @@
 Each kind has one file of tensors (`FILES`); reading one checks every byte first.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from catalog.artefacts import ArtefactRef
-from catalog.digests import finite_or_none
 from catalog.store import Store
 from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
 from lidarpainter_models.observations.observations import SceneObservations
+from tasks.json_files import read_json, write_json
 from tasks.tensors import read_tensors, write_tensors
 
 OBSERVATIONS_FILE = "observations.safetensors"
@@ -57,14 +55,3 @@ def load_scene(store: Store, ref: ArtefactRef) -> GaussianScene:
 def load_history(ref: ArtefactRef) -> History:
     """Read the course of the fit that made an artefact."""
     return read_json(ref.folder / HISTORY_FILE)
-
-
-def write_json(path: Path, value: Any) -> None:  # noqa: ANN401 - any JSON value
-    """Write a JSON file; numbers that JSON lacks become null."""
-    text = json.dumps(finite_or_none(value), indent=1, sort_keys=True, allow_nan=False)
-    path.write_text(text + "\n", "utf-8")
-
-
-def read_json(path: Path) -> Any:  # noqa: ANN401 - any JSON value
-    """Read a JSON file."""
-    return json.loads(path.read_text("utf-8"))

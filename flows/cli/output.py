@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from catalog.digests import finite_or_none
+from tasks.json_files import finite_or_none
 
 Cell = str | int | float | bool | None
 FILE_WIDTH = 200

@@ -20,11 +20,12 @@ from lidarpainter_models.painter import load_painter
 from lidarpainter_models.scenes.splits import ViewSplit
 from tasks.evaluation.scene import JudgeSettings
 from tasks.evaluation.scores import SCORES_FILE
+from tasks.json_files import write_json
 from tasks.painter.painters import painter_digest
 from tasks.progress import listener
 from tasks.scenes import SplitSpec, open_split
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
-from tasks.stored import FittedRef, load_observations, load_scene, write_json
+from tasks.stored import FittedRef, load_observations, load_scene
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -23,11 +23,12 @@ from lidarpainter_models.synthetic.street import SyntheticStreet
 from tasks.evaluation.judging import known_street
 from tasks.evaluation.scene import JudgeSettings
 from tasks.evaluation.scores import FLICKER, SCORES_FILE
+from tasks.json_files import write_json
 from tasks.painter.painters import painter_digest
 from tasks.progress import listener
 from tasks.scenes import SplitSpec, open_split
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
-from tasks.stored import FittedRef, load_observations, load_scene, write_json
+from tasks.stored import FittedRef, load_observations, load_scene
 
 RENDER = "render"
 PAINTED = "painted"

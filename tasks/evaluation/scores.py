@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from catalog.artefacts import ArtefactRef
-from tasks.stored import read_json
+from tasks.json_files import read_json
 
 SCORES_FILE = "scores.json"
 DEPTH = "depth_within_5_percent"

@@ -19,13 +19,13 @@ from lidarpainter_models.painter.nano.tiles import TileConfig
 from lidarpainter_models.painter.one_step.painter import OneStepPainter
 from lidarpainter_models.painter.protocol import Painter
 from lidarpainter_models.training_data.pairs import PairFolder
+from tasks.json_files import read_json, write_json
 from tasks.measuring import measured
 from tasks.painter.harvest import PairSet
 from tasks.painter.judged_fits import JudgedFit, open_fits
 from tasks.painter.painting_samples import write_samples
 from tasks.progress import listener
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
-from tasks.stored import read_json, write_json
 
 SCORES_FILE = "painting-scores.json"
 SAMPLES_FILE = "samples.png"

@@ -13,7 +13,7 @@ from prefect import task
 
 import lidarpainter_models
 from catalog.artefacts import ArtefactRef, Workplace
-from catalog.digests import DIGEST_LENGTH, canonical_json, digest_file, finite_or_none
+from catalog.digests import DIGEST_LENGTH, canonical_json, digest_file
 from catalog.store import open_store
 from lidarpainter_models.evaluation.held_back import (
     TARGETS_KEY,
@@ -25,12 +25,12 @@ from lidarpainter_models.metrics.lpips import LpipsFiles
 from lidarpainter_models.painter.training.loop import TrainingProgress
 from lidarpainter_models.readers.pandaset.reader import LICENCE as PANDASET_LICENCE
 from lidarpainter_models.training_data.pairs import PairFolder
+from tasks.json_files import finite_or_none, read_json, write_json
 from tasks.painter.harvest import PairSet
 from tasks.painter.judge import open_sets
 from tasks.painter.students import NO_FILES, PainterTraining, student_of
 from tasks.progress import listener
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
-from tasks.stored import read_json, write_json
 
 WEIGHTS_SUFFIX = ".safetensors"
 RECORD_SUFFIX = ".json"

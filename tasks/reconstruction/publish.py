@@ -10,17 +10,26 @@ from prefect import task
 
 import lidarpainter_models
 from catalog.artefacts import ArtefactRef
-from catalog.digests import canonical_json, finite_or_none, plain
+from catalog.digests import canonical_json, plain
 from catalog.records import MetricRecord, RunRecord, metric_rows, run_id_of
 from catalog.store import Store, open_store
+from tasks.evaluation.scene import evaluate
 from tasks.evaluation.scores import metric_values
+from tasks.json_files import finite_or_none
+from tasks.reconstruction.fit import fit, refine
+from tasks.reconstruction.paint import paint
+from tasks.reconstruction.prepare import prepare
+from tasks.reconstruction.report import write_report
 from tasks.scenes import open_scene
-from tasks.stages import STAGE_OPTIONS, library_digest
+from tasks.stages import STAGE_OPTIONS, code_digest
+
+STAGES = (prepare, fit, refine, paint, evaluate, write_report)
+"""What a run is made by: its id follows their code."""
 
 
 @task(**STAGE_OPTIONS)
 def begin_run(store_path: Path, parameters: Any, device: str) -> RunRecord:  # noqa: ANN401
-    """Enter a run as running; the same scene content, parameters and library are the same run.
+    """Enter a run as running; the same scene content, parameters and code are the same run.
 
     Args:
         store_path: the store.
@@ -29,14 +38,15 @@ def begin_run(store_path: Path, parameters: Any, device: str) -> RunRecord:  # n
     """
     store = open_store(store_path)
     scene = open_scene(store, parameters.scene)
+    source_digest = code_digest(*(stage.fn for stage in STAGES))
     record = RunRecord(
-        run_id=run_id_of(scene.content_digest, parameters, library_digest()),
+        run_id=run_id_of(scene.content_digest, parameters, source_digest),
         scene_id=parameters.scene,
         scene_digest=scene.content_digest,
         preset=parameters.preset,
         painter=parameters.painter,
         parameters=canonical_json(plain(parameters)),
-        source_digest=library_digest(),
+        source_digest=source_digest,
         software_version=lidarpainter_models.__version__,
         started_at=datetime.now(UTC),
         device=device,

@@ -21,7 +21,7 @@ from tasks.painter.painters import painter_digest
 from tasks.reconstruction.comparisons import Subject, comparisons
 from tasks.reconstruction.report_figures import plots, tables
 from tasks.scenes import SplitSpec, open_split
-from tasks.stages import STAGE_OPTIONS, StageResult, library_digest, run_stage
+from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
 from tasks.stored import FittedRef, load_observations, load_scene
 
 REPORT_FILE = "report.html"
@@ -114,5 +114,4 @@ def _provenance(store: Store, inputs: ReportInputs) -> dict[str, str]:
         "licence of the data": recorded.manifest["licence"],
         "painter": f"{inputs.painter} ({painter_digest(inputs.painter)})",
         "software": f"lidarpainter {lidarpainter_models.__version__}",
-        "library source": library_digest(),
     }

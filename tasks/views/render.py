@@ -23,11 +23,12 @@ from lidarpainter_models.painter import load_painter
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
+from tasks.json_files import write_json
 from tasks.progress import listener
 from tasks.runs import FinishedRun
 from tasks.scenes import open_scene
 from tasks.stages import STAGE_OPTIONS
-from tasks.stored import load_observations, load_scene, write_json
+from tasks.stored import load_observations, load_scene
 
 STAGE = "render"
 POSES_FILE = "trajectory.json"

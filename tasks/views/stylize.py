@@ -18,10 +18,10 @@ from lidarpainter_models.metrics.edges import EdgeConfig, EdgeScores, edge_agree
 from lidarpainter_models.observations.observations import shrink_image
 from lidarpainter_models.painter.styles import StyleConfig, StyleView, apply_style, check_prompt
 from lidarpainter_models.scenes.records import RecordedView
+from tasks.json_files import write_json
 from tasks.progress import listener
 from tasks.runs import FinishedRun
 from tasks.stages import STAGE_OPTIONS
-from tasks.stored import write_json
 from tasks.views.render import POSES_FILE, OpenedRun, RenderRequest, image_record, open_views
 
 STAGE = "stylize"

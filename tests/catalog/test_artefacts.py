@@ -3,22 +3,26 @@
 import errno
 import json
 import os
+import platform
 import signal
 import subprocess
 import sys
 import time
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
-from catalog.artefacts import ArtefactStore, Recipe
-from catalog.errors import DamagedArtefactError, StorageError, UnknownRecordError
+from catalog.artefacts import MANIFEST_NAME, ArtefactStore, Recipe
+from catalog.code_closure import Code
+from catalog.errors import CatalogError, DamagedArtefactError, StorageError, UnknownRecordError
 
 # started as another process: computes slowly, counts how often it was asked to
 WORKER = """
 import sys, time
 from pathlib import Path
 from catalog.artefacts import ArtefactStore, Recipe
+from catalog.code_closure import Code
 
 root, seconds = Path(sys.argv[1]), float(sys.argv[2])
 
@@ -30,14 +34,16 @@ def build(place):
     time.sleep(seconds)
     (place.output / "whole.bin").write_bytes(b"whole")
 
-recipe = Recipe(kind="fit", inputs={"scene": "s"}, config={"steps": 1}, source_digest="x")
+code = Code(("a:build",), {"a": "x"})
+recipe = Recipe(kind="fit", inputs={"scene": "s"}, config={"steps": 1}, code=code)
 ref, computed = ArtefactStore(root).produce(recipe, build)
 print(ref.digest, computed)
 """
 
 
 def recipe_of(steps=1, source="x"):
-    return Recipe(kind="fit", inputs={"scene": "s"}, config={"steps": steps}, source_digest=source)
+    code = Code(("a:build",), {"a": source})
+    return Recipe(kind="fit", inputs={"scene": "s"}, config={"steps": steps}, code=code)
 
 
 def write_one(place):
@@ -86,6 +92,35 @@ def test_manifest_tells_what_was_made_from_what(tmp_path):
     assert manifest.summary == {"num_gaussians": 3}
     assert sorted(manifest.files) == ["data.bin", "deep/more.bin"]
     assert manifest.num_bytes == 8
+    assert (manifest.starts, manifest.code) == (["a:build"], {"a": "x"})
+    assert manifest.source_digest == recipe_of().code.digest
+    assert manifest.versions["python"] == platform.python_version()
+    assert manifest.versions["numba"] == version("numba")
+    assert manifest.host == platform.node()
+
+
+def rewrite_manifest(store, ref, **changes):
+    path = store.folder(ref) / MANIFEST_NAME
+    content = json.loads(path.read_text()) | changes
+    kept = {name: value for name, value in content.items() if value is not None}
+    path.write_text(json.dumps(kept))
+
+
+def test_a_manifest_of_the_first_version_is_read_without_what_it_lacks(tmp_path):
+    store = ArtefactStore(tmp_path)
+    ref, _ = store.produce(recipe_of(), write_one)
+    later = dict.fromkeys(["starts", "code", "versions", "host"])
+    rewrite_manifest(store, ref, manifest_version=1, **later)
+    assert store.verified(ref).versions == {}
+    assert store.find(recipe_of()) == ref
+
+
+def test_a_manifest_of_a_later_version_is_refused_and_not_overwritten(tmp_path):
+    store = ArtefactStore(tmp_path)
+    ref, _ = store.produce(recipe_of(), write_one)
+    rewrite_manifest(store, ref, manifest_version=99, meaning="unknown")
+    with pytest.raises(CatalogError, match="by a newer lidarpainter"):
+        store.produce(recipe_of(), pytest.fail)
 
 
 @pytest.mark.parametrize("changed", [recipe_of(steps=2), recipe_of(source="y")])

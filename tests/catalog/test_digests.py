@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
-from catalog.digests import canonical_json, digest_file, digest_source, digest_text
+from catalog.digests import canonical_json, digest_file, digest_text
 from catalog.errors import IdentityError
 
 JSON_VALUES = st.recursive(
@@ -64,29 +64,6 @@ def test_another_process_computes_the_same_digest():
     root = Path(__file__).resolve().parents[2]
     answer = subprocess.check_output([sys.executable, "-c", command], text=True, cwd=root)
     assert answer.strip() == digest_text(canonical_json({"a": {1, 2, 3}}))
-
-
-def test_source_digest_sees_content_names_and_only_the_parts_asked_for(tmp_path):
-    (tmp_path / "kernels" / "raster").mkdir(parents=True)
-    (tmp_path / "painter").mkdir()
-    module = tmp_path / "kernels" / "raster" / "cpu.py"
-    module.write_text("x = 1")
-    (tmp_path / "painter" / "nano.py").write_text("y = 1")
-    (tmp_path / "errors.py").write_text("z = 1")
-    parts = ["kernels", "errors.py"]
-    first = digest_source(tmp_path, parts)
-    (tmp_path / "painter" / "nano.py").write_text("y = 2")
-    assert digest_source(tmp_path, parts) == first
-    module.write_text("x = 2")
-    changed = digest_source(tmp_path, parts)
-    assert changed != first
-    module.rename(module.with_name("gpu.py"))
-    assert digest_source(tmp_path, parts) not in {first, changed}
-
-
-def test_source_that_does_not_exist_is_an_error(tmp_path):
-    with pytest.raises(IdentityError, match="no Python source"):
-        digest_source(tmp_path, ["kernels"])
 
 
 def test_file_digest_is_the_sha256_of_its_bytes(tmp_path):

@@ -1,7 +1,11 @@
 """A stage is computed once, catalogued, measured, and never stale."""
 
+from importlib import import_module
+from pathlib import Path
+
 import pytest
 
+from catalog.code_closure import SourceTree
 from catalog.errors import ConflictError, StorageError
 from catalog.store import open_store
 from lidarpainter_models.errors import DataError
@@ -33,8 +37,11 @@ def write_number(place):
     return {"num_gaussians": 3}
 
 
-def never(_place):
-    pytest.fail("computed although it was there")
+@pytest.fixture(autouse=True)
+def _code_of_these_tests(monkeypatch):
+    """Let the builds below count as code of the project."""
+    tree = SourceTree({__name__.partition(".")[0]: Path(__file__).parents[1]})
+    monkeypatch.setattr(stages, "project_source", lambda: tree)
 
 
 def run(store, build=write_number, **changes):
@@ -45,7 +52,7 @@ def run(store, build=write_number, **changes):
 def test_a_stage_is_computed_once_and_entered_into_the_catalog(tmp_path):
     store = open_store(tmp_path)
     first = run(store)
-    second = run(store, build=never)
+    second = run(store)
     assert (first.is_new, second.is_new) == (True, False)
     assert first.summary["num_gaussians"] == second.summary["num_gaussians"] == 3
     assert first.peak_memory_bytes > 1e7
@@ -54,35 +61,18 @@ def test_a_stage_is_computed_once_and_entered_into_the_catalog(tmp_path):
     assert row["config"] == '{"steps":1}'
 
 
-def test_a_changed_library_is_never_served_a_stale_result(tmp_path, monkeypatch):
-    store = open_store(tmp_path)
-    first = run(store)
-    monkeypatch.setattr(stages, "library_digest", lambda _kind: "another source")
-    second = run(store)
-    assert second.is_new
-    assert second.ref != first.ref
-
-
-def test_a_changed_task_module_is_never_served_a_stale_result(tmp_path):
-    modules = []
-    for number in (1, 2):
-        path = tmp_path / f"writer_{number}.py"
-        path.write_text(f"def build(place):\n    return {{'version': {number}}}\n")
-        names = {}
-        exec(compile(path.read_text(), str(path), "exec"), names)  # noqa: S102 - our own text
-        modules.append(names["build"])
-    first, second = (stages.stage_digest("gaussians", build) for build in modules)
-    assert first != second
-    assert stages.stage_digest("gaussians", modules[0]) == first
-
-
-@pytest.mark.parametrize("kind", sorted(stages.SOURCES))
-def test_every_kind_names_source_that_exists(kind):
-    assert len(stages.library_digest(kind)) == 32
-
-
-def test_the_whole_library_has_a_digest_of_its_own():
-    assert stages.library_digest() not in {stages.library_digest(kind) for kind in stages.SOURCES}
+def test_changed_code_is_never_served_a_stale_result(tmp_path, monkeypatch):
+    source = tmp_path / "stage_code.py"
+    source.write_text("def build(place):\n    return {'version': 1}\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    build = import_module("stage_code").build
+    store, found = open_store(tmp_path / "store"), []
+    for text in ("# 1\n", "# two\n", "VERSION = 2\n", source.read_text().replace("1", "2")):
+        source.write_text(source.read_text() + text)
+        tree = SourceTree({"stage_code": tmp_path / "stage_code"})
+        monkeypatch.setattr(stages, "project_source", lambda tree=tree: tree)
+        found.append(run(store, build=build).is_new)
+    assert found == [True, False, False, True]
 
 
 def test_who_listens_hears_a_stage_from_start_to_end(tmp_path):
@@ -101,11 +91,12 @@ def test_who_listens_hears_a_stage_from_start_to_end(tmp_path):
     assert len(heard.events) == 5
 
 
-def test_a_failing_stage_leaves_no_artefact_and_no_row(tmp_path):
-    def fail(place):
-        (place.output / "half.txt").write_text("1")
-        raise DataError("no such image")
+def fail(place):
+    (place.output / "half.txt").write_text("1")
+    raise DataError("no such image")
 
+
+def test_a_failing_stage_leaves_no_artefact_and_no_row(tmp_path):
     store = open_store(tmp_path)
     with pytest.raises(DataError, match="no such image"):
         run(store, build=fail)

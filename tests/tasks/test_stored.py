@@ -7,7 +7,7 @@ import torch
 
 from catalog.errors import DamagedArtefactError
 from tasks.evaluation.scores import metric_values, score_rows
-from tasks.stored import read_json, write_json
+from tasks.json_files import read_json, write_json
 from tasks.tensors import read_tensors, write_tensors
 
 
