@@ -49,6 +49,11 @@ class ArtefactRef:
         return Path(self.path)
 
     @property
+    def place(self) -> str:
+        """Its folder, relative to the store."""
+        return f"artefacts/{self.kind}/{self.digest}"
+
+    @property
     def artefact_id(self) -> str:
         """`kind/digest`, its id in the catalog."""
         return f"{self.kind}/{self.digest}"
@@ -136,16 +141,24 @@ class ArtefactStore:
 
     def folder(self, ref: ArtefactRef) -> Path:
         """Where the files of an artefact lie."""
-        return self.root / "artefacts" / ref.kind / ref.digest
+        return self.root / ref.place
+
+    def named(self, artefact_id: str) -> ArtefactRef:
+        """The artefact of an id in the catalog, `kind/digest`, whether it exists or not."""
+        kind, _, digest = artefact_id.partition("/")
+        return self.ref(kind, digest)
 
     def find(self, recipe: Recipe) -> ArtefactRef | None:
         """What was made from this recipe before, or None; damaged folders count as absent."""
         ref = self.ref(recipe.kind, recipe.digest)
+        return ref if self.is_complete(ref) else None
+
+    def is_complete(self, ref: ArtefactRef) -> bool:
+        """Whether all its files are there at their sizes; their bytes are not read."""
         try:
-            manifest = self.manifest(ref)
+            return _sizes_agree(self.folder(ref), self.manifest(ref))
         except (UnknownRecordError, DamagedArtefactError):
-            return None
-        return ref if _sizes_agree(self.folder(ref), manifest) else None
+            return False
 
     def produce(
         self, recipe: Recipe, build: Build, *, on_wait: Callable[[str], None] | None = None

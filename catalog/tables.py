@@ -77,6 +77,11 @@ class CatalogTables:
         ]
         return pa.table(columns, schema=schema.arrow)
 
+    def find(self, table: str, row_id: str) -> Row | None:
+        """The row with exactly this id, or None."""
+        key = _schema(table).key
+        return next((row for row in self.rows(table) if row[key] == row_id), None)
+
     def row(self, table: str, id_or_prefix: str) -> Row:
         """The one row with this id, or whose id starts with it.
 

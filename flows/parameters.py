@@ -6,15 +6,15 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from lidarpainter_models.conditioning.conditions import ConditionConfig
 from lidarpainter_models.conditioning.novel_guidance import NovelGuidanceConfig
+from lidarpainter_models.devices import Device
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.evaluation.judging import JudgeConfig
 from lidarpainter_models.evaluation.scene_scores import ScoringConfig
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.metrics.lpips import LpipsFiles
 from lidarpainter_models.observations.observations import ObservationConfig
-from tasks.evaluation.scene import JudgeSettings
-from tasks.reconstruction.paint import PaintSettings
+from tasks.opened import RunSpec, SplitSpec
 from tasks.runs import FinishedRun
-from tasks.scenes import SplitSpec
 
 
 class ViewParameters(BaseModel):
@@ -34,6 +34,8 @@ class ViewParameters(BaseModel):
     painter: str
     """Name of a painter, path of its weights or model, or `none`: then the fit goes on as long
     without painted views, which is the control for the painted one."""
+    device: Device = "auto"
+    """What the painter runs on; `auto` takes the GPU if there is one."""
     conditions: ConditionConfig
     scoring: ScoringConfig
     feature_weights: Path | None = None
@@ -42,19 +44,28 @@ class ViewParameters(BaseModel):
     """Weights for LPIPS; without both files it is null, with the reason."""
 
     @property
-    def split_spec(self) -> SplitSpec:
-        """Which views may be seen."""
-        return SplitSpec(scene_id=self.scene, spec=self.split, cameras=self.train_cameras)
-
-    @property
-    def judge_settings(self) -> JudgeSettings:
+    def judge_config(self) -> JudgeConfig:
         """How scenes are judged."""
-        return JudgeSettings(
+        return JudgeConfig(
             observation=self.observation,
             scoring=self.scoring,
             conditions=self.conditions,
             feature_weights=self.feature_weights,
             lpips=self.lpips,
+        )
+
+    @property
+    def split_spec(self) -> SplitSpec:
+        """Which views may be seen."""
+        return SplitSpec(scene_id=self.scene, spec=self.split, cameras=self.train_cameras)
+
+    def run_spec(self, store_path: Path, *, painter: str | None = None) -> RunSpec:
+        """What a run works on; another painter may stand in at view time."""
+        return RunSpec(
+            store_path=store_path,
+            split=self.split_spec,
+            painter=painter or self.painter,
+            device=self.device,
         )
 
 
@@ -70,11 +81,6 @@ class ReconstructParameters(ViewParameters):
     """The fit of one round."""
     judge_view_time: bool = False
     """Also judge what the final scene shows when it is painted at view time."""
-
-    @property
-    def paint_settings(self) -> PaintSettings:
-        """How novel views are painted."""
-        return PaintSettings(painter=self.painter, novel=self.novel, conditions=self.conditions)
 
 
 def view_parameters(run: FinishedRun) -> ViewParameters:

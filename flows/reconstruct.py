@@ -10,32 +10,34 @@ from typing import Any
 from prefect import flow
 
 from catalog.records import RunRecord
-from catalog.store import open_store
+from catalog.store import Store, open_store
 from flows.overrides import with_overrides
 from flows.parameters import ReconstructParameters
 from flows.presets import preset as preset_named
+from flows.recall import START, located, recalled, run_identity
+from lidarpainter_models.evaluation.score_tables import Scores
+from lidarpainter_models.export.run_page import GUIDANCE_COLUMNS
 from lidarpainter_models.metrics.perceptual import load_distances
-from lidarpainter_models.painter import load_painter
-from tasks.evaluation.scene import evaluate
-from tasks.evaluation.scores import Scores, load_scores
-from tasks.painter.painters import NO_PAINTER
-from tasks.reconstruction.fit import fit, refine
+from lidarpainter_models.painter.selection import NO_PAINTER
+from tasks.evaluation.views import evaluate, load_scores
+from tasks.opened import RunSpec, opened
+from tasks.reconstruction.fit import fit
 from tasks.reconstruction.paint import paint
 from tasks.reconstruction.prepare import prepare
 from tasks.reconstruction.publish import begin_run, complete_run, fail_run
-from tasks.reconstruction.report import ReportInputs, report_path, write_report
-from tasks.reconstruction.report_figures import GUIDANCE_COLUMNS
-from tasks.scenes import open_split
+from tasks.reconstruction.report import REPORT_FILE, ReportInputs, write_report
+from tasks.source import code_behind
 from tasks.stages import StageResult
 from tasks.stored import FittedRef
 
-DEVICE = "cpu"
 
-
-@dataclass
+@dataclass(frozen=True, kw_only=True)
 class Course:
-    """What happened in a run so far, stage by stage."""
+    """One run on its way: what is asked for, and what happened so far, stage by stage."""
 
+    parameters: ReconstructParameters
+    run: RunSpec
+    record: RunRecord
     stages: dict[str, StageResult] = field(default_factory=dict)
 
     def add(self, stage: str, result: StageResult) -> StageResult:
@@ -46,11 +48,24 @@ class Course:
 
 @flow(name="reconstruct")
 def reconstruct(parameters: ReconstructParameters, store_path: Path) -> dict[str, Any]:
-    """Fit a scene, paint shifted views of it, go on fitting with them, judge and report."""
+    """Fit a scene, paint shifted views of it, go on fitting with them, judge and report.
+
+    A run that is complete and unchanged is recalled: nothing is computed or written.
+    """
+    if (known := recalled(parameters, store_path)) is not None:
+        return known
     check_inputs(parameters, store_path)
-    record = begin_run(store_path, parameters, DEVICE)
+    run = parameters.run_spec(store_path)
+    store = open_store(store_path)
+    record = begin_run(
+        run,
+        run_identity(parameters, store),
+        code_behind(START).digest,
+        parameters.preset,
+        parameters,
+    )
     with failure_recorded(store_path, record):
-        return _run(parameters, store_path, record)
+        return _run(Course(parameters=parameters, run=run, record=record))
 
 
 def check_inputs(parameters: ReconstructParameters, store_path: Path) -> None:
@@ -58,11 +73,11 @@ def check_inputs(parameters: ReconstructParameters, store_path: Path) -> None:
 
     Raises:
         SceneError: the scene is not there, or lacks a camera.
-        ConfigError: the split leaves nothing to train on.
+        ConfigError: the split leaves nothing to train on, or the device is not there.
         WeightsError: the painter or the weights of a perceptual distance cannot be used.
     """
-    open_split(open_store(store_path), parameters.split_spec)
-    load_painter(parameters.painter)
+    run = opened(parameters.run_spec(store_path))
+    run.painter.load(run.device)
     load_distances(parameters.feature_weights, parameters.lpips)
 
 
@@ -82,100 +97,93 @@ def reconstruct_scene(
     return reconstruct.fn(parameters, open_store(store).root)
 
 
-def _run(parameters: ReconstructParameters, store_path: Path, record: RunRecord) -> dict[str, Any]:
+def _run(course: Course) -> dict[str, Any]:
     started = time.perf_counter()
-    course = Course()
-    seen = course.add("prepare", prepare(store_path, parameters.split_spec, parameters.observation))
-    first = course.add("fit", fit(store_path, seen.ref, parameters.fit))
+    parameters, run = course.parameters, course.run
+    seen = course.add("prepare", prepare(run, parameters.observation))
+    first = course.add("fit", fit(run, "fit", seen.ref, parameters.fit))
     fitted = FittedRef(seen.ref, first.ref)
-    final = _rounds(parameters, store_path, course, fitted)
-    scores = _judged(parameters, store_path, course, fitted, final)
-    result = _result(parameters, record, course, scores, final)
-    report = course.add(
-        "report",
-        write_report(
-            store_path,
-            ReportInputs(
-                result=result,
-                split=parameters.split_spec,
-                settings=parameters.judge_settings,
-                painter=parameters.painter,
-                unpainted=fitted,
-                final=final,
-                stages=dict(course.stages),
-            ),
-        ),
+    final = _rounds(course, fitted)
+    store = open_store(run.store_path)
+    scores = _judged(course, store, fitted, final)
+    result = _result(course, scores, final)
+    page = ReportInputs(
+        result=result,
+        source_digest=course.record.source_digest,
+        unpainted=fitted,
+        final=final,
+        stages=dict(course.stages),
     )
-    result["report"] = str(report_path(report.ref))
+    report = course.add("report", write_report(run, page, parameters.judge_config))
+    result["artefacts"]["report"] = report.ref.place
+    result["report"] = f"{report.ref.place}/{REPORT_FILE}"
     result["seconds"]["report"] = report.seconds
     result["cpu_seconds"]["report"] = report.cpu_seconds
+    result["computed_now"]["report"] = report.is_new
     result["seconds"]["total"] = time.perf_counter() - started
     refs = tuple(stage.ref for stage in course.stages.values())
-    return complete_run(store_path, record, result, scores, refs)
+    return located(complete_run(run.store_path, course.record, result, scores, refs), store)
 
 
-def _rounds(
-    parameters: ReconstructParameters, store_path: Path, course: Course, fitted: FittedRef
-) -> FittedRef:
+def _rounds(course: Course, fitted: FittedRef) -> FittedRef:
     """Paint and go on fitting; without a painter the fit goes on alone, just as long."""
+    parameters, run = course.parameters, course.run
     for number in range(1, parameters.rounds + 1):
         guidance = None
         if parameters.painter != NO_PAINTER:
             stage = f"paint-{number}"
-            guidance = course.add(
+            painted = paint(
+                run,
                 stage,
-                paint(
-                    store_path,
-                    stage,
-                    parameters.scene,
-                    fitted,
-                    parameters.paint_settings,
-                    number - 1,
-                ),
-            ).ref
+                fitted,
+                parameters.novel,
+                parameters.conditions,
+                start_frame=number - 1,
+            )
+            guidance = course.add(stage, painted).ref
         stage = f"refine-{number}"
-        refined = refine(
-            store_path, stage, fitted.observations, fitted.gaussians, guidance, parameters.refine
+        refined = fit(
+            run,
+            stage,
+            fitted.observations,
+            parameters.refine,
+            start=fitted.gaussians,
+            guidance=guidance,
         )
         fitted = FittedRef(fitted.observations, course.add(stage, refined).ref)
     return fitted
 
 
 def _judged(
-    parameters: ReconstructParameters,
-    store_path: Path,
-    course: Course,
-    unpainted: FittedRef,
-    final: FittedRef,
+    course: Course, store: Store, unpainted: FittedRef, final: FittedRef
 ) -> dict[str, Scores]:
     """Scores before painting, after it, and if asked for, painted at view time."""
-    split, settings = parameters.split_spec, parameters.judge_settings
-    before = evaluate(store_path, "evaluate-unpainted", split, unpainted, settings)
-    scores = {"unpainted": load_scores(course.add("evaluate-unpainted", before).ref)}
-    after = evaluate(store_path, "evaluate", split, final, settings)
-    scores["painted"] = load_scores(course.add("evaluate", after).ref)
-    if parameters.judge_view_time and parameters.painter != NO_PAINTER:
-        stage = "evaluate-view-time"
-        shown = evaluate(store_path, stage, split, final, settings, parameters.painter)
-        scores["view-time"] = load_scores(course.add(stage, shown).ref)
+    judged = {"unpainted": ("evaluate-unpainted", unpainted), "painted": ("evaluate", final)}
+    if course.parameters.judge_view_time and course.parameters.painter != NO_PAINTER:
+        judged["view-time"] = ("evaluate-view-time", final)
+    scores = {}
+    for variant, (stage, fitted) in judged.items():
+        found = evaluate(
+            course.run,
+            stage,
+            fitted,
+            course.parameters.judge_config,
+            view_time=variant == "view-time",
+        )
+        scores[variant] = load_scores(store, course.add(stage, found).ref)
     return scores
 
 
-def _result(
-    parameters: ReconstructParameters,
-    record: RunRecord,
-    course: Course,
-    scores: dict[str, Scores],
-    final: FittedRef,
-) -> dict[str, Any]:
+def _result(course: Course, scores: dict[str, Scores], final: FittedRef) -> dict[str, Any]:
     """What `reconstruct --json` prints, but for the report."""
-    stages = course.stages
+    parameters, stages = course.parameters, course.stages
     last_fit = next(stage for stage in stages.values() if stage.ref == final.gaussians)
     return {
-        "run_id": record.run_id,
+        "run_id": course.record.run_id,
         "scene": parameters.scene,
         "preset": parameters.preset,
         "painter": parameters.painter,
+        "device": course.record.device,
         "split": parameters.split,
         "rounds": parameters.rounds,
         "seconds": {name: stage.seconds for name, stage in stages.items()},
@@ -191,7 +199,7 @@ def _result(
             for name, stage in stages.items()
             if stage.ref.kind == "guidance"
         },
-        "artefacts": {name: stage.ref.path for name, stage in stages.items()},
+        "artefacts": {name: stage.ref.place for name, stage in stages.items()},
     }
 
 

@@ -19,6 +19,21 @@ from pathlib import Path
 STARTUP_TIMEOUT_S = 120.0
 STOP_TIMEOUT_S = 5.0
 APPLICATION = "prefect.server.api.server:create_app"
+SERVICES = (
+    "CANCELLATION_CLEANUP",
+    "CLEANUP_RECONCILER",
+    "DB_VACUUM",
+    "EVENT_LOGGER",
+    "EVENT_PERSISTER",
+    "FOREMAN",
+    "LATE_RUNS",
+    "PAUSE_EXPIRATIONS",
+    "REPOSSESSOR",
+    "SCHEDULER",
+    "TASK_RUN_RECORDER",
+    "TRIGGERS",
+)
+"""Of the server, for schedules, workers and its web page: one command has none of them."""
 # prctl(PR_SET_PDEATHSIG): the kernel ends the server when its parent dies, even of SIGKILL
 LAUNCHER = """
 import ctypes, os, signal, sys
@@ -81,6 +96,7 @@ def _start(port: int, log: int) -> subprocess.Popen[bytes]:
         "PREFECT_UI_ENABLED": "0",
         "PREFECT__SERVER_EPHEMERAL": "1",
         "PREFECT__SERVER_FINAL": "1",
+        **{f"PREFECT_SERVER_SERVICES_{name}_ENABLED": "false" for name in SERVICES},
     }
     return subprocess.Popen(  # noqa: S603 - our own interpreter and arguments
         [sys.executable, "-c", LAUNCHER, str(os.getpid()), *arguments],

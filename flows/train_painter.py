@@ -21,6 +21,7 @@ from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
 from lidarpainter_models.training_data.harvest import HarvestConfig
 from lidarpainter_models.training_data.street_harvest import StreetPlan, default_street_plans
+from tasks.opened import SplitSpec
 from tasks.painter.harvest import (
     PairSet,
     harvest_recorded,
@@ -42,7 +43,6 @@ from tasks.painter.train import (
     training_record,
     weights_path,
 )
-from tasks.scenes import SplitSpec
 from tasks.stages import StageResult
 
 SYNTHETIC = "synthetic/"

@@ -5,7 +5,7 @@ reports into silence. The listener belongs to the running context, so two flows 
 not hear each other.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Protocol
@@ -54,6 +54,19 @@ _listener: ContextVar[ProgressListener | None] = ContextVar("progress_listener",
 def listener() -> ProgressListener:
     """Who listens in this context."""
     return _listener.get() or _SILENCE
+
+
+Progress = Callable[..., None]
+"""Told how much is done of how much, and perhaps a short figure worth showing."""
+
+
+def progress_of(stage: str) -> Progress:
+    """What a stage calls with how much is done of how much, and perhaps a short figure."""
+
+    def advanced(done: float, total: float, note: str = "") -> None:
+        listener().advanced(stage, done, total, note)
+
+    return advanced
 
 
 @contextmanager

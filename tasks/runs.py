@@ -4,7 +4,6 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-from catalog.artefacts import ArtefactRef
 from catalog.errors import UnknownRecordError
 from catalog.store import Store
 from tasks.stored import FittedRef
@@ -35,7 +34,7 @@ def open_run(store: Store, run_id: str) -> FinishedRun:
     if row["status"] != "complete":
         why = f": {row['error']}" if row["error"] else ""
         raise UnknownRecordError(f"run {row['run_id']} is {row['status']}, not complete{why}")
-    refs = [_ref(store, artefact_id) for artefact_id in row["artefacts"]]
+    refs = [store.artefacts.named(artefact_id) for artefact_id in row["artefacts"]]
     observations = next(ref for ref in refs if ref.kind == "observations")
     fits = [ref for ref in refs if ref.kind == "gaussians"]
     return FinishedRun(
@@ -46,8 +45,3 @@ def open_run(store: Store, run_id: str) -> FinishedRun:
         unpainted=FittedRef(observations, fits[0]),
         final=FittedRef(observations, fits[-1]),
     )
-
-
-def _ref(store: Store, artefact_id: str) -> ArtefactRef:
-    kind, _, digest = artefact_id.partition("/")
-    return store.artefacts.ref(kind, digest)

@@ -7,7 +7,6 @@ see the thin task only, and what is done is written in the store.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 from prefect import Task
@@ -16,13 +15,13 @@ from prefect.client.schemas.objects import State, TaskRun
 
 import lidarpainter_models
 from catalog.artefacts import ArtefactRef, Recipe, Workplace
-from catalog.code_closure import SourceTree
 from catalog.errors import CatalogError, ConflictError
 from catalog.records import artefact_row
 from catalog.store import Store
 from lidarpainter_models.errors import LidarPainterError
 from tasks.measuring import measured
-from tasks.progress import listener
+from tasks.progress import Progress, listener, progress_of
+from tasks.source import project_source
 
 RETRIES = 2
 RETRY_DELAY_S = 3
@@ -43,17 +42,6 @@ class StageResult:
     summary: dict[str, Any]
 
 
-@cache
-def project_source() -> SourceTree:
-    """The source of the packages whose code decides what lies in an artefact."""
-    return SourceTree.of_packages("tasks", "lidarpainter_models")
-
-
-def code_digest(*builds: Callable[..., Any]) -> str:
-    """Digest of all code that some builds run, such as those of a run."""
-    return project_source().code(*builds).digest
-
-
 def run_stage(
     store: Store,
     *,
@@ -61,7 +49,7 @@ def run_stage(
     kind: str,
     inputs: Mapping[str, str],
     config: Any,  # noqa: ANN401 - any configuration with a canonical form
-    build: Callable[[Workplace], Mapping[str, Any]],
+    build: Callable[[Workplace, Progress], Mapping[str, Any]],
 ) -> StageResult:
     """Produce the artefact of a stage, or take the one that is there, and catalogue it.
 
@@ -71,7 +59,8 @@ def run_stage(
         kind: its kind for the catalog.
         inputs: digest of every input, by the part it plays.
         config: every setting that its content depends on.
-        build: a function of a module, or a `partial` of one, that writes the files.
+        build: a function of a module, or a `partial` of one, that writes the files and tells how
+            far it is.
 
     Raises:
         IdentityError: the code that `build` runs cannot be found from the source.
@@ -86,7 +75,7 @@ def run_stage(
 
     def measured_build(place: Workplace) -> dict[str, Any]:
         with measured() as cost:
-            summary = build(place)
+            summary = build(place, progress_of(stage))
         return {
             **summary,
             "cpu_seconds": round(cost.cpu_seconds, 3),

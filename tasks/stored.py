@@ -4,6 +4,7 @@ Each kind has one file of tensors (`FILES`); reading one checks every byte first
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 from catalog.artefacts import ArtefactRef
@@ -35,9 +36,15 @@ def save_observations(folder: Path, observations: SceneObservations) -> None:
 
 
 def load_observations(store: Store, ref: ArtefactRef) -> SceneObservations:
-    """Read the observations of an artefact."""
+    """The observations of an artefact, read and checked once in a process."""
+    path = store.artefacts.folder(ref) / OBSERVATIONS_FILE
+    return _observations(store, ref, path, *_as_it_is(path))
+
+
+@lru_cache(maxsize=1)
+def _observations(store: Store, ref: ArtefactRef, path: Path, *_as_it_is: int) -> SceneObservations:
     store.artefacts.verified(ref)
-    return SceneObservations.from_arrays(*read_tensors(ref.folder / OBSERVATIONS_FILE))
+    return SceneObservations.from_arrays(*read_tensors(path))
 
 
 def save_scene(folder: Path, scene: GaussianScene, history: History) -> None:
@@ -47,11 +54,29 @@ def save_scene(folder: Path, scene: GaussianScene, history: History) -> None:
 
 
 def load_scene(store: Store, ref: ArtefactRef) -> GaussianScene:
-    """Read the fitted scene of an artefact."""
+    """The fitted scene of an artefact, read and checked once in a process.
+
+    It is shared: whoever changes it takes a copy.
+    """
+    path = store.artefacts.folder(ref) / SCENE_FILE
+    return _scene(store, ref, path, *_as_it_is(path))
+
+
+@lru_cache(maxsize=2)  # the first fit and the last one are judged side by side
+def _scene(store: Store, ref: ArtefactRef, path: Path, *_as_it_is: int) -> GaussianScene:
     store.artefacts.verified(ref)
-    return GaussianScene.from_arrays(*read_tensors(ref.folder / SCENE_FILE))
+    return GaussianScene.from_arrays(*read_tensors(path))
 
 
-def load_history(ref: ArtefactRef) -> History:
+def _as_it_is(path: Path) -> tuple[int, int]:
+    """What changes when a file does: what was kept of it is then read and checked again."""
+    try:
+        found = path.stat()
+    except OSError:
+        return 0, 0
+    return found.st_size, found.st_mtime_ns
+
+
+def load_history(store: Store, ref: ArtefactRef) -> History:
     """Read the course of the fit that made an artefact."""
-    return read_json(ref.folder / HISTORY_FILE)
+    return read_json(store.artefacts.folder(ref) / HISTORY_FILE)

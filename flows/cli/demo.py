@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from flows.cli.output import print_json
-from flows.cli.shared_options import AsJson
+from flows.cli.shared_options import AsJson, Painter, Settings
 
 REPORT_NAME = "report.html"
 
@@ -17,14 +17,8 @@ def demo(
     seed: Annotated[
         int, typer.Option(min=0, max=999, help="Which street; painters train on other seeds.")
     ] = 1,
-    painter: Annotated[
-        str | None,
-        typer.Option(help="none, overlay, warp, nano, weights or a model; the preset's if absent."),
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="Any setting: fit.steps=500. May be repeated."),
-    ] = None,
+    painter: Painter = None,
+    settings: Settings = None,
     as_json: AsJson = False,
 ) -> None:
     """Run the built-in street through the whole pipeline; ends with report.html in --out."""

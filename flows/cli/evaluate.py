@@ -6,11 +6,14 @@ from typing import Annotated, Any
 import typer
 
 from flows.cli.output import print_json, print_table
-from flows.cli.shared_options import AsJson, RunName
+from flows.cli.shared_options import AsJson, RunName, parse_previous
 from lidarpainter_models.errors import ConfigError
 
-PROTOCOLS = ("paper", "truth", "cross-camera", "flicker")
 FLICKER = "flicker"
+CROSS_CAMERA = "cross-camera"
+PROTOCOLS = ("paper", "truth", CROSS_CAMERA, FLICKER)
+VARIANTS = ("unpainted", "painted", "view-time")
+FLICKER_COLUMNS = ("flicker", "moving_flicker", "valid_share", "psnr", "num_pairs")
 
 
 def evaluate(  # noqa: PLR0913 - the options of a command
@@ -40,52 +43,27 @@ def evaluate(  # noqa: PLR0913 - the options of a command
     """Judge a finished run on views it never saw."""
     _check(protocol, previous)
     from catalog.store import open_store
-    from flows.cli.flicker import show_flicker
     from flows.cli.progress import shown_progress
-    from flows.overrides import with_changes
-    from flows.parameters import view_parameters
-    from tasks.evaluation.cross_camera import evaluate_strips
-    from tasks.evaluation.scene import evaluate as evaluate_task
-    from tasks.evaluation.scores import load_scores
-    from tasks.reconstruction.publish import record_scores
-    from tasks.runs import open_run
+    from flows.evaluate import EvaluationRequest, evaluate_run
 
-    store = open_store()
-    finished = open_run(store, run)
-    parameters = view_parameters(finished)
-    parameters = with_changes(parameters, _weights(feature_weights, lpips_backbone, lpips_heads))
-    if protocol == FLICKER:
-        show_flicker(store, finished, parameters, painter, previous, as_json=as_json)
-        return
-    variants: dict[str, tuple[Any, str | None]] = {
-        "unpainted": (finished.unpainted, None),
-        "painted": (finished.final, None),
-    }
-    if postpaint or painter:
-        variants["view-time"] = (finished.final, painter or parameters.painter)
-    judge = evaluate_strips if protocol == "cross-camera" else evaluate_task
-    scores = {}
+    request = EvaluationRequest(
+        run=run,
+        protocol=protocol,
+        is_painted=postpaint,
+        painter=painter,
+        changes=_weights(feature_weights, lpips_backbone, lpips_heads),
+        previous=parse_previous(previous),
+    )
     with shown_progress():
-        for name, (fitted, chosen) in variants.items():
-            judged = judge.fn(
-                store.root,
-                f"{protocol}-{name}",
-                parameters.split_spec,
-                fitted,
-                parameters.judge_settings,
-                chosen,
-            )
-            scores[name] = load_scores(judged.ref)
-    record_scores(store, finished.run_id, finished.scene_id, scores)
-    if protocol == "truth":
-        scores = {name: _with_truth(found, finished.scene_id) for name, found in scores.items()}
-    result = {"run_id": finished.run_id, "scene": finished.scene_id, "protocol": protocol, **scores}
+        result = evaluate_run(open_store(), request)
     if as_json:
         print_json(result)
-    elif protocol == "cross-camera":
-        _show_strips(result, list(variants))
+    elif protocol == FLICKER:
+        _show_flicker(result)
+    elif protocol == CROSS_CAMERA:
+        _show_strips(result)
     else:
-        _show(result, list(variants))
+        _show(result)
 
 
 def _check(protocol: str, previous: str | None) -> None:
@@ -110,23 +88,10 @@ def _weights(features: Path | None, backbone: Path | None, heads: Path | None) -
     return changes
 
 
-def _with_truth(scores: dict[str, Any], scene_id: str) -> dict[str, Any]:
-    """Only views whose true image is known beside the path.
+def _show(result: dict[str, Any]) -> None:
+    from lidarpainter_models.evaluation.score_tables import metric_values
 
-    Raises:
-        ConfigError: the scene has no such truth.
-    """
-    known = {name: found for name, found in scores["novel"].items() if found.get("psnr")}
-    if not known:
-        raise ConfigError(
-            f"scene {scene_id} has no true images beside its path; only synthetic streets have"
-        )
-    return {"novel": known}
-
-
-def _show(result: dict[str, Any], variants: list[str]) -> None:
-    from tasks.evaluation.scores import metric_values
-
+    variants = [name for name in VARIANTS if name in result]
     numbers: dict[tuple[str, str, str], dict[str, float | None]] = {}
     for variant in variants:
         for protocol, trajectory, name, value, _reason in metric_values(result[variant]):
@@ -140,10 +105,21 @@ def _show(result: dict[str, Any], variants: list[str]) -> None:
     print_table(title, ["truth", "view", "figure", *variants], rows, num_text_columns=3)
 
 
-def _show_strips(result: dict[str, Any], variants: list[str]) -> None:
+def _show_strips(result: dict[str, Any]) -> None:
+    variants = [name for name in VARIANTS if name in result]
     rows = [
         [name, *(result[variant][name]["psnr"] for variant in variants)]
         for name in result[variants[0]]
     ]
     title = f"{result['scene']}, run {result['run_id']}: PSNR on strips seen by two cameras"
     print_table(title, ["judging camera", *variants], rows)
+
+
+def _show_flicker(result: dict[str, Any]) -> None:
+    rows = [
+        [shift, image, *(scores[name] for name in FLICKER_COLUMNS)]
+        for shift, images in result[FLICKER].items()
+        for image, scores in images.items()
+    ]
+    title = f"{result['scene']}, run {result['run_id']}: mean rgb difference of neighbouring frames"
+    print_table(title, ["view", "image", *FLICKER_COLUMNS], rows, num_text_columns=2)

@@ -1,17 +1,14 @@
 """`lidarpainter ingest`: from a dataset as downloaded to scenes in the store."""
 
-import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from flows.cli.output import complain, format_bytes, print_json, print_table
-from flows.cli.shared_options import AsJson
-from lidarpainter_models.errors import ConfigError
+from flows.cli.shared_options import AsJson, parse_frames, parse_names
 
 SOME_FAILED = 2
-RANGE = re.compile(r"(\d*):(\d*)")
 
 
 def ingest(  # noqa: PLR0913 - one per option
@@ -68,34 +65,3 @@ def ingest(  # noqa: PLR0913 - one per option
         print_table(f"scenes in {store.root}", columns, cells)
     if failures:
         raise typer.Exit(SOME_FAILED)
-
-
-def parse_frames(text: str | None) -> slice | None:
-    """`A:B`, `A:` or `:B` as a slice of frames.
-
-    Raises:
-        ConfigError: the text says something else.
-    """
-    if text is None:
-        return None
-    match = RANGE.fullmatch(text)
-    if match is None:
-        raise ConfigError(f"frames {text!r}: expected A:B, such as 0:17")
-    start, stop = (int(part) if part else None for part in match.groups())
-    if stop is not None and stop <= (start or 0):
-        raise ConfigError(f"frames {text!r}: expected A < B")
-    return slice(start, stop)
-
-
-def parse_names(text: str | None) -> tuple[str, ...] | None:
-    """Names with commas between.
-
-    Raises:
-        ConfigError: a name is empty.
-    """
-    if text is None:
-        return None
-    names = tuple(name.strip() for name in text.split(","))
-    if not all(names):
-        raise ConfigError(f"{text!r}: expected names with commas between")
-    return names

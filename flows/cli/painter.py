@@ -118,7 +118,7 @@ def train(  # noqa: PLR0913 - the options of a command
 
     A killed training goes on where it stopped.
     """
-    from flows.cli.ingest import parse_names
+    from flows.cli.shared_options import parse_names
     from flows.cli.training import first_choices, run_training, train_parameters
     from flows.overrides import with_changes, with_overrides
 
@@ -249,7 +249,7 @@ def ablate(  # noqa: PLR0913 - the options of a command
 
     Small ones, or with --base one-step painters wired in different ways.
     """
-    from flows.cli.ingest import parse_names
+    from flows.cli.shared_options import parse_names
     from flows.cli.training import ablation_parameters, first_choices, run_ablation
     from flows.overrides import with_changes, with_overrides
 

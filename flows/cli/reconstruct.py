@@ -5,17 +5,15 @@ from typing import Annotated, Any
 import typer
 
 from flows.cli.output import Cell, format_bytes, print_json, print_pairs, print_table
-from flows.cli.shared_options import AsJson
+from flows.cli.shared_options import AsJson, DeviceName, Painter, Settings, parse_names
 from lidarpainter_models.errors import ConfigError
 
 
 def reconstruct(  # noqa: PLR0913 - the options of a command
     scene: Annotated[str, typer.Argument(help="dataset/sequence, as ingested.")],
     preset: Annotated[str, typer.Option(help="preview, balanced or paper.")] = "preview",
-    painter: Annotated[
-        str | None,
-        typer.Option(help="none, overlay, warp, nano, weights or a model; the preset's if absent."),
-    ] = None,
+    painter: Painter = None,
+    device: DeviceName = "auto",
     shift: Annotated[
         str | None, typer.Option(help="Metres to both sides to paint at, such as 2,3.")
     ] = None,
@@ -27,15 +25,11 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     train_cameras: Annotated[
         str | None, typer.Option(help="Cameras to train on, with commas between.")
     ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="Any other setting: fit.steps=500. May be repeated."),
-    ] = None,
+    settings: Settings = None,
     as_json: AsJson = False,
 ) -> None:
     """Turn a stored scene into a fitted, painted, judged and reported one."""
     from catalog.store import open_store
-    from flows.cli.ingest import parse_names
     from flows.cli.running import run_reconstruction
     from flows.overrides import with_changes, with_overrides
     from flows.presets import preset as preset_named
@@ -43,6 +37,7 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     parameters = preset_named(preset, scene)
     changes: dict[str, Any] = {
         "painter": painter,
+        "device": device,
         "rounds": rounds,
         "split": split,
         "train_cameras": parse_names(train_cameras),
@@ -74,7 +69,7 @@ def shifted(novel: Any, shift: str | None, up: str | None) -> Any:  # noqa: ANN4
 
 def show(result: dict[str, Any]) -> None:
     """The result as tables."""
-    from tasks.evaluation.scores import SCORE_COLUMNS, SCORE_NOTE, score_rows
+    from lidarpainter_models.evaluation.score_tables import SCORE_COLUMNS, SCORE_NOTE, score_rows
 
     title = f"{result['scene']}, painter {result['painter']}"
     print_table(title, SCORE_COLUMNS, score_rows(result), SCORE_NOTE)

@@ -6,7 +6,15 @@ from typing import Annotated
 import typer
 
 from flows.cli.output import print_json, print_pairs
-from flows.cli.shared_options import AsJson, FollowedCamera, FollowedFrames, RunName, TrajectorySpec
+from flows.cli.shared_options import (
+    AsJson,
+    FollowedCamera,
+    FollowedFrames,
+    RunName,
+    TrajectorySpec,
+    parse_frames,
+    parse_previous,
+)
 
 
 def render(  # noqa: PLR0913 - the options of a command
@@ -32,41 +40,28 @@ def render(  # noqa: PLR0913 - the options of a command
 ) -> None:
     """Render a finished run where nobody drove."""
     from catalog.store import open_store
-    from flows.cli.flicker import parse_previous
-    from flows.cli.ingest import parse_frames
     from flows.cli.progress import shown_progress
-    from flows.parameters import view_parameters
+    from flows.views import PathRequest, render_run
     from lidarpainter_models.conditioning.sequences import SequenceConfig
     from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
-    from tasks.runs import open_run
-    from tasks.views.render import RenderRequest
-    from tasks.views.render import render as render_task
 
-    path = parse_trajectory(trajectory)
-    store = open_store()
-    finished = open_run(store, run)
-    parameters = view_parameters(finished)
-    request = RenderRequest(
-        trajectory=path,
+    path = PathRequest(
+        run=run,
+        trajectory=parse_trajectory(trajectory),
         camera=camera,
         frames=parse_frames(frames),
-        painter=(painter or parameters.painter) if postpaint or painter else None,
-        prompt=prompt,
-        sequence=SequenceConfig() if previous is None else parse_previous(previous)[0],
-        observation=parameters.observation,
-        conditions=parameters.conditions,
+        is_painted=postpaint or painter is not None,
+        painter=painter,
     )
     with shown_progress():
-        made = render_task.fn(store.root, finished, request, out.absolute())
-    result = {
-        "run_id": finished.run_id,
-        "trajectory": path.spec,
-        "painter": request.painter,
-        "prompt": request.prompt,
-        "previous": request.sequence.previous,
-        **made,
-    }
+        result = render_run(
+            open_store(),
+            path,
+            out.absolute(),
+            prompt=prompt,
+            sequence=SequenceConfig() if previous is None else parse_previous(previous)[0],
+        )
     if as_json:
         print_json(result)
     else:
-        print_pairs(f"images of {finished.scene_id}", result)
+        print_pairs(f"images of {result['scene']}", result)

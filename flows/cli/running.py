@@ -7,11 +7,14 @@ from typing import Any
 from catalog.store import Store
 from flows.cli.progress import shown_progress
 from flows.parameters import ReconstructParameters
+from flows.recall import recalled
 from flows.server import prefect_server
 
 
 def run_reconstruction(parameters: ReconstructParameters, store: Store) -> dict[str, Any]:
-    """Reconstruct one scene of the store."""
+    """Reconstruct one scene of the store; what is known already is not asked of a server."""
+    if (known := recalled(parameters, store.root)) is not None:
+        return known
     from flows.reconstruct import check_inputs, reconstruct
 
     check_inputs(parameters, store.root)  # before a server is started for nothing

@@ -1,9 +1,28 @@
-"""Options that several commands have, with the same meaning in each."""
+"""Options that several commands have, with the same meaning in each, and how they are read."""
 
-from typing import Annotated
+import re
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 
+from lidarpainter_models.errors import ConfigError
+
+if TYPE_CHECKING:
+    from lidarpainter_models.conditioning.sequences import SequenceConfig
+
+RANGE = re.compile(r"(\d*):(\d*)")
+
+Painter = Annotated[
+    str | None,
+    typer.Option(help="none, overlay, warp, nano, weights or a model; the preset's if absent."),
+]
+DeviceName = Annotated[
+    str, typer.Option(help="auto, cpu or cuda: what the painter runs on; auto takes a GPU if any.")
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Any other setting: fit.steps=500. May be repeated."),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 RunName = Annotated[str, typer.Argument(help="A run id, a unique prefix of one, or latest.")]
 TrajectorySpec = Annotated[
@@ -15,3 +34,51 @@ FollowedCamera = Annotated[
 FollowedFrames = Annotated[
     str | None, typer.Option(help="Recorded frames A:B to follow, B excluded.")
 ]
+
+
+def parse_frames(text: str | None) -> slice | None:
+    """`A:B`, `A:` or `:B` as a slice of frames.
+
+    Raises:
+        ConfigError: the text says something else.
+    """
+    if text is None:
+        return None
+    match = RANGE.fullmatch(text)
+    if match is None:
+        raise ConfigError(f"frames {text!r}: expected A:B, such as 0:17")
+    start, stop = (int(part) if part else None for part in match.groups())
+    if stop is not None and stop <= (start or 0):
+        raise ConfigError(f"frames {text!r}: expected A < B")
+    return slice(start, stop)
+
+
+def parse_names(text: str | None) -> tuple[str, ...] | None:
+    """Names with commas between.
+
+    Raises:
+        ConfigError: a name is empty.
+    """
+    if text is None:
+        return None
+    names = tuple(name.strip() for name in text.split(","))
+    if not all(names):
+        raise ConfigError(f"{text!r}: expected names with commas between")
+    return names
+
+
+def parse_previous(text: str | None) -> tuple["SequenceConfig", ...]:
+    """What becomes of the frame before: `mixed`, `shown`, or both with a comma between.
+
+    Raises:
+        ConfigError: the text says something else.
+    """
+    from lidarpainter_models.conditioning.sequences import PreviousUse, SequenceConfig
+
+    if text is None:
+        return ()
+    names = dict.fromkeys(name.strip() for name in text.split(","))
+    uses: dict[str, PreviousUse] = {use: use for use in get_args(PreviousUse)}
+    if not names.keys() <= uses.keys():
+        raise ConfigError(f"--previous {text!r}: expected {', '.join(uses)}")
+    return tuple(SequenceConfig(previous=uses[name]) for name in names)

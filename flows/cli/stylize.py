@@ -6,7 +6,14 @@ from typing import Annotated, Any
 import typer
 
 from flows.cli.output import print_json, print_pairs
-from flows.cli.shared_options import AsJson, FollowedCamera, FollowedFrames, RunName, TrajectorySpec
+from flows.cli.shared_options import (
+    AsJson,
+    FollowedCamera,
+    FollowedFrames,
+    RunName,
+    TrajectorySpec,
+    parse_frames,
+)
 
 
 def stylize(  # noqa: PLR0913 - the options of a command
@@ -29,39 +36,31 @@ def stylize(  # noqa: PLR0913 - the options of a command
     as_json: AsJson = False,
 ) -> None:
     """Show a finished run in another weather or at night, and how well its edges are kept."""
-    from dataclasses import replace
-
     from catalog.store import open_store
-    from flows.cli.ingest import parse_frames
     from flows.cli.progress import shown_progress
-    from flows.parameters import view_parameters
+    from flows.views import PathRequest, stylize_run
     from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
-    from tasks.runs import open_run
-    from tasks.views.render import RenderRequest
-    from tasks.views.stylize import StylizeRequest
-    from tasks.views.stylize import stylize as stylize_task
 
-    path = parse_trajectory(trajectory)
-    store = open_store()
-    finished = open_run(store, run)
-    parameters = view_parameters(finished)
-    observation = parameters.observation
-    if width is not None:
-        observation = replace(observation, width_px=width)
-    view = RenderRequest(
-        trajectory=path,
+    path = PathRequest(
+        run=run,
+        trajectory=parse_trajectory(trajectory),
         camera=camera,
         frames=parse_frames(frames),
+        is_painted=painter is not None,
         painter=painter,
-        observation=observation,
-        conditions=parameters.conditions,
     )
     asked: Any = images  # the request says which there are
-    request = StylizeRequest(prompt=prompt, view=view, images=asked, seed=seed)
     with shown_progress():
-        made = stylize_task.fn(store.root, finished, request, out.absolute())
-    result = {"run_id": finished.run_id, "prompt": prompt, "trajectory": path.spec, **made}
+        result = stylize_run(
+            open_store(),
+            path,
+            out.absolute(),
+            prompt=prompt,
+            images=asked,
+            width_px=width,
+            seed=seed,
+        )
     if as_json:
         print_json(result)
     else:
-        print_pairs(f"{prompt} images of {finished.scene_id}", result)
+        print_pairs(f"{prompt} images of {result['scene']}", result)

@@ -6,8 +6,8 @@ from typing import Any
 
 from catalog.store import open_store
 from flows.ablate_painter import AblationParameters, ablate_painter, check_ablation
-from flows.cli.ingest import parse_names
 from flows.cli.progress import shown_progress
+from flows.cli.shared_options import parse_names
 from flows.parameters import view_parameters
 from flows.server import prefect_server
 from flows.train_painter import (
@@ -160,5 +160,5 @@ def judged_fit(run: str) -> JudgedFit:
         run_id=finished.run_id,
         split=parameters.split_spec,
         fitted=finished.unpainted,
-        settings=parameters.judge_settings,
+        settings=parameters.judge_config,
     )

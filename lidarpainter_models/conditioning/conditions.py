@@ -6,7 +6,7 @@ named whose exposure all of them then take.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
@@ -88,6 +88,11 @@ class ConditionBuilder:
     def recorded_cameras(self) -> tuple[Camera, ...]:
         """The training views' cameras at their refined poses."""
         return tuple(self._cameras.values())
+
+    @property
+    def refined_views(self) -> list[TrainingView]:
+        """The training views with their cameras where the fit found them to be."""
+        return [replace(view, camera=self._cameras[key]) for key, view in self._views.items()]
 
     def source(self, key: ViewKey) -> SourceImage:
         """A training image with the surfaces it shows, colours before its exposure."""

@@ -6,11 +6,11 @@ the log's own. The two are reported side by side and never mixed.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from lidarpainter_models.evaluation.judged_views import JudgedView, actor_mask
@@ -24,6 +24,7 @@ from lidarpainter_models.observations.observations import (
     shrink_image,
 )
 from lidarpainter_models.scenes.driving_scene import DrivingScene, RecordedView
+from lidarpainter_models.scenes.records import ViewKey
 from lidarpainter_models.synthetic.street import SyntheticStreet
 
 Poses = Literal["interpolated", "recorded"]
@@ -36,6 +37,18 @@ class HeldOut:
     scene: DrivingScene
     test_views: Sequence[RecordedView]
     observation: ObservationConfig
+    _images_u8: dict[ViewKey, UInt8[Tensor, "height width 3"]] = field(
+        default_factory=dict, repr=False, compare=False
+    )
+
+    def image_of(self, view: RecordedView) -> Float[Tensor, "height width 3"]:
+        """The recorded image at fit size, decoded at the first call."""
+        if view.key not in self._images_u8:
+            camera = fit_camera(view, self.observation)
+            self._images_u8[view.key] = shrink_image(
+                self.scene.read_image(view), width_px=camera.width_px, height_px=camera.height_px
+            )
+        return self._images_u8[view.key].float() / 255
 
     def camera_of(self, fitted: GaussianScene, view: RecordedView, poses: Poses) -> Camera:
         """The view's camera at fit size, at its recorded or its interpolated pose."""
@@ -58,15 +71,12 @@ class HeldOut:
         judged = []
         for view in self.test_views:
             camera = self.camera_of(fitted, view, poses)
-            image = shrink_image(
-                self.scene.read_image(view), width_px=camera.width_px, height_px=camera.height_px
-            )
             judged.append(
                 JudgedView(
                     name=f"{view.camera_name}/{view.frame_index}",
                     camera=camera,
                     timestamp_ns=view.timestamp_ns,
-                    truth_rgb=image.float() / 255,
+                    truth_rgb=self.image_of(view),
                     actor_mask=actor_mask(camera, self.scene.tracks, view.timestamp_ns),
                 )
             )

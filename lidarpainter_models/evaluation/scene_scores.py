@@ -4,14 +4,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from jaxtyping import Float
-from torch import Tensor
-
-from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.judged_views import Renderer, ViewScores, score_views
 from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
-from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectories import Shift
 from lidarpainter_models.metrics.depth import (
     DepthScores,
@@ -19,7 +14,6 @@ from lidarpainter_models.metrics.depth import (
     score_depth,
 )
 from lidarpainter_models.metrics.perceptual import PerceptualDistances
-from lidarpainter_models.painter.protocol import Painter
 from lidarpainter_models.synthetic.street import SyntheticStreet
 
 JUDGED_SHIFTS = (
@@ -37,27 +31,6 @@ class ScoringConfig:
     """Which trajectories are judged."""
 
     shifts: tuple[Shift, ...] = JUDGED_SHIFTS
-
-
-def scene_renderer(fitted: GaussianScene, camera_name: str | None = None) -> Renderer:
-    """The scene as it is, without painting."""
-
-    def render(camera: Camera, timestamp_ns: int) -> Float[Tensor, "height width 3"]:
-        return fitted.render(camera, timestamp_ns, camera_name=camera_name).rgb
-
-    return render
-
-
-def painted_renderer(
-    builder: ConditionBuilder, painter: Painter, camera_name: str | None = None
-) -> Renderer:
-    """The scene followed by a painter: painting at view time."""
-
-    def render(camera: Camera, timestamp_ns: int) -> Float[Tensor, "height width 3"]:
-        conditions = builder.conditions(camera, timestamp_ns, camera_name=camera_name)
-        return painter.paint(conditions).rgb
-
-    return render
 
 
 def _view_scores(scores: ViewScores | None) -> dict[str, Any]:

@@ -1,17 +1,61 @@
 """The views by which cameras left out of a fit judge it: see `strips` for what they measure."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from typing import Any
 
+from lidarpainter_models.errors import DataError
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.strips import StripView
+from lidarpainter_models.evaluation.judged_views import Renderer
+from lidarpainter_models.evaluation.shown import ShownScene
+from lidarpainter_models.evaluation.strips import StripView, calibrate_strip, score_strips
 from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
 from lidarpainter_models.geometry.transforms import invert_rigid
-from lidarpainter_models.observations.observations import fit_camera, shrink_image
+from lidarpainter_models.observations.observations import fit_camera
+from lidarpainter_models.scenes.splits import ViewSplit
 
 
-def judging_cameras(held_out: HeldOut, fitted_cameras: Sequence[str]) -> tuple[str, ...]:
-    """The scene's cameras that no fit has seen."""
-    return tuple(name for name in held_out.scene.camera_names if name not in fitted_cameras)
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StripJudgement:
+    """How fitted scenes are held against the cameras that their fit did not see."""
+
+    held_out: HeldOut
+    views: ViewSplit
+
+    @property
+    def fitted_camera(self) -> str:
+        """The camera that the others are held against."""
+        return self.views.train[0].camera_name
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The scene's cameras that no fit has seen."""
+        fitted = {view.camera_name for view in self.views.train}
+        return tuple(name for name in self.held_out.scene.camera_names if name not in fitted)
+
+    def scores(self, shown: ShownScene, progress: Callable[[int, int], None]) -> dict[str, Any]:
+        """Every camera's scores in the colours of the fitted one, or why there are none."""
+        scores, render = {}, shown.renderer(self.fitted_camera)
+        for done, name in enumerate(self.cameras, start=1):
+            scores[name] = self._score(shown.scene, render, name)
+            progress(done, len(self.cameras))
+        return scores
+
+    def _score(self, fitted: GaussianScene, render: Renderer, camera: str) -> dict[str, Any]:
+        def views_of(frames: tuple[int, ...]) -> list[StripView]:
+            return strip_views(
+                self.held_out,
+                fitted,
+                judging_camera=camera,
+                fitted_camera=self.fitted_camera,
+                frames=frames,
+            )
+
+        try:
+            calibration = calibrate_strip(render, views_of(self.views.train_frames))
+            return asdict(score_strips(render, views_of(self.views.test_frames), calibration))
+        except DataError as error:
+            return {"psnr": None, "psnr_reason": str(error)}
 
 
 def strip_views(
@@ -44,14 +88,11 @@ def strip_views(
         found_from_logged = found.world_from_camera @ invert_rigid(logged.world_from_camera)
         camera = fit_camera(own, held_out.observation)
         camera = camera.at(found_from_logged @ camera.world_from_camera)
-        image = shrink_image(
-            scene.read_image(own), width_px=camera.width_px, height_px=camera.height_px
-        )
         views.append(
             StripView(
                 camera=camera,
                 timestamp_ns=own.timestamp_ns,
-                truth_rgb=image.float() / 255,
+                truth_rgb=held_out.image_of(own),
                 fitted_camera=found,
                 points_world=held_out.points_at(own),
             )

@@ -9,7 +9,9 @@ Martin et al. (2004). Only pixels near LiDAR hits are judged, where the depth th
 was measured.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import fmean
 
 import cv2
 import numpy as np
@@ -140,3 +142,11 @@ def _share_near(edges: np.ndarray, others: np.ndarray, reach_px: int) -> float:
 def _grown(mask: np.ndarray, reach_px: int) -> np.ndarray:
     side = 2 * reach_px + 1
     return cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
+
+
+def mean_edge_scores(scores: Sequence[EdgeScores]) -> dict[str, float | None]:
+    """Means over images, `edge_` before their names; None where no image has edges near LiDAR."""
+    return {
+        f"edge_{name}": fmean(getattr(score, name) for score in scores) if scores else None
+        for name in ("f1", "precision", "recall", "judged_share")
+    }

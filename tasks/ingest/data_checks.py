@@ -13,7 +13,7 @@ from lidarpainter_models.export.images import write_png
 from lidarpainter_models.readers import ingest_scene, list_sequences
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from tasks.health import Finding
-from tasks.scenes import open_scene
+from tasks.opened import open_scene
 
 TRIAL_FRAMES = slice(0, 6)
 """A dataset is tried on this much of each sequence: enough to tell how its cameras are turned."""

@@ -27,8 +27,8 @@ from lidarpainter_models.training_data.harvest import (
 from lidarpainter_models.training_data.pairs import PairFolder, PairWriter
 from lidarpainter_models.training_data.street_harvest import StreetPlan, harvest_shifted_street
 from tasks.ingest.ingest import ingest_street
-from tasks.progress import listener
-from tasks.scenes import SplitSpec, open_scene, open_split
+from tasks.opened import SplitSpec, open_scene, open_split
+from tasks.progress import Progress, listener
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
 
 PAIRS_FOLDER = "pairs"
@@ -129,10 +129,10 @@ def _has_street(store: Store, scene_id: str, config: SyntheticStreetConfig) -> b
 
 def _writing_pairs(
     stage: str, harvest: Callable[[PairWriter, HarvestProgress], None]
-) -> Callable[[Workplace], dict[str, Any]]:
+) -> Callable[[Workplace, Progress], dict[str, Any]]:
     """A stage that keeps finished pairs in its scratch folder until all are there."""
 
-    def build(place: Workplace) -> dict[str, Any]:
+    def build(place: Workplace, _progress: Progress) -> dict[str, Any]:
         unfinished = place.scratch / PAIRS_FOLDER
         harvest(
             PairWriter(unfinished), lambda done, total: listener().advanced(stage, done, total, "")

@@ -24,7 +24,7 @@ from tasks.measuring import measured
 from tasks.painter.harvest import PairSet
 from tasks.painter.judged_fits import JudgedFit, open_fits
 from tasks.painter.painting_samples import write_samples
-from tasks.progress import listener
+from tasks.progress import Progress, listener
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
 
 SCORES_FILE = "painting-scores.json"
@@ -152,7 +152,7 @@ def judge_held_back(
     if feature_weights is not None:
         inputs["features"] = digest_file(feature_weights)[:DIGEST_LENGTH]
 
-    def build(place: Workplace) -> dict[str, Any]:
+    def build(place: Workplace, _progress: Progress) -> dict[str, Any]:
         painter = load_painter(weights)
         scores = _scores(painter, judged, distance, stage)
         write_json(place.output / SCORES_FILE, scores)

@@ -10,9 +10,8 @@ from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.judged_pairs import JudgedPairs, judged_pairs, unseen_views
-from tasks.evaluation.judging import known_street
-from tasks.evaluation.scene import JudgeSettings
-from tasks.scenes import SplitSpec, open_split
+from lidarpainter_models.evaluation.judging import JudgeConfig, known_street
+from tasks.opened import SplitSpec, open_split
 from tasks.stored import FittedRef, load_observations, load_scene
 
 
@@ -24,7 +23,7 @@ class JudgedFit:
     run_id: str
     split: SplitSpec
     fitted: FittedRef
-    settings: JudgeSettings
+    settings: JudgeConfig
 
     def open(self, trained: AbstractSet[str]) -> "OpenedFit":
         """Its pairs, by scene and trajectory, without frames that painters were trained on.

@@ -29,7 +29,7 @@ from tasks.json_files import finite_or_none, read_json, write_json
 from tasks.painter.harvest import PairSet
 from tasks.painter.judge import open_sets
 from tasks.painter.students import NO_FILES, PainterTraining, student_of
-from tasks.progress import listener
+from tasks.progress import Progress, listener
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
 
 WEIGHTS_SUFFIX = ".safetensors"
@@ -81,7 +81,7 @@ def train(  # noqa: PLR0913 - what a training stands on
         note = f"step {progress.step}" + ("" if loss is None else f", loss {loss:.4f}")
         listener().advanced(stage, progress.share_done, 1.0, note)
 
-    def build(place: Workplace) -> dict[str, Any]:
+    def build(place: Workplace, _progress: Progress) -> dict[str, Any]:
         for folder in folders.values():
             folder.verify()
         trained = student.learn(list(learnt.values()), place.scratch, told)

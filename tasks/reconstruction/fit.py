@@ -1,18 +1,20 @@
 """Fit Gaussians to observations, from scratch or on from a fitted scene with painted views."""
 
+from collections.abc import Callable
 from dataclasses import asdict
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 from prefect import task
 
 from catalog.artefacts import ArtefactRef, Workplace
-from catalog.store import Store, open_store
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import FitConfig
-from lidarpainter_models.gaussians.fitting.fit import FitResult, fit_gaussians
-from lidarpainter_models.gaussians.model.scene_graph import describe
-from tasks.progress import listener
+from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
+from lidarpainter_models.gaussians.model.scene_graph import GaussianScene, describe
+from lidarpainter_models.observations.observations import GuidanceView, SceneObservations
+from tasks.opened import RunSpec, opened
+from tasks.progress import Progress
 from tasks.reconstruction.painted_views import load_guidance
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
 from tasks.stored import load_observations, load_scene, save_scene
@@ -22,63 +24,67 @@ CHECKPOINT_EVERY_S = 10.0
 
 
 @task(**STAGE_OPTIONS)
-def fit(store_path: Path, observations: ArtefactRef, config: FitConfig) -> StageResult:
-    """Fit a scene to what was recorded."""
-    return _run(open_store(store_path), "fit", observations, config, None, None)
-
-
-@task(**STAGE_OPTIONS)
-def refine(
-    store_path: Path,
-    stage: str,
-    observations: ArtefactRef,
-    start: ArtefactRef,
-    guidance: ArtefactRef | None,
-    config: FitConfig,
-) -> StageResult:
-    """Go on fitting, with painted views or, as an equally long control, without."""
-    return _run(open_store(store_path), stage, observations, config, start, guidance)
-
-
-def _run(
-    store: Store,
+def fit(
+    run: RunSpec,
     stage: str,
     observations: ArtefactRef,
     config: FitConfig,
-    start: ArtefactRef | None,
-    guidance: ArtefactRef | None,
+    *,
+    start: ArtefactRef | None = None,
+    guidance: ArtefactRef | None = None,
 ) -> StageResult:
+    """Fit a scene to what was recorded.
+
+    Args:
+        run: whose scene it is.
+        stage: name of this fit.
+        observations: what was recorded.
+        config: see there.
+        start: the fitted scene to go on from; None starts from the LiDAR map.
+        guidance: painted views to go on with; None, for an equally long control, has none.
+    """
+    this = opened(run)
     inputs = {"observations": observations, "start": start, "guidance": guidance}
-
-    def told(step: int, steps: int, entry: dict[str, float]) -> None:
-        note = f"{entry['psnr']:.2f} dB, {entry['num_gaussians'] / 1000:.0f}k Gaussians"
-        listener().advanced(stage, step, steps, note)
-
-    def build(place: Workplace) -> dict[str, Any]:
-        result = fit_gaussians(
-            load_observations(store, observations),
-            config,
-            start=load_scene(store, start) if start else None,
-            guidance=load_guidance(store, guidance) if guidance else (),
-            checkpoints=CheckpointFolder(
-                path=place.scratch, identity=place.scratch.name, every_seconds=CHECKPOINT_EVERY_S
-            ),
-            progress=told,
-        )
-        save_scene(place.output, result.scene, result.history)
-        return _summary(result)
-
     return run_stage(
-        store,
+        this.store,
         stage=stage,
         kind="gaussians",
         inputs={name: ref.digest for name, ref in inputs.items() if ref is not None},
         config=asdict(config),
-        build=build,
+        build=partial(
+            _build,
+            observations=partial(load_observations, this.store, observations),
+            start=partial(load_scene, this.store, start) if start is not None else None,
+            guidance=partial(load_guidance, this.store, guidance) if guidance is not None else None,
+            config=config,
+        ),
     )
 
 
-def _summary(result: FitResult) -> dict[str, Any]:
+def _build(
+    place: Workplace,
+    progress: Progress,
+    *,
+    observations: Callable[[], SceneObservations],
+    start: Callable[[], GaussianScene] | None,
+    guidance: Callable[[], tuple[GuidanceView, ...]] | None,
+    config: FitConfig,
+) -> dict[str, Any]:
+    def told(step: int, steps: int, entry: dict[str, float]) -> None:
+        note = f"{entry['psnr']:.2f} dB, {entry['num_gaussians'] / 1000:.0f}k Gaussians"
+        progress(step, steps, note)
+
+    result = fit_gaussians(
+        observations(),
+        config,
+        start=start().copy() if start else None,  # the fit moves what it is given
+        guidance=guidance() if guidance else (),
+        checkpoints=CheckpointFolder(
+            path=place.scratch, identity=place.scratch.name, every_seconds=CHECKPOINT_EVERY_S
+        ),
+        progress=told,
+    )
+    save_scene(place.output, result.scene, result.history)
     last = result.history[-1]
     return {
         **describe(result.scene),

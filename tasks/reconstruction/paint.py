@@ -1,109 +1,100 @@
 """Paint views that nobody recorded, to guide the fit on."""
 
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 from prefect import task
 
 from catalog.artefacts import Workplace
-from catalog.store import open_store
-from lidarpainter_models.conditioning.conditions import ConditionBuilder, ConditionConfig
+from lidarpainter_models.conditioning.conditions import ConditionConfig
 from lidarpainter_models.conditioning.novel_guidance import (
     NovelGuidanceConfig,
     NovelPainting,
     novel_cameras,
     paint_novel_views,
 )
-from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
-from lidarpainter_models.observations.observations import TrainingView
-from lidarpainter_models.painter import load_painter
-from tasks.painter.painters import painter_digest
-from tasks.progress import listener
+from lidarpainter_models.evaluation.shown import ViewTimePainting
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from tasks.evaluation.shown import view_time_painting
+from tasks.opened import RunSpec, opened
+from tasks.progress import Progress
 from tasks.reconstruction.painted_views import save_guidance
-from tasks.scenes import open_scene
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
-from tasks.stored import FittedRef, load_observations, load_scene
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PaintSettings:
-    """How novel views are painted."""
-
-    painter: str
-    """Name of a painter or path of its weights."""
-    novel: NovelGuidanceConfig
-    conditions: ConditionConfig
+from tasks.stored import FittedRef
 
 
 @task(**STAGE_OPTIONS)
 def paint(
-    store_path: Path,
+    run: RunSpec,
     stage: str,
-    scene_id: str,
     fitted: FittedRef,
-    settings: PaintSettings,
+    novel: NovelGuidanceConfig,
+    conditions: ConditionConfig,
+    *,
     start_frame: int,
 ) -> StageResult:
     """Render shifted views of a fitted scene, paint them and weigh every pixel.
 
     Args:
-        store_path: the store.
+        run: whose recorded path is shifted, and who paints.
         stage: name of this round's painting.
-        scene_id: whose recorded path is shifted.
         fitted: what is rendered.
-        settings: see there.
+        novel: which views.
+        conditions: what the painter is shown of them.
         start_frame: training frame counted from, so that rounds paint different frames.
     """
-    store = open_store(store_path)
-    recorded = open_scene(store, scene_id)
-
-    def build(place: Workplace) -> dict[str, Any]:
-        seen = load_observations(store, fitted.observations)
-        scene = load_scene(store, fitted.gaussians)
-        builder = ConditionBuilder(scene, seen.lidar_map, seen.views, config=settings.conditions)
-        cameras = novel_cameras(
-            [refined_view(scene, view) for view in seen.views],
-            recorded.frame_indices,
-            recorded.world_from_ego,
-            config=settings.novel,
-            start=start_frame,
-        )
-        paintings = paint_novel_views(
-            builder,
-            load_painter(settings.painter),
-            cameras,
-            config=settings.novel,
-            progress=lambda done, total: listener().advanced(stage, done, total, ""),
-        )
-        save_guidance(place.output, paintings)
-        return _summary(paintings, len(cameras))
-
+    this = opened(run)
     return run_stage(
-        store,
+        this.store,
         stage=stage,
         kind="guidance",
         inputs={
-            "scene": recorded.content_digest,
+            "scene": this.scene.content_digest,
             "observations": fitted.observations.digest,
             "gaussians": fitted.gaussians.digest,
-            "painter": painter_digest(settings.painter),
+            "painter": this.painter.digest,
         },
-        config={
-            "novel": asdict(settings.novel),
-            "conditions": asdict(settings.conditions),
-            "start": start_frame,
-        },
-        build=build,
+        config={"novel": asdict(novel), "conditions": asdict(conditions), "start": start_frame},
+        build=partial(
+            _build,
+            scene=this.scene,
+            painting=partial(
+                view_time_painting, this.store, fitted, conditions, this.painter, this.device
+            ),
+            novel=novel,
+            start_frame=start_frame,
+        ),
     )
 
 
-def refined_view(scene: GaussianScene, view: TrainingView) -> TrainingView:
-    """A training view with its camera where the fit found it to be."""
-    camera = scene.corrected_camera(
-        view.camera, timestamp_ns=view.timestamp_ns, camera_name=view.key[1], key=view.key
+def _build(
+    place: Workplace,
+    progress: Progress,
+    *,
+    scene: DrivingScene,
+    painting: Callable[[], ViewTimePainting],
+    novel: NovelGuidanceConfig,
+    start_frame: int,
+) -> dict[str, Any]:
+    shown = painting()
+    cameras = novel_cameras(
+        shown.conditions.refined_views,
+        scene.frame_indices,
+        scene.world_from_ego,
+        config=novel,
+        start=start_frame,
     )
-    return replace(view, camera=camera)
+    paintings = paint_novel_views(
+        shown.conditions,
+        shown.painter.load(shown.device),
+        cameras,
+        config=novel,
+        progress=progress,
+    )
+    save_guidance(place.output, paintings)
+    return _summary(paintings, len(cameras))
 
 
 def _summary(paintings: list[NovelPainting], num_cameras: int) -> dict[str, Any]:

@@ -1,16 +1,17 @@
 """Bring a stored scene into the form that a fit reads."""
 
 from dataclasses import asdict
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 from prefect import task
 
 from catalog.artefacts import Workplace
-from catalog.store import open_store
 from lidarpainter_models.observations.observations import ObservationConfig, prepare_observations
-from tasks.progress import listener
-from tasks.scenes import SplitSpec, open_split
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.splits import ViewSplit
+from tasks.opened import RunSpec, opened
+from tasks.progress import Progress
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
 from tasks.stored import save_observations
 
@@ -18,31 +19,36 @@ STAGE = "prepare"
 
 
 @task(**STAGE_OPTIONS)
-def prepare(store_path: Path, split: SplitSpec, config: ObservationConfig) -> StageResult:
+def prepare(run: RunSpec, config: ObservationConfig) -> StageResult:
     """Read images, sweeps and boxes of the training side into one artefact."""
-    store = open_store(store_path)
-    scene, views = open_split(store, split)
-
-    def build(place: Workplace) -> dict[str, Any]:
-        observations = prepare_observations(
-            scene,
-            views,
-            config,
-            progress=lambda done, total: listener().advanced(STAGE, done, total, ""),
-        )
-        save_observations(place.output, observations)
-        return {
-            "num_views": len(observations.views),
-            "num_test_views": len(views.test),
-            "num_tracks": len(observations.tracks),
-            "num_street_points": len(observations.lidar_map.street.xyz_m),
-        }
-
+    this = opened(run)
     return run_stage(
-        store,
+        this.store,
         stage=STAGE,
         kind="observations",
-        inputs={"scene": scene.content_digest},
-        config={"split": split.spec, "cameras": split.cameras, "observation": asdict(config)},
-        build=build,
+        inputs={"scene": this.scene.content_digest},
+        config={
+            "split": run.split.spec,
+            "cameras": run.split.cameras,
+            "observation": asdict(config),
+        },
+        build=partial(_build, scene=this.scene, views=this.views, config=config),
     )
+
+
+def _build(
+    place: Workplace,
+    progress: Progress,
+    *,
+    scene: DrivingScene,
+    views: ViewSplit,
+    config: ObservationConfig,
+) -> dict[str, Any]:
+    observations = prepare_observations(scene, views, config, progress=progress)
+    save_observations(place.output, observations)
+    return {
+        "num_views": len(observations.views),
+        "num_test_views": len(views.test),
+        "num_tracks": len(observations.tracks),
+        "num_street_points": len(observations.lidar_map.street.xyz_m),
+    }

@@ -11,47 +11,45 @@ from prefect import task
 import lidarpainter_models
 from catalog.artefacts import ArtefactRef
 from catalog.digests import canonical_json, plain
-from catalog.records import MetricRecord, RunRecord, metric_rows, run_id_of
+from catalog.records import MetricRecord, RunRecord, metric_rows
 from catalog.store import Store, open_store
-from tasks.evaluation.scene import evaluate
-from tasks.evaluation.scores import metric_values
+from lidarpainter_models.evaluation.score_tables import metric_values
 from tasks.json_files import finite_or_none
-from tasks.reconstruction.fit import fit, refine
-from tasks.reconstruction.paint import paint
-from tasks.reconstruction.prepare import prepare
-from tasks.reconstruction.report import write_report
-from tasks.scenes import open_scene
-from tasks.stages import STAGE_OPTIONS, code_digest
-
-STAGES = (prepare, fit, refine, paint, evaluate, write_report)
-"""What a run is made by: its id follows their code."""
+from tasks.opened import RunSpec, opened
+from tasks.stages import STAGE_OPTIONS
 
 
 @task(**STAGE_OPTIONS)
-def begin_run(store_path: Path, parameters: Any, device: str) -> RunRecord:  # noqa: ANN401
-    """Enter a run as running; the same scene content, parameters and code are the same run.
+def begin_run(
+    run: RunSpec,
+    run_id: str,
+    source_digest: str,
+    preset: str,
+    parameters: Any,  # noqa: ANN401 - anything with a canonical form
+) -> RunRecord:
+    """Enter a run as running.
 
     Args:
-        store_path: the store.
-        parameters: the flow's parameters, with `scene`, `preset` and `painter`.
-        device: what the fit runs on.
+        run: what it works on.
+        run_id: its identity; the same run entered again takes the place of the first.
+        source_digest: of the code behind it.
+        preset: name of the preset it started from.
+        parameters: all of them.
     """
-    store = open_store(store_path)
-    scene = open_scene(store, parameters.scene)
-    source_digest = code_digest(*(stage.fn for stage in STAGES))
+    this = opened(run)
     record = RunRecord(
-        run_id=run_id_of(scene.content_digest, parameters, source_digest),
-        scene_id=parameters.scene,
-        scene_digest=scene.content_digest,
-        preset=parameters.preset,
-        painter=parameters.painter,
+        run_id=run_id,
+        scene_id=run.split.scene_id,
+        scene_digest=this.scene.content_digest,
+        preset=preset,
+        painter=run.painter,
         parameters=canonical_json(plain(parameters)),
         source_digest=source_digest,
         software_version=lidarpainter_models.__version__,
         started_at=datetime.now(UTC),
-        device=device,
+        device=str(this.device),
     )
-    store.tables.merge("runs", [record.row()])
+    this.store.tables.merge("runs", [record.row()])
     return record
 
 
@@ -75,7 +73,7 @@ def complete_run(
     Args:
         store_path: the store.
         record: as it was begun.
-        result: what the command prints.
+        result: what the command prints, with names relative to the store for paths.
         scores: evaluations by variant (`unpainted`, `painted`, ...).
         artefacts: everything made or reused.
 

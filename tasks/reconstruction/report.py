@@ -1,28 +1,28 @@
 """Write the page about a run: images, tables, curves, provenance."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 from prefect import task
 
 import lidarpainter_models
 from catalog.artefacts import ArtefactRef, Workplace
-from catalog.store import Store, open_store
-from lidarpainter_models.conditioning.conditions import ConditionBuilder
+from catalog.store import Store
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.export.report import Comparison, Report, render_report
-from lidarpainter_models.painter import load_painter
-from lidarpainter_models.synthetic.street import SyntheticStreet
-from tasks.evaluation.judging import GENERATOR_ENTRY
-from tasks.evaluation.scene import JudgeSettings
-from tasks.painter.painters import painter_digest
-from tasks.reconstruction.comparisons import Subject, comparisons
-from tasks.reconstruction.report_figures import plots, tables
-from tasks.scenes import SplitSpec, open_split
+from lidarpainter_models.evaluation.judging import JudgeConfig
+from lidarpainter_models.evaluation.shown import ViewTimePainting
+from lidarpainter_models.export.comparisons import Subject, comparisons
+from lidarpainter_models.export.report import render_report
+from lidarpainter_models.export.run_page import RunPage, StageCost
+from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
+from lidarpainter_models.geometry.trajectories import Shift
+from tasks.evaluation.shown import view_time_painting
+from tasks.opened import OpenedRun, RunSpec, opened
+from tasks.progress import Progress
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
-from tasks.stored import FittedRef, load_observations, load_scene
+from tasks.stored import FittedRef, History, load_history, load_scene
 
 REPORT_FILE = "report.html"
 
@@ -33,85 +33,87 @@ class ReportInputs:
 
     result: Mapping[str, Any]
     """What the command prints."""
-    split: SplitSpec
-    settings: JudgeSettings
-    painter: str
+    source_digest: str
+    """Of the code behind the run."""
     unpainted: FittedRef
     final: FittedRef
     stages: Mapping[str, StageResult]
 
 
 @task(**STAGE_OPTIONS)
-def write_report(store_path: Path, inputs: ReportInputs) -> StageResult:
+def write_report(run: RunSpec, inputs: ReportInputs, config: JudgeConfig) -> StageResult:
     """Write the report of a run as an artefact."""
-    store = open_store(store_path)
-
-    def build(place: Workplace) -> dict[str, Any]:
-        report = Report(
-            title=f"LidarPainter: {inputs.result['scene']}",
-            summary=_summary(inputs),
-            comparisons=_comparisons(store, inputs),
-            tables=tables(inputs.result, inputs.stages),
-            plots=plots(inputs.stages),
-            provenance=_provenance(store, inputs),
-        )
-        (place.output / REPORT_FILE).write_text(render_report(report), "utf-8")
-        return {}
-
+    this = opened(run)
+    stages = inputs.stages
+    fits = {name: made.ref for name, made in stages.items() if made.ref.kind == "gaussians"}
     return run_stage(
-        store,
+        this.store,
         stage="report",
         kind="report",
-        inputs={name: stage.ref.digest for name, stage in inputs.stages.items()}
-        | {"painter": painter_digest(inputs.painter)},
+        inputs={name: stage.ref.digest for name, stage in stages.items()}
+        | {"painter": this.painter.digest},
         config={"run": inputs.result["run_id"]},
-        build=build,
-    )
-
-
-def report_path(ref: ArtefactRef) -> Path:
-    """Where the page of a report artefact lies."""
-    return ref.folder / REPORT_FILE
-
-
-def _comparisons(store: Store, inputs: ReportInputs) -> list[Comparison]:
-    recorded, views = open_split(store, inputs.split)
-    judged = views.test or views.train
-    seen = load_observations(store, inputs.final.observations)
-    final = load_scene(store, inputs.final.gaussians)
-    has_truth = GENERATOR_ENTRY in recorded.manifest
-    subject = Subject(
-        held_out=HeldOut(
-            scene=recorded, test_views=judged, observation=inputs.settings.observation
+        build=partial(
+            _build,
+            page=RunPage(
+                result=inputs.result,
+                costs=[_cost(name, made) for name, made in stages.items()],
+                provenance=_provenance(this, inputs),
+            ),
+            histories=partial(_histories, this.store, fits),
+            held_out=this.held_out(config.observation, or_train=True),
+            shifts=config.scoring.shifts,
+            unpainted=partial(load_scene, this.store, inputs.unpainted.gaussians),
+            painting=partial(
+                view_time_painting,
+                this.store,
+                inputs.final,
+                config.conditions,
+                this.painter,
+                this.device,
+            ),
         ),
-        unpainted=load_scene(store, inputs.unpainted.gaussians),
-        final=final,
-        final_builder=ConditionBuilder(
-            final, seen.lidar_map, seen.views, config=inputs.settings.conditions
-        ),
-        painter=load_painter(inputs.painter),
-        street=SyntheticStreet.from_manifest(recorded.manifest) if has_truth else None,
-    )
-    return comparisons(subject, inputs.settings.scoring.shifts)
-
-
-def _summary(inputs: ReportInputs) -> str:
-    result = inputs.result
-    rounds = "1 round" if result["rounds"] == 1 else f"{result['rounds']} rounds"
-    return (
-        f"Preset {result['preset']}, painter {result['painter']}, split {result['split']}, "
-        f"{result['num_gaussians']} Gaussians. Painted means: after {rounds} of "
-        "painting shifted views and fitting on with them."
     )
 
 
-def _provenance(store: Store, inputs: ReportInputs) -> dict[str, str]:
-    recorded, _views = open_split(store, inputs.split)
+def _build(
+    place: Workplace,
+    _progress: Progress,
+    *,
+    page: RunPage,
+    histories: Callable[[], dict[str, History]],
+    held_out: HeldOut,
+    shifts: Sequence[Shift],
+    unpainted: Callable[[], GaussianScene],
+    painting: Callable[[], ViewTimePainting],
+) -> dict[str, Any]:
+    subject = Subject(held_out=held_out, unpainted=unpainted(), painting=painting())
+    report = page.report(comparisons(subject, shifts), histories())
+    (place.output / REPORT_FILE).write_text(render_report(report), "utf-8")
+    return {}
+
+
+def _cost(name: str, stage: StageResult) -> StageCost:
+    return StageCost(
+        stage=name,
+        seconds=stage.seconds,
+        cpu_seconds=stage.cpu_seconds,
+        peak_memory_bytes=stage.peak_memory_bytes,
+        artefact=stage.ref.digest,
+    )
+
+
+def _histories(store: Store, fits: Mapping[str, ArtefactRef]) -> dict[str, History]:
+    return {name: load_history(store, ref) for name, ref in fits.items()}
+
+
+def _provenance(this: OpenedRun, inputs: ReportInputs) -> dict[str, str]:
     return {
         "run": inputs.result["run_id"],
         "scene": inputs.result["scene"],
-        "scene content": recorded.content_digest,
-        "licence of the data": recorded.manifest["licence"],
-        "painter": f"{inputs.painter} ({painter_digest(inputs.painter)})",
+        "scene content": this.scene.content_digest,
+        "licence of the data": this.scene.manifest["licence"],
+        "painter": f"{this.spec.painter} ({this.painter.digest})",
         "software": f"lidarpainter {lidarpainter_models.__version__}",
+        "source": inputs.source_digest,
     }

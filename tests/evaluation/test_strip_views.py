@@ -6,9 +6,10 @@ from gaussian_world import scene_trained_on
 from toy_street import ToyStreet
 
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.strip_views import judging_cameras, strip_views
+from lidarpainter_models.evaluation.strip_views import StripJudgement, strip_views
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.observations.observations import ObservationConfig
+from lidarpainter_models.scenes.splits import split_views
 
 SIDE = ("front", 1.0), ("side", 0.8)
 MOTION = torch.tensor([0.0, 0.02, 0.01, 0.1, 0.0, 0.05], dtype=torch.float64)
@@ -38,7 +39,8 @@ def side_poses(street, fitted, frames):
 
 
 def test_only_cameras_that_no_fit_saw_judge(street):
-    assert judging_cameras(held_out(street), ("front",)) == ("side",)
+    views = split_views(street, "alternate", ("front",))
+    assert StripJudgement(held_out=held_out(street), views=views).cameras == ("side",)
 
 
 def test_uncorrected_fit_leaves_the_judging_camera_where_the_log_says(street):

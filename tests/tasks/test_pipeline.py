@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import pytest
@@ -14,22 +13,22 @@ from catalog.store import open_store
 from lidarpainter_models.conditioning.sequences import SequenceConfig
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.evaluation.scene_scores import ScoringConfig
+from lidarpainter_models.evaluation.score_tables import flicker_by_image, metric_values
 from lidarpainter_models.geometry.trajectories import Shift
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.metrics import lpips
 from lidarpainter_models.metrics.backbones import SQUEEZENET
-from tasks.evaluation.flicker import by_image, evaluate_flicker
-from tasks.evaluation.scene import evaluate
-from tasks.evaluation.scores import load_scores, metric_values
+from tasks.evaluation.flicker import evaluate_flicker
+from tasks.evaluation.views import evaluate, load_scores
 from tasks.ingest.ingest import record_scene
 from tasks.painter.judge import judge_painters
 from tasks.painter.judged_fits import JudgedFit
-from tasks.reconstruction.fit import fit, refine
+from tasks.reconstruction.fit import fit
 from tasks.reconstruction.paint import paint
 from tasks.reconstruction.painted_views import load_guidance
 from tasks.reconstruction.prepare import prepare
 from tasks.reconstruction.publish import begin_run, complete_run, fail_run
-from tasks.reconstruction.report import ReportInputs, report_path, write_report
+from tasks.reconstruction.report import REPORT_FILE, ReportInputs, write_report
 from tasks.runs import open_run
 from tasks.stored import FittedRef, load_history, load_scene
 from tasks.views.render import RenderRequest, render
@@ -51,24 +50,24 @@ def parameters():
 @pytest.fixture(scope="module")
 def stages(store, parameters):
     """Every stage's result by its name."""
-    root = store.root
-    seen = prepare.fn(root, parameters.split_spec, parameters.observation)
-    first = fit.fn(root, seen.ref, parameters.fit)
+    run = parameters.run_spec(store.root)
+    seen = prepare.fn(run, parameters.observation)
+    first = fit.fn(run, "fit", seen.ref, parameters.fit)
     fitted = FittedRef(seen.ref, first.ref)
-    painted = paint.fn(root, "paint-1", TOY_SCENE, fitted, parameters.paint_settings, 0)
-    refined = refine.fn(root, "refine-1", seen.ref, first.ref, painted.ref, parameters.refine)
-    final = FittedRef(seen.ref, refined.ref)
-    split, settings = parameters.split_spec, parameters.judge_settings
+    novel, conditions = parameters.novel, parameters.conditions
+    painted = paint.fn(run, "paint-1", fitted, novel, conditions, start_frame=0)
+    refined = fit.fn(
+        run, "refine-1", seen.ref, parameters.refine, start=first.ref, guidance=painted.ref
+    )
+    final, config = FittedRef(seen.ref, refined.ref), parameters.judge_config
     return {
         "prepare": seen,
         "fit": first,
         "paint-1": painted,
         "refine-1": refined,
-        "evaluate-unpainted": evaluate.fn(root, "evaluate-unpainted", split, fitted, settings),
-        "evaluate": evaluate.fn(root, "evaluate", split, final, settings),
-        "evaluate-view-time": evaluate.fn(
-            root, "evaluate-view-time", split, final, settings, "warp"
-        ),
+        "evaluate-unpainted": evaluate.fn(run, "evaluate-unpainted", fitted, config),
+        "evaluate": evaluate.fn(run, "evaluate", final, config),
+        "evaluate-view-time": evaluate.fn(run, "evaluate-view-time", final, config, view_time=True),
     }
 
 
@@ -80,10 +79,11 @@ def final(stages):
 @pytest.fixture(scope="module")
 def run(store, parameters, stages, final):
     """A complete run with its report."""
-    record = begin_run.fn(store.root, parameters, "cpu")
+    asked = parameters.run_spec(store.root)
+    record = begin_run.fn(asked, "a" * 16, "b" * 32, "preview", parameters)
     scores = {
-        "unpainted": load_scores(stages["evaluate-unpainted"].ref),
-        "painted": load_scores(stages["evaluate"].ref),
+        "unpainted": load_scores(store, stages["evaluate-unpainted"].ref),
+        "painted": load_scores(store, stages["evaluate"].ref),
     }
     result = {
         "run_id": record.run_id,
@@ -99,19 +99,15 @@ def run(store, parameters, stages, final):
         "unpainted": scores["unpainted"],
         "guidance": {"paint-1": stages["paint-1"].summary},
     }
-    report = write_report.fn(
-        store.root,
-        ReportInputs(
-            result=result,
-            split=parameters.split_spec,
-            settings=parameters.judge_settings,
-            painter="warp",
-            unpainted=FittedRef(stages["prepare"].ref, stages["fit"].ref),
-            final=final,
-            stages=stages,
-        ),
+    page = ReportInputs(
+        result=result,
+        source_digest=record.source_digest,
+        unpainted=FittedRef(stages["prepare"].ref, stages["fit"].ref),
+        final=final,
+        stages=stages,
     )
-    result["report"] = str(report_path(report.ref))
+    report = write_report.fn(asked, page, parameters.judge_config)
+    result["report"] = f"{report.ref.place}/{REPORT_FILE}"
     refs = tuple(stage.ref for stage in stages.values())
     complete_run.fn(store.root, record, result, scores, refs)
     return open_run(store, record.run_id)
@@ -124,13 +120,14 @@ def test_every_stage_leaves_an_artefact_with_a_manifest(store, stages):
 
 
 def test_a_stage_asked_again_is_not_computed_again(store, parameters, stages):
-    again = fit.fn(store.root, stages["prepare"].ref, parameters.fit)
+    run = parameters.run_spec(store.root)
+    again = fit.fn(run, "fit", stages["prepare"].ref, parameters.fit)
     assert not again.is_new
     assert again.ref == stages["fit"].ref
 
 
 def test_a_fit_keeps_its_course_and_no_scratch(store, stages):
-    history = load_history(stages["fit"].ref)
+    history = load_history(store, stages["fit"].ref)
     assert [entry["step"] for entry in history] == [5, 10, 12]
     assert list((store.root / "work").iterdir()) == []
     scene = load_scene(store, stages["fit"].ref)
@@ -143,12 +140,12 @@ def test_painted_views_come_back_as_guidance(store, stages):
     for view in views:
         assert view.rgb.shape == (view.camera.height_px, view.camera.width_px, 3)
         assert 0 <= float(view.weight.min()) <= float(view.weight.max()) <= 1
-    images = stages["paint-1"].ref.folder / "images" / "left-2m"
+    images = store.artefacts.folder(stages["paint-1"].ref) / "images" / "left-2m"
     assert {path.stem for path in images.iterdir()} >= {"render", "painted", "confidence"}
 
 
-def test_scores_say_why_a_number_is_missing(stages):
-    scores = load_scores(stages["evaluate"].ref)
+def test_scores_say_why_a_number_is_missing(store, stages):
+    scores = load_scores(store, stages["evaluate"].ref)
     assert scores["recorded"]["psnr"] > 10
     assert scores["recorded"]["num_views"] == 2
     left = scores["novel"]["left-2m"]
@@ -169,10 +166,10 @@ def test_lpips_stands_in_the_scores_where_both_files_are_given(
     }
     torch.save(heads, tmp_path / "heads.pth")
     files = lpips.LpipsFiles(backbone=tmp_path / "backbone.pth", heads=tmp_path / "heads.pth")
-    without = parameters.judge_settings
-    for settings, has_figure in ((without, False), (replace(without, lpips=files), True)):
-        judged = evaluate.fn(store.root, "evaluate", parameters.split_spec, final, settings)
-        recorded = load_scores(judged.ref)["recorded"]
+    without, asked = parameters.judge_config, parameters.run_spec(store.root)
+    for config, has_figure in ((without, False), (replace(without, lpips=files), True)):
+        judged = evaluate.fn(asked, "evaluate", final, config)
+        recorded = load_scores(store, judged.ref)["recorded"]
         assert (recorded["lpips"] is not None) is has_figure
         assert ("lpips_reason" in recorded) is not has_figure
     assert recorded["lpips"] > 0
@@ -189,7 +186,7 @@ def test_painters_are_judged_by_the_held_out_views_of_a_first_fit(store, run, pa
         run_id=run.run_id,
         split=parameters.split_spec,
         fitted=run.unpainted,
-        settings=parameters.judge_settings,
+        settings=parameters.judge_config,
     )
     labels = {"none": "none", "warp": "warp"}
     found = judge_painters.fn(labels, (), fits=[fit_of_run])
@@ -206,14 +203,12 @@ def test_painters_are_judged_by_the_held_out_views_of_a_first_fit(store, run, pa
 
 
 def test_neighbouring_frames_are_compared_along_every_shift(store, parameters, final):
-    settings = replace(
-        parameters.judge_settings, scoring=ScoringConfig(shifts=(Shift(lateral_m=1.0),))
-    )
+    shifts = ScoringConfig(shifts=(Shift(lateral_m=1.0),))
+    config = replace(parameters.judge_config, scoring=shifts)
     mixed = (SequenceConfig(previous="mixed"),)
-    judged = evaluate_flicker.fn(
-        store.root, "flicker", parameters.split_spec, final, settings, "warp", mixed
-    )
-    scores = load_scores(judged.ref)
+    asked = parameters.run_spec(store.root)
+    judged = evaluate_flicker.fn(asked, "flicker", final, config, mixed)
+    scores = load_scores(store, judged.ref)
     found = scores["flicker"]["left-1m"]
     assert set(found) == {"render", "painted", "painted, previous mixed"}
     assert 0 < found["painted, previous mixed"]["flicker"] < found["painted"]["flicker"]
@@ -221,13 +216,13 @@ def test_neighbouring_frames_are_compared_along_every_shift(store, parameters, f
     assert 0 < found["render"]["valid_share"] < 1
     by_name = {
         image: {name: value for _, _, name, value, _ in metric_values(values)}
-        for image, values in by_image(scores["flicker"]).items()
+        for image, values in flicker_by_image(scores["flicker"]).items()
     }
     assert by_name["painted"]["flicker"] == found["painted"]["flicker"]
 
 
-def test_a_report_stands_alone(run):
-    page = Path(run.result["report"]).read_text("utf-8")
+def test_a_report_stands_alone(store, run):
+    page = (store.root / run.result["report"]).read_text("utf-8")
     assert page.startswith("<!doctype html>")
     assert run.run_id in page
     assert "http://" not in page.replace("http://www.w3.org", "")
@@ -249,23 +244,23 @@ def test_a_run_is_found_with_its_numbers(store, run):
 
 
 def test_a_failed_run_says_why(store, parameters):
-    other = parameters.model_copy(update={"preset": "balanced"})
-    record = begin_run.fn(store.root, other, "cpu")
+    asked = parameters.run_spec(store.root)
+    record = begin_run.fn(asked, "f" * 16, "b" * 32, "balanced", parameters)
     assert store.tables.row("runs", record.run_id)["status"] == "running"
     fail_run.fn(store.root, record, "SceneError: no image")
     assert store.tables.row("runs", record.run_id)["error"] == "SceneError: no image"
 
 
-@pytest.mark.parametrize("painter", [None, "warp"])
-def test_a_run_is_rendered_where_nobody_drove(store, run, parameters, tmp_path, painter):
+@pytest.mark.parametrize("is_painted", [False, True])
+def test_a_run_is_rendered_where_nobody_drove(store, run, parameters, tmp_path, is_painted):
     request = RenderRequest(
         trajectory=parse_trajectory("lane-change:2+up:0.5"),
         frames=slice(1, 3),
-        painter=painter,
+        is_painted=is_painted,
         observation=parameters.observation,
         conditions=parameters.conditions,
     )
-    made = render.fn(store.root, run, request, tmp_path)
+    made = render.fn(parameters.run_spec(store.root), run.final, request, tmp_path)
     assert made["num_images"] == 2
     described = json.loads((tmp_path / "trajectory.json").read_text())
     assert [row["file"] for row in described["images"]] == ["0001.png", "0002.png"]
@@ -282,7 +277,7 @@ def test_a_run_is_shown_in_fog_beside_the_clear_images(store, run, parameters, t
         conditions=parameters.conditions,
     )
     request = StylizeRequest(prompt="foggy", view=view, images=images)
-    made = stylize.fn(store.root, run, request, tmp_path / "a")
+    made = stylize.fn(parameters.run_spec(store.root), run.final, request, tmp_path / "a")
     assert made["num_images"] == 2
     assert 0.5 < made["edge_f1"] <= 1
     described = json.loads((tmp_path / "a" / "trajectory.json").read_text())
@@ -291,7 +286,7 @@ def test_a_run_is_shown_in_fog_beside_the_clear_images(store, run, parameters, t
         cv2.imread(str(tmp_path / "a" / name)) for name in ("0001.png", "clear/0001.png")
     )
     assert float(foggy.std()) < float(clear.std())
-    stylize.fn(store.root, run, request, tmp_path / "b")
+    stylize.fn(parameters.run_spec(store.root), run.final, request, tmp_path / "b")
     again = (tmp_path / "b" / "0001.png").read_bytes()
     assert again == (tmp_path / "a" / "0001.png").read_bytes()
 
@@ -300,35 +295,35 @@ def test_a_painter_is_asked_for_the_prompt(store, run, parameters, tmp_path):
     request = RenderRequest(
         trajectory=parse_trajectory("recorded"),
         frames=slice(1, 2),
-        painter="nano",
+        is_painted=True,
         prompt="foggy",
         observation=parameters.observation,
         conditions=parameters.conditions,
     )
     with pytest.raises(ConfigError, match="knows no prompt 'foggy', only: clear"):
-        render.fn(store.root, run, request, tmp_path)
+        render.fn(parameters.run_spec(store.root, painter="nano"), run.final, request, tmp_path)
     with pytest.raises(ConfigError, match="prompt 'foggy' needs a painter"):
-        replace(request, painter=None)
+        replace(request, is_painted=False)
 
 
 def test_a_path_is_painted_with_the_previous_image_mixed_in(store, run, parameters, tmp_path):
     plain = RenderRequest(
         trajectory=parse_trajectory("lateral:1"),
         frames=slice(0, 3),
-        painter="warp",
+        is_painted=True,
         observation=parameters.observation,
         conditions=parameters.conditions,
     )
     mixed = replace(plain, sequence=SequenceConfig(previous="mixed"))
     for name, request in (("plain", plain), ("mixed", mixed)):
-        render.fn(store.root, run, request, tmp_path / name)
+        render.fn(parameters.run_spec(store.root), run.final, request, tmp_path / name)
     same = [
         (tmp_path / "plain" / name).read_bytes() == (tmp_path / "mixed" / name).read_bytes()
         for name in ("0000.png", "0001.png", "0002.png")
     ]
     assert same == [True, False, False]
     with pytest.raises(ConfigError, match="--previous needs a painter"):
-        replace(mixed, painter=None)
+        replace(mixed, is_painted=False)
 
 
 def test_recorded_images_exist_only_where_somebody_stood(parameters):
@@ -352,18 +347,18 @@ def test_an_unknown_camera_is_named_before_anything_is_drawn(store, run, paramet
         observation=parameters.observation,
         conditions=parameters.conditions,
     )
-    with pytest.raises(SceneError, match="no camera 'back', it has front"):
-        render.fn(store.root, run, request, tmp_path)
+    with pytest.raises(SceneError, match="saw no camera 'back', it saw front"):
+        render.fn(parameters.run_spec(store.root), run.final, request, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_damaged_input_is_found_and_not_used(store, parameters, stages):
-    file = stages["prepare"].ref.folder / "observations.safetensors"
+    file = store.artefacts.folder(stages["prepare"].ref) / "observations.safetensors"
     content = file.read_bytes()
     file.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
     try:
         config = parameters.fit.__class__(steps=1)
         with pytest.raises(DamagedArtefactError, match="is not what was written"):
-            fit.fn(store.root, stages["prepare"].ref, config)
+            fit.fn(parameters.run_spec(store.root), "fit", stages["prepare"].ref, config)
     finally:
         file.write_bytes(content)

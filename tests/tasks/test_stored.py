@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from catalog.errors import DamagedArtefactError
-from tasks.evaluation.scores import metric_values, score_rows
+from lidarpainter_models.evaluation.score_tables import metric_values, score_rows
 from tasks.json_files import read_json, write_json
 from tasks.tensors import read_tensors, write_tensors
 

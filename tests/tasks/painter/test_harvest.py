@@ -10,8 +10,8 @@ from catalog.store import open_store
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.synthetic import SyntheticStreetConfig
 from lidarpainter_models.training_data.harvest import HarvestConfig
+from tasks.opened import SplitSpec
 from tasks.painter import harvest
-from tasks.scenes import SplitSpec
 
 SPLIT = SplitSpec(scene_id=TOY_SCENE, spec="alternate")
 

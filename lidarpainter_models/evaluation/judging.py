@@ -1,22 +1,26 @@
 """Every figure of one fitted scene under one way of rendering it, camera by camera."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
+from lidarpainter_models.conditioning.conditions import ConditionConfig
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.judged_views import Renderer
 from lidarpainter_models.evaluation.scene_scores import (
+    ScoringConfig,
     score_geometry,
     score_recorded,
     score_synthetic,
 )
-from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
-from lidarpainter_models.geometry.trajectories import Shift
-from lidarpainter_models.metrics.perceptual import PerceptualDistances
+from lidarpainter_models.evaluation.score_tables import DEPTH, Scores
+from lidarpainter_models.evaluation.shown import ShownScene
+from lidarpainter_models.metrics.lpips import LpipsFiles
+from lidarpainter_models.metrics.perceptual import PerceptualDistances, load_distances
+from lidarpainter_models.observations.observations import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.synthetic.street import SyntheticStreet
-from tasks.evaluation.scores import DEPTH, Scores
 
 GENERATOR_ENTRY = "generator"
 """Entry of a scene's manifest by which the synthetic street is built again."""
@@ -24,46 +28,68 @@ NO_IMAGES = "nobody took images there"
 NO_INCEPTION = "Inception weights are user-supplied and none were given"
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JudgeConfig:
+    """How a fitted scene is judged."""
+
+    observation: ObservationConfig
+    scoring: ScoringConfig
+    conditions: ConditionConfig
+    feature_weights: Path | None = None
+    """SqueezeNet 1.1 weights for the feature distance; None leaves it out."""
+    lpips: LpipsFiles = field(default_factory=LpipsFiles)
+    """Weights for LPIPS; without both files it is left out."""
+
+    @property
+    def weight_files(self) -> dict[str, Path]:
+        """Files that the perceptual distances depend on, by the part they play."""
+        files = {
+            "features": self.feature_weights,
+            "lpips backbone": self.lpips.backbone,
+            "lpips heads": self.lpips.heads,
+        }
+        return {name: path for name, path in files.items() if path is not None}
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Judgement:
-    """What is judged, and how it is rendered."""
+    """How fitted scenes are held against the views that no fit saw."""
 
     held_out: HeldOut
-    fitted: GaussianScene
-    render_as: Callable[[str], Renderer]
-    """Renderer in the colours of a camera."""
-    shifts: Sequence[Shift]
-    distances: PerceptualDistances
-    progress: Callable[[int, int], None]
+    config: JudgeConfig
 
-    def scores(self) -> Scores:
+    def scores(self, shown: ShownScene, progress: Callable[[int, int], None]) -> Scores:
         """Recorded views, views beside the path, and depth at both."""
+        shifts = self.config.scoring.shifts
+        distances = load_distances(self.config.feature_weights, self.config.lpips)
         cameras = tuple(dict.fromkeys(view.camera_name for view in self.held_out.test_views))
-        parts = {name: self._of_camera(name) for name in cameras}
+        parts = {name: self._of_camera(shown, name, distances) for name in cameras}
         recorded = _mean([recorded for recorded, _novel in parts.values()])
         novel = {
             shift.name: _mean([novel[shift.name] for _recorded, novel in parts.values()])
-            for shift in self.shifts
+            for shift in shifts
         }
-        fractions = score_geometry(self.held_out, self.fitted, self.shifts, progress=self.progress)
+        fractions = score_geometry(self.held_out, shown.scene, shifts, progress=progress)
         for name, fraction in fractions.items():
             novel.get(name, recorded)[DEPTH] = fraction
         by_camera = {name: recorded for name, (recorded, _novel) in parts.items()}
         return {"recorded": recorded, "novel": novel, "recorded_by_camera": by_camera}
 
-    def _of_camera(self, name: str) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    def _of_camera(
+        self, shown: ShownScene, name: str, distances: PerceptualDistances
+    ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+        shifts = self.config.scoring.shifts
         views = [view for view in self.held_out.test_views if view.camera_name == name]
-        part, render = replace(self.held_out, test_views=views), self.render_as(name)
-        recorded = score_recorded(render, part, self.fitted, distances=self.distances)
+        part = replace(self.held_out, test_views=views)
+        fitted, render = shown.scene, shown.renderer(name)
+        recorded = score_recorded(render, part, fitted, distances=distances)
         street = known_street(part.scene)
         if street is None:
-            return recorded, {shift.name: _unknown(len(views)) for shift in self.shifts}
-        novel = score_synthetic(
-            render, part, self.fitted, street, self.shifts, distances=self.distances
-        )
-        return recorded, novel
+            return recorded, {shift.name: _unknown(len(views)) for shift in shifts}
+        return recorded, score_synthetic(render, part, fitted, street, shifts, distances=distances)
 
 
+@lru_cache(maxsize=1)
 def known_street(scene: DrivingScene) -> SyntheticStreet | None:
     """The world that a scene was drawn from; None for a recorded one."""
     if GENERATOR_ENTRY not in scene.manifest:

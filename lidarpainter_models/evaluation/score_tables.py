@@ -1,12 +1,8 @@
-"""Scores of an evaluation: where they lie, every number by name, and the table of them."""
+"""Scores of an evaluation: every number by its name, and the table of them."""
 
 from collections.abc import Mapping
 from typing import Any
 
-from catalog.artefacts import ArtefactRef
-from tasks.json_files import read_json
-
-SCORES_FILE = "scores.json"
 DEPTH = "depth_within_5_percent"
 FLICKER = "flicker"
 """Entry of an evaluation that compared neighbouring frames."""
@@ -25,11 +21,6 @@ SCORE_NOTE = "PSNR in dB; depth: part of unseen LiDAR pixels that the rendered d
 ScoreCell = str | float | int | None
 Scores = dict[str, Any]
 """`recorded` and `novel` as `reconstruct --json` prints them."""
-
-
-def load_scores(ref: ArtefactRef) -> Scores:
-    """Read the scores of an evaluation."""
-    return read_json(ref.folder / SCORES_FILE)
 
 
 def metric_values(
@@ -64,6 +55,15 @@ def metric_values(
             protocol = "depth" if name.startswith("depth") else "truth"
             found.append((protocol, trajectory, name, value, values.get(f"{name}_reason")))
     return found
+
+
+def flicker_by_image(flicker: Mapping[str, Mapping[str, Any]]) -> dict[str, Scores]:
+    """Flicker by shift and image as the catalog takes it: by image, then by shift."""
+    images = sorted({name for found in flicker.values() for name in found})
+    return {
+        image: {FLICKER: {shift: found[image] for shift, found in flicker.items()}}
+        for image in images
+    }
 
 
 def _numbers(values: Mapping[str, Any]) -> list[tuple[str, float | None]]:

@@ -1,0 +1,112 @@
+"""Judge a finished run again, or under another protocol; a query, so no server is needed."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from catalog.store import Store
+from flows.overrides import with_changes
+from flows.parameters import ViewParameters, view_parameters
+from lidarpainter_models.conditioning.sequences import SequenceConfig
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.evaluation.score_tables import FLICKER, Scores, flicker_by_image
+from tasks.evaluation.flicker import evaluate_flicker
+from tasks.evaluation.strips import evaluate_strips
+from tasks.evaluation.views import evaluate, load_scores
+from tasks.reconstruction.publish import record_scores
+from tasks.runs import FinishedRun, open_run
+from tasks.stored import FittedRef
+
+CROSS_CAMERA = "cross-camera"
+TRUTH = "truth"
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationRequest:
+    """What is judged, and how."""
+
+    run: str
+    """A run id, a unique prefix of one, or `latest`."""
+    protocol: str
+    """`paper`, `truth`, `cross-camera` or `flicker`."""
+    is_painted: bool = False
+    """Judge what is painted at view time as well."""
+    painter: str | None = None
+    """Who paints then; None takes the run's own."""
+    changes: Mapping[str, Any]
+    """Fields of the run's parameters that are replaced, such as weights of distances."""
+    previous: tuple[SequenceConfig, ...] = ()
+    """For flicker: what else may become of the frame painted before."""
+
+
+def evaluate_run(store: Store, request: EvaluationRequest) -> dict[str, Any]:
+    """Judge a finished run on views it never saw, and enter the scores into the catalog.
+
+    Returns:
+        `run_id`, `scene`, `protocol`, and the scores by variant (for flicker by shift).
+
+    Raises:
+        UnknownRecordError: there is no such run, or it did not complete.
+        ConfigError: the scene cannot be judged under this protocol.
+    """
+    finished = open_run(store, request.run)
+    parameters = with_changes(view_parameters(finished), request.changes)
+    about = {
+        "run_id": finished.run_id,
+        "scene": finished.scene_id,
+        "protocol": request.protocol,
+    }
+    if request.protocol == FLICKER:
+        return about | _flicker(store, finished, parameters, request)
+    scores = _variants(store, finished, parameters, request)
+    record_scores(store, finished.run_id, finished.scene_id, scores)
+    if request.protocol == TRUTH:
+        scores = {name: _with_truth(found, finished.scene_id) for name, found in scores.items()}
+    return about | scores
+
+
+def _variants(
+    store: Store, finished: FinishedRun, parameters: ViewParameters, request: EvaluationRequest
+) -> dict[str, Scores]:
+    judged: dict[str, FittedRef] = {"unpainted": finished.unpainted, "painted": finished.final}
+    if request.is_painted or request.painter:
+        judged["view-time"] = finished.final
+    judge = evaluate_strips if request.protocol == CROSS_CAMERA else evaluate
+    run = parameters.run_spec(store.root, painter=request.painter)
+    scores = {}
+    for name, fitted in judged.items():
+        made = judge.fn(
+            run,
+            f"{request.protocol}-{name}",
+            fitted,
+            parameters.judge_config,
+            view_time=name == "view-time",
+        )
+        scores[name] = load_scores(store, made.ref)
+    return scores
+
+
+def _flicker(
+    store: Store, finished: FinishedRun, parameters: ViewParameters, request: EvaluationRequest
+) -> dict[str, Any]:
+    run = parameters.run_spec(store.root, painter=request.painter)
+    made = evaluate_flicker.fn(
+        run, FLICKER, finished.final, parameters.judge_config, request.previous
+    )
+    found = load_scores(store, made.ref)[FLICKER]
+    record_scores(store, finished.run_id, finished.scene_id, flicker_by_image(found))
+    return {"painter": run.painter, FLICKER: found}
+
+
+def _with_truth(scores: Scores, scene_id: str) -> Scores:
+    """Only views whose true image is known beside the path.
+
+    Raises:
+        ConfigError: the scene has no such truth.
+    """
+    known = {name: found for name, found in scores["novel"].items() if found.get("psnr")}
+    if not known:
+        raise ConfigError(
+            f"scene {scene_id} has no true images beside its path; only synthetic streets have"
+        )
+    return {"novel": known}

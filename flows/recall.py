@@ -1,0 +1,57 @@
+"""What a run printed when it was made: the same run is not made twice.
+
+Kept apart from `reconstruct`, so that a command that computes nothing imports neither Prefect nor
+what a fit needs.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from catalog.digests import plain
+from catalog.records import run_id_of
+from catalog.store import Store, open_store
+from flows.parameters import ReconstructParameters
+from lidarpainter_models.painter.selection import PainterChoice
+from tasks.opened import open_scene
+from tasks.source import code_behind
+from tasks.weights import weights_digests
+
+START = "flows.reconstruct:reconstruct"
+"""The code of a run is what this flow reaches."""
+
+
+def run_identity(parameters: ReconstructParameters, store: Store) -> str:
+    """The id of a run: the same scene content, parameters, weights and code are the same run."""
+    scene = open_scene(store, parameters.scene)
+    weights = weights_digests(parameters.judge_config)
+    return run_id_of(
+        scene.content_digest,
+        [plain(parameters), PainterChoice.of(parameters.painter).digest, weights],
+        code_behind(START).digest,
+    )
+
+
+def recalled(parameters: ReconstructParameters, store_path: Path) -> dict[str, Any] | None:
+    """The result of this run if it is complete and all that it made is there, else None.
+
+    Raises:
+        SceneError: the scene is not there.
+        WeightsError: the painter or the weights of a perceptual distance cannot be used.
+    """
+    store = open_store(store_path)
+    row = store.tables.find("runs", run_identity(parameters, store))
+    if row is None or row["status"] != "complete":
+        return None
+    made = [store.artefacts.named(artefact_id) for artefact_id in row["artefacts"]]
+    if not all(store.artefacts.is_complete(ref) for ref in made):
+        return None
+    result = json.loads(row["result"])
+    result["computed_now"] = dict.fromkeys(result["computed_now"], False)
+    return located(result, store)
+
+
+def located(result: dict[str, Any], store: Store) -> dict[str, Any]:
+    """A stored result with paths in place of names relative to the store."""
+    paths = {name: str(store.root / place) for name, place in result["artefacts"].items()}
+    return {**result, "artefacts": paths, "report": str(store.root / result["report"])}

@@ -1,0 +1,116 @@
+"""Show a finished run along a trajectory, as it is, painted or styled; queries without a server."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from catalog.store import Store
+from flows.parameters import view_parameters
+from lidarpainter_models.conditioning.sequences import SequenceConfig
+from lidarpainter_models.geometry.trajectory_specs import Trajectory
+from tasks.runs import open_run
+from tasks.views.render import RenderRequest, render
+from tasks.views.stylize import Images, StylizeRequest, stylize
+
+
+@dataclass(frozen=True, kw_only=True)
+class PathRequest:
+    """Which run is followed, and where."""
+
+    run: str
+    """A run id, a unique prefix of one, or `latest`."""
+    trajectory: Trajectory
+    camera: str | None = None
+    frames: slice | None = None
+    is_painted: bool = False
+    """Whether a painter paints every image."""
+    painter: str | None = None
+    """Who; None takes the run's own."""
+
+
+def render_run(
+    store: Store,
+    path: PathRequest,
+    out: Path,
+    *,
+    prompt: str,
+    sequence: SequenceConfig,
+) -> dict[str, Any]:
+    """Render a finished run where nobody drove.
+
+    Args:
+        store: where the run is.
+        path: where to look from.
+        out: folder for the images.
+        prompt: what a painter that was trained for styles is asked for.
+        sequence: what becomes of the image painted before.
+    """
+    finished = open_run(store, path.run)
+    parameters = view_parameters(finished)
+    run = parameters.run_spec(store.root, painter=path.painter)
+    request = RenderRequest(
+        trajectory=path.trajectory,
+        camera=path.camera,
+        frames=path.frames,
+        is_painted=path.is_painted,
+        prompt=prompt,
+        sequence=sequence,
+        observation=parameters.observation,
+        conditions=parameters.conditions,
+    )
+    made = render.fn(run, finished.final, request, out)
+    return {
+        "run_id": finished.run_id,
+        "scene": finished.scene_id,
+        "trajectory": path.trajectory.spec,
+        "painter": run.painter if request.is_painted else None,
+        "prompt": prompt,
+        "previous": sequence.previous,
+        **made,
+    }
+
+
+def stylize_run(
+    store: Store,
+    path: PathRequest,
+    out: Path,
+    *,
+    prompt: str,
+    images: Images,
+    width_px: int | None,
+    seed: int,
+) -> dict[str, Any]:
+    """Show a finished run in another weather or at night, and how well its edges are kept.
+
+    Args:
+        store: where the run is.
+        path: where to look from.
+        out: folder for the images.
+        prompt: the style.
+        images: whether renders are styled, or what the camera recorded.
+        width_px: of the images; None takes that of the fit.
+        seed: decides lit windows, drops and noise.
+    """
+    finished = open_run(store, path.run)
+    parameters = view_parameters(finished)
+    observation = parameters.observation
+    if width_px is not None:
+        observation = replace(observation, width_px=width_px)
+    view = RenderRequest(
+        trajectory=path.trajectory,
+        camera=path.camera,
+        frames=path.frames,
+        is_painted=path.is_painted,
+        observation=observation,
+        conditions=parameters.conditions,
+    )
+    request = StylizeRequest(prompt=prompt, view=view, images=images, seed=seed)
+    run = parameters.run_spec(store.root, painter=path.painter)
+    made = stylize.fn(run, finished.final, request, out)
+    return {
+        "run_id": finished.run_id,
+        "scene": finished.scene_id,
+        "prompt": prompt,
+        "trajectory": path.trajectory.spec,
+        **made,
+    }

@@ -1,0 +1,109 @@
+"""The page about a run: its scores, what it took, the course of its fits."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from lidarpainter_models.evaluation.score_tables import SCORE_COLUMNS, SCORE_NOTE, score_rows
+from lidarpainter_models.export.report import Cell, Comparison, Plot, Report, Table
+
+MEGABYTE = 1e6
+GUIDANCE_COLUMNS = ("num_cameras", "num_without_room", "num_refused", "num_views", "mean_weight")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StageCost:
+    """What a stage took when it was computed."""
+
+    stage: str
+    seconds: float
+    cpu_seconds: float
+    peak_memory_bytes: int
+    artefact: str
+    """Digest of what it made."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunPage:
+    """What is known about a run before anything is drawn."""
+
+    result: Mapping[str, Any]
+    """What `reconstruct` prints."""
+    costs: Sequence[StageCost]
+    provenance: Mapping[str, str]
+
+    def report(
+        self,
+        comparisons: Sequence[Comparison],
+        histories: Mapping[str, Sequence[Mapping[str, float]]],
+    ) -> Report:
+        """The page, with images and the course of every fit by stage."""
+        return Report(
+            title=f"LidarPainter: {self.result['scene']}",
+            summary=_summary(self.result),
+            comparisons=comparisons,
+            tables=_tables(self.result, self.costs),
+            plots=_plots(histories),
+            provenance=self.provenance,
+        )
+
+
+def _summary(result: Mapping[str, Any]) -> str:
+    rounds = "1 round" if result["rounds"] == 1 else f"{result['rounds']} rounds"
+    return (
+        f"Preset {result['preset']}, painter {result['painter']}, split {result['split']}, "
+        f"{result['num_gaussians']} Gaussians. Painted means: after {rounds} of "
+        "painting shifted views and fitting on with them."
+    )
+
+
+def _tables(result: Mapping[str, Any], costs: Sequence[StageCost]) -> list[Table]:
+    """Scores, stages and painted views of a run."""
+    stages: list[list[Cell]] = [
+        [
+            cost.stage,
+            cost.seconds,
+            cost.cpu_seconds,
+            cost.peak_memory_bytes / MEGABYTE,
+            cost.artefact,
+        ]
+        for cost in costs
+    ]
+    guidance = [
+        [name, *(values[key] for key in GUIDANCE_COLUMNS)]
+        for name, values in result["guidance"].items()
+    ]
+    tables = [
+        Table(
+            title="Held-out views",
+            columns=SCORE_COLUMNS,
+            rows=score_rows(result),
+            note=SCORE_NOTE,
+        ),
+        Table(
+            title="Stages",
+            columns=["stage", "seconds", "CPU seconds", "peak memory, MB", "artefact"],
+            rows=stages,
+            note="As computed; a stage that was there already keeps the time it took then.",
+        ),
+    ]
+    if guidance:
+        tables.append(
+            Table(title="Painted views", columns=["round", *GUIDANCE_COLUMNS], rows=guidance)
+        )
+    return tables
+
+
+def _plots(histories: Mapping[str, Sequence[Mapping[str, float]]]) -> list[Plot]:
+    """The course of every fit of a run, by stage."""
+
+    def lines(key: str) -> dict[str, list[tuple[float, float]]]:
+        return {
+            name: [(entry["step"], entry[key]) for entry in history]
+            for name, history in histories.items()
+        }
+
+    return [
+        Plot(title="Training views", x_label="step", y_label="PSNR, dB", series=lines("psnr")),
+        Plot(title="Size", x_label="step", y_label="Gaussians", series=lines("num_gaussians")),
+    ]

@@ -1,0 +1,59 @@
+"""Fitted scenes of the store, ready to be judged or shown: as they are or painted at view time."""
+
+from collections.abc import Callable
+from functools import partial
+
+import torch
+
+from catalog.store import Store
+from lidarpainter_models.conditioning.conditions import ConditionBuilder, ConditionConfig
+from lidarpainter_models.evaluation.judging import JudgeConfig
+from lidarpainter_models.evaluation.shown import ShownScene, ViewTimePainting
+from lidarpainter_models.painter.selection import PainterChoice
+from tasks.opened import OpenedRun
+from tasks.stored import FittedRef, load_observations, load_scene
+
+
+def shown_by(
+    this: OpenedRun, fitted: FittedRef, config: JudgeConfig, *, view_time: bool
+) -> Callable[[], ShownScene]:
+    """Opens a fitted scene as it is, or as the run's painter paints it at view time."""
+    if not view_time:
+        return partial(unpainted_scene, this.store, fitted)
+    return partial(painted_scene, this.store, fitted, config.conditions, this.painter, this.device)
+
+
+def unpainted_scene(store: Store, fitted: FittedRef) -> ShownScene:
+    """A fitted scene as it is."""
+    return ShownScene(scene=load_scene(store, fitted.gaussians))
+
+
+def painted_scene(
+    store: Store,
+    fitted: FittedRef,
+    conditions: ConditionConfig,
+    painter: PainterChoice,
+    device: torch.device,
+) -> ShownScene:
+    """A fitted scene as a painter paints it at view time."""
+    painting = view_time_painting(store, fitted, conditions, painter, device)
+    return ShownScene(scene=painting.conditions.scene, painting=painting)
+
+
+def view_time_painting(
+    store: Store,
+    fitted: FittedRef,
+    conditions: ConditionConfig,
+    painter: PainterChoice,
+    device: torch.device,
+) -> ViewTimePainting:
+    """What a painter needs to paint a fitted scene at view time."""
+    builder = condition_builder(store, fitted, conditions)
+    return ViewTimePainting(conditions=builder, painter=painter, device=device)
+
+
+def condition_builder(store: Store, fitted: FittedRef, config: ConditionConfig) -> ConditionBuilder:
+    """What a painter is shown of a fitted scene."""
+    seen = load_observations(store, fitted.observations)
+    scene = load_scene(store, fitted.gaussians)
+    return ConditionBuilder(scene, seen.lidar_map, seen.views, config=config)

@@ -1,0 +1,71 @@
+"""Judge a fitted scene on views it never saw, as it is or painted at view time."""
+
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import partial
+from typing import Any
+
+from prefect import task
+
+from catalog.artefacts import ArtefactRef, Workplace
+from catalog.store import Store
+from lidarpainter_models.evaluation.judging import JudgeConfig, Judgement
+from lidarpainter_models.evaluation.score_tables import Scores
+from lidarpainter_models.evaluation.shown import ShownScene
+from tasks.evaluation.shown import shown_by
+from tasks.json_files import read_json, write_json
+from tasks.opened import OpenedRun, RunSpec, opened
+from tasks.progress import Progress
+from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
+from tasks.stored import FittedRef
+from tasks.weights import weights_digests
+
+SCORES_FILE = "scores.json"
+
+
+@task(**STAGE_OPTIONS)
+def evaluate(
+    run: RunSpec, stage: str, fitted: FittedRef, config: JudgeConfig, *, view_time: bool = False
+) -> StageResult:
+    """Score a scene as it is, or what it shows once the run's painter has painted it."""
+    this = opened(run)
+    return run_stage(
+        this.store,
+        stage=stage,
+        kind="evaluation",
+        inputs=judged_inputs(this, fitted, view_time=view_time) | weights_digests(config),
+        config={
+            "split": run.split,
+            "observation": asdict(config.observation),
+            "scoring": asdict(config.scoring),
+            "conditions": asdict(config.conditions),
+        },
+        build=partial(
+            _build,
+            judgement=Judgement(held_out=this.held_out(config.observation), config=config),
+            shown=shown_by(this, fitted, config, view_time=view_time),
+        ),
+    )
+
+
+def judged_inputs(this: OpenedRun, fitted: FittedRef, *, view_time: bool) -> dict[str, str]:
+    """Digests of what every judgement of a fitted scene depends on."""
+    inputs = {
+        "scene": this.scene.content_digest,
+        "observations": fitted.observations.digest,
+        "gaussians": fitted.gaussians.digest,
+    }
+    return inputs | ({"painter": this.painter.digest} if view_time else {})
+
+
+def load_scores(store: Store, ref: ArtefactRef) -> Scores:
+    """Read the scores of an evaluation."""
+    return read_json(store.artefacts.folder(ref) / SCORES_FILE)
+
+
+def _build(
+    place: Workplace, progress: Progress, *, judgement: Judgement, shown: Callable[[], ShownScene]
+) -> dict[str, Any]:
+    scores = judgement.scores(shown(), progress)
+    write_json(place.output / SCORES_FILE, scores)
+    return {"psnr": scores["recorded"]["psnr"], "num_views": scores["recorded"]["num_views"]}

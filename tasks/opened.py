@@ -1,0 +1,118 @@
+"""A run opened once: its scene, split, painter and device, shared by all its stages.
+
+Tasks pass a `RunSpec`, which is a few words, never tensors; `opened` turns it into an `OpenedRun`
+that all stages of one process share. So a scene is opened once and a painter loaded once, however
+many stages ask; `tasks.stored` does the same for artefacts.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+import torch
+
+from catalog.store import Store, open_store
+from lidarpainter_models.devices import Device, chosen_device
+from lidarpainter_models.errors import SceneError
+from lidarpainter_models.evaluation.held_out import HeldOut
+from lidarpainter_models.observations.observations import ObservationConfig
+from lidarpainter_models.painter.selection import NO_PAINTER, PainterChoice
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.schema import MANIFEST_NAME
+from lidarpainter_models.scenes.splits import ViewSplit, split_views
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SplitSpec:
+    """Which views of a scene may be seen."""
+
+    scene_id: str
+    spec: str = "alternate"
+    """`alternate`, `forward:17:8` or `all`; see `lidarpainter_models.scenes.splits`."""
+    cameras: tuple[str, ...] | None = None
+    """Cameras to train on and to judge; None takes all."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunSpec:
+    """What a run works on, in words that any process understands."""
+
+    store_path: Path
+    split: SplitSpec
+    painter: str = NO_PAINTER
+    """Name of a painter, or path of its weights or model."""
+    device: Device = "auto"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OpenedRun:
+    """What a run works on, ready to be used; read when first asked for and kept."""
+
+    spec: RunSpec
+    store: Store
+    scene: DrivingScene
+    views: ViewSplit
+    device: torch.device
+
+    @cached_property
+    def painter(self) -> PainterChoice:
+        """Who paints; loaded at its first painting."""
+        return PainterChoice.of(self.spec.painter)
+
+    def held_out(self, observation: ObservationConfig, *, or_train: bool = False) -> HeldOut:
+        """The views that no fit saw; with `or_train` those it saw, where it saw all."""
+        views = self.views.test or (self.views.train if or_train else ())
+        return HeldOut(scene=self.scene, test_views=views, observation=observation)
+
+
+def opened(spec: RunSpec) -> OpenedRun:
+    """The run of a spec, opened once in a process as long as its scene stays as it is.
+
+    Raises:
+        SceneError: the scene is not there, is not complete, or lacks a camera.
+        ConfigError: the split leaves nothing to train on, or the device is not there.
+    """
+    scene = open_scene(open_store(spec.store_path), spec.split.scene_id)
+    return _opened(spec, scene)
+
+
+def open_scene(store: Store, scene_id: str) -> DrivingScene:
+    """A scene of the store, opened once in a process as long as it stays as it is.
+
+    Raises:
+        SceneError: it is not there, or not complete.
+    """
+    folder = store.scene_folder(scene_id)
+    try:
+        manifest = (folder / MANIFEST_NAME).stat()
+    except OSError:
+        known = sorted(
+            f"{path.parent.name}/{path.name}" for path in store.root.glob("scenes/*/[!.]*")
+        )
+        raise SceneError(
+            f"no scene {scene_id} in {store.root}: ingest it first "
+            f"(there {'is' if len(known) == 1 else 'are'} {', '.join(known) or 'none'})"
+        ) from None
+    return _scene(folder, manifest.st_ino, manifest.st_mtime_ns)
+
+
+def open_split(store: Store, split: SplitSpec) -> tuple[DrivingScene, ViewSplit]:
+    """A scene and its views on both sides of the split."""
+    scene = open_scene(store, split.scene_id)
+    return scene, split_views(scene, split.spec, split.cameras)
+
+
+@lru_cache(maxsize=4)
+def _scene(folder: Path, _inode: int, _changed_ns: int) -> DrivingScene:
+    return DrivingScene.open(folder)
+
+
+@lru_cache(maxsize=1)
+def _opened(spec: RunSpec, scene: DrivingScene) -> OpenedRun:
+    return OpenedRun(
+        spec=spec,
+        store=open_store(spec.store_path),
+        scene=scene,
+        views=split_views(scene, spec.split.spec, spec.split.cameras),
+        device=chosen_device(spec.device),
+    )
