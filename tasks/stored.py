@@ -12,7 +12,7 @@ from catalog.store import Store
 from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
 from lidarpainter_models.observations.observations import SceneObservations
 from tasks.json_files import read_json, write_json
-from tasks.tensors import read_tensors, write_tensors
+from lidarpainter_models.storage.tensor_files import read_tensors, write_tensors
 
 OBSERVATIONS_FILE = "observations.safetensors"
 SCENE_FILE = "scene.safetensors"

@@ -119,7 +119,7 @@ def write_painter(weights: Path, record: dict[str, Any], out: Path) -> dict[str,
     Raises:
         StorageError: the disk refuses.
     """
-    from lidarpainter_models.painter.whole_files import write_whole
+    from lidarpainter_models.storage.whole_files import write_whole
 
     path = out if out.suffix == WEIGHTS_SUFFIX else out / weights.name
     record_path = path.with_suffix(".json")

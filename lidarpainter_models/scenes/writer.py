@@ -25,7 +25,6 @@ from lidarpainter_models.errors import DataError, SceneError
 from lidarpainter_models.geometry.transforms import is_rigid
 from lidarpainter_models.scenes import schema
 from lidarpainter_models.scenes.array_writer import create_arrays
-from lidarpainter_models.scenes.publishing import AsideFolder, storage_errors
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, SweepPoints
 from lidarpainter_models.scenes.stored import content_digest, stored_digest
 from lidarpainter_models.scenes.validation import (
@@ -39,6 +38,8 @@ from lidarpainter_models.scenes.validation import (
     require_size,
     require_time,
 )
+from lidarpainter_models.storage.whole_files import storage_errors
+from lidarpainter_models.storage.whole_folders import AsideFolder
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

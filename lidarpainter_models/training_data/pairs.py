@@ -13,14 +13,13 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.painter.examples import PaintingPair, Window
 from lidarpainter_models.painter.protocol import PaintingConditions
-from lidarpainter_models.painter.whole_files import write_whole
+from lidarpainter_models.storage.tensor_files import open_tensors, pack_tensors
+from lidarpainter_models.storage.whole_files import write_whole
 
 PAIR_FORMAT = "lidarpainter-pair/1"
 INDEX_NAME = "index.json"
@@ -84,8 +83,9 @@ class PairFolder:
             DataError: a file is damaged.
         """
         for index, entry in enumerate(self._pairs):
-            if tensor_name not in _tensor_names(self.folder / entry["file"]):
-                return self.name(index)
+            with open_tensors(self.folder / entry["file"]) as (file, _):
+                if tensor_name not in file.keys():  # noqa: SIM118 - the file is no mapping
+                    return self.name(index)
         return None
 
     def verify(self) -> None:
@@ -152,29 +152,15 @@ def load_pair(path: Path, window: Window | None = None) -> PaintingPair:
     Raises:
         DataError: the file is missing, damaged or not a pair.
     """
-    try:
-        with safe_open(path, framework="pt") as file:
-            header = json.loads((file.metadata() or {}).get("lidarpainter", "{}"))
-            if header.get("format") != PAIR_FORMAT:
-                raise DataError(
-                    f"{path} has format {header.get('format')!r}, expected {PAIR_FORMAT!r}"
-                )
-            names = _KINDS.keys() - (_OPTIONAL - set(file.keys()))
-            stored = {name: _cut(file.get_slice(name), name, window) for name in names}
-    except (SafetensorError, OSError, json.JSONDecodeError) as error:
-        raise DataError(f"{path} is not a readable pair: {error}") from None
+    with open_tensors(path) as (file, header):
+        if header.get("format") != PAIR_FORMAT:
+            raise DataError(f"{path} has format {header.get('format')!r}, expected {PAIR_FORMAT!r}")
+        names = _KINDS.keys() - (_OPTIONAL - set(file.keys()))
+        stored = {name: _cut(file.get_slice(name), name, window) for name in names}
     values = {name: _decode(stored[name], _KINDS[name]) for name in stored}
     target_rgb, target_valid = values.pop("target_rgb"), values.pop("target_valid")
     conditions = PaintingConditions(**values, prompt=header["prompt"])
     return PaintingPair(conditions=conditions, target_rgb=target_rgb, target_valid=target_valid)
-
-
-def _tensor_names(path: Path) -> frozenset[str]:
-    try:
-        with safe_open(path, framework="pt") as file:
-            return frozenset(file.keys())
-    except (SafetensorError, OSError) as error:
-        raise DataError(f"{path} is not a readable pair: {error}") from None
 
 
 @runtime_checkable
@@ -219,8 +205,7 @@ def _encode(pair: PaintingPair, provenance: dict[str, Any]) -> bytes:
         "prompt": pair.conditions.prompt,
         "provenance": provenance,
     }
-    # one entry, because safetensors writes several in random order
-    return save(tensors, {"lidarpainter": json.dumps(header, sort_keys=True)})
+    return pack_tensors(tensors, header)
 
 
 def _decode(stored: Tensor, kind: str) -> Tensor:

@@ -20,6 +20,7 @@ import lidarpainter_models
 from catalog.errors import CatalogError
 from lidarpainter_models.errors import LidarPainterError
 from lidarpainter_models.scenes.stored import stored_digest
+from lidarpainter_models.storage.whole_files import write_whole
 from tasks.ingest.ingest import ingest_sequence
 from tasks.progress import listener
 
@@ -102,10 +103,7 @@ def ingest_or_recall(request: IngestRequest, name: str, again: bool) -> dict[str
     row = ingest_sequence.fn(
         request.store_path, request.dataset, request.root, name, request.frames, request.cameras
     )
-    note.parent.mkdir(parents=True, exist_ok=True)
-    aside = note.with_suffix(".writing")
-    aside.write_text(json.dumps({"request": request.key(), "row": row}), "utf-8")
-    aside.replace(note)
+    write_whole(note, json.dumps({"request": request.key(), "row": row}).encode())
     return row
 
 

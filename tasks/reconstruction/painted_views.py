@@ -16,7 +16,7 @@ from lidarpainter_models.conditioning.novel_guidance import NovelPainting, guida
 from lidarpainter_models.export.images import write_png
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.observations.observations import GuidanceView
-from tasks.tensors import read_tensors, write_tensors
+from lidarpainter_models.storage.tensor_files import read_tensors, write_tensors
 
 GUIDANCE_FILE = "guidance.safetensors"
 IMAGE_FOLDER = "images"

@@ -3,38 +3,8 @@
 import math
 
 import pytest
-import torch
-
-from catalog.errors import DamagedArtefactError
 from lidarpainter_models.evaluation.score_tables import metric_values, score_rows
 from tasks.json_files import read_json, write_json
-from tasks.tensors import read_tensors, write_tensors
-
-
-def test_tensors_and_metadata_come_back_bit_for_bit(tmp_path):
-    generator = torch.Generator().manual_seed(0)
-    arrays = {
-        "a": torch.randn(3, 4, generator=generator, dtype=torch.float64).T,
-        "b": torch.tensor([True, False]),
-        "empty": torch.zeros(0, 3, dtype=torch.uint8),
-    }
-    metadata = {"schema": 1, "names": ["ä", "b"], "pi": math.pi}
-    write_tensors(tmp_path / "x.safetensors", arrays, metadata)
-    found, described = read_tensors(tmp_path / "x.safetensors")
-    assert described == metadata
-    assert found.keys() == arrays.keys()
-    assert all(torch.equal(found[name], arrays[name]) for name in arrays)
-
-
-@pytest.mark.parametrize(
-    "content", [None, b"", b"not tensors", b"\x08\x00\x00\x00\x00\x00\x00\x00{}"]
-)
-def test_a_file_of_something_else_is_damaged(tmp_path, content):
-    path = tmp_path / "x.safetensors"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(DamagedArtefactError, match="cannot be read"):
-        read_tensors(path)
 
 
 def test_json_has_no_infinity(tmp_path):

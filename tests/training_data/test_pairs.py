@@ -128,7 +128,7 @@ def overwrite(path):
 def test_a_damaged_pair_is_one_clear_line(folder, spoil):
     path = folder / "pair-1.safetensors"
     spoil(path)
-    with pytest.raises(DataError, match=r"pair-1\.safetensors is not a readable pair") as caught:
+    with pytest.raises(DataError, match=r"pair-1\.safetensors is not a readable") as caught:
         PairFolder(folder).read(1)
     assert "\n" not in str(caught.value)
 

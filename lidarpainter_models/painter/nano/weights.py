@@ -16,7 +16,7 @@ from torch import Tensor
 from lidarpainter_models.errors import WeightsError
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.nano.painter import NanoPainter
-from lidarpainter_models.painter.whole_files import write_whole
+from lidarpainter_models.storage.whole_files import write_whole
 
 WEIGHTS_FORMAT = "lidarpainter-nano/1"
 CPU = torch.device("cpu")

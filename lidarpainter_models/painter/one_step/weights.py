@@ -29,7 +29,7 @@ from lidarpainter_models.painter.one_step.tensor_files import (
     check_shapes,
     open_tensors,
 )
-from lidarpainter_models.painter.whole_files import write_whole
+from lidarpainter_models.storage.whole_files import write_whole
 
 WEIGHTS_FORMAT = "lidarpainter-one-step/1"
 PROMPT = "prompt:"

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.painter.training.trainee import Trainee
-from lidarpainter_models.painter.whole_files import write_whole
+from lidarpainter_models.storage.whole_files import write_whole
 
 CHECKPOINT_NAME = "training.pt"
 UNSHAPING = ("checkpoint_every_s",)

@@ -7,31 +7,15 @@ the same name clears it away.
 
 import errno
 import fcntl
-import os
 import secrets
 import shutil
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 
-from lidarpainter_models.errors import LidarPainterError, StorageError
+from lidarpainter_models.storage.whole_files import storage_errors, sync
 
 _LOCK_NAME = ".writing"
 _NUM_SYNC_THREADS = 8
-
-
-@contextmanager
-def storage_errors(path: Path) -> Iterator[None]:
-    """Turn a failed write or read below `path` into a one-line `StorageError`."""
-    try:
-        yield
-    except OSError as error:
-        if isinstance(error, LidarPainterError):
-            raise
-        reason = error.strerror or str(error)
-        hint = "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
-        raise StorageError(f"{path}: cannot be written: {reason}{hint}") from error
 
 
 class AsideFolder:
@@ -71,7 +55,7 @@ class AsideFolder:
                 # a folder with content cannot be renamed over: the old one steps aside first
                 self.final.rename(replaced)
                 continue
-        _sync(self.final.parent)
+        sync(self.final.parent)
         self._lock.close()
         shutil.rmtree(replaced, ignore_errors=True)
 
@@ -89,13 +73,5 @@ def _clear_abandoned(final: Path) -> None:
 def _sync_tree(folder: Path) -> None:
     paths = [folder, *folder.rglob("*")]
     with ThreadPoolExecutor(_NUM_SYNC_THREADS) as pool:  # the disk takes many requests at once
-        for _ in pool.map(_sync, paths):
+        for _ in pool.map(sync, paths):
             pass
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
