@@ -12,7 +12,7 @@ from lidarpainter_models.evaluation.judging import JudgeConfig
 from lidarpainter_models.evaluation.scene_scores import ScoringConfig
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.metrics.lpips import LpipsFiles
-from lidarpainter_models.observations.observations import ObservationConfig
+from lidarpainter_models.observations.fit_size import ObservationConfig
 from tasks.opened import RunSpec, SplitSpec
 from tasks.runs import FinishedRun
 

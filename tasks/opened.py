@@ -15,7 +15,7 @@ from catalog.store import Store, open_store
 from lidarpainter_models.devices import Device, chosen_device
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.observations.observations import ObservationConfig
+from lidarpainter_models.observations.fit_size import ObservationConfig
 from lidarpainter_models.painter.selection import NO_PAINTER, PainterChoice
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.schema import MANIFEST_NAME

@@ -10,9 +10,13 @@ from pathlib import Path
 from catalog.artefacts import ArtefactRef
 from catalog.store import Store
 from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
-from lidarpainter_models.observations.observations import SceneObservations
-from tasks.json_files import read_json, write_json
+from lidarpainter_models.observations.stored_form import (
+    observations_from_arrays,
+    observations_to_arrays,
+)
+from lidarpainter_models.observations.views import SceneObservations
 from lidarpainter_models.storage.tensor_files import read_tensors, write_tensors
+from tasks.json_files import read_json, write_json
 
 OBSERVATIONS_FILE = "observations.safetensors"
 SCENE_FILE = "scene.safetensors"
@@ -32,7 +36,7 @@ History = list[dict[str, float]]
 
 def save_observations(folder: Path, observations: SceneObservations) -> None:
     """Write observations into a folder."""
-    write_tensors(folder / OBSERVATIONS_FILE, *observations.to_arrays())
+    write_tensors(folder / OBSERVATIONS_FILE, *observations_to_arrays(observations))
 
 
 def load_observations(store: Store, ref: ArtefactRef) -> SceneObservations:
@@ -44,7 +48,7 @@ def load_observations(store: Store, ref: ArtefactRef) -> SceneObservations:
 @lru_cache(maxsize=1)
 def _observations(store: Store, ref: ArtefactRef, path: Path, *_as_it_is: int) -> SceneObservations:
     store.artefacts.verified(ref)
-    return SceneObservations.from_arrays(*read_tensors(path))
+    return observations_from_arrays(*read_tensors(path))
 
 
 def save_scene(folder: Path, scene: GaussianScene, history: History) -> None:

@@ -26,7 +26,7 @@ from lidarpainter_models.lidar.lidar_images import (
 )
 from lidarpainter_models.lidar.lidar_map import LidarMap
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
-from lidarpainter_models.observations.observations import TrainingView
+from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT, PaintingConditions
 from lidarpainter_models.scenes.records import ViewKey
 

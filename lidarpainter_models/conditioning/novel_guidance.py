@@ -27,7 +27,7 @@ from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectories import Shift, road_directions, shift_pose
 from lidarpainter_models.lidar.lidar_map import LidarMap
-from lidarpainter_models.observations.observations import GuidanceView, TrainingView
+from lidarpainter_models.observations.views import GuidanceView, TrainingView
 from lidarpainter_models.painter.protocol import Painter, Painting, PaintingConditions
 from lidarpainter_models.scenes.records import ViewKey
 from lidarpainter_models.scenes.tracks import ActorTrack

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
@@ -17,12 +16,7 @@ from lidarpainter_models.evaluation.judged_views import JudgedView, actor_mask
 from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectories import Shift, road_directions, shift_pose
-from lidarpainter_models.lidar.sparse_depth import move_actor_points
-from lidarpainter_models.observations.observations import (
-    ObservationConfig,
-    fit_camera,
-    shrink_image,
-)
+from lidarpainter_models.observations.fit_size import ObservationConfig, fit_camera, shrink_image
 from lidarpainter_models.scenes.driving_scene import DrivingScene, RecordedView
 from lidarpainter_models.scenes.records import ViewKey
 from lidarpainter_models.synthetic.street import SyntheticStreet
@@ -99,16 +93,3 @@ class HeldOut:
                 )
             )
         return judged
-
-    def points_at(self, view: RecordedView) -> Float[Tensor, "points 3"]:
-        """The frame's sweeps in the world, actors moved to the view's exposure."""
-        clouds = [
-            move_actor_points(
-                self.scene.read_sweep(sweep).xyz_m,
-                [track for track in self.scene.tracks if track.is_moving],
-                from_ns=sweep.timestamp_ns,
-                to_ns=view.timestamp_ns,
-            )
-            for sweep in self.scene.sweeps_of(view.frame_index)
-        ]
-        return torch.cat(clouds) if clouds else torch.zeros(0, 3)

@@ -18,7 +18,7 @@ from lidarpainter_models.evaluation.score_tables import DEPTH, Scores
 from lidarpainter_models.evaluation.shown import ShownScene
 from lidarpainter_models.metrics.lpips import LpipsFiles
 from lidarpainter_models.metrics.perceptual import PerceptualDistances, load_distances
-from lidarpainter_models.observations.observations import ObservationConfig
+from lidarpainter_models.observations.fit_size import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.synthetic.street import SyntheticStreet
 

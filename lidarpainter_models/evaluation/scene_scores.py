@@ -8,6 +8,7 @@ from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.judged_views import Renderer, ViewScores, score_views
 from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
 from lidarpainter_models.geometry.trajectories import Shift
+from lidarpainter_models.lidar.sparse_depth import points_at_exposure
 from lidarpainter_models.metrics.depth import (
     DepthScores,
     pooled_inlier_fraction,
@@ -93,7 +94,9 @@ def score_geometry(
     """Part of held-out LiDAR pixels that the rendered depth meets within 5 %, per trajectory."""
     scores: dict[str, list[DepthScores]] = {shift.name: [] for shift in (Shift(), *shifts)}
     for done, view in enumerate(held_out.test_views, start=1):
-        points = held_out.points_at(view)  # costs more than all the renders of the view
+        points = points_at_exposure(
+            held_out.scene, view
+        )  # costs more than all the renders of the view
         for shift in (Shift(), *shifts):
             camera = held_out.shifted_camera(fitted, view, shift)
             depth_m = fitted.render(camera, view.timestamp_ns).depth_m

@@ -11,7 +11,8 @@ from lidarpainter_models.evaluation.shown import ShownScene
 from lidarpainter_models.evaluation.strips import StripView, calibrate_strip, score_strips
 from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
 from lidarpainter_models.geometry.transforms import invert_rigid
-from lidarpainter_models.observations.observations import fit_camera
+from lidarpainter_models.lidar.sparse_depth import points_at_exposure
+from lidarpainter_models.observations.fit_size import fit_camera
 from lidarpainter_models.scenes.splits import ViewSplit
 
 
@@ -94,7 +95,7 @@ def strip_views(
                 timestamp_ns=own.timestamp_ns,
                 truth_rgb=held_out.image_of(own),
                 fitted_camera=found,
-                points_world=held_out.points_at(own),
+                points_world=points_at_exposure(scene, own),
             )
         )
     return views

@@ -3,6 +3,8 @@
 Every point is handled by one thread alone, so the number of threads changes no bit.
 """
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 
@@ -10,6 +12,26 @@ SLOTS = 4
 """Best samples that a point keeps."""
 AGREEMENT = 32.0
 """Samples further than this (of 255, in any channel) from the typical one are outliers."""
+
+
+class BestSamples(NamedTuple):
+    """The best samples of every point, heaviest first."""
+
+    weight: np.ndarray
+    """(points, slots) float32, 0 where a slot is empty."""
+    rgb: np.ndarray
+    """(points, slots, 3) uint8."""
+    view: np.ndarray
+    """(points, slots) int16: number of the view that each sample is from."""
+
+    @classmethod
+    def none_yet(cls, num_points: int) -> "BestSamples":
+        """Empty slots."""
+        return cls(
+            weight=np.zeros((num_points, SLOTS), np.float32),
+            rgb=np.zeros((num_points, SLOTS, 3), np.uint8),
+            view=np.zeros((num_points, SLOTS), np.int16),
+        )
 
 
 @numba.njit(cache=True)
@@ -45,15 +67,10 @@ def project_inside(
 
 @numba.njit(cache=True, parallel=True)
 def insert_samples(
-    rows: np.ndarray,
-    weight: np.ndarray,
-    rgb: np.ndarray,
-    view: int,
-    slot_weight: np.ndarray,
-    slot_rgb: np.ndarray,
-    slot_view: np.ndarray,
+    best: BestSamples, rows: np.ndarray, weight: np.ndarray, rgb: np.ndarray, view: int
 ) -> None:
-    """Put one image's samples among the best of their points, heaviest first, in place."""
+    """Put one image's samples among the best of their points (rows), in place."""
+    slot_weight, slot_rgb, slot_view = best
     for i in numba.prange(rows.shape[0]):
         row, w = rows[i], weight[i]
         slot = SLOTS
@@ -139,15 +156,14 @@ def _bilinear(image: np.ndarray, u: float, v: float, rgb: np.ndarray) -> None:
 
 
 @numba.njit(cache=True, parallel=True)
-def combine_samples(
-    slot_weight: np.ndarray, slot_rgb: np.ndarray, slot_view: np.ndarray, view_gain: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def combine_samples(best: BestSamples, view_gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """One colour (uint8) per point from its samples, and whether it has any.
 
     Samples are brought to one exposure by the gain of their view. The weighted median in
     brightness is the typical one; the colour is the mean, weighted by the square of the weights,
     of the samples that agree with it.
     """
+    slot_weight, slot_rgb, slot_view = best
     points = slot_weight.shape[0]
     rgb = np.zeros((points, 3), dtype=np.uint8)
     has_colour = np.zeros(points, dtype=np.bool_)

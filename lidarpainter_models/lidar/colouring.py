@@ -13,20 +13,14 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.lidar.actor_separation import poses_at
-from lidarpainter_models.lidar.colour_sampling import (
-    SLOTS,
-    combine_samples,
-    insert_samples,
-    project_inside,
-)
+from lidarpainter_models.lidar.colour_sampling import BestSamples, combine_samples, insert_samples
 from lidarpainter_models.lidar.exposure_matching import match_exposure
-from lidarpainter_models.lidar.map_points import MapPoints
+from lidarpainter_models.lidar.lidar_map import LidarMap
 from lidarpainter_models.lidar.point_visibility import (
     Neighbourhood,
     Visibility,
@@ -34,8 +28,15 @@ from lidarpainter_models.lidar.point_visibility import (
     surface_visibility,
     visible_points,
 )
+from lidarpainter_models.lidar.points_in_view import (
+    Body,
+    CellGrid,
+    PlacedActors,
+    PointsInView,
+    place_actors,
+    points_in_view,
+)
 from lidarpainter_models.lidar.rim_colours import ImageLevels, RimConfig, rim_samples
-from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.scenes.tracks import ActorTrack
 
@@ -82,216 +83,103 @@ class ColouringConfig:
                 raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
 
 
-def colour_map(
-    scene: DrivingScene,
-    street: MapPoints,
-    actors: dict[str, MapPoints],
-    views: Sequence[RecordedView],
-    config: ColouringConfig,
-) -> tuple[MapPoints, dict[str, MapPoints]]:
-    """The same points with the colours that the views give them.
+class MapColouring:
+    """Colours the points of a map, one image after another."""
 
-    Colours have the exposure of the first view's camera. Points that no view saw keep
-    `has_colour` false.
+    def __init__(
+        self,
+        lidar_map: LidarMap,
+        tracks: Sequence[ActorTrack],
+        views: Sequence[RecordedView],
+        config: ColouringConfig,
+    ) -> None:
+        """Take the points, all actors of the scene, and the views whose images will be added.
 
-    Raises:
-        SceneError: the points of an actor that has no track.
-    """
-    tracks = {track.actor_id: track for track in scene.tracks}
-    unknown = sorted(set(actors) - set(tracks))
-    if unknown:
-        raise SceneError(f"{scene.path}: no track for the actors {', '.join(unknown)}")
-    bodies = [_Body(None, street), *(_Body(tracks[name], actors[name]) for name in actors)]
-    samples = _Samples(sum(len(body.points) for body in bodies))
-    camera_names = list(dict.fromkeys(view.camera_name for view in views))
-    for number, (view, actors_then) in enumerate(
-        zip(views, _actors_at(views, scene.tracks), strict=True)
-    ):
-        image = _shrunk(scene.read_image(view), config)
-        _sample_view(image, view, number, bodies, actors_then, samples, config)
-    if views:
-        view_camera = np.array([camera_names.index(view.camera_name) for view in views])
-        gains = match_exposure(samples.weight, samples.rgb, samples.view, view_camera)
-    else:
+        Raises:
+            SceneError: the points of an actor that has no track.
+        """
+        known = {track.actor_id: track for track in tracks}
+        unknown = sorted(set(lidar_map.actors) - set(known))
+        if unknown:
+            raise SceneError(f"points of actors without a track: {', '.join(unknown)}")
+        self._config = config
+        self._actor_ids = list(lidar_map.actors)
+        actors = [Body(known[name], points) for name, points in lidar_map.actors.items()]
+        self._bodies = [Body(None, lidar_map.street), *actors]
+        self._samples = BestSamples.none_yet(sum(len(body.points) for body in self._bodies))
+        self._view_numbers = {view.key: number for number, view in enumerate(views)}
+        self._placed = place_actors(views, tracks)
+
+    def add(self, view: RecordedView, image: UInt8[Tensor, "height width 3"]) -> None:
+        """Take samples from the recorded image of one of the views."""
+        config, actors = self._config, self._placed[view.key]
+        image = _shrunk(image, config)
+        camera = view.camera.resized(width_px=image.shape[1], height_px=image.shape[0])
+        grid = CellGrid.over(camera, config.grid_rad)
+        inside = points_in_view(
+            self._bodies, camera, view.timestamp_ns, actors, grid, near_m=config.near_m
+        )
+        if len(inside) == 0:
+            return
+        visibility = _visibility(inside, grid.camera, actors, config)
+        is_visible = visible_points(
+            inside.cells_uv, inside.depth_m, visibility, tolerance=config.hidden_tolerance
+        )
+        seen = inside.keep(is_visible.nonzero()[:, 0])
+        footprint_px = seen.range_m * config.footprint_rad * camera.fx_px / seen.depth_m
+        levels = ImageLevels(image, footprint_px)
+        rgb, trust = rim_samples(levels, seen, visibility, grid.cells_per_pixel, config.rims)
+        weight = trust / (1 + (seen.age_s / config.recency_s) ** 2)
+        weight *= footprint_px.clamp(max=_FINE_ENOUGH_PX) ** 2
+        number = self._view_numbers[view.key]
+        insert_samples(self._samples, seen.rows.numpy(), weight.numpy(), rgb.numpy(), number)
+
+    def coloured(self) -> LidarMap:
+        """The map with the colours that the images added gave it.
+
+        Colours have the exposure of the first view's camera. Points that no image showed keep
+        `has_colour` false.
+        """
+        cameras = [camera_name for _, camera_name in self._view_numbers]
+        order = list(dict.fromkeys(cameras))
         gains = np.ones((1, 3), np.float32)
-    rgb, has_colour = combine_samples(samples.weight, samples.rgb, samples.view, gains)
-    coloured, start = [], 0
-    for body in bodies:
-        rows = slice(start, start + len(body.points))
-        coloured.append(
-            replace(
-                body.points,
-                rgb_u8=torch.from_numpy(rgb[rows].copy()),
-                has_colour=torch.from_numpy(has_colour[rows].copy()),
+        if cameras:
+            view_camera = np.array([order.index(name) for name in cameras])
+            gains = match_exposure(self._samples, view_camera)
+        rgb, has_colour = map(torch.from_numpy, combine_samples(self._samples, gains))
+        sizes = [len(body.points) for body in self._bodies]
+        street, *actors = (
+            replace(body.points, rgb_u8=own_rgb.clone(), has_colour=own_has.clone())
+            for body, own_rgb, own_has in zip(
+                self._bodies, rgb.split(sizes), has_colour.split(sizes), strict=True
             )
         )
-        start = rows.stop
-    return coloured[0], dict(zip(actors, coloured[1:], strict=True))
-
-
-_ActorsThen = dict[str, tuple[ActorTrack, Tensor]]
-"""Tracks by actor id, with `world_from_box` at one time."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Body:
-    """The street (no track) or an actor."""
-
-    track: ActorTrack | None
-    points: MapPoints
-
-
-class _Samples:
-    """The best samples of every point, heaviest first."""
-
-    def __init__(self, num_points: int) -> None:
-        self.weight = np.zeros((num_points, SLOTS), np.float32)
-        self.rgb = np.zeros((num_points, SLOTS, 3), np.uint8)
-        self.view = np.zeros((num_points, SLOTS), np.int16)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _InView:
-    """Points of all bodies that fall into an image."""
-
-    rows: Int[Tensor, " points"]
-    """Position among the points of all bodies."""
-    pixels_uv: Float[Tensor, "points 2"]
-    depth_m: Float[Tensor, " points"]
-    range_m: Float[Tensor, " points"]
-    age_s: Float[Tensor, " points"]
-    """Time between the image and the point, >= 0."""
-    is_actor: Bool[Tensor, " points"]
-
-
-def _sample_view(
-    image: UInt8[Tensor, "height width 3"],
-    view: RecordedView,
-    number: int,
-    bodies: Sequence[_Body],
-    actors_then: _ActorsThen,
-    samples: _Samples,
-    config: ColouringConfig,
-) -> None:
-    """Take one image's samples into account."""
-    height_px, width_px = image.shape[:2]
-    camera = view.camera.resized(width_px=width_px, height_px=height_px)
-    seen = _project(bodies, camera, view.timestamp_ns, actors_then, config)
-    if len(seen.rows) == 0:
-        return
-    cell_px = max(1.0, config.grid_rad * camera.fx_px)
-    grid = camera.resized(
-        width_px=max(1, round(width_px / cell_px)), height_px=max(1, round(height_px / cell_px))
-    )
-    scale = torch.tensor([grid.width_px / width_px, grid.height_px / height_px])
-    cells_uv = (seen.pixels_uv * scale).long()
-    cells_uv[:, 0].clamp_(max=grid.width_px - 1)
-    cells_uv[:, 1].clamp_(max=grid.height_px - 1)
-    visibility = _visibility(seen, cells_uv, grid, actors_then, config)
-    visible = visible_points(cells_uv, seen.depth_m, visibility, tolerance=config.hidden_tolerance)
-    kept = visible.nonzero()[:, 0]
-    footprint_px = (seen.range_m * config.footprint_rad * camera.fx_px / seen.depth_m)[kept]
-    levels = ImageLevels(image, footprint_px)
-    rgb, trust = rim_samples(
-        levels,
-        seen.pixels_uv[kept],
-        cells_uv[kept],
-        seen.depth_m[kept],
-        visibility,
-        scale,
-        config.rims,
-    )
-    weight = trust / (1 + (seen.age_s[kept] / config.recency_s) ** 2)
-    weight *= footprint_px.clamp(max=_FINE_ENOUGH_PX) ** 2
-    insert_samples(
-        *(seen.rows[kept].numpy(), weight.numpy(), rgb.numpy(), number),
-        *(samples.weight, samples.rgb, samples.view),
-    )
-
-
-def _actors_at(views: Sequence[RecordedView], tracks: Sequence[ActorTrack]) -> list[_ActorsThen]:
-    """For each view the tracks present at its exposure, with `world_from_box` then."""
-    present: list[_ActorsThen] = [{} for _ in views]
-    if not views:
-        return present
-    times_ns = torch.tensor([view.timestamp_ns for view in views])
-    for track in tracks:
-        for number, pose in enumerate(poses_at(track, times_ns)):
-            if track.is_present(views[number].timestamp_ns):
-                present[number][track.actor_id] = (track, pose)
-    return present
-
-
-def _project(
-    bodies: Sequence[_Body],
-    camera: Camera,
-    timestamp_ns: int,
-    actors_then: _ActorsThen,
-    config: ColouringConfig,
-) -> _InView:
-    """Where the points of all bodies stand in an image taken at a time."""
-    lens = torch.tensor(
-        [[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]],
-        dtype=torch.float64,
-    )
-    parts, start = [], 0
-    for body in bodies:
-        first, start = start, start + len(body.points)
-        camera_from_points = camera.camera_from_world
-        if body.track is not None:
-            if body.track.actor_id not in actors_then:
-                continue
-            _, world_from_box = actors_then[body.track.actor_id]
-            camera_from_points = camera_from_points @ world_from_box
-        pixels_from_points = (lens @ camera_from_points[:3]).numpy()
-        rows, pixels_uv, depth_m = map(
-            torch.from_numpy,
-            project_inside(
-                body.points.xyz_m.contiguous().numpy(),
-                *(pixels_from_points, camera.width_px, camera.height_px, config.near_m),
-            ),
-        )
-        age_ns = (body.points.timestamp_ns[rows] - timestamp_ns).abs()
-        is_actor = torch.full_like(rows, body.track is not None, dtype=torch.bool)
-        columns = (pixels_uv, depth_m, body.points.range_m[rows], age_ns.float() * 1e-9, is_actor)
-        parts.append((rows + first, *columns))
-    rows, pixels_uv, depth_m, range_m, age_s, is_actor = map(torch.cat, zip(*parts, strict=True))
-    return _InView(
-        rows=rows,
-        pixels_uv=pixels_uv,
-        depth_m=depth_m,
-        range_m=range_m,
-        age_s=age_s,
-        is_actor=is_actor,
-    )
+        return LidarMap(street=street, actors=dict(zip(self._actor_ids, actors, strict=True)))
 
 
 def _visibility(
-    seen: _InView,
-    cells_uv: Int[Tensor, "points 2"],
-    grid: Camera,
-    actors_then: _ActorsThen,
-    config: ColouringConfig,
+    inside: PointsInView, cells: Camera, actors: PlacedActors, config: ColouringConfig
 ) -> Visibility:
-    """What stands before and around each cell when the image was taken."""
-    solid = (seen.is_actor | (seen.age_s <= config.surface_window_s)).nonzero()[:, 0]
-    footprint_px = seen.range_m * config.beam_spacing_rad * grid.fx_px / seen.depth_m
+    """What stood before and around each cell when the image was taken."""
+    is_solid = inside.is_actor | (inside.age_s <= config.surface_window_s)
+    solid = inside.keep(is_solid.nonzero()[:, 0])
+    footprint_px = solid.range_m * config.beam_spacing_rad * cells.fx_px / solid.depth_m
     boxes = [
         (world_from_box, track.size_m * _solid_share(track, config))
-        for track, world_from_box in actors_then.values()
+        for track, world_from_box in actors.values()
     ]
     return surface_visibility(
-        cells_uv[solid],
-        seen.depth_m[solid],
-        (footprint_px[solid] / 2).round().long().clamp(max=2),
-        grid,
+        solid.cells_uv,
+        solid.depth_m,
+        (footprint_px / 2).round().long().clamp(max=2),
+        cells,
         Neighbourhood(
-            gap_px=max(1, round(config.gap_rad * grid.fx_px)),
-            edge_px=max(1, round(config.edge_rad * grid.fx_px)),
-            rim_px=max(1, round(config.rim_rad * grid.fx_px)),
+            gap_px=max(1, round(config.gap_rad * cells.fx_px)),
+            edge_px=max(1, round(config.edge_rad * cells.fx_px)),
+            rim_px=max(1, round(config.rim_rad * cells.fx_px)),
             edge_tolerance=config.rims.edge_tolerance,
         ),
-        box_far_ends(boxes, grid),
+        box_far_ends(boxes, cells),
     )
 
 

@@ -7,6 +7,8 @@ the cameras are joined by weighted least squares over all pairs that share point
 
 import numpy as np
 
+from lidarpainter_models.lidar.colour_sampling import BestSamples
+
 DARKEST, BRIGHTEST = 16, 240
 """Samples outside are clipped or noisy and say nothing about exposure."""
 LEAST_SHARED = 100
@@ -17,23 +19,19 @@ _ROUNDS = 8
 _MOST_POINTS = 40_000
 
 
-def match_exposure(
-    slot_weight: np.ndarray, slot_rgb: np.ndarray, slot_view: np.ndarray, view_camera: np.ndarray
-) -> np.ndarray:
+def match_exposure(samples: BestSamples, view_camera: np.ndarray) -> np.ndarray:
     """Gains (views, 3) float32 that bring every view to the exposure of camera 0.
 
     A camera that shares too few points with those joined to camera 0 keeps gain 1.
 
     Args:
-        slot_weight: (points, slots), 0 where a slot is empty.
-        slot_rgb: (points, slots, 3) uint8.
-        slot_view: (points, slots) view of each sample.
+        samples: of every point.
         view_camera: (views,) camera of each view.
     """
-    several = np.flatnonzero(slot_weight[:, 1] > 0)
+    several = np.flatnonzero(samples.weight[:, 1] > 0)
     several = several[:: max(1, len(several) // _MOST_POINTS)]
-    rgb, view = slot_rgb[several], slot_view[several]
-    usable = (slot_weight[several] > 0) & (rgb >= DARKEST).all(-1) & (rgb <= BRIGHTEST).all(-1)
+    rgb, view = samples.rgb[several], samples.view[several]
+    usable = (samples.weight[several] > 0) & (rgb >= DARKEST).all(-1) & (rgb <= BRIGHTEST).all(-1)
     log_rgb = np.log(np.maximum(rgb, 1).astype(np.float32))
     departures = _departures(log_rgb, usable, view, view_camera)
     log_rgb += departures[view]

@@ -23,8 +23,7 @@ from torch import Tensor
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.point_blend import blend_points
-from lidarpainter_models.lidar.lidar_map import LidarMap
-from lidarpainter_models.lidar.map_points import MapPoints
+from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.lidar.point_surfaces import (
     DIRECTIONS,
     curtain,

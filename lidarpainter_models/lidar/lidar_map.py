@@ -1,180 +1,86 @@
-"""Every LiDAR point of a log in its place: the street in the world, actors in their boxes.
+"""The LiDAR map of a log: points of many sweeps with their colours and when they were measured.
 
-The street keeps what stands still, parked cars too; points of moving actors are carried to the box
-frame of their actor by the pose at each point's own time, so that all sweeps of an actor fall onto
-one another. When a point was measured stays with it: which points an image may use, and how old
-they are then, is decided when one is rendered. Colours come from the given images alone.
+The street stands in the world, each moving actor in the frame of its box; metres.
 """
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import torch
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from lidarpainter_models.errors import ConfigError, SceneError
-from lidarpainter_models.lidar.actor_separation import (
-    NearActors,
-    SeparationConfig,
-    height_above_ground,
-    near_actors,
-)
-from lidarpainter_models.lidar.colouring import ColouringConfig, colour_map
-from lidarpainter_models.lidar.ground_heights import GroundHeights
-from lidarpainter_models.lidar.map_points import MapPoints
-from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.records import RecordedView, Sweep
-from lidarpainter_models.scenes.tracks import ActorTrack
 
-__all__ = ["LidarMap", "LidarMapConfig", "MapPoints", "build_lidar_map"]
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MapPoints:
+    """Points of the street (world frame) or of one actor (its box frame)."""
 
-_GROUND_SAMPLE = 400_000
-"""Points that the ground is estimated from; more do not change it."""
+    xyz_m: Float[Tensor, "points 3"]
+    """float32."""
+    rgb_u8: UInt8[Tensor, "points 3"]
+    """0 where the point has no colour; exposure as the first camera's."""
+    has_colour: Bool[Tensor, " points"]
+    """Whether an image saw the point."""
+    frame_index: Int[Tensor, " points"]
+    """Of the sweep it was measured in."""
+    timestamp_ns: Int[Tensor, " points"]
+    """When it was measured."""
+    range_m: Float[Tensor, " points"]
+    """Distance from the LiDAR that measured it: how coarsely its surface was sampled."""
 
+    def __len__(self) -> int:
+        """How many points there are."""
+        return self.xyz_m.shape[0]
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LidarMapConfig:
-    """Which points enter the map, and how they are told apart and coloured."""
+    def keep(self, kept: Tensor) -> "MapPoints":
+        """The points marked or listed."""
+        return type(self)(**{field.name: getattr(self, field.name)[kept] for field in fields(self)})
 
-    min_range_m: float = 1.0
-    """Nearer returns come from the LiDAR's own housing."""
-    ego_range_m: float = 2.6
-    """Returns nearer than this are the ego vehicle's own body..."""
-    ego_half_width_m: float = 1.2
-    """... when also less than this to the left or right of the LiDAR; a car beside it is not."""
-    max_range_m: float = 300.0
-    """Further returns are left out: there a beam is a metre wide."""
-    separation: SeparationConfig = field(default_factory=SeparationConfig)
-    colouring: ColouringConfig = field(default_factory=ColouringConfig)
+    def to_arrays(self) -> dict[str, Tensor]:
+        """Columns by name, for storage."""
+        return {field.name: getattr(self, field.name).contiguous() for field in fields(self)}
 
-    def __post_init__(self) -> None:
-        """Refuse an empty interval of ranges."""
-        if not 0 <= self.min_range_m < self.max_range_m:
-            raise ConfigError(
-                f"ranges must satisfy 0 <= min < max, got {self.min_range_m} and "
-                f"{self.max_range_m} m"
+    @classmethod
+    def concatenate(cls, parts: Sequence["MapPoints"]) -> "MapPoints":
+        """All points of several parts, in their order; none give no points."""
+        if not parts:
+            return cls.uncoloured(
+                xyz_m=torch.zeros(0, 3),
+                frame_index=torch.zeros(0, dtype=torch.int64),
+                timestamp_ns=torch.zeros(0, dtype=torch.int64),
+                range_m=torch.zeros(0),
             )
+        columns = {
+            field.name: torch.cat([getattr(part, field.name) for part in parts])
+            for field in fields(cls)
+        }
+        return cls(**columns)
+
+    @classmethod
+    def uncoloured(
+        cls,
+        *,
+        xyz_m: Float[Tensor, "points 3"],
+        frame_index: Int[Tensor, " points"],
+        timestamp_ns: Int[Tensor, " points"],
+        range_m: Float[Tensor, " points"],
+    ) -> "MapPoints":
+        """Points that no image has been asked about yet."""
+        return cls(
+            xyz_m=xyz_m,
+            rgb_u8=torch.zeros(xyz_m.shape, dtype=torch.uint8),
+            has_colour=torch.zeros(xyz_m.shape[0], dtype=torch.bool),
+            frame_index=frame_index,
+            timestamp_ns=timestamp_ns,
+            range_m=range_m,
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LidarMap:
-    """The coloured points of a log."""
+    """The points of a log."""
 
     street: MapPoints
     """In the world."""
     actors: dict[str, MapPoints]
     """By actor id, in the box frame, from the whole log; only moving actors with points."""
-
-
-def build_lidar_map(
-    scene: DrivingScene,
-    *,
-    split_frames: Collection[int],
-    colour_views: Sequence[RecordedView],
-    config: LidarMapConfig | None = None,
-) -> LidarMap:
-    """Gather the sweeps of some frames into one map, coloured by some images.
-
-    Args:
-        scene: where sweeps, images and tracks are read from.
-        split_frames: frames whose sweeps may be used.
-        colour_views: images that may give colours: those of the training set, no others.
-        config: see there.
-
-    Raises:
-        SceneError: the frames hold no point in range.
-    """
-    config = config or LidarMapConfig()
-    tracks = [track for track in scene.tracks if track.is_moving]
-    sweeps = [
-        _place_sweep(scene, sweep, tracks, config)
-        for sweep in scene.sweeps
-        if sweep.frame_index in set(split_frames)
-    ]
-    street_parts = [placed.points.keep(~placed.is_near) for placed in sweeps]
-    if sum(len(part) for part in street_parts) == 0:
-        raise SceneError(
-            f"{scene.dataset}/{scene.sequence}: no LiDAR point within {config.max_range_m:g} m in "
-            f"frames {sorted(split_frames)}"
-        )
-    ground = _ground(street_parts)
-    actor_parts: dict[str, list[MapPoints]] = {}
-    for placed in sweeps:
-        road, of_actors = _sort_near_points(placed, tracks, ground, config.separation)
-        street_parts.append(road)
-        for actor_id, points in of_actors.items():
-            actor_parts.setdefault(actor_id, []).append(points)
-    street = MapPoints.concatenate(street_parts)
-    actors = {actor_id: MapPoints.concatenate(parts) for actor_id, parts in actor_parts.items()}
-    street, actors = colour_map(scene, street, actors, colour_views, config.colouring)
-    return LidarMap(street=street, actors=actors)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _PlacedSweep:
-    """A sweep in the world and what of it lies in or beside actors."""
-
-    points: MapPoints
-    near: NearActors
-
-    @property
-    def is_near(self) -> Tensor:
-        """Marks the points in or beside actors."""
-        marks = torch.zeros(len(self.points), dtype=torch.bool)
-        marks[self.near.rows] = True
-        return marks
-
-
-def _place_sweep(
-    scene: DrivingScene, sweep: Sweep, tracks: Sequence[ActorTrack], config: LidarMapConfig
-) -> _PlacedSweep:
-    """Read a sweep, drop what is out of range, and find what lies near actors."""
-    read = scene.read_sweep(sweep)
-    away = read.xyz_m - sweep.world_from_lidar[:3, 3].to(read.xyz_m)
-    range_m = away.norm(dim=-1)
-    left = scene.world_from_ego[scene.frame_position(sweep.frame_index), :3, 1].to(away)
-    is_ego = (range_m < config.ego_range_m) & ((away @ left).abs() < config.ego_half_width_m)
-    used = (range_m >= config.min_range_m) & (range_m <= config.max_range_m) & ~is_ego
-    timestamp_ns = sweep.timestamp_ns + read.time_offset_ns[used].to(torch.int64)
-    points = MapPoints.uncoloured(
-        xyz_m=read.xyz_m[used],
-        frame_index=torch.full_like(timestamp_ns, sweep.frame_index),
-        timestamp_ns=timestamp_ns,
-        range_m=range_m[used],
-    )
-    near = near_actors(points.xyz_m, timestamp_ns, tracks, config.separation)
-    return _PlacedSweep(points=points, near=near)
-
-
-def _ground(street_parts: Sequence[MapPoints]) -> GroundHeights:
-    """The ground, from an even sample of the street."""
-    total = sum(len(part) for part in street_parts)
-    step = max(1, total // _GROUND_SAMPLE)
-    return GroundHeights(torch.cat([part.xyz_m[::step] for part in street_parts]))
-
-
-def _sort_near_points(
-    placed: _PlacedSweep,
-    tracks: Sequence[ActorTrack],
-    ground: GroundHeights,
-    config: SeparationConfig,
-) -> tuple[MapPoints, dict[str, MapPoints]]:
-    """Of the points near actors: the road under them, and the points of each actor.
-
-    What is neither (the margin around an actor, tyres where they touch the road) is dropped.
-    """
-    near, beside = placed.near, placed.points.keep(placed.near.rows)
-    height_m = height_above_ground(beside.xyz_m, near.bottom_m, ground, config)
-    road = beside.keep(height_m < config.road_height_m)
-    is_actor = (height_m >= config.clearance_m) & (near.outside_m <= config.actor_margin_m)
-    of_actors = {}
-    for index in torch.unique(near.track[is_actor]).tolist():
-        rows = (is_actor & (near.track == index)).nonzero()[:, 0]
-        picked = beside.keep(rows)
-        of_actors[tracks[index].actor_id] = MapPoints.uncoloured(
-            xyz_m=near.xyz_box_m[rows],
-            frame_index=picked.frame_index,
-            timestamp_ns=picked.timestamp_ns,
-            range_m=picked.range_m,
-        )
-    return road, of_actors

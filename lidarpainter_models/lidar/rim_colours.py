@@ -9,6 +9,7 @@ from torch import Tensor
 
 from lidarpainter_models.lidar.colour_sampling import sample_levels, steps_inside
 from lidarpainter_models.lidar.point_visibility import Visibility
+from lidarpainter_models.lidar.points_in_view import PointsInView
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,14 +55,12 @@ class ImageLevels:
 
 def rim_samples(
     levels: ImageLevels,
-    pixels_uv: Float[Tensor, "kept 2"],
-    cells_uv: Int[Tensor, "kept 2"],
-    depth_m: Float[Tensor, " kept"],
+    points: PointsInView,
     visibility: Visibility,
     cells_per_pixel: Float[Tensor, "2"],
     config: RimConfig,
-) -> tuple[UInt8[Tensor, "kept 3"], Float[Tensor, " kept"]]:
-    """Colours of visible samples, and how far the place of each is to be trusted.
+) -> tuple[UInt8[Tensor, "points 3"], Float[Tensor, " points"]]:
+    """Colours of visible points, and how far the place of each is to be trusted.
 
     On the rim of a surface a small error of pose takes the colour of what is beside it. Where the
     colour there is more like that beyond the rim than like that of the nearest inner cell, the
@@ -69,32 +68,34 @@ def rim_samples(
 
     Args:
         levels: the image.
-        pixels_uv: continuous positions.
-        cells_uv: column and row on the grid of `visibility`.
-        depth_m: camera z.
+        points: those that nothing hides.
         visibility: what stands around.
         cells_per_pixel: of the grid, in u and v.
         config: see there.
     """
-    rgb = levels.sample(pixels_uv)
-    trust = torch.ones_like(depth_m)
-    column, row = cells_uv.unbind(-1)
-    is_behind = visibility.nearest_m[row, column] < depth_m * (1 - config.edge_tolerance)
-    is_before = visibility.furthest_m[row, column] > depth_m * (1 + config.edge_tolerance)
+    rgb = levels.sample(points.pixels_uv)
+    trust = torch.ones_like(points.depth_m)
+    column, row = points.cells_uv.unbind(-1)
+    nearest_m, furthest_m = visibility.nearest_m[row, column], visibility.furthest_m[row, column]
+    is_behind = nearest_m < points.depth_m * (1 - config.edge_tolerance)
+    is_before = furthest_m > points.depth_m * (1 + config.edge_tolerance)
     trust[is_behind] = config.behind_edge_weight
     on_rim = is_before.nonzero()[:, 0]
     trust[on_rim] *= config.rim_weight
     steps, has_inner = map(
         torch.from_numpy,
         steps_inside(
-            *(cells_uv[on_rim].numpy(), depth_m[on_rim].numpy(), visibility.inner_m.numpy()),
-            *(config.inner_reach, config.edge_tolerance),
+            points.cells_uv[on_rim].numpy(),
+            points.depth_m[on_rim].numpy(),
+            visibility.inner_m.numpy(),
+            config.inner_reach,
+            config.edge_tolerance,
         ),
     )
-    moved, steps = on_rim[has_inner], steps[has_inner] / cells_per_pixel
+    moved, steps_px = on_rim[has_inner], steps[has_inner] / cells_per_pixel
     own = rgb[moved].float()
-    inner = levels.sample(pixels_uv[moved] + steps, moved)
-    beyond = levels.sample(pixels_uv[moved] - steps, moved)
+    inner = levels.sample(points.pixels_uv[moved] + steps_px, moved)
+    beyond = levels.sample(points.pixels_uv[moved] - steps_px, moved)
     to_inner, to_beyond = (own - inner.float()).norm(dim=-1), (own - beyond.float()).norm(dim=-1)
     is_foreign = (to_beyond < config.foreign_likeness) & (to_inner > config.foreign_contrast)
     rgb[moved[is_foreign]] = inner[is_foreign]

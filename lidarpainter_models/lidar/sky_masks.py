@@ -15,20 +15,18 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError, ShapeError
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.records import RecordedView
 
 _GROWTH_ROUNDS = 3
 _SMALL_PIECE_PX = 30
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SkyConfig:
+class SkyMaskConfig:
     """When a pixel is believed to be sky. Colours are of 255; angles follow the resolution."""
 
     least_elevation_rad: float = 0.0
@@ -56,25 +54,25 @@ class SkyConfig:
 
 
 def sky_mask(
-    scene: DrivingScene, view: RecordedView, camera: Camera, *, config: SkyConfig | None = None
+    rgb_u8: UInt8[Tensor, "height width 3"],
+    points_world: Float[Tensor, "points 3"],
+    camera: Camera,
+    *,
+    config: SkyMaskConfig | None = None,
 ) -> Bool[Tensor, "height width"]:
     """Sky in a recorded image.
 
     Args:
-        scene: gives the image and the points of the same frame.
-        view: which image.
-        camera: the view's camera on the pixel grid wanted.
+        rgb_u8: the image.
+        points_world: LiDAR points of the same frame.
+        camera: on the same grid as the image.
         config: see there.
     """
-    image = scene.read_image(view).numpy()
-    size = (camera.width_px, camera.height_px)
-    if image.shape[:2] != size[::-1]:
-        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    pixels_uv, depth_m = camera.project(scene.read_points(view.frame_index).xyz_m)
+    pixels_uv, depth_m = camera.project(points_world)
     column, row = pixels_uv[camera.contains(pixels_uv, depth_m)].long().unbind(-1)
     has_return = torch.zeros(camera.height_px, camera.width_px, dtype=torch.bool)
     has_return[row, column] = True
-    return sky_from_returns(torch.from_numpy(image), has_return, camera, config=config)
+    return sky_from_returns(rgb_u8, has_return, camera, config=config)
 
 
 def sky_from_returns(
@@ -82,7 +80,7 @@ def sky_from_returns(
     has_return: Bool[Tensor, "height width"],
     camera: Camera,
     *,
-    config: SkyConfig | None = None,
+    config: SkyMaskConfig | None = None,
 ) -> Bool[Tensor, "height width"]:
     """Sky in an image whose LiDAR returns are known.
 
@@ -95,7 +93,7 @@ def sky_from_returns(
     Raises:
         ShapeError: image, returns and camera differ in size.
     """
-    config = config or SkyConfig()
+    config = config or SkyMaskConfig()
     size = (camera.height_px, camera.width_px)
     if tuple(rgb_u8.shape) != (*size, 3) or tuple(has_return.shape) != size:
         raise ShapeError(

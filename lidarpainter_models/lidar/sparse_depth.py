@@ -15,7 +15,9 @@ from torch import Tensor
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
-from lidarpainter_models.scenes.driving_scene import ActorTrack
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.records import RecordedView
+from lidarpainter_models.scenes.tracks import ActorTrack
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,3 +76,17 @@ def move_actor_points(
         step = track.pose_at(to_ns).double() @ invert_rigid(world_from_box)
         moved[inside] = transform_points(step, points_world[inside].double()).float()
     return moved
+
+
+def points_at_exposure(scene: DrivingScene, view: RecordedView) -> Float[Tensor, "points 3"]:
+    """The sweeps of a view's frame in the world, moving actors where they are in its image."""
+    clouds = [
+        move_actor_points(
+            scene.read_sweep(sweep).xyz_m,
+            scene.tracks,
+            from_ns=sweep.timestamp_ns,
+            to_ns=view.timestamp_ns,
+        )
+        for sweep in scene.sweeps_of(view.frame_index)
+    ]
+    return torch.cat(clouds) if clouds else torch.zeros(0, 3)

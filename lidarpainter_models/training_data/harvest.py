@@ -12,8 +12,9 @@ from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
-from lidarpainter_models.lidar.lidar_map import build_lidar_map
-from lidarpainter_models.observations.observations import SceneObservations, prepare_observations
+from lidarpainter_models.lidar.map_building import build_lidar_map
+from lidarpainter_models.observations.preparation import prepare_observations
+from lidarpainter_models.observations.views import SceneObservations
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import ViewKey
 from lidarpainter_models.scenes.splits import ViewSplit

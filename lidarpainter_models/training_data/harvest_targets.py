@@ -19,7 +19,8 @@ from lidarpainter_models.gaussians.fitting.config import FitConfig, RefinementCo
 from lidarpainter_models.gaussians.fitting.densification import DensificationConfig
 from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.observations.observations import ObservationConfig, SceneObservations
+from lidarpainter_models.observations.fit_size import ObservationConfig
+from lidarpainter_models.observations.views import SceneObservations
 from lidarpainter_models.painter.examples import PaintingPair
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.training_data.corruptions import CorruptionConfig, corrupt_gaussians

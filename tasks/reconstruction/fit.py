@@ -12,7 +12,7 @@ from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.gaussians.model.scene_graph import GaussianScene, describe
-from lidarpainter_models.observations.observations import GuidanceView, SceneObservations
+from lidarpainter_models.observations.views import GuidanceView, SceneObservations
 from tasks.opened import RunSpec, opened
 from tasks.progress import Progress
 from tasks.reconstruction.painted_views import load_guidance

@@ -15,7 +15,7 @@ from catalog.store import Store
 from lidarpainter_models.conditioning.novel_guidance import NovelPainting, guidance_views
 from lidarpainter_models.export.images import write_png
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.observations.observations import GuidanceView
+from lidarpainter_models.observations.views import GuidanceView
 from lidarpainter_models.storage.tensor_files import read_tensors, write_tensors
 
 GUIDANCE_FILE = "guidance.safetensors"

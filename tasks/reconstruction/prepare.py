@@ -7,7 +7,8 @@ from typing import Any
 from prefect import task
 
 from catalog.artefacts import Workplace
-from lidarpainter_models.observations.observations import ObservationConfig, prepare_observations
+from lidarpainter_models.observations.fit_size import ObservationConfig
+from lidarpainter_models.observations.preparation import prepare_observations
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import ViewSplit
 from tasks.opened import RunSpec, opened

@@ -16,7 +16,7 @@ from lidarpainter_models.conditioning.sequences import SequenceConfig, SequenceP
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.export.images import write_png
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
-from lidarpainter_models.observations.observations import ObservationConfig
+from lidarpainter_models.observations.fit_size import ObservationConfig
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
 from tasks.evaluation.shown import condition_builder
 from tasks.json_files import write_json

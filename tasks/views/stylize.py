@@ -14,7 +14,7 @@ from lidarpainter_models.export.images import write_png
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.sky_masks import sky_mask
 from lidarpainter_models.metrics.edges import EdgeConfig, edge_agreement, mean_edge_scores
-from lidarpainter_models.observations.observations import shrink_image
+from lidarpainter_models.observations.fit_size import shrink_image
 from lidarpainter_models.painter.styles import StyleConfig, StyleView, apply_style, check_prompt
 from lidarpainter_models.scenes.records import RecordedView
 from tasks.json_files import write_json
@@ -103,6 +103,7 @@ def _view(
         rgb, sky = path.image(camera, moment), None
     else:
         size = {"width_px": camera.width_px, "height_px": camera.height_px}
-        rgb = shrink_image(path.recorded.read_image(moment), **size).float() / 255
-        sky = sky_mask(path.recorded, moment, camera)
+        rgb_u8 = shrink_image(path.recorded.read_image(moment), **size)
+        points_world = path.recorded.read_points(moment.frame_index).xyz_m
+        rgb, sky = rgb_u8.float() / 255, sky_mask(rgb_u8, points_world, camera)
     return style_view(path.builder, camera, moment.timestamp_ns, rgb, sky)

@@ -34,7 +34,7 @@ from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_rotation
 from lidarpainter_models.kernels.gaussian_raster import render_gaussians
 from lidarpainter_models.kernels.ssim import l1_ssim_loss
-from lidarpainter_models.observations.observations import TrainingView
+from lidarpainter_models.observations.views import TrainingView
 
 SIZE = (30_000, 480, 320)
 BLOCK_M = 1000.0

@@ -10,7 +10,7 @@ from lidarpainter_models.evaluation.judged_pairs import judged_pairs, unseen_vie
 from lidarpainter_models.evaluation.judged_views import JudgedView
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectories import Shift
-from lidarpainter_models.observations.observations import ObservationConfig
+from lidarpainter_models.observations.fit_size import ObservationConfig
 from lidarpainter_models.painter.protocol import PaintingConditions
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView

@@ -4,9 +4,10 @@ import torch
 from toy_street import BLUE, CAR_X_M, GREEN, GROUND, RED, WALL_X_M, ToyStreet
 
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.lidar.colour_sampling import BestSamples
 from lidarpainter_models.lidar.colouring import ColouringConfig
 from lidarpainter_models.lidar.exposure_matching import match_exposure
-from lidarpainter_models.lidar.lidar_map import build_lidar_map
+from lidarpainter_models.lidar.map_building import build_lidar_map
 
 FRAMES = (0, 1, 2, 3)
 
@@ -75,9 +76,8 @@ def test_an_exposure_jump_of_one_view_is_found():
     view = np.stack([generator.permutation(4)[:3] for _ in range(points)])
     noisy = true * gains[view][..., None] * generator.normal(1, 0.03, (points, 3, 3))
     noisy[::11] = 230  # outliers
-    found = match_exposure(
-        np.ones((points, 3), np.float32), noisy.astype(np.uint8), view, np.zeros(4, int)
-    )
+    samples = BestSamples(np.ones((points, 3), np.float32), noisy.astype(np.uint8), view)
+    found = match_exposure(samples, np.zeros(4, int))
     np.testing.assert_allclose(found[2], 1.25, rtol=0.03)
     np.testing.assert_allclose(found[[0, 1, 3]], 1.0, rtol=0.01)
 
@@ -86,7 +86,7 @@ def test_a_camera_without_shared_points_keeps_its_exposure():
     weight = np.ones((500, 2), np.float32)
     rgb = np.full((500, 2, 3), 100, np.uint8)
     view = np.repeat(np.array([[0, 1], [2, 3]]), 250, axis=0)
-    gains = match_exposure(weight, rgb, view, np.array([0, 0, 1, 1]))
+    gains = match_exposure(BestSamples(weight, rgb, view), np.array([0, 0, 1, 1]))
     np.testing.assert_array_equal(gains, 1)
 
 

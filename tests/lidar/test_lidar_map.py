@@ -7,7 +7,8 @@ from toy_street import CAR_SIZE_M, CAR_X_M, WALL_X_M, ToyStreet
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.lidar.actor_separation import SeparationConfig, poses_at
 from lidarpainter_models.lidar.ground_heights import GroundHeights
-from lidarpainter_models.lidar.lidar_map import LidarMapConfig, MapPoints, build_lidar_map
+from lidarpainter_models.lidar.lidar_map import MapPoints
+from lidarpainter_models.lidar.map_building import LidarMapConfig, build_lidar_map
 
 
 @pytest.fixture(scope="module")
@@ -80,15 +81,7 @@ def test_no_points_is_an_error(street):
         LidarMapConfig(min_range_m=10, max_range_m=5)
 
 
-def test_map_points_survive_storage(lidar_map):
-    stored = lidar_map.street.to_arrays()
-    assert all(
-        torch.equal(stored[k], v) for k, v in MapPoints.from_arrays(stored).to_arrays().items()
-    )
-    with pytest.raises(SceneError, match="lack the columns range_m"):
-        MapPoints.from_arrays({k: v for k, v in stored.items() if k != "range_m"})
-    with pytest.raises(SceneError, match="different lengths"):
-        MapPoints.from_arrays(stored | {"range_m": stored["range_m"][1:]})
+def test_no_parts_make_no_points():
     assert len(MapPoints.concatenate([])) == 0
 
 

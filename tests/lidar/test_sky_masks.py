@@ -5,7 +5,8 @@ from toy_street import EYE, LOOK_FORWARD, SKY, ToyStreet
 from lidarpainter_models.errors import ConfigError, ShapeError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_rotation
-from lidarpainter_models.lidar.sky_masks import SkyConfig, sky_from_returns, sky_mask
+from lidarpainter_models.lidar.sky_masks import SkyMaskConfig, sky_from_returns, sky_mask
+from lidarpainter_models.observations.fit_size import shrink_image
 
 HEIGHT, WIDTH, HORIZON = 120, 200, 80
 
@@ -115,7 +116,9 @@ def test_a_recorded_view_is_masked_on_the_grid_asked_for():
     street = ToyStreet()
     view = street.views[0]
     camera = view.camera.resized(width_px=120, height_px=68)
-    sky = sky_mask(street, view, camera)
+    size = {"width_px": camera.width_px, "height_px": camera.height_px}
+    image = shrink_image(street.read_image(view), **size)
+    sky = sky_mask(image, street.read_points(view.frame_index).xyz_m, camera)
     assert sky.shape == (68, 120)
     truth = (street.read_image(view) == torch.tensor(SKY, dtype=torch.uint8)).all(-1)[::2, ::2]
     assert not (sky & ~truth).any()
@@ -127,4 +130,4 @@ def test_inputs_that_do_not_fit_are_refused(camera):
     with pytest.raises(ShapeError, match="image and returns"):
         sky_from_returns(image_of([]), returns_in(), small)
     with pytest.raises(ConfigError, match="clear_rad"):
-        SkyConfig(clear_rad=0)
+        SkyMaskConfig(clear_rad=0)

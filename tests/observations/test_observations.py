@@ -3,6 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 from gaussian_world import camera_at, car_track
+from toy_street import ToyStreet
 
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.gaussians.fitting.images import full_image, half_image, shrink_depth
@@ -12,19 +13,21 @@ from lidarpainter_models.lidar.sparse_depth import (
     move_actor_points,
     sparse_lidar_depth,
 )
-from lidarpainter_models.observations.observations import (
-    ObservationConfig,
-    SceneObservations,
-    shrink_image,
+from lidarpainter_models.observations.fit_size import ObservationConfig, shrink_image
+from lidarpainter_models.observations.preparation import prepare_observations
+from lidarpainter_models.observations.stored_form import (
+    observations_from_arrays,
+    observations_to_arrays,
 )
+from lidarpainter_models.scenes.splits import split_views
 
 FRAME_NS = 100_000_000
 
 
 def test_stored_observations_are_the_same(world):
-    arrays, metadata = world.observations.to_arrays()
-    again = SceneObservations.from_arrays(arrays, metadata)
-    second_arrays, second_metadata = again.to_arrays()
+    arrays, metadata = observations_to_arrays(world.observations)
+    again = observations_from_arrays(arrays, metadata)
+    second_arrays, second_metadata = observations_to_arrays(again)
     assert metadata == second_metadata
     assert arrays.keys() == second_arrays.keys()
     assert all(torch.equal(value, second_arrays[name]) for name, value in arrays.items())
@@ -32,9 +35,21 @@ def test_stored_observations_are_the_same(world):
 
 
 def test_observations_of_another_version_are_refused(world):
-    arrays, metadata = world.observations.to_arrays()
+    arrays, metadata = observations_to_arrays(world.observations)
     with pytest.raises(SceneError, match="prepare them again"):
-        SceneObservations.from_arrays(arrays, {**metadata, "schema": 0})
+        observations_from_arrays(arrays, {**metadata, "schema": 0})
+
+
+def test_every_training_image_is_decoded_once():
+    street, read = ToyStreet(), []
+    street.read_image = lambda view: read.append(view.key) or ToyStreet.read_image(street, view)
+    split = split_views(street, "alternate")
+    observations = prepare_observations(street, split, ObservationConfig(width_px=120))
+    assert read == [view.key for view in split.train]
+    assert [view.key for view in observations.views] == read
+    points = observations.lidar_map.street
+    assert sorted(points.frame_index.unique().tolist()) == [0, 2]
+    assert float(points.has_colour.float().mean()) > 0.9
 
 
 def test_image_is_averaged_by_area():

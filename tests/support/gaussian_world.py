@@ -18,9 +18,8 @@ from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
 from lidarpainter_models.gaussians.model.sky import SkyConfig, SkyTexture, sky_layout
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_rotation
-from lidarpainter_models.lidar.lidar_map import LidarMap
-from lidarpainter_models.lidar.map_points import MapPoints
-from lidarpainter_models.observations.observations import SceneObservations, TrainingView
+from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
+from lidarpainter_models.observations.views import SceneObservations, TrainingView
 from lidarpainter_models.scenes.driving_scene import ActorTrack
 
 WIDTH_PX, HEIGHT_PX = 64, 48

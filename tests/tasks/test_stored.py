@@ -2,7 +2,6 @@
 
 import math
 
-import pytest
 from lidarpainter_models.evaluation.score_tables import metric_values, score_rows
 from tasks.json_files import read_json, write_json
 

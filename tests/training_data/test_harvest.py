@@ -9,7 +9,7 @@ import torch
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.initialisation.scene import InitialisationConfig
-from lidarpainter_models.observations.observations import ObservationConfig
+from lidarpainter_models.observations.fit_size import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import ImageRecord, SweepPoints
 from lidarpainter_models.scenes.splits import split_views

@@ -23,7 +23,7 @@ from lidarpainter_models.gaussians.fitting.step import Perceptual, fit_step
 from lidarpainter_models.gaussians.initialisation.scene import initialise_scene
 from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
 from lidarpainter_models.gaussians.model.sky import seen_as_sky
-from lidarpainter_models.observations.observations import GuidanceView, SceneObservations
+from lidarpainter_models.observations.views import GuidanceView, SceneObservations
 
 Progress = Callable[[int, int, dict[str, float]], None]
 """Told the steps done, the steps in all and the newest entry of the history."""

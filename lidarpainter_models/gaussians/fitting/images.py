@@ -9,7 +9,8 @@ from torch import Tensor
 
 from lidarpainter_models.gaussians.fitting.pixel_terms import NOTHING, OPEN, SKY, SOLID, PixelFacts
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.observations.observations import TrainingView, shrink_image
+from lidarpainter_models.observations.fit_size import shrink_image
+from lidarpainter_models.observations.views import TrainingView
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

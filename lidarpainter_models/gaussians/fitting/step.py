@@ -25,7 +25,7 @@ from lidarpainter_models.geometry.box_masks import project_boxes
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
 from lidarpainter_models.kernels.ssim import l1_ssim_loss
-from lidarpainter_models.observations.observations import GuidanceView
+from lidarpainter_models.observations.views import GuidanceView
 
 Perceptual = Callable[
     [Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]], Float[Tensor, ""]

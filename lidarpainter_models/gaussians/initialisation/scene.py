@@ -37,7 +37,7 @@ from lidarpainter_models.gaussians.model.sky import SkyConfig, sky_from_images, 
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import transform_points
 from lidarpainter_models.lidar.lidar_map import MapPoints
-from lidarpainter_models.observations.observations import SceneObservations, TrainingView
+from lidarpainter_models.observations.views import SceneObservations, TrainingView
 from lidarpainter_models.scenes.driving_scene import ActorTrack
 
 _MOST_VIEWS_PER_ACTOR = 24

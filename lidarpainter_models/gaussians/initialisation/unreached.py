@@ -22,7 +22,7 @@ from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
 from lidarpainter_models.geometry.box_masks import project_boxes
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation
 from lidarpainter_models.lidar.ground_heights import GroundHeights
-from lidarpainter_models.observations.observations import TrainingView
+from lidarpainter_models.observations.views import TrainingView
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

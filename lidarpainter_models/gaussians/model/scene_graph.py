@@ -28,9 +28,9 @@ from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_tangent
 from lidarpainter_models.kernels.backends import Backend
 from lidarpainter_models.kernels.gaussian_raster import SplatImage, render_gaussians
-from lidarpainter_models.observations.stored_tracks import tracks_from_arrays, tracks_to_arrays
 from lidarpainter_models.scenes.driving_scene import ActorTrack
 from lidarpainter_models.scenes.records import ViewKey
+from lidarpainter_models.scenes.stored_tracks import tracks_from_arrays, tracks_to_arrays
 
 OPAQUE = 1 - 1 / 512
 """From this opacity on the sky is not looked up: it would change no byte by more than half."""

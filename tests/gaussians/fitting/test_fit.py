@@ -22,7 +22,7 @@ from lidarpainter_models.gaussians.initialisation.scene import (
     initialise_scene,
 )
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
-from lidarpainter_models.observations.observations import GuidanceView
+from lidarpainter_models.observations.views import GuidanceView
 
 STEPS = 40
 

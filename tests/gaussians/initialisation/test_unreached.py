@@ -15,7 +15,7 @@ from lidarpainter_models.gaussians.initialisation.unreached import (
 )
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.observations.observations import TrainingView
+from lidarpainter_models.observations.views import TrainingView
 
 
 def sideways_cameras():

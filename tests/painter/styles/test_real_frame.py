@@ -6,11 +6,7 @@ import torch
 from lidarpainter_models.lidar.sky_masks import sky_mask
 from lidarpainter_models.lidar.sparse_depth import SparseDepthConfig, sparse_lidar_depth
 from lidarpainter_models.metrics.edges import edge_agreement
-from lidarpainter_models.observations.observations import (
-    ObservationConfig,
-    fit_camera,
-    shrink_image,
-)
+from lidarpainter_models.observations.fit_size import ObservationConfig, fit_camera, shrink_image
 from lidarpainter_models.painter.styles import StyleView, apply_style
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -26,10 +22,11 @@ def recorded(shared_folder, tmp_path_factory):
     camera = fit_camera(moment, ObservationConfig(width_px=960))
     size = {"width_px": camera.width_px, "height_px": camera.height_px}
     points = scene.read_points(moment.frame_index).xyz_m
+    image = shrink_image(scene.read_image(moment), **size)
     return StyleView(
-        rgb=shrink_image(scene.read_image(moment), **size).float() / 255,
+        rgb=image.float() / 255,
         depth_m=sparse_lidar_depth(points, camera, config=SparseDepthConfig()),
-        sky=sky_mask(scene, moment, camera).float(),
+        sky=sky_mask(image, points, camera).float(),
         camera=camera,
     )
 

@@ -1,0 +1,44 @@
+"""At which size a fit sees recorded images."""
+
+from dataclasses import dataclass, field
+
+import cv2
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.lidar.sparse_depth import SparseDepthConfig
+from lidarpainter_models.scenes.records import RecordedView
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ObservationConfig:
+    """How recordings are prepared for a fit."""
+
+    width_px: int = 480
+    """Fit width; the height keeps each camera's aspect ratio."""
+    depth: SparseDepthConfig = field(default_factory=SparseDepthConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse images too small for the SSIM window."""
+        if self.width_px < 32:
+            raise ConfigError(f"width_px must be at least 32, got {self.width_px}")
+
+
+def shrink_image(
+    rgb_u8: UInt8[Tensor, "height width 3"], *, width_px: int, height_px: int
+) -> UInt8[Tensor, "rows columns 3"]:
+    """Area-averaged copy of an image."""
+    if rgb_u8.shape[:2] == (height_px, width_px):
+        return rgb_u8
+    small = cv2.resize(rgb_u8.numpy(), (width_px, height_px), interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(small)
+
+
+def fit_camera(view: RecordedView, config: ObservationConfig) -> Camera:
+    """The view's camera at fit size; images are never enlarged."""
+    width_px = min(config.width_px, view.camera.width_px)
+    height_px = max(round(view.camera.height_px * width_px / view.camera.width_px), 1)
+    return view.camera.resized(width_px=width_px, height_px=height_px)

@@ -1,0 +1,81 @@
+"""Read everything that a fit needs of a scene, each image once.
+
+Only training views and the sweeps of training frames enter.
+"""
+
+from collections.abc import Callable
+
+from jaxtyping import UInt8
+from torch import Tensor
+
+from lidarpainter_models.errors import SceneError
+from lidarpainter_models.lidar.colouring import MapColouring
+from lidarpainter_models.lidar.map_building import LidarMapConfig, gather_points
+from lidarpainter_models.lidar.sky_masks import sky_mask
+from lidarpainter_models.lidar.sparse_depth import points_at_exposure, sparse_lidar_depth
+from lidarpainter_models.observations.fit_size import ObservationConfig, fit_camera, shrink_image
+from lidarpainter_models.observations.views import SceneObservations, TrainingView
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.records import RecordedView
+from lidarpainter_models.scenes.splits import ViewSplit
+
+
+def prepare_observations(
+    scene: DrivingScene,
+    split: ViewSplit,
+    config: ObservationConfig,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> SceneObservations:
+    """Prepare what a fit on the split's training views needs.
+
+    Args:
+        scene: where it is read from.
+        split: its training views give images, its training frames give sweeps.
+        config: see there.
+        progress: told after each view how many of how many are done.
+
+    Raises:
+        SceneError: the split has no training views.
+    """
+    if not split.train:
+        raise SceneError(f"the split of {scene.dataset}/{scene.sequence} has no training views")
+    map_config = LidarMapConfig()
+    colouring = MapColouring(
+        gather_points(scene, split.train_frames, map_config),
+        scene.tracks,
+        split.train,
+        map_config.colouring,
+    )
+    views = []
+    for done, recorded in enumerate(split.train, start=1):
+        image = scene.read_image(recorded)
+        views.append(_training_view(scene, recorded, image, config))
+        colouring.add(recorded, image)
+        if progress is not None:
+            progress(done, len(split.train))
+    return SceneObservations(
+        views=tuple(views),
+        lidar_map=colouring.coloured(),
+        tracks=tuple(track for track in scene.tracks if track.is_moving),
+    )
+
+
+def _training_view(
+    scene: DrivingScene,
+    recorded: RecordedView,
+    image: UInt8[Tensor, "recorded_height recorded_width 3"],
+    config: ObservationConfig,
+) -> TrainingView:
+    """A recorded image at fit size, with its sky and its frame's LiDAR depth."""
+    camera = fit_camera(recorded, config)
+    rgb_u8 = shrink_image(image, width_px=camera.width_px, height_px=camera.height_px)
+    points_world = points_at_exposure(scene, recorded)
+    return TrainingView(
+        key=recorded.key,
+        camera=camera,
+        timestamp_ns=recorded.timestamp_ns,
+        rgb_u8=rgb_u8,
+        sky_mask=sky_mask(rgb_u8, scene.read_points(recorded.frame_index).xyz_m, camera),
+        lidar_depth_m=sparse_lidar_depth(points_world, camera, config=config.depth),
+    )

@@ -1,0 +1,91 @@
+"""Observations as named arrays and JSON-able metadata, so that a fit reads no dataset."""
+
+from dataclasses import fields
+from typing import Any
+
+from torch import Tensor
+
+from lidarpainter_models.errors import SceneError
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
+from lidarpainter_models.observations.views import SceneObservations, TrainingView
+from lidarpainter_models.scenes.stored_tracks import COLUMNS as TRACK_COLUMNS
+from lidarpainter_models.scenes.stored_tracks import tracks_from_arrays, tracks_to_arrays
+
+SCHEMA = 1
+_LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
+_IMAGES = ("rgb_u8", "sky_mask", "lidar_depth_m")
+
+
+def observations_to_arrays(
+    observations: SceneObservations,
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Arrays and metadata; `observations_from_arrays` is the inverse, bit for bit."""
+    track_arrays, track_records = tracks_to_arrays(observations.tracks)
+    arrays = {f"tracks.{name}": value for name, value in track_arrays.items()}
+    lidar_map = observations.lidar_map
+    actor_ids = sorted(lidar_map.actors)
+    for index, part in enumerate(
+        [lidar_map.street, *(lidar_map.actors[name] for name in actor_ids)]
+    ):
+        arrays |= {f"map.{index}.{name}": value for name, value in part.to_arrays().items()}
+    records = []
+    for index, view in enumerate(observations.views):
+        for name in _IMAGES:
+            arrays[f"view.{index}.{name}"] = getattr(view, name).contiguous()
+        arrays[f"view.{index}.world_from_camera"] = view.camera.world_from_camera.contiguous()
+        lens = {name: getattr(view.camera, name) for name in _LENS}
+        records.append({"key": list(view.key), "timestamp_ns": view.timestamp_ns, "lens": lens})
+    metadata = {
+        "schema": SCHEMA,
+        "views": records,
+        "tracks": track_records,
+        "map_actors": actor_ids,
+    }
+    return arrays, metadata
+
+
+def observations_from_arrays(
+    arrays: dict[str, Tensor], metadata: dict[str, Any]
+) -> SceneObservations:
+    """Rebuild stored observations.
+
+    Raises:
+        SceneError: they were written by another version.
+    """
+    if metadata.get("schema") != SCHEMA:
+        raise SceneError(
+            f"stored observations have schema {metadata.get('schema')}, this version reads "
+            f"{SCHEMA}: prepare them again"
+        )
+    tracks = tracks_from_arrays(
+        {name: arrays[f"tracks.{name}"] for name in TRACK_COLUMNS}, metadata["tracks"]
+    )
+    street, *actors = (
+        MapPoints(
+            **{column.name: arrays[f"map.{index}.{column.name}"] for column in fields(MapPoints)}
+        )
+        for index in range(len(metadata["map_actors"]) + 1)
+    )
+    views = [_stored_view(arrays, index, row) for index, row in enumerate(metadata["views"])]
+    return SceneObservations(
+        views=tuple(views),
+        lidar_map=LidarMap(
+            street=street, actors=dict(zip(metadata["map_actors"], actors, strict=True))
+        ),
+        tracks=tracks,
+    )
+
+
+def _stored_view(arrays: dict[str, Tensor], index: int, record: dict[str, Any]) -> TrainingView:
+    """One view of stored observations."""
+    frame_index, camera_name = record["key"]
+    images = {name: arrays[f"view.{index}.{name}"] for name in _IMAGES}
+    return TrainingView(
+        key=(int(frame_index), str(camera_name)),
+        camera=Camera(
+            world_from_camera=arrays[f"view.{index}.world_from_camera"], **record["lens"]
+        ),
+        timestamp_ns=record["timestamp_ns"],
+        **images,
+    )

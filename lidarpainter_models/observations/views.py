@@ -1,0 +1,62 @@
+"""What a fit sees of a scene: training images at fit size, sparse depth, sky masks, LiDAR map.
+
+Frames: world (z up) and camera (x right, y down, z forward); metres.
+"""
+
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.lidar.lidar_map import LidarMap
+from lidarpainter_models.scenes.records import ViewKey
+from lidarpainter_models.scenes.tracks import ActorTrack
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrainingView:
+    """One recorded image that a fit may use."""
+
+    key: ViewKey
+    camera: Camera
+    """As recorded, at fit size."""
+    timestamp_ns: int
+    rgb_u8: UInt8[Tensor, "height width 3"]
+    sky_mask: Bool[Tensor, "height width"]
+    lidar_depth_m: Float[Tensor, "height width"]
+    """The own frame's sweeps, 0 where no point falls."""
+
+    @property
+    def rgb(self) -> Float[Tensor, "height width 3"]:
+        """The image as floats."""
+        return self.rgb_u8.float() / 255
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GuidanceView:
+    """One painted image of a view nobody recorded."""
+
+    camera: Camera
+    """Where the image was painted; it is never corrected."""
+    timestamp_ns: int
+    rgb: Float[Tensor, "height width 3"]
+    weight: Float[Tensor, "height width"]
+    """Confidence per pixel, 0 to 1."""
+    lidar_depth_m: Float[Tensor, "height width"]
+    """Sparse LiDAR depth in this view, 0 where there is none."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneObservations:
+    """All that a fit sees."""
+
+    views: tuple[TrainingView, ...]
+    lidar_map: LidarMap
+    tracks: tuple[ActorTrack, ...]
+    """Moving actors only."""
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """Cameras that have training views, sorted."""
+        return tuple(sorted({view.key[1] for view in self.views}))
