@@ -6,7 +6,7 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from lidarpainter_models.geometry.boxes import box_corners
+from lidarpainter_models.geometry.boxes import BOX_EDGES, box_corners
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -15,8 +15,6 @@ from lidarpainter_models.scenes.tracks import ActorTrack
 _NEAREST_M, _FARTHEST_M = 3.0, 90.0
 _NEAR_PLANE_M = 0.3
 _MOVING_RGB, _PARKED_RGB = (80, 255, 80), (255, 255, 255)
-# corners differ in one axis along an edge; box_corners counts x slowest, z fastest
-_EDGES = tuple((i, i + step) for step in (1, 2, 4) for i in range(8) if not i & step)
 
 
 def draw_overlay(
@@ -62,7 +60,7 @@ def _draw_box(image: np.ndarray, camera: Camera, track: ActorTrack, timestamp_ns
     corners = transform_points(camera_from_box, box_corners(track.size_m.double())).numpy()
     colour = _MOVING_RGB if track.is_moving else _PARKED_RGB
     crossed = ((4, 7), (5, 6))  # the diagonals of the face at +x
-    for first, second in (*_EDGES, *crossed):
+    for first, second in (*BOX_EDGES, *crossed):
         _draw_line(image, camera, corners[first], corners[second], colour)
 
 

@@ -13,18 +13,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lidarpainter_models.geometry.boxes import box_corners
+from lidarpainter_models.geometry.box_masks import FARTHEST_PX, project_box
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.geometry.transforms import transform_points
 from lidarpainter_models.metrics.images import ImageScores, pooled_psnr, score_image
 from lidarpainter_models.metrics.perceptual import PerceptualDistances
 from lidarpainter_models.scenes.driving_scene import ActorTrack
 
 Renderer = Callable[[Camera, int], Float[Tensor, "height width 3"]]
 """Image of a camera (fit resolution) at a time in nanoseconds."""
-
-NEAR_M = 0.5
-"""Boxes with a corner nearer than this to the image plane are left out of actor masks."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,15 +58,11 @@ def actor_mask(
     for track in tracks:
         if not track.is_moving or not track.is_present(timestamp_ns):
             continue
-        corners = box_corners(track.size_m.double())
-        pixels, depth_m = camera.project(
-            transform_points(track.pose_at(timestamp_ns).double(), corners)
-        )
-        if float(depth_m.min()) < NEAR_M:
-            continue
-        limit = 4.0 * max(camera.width_px, camera.height_px)
-        hull = cv2.convexHull(pixels.clamp(-limit, limit).numpy().astype(np.float32))
-        cv2.fillConvexPoly(mask, np.round(hull - 0.5).astype(np.int32), 1)
+        pixels_uv = project_box(camera, track.pose_at(timestamp_ns), track.size_m)
+        if len(pixels_uv):
+            clamped = pixels_uv.clamp(-FARTHEST_PX, FARTHEST_PX).numpy().astype(np.float32)
+            hull = cv2.convexHull(clamped)
+            cv2.fillConvexPoly(mask, np.round(hull - 0.5).astype(np.int32), 1)
     return torch.from_numpy(mask.astype(bool))
 
 

@@ -10,6 +10,9 @@ from torch import Tensor
 
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 
+BOX_EDGES = tuple((i, i + step) for step in (1, 2, 4) for i in range(8) if not i & step)
+"""Pairs of the corners that `box_corners` gives: those that differ in one axis."""
+
 
 def is_inside_box(
     points_world: Float[Tensor, "points 3"],

@@ -16,13 +16,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lidarpainter_models.geometry.box_masks import FARTHEST_PX, project_box
 from lidarpainter_models.geometry.boxes import box_corners
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import transform_points
 from lidarpainter_models.kernels.point_splat import splat_points
 
 _FAR_M = 1e6
-_BOX_NEAR_M = 0.3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -115,18 +115,15 @@ def box_far_ends(
     """
     far_ends = np.full((camera.height_px, camera.width_px), _FAR_M, np.float32)
     for world_from_box, size_m in boxes:
-        corners = transform_points(world_from_box.double(), box_corners(size_m.double()))
-        corners = transform_points(camera.camera_from_world, corners)
-        z = corners[:, 2]
-        if float(z.max()) <= _BOX_NEAR_M:
+        pixels_uv = project_box(camera, world_from_box, size_m)
+        if len(pixels_uv) == 0:
             continue
-        # a box that reaches behind the camera is drawn from just before it
-        u = corners[:, 0] / z.clamp(min=_BOX_NEAR_M) * camera.fx_px + camera.cx_px
-        v = corners[:, 1] / z.clamp(min=_BOX_NEAR_M) * camera.fy_px + camera.cy_px
-        outline = torch.stack([u, v], dim=-1).clamp(-1e4, 1e4).floor().int().numpy()
+        outline = pixels_uv.clamp(-FARTHEST_PX, FARTHEST_PX).floor().int().numpy()
         mask = np.zeros(far_ends.shape, np.uint8)
         cv2.fillConvexPoly(mask, cv2.convexHull(outline), 1)
-        np.minimum(far_ends, np.float32(z.max()), out=far_ends, where=mask > 0)
+        corners = transform_points(world_from_box.double(), box_corners(size_m.double()))
+        far_end_m = transform_points(camera.camera_from_world, corners)[:, 2].max()
+        np.minimum(far_ends, np.float32(far_end_m), out=far_ends, where=mask > 0)
     return torch.from_numpy(far_ends)
 
 
