@@ -71,7 +71,7 @@ class ConditionBuilder:
         self.lidar_map = lidar_map
         self.config = config or ConditionConfig()
         self.tracks = scene.tracks
-        self._boxes = MovingBoxes(self.tracks, self.config.warp.boxes)
+        self.boxes = MovingBoxes(self.tracks, self.config.warp.boxes)
         self._views = {view.key: view for view in training_views}
         self._cameras = {
             view.key: scene.corrected_camera(
@@ -166,7 +166,7 @@ class ConditionBuilder:
                 is_sky,
             ),
             sources,
-            self._boxes,
+            self.boxes,
             count=self.config.num_references,
             config=self.config.warp,
         )

@@ -33,6 +33,18 @@ class WarpTarget(NamedTuple):
     is_sky: Bool[Tensor, "height width"]
     """Looked for at infinity where the first guess knows nothing."""
 
+    @classmethod
+    def of_render(
+        cls,
+        camera: Camera,
+        timestamp_ns: int,
+        depth_m: Float[Tensor, "height width"],
+        alpha: Float[Tensor, "height width"],
+        config: WarpConfig,
+    ) -> "WarpTarget":
+        """A view of which the render alone is known; what has no depth and is clear is sky."""
+        return cls(camera, timestamp_ns, [depth_m], alpha < config.sky_alpha)
+
 
 class WarpedReferences(NamedTuple):
     """Recorded colours in another view, best first; 0 where not valid."""

@@ -12,7 +12,8 @@ from typing import Literal, NamedTuple
 import torch
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
-from lidarpainter_models.conditioning.warping import SourceImage, warp_images
+from lidarpainter_models.conditioning.references import WarpTarget, warped_references
+from lidarpainter_models.conditioning.warping import SourceImage
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.painter.protocol import (
@@ -112,14 +113,12 @@ class SequencePainter:
     ) -> Painting:
         if self._previous is None:
             return self._painter.paint(conditions)
-        carried, valid = warp_images(
-            camera,
-            timestamp_ns,
-            conditions.render_depth_m,
-            conditions.render_alpha,
-            [self._previous],
-            self._builder.tracks,
-            config=self._builder.config.warp,
+        config = self._builder.config.warp
+        target = WarpTarget.of_render(
+            camera, timestamp_ns, conditions.render_depth_m, conditions.render_alpha, config
+        )
+        carried, valid = warped_references(
+            target, [self._previous], self._builder.boxes, count=1, config=config
         )
         if self._config.previous == "shown":
             shown = replace(

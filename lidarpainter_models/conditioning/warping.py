@@ -8,7 +8,6 @@ Frames: world z up; camera x right, y down, z forward; depth is camera z in metr
 pixel centres at half-integers.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -17,8 +16,7 @@ from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.lidar.moving_boxes import BoxConfig, MovingBoxes
-from lidarpainter_models.scenes.driving_scene import ActorTrack
+from lidarpainter_models.lidar.moving_boxes import BoxConfig
 
 SKY_DEPTH_M = 1e5
 """Far enough for any parallax to vanish, near enough for float32."""
@@ -70,65 +68,6 @@ def source_cost_m(
     return float(
         distance_m + config.angle_weight_m_rad * angle_rad + config.time_weight_m_s * seconds
     )
-
-
-def nearest_sources(
-    target_camera: Camera,
-    timestamp_ns: int,
-    sources: Sequence[SourceImage],
-    *,
-    count: int,
-    exclude: frozenset[tuple[int, str]] = frozenset(),
-    config: WarpConfig | None = None,
-) -> tuple[SourceImage, ...]:
-    """The `count` sources nearest in place, direction and time; ties go to the earlier one."""
-    config = config or WarpConfig()
-    allowed = [source for source in sources if source.key not in exclude]
-    allowed.sort(
-        key=lambda source: source_cost_m(
-            target_camera, timestamp_ns, source.camera, source.timestamp_ns, config
-        )
-    )
-    return tuple(allowed[:count])
-
-
-def warp_images(
-    target_camera: Camera,
-    target_timestamp_ns: int,
-    target_depth_m: Float[Tensor, "height width"],
-    target_alpha: Float[Tensor, "height width"],
-    sources: Sequence[SourceImage],
-    tracks: Sequence[ActorTrack],
-    *,
-    config: WarpConfig | None = None,
-) -> tuple[Float[Tensor, "sources height width 3"], Bool[Tensor, "sources height width"]]:
-    """Every source as the target camera would see it, and where that is known.
-
-    A pixel without depth is sky if its alpha is low, else nothing is known of it. `tracks` are
-    the moving actors. Images are 0 where they are not valid.
-    """
-    config = config or WarpConfig()
-    height_px, width_px = target_depth_m.shape
-    has_depth = target_depth_m > 0
-    is_sky = ~has_depth & (target_alpha < config.sky_alpha)
-    depth_m = torch.where(has_depth, target_depth_m, SKY_DEPTH_M)
-    points_world = target_camera.unproject(depth_m).reshape(-1, 3)
-    known = (has_depth | is_sky).reshape(-1)
-    boxes = MovingBoxes(tracks, config.boxes)
-    owners = boxes.owners(points_world, target_timestamp_ns)
-    images, valids = [], []
-    for source in sources:
-        points, present = boxes.moved(
-            points_world, owners, from_ns=target_timestamp_ns, to_ns=source.timestamp_ns
-        )
-        rgb, seen = sample_source(source, points, is_sky.reshape(-1), config=config)
-        valid = (seen & present & known).reshape(height_px, width_px)
-        images.append(torch.where(valid[..., None], rgb.reshape(height_px, width_px, 3), 0))
-        valids.append(valid)
-    if not images:
-        empty = target_depth_m.new_zeros(0, height_px, width_px)
-        return empty[..., None].expand(-1, -1, -1, 3), empty.to(torch.bool)
-    return torch.stack(images), torch.stack(valids)
 
 
 def sample_source(

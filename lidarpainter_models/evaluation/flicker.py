@@ -13,7 +13,8 @@ from statistics import fmean
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lidarpainter_models.conditioning.warping import SourceImage, WarpConfig, warp_images
+from lidarpainter_models.conditioning.references import WarpTarget, warped_references
+from lidarpainter_models.conditioning.warping import SourceImage, WarpConfig
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.moving_boxes import BACKGROUND, MovingBoxes
 from lidarpainter_models.metrics.images import psnr_from_error, squared_error
@@ -63,7 +64,6 @@ class FlickerTally:
 
     def __init__(self, tracks: Sequence[ActorTrack], config: WarpConfig | None = None) -> None:
         """Take the moving actors, and when two views show the same surface."""
-        self._tracks = tracks
         self._config = config or WarpConfig()
         self._boxes = MovingBoxes(tracks, self._config.boxes)
         self._images: dict[str, _ImageTally] = {}
@@ -108,23 +108,21 @@ class FlickerTally:
             )
             for name, rgb in before.images.items()
         ]
-        carried, valid = warp_images(
-            now.camera,
-            now.timestamp_ns,
-            now.depth_m,
-            now.alpha,
-            sources,
-            self._tracks,
-            config=self._config,
+        target = WarpTarget.of_render(
+            now.camera, now.timestamp_ns, now.depth_m, now.alpha, self._config
         )
-        compared = valid[0]  # of depth alone, so the same for all images
+        carried = [
+            warped_references(target, [source], self._boxes, count=1, config=self._config)
+            for source in sources
+        ]
+        compared = carried[0].valid[0]  # of depth alone, so the same for all images
         moving = compared & self._on_actors(now)
         self._num_pairs += 1
         self._num_pixels += compared.numel()
         self._num_valid += int(compared.sum())
         self._num_moving += int(moving.sum())
-        for rgb, (name, image) in zip(carried, now.images.items(), strict=True):
-            difference = (rgb - image).abs().mean(dim=-1).double()
+        for warped, (name, image) in zip(carried, now.images.items(), strict=True):
+            difference = (warped.rgb[0] - image).abs().mean(dim=-1).double()
             self._images[name].difference += float(difference[compared].sum())
             self._images[name].moving_difference += float(difference[moving].sum())
 

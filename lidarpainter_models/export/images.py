@@ -1,4 +1,4 @@
-"""Images as files: PNG without loss, JPEG for pages, depth maps in false colour."""
+"""Images as files: PNG without loss, JPEG for pages."""
 
 import base64
 from pathlib import Path
@@ -12,22 +12,11 @@ from torch import Tensor
 from lidarpainter_models.errors import StorageError
 
 JPEG_QUALITY = 90
-DEPTH_RANGE_M = (2.0, 80.0)
-"""Nearest and farthest depth that false colours tell apart."""
 
 
 def to_bytes(rgb: Float[Tensor, "height width 3"]) -> np.ndarray:
     """Round rgb in [0, 1] to uint8 (height, width, 3)."""
     return (rgb.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-
-
-def colour_depth(depth_m: Float[Tensor, "height width"]) -> Float[Tensor, "height width 3"]:
-    """Logarithmic false colours, near is warm; holes (0) are black."""
-    near, far = (float(np.log(bound)) for bound in DEPTH_RANGE_M)
-    scaled = (torch.log(depth_m.clamp(min=1e-3)) - near) / (far - near)
-    grey = ((1 - scaled.clamp(0, 1)) * 255).to(torch.uint8).cpu().numpy()
-    rgb = cv2.cvtColor(cv2.applyColorMap(grey, cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)
-    return torch.from_numpy(rgb).float() / 255 * (depth_m > 0).cpu()[..., None]
 
 
 def jpeg_data_url(rgb: Float[Tensor, "height width 3"]) -> str:

@@ -1,20 +1,23 @@
 import pytest
 import torch
 
-from lidarpainter_models.conditioning.warping import (
-    WarpConfig,
-    nearest_sources,
-    warp_images,
-)
+from lidarpainter_models.conditioning.references import WarpTarget, warped_references
+from lidarpainter_models.conditioning.warping import WarpConfig
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.lidar.moving_boxes import BACKGROUND, MovingBoxes
 
 SECOND_NS = 1_000_000_000
 
 
+def warp(target, timestamp_ns, depth_m, alpha, source, tracks=()):
+    config = WarpConfig()
+    wanted = WarpTarget.of_render(target, timestamp_ns, depth_m, alpha, config)
+    return warped_references(wanted, [source], MovingBoxes(tracks), count=1, config=config)
+
+
 def warp_one(target, boards, source, draw, tracks=(), *, timestamp_ns=0):
     truth, depth_m = draw(target, boards)
-    rgb, valid = warp_images(target, timestamp_ns, depth_m, (depth_m > 0).float(), [source], tracks)
+    rgb, valid = warp(target, timestamp_ns, depth_m, (depth_m > 0).float(), source, tracks)
     return truth, rgb[0], valid[0]
 
 
@@ -62,7 +65,7 @@ def test_a_surface_at_a_grazing_angle_passes_the_depth_test(camera_at, source_of
         **{**vars(image), "depth_m": ground_depth(source_camera), "alpha": torch.ones(48, 64)}
     )
     depth_m = ground_depth(target)
-    _, valid = warp_images(target, 0, depth_m, torch.ones(48, 64), [source], [])
+    _, valid = warp(target, 0, depth_m, torch.ones(48, 64), source)
     # the row at 34 m and those nearer: there one row already is 40 % of the depth
     assert valid[0, 27:, 4:60].all()
 
@@ -85,9 +88,7 @@ def test_sky_hidden_in_the_source_is_invalid(camera_at, board, draw, source_of):
 
 def test_a_hole_that_is_no_sky_stays_unknown(camera_at, source_of):
     source = source_of(camera_at(), [])
-    _, valid = warp_images(
-        camera_at(), 0, torch.zeros(48, 64), torch.full((48, 64), 0.9), [source], []
-    )
+    _, valid = warp(camera_at(), 0, torch.zeros(48, 64), torch.full((48, 64), 0.9), source)
     assert not valid.any()
 
 
@@ -102,11 +103,11 @@ def test_an_actor_is_carried_by_its_box(camera_at, board, draw, source_of, movin
     source = source_of(camera_at(), boards(2.0), timestamp_ns=then)
     target = camera_at()
     truth, depth_m = draw(target, boards(-1.0))
-    rgb, valid = warp_images(target, now, depth_m, torch.ones(48, 64), [source], [track])
+    rgb, valid = warp(target, now, depth_m, torch.ones(48, 64), source, [track])
     on_car = (depth_m < 11) & (torch.arange(48)[:, None] < 30)
     assert valid[0][on_car].float().mean() > 0.75  # all but its rim
     assert (rgb[0] - truth)[valid[0]].abs().max() < 5e-3
-    _, as_street = warp_images(target, now, depth_m, torch.ones(48, 64), [source], [])
+    _, as_street = warp(target, now, depth_m, torch.ones(48, 64), source)
     assert not as_street[0][on_car].any()
 
 
@@ -129,24 +130,11 @@ def test_the_road_under_an_actor_stays_with_the_street(moving_track):
     assert owners.tolist() == [0, 0, BACKGROUND, BACKGROUND, BACKGROUND]
 
 
-def test_nearest_sources_weigh_place_direction_and_time(camera_at, source_of):
-    sources = [
-        source_of(camera_at(0), [], frame=0),
-        source_of(camera_at(1), [], frame=1),
-        source_of(camera_at(1, yaw_rad=1.0), [], frame=2),
-        source_of(camera_at(1), [], frame=3, timestamp_ns=SECOND_NS),
-    ]
-    picked = nearest_sources(camera_at(1.1), 0, sources, count=3)
-    assert [source.key[0] for source in picked] == [1, 0, 3]
-    others = nearest_sources(camera_at(1.1), 0, sources, count=9, exclude=frozenset({(1, "front")}))
-    assert [source.key[0] for source in others] == [0, 3, 2]
-
-
-def test_no_sources_give_no_images(camera_at):
-    empty = torch.zeros(48, 64)
-    rgb, valid = warp_images(camera_at(), 0, empty, empty, [], [])
-    assert rgb.shape == (0, 48, 64, 3)
-    assert valid.shape == (0, 48, 64)
+def test_no_sources_give_no_colours(camera_at):
+    nowhere = WarpTarget(camera_at(), 0, [torch.zeros(48, 64)], torch.ones(48, 64) > 0)
+    warped = warped_references(nowhere, [], MovingBoxes([]), count=2)
+    assert warped.rgb.shape == (2, 48, 64, 3)
+    assert not warped.valid.any()
 
 
 def test_a_tolerance_of_everything_is_refused():

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lidarpainter_models.errors import StorageError
-from lidarpainter_models.export.images import colour_depth, to_bytes, write_png
+from lidarpainter_models.export.images import to_bytes, write_png
 from lidarpainter_models.export.report import (
     Comparison,
     Plot,
@@ -61,12 +61,6 @@ def test_missing_numbers_print_as_a_dash_and_numbers_shortly():
 def test_bytes_round_and_clamp():
     rgb = torch.tensor([[[-1.0, 0.5, 2.0]]])
     assert to_bytes(rgb).tolist() == [[[0, 128, 255]]]
-
-
-def test_holes_in_a_depth_map_are_black():
-    coloured = colour_depth(torch.tensor([[0.0, 10.0]]))
-    assert float(coloured[0, 0].sum()) == 0
-    assert float(coloured[0, 1].sum()) > 0
 
 
 def test_unwritable_place_is_named(tmp_path):
