@@ -1,8 +1,9 @@
-"""Environment variables that must stand before heavy packages are imported.
+"""Settings of the whole process that must stand before heavy packages are imported.
 
 What the user has set stays as it is.
 """
 
+import ctypes
 import math
 import os
 import tempfile
@@ -24,12 +25,15 @@ QUIET = {"PREFECT_LOGGING_LEVEL": "CRITICAL"}
 """Errors reach the user as one line of ours, not as Prefect's traceback."""
 
 
+KEPT_BYTES = 32 << 20
+"""Largest freed block that the C library keeps for the next use: as far as glibc goes by itself."""
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 CPU_LIMIT = Path("/sys/fs/cgroup/cpu.max")
 """Quota and period in microseconds, where a container has one."""
 
 
 def prepare_environment(*, is_quiet: bool) -> None:
-    """Set what Prefect, OpenMP and numba read at import.
+    """Set what Prefect, OpenMP and numba read at import, and keep freed memory.
 
     Args:
         is_quiet: whether Prefect keeps its log lines to itself.
@@ -38,9 +42,23 @@ def prepare_environment(*, is_quiet: bool) -> None:
     counts = {"NUMBA_NUM_THREADS": threads, "OMP_NUM_THREADS": threads}
     for name, value in {**PREFECT, **THREADS, **counts, **(QUIET if is_quiet else {})}.items():
         os.environ.setdefault(name, value)
+    _keep_freed_memory()
     if not _has_cache_folder():
         # a fresh private folder: compiled code is unpickled, nobody else may put it there
         os.environ.setdefault("NUMBA_CACHE_DIR", tempfile.mkdtemp(prefix="lidarpainter-numba-"))
+
+
+def _keep_freed_memory() -> None:
+    """Let glibc keep blocks up to `KEPT_BYTES` from the start.
+
+    It comes to that by itself once such a block was freed (mallopt(3), M_MMAP_THRESHOLD); until
+    then every image pays for fresh pages, ten thousand page faults a painted view. Other C
+    libraries have no such setting.
+    """
+    adjust = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None
+    if adjust is not None and not any(name.startswith("MALLOC_") for name in os.environ):
+        adjust(M_MMAP_THRESHOLD, KEPT_BYTES)
+        adjust(M_TRIM_THRESHOLD, 2 * KEPT_BYTES)
 
 
 def usable_cores(cpu_limit: Path = CPU_LIMIT) -> int:

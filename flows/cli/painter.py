@@ -324,6 +324,7 @@ def _show_info(result: dict[str, Any]) -> None:
         "size": format_bytes(result["num_bytes"]),
         "parameters": result["num_parameters"],
         **{f"parameters, {name}": count for name, count in result["parameters"].items()},
+        "precision here": result.get("precision"),
         "licence": result["licence"],
     }
     for name, value in (*result["architecture"].items(), *result["provenance"].items()):

@@ -2,10 +2,9 @@
 
 from typing import Any
 
-from torch import nn
-
 from lidarpainter_models.painter.nano.painter import NanoPainter
 from lidarpainter_models.painter.one_step.painter import OneStepPainter
+from lidarpainter_models.painter.precision import type_name
 from lidarpainter_models.painter.protocol import Painter
 
 NO_LICENCE = "Apache-2.0, a rule of the package"
@@ -24,13 +23,13 @@ def describe_painter(painter: Painter) -> dict[str, Any]:
             **config.to_dict(),
             "candidates": list(config.candidates),
         }
-        return _learned(painter.name, architecture, painter.network, painter.provenance)
+        return _learned(painter, architecture)
     if isinstance(painter, OneStepPainter):
         architecture = {
             "summary": "one step of a latent diffusion model, guided by LiDAR",
             **painter.network.config.to_dict(),
         }
-        return _learned(painter.name, architecture, painter.network, painter.provenance)
+        return _learned(painter, architecture)
     summary = (type(painter).__doc__ or painter.name).strip().splitlines()[0]
     return {
         "name": painter.name,
@@ -42,16 +41,15 @@ def describe_painter(painter: Painter) -> dict[str, Any]:
     }
 
 
-def _learned(
-    name: str, architecture: dict[str, Any], network: nn.Module, provenance: dict[str, Any]
-) -> dict[str, Any]:
+def _learned(painter: NanoPainter | OneStepPainter, architecture: dict[str, Any]) -> dict[str, Any]:
     parts = {
         part: sum(parameter.numel() for parameter in module.parameters())
-        for part, module in network.named_children()
+        for part, module in painter.network.named_children()
     }
-    rest = dict(provenance)
+    rest = dict(painter.provenance)
     return {
-        "name": name,
+        "name": painter.name,
+        "precision": type_name(painter.precision),
         "architecture": architecture,
         "parameters": parts,
         "num_parameters": sum(parts.values()),

@@ -37,8 +37,8 @@ DIGEST_LENGTH = 32
 
 Kind = Literal["rule", "nano", "one-step"]
 
-_loaded: dict[tuple[str, str], Painter] = {}
-"""The painter that was loaded last, by its digest and device."""
+_loaded: dict[tuple[str, str, torch.dtype | None], Painter] = {}
+"""The painter that was loaded last, by its digest, device and precision."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,25 +105,29 @@ class PainterChoice:
         joined = "\n".join([preset, *digests])
         return hashlib.sha256(joined.encode()).hexdigest()[:DIGEST_LENGTH]
 
-    def load(self, device: torch.device) -> Painter:
+    def load(self, device: torch.device, precision: torch.dtype | None = None) -> Painter:
         """The painter; whoever asks for the same one again gets the one that is in memory.
+
+        Args:
+            device: where it paints.
+            precision: of a learned painter; None takes what the device computes faster.
 
         Raises:
             WeightsError: weights are missing, damaged, or do not belong together.
             MissingPackageError: a one-step painter without the extra `diffusion`.
         """
-        key = (self.digest, str(device))
+        key = (self.digest, str(device), precision)
         if key not in _loaded:
             _loaded.clear()  # before the next is read: two of full size do not fit into memory
-            _loaded[key] = self._read(device)
+            _loaded[key] = self._read(device, precision)
         return _loaded[key]
 
-    def _read(self, device: torch.device) -> Painter:
+    def _read(self, device: torch.device, precision: torch.dtype | None) -> Painter:
         if self.kind == "rule":
             return RULES[self.name]()
         if self.kind == "nano":
-            return load_weights(self.files[0], device=device)
-        return load_one_step(self.name).to(device)
+            return load_weights(self.files[0], device=device, precision=precision)
+        return load_one_step(self.name, device=device, dtype=precision)
 
 
 def load_painter(name_or_path: str | Path, device: torch.device | None = None) -> Painter:

@@ -179,7 +179,7 @@ def _sparing(painter: NanoPainter, tiles: TileConfig) -> NanoPainter:
     return NanoPainter(
         painter.network,
         provenance=painter.provenance,
-        half_precision=painter.half_precision,
+        precision=painter.precision,
         tiles=tiles,
     )
 

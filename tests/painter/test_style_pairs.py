@@ -122,7 +122,7 @@ def test_more_prompts_leave_what_is_known_as_it_was(make_conditions):
     extended = with_more_prompts(network, STYLED).eval()
     conditions = make_conditions(32, 32)
     before, after = (
-        NanoPainter(one, half_precision=False).paint(conditions) for one in (network, extended)
+        NanoPainter(one, precision=torch.float32).paint(conditions) for one in (network, extended)
     )
     assert torch.equal(before.rgb, after.rgb)
     assert torch.equal(before.confidence, after.confidence)
@@ -160,7 +160,7 @@ def test_a_short_training_learns_that_a_prompt_for_night_means_night(make_pair, 
         average_decay=0.8,
         half_precision=False,
     )
-    painter = NanoPainter(train_nano([source], config).network, half_precision=False)
+    painter = NanoPainter(train_nano([source], config).network, precision=torch.float32)
     pair = deep_pair(make_pair, 1)
     dark = styled_pair(pair, "night", generator_of(0))
     for shown, own, other in ((pair, pair, dark), (dark, dark, pair)):

@@ -1,7 +1,7 @@
 """The small painter as users meet it: one view in, one repaired view out.
 
-Runs on the device its network lies on. On a CPU the U-Net runs in bfloat16, about twice as fast as
-float32; images, mixing and confidence stay in float32.
+Runs on the device its network lies on. The U-Net runs in the type that this device computes faster
+(`precision.py`); images, mixing and confidence stay in float32.
 """
 
 from typing import Any
@@ -19,10 +19,8 @@ from lidarpainter_models.painter.nano.tiles import (
     grown_to_pixels,
     painted_parts,
 )
+from lidarpainter_models.painter.precision import faster_type
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT, Painting, PaintingConditions
-
-KEPT_BYTES = 30_000_000
-"""Largest block that the C library keeps for the next view; under glibc's limit of 32 MiB."""
 
 
 class NanoPainter:
@@ -44,7 +42,7 @@ class NanoPainter:
         network: NanoNetwork,
         *,
         provenance: dict[str, Any] | None = None,
-        half_precision: bool = True,
+        precision: torch.dtype | None = None,
         tiles: TileConfig | None = None,
     ) -> None:
         """Take a trained network.
@@ -53,16 +51,16 @@ class NanoPainter:
             network: the fusion network; frozen and laid out for speed here. It stays in its own
                 precision, and a copy of it paints.
             provenance: where its weights come from, as stored beside them.
-            half_precision: run the convolutions in bfloat16.
+            precision: of the convolutions, bfloat16 or float32; None takes the faster one.
             tiles: paint only tiles that need it; None paints the whole image.
         """
         frozen = network.eval().requires_grad_(False)
         # torch's stub lacks memory_format
         self.network = frozen.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._network = self.network.halved() if half_precision else self.network
-        _keep_freed_memory()
+        self.precision = precision or faster_type(network.head.weight.device)
+        is_halved = self.precision == torch.bfloat16
+        self._network = self.network.halved() if is_halved else self.network
         self.provenance = provenance or {}
-        self.half_precision = half_precision
         self.tiles = tiles
 
     @torch.inference_mode()
@@ -115,14 +113,3 @@ class NanoPainter:
             hull = input_hull(conditions, inputs=config.inputs)
             rgb = torch.minimum(torch.maximum(rgb, hull.lower), hull.upper)
         return Painting(rgb=rgb.clamp(0, 1).contiguous(), confidence=confidence.to(home))
-
-
-def _keep_freed_memory() -> None:
-    """Let the C library keep what one view frees for the next.
-
-    glibc gives what is freed beyond a threshold back to the system, and every view would pay
-    for fresh pages: thousands of page faults, about a tenth of its time. The threshold follows the
-    largest block ever freed (mallopt(3), M_MMAP_THRESHOLD), so freeing one is enough; the process
-    then keeps at most twice its size. Other C libraries take no notice.
-    """
-    torch.empty(KEPT_BYTES, dtype=torch.uint8)

@@ -48,8 +48,10 @@ def save_weights(
     write_whole(path, save(tensors, metadata))
 
 
-def load_weights(path: Path, *, device: torch.device = CPU) -> NanoPainter:
-    """Read a painter from its weights file.
+def load_weights(
+    path: Path, *, device: torch.device = CPU, precision: torch.dtype | None = None
+) -> NanoPainter:
+    """Read a painter from its weights file; it paints in the faster precision unless one is said.
 
     Raises:
         WeightsError: the file is missing, damaged, or holds another network.
@@ -68,9 +70,8 @@ def load_weights(path: Path, *, device: torch.device = CPU) -> NanoPainter:
     if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
         raise WeightsError(f"weights file {path} holds values that are not finite")
     network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
-    return NanoPainter(
-        network.to(device), provenance=header["provenance"] | {"licence": header["licence"]}
-    )
+    provenance = header["provenance"] | {"licence": header["licence"]}
+    return NanoPainter(network.to(device), provenance=provenance, precision=precision)
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:

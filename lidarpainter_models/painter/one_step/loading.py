@@ -35,8 +35,10 @@ from lidarpainter_models.painter.one_step.painter import OneStepPainter
 from lidarpainter_models.painter.one_step.presets import PRESETS, preset_named
 from lidarpainter_models.painter.one_step.prompts import PromptBook
 from lidarpainter_models.painter.one_step.weights import TrainedFile, apply_trained, read_trained
+from lidarpainter_models.painter.precision import faster_type
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
 
+CPU = torch.device("cpu")
 SUFFIX = ".safetensors"
 UNTRAINED = "none for repairing renders: the model as it comes"
 MARK_TOLERANCE = 1e-2
@@ -46,15 +48,18 @@ MARK_TOLERANCE = 1e-2
 def load_one_step(
     name: str,
     *,
-    dtype: torch.dtype = torch.bfloat16,
+    device: torch.device = CPU,
+    dtype: torch.dtype | None = None,
     merges: bool = True,
     may_download: bool = False,
 ) -> OneStepPainter:
-    """A painter on the CPU.
+    """A painter on a device.
 
     Args:
         name: see the module.
+        device: where it paints.
         dtype: type of the weights; the step, the fusion and the U-Net's last layer stay float32.
+            None takes what the device computes faster.
         merges: merge adapters into the model and make it lean; without, it can be trained on.
         may_download: fetch a model of the hub that is not in the user's cache.
 
@@ -63,8 +68,10 @@ def load_one_step(
         ConfigError: there is no such preset.
         MissingPackageError: the extra `diffusion` is not installed.
     """
+    dtype = dtype or faster_type(device)
     if name.endswith(SUFFIX):
-        return load_trained(Path(name), dtype=dtype, merges=merges, may_download=may_download)
+        trained = load_trained(Path(name), dtype=dtype, merges=merges, may_download=may_download)
+        return trained.to(device)
     model, preset = split_preset(name)
     base = open_base(model, may_download=may_download)
     config = preset_named(preset)
@@ -74,7 +81,7 @@ def load_one_step(
     if merges:
         made_lean(network)
     untrained = {"training": UNTRAINED, "trained_targets": []}
-    return OneStepPainter(network, prompts, _origin(base, parts) | untrained)
+    return OneStepPainter(network, prompts, _origin(base, parts) | untrained).to(device)
 
 
 def load_trained(

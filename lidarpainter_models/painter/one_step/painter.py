@@ -54,6 +54,11 @@ class OneStepPainter:
         self.provenance = provenance
         self._graphed = GraphedNetwork(self.network)
 
+    @property
+    def precision(self) -> torch.dtype:
+        """Of its weights."""
+        return next(self.network.autoencoder.parameters()).dtype
+
     def to(self, device: torch.device) -> "OneStepPainter":
         """Move the network; on CUDA it is then replayed as a graph for each size of image."""
         self.network.to(device)

@@ -1,4 +1,4 @@
-"""What painting costs beside computing."""
+"""What painting costs beside computing, in a process that is set up as the command is."""
 
 import platform
 import subprocess
@@ -9,6 +9,8 @@ import pytest
 FAULTS_OF_A_VIEW = """
 import resource
 import statistics
+from flows.environment import prepare_environment
+prepare_environment(is_quiet=True)
 import torch
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.nano.painter import NanoPainter

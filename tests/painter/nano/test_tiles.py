@@ -63,7 +63,7 @@ def test_doubt_is_the_mean_difference_of_what_is_known(make_conditions):
 def test_only_the_tile_with_a_doubt_is_painted(network, one_doubt):
     config = replace(TILES, keep_below=1e-4)
     assert doubtful_tiles(one_doubt, config).nonzero().tolist() == [[1, 2]]
-    painter = NanoPainter(network, half_precision=False, tiles=config)
+    painter = NanoPainter(network, precision=torch.float32, tiles=config)
     painting = painter.paint(one_doubt)
     inside = torch.zeros(80, 96, dtype=torch.bool)
     inside[16:32, 32:48] = True
@@ -75,15 +75,15 @@ def test_only_the_tile_with_a_doubt_is_painted(network, one_doubt):
 
 def test_doubt_everywhere_paints_as_without_tiles(network, make_conditions):
     conditions = make_conditions(40, 56)
-    whole = NanoPainter(network, half_precision=False).paint(conditions)
-    tiled = NanoPainter(network, half_precision=False, tiles=TILES).paint(conditions)
+    whole = NanoPainter(network, precision=torch.float32).paint(conditions)
+    tiled = NanoPainter(network, precision=torch.float32, tiles=TILES).paint(conditions)
     assert torch.equal(whole.rgb, tiled.rgb)
     assert tiled.kept_share == 0
 
 
 def test_what_agrees_everywhere_is_not_painted_at_all(network, one_doubt):
     conditions = replace(one_doubt, lidar_rgb=one_doubt.render_rgb)
-    painting = NanoPainter(network, half_precision=False, tiles=TILES).paint(conditions)
+    painting = NanoPainter(network, precision=torch.float32, tiles=TILES).paint(conditions)
     assert torch.equal(painting.rgb, conditions.render_rgb)
     assert painting.kept_share == 1
 
@@ -116,7 +116,7 @@ def test_many_parts_cost_more_than_the_whole_image():
 def test_a_style_paints_every_pixel(one_doubt):
     torch.manual_seed(0)
     config = NanoConfig(widths=(8, 8, 8), blocks=(1, 1, 1), prompts=("clear", "foggy"))
-    painter = NanoPainter(NanoNetwork(config), half_precision=False, tiles=TILES)
+    painter = NanoPainter(NanoNetwork(config), precision=torch.float32, tiles=TILES)
     assert painter.paint(replace(one_doubt, prompt="foggy")).kept_share == 0
     assert painter.paint(replace(one_doubt, prompt="clear")).kept_share == 1
 

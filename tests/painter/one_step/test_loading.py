@@ -12,12 +12,12 @@ from safetensors.torch import load_file, save_file
 from tiny_diffusion import write_model
 
 from lidarpainter_models.errors import ConfigError, MissingPackageError, WeightsError
-from lidarpainter_models.painter import load_painter
+from lidarpainter_models.painter import UnpaintedPainter, load_painter, selection
 from lidarpainter_models.painter.one_step.assembly import trained_names
 from lidarpainter_models.painter.one_step.loading import load_one_step
-from lidarpainter_models.painter.one_step.painter import OneStepPainter
 from lidarpainter_models.painter.one_step.presets import PRESETS
 from lidarpainter_models.painter.one_step.weights import METADATA_KEY, read_header, save_trained
+from lidarpainter_models.painter.precision import faster_type
 
 FLOAT = torch.float32
 ROOT = Path(__file__).resolve().parents[3]
@@ -33,7 +33,7 @@ def own_model(model_folder, tmp_path):
 @pytest.fixture(scope="module")
 def training(model_folder, tmp_path_factory):
     """A weights file whose every weight was changed, and the painter it was saved from."""
-    painter = load_one_step(f"{model_folder}:paper", merges=False)
+    painter = load_one_step(f"{model_folder}:paper", dtype=torch.bfloat16, merges=False)
     generator = torch.Generator().manual_seed(0)
     state = dict(painter.network.named_parameters())
     with torch.no_grad():
@@ -88,22 +88,27 @@ def test_every_preset_paints_with_a_folders_weights(preset, model_folder, make_c
     painting = painter.paint(make_conditions(70, 100))
     assert painting.rgb.shape == (70, 100, 3)
     types = {parameter.dtype for parameter in painter.network.autoencoder.parameters()}
-    assert types == {torch.bfloat16}
+    assert types == {painter.precision} == {faster_type(torch.device("cpu"))}
 
 
 def test_painter_goes_to_the_gpu_if_there_is_one(model_folder, monkeypatch):
     went = []
-    monkeypatch.setattr(OneStepPainter, "to", lambda _, device: went.append(device.type))
+
+    def load(_name, *, device, dtype):
+        went.append((device.type, dtype))
+        return UnpaintedPainter()
+
+    monkeypatch.setattr(selection, "load_one_step", load)
+    monkeypatch.setattr(selection, "_loaded", {})
     load_painter(str(model_folder))
-    assert went == []
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     load_painter(str(model_folder))
-    assert went == ["cuda"]
+    assert went == [("cpu", None), ("cuda", None)]
 
 
 def test_trained_weights_come_back_bit_for_bit(trained, make_conditions):
     painter, path = trained
-    again = load_one_step(str(path), merges=False)
+    again = load_one_step(str(path), dtype=torch.bfloat16, merges=False)
     before, after = (dict(one.network.named_parameters()) for one in (painter, again))
     assert before.keys() == after.keys()
     assert all(torch.equal(before[name], after[name]) for name in before)
