@@ -40,18 +40,11 @@ class ArtefactRef:
 
     kind: str
     digest: str
-    path: str
-    """Folder of the artefact, as text."""
 
-    @property
-    def folder(self) -> Path:
-        """Folder of the artefact."""
-        return Path(self.path)
-
-    @property
-    def place(self) -> str:
-        """Its folder, relative to the store."""
-        return f"artefacts/{self.kind}/{self.digest}"
+    @classmethod
+    def of_id(cls, artefact_id: str) -> "ArtefactRef":
+        """The artefact with an id of the catalog."""
+        return cls(*artefact_id.split("/", 1))
 
     @property
     def artefact_id(self) -> str:
@@ -135,22 +128,13 @@ class ArtefactStore:
     def __init__(self, root: Path) -> None:
         self.root = root
 
-    def ref(self, kind: str, digest: str) -> ArtefactRef:
-        """The name of an artefact, whether it exists or not."""
-        return ArtefactRef(kind, digest, str(self.root / "artefacts" / kind / digest))
-
     def folder(self, ref: ArtefactRef) -> Path:
-        """Where the files of an artefact lie."""
-        return self.root / ref.place
-
-    def named(self, artefact_id: str) -> ArtefactRef:
-        """The artefact of an id in the catalog, `kind/digest`, whether it exists or not."""
-        kind, _, digest = artefact_id.partition("/")
-        return self.ref(kind, digest)
+        """Where the files of an artefact lie, whether it exists or not."""
+        return self.root / "artefacts" / ref.kind / ref.digest
 
     def find(self, recipe: Recipe) -> ArtefactRef | None:
         """What was made from this recipe before, or None; damaged folders count as absent."""
-        ref = self.ref(recipe.kind, recipe.digest)
+        ref = ArtefactRef(recipe.kind, recipe.digest)
         return ref if self.is_complete(ref) else None
 
     def is_complete(self, ref: ArtefactRef) -> bool:
@@ -225,7 +209,7 @@ class ArtefactStore:
 
     def _build(self, recipe: Recipe, build: Build) -> ArtefactRef:
         """Write aside, then rename; the caller holds the lock."""
-        ref = self.ref(recipe.kind, recipe.digest)
+        ref = ArtefactRef(recipe.kind, recipe.digest)
         aside = self.root / "aside"
         scratch = self.root / "work" / recipe.digest
         with storage_errors(f"cannot store {ref.artefact_id} below {self.root}"):

@@ -43,17 +43,6 @@ def held_lock(path: Path, *, on_wait: Callable[[str], None] | None = None) -> It
         os.close(descriptor)  # closing the only descriptor releases the lock
 
 
-def is_locked(path: Path) -> bool:
-    """Whether some process holds the lock right now."""
-    if not path.exists():
-        return False
-    descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
-    try:
-        return not _try_acquire(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def _acquire(descriptor: int, on_wait: Callable[[str], None] | None) -> bool:
     if _try_acquire(descriptor):
         return False

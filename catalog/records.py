@@ -27,7 +27,6 @@ class SceneRecord:
     sequence: str
     content_digest: str
     licence: str
-    path: str
     num_frames: int
     num_views: int
     cameras: tuple[str, ...]
@@ -106,7 +105,6 @@ def artefact_row(ref: ArtefactRef, manifest: Manifest) -> dict[str, Any]:
         "inputs": canonical_json(manifest.inputs),
         "config": canonical_json(manifest.config),
         "source_digest": manifest.source_digest,
-        "path": ref.path,
         "num_bytes": manifest.num_bytes,
         "seconds": manifest.seconds,
         "created_at": datetime.fromisoformat(manifest.created_at),

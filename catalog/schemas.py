@@ -1,4 +1,16 @@
-"""The catalog's tables: every column once, with its type, unit and meaning."""
+"""The catalog's tables: every column once, with its type, unit and meaning.
+
+What becomes of what older and newer software stored, in tables and in manifests alike:
+
+- Columns and fields are only ever added, and keep their meaning. An older row reads as null where
+  it lacks a column (an older manifest as the default of the field), and the column is added to the
+  table with the next row that is written.
+- A column that is no longer listed here stays in tables that have it, and is not read.
+- A manifest's version goes up with its fields; a version above one's own is refused, never
+  overwritten. The digest of an artefact does not cover it: nothing is computed anew.
+- Names of files count from the folder of the store. Rows of version 0.1 hold absolute ones, which
+  are taken as they are.
+"""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -61,7 +73,6 @@ SCENES = TableSchema(
         Column("sequence", "text", "name of the log in its dataset"),
         Column("content_digest", "text", "digest of everything the stored scene holds"),
         Column("licence", "text", "terms of the data"),
-        Column("path", "text", "folder of the scene"),
         Column("num_frames", "integer", "frames"),
         Column("num_views", "integer", "camera images"),
         Column("cameras", "texts", "names of the cameras"),
@@ -96,7 +107,7 @@ RUNS = TableSchema(
         Column("host", "text", "machine it ran on"),
         Column("artefacts", "texts", "kind/digest of everything it made or reused"),
         Column("result", "text", "what `reconstruct --json` printed, JSON"),
-        Column("report", "text", "path of the report"),
+        Column("report", "text", "file of the report, from the folder of the store"),
         Column("software_version", "text", "version of lidarpainter"),
         Column("source_digest", "text", "digest of the code of its stages"),
     ),
@@ -112,7 +123,6 @@ ARTEFACTS = TableSchema(
         Column("inputs", "text", "digest of every input by its part, JSON"),
         Column("config", "text", "configuration of the stage, canonical JSON"),
         Column("source_digest", "text", "digest of the code that made it"),
-        Column("path", "text", "folder of the artefact"),
         Column("num_bytes", "integer", "size of its files", "byte"),
         Column("seconds", "number", "wall time of the process that finished it", "s"),
         Column("created_at", "time", "when it was finished"),
@@ -143,7 +153,7 @@ PAINTERS = TableSchema(
     (
         Column("painter_id", "text", "digest of the weights file"),
         Column("name", "text", "name of the painter"),
-        Column("path", "text", "weights file"),
+        Column("path", "text", "weights file, from the folder of the store or else absolute"),
         Column("num_bytes", "integer", "size of the weights", "byte"),
         Column("record", "text", "how it was trained, JSON"),
         Column("created_at", "time", "when training ended"),

@@ -45,6 +45,15 @@ class Store:
         dataset, sequence = split_scene_id(scene_id)
         return self.root / "scenes" / dataset / sequence
 
+    def name_of(self, path: Path) -> str:
+        """A path as rows hold it: from the folder of the store; outside it, absolute."""
+        path = path.absolute()
+        return str(path.relative_to(self.root) if path.is_relative_to(self.root) else path)
+
+    def path_of(self, name: str) -> Path:
+        """The path that a row holds, see `name_of`."""
+        return self.root / name
+
     def scene_lock(
         self, scene_id: str, *, on_wait: Callable[[str], None] | None = None
     ) -> AbstractContextManager[bool]:

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 from prefect import flow
 from pydantic import BaseModel, ConfigDict
 
+from catalog.store import open_store
 from flows.train_painter import named_sets, training_cost
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.metrics.lpips import LpipsFiles
@@ -51,7 +52,7 @@ def ablate_painter(parameters: AblationParameters, store_path: Path) -> dict[str
     for label, config in variants.items():
         stage = f"train {label}"
         trained = train(store_path, stage, learnt, config, 0.0, parameters.base, parameters.lpips)
-        painters[label] = str(weights_path(trained.ref))
+        painters[label] = str(weights_path(open_store(store_path), trained.ref))
         costs[label] = training_cost(trained)
     judged = judge_painters(
         painters, named_sets(parameters.test_folders), parameters.feature_weights

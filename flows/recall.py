@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from catalog.artefacts import ArtefactRef
 from catalog.digests import plain
 from catalog.records import run_id_of
 from catalog.store import Store, open_store
@@ -43,7 +44,7 @@ def recalled(parameters: ReconstructParameters, store_path: Path) -> dict[str, A
     row = store.tables.find("runs", run_identity(parameters, store))
     if row is None or row["status"] != "complete":
         return None
-    made = [store.artefacts.named(artefact_id) for artefact_id in row["artefacts"]]
+    made = [ArtefactRef.of_id(artefact_id) for artefact_id in row["artefacts"]]
     if not all(store.artefacts.is_complete(ref) for ref in made):
         return None
     result = json.loads(row["result"])
@@ -52,6 +53,10 @@ def recalled(parameters: ReconstructParameters, store_path: Path) -> dict[str, A
 
 
 def located(result: dict[str, Any], store: Store) -> dict[str, Any]:
-    """A stored result with paths in place of names relative to the store."""
-    paths = {name: str(store.root / place) for name, place in result["artefacts"].items()}
-    return {**result, "artefacts": paths, "report": str(store.root / result["report"])}
+    """A stored result with paths in place of what the store calls things."""
+    refs = {name: ArtefactRef.of_id(one) for name, one in result["artefacts"].items()}
+    return {
+        **result,
+        "artefacts": {name: str(store.artefacts.folder(ref)) for name, ref in refs.items()},
+        "report": str(store.path_of(result["report"])),
+    }

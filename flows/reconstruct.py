@@ -115,8 +115,8 @@ def _run(course: Course) -> dict[str, Any]:
         stages=dict(course.stages),
     )
     report = course.add("report", write_report(run, page, parameters.judge_config))
-    result["artefacts"]["report"] = report.ref.place
-    result["report"] = f"{report.ref.place}/{REPORT_FILE}"
+    result["artefacts"]["report"] = report.ref.artefact_id
+    result["report"] = store.name_of(store.artefacts.folder(report.ref) / REPORT_FILE)
     result["seconds"]["report"] = report.seconds
     result["cpu_seconds"]["report"] = report.cpu_seconds
     result["computed_now"]["report"] = report.is_new
@@ -199,7 +199,7 @@ def _result(course: Course, scores: dict[str, Scores], final: FittedRef) -> dict
             for name, stage in stages.items()
             if stage.ref.kind == "guidance"
         },
-        "artefacts": {name: stage.ref.place for name, stage in stages.items()},
+        "artefacts": {name: stage.ref.artefact_id for name, stage in stages.items()},
     }
 
 

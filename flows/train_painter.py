@@ -8,7 +8,7 @@ from typing import Any
 from prefect import flow
 from pydantic import BaseModel, ConfigDict
 
-from catalog.store import split_scene_id
+from catalog.store import open_store, split_scene_id
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.held_back import (
     FIRST_TRAINING_SEED,
@@ -99,6 +99,7 @@ def harvest_pairs(parameters: HarvestParameters, store_path: Path) -> dict[str, 
 def train_painter(parameters: TrainPainterParameters, store_path: Path) -> dict[str, Any]:
     """Harvest, train, judge on what was held back, and enter the painter into the catalog."""
     check_sources(parameters)
+    store = open_store(store_path)
     harvested = _harvested(parameters, store_path)
     sets = (*(made for made, _ in harvested), *named_sets(parameters.pair_folders))
     start = parameters.base or parameters.start
@@ -114,21 +115,24 @@ def train_painter(parameters: TrainPainterParameters, store_path: Path) -> dict[
     )
     scores, samples = None, None
     if parameters.held_back > 0:
-        weights = weights_path(trained.ref)
+        weights = weights_path(store, trained.ref)
         judged = judge_held_back(
             store_path, "judge", weights, sets, parameters.held_back, parameters.feature_weights
         )
-        scores, samples = load_painting_scores(judged.ref), str(samples_path(judged.ref))
+        scores, samples = (
+            load_painting_scores(store, judged.ref),
+            str(samples_path(store, judged.ref)),
+        )
     row = publish_painter(store_path, trained.ref, scores)
     return {
         "painter_id": row["painter_id"],
-        "weights": row["path"],
+        "weights": str(store.path_of(row["path"])),
         "num_bytes": row["num_bytes"],
         "pairs": [_described(*made) for made in harvested],
         "training": training_cost(trained),
         "held_back": scores,
         "samples": samples,
-        "record": training_record(trained.ref, scores),
+        "record": training_record(store, trained.ref, scores),
     }
 
 
@@ -183,7 +187,7 @@ def _harvested(
         else:
             split = SplitSpec(scene_id=scene_id, spec=parameters.split, cameras=parameters.cameras)
             result = harvest_recorded(store_path, stage, split, parameters.harvest)
-        made.append((pair_set(scene_id, result.ref), result))
+        made.append((pair_set(open_store(store_path), scene_id, result.ref), result))
     return made
 
 

@@ -4,6 +4,7 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
+from catalog.artefacts import ArtefactRef
 from catalog.errors import UnknownRecordError
 from catalog.store import Store
 from tasks.stored import FittedRef
@@ -34,7 +35,7 @@ def open_run(store: Store, run_id: str) -> FinishedRun:
     if row["status"] != "complete":
         why = f": {row['error']}" if row["error"] else ""
         raise UnknownRecordError(f"run {row['run_id']} is {row['status']}, not complete{why}")
-    refs = [store.artefacts.named(artefact_id) for artefact_id in row["artefacts"]]
+    refs = [ArtefactRef.of_id(artefact_id) for artefact_id in row["artefacts"]]
     observations = next(ref for ref in refs if ref.kind == "observations")
     fits = [ref for ref in refs if ref.kind == "gaussians"]
     return FinishedRun(

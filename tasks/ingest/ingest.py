@@ -80,7 +80,6 @@ def record_scene(store: Store, path: Path) -> dict[str, Any]:
         sequence=scene.sequence,
         content_digest=scene.content_digest,
         licence=scene.manifest["licence"],
-        path=str(path),
         num_frames=len(scene.frame_indices),
         num_views=len(scene.views),
         cameras=scene.camera_names,

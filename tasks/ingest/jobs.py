@@ -18,6 +18,7 @@ from typing import Any
 
 import lidarpainter_models
 from catalog.errors import CatalogError
+from catalog.store import open_store
 from lidarpainter_models.errors import LidarPainterError
 from lidarpainter_models.scenes.stored import stored_digest
 from lidarpainter_models.storage.whole_files import write_whole
@@ -111,10 +112,10 @@ def _noted(note: Path, request: IngestRequest) -> dict[str, Any] | None:
     try:
         noted = json.loads(note.read_text("utf-8"))
         row = noted["row"]
-        is_same = noted["request"] == request.key()
-        return (
-            row if is_same and stored_digest(Path(row["path"])) == row["content_digest"] else None
-        )
+        if noted["request"] != request.key():
+            return None
+        folder = open_store(request.store_path).scene_folder(row["scene_id"])
+        return row if stored_digest(folder) == row["content_digest"] else None
     except (OSError, ValueError, KeyError, TypeError):
         return None  # no note, or one that cannot be read: the sequence is read anew
 

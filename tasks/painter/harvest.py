@@ -113,9 +113,9 @@ def street_id(seed: int) -> str:
     return f"synthetic/street-{seed:04d}"
 
 
-def pair_set(name: str, ref: ArtefactRef) -> PairSet:
+def pair_set(store: Store, name: str, ref: ArtefactRef) -> PairSet:
     """The pairs of an artefact."""
-    return PairSet(name=name, folder=ref.folder / PAIRS_FOLDER)
+    return PairSet(name=name, folder=store.artefacts.folder(ref) / PAIRS_FOLDER)
 
 
 def _has_street(store: Store, scene_id: str, config: SyntheticStreetConfig) -> bool:

@@ -8,7 +8,7 @@ from prefect import task
 
 from catalog.artefacts import ArtefactRef, Workplace
 from catalog.digests import DIGEST_LENGTH, digest_file
-from catalog.store import open_store
+from catalog.store import Store, open_store
 from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.evaluation.held_back import hold_back, trained_targets, unseen_pairs
 from lidarpainter_models.evaluation.painting import JudgingPairs, score_painter
@@ -184,14 +184,14 @@ def _sparing(painter: NanoPainter, tiles: TileConfig) -> NanoPainter:
     )
 
 
-def load_painting_scores(ref: ArtefactRef) -> dict[str, Any]:
+def load_painting_scores(store: Store, ref: ArtefactRef) -> dict[str, Any]:
     """Read the scores of `judge_held_back`."""
-    return read_json(ref.folder / SCORES_FILE)
+    return read_json(store.artefacts.folder(ref) / SCORES_FILE)
 
 
-def samples_path(ref: ArtefactRef) -> Path:
+def samples_path(store: Store, ref: ArtefactRef) -> Path:
     """The images that `judge_held_back` has painted: render, LiDAR, painted, true."""
-    return ref.folder / SAMPLES_FILE
+    return store.artefacts.folder(ref) / SAMPLES_FILE
 
 
 def open_sets(sets: Sequence[PairSet]) -> dict[str, PairFolder]:

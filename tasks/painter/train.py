@@ -14,7 +14,7 @@ from prefect import task
 import lidarpainter_models
 from catalog.artefacts import ArtefactRef, Workplace
 from catalog.digests import DIGEST_LENGTH, canonical_json, digest_file
-from catalog.store import open_store
+from catalog.store import Store, open_store
 from lidarpainter_models.evaluation.held_back import (
     TARGETS_KEY,
     PairSubset,
@@ -130,14 +130,14 @@ def publish_painter(
         scores: its figures on held-back pairs, if there are any.
     """
     store = open_store(store_path)
-    weights = weights_path(trained)
+    weights = weights_path(store, trained)
     manifest = store.artefacts.verified(trained)
     row = {
         "painter_id": digest_file(weights)[:DIGEST_LENGTH],
         "name": weights.stem,
-        "path": str(weights),
+        "path": store.name_of(weights),
         "num_bytes": weights.stat().st_size,
-        "record": canonical_json(training_record(trained, scores)),
+        "record": canonical_json(training_record(store, trained, scores)),
         "created_at": datetime.fromisoformat(manifest.created_at),
         "software_version": manifest.software_version,
     }
@@ -145,15 +145,17 @@ def publish_painter(
     return row
 
 
-def weights_path(trained: ArtefactRef) -> Path:
+def weights_path(store: Store, trained: ArtefactRef) -> Path:
     """The weights of a trained painter, called after its kind."""
-    (path,) = trained.folder.glob(f"*{WEIGHTS_SUFFIX}")
+    (path,) = store.artefacts.folder(trained).glob(f"*{WEIGHTS_SUFFIX}")
     return path
 
 
-def training_record(trained: ArtefactRef, scores: dict[str, Any] | None) -> dict[str, Any]:
+def training_record(
+    store: Store, trained: ArtefactRef, scores: dict[str, Any] | None
+) -> dict[str, Any]:
     """How a painter was trained and what it reached on the pairs held back."""
-    record = read_json(weights_path(trained).with_suffix(RECORD_SUFFIX))
+    record = read_json(weights_path(store, trained).with_suffix(RECORD_SUFFIX))
     return finite_or_none(record | {"held_back_scores": scores})
 
 

@@ -1,5 +1,6 @@
 """A lock keeps others out for as long as its holder lives."""
 
+import fcntl
 import subprocess
 import sys
 import threading
@@ -8,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from catalog.errors import StorageError
-from catalog.locks import held_lock, is_locked
+from catalog.locks import held_lock
 
 ROOT = Path(__file__).resolve().parents[2]
 HOLDER = """
@@ -21,9 +22,17 @@ with held_lock(Path(sys.argv[1])):
 """
 
 
+def is_locked(path):
+    with path.open() as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
+
+
 def test_a_lock_is_held_inside_the_block_only(tmp_path):
     path = tmp_path / "locks" / "a.lock"
-    assert not is_locked(path)
     with held_lock(path) as waited:
         assert not waited
         assert is_locked(path)

@@ -1,6 +1,7 @@
 """The stages of a reconstruction, one after the other, without a server."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -9,6 +10,7 @@ import torch
 from toy_store import TOY_SCENE, small_parameters, write_toy_scene
 
 from catalog.errors import DamagedArtefactError
+from catalog.schemas import TABLES
 from catalog.store import open_store
 from lidarpainter_models.conditioning.sequences import SequenceConfig
 from lidarpainter_models.errors import ConfigError, SceneError
@@ -107,7 +109,7 @@ def run(store, parameters, stages, final):
         stages=stages,
     )
     report = write_report.fn(asked, page, parameters.judge_config)
-    result["report"] = f"{report.ref.place}/{REPORT_FILE}"
+    result["report"] = store.name_of(store.artefacts.folder(report.ref) / REPORT_FILE)
     refs = tuple(stage.ref for stage in stages.values())
     complete_run.fn(store.root, record, result, scores, refs)
     return open_run(store, record.run_id)
@@ -362,3 +364,32 @@ def test_a_damaged_input_is_found_and_not_used(store, parameters, stages):
             fit.fn(parameters.run_spec(store.root), "fit", stages["prepare"].ref, config)
     finally:
         file.write_bytes(content)
+
+
+def looked_at(store, parameters):
+    """A run of a store, after everything that reading it is there for was done with it."""
+    run = open_run(store, "latest")
+    assert load_scene(store, run.final.gaussians).num_gaussians == run.result["num_gaussians"]
+    assert store.path_of(run.result["report"]).is_file()
+    asked = parameters.run_spec(store.root)
+    seen = prepare.fn(asked, parameters.observation)
+    first = fit.fn(asked, "fit", seen.ref, parameters.fit)
+    judged = evaluate.fn(asked, "evaluate", run.final, parameters.judge_config)
+    assert [stage.is_new for stage in (seen, first, judged)] == [False] * 3
+    return run
+
+
+def content_of(root):
+    return {path: path.stat().st_mtime_ns for path in root.rglob("*")}
+
+
+def test_a_store_that_was_moved_is_read_and_nothing_is_written(store, run, parameters, tmp_path):
+    moved = open_store(tmp_path / "moved")
+    shutil.copytree(store.root, moved.root)
+    for file in moved.root.glob("artefacts/*/*/manifest.json"):
+        assert str(store.root) not in file.read_text()
+    for table in TABLES:
+        assert str(store.root) not in str(moved.tables.rows(table))
+    before = content_of(moved.root)
+    assert looked_at(moved, parameters).run_id == run.run_id
+    assert content_of(moved.root) == before

@@ -6,6 +6,7 @@ import shutil
 import pytest
 from toy_store import write_toy_scene
 
+from catalog.store import open_store
 from lidarpainter_models.errors import LidarPainterError
 from tasks.ingest import jobs as ingest_jobs
 from tasks.ingest.jobs import IngestRequest, ingest_or_recall, ingest_sequences
@@ -65,6 +66,6 @@ def test_another_request_or_a_scene_that_is_gone_is_read_anew(request_of, monkey
     )
     ingest_or_recall(fewer, "a", False)
     ingest_or_recall(request_of, "a", False)
-    shutil.rmtree(row["path"])
+    shutil.rmtree(open_store(request_of.store_path).scene_folder(row["scene_id"]))
     ingest_or_recall(request_of, "a", False)
     assert read == ["a"] * 4

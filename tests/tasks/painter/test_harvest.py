@@ -53,7 +53,7 @@ def test_pairs_of_a_killed_harvest_are_kept(store, monkeypatch):
     assert added == [2, 3]
     assert made.summary["num_pairs"] == 4
     assert made.summary["num_targets"] == 2
-    assert len(harvest.pair_set("toy", made.ref).open()) == 4
+    assert len(harvest.pair_set(store, "toy", made.ref).open()) == 4
     monkeypatch.setattr(harvest, "harvest_left_out", pytest.fail)
     again = harvest.harvest_recorded.fn(store.root, "harvest", SPLIT, HarvestConfig())
     assert not again.is_new
