@@ -6,48 +6,71 @@ import.
 """
 
 from collections.abc import Callable
+from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, Literal, get_args
 
 import torch
+from torch import Tensor
 
 from lidarpainter_models.errors import BackendError
 
 Backend = Literal["auto", "reference", "cpu", "cuda"]
 
 
-def available_backends(kernel: str) -> tuple[str, ...]:
-    """The backends of a kernel that can run on this machine."""
-    found = [
+@cache
+def _written_backends(kernel: str) -> tuple[str, ...]:
+    return tuple(
         backend
         for backend in get_args(Backend)[1:]
         if find_spec(f"lidarpainter_models.kernels.{kernel}.{backend}") is not None
-    ]
-    if not torch.cuda.is_available() and "cuda" in found:
-        found.remove("cuda")
-    return tuple(found)
+    )
 
 
-def chosen_backend(backend: Backend, device: torch.device) -> str:
-    """The backend by name; `auto` takes cuda for GPU tensors and cpu for others."""
-    if backend == "auto":
-        return "cuda" if device.type == "cuda" else "cpu"
-    return backend
+def available_backends(kernel: str) -> tuple[str, ...]:
+    """The backends of a kernel that can run on this machine."""
+    written = _written_backends(kernel)
+    if "cuda" in written and not torch.cuda.is_available():
+        return tuple(backend for backend in written if backend != "cuda")
+    return written
 
 
 def implementation(
     kernel: str, function: str, backend: Backend, device: torch.device
 ) -> Callable[..., Any]:
-    """The function of a kernel's backend, see `chosen_backend`.
+    """The function of a kernel's backend.
+
+    `auto` takes numba on the CPU, on a GPU cuda where it is written, elsewhere the plain reference.
 
     Raises:
         BackendError: the backend does not exist for this kernel or cannot run here.
     """
-    chosen = chosen_backend(backend, device)
-    if chosen not in available_backends(kernel):
+    found = available_backends(kernel)
+    chosen: str = backend
+    if backend == "auto":
+        fast = "cuda" if device.type == "cuda" else "cpu"
+        is_home = device.type in ("cpu", "cuda")
+        chosen = fast if is_home and fast in found else "reference"
+    if chosen not in found:
         raise BackendError(
-            f"kernel {kernel!r} has no {chosen!r} backend here "
-            f"(available: {', '.join(available_backends(kernel))})"
+            f"kernel {kernel!r} has no {chosen!r} backend here (available: {', '.join(found)})"
         )
+    if chosen == "cpu" and device.type != "cpu":
+        raise BackendError(f"the numba {kernel} runs on the CPU, got a tensor on {device}")
     return getattr(import_module(f"lidarpainter_models.kernels.{kernel}.{chosen}"), function)
+
+
+def float32_implementation(
+    kernel: str, function: str, backend: Backend, like: Tensor
+) -> Callable[..., Any]:
+    """`implementation` of a kernel whose numba version takes float32 alone.
+
+    Raises:
+        BackendError: see `implementation`; or numba was asked for another kind of numbers.
+    """
+    if like.dtype != torch.float32 and backend == "auto":
+        backend = "reference"
+    if like.dtype != torch.float32 and backend == "cpu":
+        raise BackendError(f"the numba {kernel} takes float32, got {like.dtype}")
+    return implementation(kernel, function, backend, like.device)

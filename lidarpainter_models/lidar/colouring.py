@@ -18,7 +18,7 @@ from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.lidar.colour_sampling import BestSamples, combine_samples, insert_samples
+from lidarpainter_models.kernels.colour_sampling import BestSamples, combine_samples, insert_samples
 from lidarpainter_models.lidar.exposure_matching import match_exposure
 from lidarpainter_models.lidar.lidar_map import LidarMap
 from lidarpainter_models.lidar.point_visibility import (

@@ -7,7 +7,7 @@ the cameras are joined by weighted least squares over all pairs that share point
 
 import numpy as np
 
-from lidarpainter_models.lidar.colour_sampling import BestSamples
+from lidarpainter_models.kernels.colour_sampling import BestSamples
 
 DARKEST, BRIGHTEST = 16, 240
 """Samples outside are clipped or noisy and say nothing about exposure."""

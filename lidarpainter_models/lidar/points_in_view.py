@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.kernels.colour_sampling import project_inside
 from lidarpainter_models.lidar.actor_separation import poses_at
-from lidarpainter_models.lidar.colour_sampling import project_inside
 from lidarpainter_models.lidar.lidar_map import MapPoints
 from lidarpainter_models.scenes.records import RecordedView, ViewKey
 from lidarpainter_models.scenes.tracks import ActorTrack

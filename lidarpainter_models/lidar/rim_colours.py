@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from lidarpainter_models.lidar.colour_sampling import sample_levels, steps_inside
+from lidarpainter_models.kernels.colour_sampling import sample_levels, steps_inside
 from lidarpainter_models.lidar.point_visibility import Visibility
 from lidarpainter_models.lidar.points_in_view import PointsInView
 

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from lidarpainter_models.errors import ShapeError
-from lidarpainter_models.kernels.point_splat import splat_points, splat_views
+from lidarpainter_models.kernels.point_splat import splat_points
 from lidarpainter_models.kernels.point_splat.cpu import PIECE
 
 
@@ -141,31 +141,3 @@ def test_discs_across_bands_of_rows_are_whole(height_px):
     inputs = random_splat(3000, seed=6) | {"height_px": height_px}
     expected = splat_points(**inputs, backend="reference")
     assert torch.equal(splat_points(**inputs, backend="cpu"), expected)
-
-
-def test_several_cameras_see_what_each_sees_alone():
-    views = [random_splat(400, seed=seed) for seed in (7, 8, 9)]
-    size = {name: views[0][name] for name in ("height_px", "width_px")}
-    stacked = {
-        name: torch.stack([view[name] for view in views])
-        for name in ("pixels_uv", "depth_m", "radius_px")
-    }
-    images = splat_views(**stacked, **size)
-    for image, view in zip(images, views, strict=True):
-        assert torch.equal(image, splat_points(**view))
-    without = splat_views(stacked["pixels_uv"][:0], stacked["depth_m"][:0], **size)
-    assert without.shape == (0, size["height_px"], size["width_px"])
-
-
-def test_views_that_do_not_fit_together_are_refused():
-    pixels = torch.zeros(2, 3, 2, dtype=torch.int64)
-    with pytest.raises(ShapeError, match="views, points"):
-        splat_views(pixels, torch.ones(2, 4), height_px=2, width_px=2)
-    with pytest.raises(ShapeError, match="per view and point"):
-        splat_views(
-            pixels,
-            torch.ones(2, 3),
-            height_px=2,
-            width_px=2,
-            radius_px=torch.ones(3, dtype=torch.int64),
-        )

@@ -4,7 +4,7 @@ import torch
 from toy_street import BLUE, CAR_X_M, GREEN, GROUND, RED, WALL_X_M, ToyStreet
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.lidar.colour_sampling import BestSamples
+from lidarpainter_models.kernels.colour_sampling import BestSamples
 from lidarpainter_models.lidar.colouring import ColouringConfig
 from lidarpainter_models.lidar.exposure_matching import match_exposure
 from lidarpainter_models.lidar.map_building import build_lidar_map

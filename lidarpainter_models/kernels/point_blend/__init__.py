@@ -41,8 +41,6 @@ def blend_points(  # noqa: PLR0913 -- one option each
     ]:
         if tensor.shape[0] != num_points:
             raise ShapeError(f"{num_points} depths need as many {name}, got {tensor.shape[0]}")
-    if backend == "auto" and depth_m.device.type != "cpu":
-        backend = "reference"  # plain tensor code runs on any device
     blend = implementation("point_blend", "blend_points", backend, depth_m.device)
     return blend(
         positions_uv, depth_m, attributes, surface_depth_m, weight, radius_px, float(tolerance)

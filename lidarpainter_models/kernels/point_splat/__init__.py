@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidarpainter_models.errors import BackendError, ShapeError
+from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.kernels.backends import Backend, implementation
 
 
@@ -46,53 +46,9 @@ def splat_points(
         )
     if min(height_px, width_px) < 0:
         raise ShapeError(f"need an image size >= 0, got {width_px} x {height_px} px")
-    on_cpu = depth_m.device.type == "cpu"
-    if backend == "cpu" and not on_cpu:
-        raise BackendError(f"the numba point splatter runs on the CPU, got {depth_m.device}")
-    if backend == "auto":
-        backend = "cpu" if on_cpu else "reference"
     return implementation("point_splat", "splat_points", backend, depth_m.device)(
         pixels_uv, depth_m.detach(), _one_per_point(radius_px, depth_m), height_px, width_px
     )
-
-
-def splat_views(
-    pixels_uv: Int[Tensor, "views points 2"],
-    depth_m: Float[Tensor, "views points"],
-    *,
-    height_px: int,
-    width_px: int,
-    radius_px: Int[Tensor, "views points"] | int = 0,
-    backend: Backend = "auto",
-) -> Int[Tensor, "views height width"]:
-    """`splat_points` for the same points as several cameras see them.
-
-    Raises:
-        ShapeError: the views do not fit together, or see `splat_points`.
-        BackendError: see `splat_points`.
-    """
-    views = depth_m.shape[0] if depth_m.ndim == 2 else 0
-    if depth_m.ndim != 2 or pixels_uv.shape != (*depth_m.shape, 2):
-        raise ShapeError(
-            f"need pixels (views, points, 2) and depths (views, points), got "
-            f"{tuple(pixels_uv.shape)} and {tuple(depth_m.shape)}"
-        )
-    if not isinstance(radius_px, int) and radius_px.shape != depth_m.shape:
-        raise ShapeError(
-            f"need one radius per view and point, got {tuple(radius_px.shape)} for "
-            f"{tuple(depth_m.shape)}"
-        )
-    winner = pixels_uv.new_empty((views, height_px, width_px), dtype=torch.int64)
-    for view in range(views):
-        winner[view] = splat_points(
-            pixels_uv[view],
-            depth_m[view],
-            height_px=height_px,
-            width_px=width_px,
-            radius_px=radius_px if isinstance(radius_px, int) else radius_px[view],
-            backend=backend,
-        )
-    return winner
 
 
 def _one_per_point(radius_px: Tensor | int, depth_m: Tensor) -> Tensor:

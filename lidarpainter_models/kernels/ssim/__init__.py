@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.errors import BackendError, ShapeError
-from lidarpainter_models.kernels.backends import Backend, implementation
+from lidarpainter_models.errors import ShapeError
+from lidarpainter_models.kernels.backends import Backend, float32_implementation
 
 
 def ssim_map(
@@ -28,10 +28,8 @@ def ssim_map(
         BackendError: the numba version was asked for and the images are not float32 on the CPU.
     """
     _check_images(first_rgb, second_rgb)
-    chosen = _choose(first_rgb, backend)
-    return implementation("ssim", "ssim_map", chosen, first_rgb.device)(
-        first_rgb, second_rgb.detach()
-    )
+    compute = float32_implementation("ssim", "ssim_map", backend, first_rgb)
+    return compute(first_rgb, second_rgb.detach())
 
 
 def ssim(
@@ -77,11 +75,9 @@ def l1_ssim_loss(
             f"need one weight per pixel, got {tuple(pixel_weight.shape)} for an image of "
             f"{tuple(rendered.shape)}"
         )
-    chosen = _choose(rendered, backend)
     weight = pixel_weight.detach().to(rendered.dtype)
-    return implementation("ssim", "l1_ssim_loss", chosen, rendered.device)(
-        rendered, target.detach(), weight, ssim_weight
-    )
+    compute = float32_implementation("ssim", "l1_ssim_loss", backend, rendered)
+    return compute(rendered, target.detach(), weight, ssim_weight)
 
 
 def _check_images(first: Tensor, second: Tensor) -> None:
@@ -92,14 +88,3 @@ def _check_images(first: Tensor, second: Tensor) -> None:
         )
     if first.dtype != second.dtype:
         raise ShapeError(f"need images of one dtype, got {first.dtype} and {second.dtype}")
-
-
-def _choose(image: Tensor, backend: Backend) -> Backend:
-    is_fast = image.dtype == torch.float32 and image.device.type == "cpu"
-    if backend == "auto":
-        return "cpu" if is_fast else "reference"
-    if backend == "cpu" and not is_fast:
-        raise BackendError(
-            f"the numba SSIM takes float32 on the CPU, got {image.dtype} on {image.device}"
-        )
-    return backend
