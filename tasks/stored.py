@@ -9,7 +9,8 @@ from pathlib import Path
 
 from catalog.artefacts import ArtefactRef
 from catalog.store import Store
-from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.gaussians.model.stored_scene import scene_from_arrays, scene_to_arrays
 from lidarpainter_models.observations.stored_form import (
     observations_from_arrays,
     observations_to_arrays,
@@ -53,7 +54,7 @@ def _observations(store: Store, ref: ArtefactRef, path: Path, *_as_it_is: int) -
 
 def save_scene(folder: Path, scene: GaussianScene, history: History) -> None:
     """Write a fitted scene and the course of its fit into a folder."""
-    write_tensors(folder / SCENE_FILE, *scene.to_arrays())
+    write_tensors(folder / SCENE_FILE, *scene_to_arrays(scene))
     write_json(folder / HISTORY_FILE, history)
 
 
@@ -69,7 +70,7 @@ def load_scene(store: Store, ref: ArtefactRef) -> GaussianScene:
 @lru_cache(maxsize=2)  # the first fit and the last one are judged side by side
 def _scene(store: Store, ref: ArtefactRef, path: Path, *_as_it_is: int) -> GaussianScene:
     store.artefacts.verified(ref)
-    return GaussianScene.from_arrays(*read_tensors(path))
+    return scene_from_arrays(*read_tensors(path))
 
 
 def _as_it_is(path: Path) -> tuple[int, int]:

@@ -17,7 +17,8 @@ from lidarpainter_models.conditioning.references import WarpTarget, warped_refer
 from lidarpainter_models.conditioning.surface_depth import SurfaceDepthConfig, surface_depth
 from lidarpainter_models.conditioning.warping import SourceImage, WarpConfig, source_cost_m
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.gaussians.model.scene_graph import GaussianScene, SceneRender
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.gaussians.model.scene_rendering import SceneRender
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.lidar_images import (
     LidarImage,

@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from lidarpainter_models.evaluation.judged_views import JudgedView, actor_mask
-from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectories import Shift, road_directions, shift_pose
 from lidarpainter_models.observations.fit_size import ObservationConfig, fit_camera, shrink_image

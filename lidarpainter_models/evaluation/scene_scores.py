@@ -6,7 +6,7 @@ from typing import Any
 
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.judged_views import Renderer, ViewScores, score_views
-from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.trajectories import Shift
 from lidarpainter_models.lidar.sparse_depth import points_at_exposure
 from lidarpainter_models.metrics.depth import (

@@ -9,7 +9,7 @@ from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.judged_views import Renderer
 from lidarpainter_models.evaluation.shown import ShownScene
 from lidarpainter_models.evaluation.strips import StripView, calibrate_strip, score_strips
-from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.lidar.sparse_depth import points_at_exposure
 from lidarpainter_models.observations.fit_size import fit_camera

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
-from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.lidar.map_building import build_lidar_map
 from lidarpainter_models.observations.preparation import prepare_observations
 from lidarpainter_models.observations.views import SceneObservations

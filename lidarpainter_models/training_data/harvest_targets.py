@@ -17,7 +17,7 @@ from lidarpainter_models.conditioning.conditions import ConditionBuilder, Condit
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.fitting.config import FitConfig, RefinementConfig
 from lidarpainter_models.gaussians.fitting.densification import DensificationConfig
-from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.observations.fit_size import ObservationConfig
 from lidarpainter_models.observations.views import SceneObservations

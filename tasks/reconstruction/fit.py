@@ -11,7 +11,8 @@ from catalog.artefacts import ArtefactRef, Workplace
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
-from lidarpainter_models.gaussians.model.scene_graph import GaussianScene, describe
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene, describe
+from lidarpainter_models.gaussians.model.stored_scene import copy_scene
 from lidarpainter_models.observations.views import GuidanceView, SceneObservations
 from tasks.opened import RunSpec, opened
 from tasks.progress import Progress
@@ -77,7 +78,7 @@ def _build(
     result = fit_gaussians(
         observations(),
         config,
-        start=start().copy() if start else None,  # the fit moves what it is given
+        start=copy_scene(start()) if start else None,  # the fit moves what it is given
         guidance=guidance() if guidance else (),
         checkpoints=CheckpointFolder(
             path=place.scratch, identity=place.scratch.name, every_seconds=CHECKPOINT_EVERY_S

@@ -16,7 +16,7 @@ from lidarpainter_models.evaluation.shown import ViewTimePainting
 from lidarpainter_models.export.comparisons import Subject, comparisons
 from lidarpainter_models.export.report import render_report
 from lidarpainter_models.export.run_page import RunPage, StageCost
-from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.trajectories import Shift
 from tasks.evaluation.shown import view_time_painting
 from tasks.opened import OpenedRun, RunSpec, opened

@@ -54,6 +54,39 @@ def test_library_keeps_its_hands_still():
     assert offenders == []
 
 
+def test_compiled_code_lives_with_the_kernels():
+    """And in the synthetic street's ray tracer, which nothing else uses."""
+    homes = [ROOT / "lidarpainter_models" / name for name in ("kernels", "synthetic/raytracing")]
+    offenders = [
+        relative(path)
+        for path in SOURCES
+        if re.search(r"^\s*(import|from) numba\b", path.read_text("utf-8"), re.MULTILINE)
+        and not any(path.is_relative_to(home) for home in homes)
+    ]
+    assert offenders == []
+
+
+def test_kernels_are_asked_at_their_doors():
+    """Backends are chosen by the door of a kernel, nowhere else in the library."""
+    kernels = ROOT / "lidarpainter_models" / "kernels"
+    inside = re.compile(r"kernels\.\w+(\.(cpu|cuda)\b| import .*\b(cpu|cuda)\b)")
+    offenders = [
+        relative(path)
+        for path in SOURCES
+        if not path.is_relative_to(kernels) and inside.search(path.read_text("utf-8"))
+    ]
+    assert offenders == []
+
+
+@pytest.mark.parametrize(
+    "kernel",
+    [path.parent for path in SOURCES if path.name == "cpu.py"],
+    ids=lambda folder: folder.name,
+)
+def test_every_kernel_has_its_plain_reference(kernel):
+    assert (kernel / "reference.py").is_file()
+
+
 def test_import_contracts_hold():
     result = subprocess.run(
         [Path(sys.executable).parent / "lint-imports", "--no-cache"],

@@ -17,22 +17,19 @@ from bench_raster import STAGES, Stages
 from bench_records import Figure
 from bench_scenes import street_like_splats
 from bench_work import ADAM_BYTES, SSIM_BYTES_PER_VALUE, SSIM_FLOP_PER_VALUE
+from splat_drawing import render
 
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.images import full_image
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import fit_step
-from lidarpainter_models.gaussians.model.corrections import (
-    ActorCorrections,
-    CameraCorrections,
-    ExposureCorrections,
-)
+from lidarpainter_models.gaussians.model.actors import Actors
+from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
-from lidarpainter_models.gaussians.model.sky import SkyConfig, SkyTexture, sky_layout
-from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
+from lidarpainter_models.gaussians.model.sky import SkyTexture, SkyTextureConfig, sky_layout
 from lidarpainter_models.geometry.transforms import rigid_from_rotation
-from lidarpainter_models.kernels.gaussian_raster import render_gaussians
 from lidarpainter_models.kernels.ssim import l1_ssim_loss
 from lidarpainter_models.observations.views import TrainingView
 
@@ -52,15 +49,7 @@ def street_scene(count, width_px, height_px, *, blocks=1):
         turn = torch.diag(torch.tensor([1.0, 1.0, 1.0]) if block % 2 == 0 else _BACKWARDS)
         rotation = turn @ look_forward
         place = torch.tensor([0.0, BLOCK_M * block, 1.0])
-        camera = {name: splats[name] for name in ("fx_px", "fy_px", "cx_px", "cy_px")}
-        cameras.append(
-            Camera(
-                world_from_camera=rigid_from_rotation(rotation, place).double(),
-                width_px=width_px,
-                height_px=height_px,
-                **camera,
-            )
-        )
+        cameras.append(splats["camera"].at(rigid_from_rotation(rotation, place).double()))
         sets.append(_placed(splats, rotation, place))
     gaussians = GaussianSet(
         **{name: torch.cat([s[name] for s in sets]) for name in sets[0]},
@@ -88,14 +77,15 @@ def _scene(gaussians, cameras):
     times = torch.arange(len(cameras)) * 100_000_000
     return GaussianScene(
         gaussians=gaussians,
-        recorded_tracks=(),
-        sky=SkyTexture.constant(sky_layout(cameras, SkyConfig()), torch.tensor([0.6, 0.7, 0.9])),
+        sky=SkyTexture.constant(
+            sky_layout(cameras, SkyTextureConfig()), torch.tensor([0.6, 0.7, 0.9])
+        ),
         cameras=CameraCorrections.none(
             [(frame, "front") for frame in range(len(cameras))],
             times,
             torch.stack([camera.world_from_camera for camera in cameras]),
         ),
-        actors=ActorCorrections.none(0, times),
+        actors=Actors.uncorrected((), times),
         exposure=ExposureCorrections.none(["front"]),
     )
 
@@ -189,18 +179,15 @@ def iteration_figures(machine, repeats):
 
 def _loss(target, *, splats):
     """The image loss and its gradient, of a drawn image or of a given one."""
-    if splats is None:
-        rgb = (target * 0.9).requires_grad_()
-    else:
-        rgb = render_gaussians(**splats, backend="cpu").rgb
+    rgb = (target * 0.9).requires_grad_() if splats is None else render(splats, backend="cpu").rgb
     l1_ssim_loss(rgb, target).backward()
 
 
 def _adam_of(fit):
     """The optimiser's step on everything that the fit's one view shows."""
     scene = fit.state.scene
-    camera = scene.cameras.world_from_camera(0), *scene.world_from_actors(0)
-    rows = fit.state.blocks.rows_in_view([(fit.images[0].camera, scene.camera_from_body(*camera))])
+    bodies = camera_from_body(scene.cameras.world_from_camera(0), *scene.actors.corrected_poses(0))
+    rows = fit.state.blocks.rows_in_view([(fit.images[0].camera, bodies)])
     seen = fit.state.gaussian_adam.seen(scene.gaussians, rows)
     for leaf in (seen.means, seen.rotation_wxyz, seen.log_scale, seen.opacity_logit, seen.sh):
         leaf.grad = leaf.detach().clone()

@@ -9,20 +9,17 @@ from bench_machine import best_cpu_s, best_wall_s, multiply_adds
 from bench_records import Figure
 from bench_scenes import LEARNED, street_like_splats
 from bench_work import BACKWARD_LANE_FLOP, FORWARD_LANE_FLOP, count_lanes, raster_bytes
+from splat_drawing import render, split
 
-from lidarpainter_models.kernels.gaussian_raster import cpu, render_gaussians, render_views
+from lidarpainter_models.kernels.gaussian_raster import cpu, render_views
 from lidarpainter_models.kernels.gaussian_raster.binning import list_tiles
 from lidarpainter_models.kernels.gaussian_raster.blending import Images, blend
 from lidarpainter_models.kernels.gaussian_raster.blending_gradients import entry_sums
 from lidarpainter_models.kernels.gaussian_raster.projection import IS_VISIBLE, project
 from lidarpainter_models.kernels.gaussian_raster.projection_gradients import unproject
-from lidarpainter_models.kernels.gaussian_raster.splat_inputs import SplatView
 
 GAUSSIAN_GROWTH = (20_000, 40_000, 80_000, 160_000, 320_000, 640_000, 1_000_000)
 PIXEL_GROWTH = ((400, 250), (560, 360), (800, 500), (1120, 720), (1600, 1000), (2000, 1000))
-
-
-CAMERA = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
 
 
 class Stages:
@@ -32,10 +29,9 @@ class Stages:
         count = len(splats["means"])
         names = ("means", "rotation_wxyz", "scale_m", "opacity", "sh")
         tensors = tuple(splats[name] for name in names)
-        tensors += (torch.zeros(count, 0), torch.zeros(count, 2))
-        tensors += (splats["camera_from_body"], splats["body_index"])
+        tensors += (torch.zeros(count, 0), splats["camera_from_body"], splats["body_index"])
         self.gaussians = cpu._gaussians(tensors)
-        self.view = cpu._compiled_view(SplatView(**{name: splats[name] for name in CAMERA}))
+        self.view = cpu._compiled_view(splats["camera"])
         self.records = self.project()
         self.lists = self.list_tiles()
         self.drawn = self.blend()
@@ -75,12 +71,12 @@ LEAST_TIMES_REFERENCE = 25.0
 def forward(splats):
     """One image, without what a backward pass needs."""
     with torch.no_grad():
-        return render_gaussians(**splats, backend="cpu")
+        return render(splats, backend="cpu")
 
 
 def step(splats, backend="cpu"):
     """One image and all gradients, not added to earlier ones."""
-    image = render_gaussians(**splats, backend=backend)
+    image = render(splats, backend=backend)
     torch.autograd.grad(_loss(image), [splats[name] for name in LEARNED])
 
 
@@ -201,14 +197,13 @@ def view_figures(size, repeats, *, num_views=3):
     """Several views with all gradients in one call, against as many calls."""
     numba.set_num_threads(1)
     splats = street_like_splats(*size)
-    camera = {name: splats[name] for name in CAMERA}
-    shared = {name: value for name, value in splats.items() if name not in CAMERA}
-    shared["camera_from_body"] = shared["camera_from_body"].detach().repeat(num_views, 1, 1, 1)
-    learned = [value for name, value in shared.items() if name in LEARNED[:-1]]
-    views = [SplatView(**camera) for _ in range(num_views)]
+    gaussians, rest = split(splats)
+    transforms = rest["camera_from_body"].detach().repeat(num_views, 1, 1, 1)
+    learned = [splats[name] for name in LEARNED[:-1]]
 
     def together():
-        images = render_views(**shared, views=views, backend="cpu")
+        cameras = [rest["camera"]] * num_views
+        images = render_views(gaussians, transforms, cameras, backend="cpu")
         torch.autograd.grad(sum(_loss(image) for image in images), learned)
 
     one_ms = 1e3 * best_cpu_s(lambda: step(splats), repeats)

@@ -1,6 +1,7 @@
 """Seeded scenes whose work is like a street's, at any size."""
 
 import torch
+from splat_drawing import pinhole
 
 LEARNED = ("means", "rotation_wxyz", "scale_m", "opacity", "sh", "camera_from_body")
 
@@ -31,8 +32,15 @@ def street_like_splats(count, width_px, height_px):
     }
     for name in LEARNED:
         splats[name].requires_grad_()
-    camera = {"fx_px": focal_px, "fy_px": focal_px, "width_px": width_px, "height_px": height_px}
-    return splats | camera | {"cx_px": width_px / 2, "cy_px": height_px / 2}
+    splats["camera"] = pinhole(
+        fx_px=focal_px,
+        fy_px=focal_px,
+        cx_px=width_px / 2,
+        cy_px=height_px / 2,
+        width_px=width_px,
+        height_px=height_px,
+    )
+    return splats
 
 
 def street_like_points(count, width_px, height_px):

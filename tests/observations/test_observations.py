@@ -7,7 +7,7 @@ from toy_street import ToyStreet
 
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.gaussians.fitting.images import full_image, half_image, shrink_depth
-from lidarpainter_models.gaussians.fitting.pixel_terms import OPEN, SKY, SOLID
+from lidarpainter_models.kernels.pixel_losses import OPEN, SKY, SOLID
 from lidarpainter_models.lidar.sparse_depth import (
     SparseDepthConfig,
     move_actor_points,

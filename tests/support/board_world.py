@@ -8,14 +8,11 @@ import torch
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.warping import SourceImage
-from lidarpainter_models.gaussians.model.corrections import (
-    ActorCorrections,
-    CameraCorrections,
-    ExposureCorrections,
-)
+from lidarpainter_models.gaussians.model.actors import Actors
+from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
-from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
-from lidarpainter_models.gaussians.model.sky import SkyConfig, SkyTexture, sky_layout
+from lidarpainter_models.gaussians.model.sky import SkyTexture, SkyTextureConfig, sky_layout
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_rotation, rotation_from_vector
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
@@ -173,13 +170,12 @@ def scene(views, board):
     keys = [view.key for view in views]
     times = torch.tensor([view.timestamp_ns for view in views])
     poses = torch.stack([view.camera.world_from_camera for view in views])
-    layout = sky_layout([view.camera for view in views], SkyConfig())
+    layout = sky_layout([view.camera for view in views], SkyTextureConfig())
     return GaussianScene(
         gaussians=gaussians,
-        recorded_tracks=(),
         sky=SkyTexture.constant(layout, torch.tensor([0.5, 0.7, 0.9])),
         cameras=CameraCorrections.none(keys, times, poses),
-        actors=ActorCorrections.none(0, times),
+        actors=Actors.uncorrected((), times),
         exposure=ExposureCorrections.none(["front"]),
     )
 

@@ -29,15 +29,11 @@ def isect_tiles(
     """Tiles per Gaussian, ids of the intersections (image, tile, depth), and their rows."""
     assert sort
     assert not segmented
-    if packed:
-        nnz = means2d.shape[0]
-        assert image_ids.shape == gaussian_ids.shape == (nnz,)
-        assert int(image_ids.max()) < n_images
-        image = image_ids
-    else:
-        images, nnz = means2d.shape[:2]
-        image = torch.arange(images).repeat_interleave(nnz)
-        nnz *= images
+    assert packed, "the form that the backend uses"
+    nnz = means2d.shape[0]
+    assert image_ids.shape == gaussian_ids.shape == (nnz,)
+    assert int(image_ids.max()) < n_images
+    image = image_ids
     dims = means2d.shape[:-1]
     assert radii.shape == (*dims, 2)
     assert radii.dtype == torch.int32
@@ -82,13 +78,12 @@ def rasterize_to_pixels(
 ):
     """Values (images, height, width, channels) and alpha; with `absgrad` see the documentation."""
     dims = means2d.shape[:-1]
-    assert len(dims) == (1 if packed else 2)
+    assert packed
+    assert len(dims) == 1
     assert means2d.is_contiguous()
     assert conics.shape == (*dims, 3)
     assert opacities.shape == dims
     assert colors.shape[:-1] == dims
-    if not packed:
-        assert isect_offsets.shape[0] == dims[0]
     splats = [value.reshape(-1, *value.shape[len(dims) :]) for value in (means2d, conics, colors)]
     splats.append(opacities.reshape(-1))
     watched = _AbsoluteGradient(means2d) if absgrad else None

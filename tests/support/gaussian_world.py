@@ -4,18 +4,15 @@ A rough, speckled wall 8 m ahead, a speckled car in front of it that drives to t
 plain sky above.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
-from lidarpainter_models.gaussians.model.corrections import (
-    ActorCorrections,
-    CameraCorrections,
-    ExposureCorrections,
-)
+from lidarpainter_models.gaussians.model.actors import Actors
+from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
-from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
-from lidarpainter_models.gaussians.model.sky import SkyConfig, SkyTexture, sky_layout
+from lidarpainter_models.gaussians.model.sky import SkyTexture, SkyTextureConfig, sky_layout
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_rotation
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
@@ -39,6 +36,15 @@ def camera_at(x_m, *, width_px=WIDTH_PX, height_px=HEIGHT_PX):
         cy_px=height_px / 2,
         width_px=width_px,
         height_px=height_px,
+    )
+
+
+def turned_camera(yaw_rad):
+    """A camera at the origin that looks along world x, turned to the left."""
+    base = camera_at(0.0)
+    turn = rotation_from_vector(torch.tensor([0.0, 0.0, yaw_rad]).double())
+    return base.at(
+        rigid_from_rotation(turn @ base.world_from_camera[:3, :3], torch.zeros(3).double())
     )
 
 
@@ -80,14 +86,13 @@ def scene_of(gaussians, cameras, tracks=(), *, sky_rgb=SKY_RGB, timestamps_ns=No
     times = torch.arange(len(cameras)) * FRAME_NS if timestamps_ns is None else timestamps_ns
     return GaussianScene(
         gaussians=gaussians,
-        recorded_tracks=tuple(tracks),
-        sky=SkyTexture.constant(sky_layout(cameras, SkyConfig()), sky_rgb),
+        sky=SkyTexture.constant(sky_layout(cameras, SkyTextureConfig()), sky_rgb),
         cameras=CameraCorrections.none(
             [(frame, "front") for frame in range(len(cameras))],
             times,
             torch.stack([camera.world_from_camera for camera in cameras]),
         ),
-        actors=ActorCorrections.none(len(tracks), times),
+        actors=Actors.uncorrected(tracks, times),
         exposure=ExposureCorrections.none(["front"]),
     )
 
@@ -96,12 +101,12 @@ def scene_trained_on(views):
     """One Gaussian ahead of the given recorded views, which are the scene's training views."""
     ahead = round_gaussians(torch.tensor([[8.0, 0.0, 1.0]]), torch.full((1, 3), 0.5), sigma_m=0.5)
     scene = scene_of(ahead, [view.camera for view in views])
-    scene.cameras = CameraCorrections.none(
+    cameras = CameraCorrections.none(
         [view.key for view in views],
         torch.tensor([view.timestamp_ns for view in views]),
         torch.stack([view.camera.world_from_camera for view in views]),
     )
-    return scene
+    return replace(scene, cameras=cameras)
 
 
 def map_points(xyz_m, rgb):
@@ -141,7 +146,9 @@ def observe(scene, cameras, wall, car):
             )
         )
     lidar_map = LidarMap(street=wall, actors={"car": car})
-    return SceneObservations(views=tuple(views), lidar_map=lidar_map, tracks=scene.recorded_tracks)
+    return SceneObservations(
+        views=tuple(views), lidar_map=lidar_map, tracks=scene.actors.recorded_tracks
+    )
 
 
 def build_world():

@@ -5,7 +5,7 @@ from typing import Literal
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.fitting.densification import DensificationConfig
-from lidarpainter_models.gaussians.fitting.losses import LossWeights
+from lidarpainter_models.gaussians.fitting.losses import FitLossWeights
 from lidarpainter_models.gaussians.fitting.optimiser import LearningRates
 from lidarpainter_models.gaussians.fitting.shape_limits import ShapeLimits
 from lidarpainter_models.gaussians.initialisation.scene import InitialisationConfig
@@ -48,6 +48,8 @@ class GuidanceConfig:
     """Of its loss (the paper's lambda_novel, 0.2, changed nothing on short schedules)."""
     ssim: float = 0.1
     """Of 1 - SSIM in its loss, as in the paper."""
+    perceptual: float = 0.0
+    """Of the perceptual distance in its loss, where one is given to the fit (1 in the paper)."""
     freedom: GuidanceFreedom = "all"
     """What painted views may change: everything, or only colour and opacity. A painted guess in a
     hole would otherwise pull surfaces off their LiDAR depth."""
@@ -69,7 +71,7 @@ class FitConfig:
     initialisation: InitialisationConfig = field(default_factory=InitialisationConfig)
     densification: DensificationConfig = field(default_factory=DensificationConfig)
     learning_rates: LearningRates = field(default_factory=LearningRates)
-    losses: LossWeights = field(default_factory=LossWeights)
+    losses: FitLossWeights = field(default_factory=FitLossWeights)
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
     shapes: ShapeLimits = field(default_factory=ShapeLimits)
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)

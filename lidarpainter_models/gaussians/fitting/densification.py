@@ -17,6 +17,10 @@ from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 
+BOX_MARGIN, BOX_MARGIN_M = 1.1, 0.1
+"""An actor's Gaussian may lie this far out, in half sizes of its box, and this much further:
+mirrors and antennas."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DensificationConfig:
@@ -32,10 +36,6 @@ class DensificationConfig:
     """Steps between two rounds; several passes over the views of a short log."""
     min_opacity: float = 0.02
     """Fainter Gaussians are dropped."""
-    box_margin: float = 1.1
-    """An actor's Gaussian may lie this far out, in half sizes of its box."""
-    box_margin_m: float = 0.1
-    """And this much further: mirrors and antennas."""
 
     def __post_init__(self) -> None:
         """Refuse a schedule that runs backwards."""
@@ -130,7 +130,7 @@ def keeps_its_place(
         stays &= columns[name].isfinite().all(dim=1)
     if box_sizes_m:
         half_m = torch.stack([size.float() for size in box_sizes_m]) / 2
-        half_m = half_m * config.box_margin + config.box_margin_m
+        half_m = half_m * BOX_MARGIN + BOX_MARGIN_M
         half_m = torch.cat([torch.full((1, 3), torch.inf), half_m]).to(stays.device)
         stays &= (columns["means"].abs() <= half_m[columns["body_index"].long()]).all(dim=1)
     return stays

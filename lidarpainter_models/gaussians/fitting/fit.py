@@ -17,12 +17,17 @@ from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.densification import densify, prune
 from lidarpainter_models.gaussians.fitting.images import FitImage, full_image, half_image
-from lidarpainter_models.gaussians.fitting.shape_limits import limit_shapes, viewing_rays
+from lidarpainter_models.gaussians.fitting.shape_limits import (
+    LIMITS_EVERY,
+    limit_shapes,
+    viewing_rays,
+)
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import Perceptual, fit_step
 from lidarpainter_models.gaussians.initialisation.scene import initialise_scene
-from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.sky import seen_as_sky
+from lidarpainter_models.gaussians.model.stored_scene import copy_scene
 from lidarpainter_models.observations.views import GuidanceView, SceneObservations
 
 Progress = Callable[[int, int, dict[str, float]], None]
@@ -38,7 +43,7 @@ class FitResult:
     """Every so many steps: step, loss, psnr (training views), num_gaussians, cpu_s."""
 
 
-def fit_gaussians(  # noqa: PLR0913 - the one door to the fit
+def fit_gaussians(
     observations: SceneObservations,
     config: FitConfig,
     *,
@@ -47,7 +52,6 @@ def fit_gaussians(  # noqa: PLR0913 - the one door to the fit
     checkpoints: CheckpointFolder | None = None,
     progress: Progress | None = None,
     perceptual: Perceptual | None = None,
-    stop_after_cpu_s: float | None = None,
 ) -> FitResult:
     """Fit a scene.
 
@@ -58,9 +62,8 @@ def fit_gaussians(  # noqa: PLR0913 - the one door to the fit
         guidance: painted views.
         checkpoints: where to keep the running fit; an existing checkpoint is taken up.
         progress: told about every entry of the history.
-        perceptual: distance of a rendered and a recorded image, weighted by the config.
-        stop_after_cpu_s: end early after so many process CPU seconds (the result then depends on
-            the machine's speed).
+        perceptual: distance of a rendered and a true image, such as LPIPS, weighted by
+            `losses.perceptual` on recorded views and `guidance.perceptual` on painted ones.
 
     Raises:
         ConfigError: the start belongs to other training views, or a weight lacks its function.
@@ -79,14 +82,10 @@ def fit_gaussians(  # noqa: PLR0913 - the one door to the fit
         is_half = state.step < config.half_resolution * config.steps
         _advance(state, half if is_half else full, guidance, config, perceptual)
         state.cpu_s = time.process_time() - cpu_before_s
-        is_out_of_time = stop_after_cpu_s is not None and state.cpu_s >= stop_after_cpu_s
-        is_last = is_out_of_time or state.step == config.steps
-        if state.step % config.log_every == 0 or is_last:
+        if state.step % config.log_every == 0 or state.step == config.steps:
             _log(state, config, progress)
-        if checkpoints is not None and (is_out_of_time or checkpoints.is_due(state.step)):
+        if checkpoints is not None and checkpoints.is_due(state.step):
             checkpoints.save(*state.keep())
-        if is_out_of_time:
-            break
     return FitResult(scene=_finished(state, config), history=state.history)
 
 
@@ -117,7 +116,7 @@ def _advance(
     state.step += 1
     state.recent.append(told)
     _change_set(state, config)
-    if state.step % config.shapes.every == 0:
+    if state.step % LIMITS_EVERY == 0:
         scene = state.caught_up()
         limit_shapes(scene.gaussians, viewing_rays(scene), config.shapes)
         state.blocks.refresh(scene.gaussians)
@@ -128,7 +127,7 @@ def _change_set(state: FitState, config: FitConfig) -> None:
     settings, fraction = config.densification, state.step / config.steps
     if state.step % settings.every or fraction < settings.start or state.step == config.steps:
         return
-    sizes = [track.size_m for track in state.scene.recorded_tracks]
+    sizes = [track.size_m for track in state.scene.actors.recorded_tracks]
     gaussians = state.caught_up().gaussians
     if fraction > settings.stop:
         state.apply(prune(gaussians, sizes, settings))
@@ -159,8 +158,8 @@ def _log(state: FitState, config: FitConfig, progress: Progress | None) -> None:
 
 def _finished(state: FitState, config: FitConfig) -> GaussianScene:
     """The scene without gradients, useless Gaussians or unseen sky."""
-    scene = state.caught_up().copy()
-    sizes = [track.size_m for track in scene.recorded_tracks]
+    scene = copy_scene(state.caught_up())
+    sizes = [track.size_m for track in scene.actors.recorded_tracks]
     change = prune(scene.gaussians, sizes, config.densification)
     return replace(scene, gaussians=change.gaussians, sky=scene.sky.filled())
 
@@ -177,5 +176,8 @@ def _check(
             f"the start was fitted to {len(start.cameras.keys)} other training views than the "
             f"{len(keys)} given"
         )
-    if config.losses.perceptual > 0 and perceptual is None:
-        raise ConfigError("losses.perceptual is positive, but no perceptual distance is given")
+    if perceptual is None and max(config.losses.perceptual, config.guidance.perceptual) > 0:
+        raise ConfigError(
+            "losses.perceptual or guidance.perceptual is positive, but no perceptual distance is "
+            "given"
+        )

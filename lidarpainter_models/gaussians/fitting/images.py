@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lidarpainter_models.gaussians.fitting.pixel_terms import NOTHING, OPEN, SKY, SOLID, PixelFacts
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.kernels.pixel_losses import NOTHING, OPEN, SKY, SOLID, PixelFacts
 from lidarpainter_models.observations.fit_size import shrink_image
 from lidarpainter_models.observations.views import TrainingView
 

@@ -1,6 +1,6 @@
 """What a fit minimises besides the terms per pixel: actors in their boxes, small corrections.
 
-Sky and LiDAR depth are in `pixel_terms`. Lengths are metres, angles radians.
+Sky and LiDAR depth are in `pixel_losses`. Lengths are metres, angles radians.
 """
 
 from dataclasses import dataclass
@@ -9,11 +9,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+ACTOR_TERM_EVERY = 10
+"""Steps between two actor terms: it needs one more blended channel."""
 _EDGE = 1e-4  # keeps logarithms finite
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LossWeights:
+class FitLossWeights:
     """How much each part of the loss counts."""
 
     ssim: float = 0.2
@@ -27,8 +29,6 @@ class LossWeights:
     the fit would otherwise hang sky-coloured needles at any depth."""
     actors: float = 0.1
     """Of the term that keeps actors inside their boxes."""
-    actors_every: int = 10
-    """Steps between two actor terms: it needs one more blended channel."""
     depth: float = 0.05
     """Of the LiDAR depth term."""
     depth_tolerance: float = 0.05

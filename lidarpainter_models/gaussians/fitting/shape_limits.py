@@ -12,8 +12,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
 from lidarpainter_models.geometry.transforms import (
     invert_rigid,
     rotation_from_quaternion,
@@ -21,23 +22,23 @@ from lidarpainter_models.geometry.transforms import (
 
 _ALONG = math.cos(math.radians(45))
 _MOST_CAMERAS = 16
+LIMITS_EVERY = 50
+"""Steps between two checks."""
+STEADY_RAY = 0.985
+"""Rays that differ more than about 10 degrees over the log pin a Gaussian's depth themselves: below
+this length of the mean unit ray the stricter limit is off."""
+LEAST_SIGMA_M = 0.003
+"""Thinnest axis; the low-pass of a pixel is wider anyway."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShapeLimits:
     """Which shapes a Gaussian may take."""
 
-    every: int = 50
-    """Steps between two checks."""
     most_elongation: float = 12.0
     """Longest over middle axis: poles and wires need needles."""
     most_elongation_along_ray: float = 2.0
     """The same for an axis within 45 degrees of the viewing ray."""
-    steady_ray: float = 0.985
-    """Rays that differ more than about 10 degrees over the log pin a Gaussian's depth themselves:
-    below this length of the mean unit ray the stricter limit is off."""
-    least_sigma_m: float = 0.003
-    """Thinnest axis; the low-pass of a pixel is wider anyway."""
     most_sigma: float = 0.1
     """Longest axis in units of the distance to the nearest camera."""
 
@@ -65,10 +66,10 @@ def viewing_rays(scene: GaussianScene, camera_rows: Sequence[int] | None = None)
     with torch.no_grad():
         for row in rows:
             timestamp_ns = int(scene.cameras.timestamps_ns[row])
-            camera_from_body = scene.camera_from_body(
-                scene.cameras.world_from_camera(row), *scene.world_from_actors(timestamp_ns)
+            actors = scene.actors.corrected_poses(timestamp_ns)
+            body_from_camera = invert_rigid(
+                camera_from_body(scene.cameras.world_from_camera(row), *actors)
             )
-            body_from_camera = invert_rigid(camera_from_body)
             offset = means - body_from_camera[body, :3, 3]
             forward = body_from_camera[body, :3, 2]
             length = offset.norm(dim=1).clamp(min=1e-3)
@@ -89,12 +90,12 @@ def limit_shapes(gaussians: GaussianSet, rays: ViewingRays, limits: ShapeLimits)
         direction = _axis(gaussians.rotation_wxyz, order[:, 2])
         length = rays.mean_direction.norm(dim=1)
         along = (direction * rays.mean_direction).sum(dim=1).abs() / length.clamp(min=1e-3)
-        is_needle = (along > _ALONG) & (length > limits.steady_ray)
+        is_needle = (along > _ALONG) & (length > STEADY_RAY)
         most = torch.where(is_needle, limits.most_elongation_along_ray, limits.most_elongation)
         limit = ordered[:, 1] + most.log()
         limit = torch.minimum(limit, (rays.distance_m * limits.most_sigma).log())
         capped = torch.minimum(gaussians.log_scale, limit[:, None])
-        gaussians.log_scale.copy_(capped.clamp(min=math.log(limits.least_sigma_m)))
+        gaussians.log_scale.copy_(capped.clamp(min=math.log(LEAST_SIGMA_M)))
 
 
 def _axis(

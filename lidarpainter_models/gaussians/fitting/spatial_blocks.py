@@ -18,27 +18,19 @@ from torch import Tensor
 from lidarpainter_models.gaussians.fitting.optimiser import LearningRates
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.kernels.frustum_culling.cpu import (
-    Bounds,
-    Frustum,
+from lidarpainter_models.kernels.frustum_culling import (
+    MOST_SIGMAS,
+    Blocks,
     mark_seen,
     refresh_bounds,
 )
-from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
-    ALPHA_CUT,
-    BLUR_PX2,
-    NEAR_M,
-    TANGENT_MARGIN,
-)
-from lidarpainter_models.kernels.sparse_adam.cpu import MOST_UNITS
+from lidarpainter_models.kernels.sparse_adam import MOST_UNITS
 
 View = tuple[Camera, Float[Tensor, "bodies 4 4"]]
 """A camera and where it has the bodies of the scene."""
 
 CELL_M = 8.0
 """Side of the smallest cells: a few hundred blocks for a street."""
-MOST_SIGMAS = math.sqrt(-2.0 * math.log(ALPHA_CUT))
-"""An opaque Gaussian reaches this far."""
 
 
 @dataclass(eq=False, kw_only=True)
@@ -46,13 +38,8 @@ class SpatialBlocks:
     """The blocks of one set of Gaussians."""
 
     block_of_row: Int[Tensor, " gaussians"]
-    order: Int[np.ndarray, " gaussians"]
-    """Row numbers, block by block."""
-    first: Int[np.ndarray, " blocks_and_one"]
-    """Where each block begins in `order`."""
-    body: Int[np.ndarray, " blocks"]
+    blocks: Blocks
     reach_sigmas: float
-    bounds: Bounds
 
     @classmethod
     def of(cls, gaussians: GaussianSet, rates: LearningRates) -> "SpatialBlocks":
@@ -69,30 +56,30 @@ class SpatialBlocks:
         order = np.argsort(numbers, kind="stable")
         count = int(numbers.max(initial=-1)) + 1
         first = np.searchsorted(numbers[order], np.arange(count + 1))
-        blocks = cls(
-            block_of_row=block_of_row,
-            order=order,
-            first=first,
-            body=gaussians.body_index.numpy()[order[first[:-1]]],
-            reach_sigmas=_reach_sigmas(rates),
-            bounds=Bounds(*(np.empty(shape) for shape in ((count, 3), (count, 3), count))),
+        low, high = torch.empty(2, count, 3, dtype=torch.float64)
+        blocks = Blocks(
+            order=torch.from_numpy(order),
+            first=torch.from_numpy(first),
+            body=torch.from_numpy(gaussians.body_index.numpy()[order[first[:-1]]]),
+            low=low,
+            high=high,
+            reach=torch.empty(count, dtype=torch.float64),
         )
-        blocks.refresh(gaussians)
-        return blocks
+        made = cls(block_of_row=block_of_row, blocks=blocks, reach_sigmas=_reach_sigmas(rates))
+        made.refresh(gaussians)
+        return made
 
     def refresh(self, gaussians: GaussianSet, rows: Int[Tensor, " changed"] | None = None) -> None:
         """Take up where the Gaussians are now: all, or those in the blocks of the given rows."""
-        is_stale = np.full(len(self.body), rows is None)
+        is_stale = torch.full((len(self.blocks.body),), rows is None)
         if rows is not None:
-            is_stale[self.block_of_row[rows].numpy()] = True
+            is_stale[self.block_of_row[rows]] = True
         refresh_bounds(
-            self.order,
-            self.first,
+            self.blocks,
+            gaussians.means,
+            gaussians.log_scale,
             is_stale,
-            gaussians.means.detach().numpy(),
-            gaussians.log_scale.detach().numpy(),
-            self.reach_sigmas,
-            self.bounds,
+            reach_sigmas=self.reach_sigmas,
         )
 
     def rows_in_view(
@@ -102,12 +89,10 @@ class SpatialBlocks:
 
         `actor_slack` is how far actors may still move (metres, radians) before they are drawn.
         """
-        is_seen = np.zeros(len(self.order), np.bool_)
+        is_seen = torch.zeros(len(self.block_of_row), dtype=torch.bool)
         for camera, camera_from_body in views:
-            bodies = camera_from_body.detach().double().numpy()
-            frustum = _frustum(camera, actor_slack)
-            mark_seen(self.order, self.first, self.body, self.bounds, bodies, frustum, is_seen)
-        return torch.from_numpy(np.flatnonzero(is_seen))
+            mark_seen(self.blocks, camera, camera_from_body, is_seen, actor_slack=actor_slack)
+        return torch.from_numpy(np.flatnonzero(is_seen.numpy()))
 
 
 def _reach_sigmas(rates: LearningRates) -> float:
@@ -136,19 +121,3 @@ def _numbered(keys: Int[np.ndarray, "gaussians 5"]) -> Int[np.ndarray, " gaussia
     numbers = np.zeros(len(keys), np.int64)
     numbers[order[1:]] = np.cumsum(differs)
     return numbers
-
-
-def _frustum(camera: Camera, actor_slack: tuple[float, float]) -> Frustum:
-    """What a camera can show, the blur of footprints included."""
-    blur_px = MOST_SIGMAS * math.sqrt(BLUR_PX2)
-    left, right = camera.cx_px + blur_px, camera.width_px - camera.cx_px + blur_px
-    top, bottom = camera.cy_px + blur_px, camera.height_px - camera.cy_px + blur_px
-    widest_x = (max(left, right) + 0.5 * TANGENT_MARGIN * camera.width_px) / camera.fx_px
-    widest_y = (max(top, bottom) + 0.5 * TANGENT_MARGIN * camera.height_px) / camera.fy_px
-    return Frustum(
-        lowest=(-left / camera.fx_px, -top / camera.fy_px),
-        highest=(right / camera.fx_px, bottom / camera.fy_px),
-        stretch=(math.hypot(1.0, widest_x), math.hypot(1.0, widest_y)),
-        near_m=NEAR_M,
-        actor_slack=actor_slack,
-    )

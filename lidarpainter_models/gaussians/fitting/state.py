@@ -20,11 +20,16 @@ from lidarpainter_models.gaussians.fitting.checkpoint import (
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.densification import GradientTally, SetChange
 from lidarpainter_models.gaussians.fitting.gaussian_adam import GaussianAdam
-from lidarpainter_models.gaussians.fitting.optimiser import RowAdam
+from lidarpainter_models.gaussians.fitting.refinement import Refinement
 from lidarpainter_models.gaussians.fitting.spatial_blocks import SpatialBlocks, View
-from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
-from lidarpainter_models.kernels.sparse_adam.cpu import MOST_STEP
+from lidarpainter_models.gaussians.model.stored_scene import (
+    copy_scene,
+    scene_from_arrays,
+    scene_to_arrays,
+)
+from lidarpainter_models.kernels.sparse_adam import MOST_STEP
 
 
 @dataclass(eq=False, kw_only=True)
@@ -35,9 +40,7 @@ class FitState:
     """Its Gaussians out of view lag behind until `caught_up`."""
     gaussian_adam: GaussianAdam
     blocks: SpatialBlocks
-    camera_adam: RowAdam
-    actor_adam: RowAdam
-    exposure_adam: RowAdam
+    refinement: Refinement
     tally: GradientTally
     generator: torch.Generator
     waiting: list[int] = field(default_factory=list)
@@ -52,16 +55,15 @@ class FitState:
     @classmethod
     def begin(cls, scene: GaussianScene, config: FitConfig) -> "FitState":
         """A fit before its first step; takes its own copy of the scene."""
-        scene = _as_leaves(scene.copy())
+        scene = copy_scene(scene)
+        scene = scene.with_gaussians(scene.gaussians.as_leaves())
         generator = torch.Generator()
         generator.manual_seed(config.seed)
         return cls(
             scene=scene,
             gaussian_adam=GaussianAdam(scene.gaussians, config.learning_rates),
             blocks=SpatialBlocks.of(scene.gaussians, config.learning_rates),
-            camera_adam=RowAdam(scene.cameras.view_tangent),
-            actor_adam=RowAdam(scene.actors.tangent.flatten(0, 1)),
-            exposure_adam=RowAdam(scene.exposure.matrix.flatten(1)),
+            refinement=Refinement.begin(scene, config),
             tally=GradientTally.zeros(scene.num_gaussians),
             generator=generator,
         )
@@ -105,15 +107,13 @@ class FitState:
 
     def keep(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Tensors and JSON-able numbers of the whole state."""
-        scene_arrays, scene_metadata = self.scene.to_arrays()
+        scene_arrays, scene_metadata = scene_to_arrays(self.scene)
         tensors = group_tensors(
             {
                 "scene": scene_arrays,
                 "gaussian_adam": self.gaussian_adam.tensors(),
                 "blocks": {"block_of_row": self.blocks.block_of_row},
-                "camera_adam": self.camera_adam.tensors(),
-                "actor_adam": self.actor_adam.tensors(),
-                "exposure_adam": self.exposure_adam.tensors(),
+                **{name: adam.tensors() for name, adam in self.refinement.adams.items()},
                 "tally": {"total": self.tally.total, "visits": self.tally.visits},
                 "random": {"state": self.generator.get_state()},
             }
@@ -133,10 +133,11 @@ class FitState:
         cls, tensors: dict[str, Tensor], numbers: dict[str, Any], config: FitConfig
     ) -> "FitState":
         """The state that `keep` described."""
-        scene = GaussianScene.from_arrays(ungroup_tensors(tensors, "scene"), numbers["scene"])
+        scene = scene_from_arrays(ungroup_tensors(tensors, "scene"), numbers["scene"])
         state = cls.begin(scene, config)
-        for name in ("gaussian_adam", "camera_adam", "actor_adam", "exposure_adam"):
-            getattr(state, name).load(ungroup_tensors(tensors, name))
+        state.gaussian_adam.load(ungroup_tensors(tensors, "gaussian_adam"))
+        for name, adam in state.refinement.adams.items():
+            adam.load(ungroup_tensors(tensors, name))
         state.blocks = SpatialBlocks.with_rows_in(
             tensors["blocks/block_of_row"], state.scene.gaussians, config.learning_rates
         )
@@ -147,11 +148,3 @@ class FitState:
         state.history = list(numbers["history"])
         state.recent = [tuple(pair) for pair in numbers["recent"]]
         return state
-
-
-def _as_leaves(scene: GaussianScene) -> GaussianScene:
-    """Let everything that a fit changes collect gradients (the sky has its own optimiser)."""
-    scene.gaussians = scene.gaussians.as_leaves()
-    for table in (scene.cameras.view_tangent, scene.actors.tangent, scene.exposure.matrix):
-        table.requires_grad_(True)
-    return scene

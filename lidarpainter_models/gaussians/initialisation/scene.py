@@ -18,7 +18,7 @@ from lidarpainter_models.gaussians.initialisation.adaptive_voxels import (
     adaptive_voxels,
 )
 from lidarpainter_models.gaussians.initialisation.surfels import (
-    SurfelConfig,
+    SPACING_SIGMA,
     fill_colours,
     surfels_from_points,
 )
@@ -26,20 +26,23 @@ from lidarpainter_models.gaussians.initialisation.unreached import (
     UnreachedConfig,
     unreached_gaussians,
 )
-from lidarpainter_models.gaussians.model.corrections import (
-    ActorCorrections,
-    CameraCorrections,
-    ExposureCorrections,
-)
+from lidarpainter_models.gaussians.model.actors import Actors
+from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
-from lidarpainter_models.gaussians.model.sky import SkyConfig, sky_from_images, sky_layout
+from lidarpainter_models.gaussians.model.sky import SkyTextureConfig, sky_from_images, sky_layout
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import transform_points
 from lidarpainter_models.lidar.lidar_map import MapPoints
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
 from lidarpainter_models.scenes.driving_scene import ActorTrack
 
+LEAST_UNSEEN_POINTS = 3
+"""Voxels with fewer points that only a camera moved aside would see are dropped."""
+LEAST_ACTOR_POINTS = 20
+"""An actor with fewer points is not modelled."""
+ACTOR_VOXEL_M = 0.05
+"""Smallest voxel on an actor; its points come from the whole log."""
 _MOST_VIEWS_PER_ACTOR = 24
 _APART_M = 64.0  # longer than any vehicle, short enough for float32 to stay exact
 
@@ -54,21 +57,14 @@ class InitialisationConfig:
     """Actors get at most this part of the start size."""
     unseen_share: float = 0.2
     """Part of the street's share for points that only a camera moved aside would see."""
-    least_unseen_points: int = 3
-    """Voxels there with fewer points are dropped."""
     aside_m: float = 3.5
     """How far aside such a camera may stand."""
     sh_degree: int = 1
     """One degree: few views see a surface from far-apart directions."""
-    least_actor_points: int = 20
-    """An actor with fewer points is not modelled."""
-    actor_voxel_m: float = 0.05
-    """Smallest voxel on an actor; its points come from the whole log."""
     street_voxel_m: float = 0.03
     """Smallest voxel on the street."""
     unreached: UnreachedConfig = field(default_factory=UnreachedConfig)
-    surfels: SurfelConfig = field(default_factory=SurfelConfig)
-    sky: SkyConfig = field(default_factory=SkyConfig)
+    sky: SkyTextureConfig = field(default_factory=SkyTextureConfig)
 
     def __post_init__(self) -> None:
         """Refuse a start without Gaussians."""
@@ -107,7 +103,7 @@ def _scene_around(
     cameras = [view.camera for view in views]
     return GaussianScene(
         gaussians=gaussians,
-        recorded_tracks=observations.tracks,
+        actors=Actors.uncorrected(observations.tracks, _frame_times(views)),
         sky=sky_from_images(
             sky_layout(cameras, config.sky),
             cameras,
@@ -119,7 +115,6 @@ def _scene_around(
             timestamps_ns,
             torch.stack([camera.world_from_camera.double() for camera in cameras]),
         ),
-        actors=ActorCorrections.none(len(observations.tracks), _frame_times(views)),
         exposure=ExposureCorrections.none(observations.camera_names),
     )
 
@@ -165,7 +160,7 @@ def _street_gaussians(
     seen = _street_voxels(points, footprint, in_image, config, max(budget - for_aside, 1))
     aside = _street_voxels(points, footprint, is_aside, config, max(for_aside, 1))
     # no image will ever shrink a lone blob there, and beside the lane it is large in the view
-    aside = aside.keep(aside.num_points >= config.least_unseen_points)
+    aside = aside.keep(aside.num_points >= LEAST_UNSEEN_POINTS)
     xyz_m = torch.cat([seen.xyz_m, aside.xyz_m])
     if xyz_m.shape[0] == 0:
         return GaussianSet.empty(sh_degree=config.sh_degree)
@@ -173,9 +168,8 @@ def _street_gaussians(
     return surfels_from_points(
         xyz_m,
         fill_colours(xyz_m, rgb, torch.cat([seen.has_colour, aside.has_colour])),
-        config.surfels,
         sh_degree=config.sh_degree,
-        most_sigma_m=torch.cat([2 * seen.size_m, config.surfels.spacing_sigma * aside.size_m]),
+        most_sigma_m=torch.cat([2 * seen.size_m, SPACING_SIGMA * aside.size_m]),
     )
 
 
@@ -208,7 +202,7 @@ def _actor_gaussians(
             continue
         footprint = _actor_footprint(points, track, observations.views, config)
         in_sight = footprint.isfinite()
-        if int(in_sight.sum()) >= config.least_actor_points:
+        if int(in_sight.sum()) >= LEAST_ACTOR_POINTS:
             clouds.append((index + 1, points.keep(in_sight), footprint[in_sight]))
     if not clouds:
         return []
@@ -221,7 +215,7 @@ def _actor_gaussians(
         torch.cat([part.has_colour for _, part, _ in clouds]),
         torch.cat([footprint for _, _, footprint in clouds]),
         budget=max(int(config.num_gaussians * config.most_actor_share), 1),
-        least_m=config.actor_voxel_m,
+        least_m=ACTOR_VOXEL_M,
     )
     owner = torch.round(voxels.xyz_m[:, 0] / _APART_M).long()
     parts = []
@@ -232,7 +226,6 @@ def _actor_gaussians(
             surfels_from_points(
                 xyz_m,
                 fill_colours(xyz_m, voxels.rgb[rows], voxels.has_colour[rows]),
-                config.surfels,
                 body=index,
                 sh_degree=config.sh_degree,
                 most_sigma_m=2 * voxels.size_m[rows],

@@ -4,8 +4,6 @@ Each point's neighbourhood gives a normal (the direction of least variance); the
 disc across it. Against round blobs this start was 0.3 to 0.4 dB ahead after 300 steps.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,21 +13,16 @@ from torch import Tensor
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SurfelConfig:
-    """Shape and opacity of a Gaussian that starts on a LiDAR point."""
-
-    spacing_sigma: float = 0.6
-    """Standard deviation in the surface, in units of the distance to the neighbours."""
-    least_thickness: float = 0.15
-    """Standard deviation across the surface, at least this part of the one along it."""
-    opacity: float = 0.7
-    """Solid enough to hide what is behind, soft enough to be moved."""
-    neighbours: int = 10
-    """Points that define a normal."""
-    spacing_neighbours: int = 4
-    """Points that define the spacing."""
+SPACING_SIGMA = 0.6
+"""Standard deviation in the surface, in units of the distance to the neighbours."""
+LEAST_THICKNESS = 0.15
+"""Standard deviation across the surface, at least this part of the one along it."""
+OPACITY = 0.7
+"""Solid enough to hide what is behind, soft enough to be moved."""
+NEIGHBOURS = 10
+"""Points that define a normal."""
+SPACING_NEIGHBOURS = 4
+"""Points that define the spacing."""
 
 
 def fill_colours(
@@ -77,7 +70,6 @@ def surface_axes(
 def surfels_from_points(
     xyz_m: Float[Tensor, "points 3"],
     rgb: Float[Tensor, "points 3"],
-    config: SurfelConfig,
     *,
     body: int = 0,
     sh_degree: int = 1,
@@ -88,7 +80,6 @@ def surfels_from_points(
     Args:
         xyz_m: where.
         rgb: colours, in [0, 1].
-        config: see there.
         body: the body that they belong to.
         sh_degree: degree of the harmonics, which start at zero but for the constant.
         most_sigma_m: largest standard deviation of each (lone points have far neighbours).
@@ -96,17 +87,17 @@ def surfels_from_points(
     count = xyz_m.shape[0]
     if count == 0:
         return GaussianSet.empty(sh_degree=sh_degree)
-    distance, index = neighbourhood(xyz_m, config.neighbours + 1)
-    near = distance[:, 1 : config.spacing_neighbours + 1]
+    distance, index = neighbourhood(xyz_m, NEIGHBOURS + 1)
+    near = distance[:, 1 : SPACING_NEIGHBOURS + 1]
     spacing_m = near.mean(dim=1) if near.shape[1] else torch.full((count,), 0.1)
-    sigma_m = (spacing_m * config.spacing_sigma).clamp(min=1e-3)
+    sigma_m = (spacing_m * SPACING_SIGMA).clamp(min=1e-3)
     if most_sigma_m is not None:
         sigma_m = torch.minimum(sigma_m, most_sigma_m)
     axes, spread = surface_axes(xyz_m[index].double())
     thickness = (spread[:, 0] / spread[:, 1].clamp(min=1e-6)).float()
-    thickness = thickness.clamp(config.least_thickness, 1.0)
+    thickness = thickness.clamp(LEAST_THICKNESS, 1.0)
     scale_m = torch.stack([sigma_m * thickness, sigma_m, sigma_m], dim=1)
-    opacity = torch.full((count,), config.opacity)
+    opacity = torch.full((count,), OPACITY)
     return GaussianSet(
         means=xyz_m.clone(),
         rotation_wxyz=quaternion_from_rotation(axes).float(),

@@ -17,12 +17,23 @@ from lidarpainter_models.gaussians.initialisation.plane_sweep import (
     sweep_cost,
     sweep_depths,
 )
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
-from lidarpainter_models.gaussians.model.scene_graph import GaussianScene
 from lidarpainter_models.geometry.box_masks import project_boxes
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation
 from lidarpainter_models.lidar.ground_heights import GroundHeights
 from lidarpainter_models.observations.views import TrainingView
+
+COMPARED_VIEWS = 3
+"""Other views of the same camera that each is compared with."""
+STRIDE_PX = 3
+"""Pixels between two Gaussians; splitting refines them later."""
+NUM_DEPTHS = 24
+"""Depths tried."""
+PRIOR = 0.03
+"""Colour difference for which a depth far from the surroundings' is believed."""
+OPACITY = 0.6
+"""First opacity."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,10 +42,6 @@ class UnreachedConfig:
 
     views_per_camera: int = 4
     """Training views that are looked at, evenly over the log."""
-    compared_views: int = 3
-    """Other views of the same camera that each is compared with."""
-    stride_px: int = 3
-    """Pixels between two Gaussians; splitting refines them later."""
     most_share: float = 0.12
     """At most this part of the start size; a larger stride is taken if need be."""
     nearest_m: float = 8.0
@@ -43,12 +50,6 @@ class UnreachedConfig:
     """Beyond it a lane's width moves nothing by a pixel."""
     most_below_ground_m: float = 1.0
     """Deeper ones are dropped; roads fall away further than the LiDAR sees them."""
-    num_depths: int = 24
-    """Depths tried."""
-    prior: float = 0.03
-    """Colour difference for which a depth far from the surroundings' is believed."""
-    opacity: float = 0.6
-    """First opacity."""
 
 
 def unreached_gaussians(
@@ -93,18 +94,18 @@ def _seeds_of_view(
     count = int(is_open.sum())
     if count == 0 or budget <= 0 or len(of_camera) < 2:
         return GaussianSet.empty(sh_degree=scene.gaussians.sh_degree)
-    stride = max(config.stride_px, int((count / budget) ** 0.5) + 1)
+    stride = max(STRIDE_PX, int((count / budget) ** 0.5) + 1)
     others = [other for other in of_camera if other.key != view.key]
-    compared = _evenly(others, config.compared_views)
-    depths_m = sweep_depths(config.nearest_m, config.farthest_m, config.num_depths)
+    compared = _evenly(others, COMPARED_VIEWS)
+    depths_m = sweep_depths(config.nearest_m, config.farthest_m, NUM_DEPTHS)
     cost = sweep_cost(
         view.camera, view.rgb, [(other.camera, other.rgb) for other in compared], depths_m
     )
     expected_m = depth_from_below(render.depth_m, fallback_m=config.farthest_m)
-    depth_m = choose_depth(cost, depths_m, expected_m, prior=config.prior)
+    depth_m = choose_depth(cost, depths_m, expected_m, prior=PRIOR)
     grid = torch.zeros_like(is_open)
     grid[stride // 2 :: stride, stride // 2 :: stride] = True
-    return _facing_discs(view, depth_m, is_open & grid, stride, config, scene.gaussians)
+    return _facing_discs(view, depth_m, is_open & grid, stride, scene.gaussians)
 
 
 def _above_ground(
@@ -131,7 +132,6 @@ def _facing_discs(
     depth_m: Float[Tensor, "height width"],
     chosen: Bool[Tensor, "height width"],
     stride: int,
-    config: UnreachedConfig,
     like: GaussianSet,
 ) -> GaussianSet:
     """Discs that face the camera at the chosen pixels."""
@@ -143,7 +143,7 @@ def _facing_discs(
         means=xyz_m,
         rotation_wxyz=quaternion_from_rotation(rotation).float().expand(count, 4).clone(),
         log_scale=torch.stack([sigma_m, sigma_m, 0.3 * sigma_m], dim=1).log(),
-        opacity_logit=torch.logit(torch.full((count,), config.opacity)),
+        opacity_logit=torch.logit(torch.full((count,), OPACITY)),
         sh_dc=sh_from_rgb(view.rgb[chosen]),
         sh_rest=torch.zeros(count, like.sh_rest.shape[1], 3),
         body_index=torch.zeros(count, dtype=torch.int32),
@@ -152,11 +152,11 @@ def _facing_discs(
 
 def _moving(scene: GaussianScene, view: TrainingView) -> Bool[Tensor, "height width"]:
     """Pixels of moving actors: what is clear there belongs to them."""
-    if not scene.recorded_tracks:
+    if not scene.actors.recorded_tracks:
         return torch.zeros_like(view.sky_mask)
     with torch.no_grad():
-        poses, present = scene.world_from_actors(view.timestamp_ns)
-    sizes = [track.size_m for track in scene.recorded_tracks]
+        poses, present = scene.actors.corrected_poses(view.timestamp_ns)
+    sizes = [track.size_m for track in scene.actors.recorded_tracks]
     return project_boxes(view.camera, poses, sizes, present > 0)
 
 

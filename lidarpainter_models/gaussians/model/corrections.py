@@ -1,10 +1,9 @@
-"""What is corrected about the recording: camera poses, actor poses and exposure.
+"""What is corrected about the recorded cameras: poses and exposure. A fit changes it in place.
 
 A camera's correction is a small rigid motion in the camera's own frame: a constant per camera
 (extrinsic calibration) plus a part per training view. The views' parts of a camera sum to zero
-(the mean is moved into the constant), so the two are told apart. An actor's correction is a small
-motion in its box frame, linear in time between knots at the training times. Tangents are
-(rotation vector in radians, translation in metres), float64.
+(the mean is moved into the constant), so the two are told apart. Tangents are (rotation vector in
+radians, translation in metres), float64.
 """
 
 from collections.abc import Sequence
@@ -20,7 +19,7 @@ from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.scenes.records import ViewKey
 
 
-@dataclass(eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class CameraCorrections:
     """Refined poses of the training views."""
 
@@ -108,38 +107,7 @@ class CameraCorrections:
                     self.camera_tangent[index] += mean
 
 
-@dataclass(eq=False, kw_only=True)
-class ActorCorrections:
-    """Small motions of the actors' boxes, linear in time between knots."""
-
-    knots_ns: Int[Tensor, " knots"]
-    tangent: Float[Tensor, "actors knots 6"]
-
-    @classmethod
-    def none(cls, num_actors: int, knots_ns: Int[Tensor, " knots"]) -> "ActorCorrections":
-        """Nothing corrected yet; knots are sorted and unique."""
-        knots = torch.unique(knots_ns)
-        return cls(
-            knots_ns=knots, tangent=torch.zeros(num_actors, knots.numel(), 6, dtype=torch.float64)
-        )
-
-    def neighbours(self, timestamp_ns: int) -> tuple[int, int, float]:
-        """The knots before and after a time and the weight of the later one."""
-        after = int(torch.searchsorted(self.knots_ns, timestamp_ns))
-        last = self.knots_ns.numel() - 1
-        if after == 0 or after > last:
-            end = min(after, last)
-            return end, end, 0.0
-        start_ns, end_ns = int(self.knots_ns[after - 1]), int(self.knots_ns[after])
-        return after - 1, after, (timestamp_ns - start_ns) / (end_ns - start_ns)
-
-    def at(self, timestamp_ns: int) -> Float[Tensor, "actors 6"]:
-        """Every actor's correction at a time; differentiable."""
-        before, after, weight = self.neighbours(timestamp_ns)
-        return (1 - weight) * self.tangent[:, before] + weight * self.tangent[:, after]
-
-
-@dataclass(eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ExposureCorrections:
     """An affine map of colours per camera: shown = matrix @ (rgb, 1)."""
 

@@ -11,53 +11,49 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lidarpainter_models.gaussians.model.sky_sampling import (
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.kernels.sky_texture import (
     SkyLayout,
     SkyRays,
+    TexelMoments,
     sample_sky,
     scatter_gradient,
     sky_rays,
+    step_texels,
 )
-from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.kernels.sky_texture import cpu as sky_kernels
 
 _FULL_TURN_FROM_RAD = math.radians(270)
+LOWEST_RAD = math.radians(-8)
+"""Elevation of the lowest row; below it, the lowest row's colour goes on."""
+MARGIN_RAD = math.radians(6)
+"""Room left and right of the training views before the edge colour goes on."""
+LEARNING_RATE, FINAL_LEARNING_RATE = 0.01, 0.001
+"""First and last Adam step, in colour units."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SkyConfig:
+class SkyTextureConfig:
     """How the sky texture is laid out and fitted."""
 
-    texel_px: float = 1.0
-    """Texel size in pixels of the sharpest training camera: finer could not be seen."""
-    lowest_rad: float = math.radians(-8)
-    """Elevation of the lowest row; below it, the lowest row's colour goes on."""
-    margin_rad: float = math.radians(6)
-    """Room left and right of the training views before the edge colour goes on."""
     max_texels: int = 2_000_000
     """The texture is coarsened to stay below this (a full turn of sharp cameras is 8 million)."""
     min_transmittance: float = 0.2
     """A texel learns only through pixels clearer than this."""
-    learning_rate: float = 0.01
-    """First Adam step, in colour units."""
-    final_learning_rate: float = 0.001
-    """Last Adam step."""
 
 
-@dataclass(eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SkyTexture:
-    """Colours by world direction, with the state of their optimiser."""
+    """Colours by world direction; a fit changes its tensors in place."""
 
     layout: SkyLayout
     rgb: Float[Tensor, "rows columns 3"]
     weight: Float[Tensor, "rows columns"]
     """How much clear image each texel has seen; 0 where the colour is a guess."""
-    first_moment: Float[Tensor, "rows columns 3"]
-    second_moment: Float[Tensor, "rows columns 3"]
-    visits: Int[Tensor, "rows columns"]
+    moments: TexelMoments
+    """Of the optimiser: a fit that goes on from this sky needs them."""
 
     @classmethod
     def constant(cls, layout: SkyLayout, rgb: Float[Tensor, "3"]) -> "SkyTexture":
@@ -67,9 +63,11 @@ class SkyTexture:
             layout=layout,
             rgb=rgb.float().expand(*size, 3).clone(),
             weight=torch.zeros(size),
-            first_moment=torch.zeros(*size, 3),
-            second_moment=torch.zeros(*size, 3),
-            visits=torch.zeros(size, dtype=torch.int32),
+            moments=TexelMoments(
+                first=torch.zeros(*size, 3),
+                second=torch.zeros(*size, 3),
+                visits=torch.zeros(size, dtype=torch.int32),
+            ),
         )
 
     def rays(self, camera: Camera, wanted: Bool[Tensor, "height width"] | None = None) -> SkyRays:
@@ -89,66 +87,27 @@ class SkyTexture:
     ) -> None:
         """One optimiser step on the texels seen through pixels of positive `clear`, in place."""
         texel_gradient, texel_weight = scatter_gradient(gradient, clear, rays, self.layout)
-        self.weight += texel_weight
-        if self.rgb.device.type == "cpu":
-            sky_kernels.adam(
-                self.rgb.numpy(),
-                self.first_moment.numpy(),
-                self.second_moment.numpy(),
-                self.visits.numpy(),
-                texel_gradient.numpy(),
-                texel_weight.numpy(),
-                learning_rate,
-            )
-        else:
-            adam_reference(self, texel_gradient, texel_weight, learning_rate)
+        self.weight.add_(texel_weight)
+        step_texels(self.rgb, self.moments, texel_gradient, texel_weight, learning_rate)
 
     def filled(self) -> "SkyTexture":
         """The same sky with every unseen texel filled in from seen ones."""
         known = self.weight.clamp(max=1.0)
         return replace(self, rgb=push_pull(self.rgb, known, wraps=self.layout.wraps))
 
-    def clone(self) -> "SkyTexture":
-        """A copy that shares no memory."""
-        tensors = {name: value.clone() for name, value in self.tensors().items()}
-        return SkyTexture(layout=self.layout, **tensors)
 
-    def tensors(self) -> dict[str, Tensor]:
-        """Everything a checkpoint must keep besides the layout."""
-        names = ("rgb", "weight", "first_moment", "second_moment", "visits")
-        return {name: getattr(self, name) for name in names}
-
-
-def adam_reference(
-    sky: SkyTexture,
-    gradient: Float[Tensor, "rows columns 3"],
-    weight: Float[Tensor, "rows columns"],
-    learning_rate: float,
-) -> None:
-    """Plain torch twin of the fast Adam step on the touched texels, in place."""
-    touched = weight > 0
-    sky.visits[touched] += 1
-    count = sky.visits[touched].clamp(max=1000).float()[:, None]
-    g = gradient[touched]
-    sky.first_moment[touched] = 0.9 * sky.first_moment[touched] + 0.1 * g
-    sky.second_moment[touched] = 0.99 * sky.second_moment[touched] + 0.01 * g * g
-    mean = sky.first_moment[touched] / (1 - 0.9**count)
-    spread = (sky.second_moment[touched] / (1 - 0.99**count)).sqrt() + 1e-12
-    sky.rgb[touched] = (sky.rgb[touched] - learning_rate * mean / spread).clamp(0, 1)
-
-
-def sky_layout(cameras: Sequence[Camera], config: SkyConfig) -> SkyLayout:
+def sky_layout(cameras: Sequence[Camera], config: SkyTextureConfig) -> SkyLayout:
     """The patch of sky that the cameras can see, or all of it where they look all round."""
     azimuth, elevation = _border_directions(cameras)
     middle = torch.atan2(azimuth.sin().mean(), azimuth.cos().mean())
     offset = torch.remainder(azimuth - middle + math.pi, 2 * math.pi) - math.pi
-    left, right = float(offset.max()) + config.margin_rad, float(-offset.min()) + config.margin_rad
-    top = min(float(elevation.max()) + config.margin_rad, math.pi / 2)
-    top = max(top, config.lowest_rad + 0.1)
-    texel = config.texel_px / max(camera.fx_px for camera in cameras)
+    left, right = float(offset.max()) + MARGIN_RAD, float(-offset.min()) + MARGIN_RAD
+    top = min(float(elevation.max()) + MARGIN_RAD, math.pi / 2)
+    top = max(top, LOWEST_RAD + 0.1)
+    texel = 1.0 / max(camera.fx_px for camera in cameras)  # finer could not be seen
     is_full = left + right > _FULL_TURN_FROM_RAD
     width = 2 * math.pi if is_full else left + right
-    texel *= max(1.0, math.sqrt(width * (top - config.lowest_rad) / texel**2 / config.max_texels))
+    texel *= max(1.0, math.sqrt(width * (top - LOWEST_RAD) / texel**2 / config.max_texels))
     columns = max(math.ceil(width / texel), 2)
     if is_full:
         texel = 2 * math.pi / columns
@@ -157,7 +116,7 @@ def sky_layout(cameras: Sequence[Camera], config: SkyConfig) -> SkyLayout:
         elevation_top_rad=top,
         texel_rad=texel,
         columns=columns,
-        rows=max(math.ceil((top - config.lowest_rad) / texel), 2),
+        rows=max(math.ceil((top - LOWEST_RAD) / texel), 2),
     )
 
 

@@ -1,39 +1,58 @@
-# ruff: noqa: ANN001, ANN201, ANN202 - numba infers these types
 """Bounds of blocks of Gaussians, and which blocks a camera may see: compiled code."""
+
+# ruff: noqa: ANN001, ANN202 - numba infers these types
 
 import math
 from typing import NamedTuple
 
 import numba
 import numpy as np
+from torch import Tensor
+
+from lidarpainter_models.kernels.frustum_culling.blocks import Blocks, Frustum
 
 
-class Bounds(NamedTuple):
-    """What the Gaussians of each block keep to, in the frame of its body, metres."""
+def refresh_bounds(
+    blocks: Blocks, means: Tensor, log_scale: Tensor, is_stale: Tensor, reach_sigmas: float
+) -> None:
+    """See `frustum_culling.refresh_bounds`."""
+    _refresh_bounds(
+        blocks.order.numpy(),
+        blocks.first.numpy(),
+        is_stale.numpy(),
+        means.numpy(),
+        log_scale.numpy(),
+        reach_sigmas,
+        _bounds(blocks),
+    )
 
+
+def mark_seen(blocks: Blocks, camera_from_body: Tensor, frustum: Frustum, is_seen: Tensor) -> None:
+    """See `frustum_culling.mark_seen`."""
+    _mark_seen(
+        blocks.order.numpy(),
+        blocks.first.numpy(),
+        blocks.body.numpy(),
+        _bounds(blocks),
+        camera_from_body.numpy(),
+        frustum,
+        is_seen.numpy(),
+    )
+
+
+class _Bounds(NamedTuple):
     low: np.ndarray
-    """(blocks, 3): of the centres."""
     high: np.ndarray
-    """(blocks, 3): under `low` where no Gaussian of the block is finite."""
     reach: np.ndarray
-    """(blocks): the farthest that any may reach from its centre."""
 
 
-class Frustum(NamedTuple):
-    """A pinhole camera's view; of two numbers the first is horizontal, the second vertical."""
-
-    lowest: tuple[float, float]
-    """Tangents x/z and y/z of the image's left and top edge."""
-    highest: tuple[float, float]
-    stretch: tuple[float, float]
-    """Most that the linearised projection stretches a Gaussian across the ray."""
-    near_m: float
-    actor_slack: tuple[float, float]
-    """How far the actors' boxes may still move before they are drawn: metres, radians."""
+def _bounds(blocks: Blocks) -> _Bounds:
+    """The arrays of the bounds; what is written to them is written to the blocks."""
+    return _Bounds(blocks.low.numpy(), blocks.high.numpy(), blocks.reach.numpy())
 
 
 @numba.njit(cache=True)
-def refresh_bounds(order, first, is_stale, means, log_scale, reach_sigmas, bounds):
+def _refresh_bounds(order, first, is_stale, means, log_scale, reach_sigmas, bounds):
     """Bounds of the stale blocks; a Gaussian that is not finite is never drawn and has none."""
     for block in range(len(is_stale)):
         if not is_stale[block]:
@@ -79,7 +98,7 @@ def _is_in_view(low, high, reach, transform, frustum):
 
 
 @numba.njit(cache=True)
-def mark_seen(order, first, body, bounds, camera_from_body, frustum, is_seen):
+def _mark_seen(order, first, body, bounds, camera_from_body, frustum, is_seen):
     """Mark the rows of all blocks in view."""
     for block in range(len(body)):
         transform = camera_from_body[body[block]]

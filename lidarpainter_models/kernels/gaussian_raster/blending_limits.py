@@ -20,14 +20,11 @@ MIN_TRANSMITTANCE = 1e-4
 TANGENT_MARGIN = 0.3
 """How far outside the image, in half field-of-view tangents, the projection stays linearised."""
 
-MIN_COMPENSATION = 1e-12
-"""Floor of the squared antialiasing factor, where its square root still has a finite slope."""
-
 COLOUR_OFFSET = 0.5
 """Grey that spherical harmonics of zero stand for."""
 
 NEAR_M = 0.1
-"""By default, Gaussians with a smaller camera z are not drawn."""
+"""Gaussians with a smaller camera z are not drawn."""
 
 BLUR_PX2 = 0.3
-"""By default added to the variance of every footprint, so that none is thinner than a pixel."""
+"""Added to the variance of every footprint, so that none is thinner than a pixel."""

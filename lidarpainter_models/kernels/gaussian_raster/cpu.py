@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.errors import BackendError
+from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.gaussian_raster.binning import TileLists, list_tiles
 from lidarpainter_models.kernels.gaussian_raster.blending import Images, blend
 from lidarpainter_models.kernels.gaussian_raster.blending_gradients import entry_sums
@@ -27,11 +28,7 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
     project,
 )
 from lidarpainter_models.kernels.gaussian_raster.projection_gradients import Gradients, unproject
-from lidarpainter_models.kernels.gaussian_raster.splat_inputs import (
-    DrawnImages,
-    SplatInputs,
-    SplatView,
-)
+from lidarpainter_models.kernels.gaussian_raster.splats import DrawnImages, Splats
 
 IMAGES = 6
 """Tensors that a view gives: four images, visible and radius."""
@@ -40,26 +37,23 @@ ONE_AT_A_TIME = threading.Lock()
 
 
 def draw_views(
-    inputs: SplatInputs, views: Sequence[SplatView], screen_gradients_out: Tensor | None
+    splats: Splats,
+    features: Float[Tensor, "gaussians features"],
+    camera_from_body: Float[Tensor, "views bodies 4 4"],
+    cameras: Sequence[Camera],
+    screen_gradients_out: Float[Tensor, "views gaussians"] | None,
 ) -> list[DrawnImages]:
-    """Images as `SplatImage` lists them: rgb, depth, alpha, features, visible, radius.
-
-    Raises:
-        BackendError: the tensors are not on the CPU.
-    """
-    if inputs.means.device.type != "cpu":
-        raise BackendError(f"the cpu backend needs tensors on the CPU, got {inputs.means.device}")
+    """Images as `SplatImage` lists them: rgb, depth, alpha, features, visible, radius."""
     drawn = _DrawViews.apply(
-        inputs.means,
-        inputs.rotation_wxyz,
-        inputs.scale_m,
-        inputs.opacity,
-        inputs.sh,
-        inputs.features,
-        inputs.screen_offset,
-        inputs.camera_from_body,
-        inputs.body_index,
-        views,
+        splats.means,
+        splats.rotation_wxyz,
+        splats.scale_m,
+        splats.opacity,
+        splats.sh,
+        features,
+        camera_from_body,
+        splats.body_index,
+        cameras,
         screen_gradients_out,
     )
     return [drawn[first : first + IMAGES] for first in range(0, len(drawn), IMAGES)]
@@ -70,7 +64,7 @@ def _array(tensor: Tensor, dtype: torch.dtype = torch.float32) -> np.ndarray:
 
 
 def _gaussians(tensors: tuple[Tensor, ...]) -> Gaussians:
-    means, rotation, scale, opacity, sh, features, offset, transforms, body_index = tensors
+    means, rotation, scale, opacity, sh, features, transforms, body_index = tensors
     return Gaussians(
         means=_array(means),
         rotation_wxyz=_array(rotation),
@@ -79,12 +73,11 @@ def _gaussians(tensors: tuple[Tensor, ...]) -> Gaussians:
         sh=_array(sh),
         body_index=_array(body_index, torch.int32),
         features=_array(features),
-        screen_offset=_array(offset),
         camera_from_body=_array(transforms, torch.float64),
     )
 
 
-def _compiled_view(view: SplatView) -> View:
+def _compiled_view(view: Camera) -> View:
     margin_x = TANGENT_MARGIN * 0.5 * view.width_px / view.fx_px
     margin_y = TANGENT_MARGIN * 0.5 * view.height_px / view.fy_px
     return View(
@@ -94,9 +87,6 @@ def _compiled_view(view: SplatView) -> View:
         cy=view.cy_px,
         width=view.width_px,
         height=view.height_px,
-        near=view.near_m,
-        blur=view.blur_px2,
-        antialias=view.antialias,
         lowest_x=-view.cx_px / view.fx_px - margin_x,
         highest_x=(view.width_px - view.cx_px) / view.fx_px + margin_x,
         lowest_y=-view.cy_px / view.fy_px - margin_y,
@@ -110,11 +100,8 @@ def _images(tensors: tuple[Tensor, ...], light: np.ndarray) -> Images:
 
 
 def _of_view(gaussians: Gaussians, place: int) -> Gaussians:
-    """The Gaussians with the offsets and transforms of one view."""
-    return gaussians._replace(
-        screen_offset=gaussians.screen_offset[place],
-        camera_from_body=gaussians.camera_from_body[place],
-    )
+    """The Gaussians with the transforms of one view."""
+    return gaussians._replace(camera_from_body=gaussians.camera_from_body[place])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -130,12 +117,12 @@ class _DrawnView:
 class _DrawViews(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:  # noqa: ANN401
-        *tensors, views, screen_gradients_out = arguments
+        *tensors, cameras, screen_gradients_out = arguments
         gaussians = _gaussians(tuple(tensors))
         drawn: list[Tensor] = []
         ctx.views = []
         with ONE_AT_A_TIME:
-            for place, view in enumerate(views):
+            for place, view in enumerate(cameras):
                 compiled = _compiled_view(view)
                 records = project(_of_view(gaussians, place), compiled)
                 lists = list_tiles(records, view.width_px, view.height_px)
@@ -178,7 +165,7 @@ class _DrawViews(torch.autograd.Function):
 
 
 def _room_for_gradients(gaussians: Gaussians) -> Gradients:
-    """Arrays for `unproject` to fill; the last three have a row per view."""
+    """Arrays for `unproject` to fill; the last two have a row per view."""
     count, (views, bodies) = len(gaussians.means), gaussians.camera_from_body.shape[:2]
     return Gradients(
         means=np.empty((count, 3), np.float32),
@@ -187,7 +174,6 @@ def _room_for_gradients(gaussians: Gaussians) -> Gradients:
         opacity=np.empty(count, np.float32),
         sh=np.empty(gaussians.sh.shape, np.float32),
         features=np.empty(gaussians.features.shape, np.float32),
-        screen_offset=np.empty((views, count, 2), np.float32),
         absolute=np.empty((views, count), np.float32),
         camera_from_body=np.zeros((views, CHUNKS, bodies, 3, 4)),
     )
@@ -196,7 +182,6 @@ def _room_for_gradients(gaussians: Gaussians) -> Gradients:
 def _gradients_of_view(found: Gradients, place: int) -> Gradients:
     """The sums that views share, and the arrays of one view."""
     return found._replace(
-        screen_offset=found.screen_offset[place],
         absolute=found.absolute[place],
         camera_from_body=found.camera_from_body[place],
     )
@@ -215,7 +200,6 @@ def _tensor_gradients(found: Gradients, tensors: tuple[Tensor, ...]) -> list[Ten
         found.opacity,
         found.sh,
         found.features,
-        found.screen_offset,
         to_transforms,
     )
     return [

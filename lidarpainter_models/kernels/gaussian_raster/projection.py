@@ -19,8 +19,9 @@ from lidarpainter_models.kernels.gaussian_raster import small_vectors as v3
 from lidarpainter_models.kernels.gaussian_raster import spherical_harmonics
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
     ALPHA_CUT,
+    BLUR_PX2,
     COLOUR_OFFSET,
-    MIN_COMPENSATION,
+    NEAR_M,
 )
 from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry
 from lidarpainter_models.kernels.gaussian_raster.small_vectors import Matrix, Quaternion, Vector
@@ -44,7 +45,7 @@ CHUNKS = 64
 
 
 class Gaussians(NamedTuple):
-    """C-contiguous float32 arrays as `render_gaussians` names them, float64 transforms."""
+    """C-contiguous float32 arrays as `Splats` names them, float64 transforms."""
 
     means: np.ndarray
     rotation_wxyz: np.ndarray
@@ -53,12 +54,11 @@ class Gaussians(NamedTuple):
     sh: np.ndarray
     body_index: np.ndarray
     features: np.ndarray
-    screen_offset: np.ndarray
     camera_from_body: np.ndarray
 
 
 class View(NamedTuple):
-    """The numbers of a `SplatView`, and the tangents x/z, y/z where projection stays linear."""
+    """The lens of a camera, and the tangents x/z, y/z where projection stays linear."""
 
     fx: float
     fy: float
@@ -66,9 +66,6 @@ class View(NamedTuple):
     cy: float
     width: int
     height: int
-    near: float
-    blur: float
-    antialias: bool
     lowest_x: float
     highest_x: float
     lowest_y: float
@@ -160,17 +157,10 @@ def footprint_of(
         tangent_y,
         row_x,
         row_y,
-        v3.dot(row_x, row_x) + view.blur,
+        v3.dot(row_x, row_x) + BLUR_PX2,
         v3.dot(row_x, row_y),
-        v3.dot(row_y, row_y) + view.blur,
+        v3.dot(row_y, row_y) + BLUR_PX2,
     )
-
-
-@numba.njit(**EXACT)
-def compensation_ratio(footprint: Footprint, determinant: float, blur: float) -> float:
-    """Area of the footprint before blurring over its area after, squared."""
-    bare = (footprint.xx - blur) * (footprint.yy - blur) - footprint.xy * footprint.xy
-    return bare / determinant
 
 
 @numba.njit(**EXACT)
@@ -218,35 +208,11 @@ def _write_shape(
 
 
 @numba.njit(**EXACT)
-def _screen_opacity(
-    gaussians: Gaussians, index: int, footprint: Footprint, determinant: float, view: View
-) -> float:
-    """Opacity after antialiasing; NaN where the footprint cannot be drawn."""
-    if not (determinant > 0.0 and footprint.xx + footprint.yy < LARGEST):
-        return math.nan
-    opacity = np.float64(gaussians.opacity[index])
-    if view.antialias:
-        ratio = compensation_ratio(footprint, determinant, view.blur)
-        opacity *= math.sqrt(max(ratio, MIN_COMPENSATION))
-    return opacity
-
-
-@numba.njit(**EXACT)
-def _write_place(
-    gaussians: Gaussians,
-    index: int,
-    footprint: Footprint,
-    reach: float,
-    view: View,
-    record: np.ndarray,
-) -> bool:
+def _write_place(footprint: Footprint, reach: float, view: View, record: np.ndarray) -> bool:
     """Write where a Gaussian lies and how far it reaches; return whether that is in the image."""
     x, y, z = footprint.point
     x = view.fx * x * footprint.inverse_z + view.cx
     y = view.fy * y * footprint.inverse_z + view.cy
-    if len(gaussians.screen_offset):
-        x += gaussians.screen_offset[index, 0]
-        y += gaussians.screen_offset[index, 1]
     half_width, half_height = math.sqrt(reach * footprint.xx), math.sqrt(reach * footprint.yy)
     record[HALF_WIDTH], record[HALF_HEIGHT], record[DEPTH] = half_width, half_height, z
     _write_centre(x, record, MEAN_X)
@@ -262,18 +228,18 @@ def _project_one(
     """Fill a Gaussian's record; return whether it can reach a pixel."""
     rotation, translation = transform_of(gaussians, index)
     point = v3.add(v3.apply(rotation, vector_of(gaussians.means, index)), translation)
-    if not view.near <= point[2] < LARGEST:
+    if not NEAR_M <= point[2] < LARGEST:
         return False
-    if not gaussians.opacity[index] >= ALPHA_CUT:
+    opacity = np.float64(gaussians.opacity[index])
+    if not ALPHA_CUT <= opacity < LARGEST:
         return False
     footprint = footprint_of(gaussians, index, point, rotation, translation, view)
     determinant = footprint.xx * footprint.yy - footprint.xy * footprint.xy
-    opacity = _screen_opacity(gaussians, index, footprint, determinant, view)
-    if not ALPHA_CUT <= opacity < LARGEST:
+    if not (determinant > 0.0 and footprint.xx + footprint.yy < LARGEST):
         return False
     log_opacity = math.log(opacity)
     reach = 2.0 * (log_opacity - LOG_CUT)
-    if not _write_place(gaussians, index, footprint, reach, view, record):
+    if not _write_place(footprint, reach, view, record):
         return False
     _write_shape(footprint, determinant, log_opacity, record)
     return _write_colour(gaussians, index, footprint, weights, record)

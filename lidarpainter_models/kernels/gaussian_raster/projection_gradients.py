@@ -30,7 +30,6 @@ from lidarpainter_models.kernels.gaussian_raster.blending_gradients import (
     add_entries,
     prefetch_entries,
 )
-from lidarpainter_models.kernels.gaussian_raster.blending_limits import MIN_COMPENSATION
 from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry
 from lidarpainter_models.kernels.gaussian_raster.projection import (
     ACROSS,
@@ -42,7 +41,6 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
     Footprint,
     Gaussians,
     View,
-    compensation_ratio,
     footprint_of,
     transform_of,
     vector_of,
@@ -58,7 +56,7 @@ AHEAD = 8
 class Gradients(NamedTuple):
     """Gradients of the arrays in `projection.Gaussians`; transforms per run in float64.
 
-    Those that several views share hold sums; the last three belong to one view.
+    Those that several views share hold sums; the last two belong to one view.
     """
 
     means: np.ndarray
@@ -67,7 +65,6 @@ class Gradients(NamedTuple):
     opacity: np.ndarray
     sh: np.ndarray
     features: np.ndarray
-    screen_offset: np.ndarray
     absolute: np.ndarray
     camera_from_body: np.ndarray
 
@@ -100,26 +97,6 @@ def _covariance_gradient(sums: np.ndarray, footprint: Footprint) -> Vector:
         to_remaining,
         to_slope - 2.0 * slope * to_remaining,
         slope * slope * to_remaining - slope * to_slope + to_yy,
-    )
-
-
-@numba.njit(**EXACT)
-def _add_compensation_gradient(
-    footprint: Footprint, blur: float, to_log: float, covariance_gradient: Vector
-) -> Vector:
-    """Add the gradient of log(compensation) with respect to the blurred covariance."""
-    xx, xy, yy = footprint.xx, footprint.xy, footprint.yy
-    determinant = xx * yy - xy * xy
-    ratio = compensation_ratio(footprint, determinant, blur)
-    if ratio < MIN_COMPENSATION:
-        return covariance_gradient
-    to_bare = 0.5 * to_log / (ratio * determinant)
-    to_blurred = -0.5 * to_log / determinant
-    to_xx, to_xy, to_yy = covariance_gradient
-    return (
-        to_xx + to_bare * (yy - blur) + to_blurred * yy,
-        to_xy - 2.0 * xy * (to_bare + to_blurred),
-        to_yy + to_bare * (xx - blur) + to_blurred * xx,
     )
 
 
@@ -255,14 +232,11 @@ def _unproject_one(  # noqa: PLR0913 - a compiled loop body
     point = v3.add(v3.apply(rotation, mean), translation)
     footprint = footprint_of(gaussians, index, point, rotation, translation, view)
     to_screen = _screen_gradient(sums, record)
-    gradients.screen_offset[index, 0], gradients.screen_offset[index, 1] = to_screen
     absolute_x, absolute_y = record[ACROSS] * sums[SUM_ABS_X], sums[SUM_ABS_Y]
     absolute = math.sqrt(absolute_x * absolute_x + absolute_y * absolute_y)
     gradients.absolute[index] = 2.0 * absolute
     _put(gradients.opacity, (index,), sums[SUM_G] / gaussians.opacity[index], adds)
     to_covariance = _covariance_gradient(sums, footprint)
-    if view.antialias:
-        to_covariance = _add_compensation_gradient(footprint, view.blur, sums[SUM_G], to_covariance)
     to_axes, to_point = _axes_gradient(footprint, to_covariance, view)
     to_centre = _centre_gradient(footprint, to_screen, sums[SUM_DEPTH], view)
     to_point = v3.add(to_point, to_centre)
@@ -284,7 +258,6 @@ def _unproject_one(  # noqa: PLR0913 - a compiled loop body
 @numba.njit(**EXACT)
 def _store_nothing(index: int, gradients: Gradients, adds: bool) -> None:
     """Gradients of a Gaussian that the view does not see."""
-    gradients.screen_offset[index] = 0.0
     gradients.absolute[index] = 0.0
     if not adds:
         gradients.means[index] = 0.0

@@ -13,21 +13,19 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
     ALPHA_CUT,
+    BLUR_PX2,
     COLOUR_OFFSET,
     MAX_ALPHA,
-    MIN_COMPENSATION,
     MIN_TRANSMITTANCE,
+    NEAR_M,
     TANGENT_MARGIN,
     TILE_PX,
 )
 from lidarpainter_models.kernels.gaussian_raster.reference_harmonics import harmonic_basis
-from lidarpainter_models.kernels.gaussian_raster.splat_inputs import (
-    DrawnImages,
-    SplatInputs,
-    SplatView,
-)
+from lidarpainter_models.kernels.gaussian_raster.splats import DrawnImages, Splats
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,25 +44,28 @@ class ScreenGaussians:
 
 
 def draw_views(
-    inputs: SplatInputs, views: Sequence[SplatView], screen_gradients_out: Tensor | None
+    splats: Splats,
+    features: Float[Tensor, "gaussians features"],
+    camera_from_body: Float[Tensor, "views bodies 4 4"],
+    cameras: Sequence[Camera],
+    screen_gradients_out: Float[Tensor, "views gaussians"] | None,
 ) -> list[DrawnImages]:
     """Images as `SplatImage` lists them: rgb, depth, alpha, features, visible, radius."""
     return [
         draw_view(
-            inputs,
-            place,
-            view,
+            project_gaussians(splats, features, camera_from_body[place], camera),
+            len(splats),
+            camera,
             None if screen_gradients_out is None else screen_gradients_out[place],
         )
-        for place, view in enumerate(views)
+        for place, camera in enumerate(cameras)
     ]
 
 
 def draw_view(
-    inputs: SplatInputs, place: int, view: SplatView, screen_gradient_out: Tensor | None
+    screen: ScreenGaussians, count: int, view: Camera, screen_gradient_out: Tensor | None
 ) -> DrawnImages:
-    """The images of one view, whose transforms and offsets lie at a place of the inputs."""
-    screen = project_gaussians(inputs, place, view)
+    """The images of one view of `count` Gaussians."""
     watch = None
     if screen_gradient_out is not None:
         watch = ScreenGradientWatch(screen.index, screen_gradient_out)
@@ -77,32 +78,33 @@ def draw_view(
     image = torch.cat(rows, dim=0)
     if watch is not None and image.requires_grad:
         image.register_hook(watch.restart)
-    visible, radius_px = screen_radii(screen, len(inputs.means))
+    visible, radius_px = screen_radii(screen, count)
     alpha, values = image[..., 0], image[..., 1:]
     return values[..., :3], values[..., 3], alpha, values[..., 4:], visible, radius_px
 
 
-def project_gaussians(inputs: SplatInputs, place: int, view: SplatView) -> ScreenGaussians:
-    """Project into the view at a place, drop what no pixel can see, and sort by depth."""
-    transforms = inputs.camera_from_body[place].to(inputs.means)
-    camera_from_body = transforms[inputs.body_index.long()]
-    rotation, translation = camera_from_body[:, :3, :3], camera_from_body[:, :3, 3]
-    point = torch.einsum("gij,gj->gi", rotation, inputs.means) + translation
-    kept = torch.nonzero((point[:, 2] >= view.near_m) & (inputs.opacity >= ALPHA_CUT))[:, 0]
+def project_gaussians(
+    splats: Splats,
+    features: Float[Tensor, "gaussians features"],
+    camera_from_body: Float[Tensor, "bodies 4 4"],
+    view: Camera,
+) -> ScreenGaussians:
+    """Project into a view, drop what no pixel can see, and sort by depth."""
+    camera_from_own = camera_from_body.to(splats.means)[splats.body_index.long()]
+    rotation, translation = camera_from_own[:, :3, :3], camera_from_own[:, :3, 3]
+    point = torch.einsum("gij,gj->gi", rotation, splats.means) + translation
+    kept = torch.nonzero((point[:, 2] >= NEAR_M) & (splats.opacity >= ALPHA_CUT))[:, 0]
     # stable: equal depths keep the order of their index
     kept = kept[torch.sort(point[kept, 2].detach(), stable=True).indices]
     point, rotation, translation = point[kept], rotation[kept], translation[kept]
-    bare = _screen_covariance(inputs, kept, point, rotation, view)
-    covariance = bare + view.blur_px2 * torch.eye(2).to(bare)
-    opacity = inputs.opacity[kept]
-    if view.antialias:
-        ratio = torch.linalg.det(bare) / torch.linalg.det(covariance)
-        opacity = opacity * ratio.clamp_min(MIN_COMPENSATION).sqrt()
+    bare = _screen_covariance(splats, kept, point, rotation, view)
+    covariance = bare + BLUR_PX2 * torch.eye(2).to(bare)
+    opacity = splats.opacity[kept]
     focal = point.new_tensor([view.fx_px, view.fy_px])
     principal = point.new_tensor([view.cx_px, view.cy_px])
-    centre = focal * point[:, :2] / point[:, 2:] + principal + inputs.screen_offset[place, kept]
-    colour = _colour(inputs, kept, rotation, translation)
-    values = torch.cat([colour, point[:, 2:], inputs.features[kept]], dim=1)
+    centre = focal * point[:, :2] / point[:, 2:] + principal
+    colour = _colour(splats, kept, rotation, translation)
+    values = torch.cat([colour, point[:, 2:], features[kept]], dim=1)
     return _seen(
         ScreenGaussians(
             index=kept,
@@ -144,14 +146,14 @@ def _rotation_matrices(rotation_wxyz: Float[Tensor, "visible 4"]) -> Float[Tenso
 
 
 def _screen_covariance(
-    inputs: SplatInputs,
+    splats: Splats,
     kept: Tensor,
     point: Float[Tensor, "visible 3"],
     rotation: Float[Tensor, "visible 3 3"],
-    view: SplatView,
+    view: Camera,
 ) -> Float[Tensor, "visible 2 2"]:
     """J W S W^T J^T before blurring; J is taken at a tangent not far outside the image."""
-    axes = rotation @ _rotation_matrices(inputs.rotation_wxyz[kept]) * inputs.scale_m[kept, None]
+    axes = rotation @ _rotation_matrices(splats.rotation_wxyz[kept]) * splats.scale_m[kept, None]
     z = point[:, 2]
     margin_x = TANGENT_MARGIN * 0.5 * view.width_px / view.fx_px
     margin_y = TANGENT_MARGIN * 0.5 * view.height_px / view.fy_px
@@ -170,15 +172,15 @@ def _screen_covariance(
 
 
 def _colour(
-    inputs: SplatInputs,
+    splats: Splats,
     kept: Tensor,
     rotation: Float[Tensor, "visible 3 3"],
     translation: Float[Tensor, "visible 3"],
 ) -> Float[Tensor, "visible 3"]:
     camera_in_body = -torch.einsum("gji,gj->gi", rotation, translation)
-    direction = torch.nn.functional.normalize(inputs.means[kept] - camera_in_body, dim=1)
-    basis = harmonic_basis(direction, inputs.sh.shape[1])
-    return torch.relu(COLOUR_OFFSET + torch.einsum("gk,gkc->gc", basis, inputs.sh[kept]))
+    direction = torch.nn.functional.normalize(splats.means[kept] - camera_in_body, dim=1)
+    basis = harmonic_basis(direction, splats.sh.shape[1])
+    return torch.relu(COLOUR_OFFSET + torch.einsum("gk,gkc->gc", basis, splats.sh[kept]))
 
 
 def _half_size(
@@ -188,7 +190,7 @@ def _half_size(
     return (reach[:, None] * torch.diagonal(covariance, dim1=1, dim2=2)).sqrt()
 
 
-def _seen(screen: ScreenGaussians, view: SplatView) -> ScreenGaussians:
+def _seen(screen: ScreenGaussians, view: Camera) -> ScreenGaussians:
     """Those whose region reaches a pixel centre; a value that is not finite fails."""
     centre, half = screen.centre_px.detach(), screen.half_size_px
     highest = centre.new_tensor([view.width_px - 0.5, view.height_px - 0.5])
@@ -231,7 +233,7 @@ class ScreenGradientWatch:
 
 
 def _draw_tile(
-    screen: ScreenGaussians, left: int, top: int, view: SplatView, watch: ScreenGradientWatch | None
+    screen: ScreenGaussians, left: int, top: int, view: Camera, watch: ScreenGradientWatch | None
 ) -> Float[Tensor, "rows columns channels"]:
     """Alpha and blended values of one tile."""
     rows, columns = min(TILE_PX, view.height_px - top), min(TILE_PX, view.width_px - left)

@@ -1,1 +1,55 @@
-"""Loss terms of every pixel and their gradients in one pass."""
+"""A drawn image over its sky, with the terms that need no second image: sky and depth.
+
+The regularisers are those that StreetCrafter (Yan et al., 2025) calls L_g: the sky stays clear,
+LiDAR says how far things are. Depth is camera z in metres, alpha the opacity of the Gaussians.
+"""
+
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.errors import ShapeError
+from lidarpainter_models.kernels.backends import Backend, float32_implementation
+from lidarpainter_models.kernels.gaussian_raster import SplatImage
+from lidarpainter_models.kernels.pixel_losses.pixel_facts import (
+    NOTHING,
+    OPEN,
+    SKY,
+    SOLID,
+    PixelFacts,
+    PixelRules,
+    PixelTerms,
+)
+from lidarpainter_models.kernels.pixel_losses.reference import depth_loss
+
+__all__ = [
+    "NOTHING",
+    "OPEN",
+    "SKY",
+    "SOLID",
+    "PixelFacts",
+    "PixelRules",
+    "PixelTerms",
+    "depth_loss",
+    "pixel_terms",
+]
+
+
+def pixel_terms(
+    image: SplatImage,
+    sky_rgb: Float[Tensor, "height width 3"],
+    facts: PixelFacts,
+    rules: PixelRules,
+    *,
+    backend: Backend = "auto",
+) -> PixelTerms:
+    """Put a drawn image over its sky and judge its alpha and depth; differentiable.
+
+    Raises:
+        ShapeError: the images differ in size.
+    """
+    size = image.alpha.shape
+    for name, tensor in (("sky_rgb", sky_rgb), ("rgb", facts.rgb), ("depth", facts.lidar_depth_m)):
+        if tensor.shape[:2] != size:
+            raise ShapeError(f"an image of {tuple(size)} needs {name} alike, got {tensor.shape}")
+    terms = float32_implementation("pixel_losses", "pixel_terms", backend, image.rgb)
+    return terms(image, sky_rgb, facts, rules)

@@ -1,6 +1,6 @@
 """Everything a step does per pixel besides the image difference, in one pass each way.
 
-Numba twin of `pixel_terms.py`, which is the law. In torch the same work is some twenty passes
+In torch the same work is some twenty passes
 over the image and costs as much as drawing a fifth of the Gaussians.
 """
 
@@ -13,6 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lidarpainter_models.kernels.gaussian_raster import SplatImage
+from lidarpainter_models.kernels.pixel_losses.pixel_facts import PixelFacts, PixelRules, PixelTerms
+
 _EDGE = 1e-4
 
 
@@ -20,7 +23,7 @@ _EDGE = 1e-4
 def _forward(rgb, depth, alpha, sky, target, kind, lidar, tolerances):
     """Image over sky; sums of both terms; their derivatives by alpha and depth."""
     height, width = alpha.shape
-    sky_tolerance, depth_tolerance = tolerances[0], tolerances[1]
+    sky_tolerance, depth_tolerance = tolerances
     shown = np.empty((height, width, 3), np.float32)
     by_alpha = np.zeros((height, width, 2), np.float32)  # of the sky term, of the depth term
     by_depth = np.zeros((height, width), np.float32)
@@ -53,7 +56,7 @@ def _forward(rgb, depth, alpha, sky, target, kind, lidar, tolerances):
 
 
 @numba.njit(cache=True)
-def _backward(gradient, alpha, sky, by_alpha, by_depth, factors, least_clear):
+def _backward(gradient, alpha, sky, by_alpha, by_depth, factors, min_transmittance):
     """Gradients by alpha, depth and sky; factors are those of both terms, the mean included."""
     height, width = alpha.shape
     to_alpha = np.empty((height, width), np.float32)
@@ -68,32 +71,38 @@ def _backward(gradient, alpha, sky, by_alpha, by_depth, factors, least_clear):
                 total -= gradient[v, u, k] * sky[v, u, k]
             to_alpha[v, u] = total
             to_depth[v, u] = depth_factor * by_depth[v, u]
-            if clear > least_clear:
+            if clear > min_transmittance:
                 for k in range(3):
                     to_sky[v, u, k] = gradient[v, u, k] * clear
     return to_alpha, to_depth, to_sky
 
 
-class PixelTerms(torch.autograd.Function):
-    """(shown, sky term, depth term) of a drawn image; see `pixel_terms.pixel_terms`."""
+def pixel_terms(
+    image: SplatImage, sky_rgb: Tensor, facts: PixelFacts, rules: PixelRules
+) -> PixelTerms:
+    """See `pixel_losses.pixel_terms`."""
+    shown, sky, depth = _PixelTerms.apply(
+        image.rgb, image.depth_m, image.alpha, sky_rgb, facts, rules
+    )
+    return PixelTerms(shown=shown, sky=sky, depth=depth)
 
+
+class _PixelTerms(torch.autograd.Function):
     @staticmethod
-    def forward(  # noqa: D102
+    def forward(
         ctx,
         rgb: Tensor,
         depth_m: Tensor,
         alpha: Tensor,
         sky_rgb: Tensor,
-        constants: tuple,
+        facts: PixelFacts,
+        rules: PixelRules,
     ):
-        target, kind, lidar_m, tolerances, least_clear = constants
-        arrays = [
-            tensor.detach().contiguous().numpy()
-            for tensor in (rgb, depth_m, alpha, sky_rgb, target, kind, lidar_m)
-        ]
-        arrays.append(np.array(tolerances, np.float64))
-        shown, by_alpha, by_depth, sky_term, depth_term, count = _forward(*arrays)
-        ctx.kept = (arrays[2], arrays[3], by_alpha, by_depth, count, least_clear)
+        given = (rgb, depth_m, alpha, sky_rgb, facts.rgb, facts.kind, facts.lidar_depth_m)
+        arrays = [tensor.detach().contiguous().numpy() for tensor in given]
+        tolerances = (rules.sky_tolerance, rules.depth_tolerance)
+        shown, by_alpha, by_depth, sky_term, depth_term, count = _forward(*(*arrays, tolerances))
+        ctx.kept = (arrays[2], arrays[3], by_alpha, by_depth, count, rules.min_transmittance)
         return (
             torch.from_numpy(shown),
             torch.tensor(sky_term, dtype=torch.float32),
@@ -101,19 +110,20 @@ class PixelTerms(torch.autograd.Function):
         )
 
     @staticmethod
-    def backward(ctx, shown_gradient, sky_gradient, depth_gradient):  # noqa: D102
-        alpha, sky, by_alpha, by_depth, count, least_clear = ctx.kept
+    def backward(ctx, shown_gradient, sky_gradient, depth_gradient):
+        alpha, sky, by_alpha, by_depth, count, min_transmittance = ctx.kept
         factors = np.array(
             [float(sky_gradient) / alpha.size, float(depth_gradient) / max(count, 1)], np.float32
         )
         gradient = shown_gradient.contiguous()
         to_alpha, to_depth, to_sky = _backward(
-            gradient.numpy(), alpha, sky, by_alpha, by_depth, factors, np.float32(least_clear)
+            gradient.numpy(), alpha, sky, by_alpha, by_depth, factors, np.float32(min_transmittance)
         )
         return (
             gradient,
             torch.from_numpy(to_depth),
             torch.from_numpy(to_alpha),
             torch.from_numpy(to_sky),
+            None,
             None,
         )

@@ -1,19 +1,71 @@
-# ruff: noqa: ANN001, ANN201, ANN202 - numba infers these types
 """Fast sky texture look-ups on a CPU: sampling, its transpose, and Adam on the texels touched.
 
-Numba twin of `sky_sampling.py`, which is the law. A dense Adam over the texture would cost more
+A dense Adam over the texture would cost more
 than the look-ups themselves; here only texels that received a gradient are visited. Everything is
 serial: bitwise repeatable, and safe to call from several threads.
 """
+
+# ruff: noqa: ANN001, ANN202 - numba infers these types
 
 import math
 
 import numba
 import numpy as np
+import torch
+from torch import Tensor
+
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.kernels.sky_texture.layout import SkyLayout, SkyRays, TexelMoments
 
 _HALF_PI = np.float32(math.pi / 2)
 _PI = np.float32(math.pi)
 _TURN = np.float32(2 * math.pi)
+
+
+def locate(camera: Camera, layout: SkyLayout, wanted: Tensor) -> Tensor:
+    """See `sky_texture.sky_rays`."""
+    lens = torch.tensor([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]).float()
+    extent = torch.tensor(
+        [layout.azimuth_left_rad, layout.elevation_top_rad, layout.texel_rad, layout.columns]
+    ).float()
+    rotation = camera.world_from_camera[:3, :3].detach().float().contiguous()
+    places = _locate(rotation.numpy(), lens.numpy(), extent.numpy(), wanted.contiguous().numpy())
+    return torch.from_numpy(places)
+
+
+def sample(texture: Tensor, rays: SkyRays, layout: SkyLayout) -> Tensor:
+    """See `sky_texture.sample_sky`."""
+    wanted = rays.wanted.contiguous().numpy()
+    return torch.from_numpy(_sample(texture.numpy(), rays.places.numpy(), wanted, layout.wraps))
+
+
+def scatter(
+    gradient: Tensor, weight: Tensor, rays: SkyRays, layout: SkyLayout
+) -> tuple[Tensor, Tensor]:
+    """See `sky_texture.scatter_gradient`."""
+    texel_gradient, texel_weight = _scatter(
+        (layout.rows, layout.columns),
+        rays.places.numpy(),
+        gradient.contiguous().numpy(),
+        weight.contiguous().numpy(),
+        layout.wraps,
+    )
+    return torch.from_numpy(texel_gradient), torch.from_numpy(texel_weight)
+
+
+def adam(
+    texture: Tensor, moments: TexelMoments, gradient: Tensor, weight: Tensor, learning_rate: float
+) -> None:
+    """See `sky_texture.step_texels`."""
+    _adam(
+        texture.numpy(),
+        moments.first.numpy(),
+        moments.second.numpy(),
+        moments.visits.numpy(),
+        gradient.numpy(),
+        weight.numpy(),
+        learning_rate,
+    )
 
 
 @numba.njit(cache=True, inline="always")
@@ -35,7 +87,7 @@ def _atan2(y, x):
 
 
 @numba.njit(cache=True)
-def locate(world_from_camera, lens, layout, wanted):
+def _locate(world_from_camera, lens, layout, wanted):
     """Continuous (column, row) in the texture of the wanted pixels' rays, texel centres at +0.5.
 
     lens: fx, fy, cx, cy in pixels. layout: azimuth of the left edge, elevation of the top edge,
@@ -84,7 +136,7 @@ def _corners(column, row, columns, rows, wraps):
 
 
 @numba.njit(cache=True)
-def sample(texture, places, wanted, wraps):
+def _sample(texture, places, wanted, wraps):
     """Bilinear colours at the places of the wanted pixels, black elsewhere."""
     rows, columns = texture.shape[:2]
     height, width = places.shape[:2]
@@ -105,7 +157,7 @@ def sample(texture, places, wanted, wraps):
 
 
 @numba.njit(cache=True)
-def scatter(shape, places, gradient, weight, wraps):
+def _scatter(shape, places, gradient, weight, wraps):
     """Transpose of `sample` on pixels of positive weight: texel gradients and summed weights."""
     rows, columns = shape
     texel_gradient = np.zeros((rows, columns, 3), np.float32)
@@ -132,7 +184,7 @@ def scatter(shape, places, gradient, weight, wraps):
 
 
 @numba.njit(cache=True)
-def adam(texture, first, second, visits, gradient, weight, rate):
+def _adam(texture, first, second, visits, gradient, weight, rate):
     """One Adam step in place on every texel of positive weight, each with its own step count."""
     beta1, beta2 = np.float32(0.9), np.float32(0.99)
     one, epsilon = np.float32(1.0), np.float32(1e-12)

@@ -1,4 +1,3 @@
-# ruff: noqa: ANN001, ANN201, ANN202, PLR0913, SIM110 - numba infers these types
 """Adam on the rows that a step saw, and what the others missed: compiled code.
 
 A row out of view has a gradient of zero: its moments fade, m by `BETA1` and v by `BETA2` a step,
@@ -16,18 +15,20 @@ terms are under 1e-11 of the first and are dropped. Every row is worked on alone
 threads change no bit.
 """
 
+# ruff: noqa: ANN001, ANN202, PLR0913, SIM110 - numba infers these types
+
 import math
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from torch import Tensor
 
-BETA1, BETA2 = 0.9, 0.99
+from lidarpainter_models.kernels.sparse_adam.state import BETA1, BETA2, AdamState, Parameters
+
 MEANS, LOG_SCALE = 0, 7
 """First of three columns each in a row of parameters; rotations lie between them."""
 OPACITY, HARMONICS = 10, 11
-VECTOR = 16
-"""Rows of moments are this many float32, a cache line, or several times as long."""
 RUN_ENDS = np.array([2, 4, 6, 8, 12, 20, 36, 68, 132, 260])
 """Last missed step of each run."""
 CHUNKS = 64
@@ -36,28 +37,77 @@ CHUNKS = 64
 _VECTORS: dict[str, Any] = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy"}
 """A division that may raise cannot be part of a vector loop."""
 
-MOST_STEP = (1 - BETA1) / math.sqrt((1 - BETA2) * (1 - BETA1**2 / BETA2))
-"""The largest step of Adam in learning rates: |m| <= 2.35 sqrt(v) by Cauchy and Schwarz."""
-MOST_UNITS = MOST_STEP / (math.sqrt(BETA2) / BETA1 - 1)
-"""The farthest that a row still moves without a gradient, in learning rates: the steps shrink by
-BETA1 / sqrt(BETA2) each."""
+
+def present_rows(state: AdamState, kept: Parameters, rows: Tensor, out: Parameters) -> None:
+    """See `sparse_adam.present_rows`."""
+    _present(
+        _columns(kept),
+        state.first.numpy(),
+        state.second.numpy(),
+        state.last.numpy(),
+        rows.numpy(),
+        _nodes(state, rows.numpy()),
+        state.count,
+        state.eps.numpy(),
+        _columns(out),
+    )
 
 
-class Parameters(NamedTuple):
-    """Parameters of Gaussians, float32 and C-contiguous."""
+def step_rows(
+    state: AdamState,
+    kept: Parameters,
+    rows: Tensor,
+    seen: Parameters,
+    gradients: Parameters,
+    rates: list[float],
+) -> None:
+    """See `sparse_adam.step_rows`."""
+    _step_rows(
+        _columns(kept),
+        state.first.numpy(),
+        state.second.numpy(),
+        state.last.numpy(),
+        rows.numpy(),
+        _columns(seen),
+        _columns(gradients),
+        np.array(rates)[state.kind_of_column.numpy()],
+        state.count,
+        state.eps.numpy(),
+    )
+
+
+def catch_up(state: AdamState, kept: Parameters) -> None:
+    """See `sparse_adam.catch_up`."""
+    _catch_up(
+        _columns(kept),
+        state.first.numpy(),
+        state.second.numpy(),
+        state.last.numpy(),
+        _nodes(state, np.arange(len(state.last))),
+        state.count,
+        state.eps.numpy(),
+    )
+
+
+class _Columns(NamedTuple):
+    """Parameters as float32 arrays, C-contiguous; harmonics (rows, numbers)."""
 
     means: np.ndarray
     rotation_wxyz: np.ndarray
     log_scale: np.ndarray
     opacity_logit: np.ndarray
-    """(rows)"""
     harmonics: np.ndarray
-    """(rows, numbers): all of them or the constant ones."""
     more_harmonics: np.ndarray
-    """(rows, numbers): those that `harmonics` lacks."""
 
 
-class Nodes(NamedTuple):
+def _columns(parameters: Parameters) -> _Columns:
+    """The compiled code's view of parameters; what it writes to contiguous ones is theirs."""
+    arrays = [value.detach().contiguous().numpy() for value in parameters]
+    flat = [value.reshape(len(value), value.shape[1] * 3) for value in arrays[4:]]
+    return _Columns(*arrays[:4], *flat)
+
+
+class _Nodes(NamedTuple):
     """What stands for the missed steps, by the step at which a row was left."""
 
     weight: np.ndarray
@@ -68,6 +118,13 @@ class Nodes(NamedTuple):
     """(starts, nodes): part of a node's step after which the Gaussian has its mean size."""
     length: np.ndarray
     """(starts): number of nodes."""
+
+
+def _nodes(state: AdamState, rows: np.ndarray) -> _Nodes:
+    """What stands for the steps that these rows missed."""
+    kind_of_column = state.kind_of_column.numpy()
+    missed = np.array(state.missed).reshape(-1, int(kind_of_column[-1]) + 1)
+    return _missed_nodes(state.last.numpy(), rows, missed, kind_of_column, state.count)
 
 
 @numba.njit(cache=True)
@@ -96,7 +153,7 @@ def _pair(rates, left, begin, end):
 
 
 @numba.njit(cache=True)
-def missed_nodes(last, rows, rates, kind_of_column, now):
+def _missed_nodes(last, rows, rates, kind_of_column, now):
     """The nodes for every step at which one of the rows was left, up to the step `now`.
 
     `rates` holds those of the latest steps, (steps, kinds).
@@ -124,7 +181,7 @@ def missed_nodes(last, rows, rates, kind_of_column, now):
             lead[start, place : place + 2] = 0.5 - min(steps, 2) / (2.0 * steps)
             begin, place = end + 1, place + 2
         length[start] = place
-    return Nodes(weight, depth, lead, length)
+    return _Nodes(weight, depth, lead, length)
 
 
 @numba.njit(cache=True)
@@ -186,7 +243,7 @@ def _drift(values, first, second, nodes, start, eps, work):
 
 
 @numba.njit(cache=True, parallel=True)
-def present(kept, first, second, last, rows, nodes, now, eps, out):
+def _present(kept, first, second, last, rows, nodes, now, eps, out):
     """Write the given rows as the steps they missed left them to `out`."""
     count, starts = len(rows), len(nodes.length)
     for chunk in numba.prange(CHUNKS):
@@ -210,7 +267,7 @@ def _fade(first, second, missed):
 
 
 @numba.njit(cache=True, parallel=True)
-def catch_up(kept, first, second, last, nodes, now, eps):
+def _catch_up(kept, first, second, last, nodes, now, eps):
     """Bring every row and its moments up to the step `now`, in place."""
     count, starts = len(last), len(nodes.length)
     for chunk in numba.prange(CHUNKS):
@@ -252,11 +309,11 @@ def _is_any(gradient):
 
 
 @numba.njit(cache=True, parallel=True)
-def step_rows(kept, first, second, last, rows, seen, gradients, rates, now, eps):
+def _step_rows(kept, first, second, last, rows, seen, gradients, rates, now, eps):
     """Adam's step number `now` on the rows with a gradient, in place.
 
-    `seen` holds the rows as `present` gave them. A row whose gradient is zero throughout has missed
-    this step as well.
+    `seen` holds the rows as `_present` gave them. A row whose gradient is zero throughout has
+    missed this step as well.
     """
     count = len(rows)
     rates = (rates / (1.0 - BETA1**now)).astype(np.float32)

@@ -186,7 +186,7 @@ def test_kept_state_goes_on_bit_for_bit():
     resumed.catch_up(copy)
     for name, value in gaussians.columns().items():
         assert torch.equal(value, getattr(copy, name)), name
-    assert torch.equal(adam.second, resumed.second)
+    assert torch.equal(adam.state.second, resumed.state.second)
 
 
 def test_centres_move_in_units_of_their_size():
@@ -235,9 +235,9 @@ def test_moments_follow_their_rows():
     adam.step(gaussians, seen, 0.0)
     adam.catch_up(gaussians)
     adam.rebuild(torch.tensor([1]), 3)
-    assert adam.first.shape[0] == 4
-    assert torch.allclose(adam.first[0, :3], torch.full((3,), 0.2))
-    assert float(adam.first[1:].abs().max()) == 0
+    assert adam.state.first.shape[0] == 4
+    assert torch.allclose(adam.state.first[0, :3], torch.full((3,), 0.2))
+    assert float(adam.state.first[1:].abs().max()) == 0
 
 
 def test_empty_set_takes_steps():

@@ -2,6 +2,7 @@ import torch
 from gaussian_world import camera_at, car_track, round_gaussians, scene_of
 
 from lidarpainter_models.gaussians.fitting.shape_limits import (
+    LEAST_SIGMA_M,
     ShapeLimits,
     limit_shapes,
     viewing_rays,
@@ -43,7 +44,7 @@ def test_rays_from_all_sides_pin_the_depth_themselves():
 
 def test_film_is_thickened_and_giant_shrunk():
     found = limited([2.0, 2.0, 1e-5])
-    assert abs(found[2] - LIMITS.least_sigma_m) < 1e-6
+    assert abs(found[2] - LEAST_SIGMA_M) < 1e-6
     assert max(found) < 10.0 * LIMITS.most_sigma + 1e-4
 
 

@@ -6,8 +6,9 @@ from gaussian_world import camera_at, car_track, round_gaussians, scene_of
 
 from lidarpainter_models.gaussians.fitting.optimiser import LearningRates
 from lidarpainter_models.gaussians.fitting.spatial_blocks import SpatialBlocks
+from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body, draw_gaussians
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
-from lidarpainter_models.kernels.sparse_adam.cpu import MOST_UNITS
+from lidarpainter_models.kernels.sparse_adam import MOST_UNITS
 
 RATES = LearningRates()
 
@@ -29,7 +30,7 @@ def view_at(scene, seed):
     twist = torch.randn(6, generator=torch.Generator().manual_seed(seed)).double()
     camera = camera_at(0.0)
     camera = camera.at(camera.world_from_camera @ rigid_from_tangent(twist))
-    bodies = scene.camera_from_body(camera.world_from_camera, *scene.actor_poses(0))
+    bodies = camera_from_body(camera.world_from_camera, *scene.actors.likely_poses(0))
     return camera, bodies
 
 
@@ -38,7 +39,7 @@ def test_every_gaussian_that_is_drawn_is_in_view(seed):
     scene = scene_of(scattered(2000, seed), [camera_at(0.0)], [car_track(2)])
     blocks = SpatialBlocks.of(scene.gaussians, RATES)
     camera, bodies = view_at(scene, seed)
-    drawn = scene.splat(camera, bodies).visible
+    drawn = draw_gaussians(scene.gaussians, bodies, camera).visible
     rows = blocks.rows_in_view([(camera, bodies)])
     is_in_view = torch.zeros_like(drawn)
     is_in_view[rows] = True
@@ -65,7 +66,7 @@ def test_bounds_hold_what_momentum_can_do(seed):
     scene.gaussians.opacity_logit += 100.0
     is_in_view = torch.zeros(2000, dtype=torch.bool)
     is_in_view[rows] = True
-    assert bool((is_in_view | ~scene.splat(camera, bodies).visible).all())
+    assert bool((is_in_view | ~draw_gaussians(scene.gaussians, bodies, camera).visible).all())
 
 
 def test_most_units_bound_what_moments_can_still_do():
@@ -92,7 +93,7 @@ def test_moved_gaussian_is_found_after_a_refresh():
     blocks = SpatialBlocks.of(scene.gaussians, RATES)
     view = (
         camera_at(0.0),
-        scene.camera_from_body(camera_at(0.0).world_from_camera, *scene.actor_poses(0)),
+        camera_from_body(camera_at(0.0).world_from_camera, *scene.actors.likely_poses(0)),
     )
     assert len(blocks.rows_in_view([view])) == 0
     gaussians.means[0, 0] = 30.0
@@ -107,15 +108,16 @@ def test_gaussians_that_are_not_finite_spoil_no_block():
     scene = scene_of(gaussians, [camera_at(0.0)], [car_track(2)])
     blocks = SpatialBlocks.of(gaussians, RATES)
     view = view_at(scene, 1)
-    drawn = scene.splat(*view).visible.nonzero()[:, 0].tolist()
+    camera, bodies = view
+    drawn = draw_gaussians(scene.gaussians, bodies, camera).visible.nonzero()[:, 0].tolist()
     assert set(drawn) <= set(blocks.rows_in_view([view]).tolist())
 
 
 def test_absent_actor_is_out_of_view():
     scene = scene_of(scattered(500, 6), [camera_at(0.0)], [car_track(2)])
     camera = camera_at(0.0)
-    poses, present = scene.actor_poses(0)
-    bodies = scene.camera_from_body(camera.world_from_camera, poses, torch.zeros_like(present))
+    poses, present = scene.actors.likely_poses(0)
+    bodies = camera_from_body(camera.world_from_camera, poses, torch.zeros_like(present))
     rows = SpatialBlocks.of(scene.gaussians, RATES).rows_in_view([(camera, bodies)])
     assert bool((scene.gaussians.body_index[rows] == 0).all())
 
@@ -123,9 +125,9 @@ def test_absent_actor_is_out_of_view():
 def test_slack_takes_in_an_actor_that_may_move_into_view():
     scene = scene_of(scattered(500, 7), [camera_at(0.0)], [car_track(2)])
     blocks, camera = SpatialBlocks.of(scene.gaussians, RATES), camera_at(0.0)
-    poses, present = scene.actor_poses(0)
+    poses, present = scene.actors.likely_poses(0)
     poses[0, 1, 3] = 40.0  # far to the left
-    view = (camera, scene.camera_from_body(camera.world_from_camera, poses, present))
+    view = (camera, camera_from_body(camera.world_from_camera, poses, present))
     of_actor = [
         int((scene.gaussians.body_index[blocks.rows_in_view([view], actor_slack=slack)] > 0).sum())
         for slack in ((0.0, 0.0), (40.0, 0.0))

@@ -7,6 +7,7 @@ import torch
 from bench_iteration import Fit
 
 from lidarpainter_models.gaussians.fitting.state import FitState
+from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
 
 BLOCKS, PASSES = 4, 6
 
@@ -30,7 +31,7 @@ def test_a_step_sees_its_own_part_of_the_street():
     scene, blocks = fit.state.scene, fit.state.blocks
     for row, image in enumerate(fit.images):
         pose = scene.cameras.world_from_camera(row).detach()
-        bodies = scene.camera_from_body(pose, *scene.world_from_actors(0))
+        bodies = camera_from_body(pose, *scene.actors.corrected_poses(0))
         rows = blocks.rows_in_view([(image.camera.at(pose), bodies)])
         assert set((rows // 400).tolist()) == {row}
 
@@ -42,7 +43,7 @@ def test_what_is_out_of_view_changes_nothing_beyond_rounding(monkeypatch):
     monkeypatch.setattr(
         type(everything.state.blocks),
         "rows_in_view",
-        lambda blocks, _views, **_slack: torch.arange(len(blocks.order)),
+        lambda blocks, _views, **_slack: torch.arange(len(blocks.block_of_row)),
     )
     steps_of(everything, BLOCKS * PASSES)
     truth = parameters_of(everything)

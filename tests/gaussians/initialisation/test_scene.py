@@ -15,7 +15,6 @@ from lidarpainter_models.gaussians.initialisation.scene import (
     pixel_footprint,
 )
 from lidarpainter_models.gaussians.initialisation.surfels import (
-    SurfelConfig,
     fill_colours,
     surfels_from_points,
 )
@@ -69,7 +68,7 @@ def test_far_points_get_larger_voxels():
 
 
 def test_surfels_lie_in_their_surface():
-    gaussians = surfels_from_points(plane(), torch.rand(400, 3), SurfelConfig())
+    gaussians = surfels_from_points(plane(), torch.rand(400, 3))
     normal = rotation_from_quaternion(gaussians.rotation_wxyz)[:, :, 0]
     assert float(normal[:, 2].abs().min()) > 0.999
     scale_m = gaussians.scale_m
@@ -80,7 +79,7 @@ def test_surfels_lie_in_their_surface():
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3])
 def test_a_handful_of_points_is_enough(count):
-    gaussians = surfels_from_points(plane(count), torch.rand(count, 3), SurfelConfig())
+    gaussians = surfels_from_points(plane(count), torch.rand(count, 3))
     assert len(gaussians) == count
     assert bool(gaussians.log_scale.isfinite().all())
     assert bool(gaussians.rotation_wxyz.isfinite().all())
@@ -88,7 +87,7 @@ def test_a_handful_of_points_is_enough(count):
 
 def test_surfel_shows_its_colour():
     rgb = torch.rand(50, 3)
-    gaussians = surfels_from_points(plane(50), rgb, SurfelConfig())
+    gaussians = surfels_from_points(plane(50), rgb)
     assert torch.allclose(gaussians.base_rgb, rgb, atol=1e-6)
 
 

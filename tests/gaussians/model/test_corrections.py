@@ -1,11 +1,8 @@
 import torch
-from gaussian_world import camera_at
+from gaussian_world import camera_at, car_track
 
-from lidarpainter_models.gaussians.model.corrections import (
-    ActorCorrections,
-    CameraCorrections,
-    ExposureCorrections,
-)
+from lidarpainter_models.gaussians.model.actors import Actors
+from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
 
 
 def two_cameras():
@@ -17,7 +14,7 @@ def two_cameras():
 
 def test_recentring_changes_no_pose_and_empties_the_mean():
     cameras = two_cameras()
-    cameras.view_tangent += 0.01 * torch.randn(4, 6).double()
+    cameras.view_tangent.add_(0.01 * torch.randn(4, 6).double())
     before = torch.stack([cameras.world_from_camera(row) for row in range(4)])
     cameras.recentre(keep_mean=True)
     after = torch.stack([cameras.world_from_camera(row) for row in range(4)])
@@ -28,14 +25,14 @@ def test_recentring_changes_no_pose_and_empties_the_mean():
 
 def test_recentring_without_keeping_drops_the_mean():
     cameras = two_cameras()
-    cameras.view_tangent += 0.01
+    cameras.view_tangent.add_(0.01)
     cameras.recentre(keep_mean=False)
     assert float(cameras.tangent(0).abs().max()) < 1e-15
 
 
 def test_camera_without_training_views_stays_as_recorded():
     cameras = two_cameras()
-    cameras.view_tangent += 0.01
+    cameras.view_tangent.add_(0.01)
     camera = camera_at(0.5)
     found = cameras.corrected(camera, key=None, timestamp_ns=0, camera_name="back")
     assert found is camera
@@ -52,9 +49,9 @@ def test_constant_of_a_camera_reaches_its_other_times():
 
 
 def test_actor_corrections_are_linear_between_knots_and_constant_beyond():
-    actors = ActorCorrections.none(1, torch.tensor([100, 300, 200]))
+    actors = Actors.uncorrected([car_track(4)], torch.tensor([100, 300, 200]))
     actors.tangent[0, :, 0] = torch.tensor([1.0, 2.0, 4.0]).double()
-    found = [float(actors.at(time)[0, 0]) for time in (0, 100, 150, 250, 300, 999)]
+    found = [float(actors.tangent_at(time)[0, 0]) for time in (0, 100, 150, 250, 300, 999)]
     assert found == [1.0, 1.0, 1.5, 3.0, 4.0, 4.0]
 
 

@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import pytest
 import torch
+from splat_drawing import pinhole, render
 from torch import Tensor
 
-from lidarpainter_models.kernels.gaussian_raster import SplatImage, render_gaussians
+from lidarpainter_models.kernels.gaussian_raster import SplatImage
 
 DIFFERENTIABLE = (
     "means",
@@ -16,7 +17,6 @@ DIFFERENTIABLE = (
     "sh",
     "camera_from_body",
     "features",
-    "screen_offset",
 )
 
 
@@ -40,7 +40,7 @@ def random_splats(
     num_bodies=3,
     size_px=4.0,
 ):
-    """Keyword arguments of `render_gaussians`; some Gaussians lie outside the image or behind."""
+    """A scene for `splat_drawing.render`; some Gaussians lie outside the image or behind."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape):
@@ -67,20 +67,19 @@ def random_splats(
         "sh": 0.3 * normal(count, coefficients, 3),
         "camera_from_body": camera_from_body,
         "features": normal(count, features),
-        "screen_offset": torch.zeros(count, 2, dtype=torch.float64),
     }
     # both backends get the same numbers: those a float32 can hold
     splats = {name: value.float().double() for name, value in splats.items()}
     splats["body_index"] = torch.randint(0, num_bodies, (count,), generator=generator)
-    camera = {
-        "fx_px": focal_px,
-        "fy_px": 1.05 * focal_px,
-        "cx_px": 0.5 * width_px + 1.3,
-        "cy_px": 0.5 * height_px - 0.8,
-        "width_px": width_px,
-        "height_px": height_px,
-    }
-    return splats | camera
+    splats["camera"] = pinhole(
+        fx_px=focal_px,
+        fy_px=1.05 * focal_px,
+        cx_px=0.5 * width_px + 1.3,
+        cy_px=0.5 * height_px - 0.8,
+        width_px=width_px,
+        height_px=height_px,
+    )
+    return splats
 
 
 def _rotations(wxyz):
@@ -93,13 +92,13 @@ def _rotations(wxyz):
     return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
 
 
-def draw_and_go_back(splats, *, backend, dtype, **settings):
+def draw_and_go_back(splats, *, backend, dtype):
     """Draw and differentiate a weighted sum of every image; the weights are seeded."""
     splats = dict(splats)
     for name in DIFFERENTIABLE:
         splats[name] = splats[name].to(dtype, copy=True).requires_grad_()
     absolute = splats["means"].new_zeros(len(splats["means"]), dtype=dtype)
-    image = render_gaussians(**splats, **settings, backend=backend, screen_gradient_out=absolute)
+    image = render(splats, backend=backend, screen_gradient_out=absolute)
     generator = torch.Generator().manual_seed(99)
     loss = image.rgb.new_zeros(())
     for channels in (image.rgb, 0.05 * image.depth_m, image.alpha, image.features):
@@ -135,12 +134,9 @@ def one_splat():
             "sh": torch.zeros(count, 1, 3, dtype=torch.float64),
             "body_index": torch.zeros(count, dtype=torch.int64),
             "camera_from_body": torch.eye(4, dtype=torch.float64)[None],
-            "fx_px": 100.0,
-            "fy_px": 100.0,
-            "cx_px": 4.5,
-            "cy_px": 4.5,
-            "width_px": 9,
-            "height_px": 9,
+            "camera": pinhole(
+                fx_px=100.0, fy_px=100.0, cx_px=4.5, cy_px=4.5, width_px=9, height_px=9
+            ),
         }
 
     return build

@@ -8,18 +8,19 @@ gsplat clamps alpha at 0.999 and not at 0.99, so no Gaussian here is that opaque
 """
 
 import sys
+from dataclasses import replace
 from functools import partial
 from types import ModuleType, SimpleNamespace
 
 import documented_gsplat
 import pytest
 import torch
+from splat_drawing import split
 
 from lidarpainter_models.errors import BackendError
 from lidarpainter_models.kernels import backends
-from lidarpainter_models.kernels.gaussian_raster import SplatView, cuda, render_views
+from lidarpainter_models.kernels.gaussian_raster import cuda, render_views
 from lidarpainter_models.kernels.gaussian_raster.cuda import import_gsplat
-from lidarpainter_models.kernels.gaussian_raster.splat_inputs import SplatInputs
 
 ON_CUDA = pytest.param(
     "cuda",
@@ -50,24 +51,20 @@ def named(backend):
     return "cuda" if backend == "stand-in" else backend
 
 
-def agreeing(splats, draw, backend, *, settings=None, **build):
+def agreeing(splats, draw, backend, **build):
     """What a backend and the reference make of the same Gaussians."""
     inputs = splats(**build)
     inputs["opacity"] = inputs["opacity"].clamp(max=0.98)
-    expected = draw(inputs, backend="reference", dtype=torch.float64, **settings or {})
+    expected = draw(inputs, backend="reference", dtype=torch.float64)
     if backend == "cuda":
         inputs = {k: v.cuda() if torch.is_tensor(v) else v for k, v in inputs.items()}
-    return draw(inputs, backend=named(backend), dtype=torch.float32, **settings or {}), expected
+    return draw(inputs, backend=named(backend), dtype=torch.float32), expected
 
 
 @pytest.mark.parametrize("backend", FAST)
-@pytest.mark.parametrize("antialias", [False, True])
 @pytest.mark.parametrize("features", [0, 1, 3])
-def test_images_agree(splats, draw, backend, antialias, features):
-    settings = {"antialias": antialias}
-    actual, expected = agreeing(
-        splats, draw, backend, count=300, features=features, settings=settings
-    )
+def test_images_agree(splats, draw, backend, features):
+    actual, expected = agreeing(splats, draw, backend, count=300, features=features)
     assert torch.equal(actual.image.visible.cpu(), expected.image.visible)
     for name, most in MEAN_ERROR.items():
         truth = getattr(expected.image, name).detach()
@@ -76,10 +73,8 @@ def test_images_agree(splats, draw, backend, antialias, features):
 
 
 @pytest.mark.parametrize("backend", FAST)
-@pytest.mark.parametrize("antialias", [False, True])
-def test_gradients_agree(splats, draw, backend, antialias):
-    settings = {"antialias": antialias}
-    actual, expected = agreeing(splats, draw, backend, count=250, features=2, settings=settings)
+def test_gradients_agree(splats, draw, backend):
+    actual, expected = agreeing(splats, draw, backend, count=250, features=2)
     for name, truth in expected.gradients.items():
         error = (actual.gradients[name].cpu() - truth).norm() / truth.norm()
         assert float(error) < GRADIENT_ERROR[backend], name
@@ -94,48 +89,43 @@ def test_no_gaussian_draws_nothing(splats, draw, backend):
     assert float(actual.gradients["camera_from_body"].abs().max()) == 0
 
 
-CAMERA = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
-
-
 def three_views(splats, device):
     """Two views of one size, apart, and a smaller one that looks at nothing."""
     scene = splats(200, features=2)
     scene["opacity"] = scene["opacity"].clamp(max=0.98)
-    tensors = {
-        name: value.to(device, torch.float32 if value.is_floating_point() else value.dtype)
-        for name, value in scene.items()
-        if torch.is_tensor(value) and name != "screen_offset"
-    }
-    transforms = tensors.pop("camera_from_body").repeat(3, 1, 1, 1)
+    camera = scene.pop("camera")
+    gaussians, rest = split(
+        {
+            name: value.to(device, torch.float32 if value.is_floating_point() else value.dtype)
+            for name, value in scene.items()
+        }
+    )
+    transforms = rest["camera_from_body"].repeat(3, 1, 1, 1)
     transforms[1, :, 0, 3] += 0.5
     transforms[2, :, 2, 3] -= 1e3
-    camera = {name: scene[name] for name in CAMERA}
-    views = [SplatView(**camera), SplatView(**camera), SplatView(**camera | {"width_px": 31})]
-    return tensors, transforms.requires_grad_(), views
+    cameras = [camera, camera, replace(camera, width_px=31)]
+    return gaussians, rest["features"], transforms.requires_grad_(), cameras
 
 
 def loss_of(images):
     return sum((image.rgb.square().sum() + image.alpha.sum()) for image in images)
 
 
-@pytest.mark.parametrize("packed", [True, False])
 @pytest.mark.parametrize("backend", ["stand-in", ON_CUDA])
-def test_packed_views_are_those_drawn_one_by_one(splats, backend, packed):
+def test_packed_views_are_those_drawn_one_by_one(splats, backend):
     device = "cuda" if backend == "cuda" else "cpu"
-    tensors, transforms, views = three_views(splats, device)
-    expected = render_views(
-        **tensors, camera_from_body=transforms, views=views, backend="reference"
-    )
+    gaussians, features, transforms, cameras = three_views(splats, device)
+    expected = render_views(gaussians, transforms, cameras, features=features, backend="reference")
     loss_of(expected).backward()
     truth, transforms.grad = transforms.grad, None
     out = torch.full((3, 200), 7.0, device=device)
     images = render_views(
-        **tensors,
-        camera_from_body=transforms,
-        views=views,
+        gaussians,
+        transforms,
+        cameras,
+        features=features,
         screen_gradients_out=out,
         backend=named(backend),
-        packed=packed,
     )
     loss_of(images).backward()
     for image, law in zip(images, expected, strict=True):
@@ -147,7 +137,8 @@ def test_packed_views_are_those_drawn_one_by_one(splats, backend, packed):
 
 
 def test_one_packed_call_holds_all_views_of_one_size(splats, monkeypatch):
-    tensors, transforms, views = three_views(splats, "cpu")
+    scene = three_views(splats, "cpu")
+    transforms = scene[2]
     transforms.data[2] = transforms.data[0]
     calls, isect_tiles = [], documented_gsplat.isect_tiles
 
@@ -156,13 +147,8 @@ def test_one_packed_call_holds_all_views_of_one_size(splats, monkeypatch):
         return isect_tiles(*arguments, **options)
 
     monkeypatch.setattr(documented_gsplat, "isect_tiles", counted)
-    inputs = SplatInputs(
-        **tensors, camera_from_body=transforms, screen_offset=torch.zeros(3, 200, 2)
-    )
-    cuda.draw_with(documented_gsplat, inputs, views, None, packed=True)
+    cuda.draw_with(documented_gsplat, *scene, None)
     assert calls == [2, 1]
-    cuda.draw_with(documented_gsplat, inputs, views, None, packed=False)
-    assert calls == [2, 1, None, None, None]
 
 
 def pretend_gsplat(monkeypatch, backend):

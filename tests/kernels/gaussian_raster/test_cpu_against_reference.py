@@ -7,8 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from lidarpainter_models.kernels.gaussian_raster import render_gaussians
+from splat_drawing import pinhole, render
 
 # float32 lanes: polynomial exponential 7e-7, rounding 6e-8 times what a pixel blends. The seeds
 # below hold no Gaussian that one side just cuts and the other just keeps: one such pixel in twenty
@@ -43,29 +42,31 @@ def relative_errors(actual, expected):
 
 
 CASES = {
-    "degree 3": ({"count": 250, "coefficients": 16}, {}),
-    "degree 2 with features and antialiasing": (
-        {"count": 250, "coefficients": 9, "features": 2, "seed": 1},
-        {"antialias": True},
-    ),
-    "degree 1, one body, one feature": (
-        {"count": 60, "coefficients": 4, "features": 1, "num_bodies": 1, "seed": 5},
-        {"near_m": 2.0},
-    ),
-    "degree 0, small and many": (
-        {"count": 700, "coefficients": 1, "features": 5, "size_px": 1.5, "seed": 3},
-        {"blur_px2": 0.1},
-    ),
-    "large and opaque": ({"count": 120, "coefficients": 1, "size_px": 40.0, "seed": 4}, {}),
+    "degree 3": {"count": 250, "coefficients": 16},
+    "degree 2 with features": {"count": 250, "coefficients": 9, "features": 2, "seed": 1},
+    "degree 1, one body": {
+        "count": 60,
+        "coefficients": 4,
+        "features": 1,
+        "num_bodies": 1,
+        "seed": 5,
+    },
+    "degree 0, small and many": {
+        "count": 700,
+        "coefficients": 1,
+        "features": 5,
+        "size_px": 1.5,
+        "seed": 3,
+    },
+    "large and opaque": {"count": 120, "coefficients": 1, "size_px": 40.0, "seed": 4},
 }
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_image_and_gradients_match_float64_autograd(splats, draw, case):
-    build, options = CASES[case]
-    inputs = splats(**build)
-    expected = draw(inputs, backend="reference", dtype=torch.float64, **options)
-    actual = draw(inputs, backend="cpu", dtype=torch.float32, **options)
+    inputs = splats(**CASES[case])
+    expected = draw(inputs, backend="reference", dtype=torch.float64)
+    actual = draw(inputs, backend="cpu", dtype=torch.float32)
     assert torch.equal(actual.image.visible, expected.image.visible)
     assert torch.allclose(actual.image.radius_px.double(), expected.image.radius_px, rtol=1e-5)
     assert max(image_errors(actual.image, expected.image).values()) < IMAGE_ERROR
@@ -75,13 +76,6 @@ def test_image_and_gradients_match_float64_autograd(splats, draw, case):
     absolute, truth = actual.absolute_gradient, expected.absolute_gradient
     assert (absolute - truth).norm() < GRADIENT_ERROR * truth.norm()
     assert torch.equal(absolute == 0, truth == 0)
-
-
-def test_absolute_gradient_is_at_least_the_gradient_of_the_centre(splats, draw):
-    drawn = draw(splats(100), backend="cpu", dtype=torch.float32)
-    centre = drawn.gradients["screen_offset"].norm(dim=1)
-    assert bool((drawn.absolute_gradient >= centre * (1 - 1e-5)).all())
-    assert drawn.absolute_gradient.max() > 0
 
 
 def test_threads_and_repetition_change_no_bit(splats, draw):
@@ -147,7 +141,7 @@ def test_second_backward_pass_gives_the_same_gradient(splats):
         k: v.float() if torch.is_tensor(v) and k != "body_index" else v for k, v in inputs.items()
     }
     inputs["means"].requires_grad_()
-    loss = render_gaussians(**inputs, backend="cpu").rgb.square().sum()
+    loss = render(inputs, backend="cpu").rgb.square().sum()
     (first,) = torch.autograd.grad(loss, inputs["means"], retain_graph=True)
     (second,) = torch.autograd.grad(loss, inputs["means"])
     assert torch.equal(first, second)
@@ -160,10 +154,9 @@ def test_second_backward_pass_gives_the_same_gradient(splats):
     width_px=st.integers(1, 40),
     height_px=st.integers(1, 40),
     stretch=st.floats(-4.0, 4.0),
-    antialias=st.booleans(),
 )
 def test_any_shape_in_any_image_is_drawn_as_the_reference_does(
-    seed, count, width_px, height_px, stretch, antialias
+    seed, count, width_px, height_px, stretch
 ):
     # fixtures and hypothesis do not mix: the scene is built here
     generator = torch.Generator().manual_seed(seed)
@@ -180,11 +173,17 @@ def test_any_shape_in_any_image_is_drawn_as_the_reference_does(
         "body_index": torch.zeros(count, dtype=torch.int32),
         "camera_from_body": torch.eye(4)[None],
     }
-    camera = {"fx_px": 20.0, "fy_px": 20.0, "cx_px": width_px / 2, "cy_px": height_px / 2}
-    camera |= {"width_px": width_px, "height_px": height_px, "antialias": antialias}
-    actual = render_gaussians(**inputs, **camera, backend="cpu")
+    camera = pinhole(
+        fx_px=20.0,
+        fy_px=20.0,
+        cx_px=width_px / 2,
+        cy_px=height_px / 2,
+        width_px=width_px,
+        height_px=height_px,
+    )
+    actual = render(inputs | {"camera": camera}, backend="cpu")
     double = {k: v.double() if v.is_floating_point() else v for k, v in inputs.items()}
-    expected = render_gaussians(**double, **camera, backend="reference")
+    expected = render(double | {"camera": camera}, backend="reference")
     assert torch.equal(actual.visible, expected.visible)
     # one flip of the alpha cut in an image of a few pixels weighs 1/255 / pixels
     flip = 2.0 / 255.0 / (width_px * height_px)

@@ -1,20 +1,20 @@
 """Several cameras in one call are the calls of one camera, bit for bit."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba
 import pytest
 import torch
+from splat_drawing import SPLATS
 
 from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.kernels.gaussian_raster import (
     SplatImage,
-    SplatView,
+    Splats,
     render_gaussians,
     render_views,
 )
 
-CAMERA = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
 SHARED = ("means", "rotation_wxyz", "scale_m", "opacity", "sh", "features")
 IMAGES = ("rgb", "depth_m", "alpha", "features")
 BACKENDS = ["reference", "cpu"]
@@ -26,7 +26,7 @@ class Street:
 
     gaussians: dict
     transforms: torch.Tensor
-    views: list
+    cameras: list
 
 
 def street_before(splats, count=150, num_views=3, dtype=torch.float32):
@@ -34,13 +34,12 @@ def street_before(splats, count=150, num_views=3, dtype=torch.float32):
     gaussians = {name: scene[name].to(dtype) for name in SHARED}
     gaussians["body_index"] = scene["body_index"]
     transforms = scene["camera_from_body"].to(dtype).repeat(num_views, 1, 1, 1)
-    camera = {name: scene[name] for name in CAMERA}
-    views = []
+    cameras = []
     for place in range(num_views):
         transforms[place, :, 0, 3] += 0.4 * place
-        changed = {"width_px": 70 - 13 * place, "fx_px": camera["fx_px"] * (1 + 0.1 * place)}
-        views.append(SplatView(**camera | changed, antialias=place == 1))
-    return Street(gaussians, transforms, views)
+        fx_px = scene["camera"].fx_px * (1 + 0.1 * place)
+        cameras.append(replace(scene["camera"], width_px=70 - 13 * place, fx_px=fx_px))
+    return Street(gaussians, transforms, cameras)
 
 
 def leaves_of(street):
@@ -49,6 +48,11 @@ def leaves_of(street):
         for name, value in street.gaussians.items()
     }
     return gaussians, street.transforms.clone().requires_grad_()
+
+
+def drawn(gaussians, transforms, cameras, **options):
+    splats = Splats(**{name: gaussians[name] for name in SPLATS})
+    return render_views(splats, transforms, cameras, features=gaussians["features"], **options)
 
 
 def loss_of(image, seed):
@@ -60,34 +64,27 @@ def loss_of(image, seed):
     return total
 
 
-def alone(street, place, backend, **options):
+def alone(street, place, backend):
     """One view by a call of its own, with gradients."""
     gaussians, transforms = leaves_of(street)
-    view = street.views[place]
     absolute = torch.zeros(len(gaussians["means"]))
     image = render_gaussians(
-        **gaussians,
-        camera_from_body=transforms[place],
-        **{name: getattr(view, name) for name in CAMERA},
-        antialias=view.antialias,
+        Splats(**{name: gaussians[name] for name in SPLATS}),
+        transforms[place],
+        street.cameras[place],
+        features=gaussians["features"],
         screen_gradient_out=absolute,
         backend=backend,
-        **options,
     )
     loss_of(image, place).backward()
     return image, {name: gaussians[name].grad for name in SHARED}, transforms.grad, absolute
 
 
-def together(street, backend, **options):
+def together(street, backend):
     gaussians, transforms = leaves_of(street)
-    absolute = torch.full((len(street.views), len(gaussians["means"])), 7.0)
-    images = render_views(
-        **gaussians,
-        camera_from_body=transforms,
-        views=street.views,
-        screen_gradients_out=absolute,
-        backend=backend,
-        **options,
+    absolute = torch.full((len(street.cameras), len(gaussians["means"])), 7.0)
+    images = drawn(
+        gaussians, transforms, street.cameras, screen_gradients_out=absolute, backend=backend
     )
     sum(loss_of(image, place) for place, image in enumerate(images)).backward()
     return images, {name: gaussians[name].grad for name in SHARED}, transforms.grad, absolute
@@ -121,9 +118,7 @@ def test_each_view_is_that_of_a_call_of_its_own(splats, backend):
 def test_a_view_that_the_loss_leaves_out_adds_nothing(splats, backend):
     street = street_before(splats)
     gaussians, transforms = leaves_of(street)
-    images = render_views(
-        **gaussians, camera_from_body=transforms, views=street.views, backend=backend
-    )
+    images = drawn(gaussians, transforms, street.cameras, backend=backend)
     loss_of(images[1], 1).backward()
     _, own, to_own_transforms, _ = alone(street, 1, backend)
     for name, gradient in own.items():
@@ -135,46 +130,31 @@ def test_threads_change_no_bit_of_several_views(splats):
     if numba.config.NUMBA_NUM_THREADS < 2:
         pytest.skip("one core")
     street, before = street_before(splats), numba.get_num_threads()
-    drawn = []
+    found = []
     try:
         for threads in (1, 2):
             numba.set_num_threads(threads)
-            drawn.append(together(street, "cpu"))
+            found.append(together(street, "cpu"))
     finally:
         numba.set_num_threads(before)
-    for first, second in zip(drawn[0][0], drawn[1][0], strict=True):
+    for first, second in zip(found[0][0], found[1][0], strict=True):
         assert_same_images(first, second)
-    assert all(torch.equal(drawn[0][1][name], drawn[1][1][name]) for name in SHARED)
-
-
-def test_offsets_belong_to_their_view(splats):
-    street = street_before(splats)
-    offsets = torch.zeros(3, 150, 2)
-    offsets[1] = 2.5
-    offsets.requires_grad_()
-    kinds = {"camera_from_body": street.transforms, "views": street.views, "backend": "cpu"}
-    moved = render_views(**street.gaussians, **kinds, screen_offsets=offsets)
-    still = render_views(**street.gaussians, **kinds)
-    assert torch.equal(moved[0].rgb, still[0].rgb)
-    assert not torch.equal(moved[1].rgb, still[1].rgb)
-    moved[1].rgb.sum().backward()
-    assert float(offsets.grad[1].abs().max()) > 0
-    assert float(offsets.grad[[0, 2]].abs().max()) == 0
+    assert all(torch.equal(found[0][1][name], found[1][1][name]) for name in SHARED)
 
 
 def test_no_view_gives_no_image(splats):
     street = street_before(splats)
-    assert render_views(**street.gaussians, camera_from_body=street.transforms[:0], views=[]) == []
+    assert drawn(street.gaussians, street.transforms[:0], []) == []
 
 
 def test_views_that_do_not_fit_together_are_refused(splats):
     street = street_before(splats)
-    with pytest.raises(ShapeError, match="3 views, but 2 cameras"):
-        render_views(**street.gaussians, camera_from_body=street.transforms, views=street.views[:2])
-    with pytest.raises(ShapeError, match="screen_gradients_out"):
-        render_views(
-            **street.gaussians,
-            camera_from_body=street.transforms,
-            views=street.views,
+    with pytest.raises(ShapeError, match=r"camera_from_body needs shape \(2, 3, 4, 4\)"):
+        drawn(street.gaussians, street.transforms, street.cameras[:2])
+    with pytest.raises(ShapeError, match="3 views and 150 Gaussians"):
+        drawn(
+            street.gaussians,
+            street.transforms,
+            street.cameras,
             screen_gradients_out=torch.zeros(3, 2),
         )

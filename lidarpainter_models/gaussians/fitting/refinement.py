@@ -1,0 +1,136 @@
+"""What a fit corrects about the recording while it goes on: camera poses, actors, exposure."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.gaussians.fitting.config import FitConfig
+from lidarpainter_models.gaussians.fitting.losses import pose_prior
+from lidarpainter_models.gaussians.fitting.optimiser import RowAdam
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+
+
+@dataclass(eq=False, kw_only=True)
+class Refinement:
+    """The corrections of a scene, which of them are refined at a step, and their optimisers."""
+
+    scene: GaussianScene
+    """Only its corrections are looked at, and they are those of every scene of the fit."""
+    config: FitConfig
+    adams: dict[str, RowAdam]
+
+    @classmethod
+    def begin(cls, scene: GaussianScene, config: FitConfig) -> "Refinement":
+        """Let the corrections collect gradients."""
+        adams = {
+            "camera_adam": RowAdam(scene.cameras.view_tangent),
+            "actor_adam": RowAdam(scene.actors.tangent.flatten(0, 1)),
+            "exposure_adam": RowAdam(scene.exposure.matrix.flatten(1)),
+        }
+        refinement = cls(scene=scene, config=config, adams=adams)
+        for table in refinement._tables():
+            table.requires_grad_(True)
+        return refinement
+
+    def refines_cameras(self, step: int) -> bool:
+        """Whether this step corrects the pose of its view."""
+        settings = self.config.refinement
+        return settings.cameras and step >= settings.start_step
+
+    def refines_actors(self, step: int) -> bool:
+        """Whether this step corrects the poses of the actors."""
+        settings = self.config.refinement
+        has_actors = bool(self.scene.actors.recorded_tracks)
+        return settings.actors and has_actors and step >= settings.start_step
+
+    @property
+    def refines_exposure(self) -> bool:
+        """One camera alone has no other to differ from."""
+        return self.config.refinement.exposure or len(self.scene.exposure.camera_names) > 1
+
+    def world_from_camera(self, row: int, step: int) -> Float[Tensor, "4 4"]:
+        """A training view's pose, differentiable where it is refined."""
+        pose = self.scene.cameras.world_from_camera(row)
+        return pose if self.refines_cameras(step) else pose.detach()
+
+    def exposed(
+        self, rgb: Float[Tensor, "height width 3"], camera_name: str
+    ) -> Float[Tensor, "height width 3"]:
+        """The image as its camera exposes it."""
+        return self.scene.exposure.apply(rgb, camera_name) if self.refines_exposure else rgb
+
+    def prior(self, row: int, timestamp_ns: int, step: int) -> Float[Tensor, ""]:
+        """Corrections are small, and an actor's change little from one knot to the next."""
+        settings, weights = self.config.refinement, self.config.losses
+        tangent, actors = self.scene.cameras.tangent(row), self.scene.actors
+        total = tangent.new_zeros(())
+        if self.refines_cameras(step):
+            total = total + weights.pose_prior * pose_prior(
+                tangent[None],
+                rotation_rad=settings.camera_noise_rad,
+                translation_m=settings.camera_noise_m,
+            )
+        if self.refines_actors(step):
+            noise = {
+                "rotation_rad": settings.actor_noise_rad,
+                "translation_m": settings.actor_noise_m,
+            }
+            now = actors.tangent_at(timestamp_ns)
+            total = total + weights.actor_prior * pose_prior(now, **noise)
+            before, after, _ = actors.neighbours(timestamp_ns)
+            last = actors.knots_ns.numel() - 1
+            for neighbour in {max(before - 1, 0), min(after + 1, last)}:
+                jump = now - actors.tangent[:, neighbour].detach()
+                total = total + weights.actor_smoothness * pose_prior(jump, **noise)
+        return total
+
+    def step(self, step: int) -> None:
+        """Move the corrections that are refined by the gradients they received; drop these."""
+        if self.refines_cameras(step):
+            table = self.scene.cameras.view_tangent
+            self.adams["camera_adam"].step(table, _gradient(table), self._rate("camera", step))
+            self.scene.cameras.recentre(keep_mean=self.config.refinement.extrinsics)
+        if self.refines_actors(step):
+            tangent = self.scene.actors.tangent
+            with torch.no_grad():
+                gradient = _gradient(tangent).view(-1, 6)
+                rate = self._rate("actor", step)
+                self.adams["actor_adam"].step(tangent.view(-1, 6), gradient, rate)
+        if self.refines_exposure:
+            self._step_exposure(step)
+        for table in self._tables():
+            table.grad = None
+
+    def _step_exposure(self, step: int) -> None:
+        matrix = self.scene.exposure.matrix
+        fraction = step / self.config.steps
+        with torch.no_grad():
+            rate = torch.full((12,), self.config.learning_rates.at("exposure", fraction))
+            gradient = _gradient(matrix).flatten(1)
+            if len(self.scene.exposure.camera_names) > 1:
+                gradient[0] = 0  # the reference: all cameras together would be free to drift
+            self.adams["exposure_adam"].step(matrix.view(-1, 12), gradient, rate)
+
+    def _rate(self, kind: str, step: int) -> Float[Tensor, "6"]:
+        """Step sizes of a tangent's columns."""
+        rates, fraction = self.config.learning_rates, step / self.config.steps
+        rotation_rad = rates.at(f"{kind}_rotation_rad", fraction)
+        translation_m = rates.at(f"{kind}_translation_m", fraction)
+        return torch.tensor([rotation_rad] * 3 + [translation_m] * 3, dtype=torch.float64)
+
+    def _tables(self) -> tuple[Tensor, Tensor, Tensor]:
+        scene = self.scene
+        return scene.cameras.view_tangent, scene.actors.tangent, scene.exposure.matrix
+
+
+def _gradient(table: Tensor) -> Tensor:
+    """What the backward pass left.
+
+    Raises:
+        RuntimeError: it never reached this table.
+    """
+    if table.grad is None:
+        raise RuntimeError(f"no gradient reached a table of shape {tuple(table.shape)}")
+    return table.grad

@@ -1,0 +1,104 @@
+"""A Gaussian scene as arrays and JSON-able metadata, and back bit for bit."""
+
+from dataclasses import asdict
+from typing import Any
+
+from torch import Tensor
+
+from lidarpainter_models.errors import SceneError
+from lidarpainter_models.gaussians.model.actors import Actors
+from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.model.sky import SkyTexture
+from lidarpainter_models.kernels.sky_texture import SkyLayout, TexelMoments
+from lidarpainter_models.scenes.stored_tracks import tracks_from_arrays, tracks_to_arrays
+
+SCHEMA = 1
+
+
+def scene_to_arrays(scene: GaussianScene) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Arrays and metadata of the whole scene; `scene_from_arrays` inverts it bitwise."""
+    track_arrays, track_records = tracks_to_arrays(scene.actors.recorded_tracks)
+    sky, cameras = scene.sky, scene.cameras
+    groups: dict[str, dict[str, Tensor]] = {
+        "gaussians": scene.gaussians.columns(),
+        "sky": {
+            "rgb": sky.rgb,
+            "weight": sky.weight,
+            "first_moment": sky.moments.first,
+            "second_moment": sky.moments.second,
+            "visits": sky.moments.visits,
+        },
+        "tracks": track_arrays,
+        "cameras": cameras.tensors(),
+        "actors": {"knots_ns": scene.actors.knots_ns, "tangent": scene.actors.tangent},
+        "exposure": {"matrix": scene.exposure.matrix},
+    }
+    arrays = {
+        f"{group}.{name}": value.detach().cpu().contiguous()
+        for group, columns in groups.items()
+        for name, value in columns.items()
+    }
+    metadata = {
+        "schema": SCHEMA,
+        "tracks": track_records,
+        "view_keys": [list(key) for key in cameras.keys],
+        "camera_names": list(cameras.camera_names),
+        "exposure_camera_names": list(scene.exposure.camera_names),
+        "sky_layout": asdict(sky.layout),
+    }
+    return arrays, metadata
+
+
+def scene_from_arrays(arrays: dict[str, Tensor], metadata: dict[str, Any]) -> GaussianScene:
+    """Rebuild a stored scene.
+
+    Raises:
+        SceneError: the arrays were written by another version or are incomplete.
+    """
+    if metadata.get("schema") != SCHEMA:
+        raise SceneError(
+            f"a stored Gaussian scene has schema {metadata.get('schema')}, this version reads "
+            f"{SCHEMA}: fit it again"
+        )
+    groups: dict[str, dict[str, Tensor]] = {}
+    for name, value in arrays.items():
+        group, _, column = name.partition(".")
+        groups.setdefault(group, {})[column] = value
+    try:
+        return GaussianScene(
+            gaussians=GaussianSet(**groups["gaussians"]),
+            actors=Actors(
+                recorded_tracks=tracks_from_arrays(groups["tracks"], metadata["tracks"]),
+                **groups["actors"],
+            ),
+            sky=_sky(groups["sky"], SkyLayout(**metadata["sky_layout"])),
+            cameras=CameraCorrections(
+                keys=tuple((int(frame), str(name)) for frame, name in metadata["view_keys"]),
+                camera_names=tuple(metadata["camera_names"]),
+                **groups["cameras"],
+            ),
+            exposure=ExposureCorrections(
+                camera_names=tuple(metadata["exposure_camera_names"]), **groups["exposure"]
+            ),
+        )
+    except (KeyError, TypeError) as error:
+        raise SceneError(f"a stored Gaussian scene is incomplete: {error}") from error
+
+
+def copy_scene(scene: GaussianScene) -> GaussianScene:
+    """The same scene, sharing no memory and collecting no gradients."""
+    arrays, metadata = scene_to_arrays(scene)
+    return scene_from_arrays({name: value.clone() for name, value in arrays.items()}, metadata)
+
+
+def _sky(arrays: dict[str, Tensor], layout: SkyLayout) -> SkyTexture:
+    return SkyTexture(
+        layout=layout,
+        rgb=arrays["rgb"],
+        weight=arrays["weight"],
+        moments=TexelMoments(
+            first=arrays["first_moment"], second=arrays["second_moment"], visits=arrays["visits"]
+        ),
+    )

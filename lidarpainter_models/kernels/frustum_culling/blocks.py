@@ -1,0 +1,65 @@
+"""Blocks of Gaussians with bounds, and what a camera can show at most. Lengths are metres."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
+    ALPHA_CUT,
+    BLUR_PX2,
+    NEAR_M,
+    TANGENT_MARGIN,
+)
+
+MOST_SIGMAS = math.sqrt(-2.0 * math.log(ALPHA_CUT))
+"""An opaque Gaussian reaches this far."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Blocks:
+    """Which Gaussians a block holds, and what they keep to in the frame of its body."""
+
+    order: Int[Tensor, " gaussians"]
+    """Row numbers, block by block."""
+    first: Int[Tensor, " blocks_and_one"]
+    """Where each block begins in `order`."""
+    body: Int[Tensor, " blocks"]
+    low: Float[Tensor, "blocks 3"]
+    """Of the centres, float64; the bounds are changed in place."""
+    high: Float[Tensor, "blocks 3"]
+    """Under `low` where no Gaussian of the block is finite."""
+    reach: Float[Tensor, " blocks"]
+    """The farthest that any may reach from its centre."""
+
+
+class Frustum(NamedTuple):
+    """A pinhole camera's view; of two numbers the first is horizontal, the second vertical."""
+
+    lowest: tuple[float, float]
+    """Tangents x/z and y/z of the image's left and top edge."""
+    highest: tuple[float, float]
+    stretch: tuple[float, float]
+    """Most that the linearised projection stretches a Gaussian across the ray."""
+    near_m: float
+    actor_slack: tuple[float, float]
+    """How far the actors' boxes may still move before they are drawn: metres, radians."""
+
+
+def frustum_of(camera: Camera, actor_slack: tuple[float, float]) -> Frustum:
+    """What a camera can show, the blur of footprints included."""
+    blur_px = MOST_SIGMAS * math.sqrt(BLUR_PX2)
+    left, right = camera.cx_px + blur_px, camera.width_px - camera.cx_px + blur_px
+    top, bottom = camera.cy_px + blur_px, camera.height_px - camera.cy_px + blur_px
+    widest_x = (max(left, right) + 0.5 * TANGENT_MARGIN * camera.width_px) / camera.fx_px
+    widest_y = (max(top, bottom) + 0.5 * TANGENT_MARGIN * camera.height_px) / camera.fy_px
+    return Frustum(
+        lowest=(-left / camera.fx_px, -top / camera.fy_px),
+        highest=(right / camera.fx_px, bottom / camera.fy_px),
+        stretch=(math.hypot(1.0, widest_x), math.hypot(1.0, widest_y)),
+        near_m=NEAR_M,
+        actor_slack=actor_slack,
+    )

@@ -1,0 +1,62 @@
+"""What Adam remembers of rows that it does not step at every step, and how it sees parameters."""
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+BETA1, BETA2 = 0.9, 0.99
+MOST_STEP = (1 - BETA1) / math.sqrt((1 - BETA2) * (1 - BETA1**2 / BETA2))
+"""The largest step of Adam in learning rates: |m| <= 2.35 sqrt(v) by Cauchy and Schwarz."""
+MOST_UNITS = MOST_STEP / (math.sqrt(BETA2) / BETA1 - 1)
+"""The farthest that a row still moves without a gradient, in learning rates: the steps shrink by
+BETA1 / sqrt(BETA2) each."""
+VECTOR = 16
+"""Rows of moments are this many float32, a cache line, or several times as long: no vector loop
+ends in single numbers."""
+
+
+class Parameters(NamedTuple):
+    """Parameters of Gaussians (or their gradients), a row each."""
+
+    means: Tensor
+    rotation_wxyz: Tensor
+    log_scale: Tensor
+    opacity_logit: Tensor
+    """(rows)"""
+    harmonics: Tensor
+    """(rows, harmonics, 3): all of them or the constant ones."""
+    more_harmonics: Tensor
+    """(rows, harmonics, 3): those that `harmonics` lacks."""
+
+
+@dataclass(eq=False, kw_only=True)
+class AdamState:
+    """Adam's moments of a set of Gaussians; a row of them has the columns of all parameters."""
+
+    kind_of_column: Int[Tensor, " columns"]
+    """Which of the learning rates a column has."""
+    eps: Float[Tensor, " columns"]
+    first: Float[Tensor, "rows columns"]
+    second: Float[Tensor, "rows columns"]
+    last: Int[Tensor, " rows"]
+    """The step after which a row was left; its parameters and moments are those of then."""
+    count: int = 0
+    missed: list[list[float]] = field(default_factory=list)
+    """Learning rates, one of each kind, of the steps since all rows were caught up."""
+
+    @classmethod
+    def empty(cls, rows: int, widths: list[int], eps: list[float]) -> "AdamState":
+        """Nothing moved yet; one width (columns) and one epsilon for each kind of parameter."""
+        padded = [*widths[:-1], widths[-1] + -sum(widths) % VECTOR]
+        kind_of_column = torch.repeat_interleave(torch.arange(len(widths)), torch.tensor(padded))
+        return cls(
+            kind_of_column=kind_of_column,
+            eps=torch.tensor(eps)[kind_of_column],
+            first=torch.zeros(rows, sum(padded)),
+            second=torch.zeros(rows, sum(padded)),
+            last=torch.zeros(rows, dtype=torch.int32),
+        )

@@ -1,0 +1,130 @@
+import math
+from dataclasses import replace
+
+import torch
+
+from lidarpainter_models.kernels.gaussian_raster import SplatImage
+from lidarpainter_models.kernels.pixel_losses import (
+    OPEN,
+    SKY,
+    SOLID,
+    PixelFacts,
+    PixelRules,
+    depth_loss,
+    pixel_terms,
+)
+from lidarpainter_models.kernels.pixel_losses.reference import (
+    clear_sky_loss,
+    composed,
+    looks_like_sky,
+)
+
+HEIGHT_PX, WIDTH_PX = 13, 17
+RULES = PixelRules(sky_tolerance=0.3, depth_tolerance=0.05, min_transmittance=0.2)
+LEAVES = ("rgb", "depth_m", "alpha", "sky_rgb")
+EPS = torch.finfo(torch.float32).eps
+
+
+def random_case(seed=0):
+    generator = torch.Generator().manual_seed(seed)
+
+    def random(*size):
+        return torch.rand(HEIGHT_PX, WIDTH_PX, *size, generator=generator)
+
+    alpha = random()
+    alpha[0, :4] = torch.tensor([0.0, 1.0, 5e-5, 1 - 5e-5])
+    leaves = [random(3), 20 * random(), alpha, random(3)]
+    facts = PixelFacts(
+        rgb=random(3),
+        kind=(4 * random()).to(torch.uint8),
+        lidar_depth_m=torch.where(random() > 0.5, 20 * random() + 1, 0.0),
+    )
+    return [leaf.requires_grad_(True) for leaf in leaves], facts
+
+
+def image_of(rgb, depth_m, alpha):
+    return SplatImage(
+        rgb=rgb,
+        depth_m=depth_m,
+        alpha=alpha,
+        features=torch.zeros(HEIGHT_PX, WIDTH_PX, 0),
+        visible=torch.zeros(0, dtype=torch.bool),
+        radius_px=torch.zeros(0),
+    )
+
+
+def terms_and_gradients(backend, dtype):
+    leaves, facts = random_case()
+    leaves = [leaf.detach().to(dtype).requires_grad_(True) for leaf in leaves]
+    facts = replace(facts, rgb=facts.rgb.to(dtype), lidar_depth_m=facts.lidar_depth_m.to(dtype))
+    rgb, depth_m, alpha, sky_rgb = leaves
+    terms = pixel_terms(image_of(rgb, depth_m, alpha), sky_rgb, facts, RULES, backend=backend)
+    weight = torch.linspace(-1, 1, terms.shown.numel(), dtype=dtype).view_as(terms.shown)
+    ((terms.shown * weight).sum() + 3 * terms.sky + 5 * terms.depth).backward()
+    found = {"shown": terms.shown, "sky": terms.sky, "depth": terms.depth}
+    found |= {name: leaf.grad for name, leaf in zip(LEAVES, leaves, strict=True)}
+    return {name: value.detach().double() for name, value in found.items()}
+
+
+def test_fast_terms_and_gradients_are_those_of_plain_torch_in_double():
+    fast, truth = (
+        terms_and_gradients("cpu", torch.float32),
+        terms_and_gradients("reference", torch.float64),
+    )
+    for name, expected in truth.items():
+        # a dozen operations a pixel, on numbers as large as the largest beside it
+        most = 16 * EPS * torch.maximum(expected.abs(), expected.abs().mean())
+        assert bool(((fast[name] - expected).abs() <= most).all()), name
+
+
+def test_sky_term_by_hand():
+    alpha = torch.tensor([[0.5, 0.5, 0.9]])
+    sky = torch.tensor([[True, False, False]])
+    solid = torch.tensor([[False, True, False]])
+    assert abs(float(clear_sky_loss(alpha, sky, solid)) - 2 * math.log(2) / 3) < 1e-6
+
+
+def test_depth_term_by_hand():
+    accumulated = torch.tensor([[5.5, 7.0, 1.0]])
+    alpha = torch.tensor([[0.5, 1.0, 0.1]])
+    lidar_m = torch.tensor([[10.0, 0.0, 10.0]])  # the second has none, the third is mostly clear
+    # expected depth 11 against 10: relative error 0.1, twice the tolerance
+    expected = math.log(3)
+    assert abs(float(depth_loss(accumulated, alpha, lidar_m, tolerance=0.05)) - expected) < 1e-5
+
+
+def test_only_open_pixels_can_look_like_sky():
+    rgb = torch.full((1, 3, 3), 0.5)
+    sky_rgb = torch.tensor([[[0.52] * 3, [0.52] * 3, [0.7] * 3]])
+    kind = torch.tensor([[OPEN, SOLID, OPEN]])
+    found = looks_like_sky(rgb, sky_rgb, kind == OPEN, tolerance=0.05)
+    assert found.tolist() == [[True, False, False]]
+
+
+def test_image_without_returns_has_no_depth_term():
+    (rgb, depth_m, alpha, sky_rgb), facts = random_case()
+    blind = PixelFacts(
+        rgb=facts.rgb,
+        kind=torch.full_like(facts.kind, SKY),
+        lidar_depth_m=torch.zeros_like(facts.lidar_depth_m),
+    )
+    terms = pixel_terms(image_of(rgb, depth_m, alpha), sky_rgb, blind, RULES)
+    (terms.depth + terms.shown.sum()).backward()
+    assert float(terms.depth.detach()) == 0
+    assert float(depth_m.grad.abs().sum()) == 0
+
+
+def test_opaque_pixels_send_no_gradient_to_the_sky():
+    alpha = torch.tensor([[0.0, 0.5, 0.79, 0.81, 1.0]])
+    sky_rgb = torch.rand(1, 5, 3, requires_grad=True)
+    splat = SplatImage(
+        rgb=torch.zeros(1, 5, 3),
+        depth_m=torch.zeros(1, 5),
+        alpha=alpha,
+        features=torch.zeros(1, 5, 0),
+        visible=torch.zeros(0, dtype=torch.bool),
+        radius_px=torch.zeros(0),
+    )
+    composed(splat, sky_rgb, 0.2).sum().backward()
+    expected = torch.tensor([[1.0, 0.5, 0.21, 0.0, 0.0]])
+    assert torch.allclose(sky_rgb.grad, expected[..., None].expand(1, 5, 3), atol=1e-6)
