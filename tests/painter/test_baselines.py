@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lidarpainter_models.errors import WeightsError
-from lidarpainter_models.painter import PAINTER_NAMES, Painter, load_painter
+from lidarpainter_models.painter import PAINTER_NAMES, load_painter
 
 
 def test_none_gives_the_render_back(make_conditions):
@@ -33,19 +33,6 @@ def test_warp_averages_what_is_valid(make_conditions):
     torch.testing.assert_close(painting.rgb[first], pair[first])
     assert torch.equal(painting.rgb[neither], conditions.render_rgb[neither])
     assert bool((painting.confidence[neither] == 0).all())
-
-
-@pytest.mark.parametrize("num_sources", [0, 1, 2, 3])
-@pytest.mark.parametrize("name", ["none", "overlay", "warp"])
-def test_painting_has_the_size_and_range_of_the_view(name, num_sources, make_conditions):
-    conditions = make_conditions(7, 9, num_sources)
-    painter = load_painter(name)
-    painting = painter.paint(conditions)
-    assert isinstance(painter, Painter)
-    assert painter.name == name
-    assert painting.rgb.shape == (7, 9, 3)
-    assert painting.confidence.shape == (7, 9)
-    assert bool(((painting.confidence >= 0) & (painting.confidence <= 1)).all())
 
 
 def test_unknown_painter_is_one_line():

@@ -69,16 +69,6 @@ def test_root_may_be_the_scene_itself(foreign, tmp_path):
     assert DrivingScene.open(path).frame_indices == (0, 1, 2)
 
 
-def test_frames_and_cameras_of_it_can_be_chosen(foreign, tmp_path):
-    path = ingested(foreign, tmp_path / "s", frames=slice(1, 3), cameras=("back_camera",))
-    scene = DrivingScene.open(path)
-    assert [view.key for view in scene.views] == [(1, "back_camera"), (2, "back_camera")]
-    with pytest.raises(DataError, match="no camera 'roof', expected some of front_camera"):
-        ingested(foreign, tmp_path / "t", cameras=("roof",))
-    with pytest.raises(DataError, match="select none of its 3 frames"):
-        ingested(foreign, tmp_path / "t", frames=slice(7, 9))
-
-
 def test_lens_and_shutter_survive(foreign, tmp_path):
     lens = {
         "distortion_model": "brown",

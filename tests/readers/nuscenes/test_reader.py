@@ -9,7 +9,6 @@ import pytest
 import torch
 from nuscenes_log import SCENE_NAME, write_nuscenes_log
 
-from lidarpainter_models.errors import DataError
 from lidarpainter_models.readers import ingest_scene, list_sequences
 from lidarpainter_models.readers.nuscenes import dataset as nuscenes_dataset
 from lidarpainter_models.readers.nuscenes.sweeps import (
@@ -133,23 +132,6 @@ def test_image_that_no_sweep_is_near_to_is_left_out(log, store):
 def test_image_of_a_key_frame_belongs_to_its_sweep_however_late(log, store):
     shift_image(log, 3, 60_000)
     assert log.read(store).view(3, "CAM_FRONT").frame_index == 3
-
-
-def test_frames_and_cameras_can_be_chosen(log, store):
-    scene = log.read(store, frames=slice(1, 3), cameras=("CAM_BACK_LEFT",))
-    assert scene.frame_indices == (1, 2)
-    assert {view.camera_name for view in scene.views} == {"CAM_BACK_LEFT"}
-    assert scene.world_from_ego[0, :3, 3].norm() < 1e-9
-    with pytest.raises(DataError, match=r"no camera 'CAM_ROOF', expected some of CAM_FRONT, "):
-        log.ingest(store, cameras=("CAM_ROOF",))
-    with pytest.raises(DataError, match="select none of its 4 frames"):
-        log.ingest(store, frames=slice(9, 12))
-
-
-def test_progress_counts_frames(log, store):
-    told = []
-    log.ingest(store, progress=lambda done, total: told.append((done, total)))
-    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
 def test_scene_without_boxes_is_a_scene(log, store):

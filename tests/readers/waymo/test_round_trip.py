@@ -164,21 +164,6 @@ def test_scene_is_sound(scene):
     assert scene.manifest["licence"].startswith("Waymo Open Dataset License")
 
 
-def test_frames_and_cameras_can_be_chosen(records, components, tmp_path):
-    for number, folder in enumerate((records, components)):
-        path = folder.ingest(tmp_path / f"{number}", frames=slice(1, 2), cameras=("SIDE_LEFT",))
-        scene = DrivingScene.open(path)
-        assert scene.frame_indices == (1,)
-        assert scene.camera_names == ("SIDE_LEFT",)
-        assert torch.allclose(scene.world_from_ego[0, :3, 3], torch.zeros(3).double(), atol=1e-9)
-
-
-def test_progress_counts_frames(records, tmp_path):
-    told = []
-    records.ingest(tmp_path / "store", progress=lambda done, total: told.append((done, total)))
-    assert told == [(1, 2), (2, 2)]
-
-
 def test_log_without_a_second_echo_or_labels_is_read(components, tmp_path):
     for component in ("lidar_box", "lidar_camera_synced_box"):
         (components.root / component / f"{SEGMENT}.parquet").unlink()

@@ -1,0 +1,163 @@
+"""Every fast kernel gives what its plain reference gives, however its input lies in memory.
+
+A kernel with a door of a few tensors is tried here through `CASES`; one that needs scenes of its
+own (gradients, several views) has a suite below `tests/kernels/`.
+"""
+
+import pkgutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from lidarpainter_models import kernels
+from lidarpainter_models.errors import BackendError
+from lidarpainter_models.kernels.backends import available_backends
+from lidarpainter_models.kernels.point_blend import blend_points
+from lidarpainter_models.kernels.point_splat import splat_points
+from lidarpainter_models.kernels.ssim import l1_ssim_loss, ssim_map
+
+SUITES = Path(__file__).resolve().parents[1] / "kernels"
+HEIGHT_PX, WIDTH_PX = 30, 45
+
+
+@dataclass(frozen=True)
+class Case:
+    """Seeded input of a kernel by its size, and how far two backends may be apart."""
+
+    make: Callable[[int, torch.Generator], dict[str, Any]]
+    call: Callable[..., Any]
+    tolerance: float
+    """0 where a selection is made; otherwise what float32 leaves of sums in another order."""
+
+
+def random_points(count: int, generator: torch.Generator) -> dict[str, Any]:
+    size = torch.tensor([WIDTH_PX + 8, HEIGHT_PX + 8])
+    pixels = (torch.rand(count, 2, generator=generator) * size - 4).long()
+    depth_m = 20 * torch.rand(count, generator=generator) - 2
+    radius_px = torch.randint(0, 4, (count,), generator=generator)
+    return {"pixels_uv": pixels, "depth_m": depth_m, "radius_px": radius_px}
+
+
+def splat(pixels_uv: Tensor, depth_m: Tensor, radius_px: Tensor, backend: Any) -> Tensor:
+    return splat_points(
+        pixels_uv,
+        depth_m,
+        radius_px=radius_px,
+        height_px=HEIGHT_PX,
+        width_px=WIDTH_PX,
+        backend=backend,
+    )
+
+
+def random_discs(count: int, generator: torch.Generator) -> dict[str, Any]:
+    size = torch.tensor([WIDTH_PX, HEIGHT_PX]).float()
+    return {
+        "positions_uv": torch.rand(count, 2, generator=generator) * size,
+        "depth_m": 9.8 + 0.4 * torch.rand(count, generator=generator),
+        "attributes": torch.rand(count, 3, generator=generator),
+        "surface_depth_m": 10.0 * (torch.rand(HEIGHT_PX, WIDTH_PX, generator=generator) < 0.8),
+        "weight": torch.rand(count, generator=generator),
+        "radius_px": 0.5 + 3 * torch.rand(count, generator=generator),
+    }
+
+
+def random_images(side_px: int, generator: torch.Generator) -> dict[str, Any]:
+    side_px = max(side_px, 1)  # no image has no pixel
+    shape = (side_px, side_px + side_px // 2, 3)
+    return {
+        "first": torch.rand(shape, generator=generator),
+        "second": torch.rand(shape, generator=generator),
+    }
+
+
+CASES = {
+    "point_splat": Case(random_points, splat, tolerance=0.0),
+    "point_blend": Case(random_discs, blend_points, tolerance=2e-5),
+    "ssim": Case(
+        random_images,
+        lambda first, second, backend: ssim_map(first, second, backend=backend),
+        tolerance=2e-5,
+    ),
+}
+KERNELS = sorted(
+    module.name
+    for module in pkgutil.iter_modules(kernels.__path__)
+    if module.ispkg and "reference" in available_backends(module.name)
+)
+FAST = [
+    (kernel, backend)
+    for kernel in CASES
+    for backend in available_backends(kernel)
+    if backend != "reference"
+]
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_every_kernel_is_tried_against_its_reference(kernel):
+    suites = (SUITES / kernel, *SUITES.glob(f"**/test_{kernel}*.py"))
+    assert kernel in CASES or any(suite.exists() for suite in suites)
+
+
+def drawn(kernel: str, count: int, *, strided: bool) -> dict[str, Any]:
+    """Input of a case; strided, every tensor is every second row of a larger one."""
+    inputs = CASES[kernel].make(count, torch.Generator().manual_seed(count))
+    if not strided:
+        return inputs
+    spread = {}
+    for name, value in inputs.items():
+        spread[name] = torch.stack([value, torch.zeros_like(value)], dim=1)[:, 0]
+        assert len(value) < 2 or not spread[name].is_contiguous()
+    return spread
+
+
+@pytest.mark.parametrize("strided", [False, True])
+@pytest.mark.parametrize("count", [0, 1, 2, 33, 257])
+@pytest.mark.parametrize(("kernel", "backend"), FAST)
+def test_a_fast_kernel_agrees_with_the_reference(kernel, backend, count, strided):
+    device = "cuda" if backend == "cuda" else "cpu"
+    case, inputs = CASES[kernel], drawn(kernel, count, strided=strided)
+    moved = {name: value.to(device) for name, value in inputs.items()}
+    found = case.call(**moved, backend=backend)
+    expected = case.call(**inputs, backend="reference")
+    before = drawn(kernel, count, strided=strided)
+    assert all(torch.equal(inputs[name], before[name]) for name in inputs)
+    for one, other in zip(tensors(found), tensors(expected), strict=True):
+        torch.testing.assert_close(one.cpu(), other, rtol=case.tolerance, atol=case.tolerance)
+
+
+@pytest.mark.parametrize("kernel", CASES)
+def test_equal_input_gives_equal_bits(kernel):
+    first, again = (
+        tensors(CASES[kernel].call(**drawn(kernel, 257, strided=False), backend="auto"))
+        for _ in range(2)
+    )
+    assert all(torch.equal(*pair) for pair in zip(first, again, strict=True))
+
+
+@pytest.mark.parametrize("kernel", CASES)
+def test_a_backend_that_is_not_here_is_refused(kernel):
+    missing = {"cpu", "cuda"} - set(available_backends(kernel))
+    for backend in missing:
+        with pytest.raises(BackendError, match=f"no '{backend}' backend here"):
+            CASES[kernel].call(**drawn(kernel, 3, strided=False), backend=backend)
+
+
+@pytest.mark.parametrize("backend", available_backends("ssim"))
+def test_gradient_of_the_image_loss_is_that_of_the_reference(backend):
+    images = random_images(33, torch.Generator().manual_seed(0))
+    gradients = []
+    for name in (backend, "reference"):
+        rendered = images["first"].clone().requires_grad_()
+        l1_ssim_loss(rendered, images["second"], backend=name).backward()
+        gradients.append(rendered.grad)
+    scale = float(gradients[1].abs().max())
+    torch.testing.assert_close(gradients[0], gradients[1], rtol=0, atol=1e-4 * scale)
+
+
+def tensors(found: Tensor | tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    return found if isinstance(found, tuple) else (found,)

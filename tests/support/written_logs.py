@@ -1,0 +1,88 @@
+"""One small sound log of every dataset on disk, for what must hold of every reader.
+
+A reader joins by an entry in `WRITERS`; the contract says so when one is missing.
+"""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from drawn_streets import drawn_street
+from nuscenes_log import SCENE_NAME, reduced, street_like_nuscenes, write_nuscenes_log
+from small_pandaset import PandasetFolder
+from waymo_components import write_v2
+from waymo_numbers import SEGMENT
+from waymo_records import write_v1
+from waymo_truth import street_config, write_truth
+
+from lidarpainter_models.readers import ingest_scene
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.synthetic import RigLidar
+
+
+@dataclass(frozen=True)
+class WrittenLog:
+    """A log as downloaded, and what it takes to read it."""
+
+    dataset: str
+    root: Path
+    sequence: str
+
+    def ingest(self, store, **options):
+        return ingest_scene(self.dataset, self.root, self.sequence, store, **options)
+
+    def read(self, store, **options):
+        return DrivingScene.open(self.ingest(store, **options))
+
+    def copied(self, root):
+        """The same log elsewhere, free to be damaged."""
+        shutil.copytree(self.root, root)
+        return WrittenLog(self.dataset, root, self.sequence)
+
+    def files(self):
+        return sorted(path for path in self.root.rglob("*") if path.is_file())
+
+
+def _pandaset(folder: Path) -> WrittenLog:
+    log = PandasetFolder(folder / "pandaset")
+    log.write_log()
+    return WrittenLog("pandaset", log.root, log.sequence)
+
+
+def _canonical(folder: Path) -> WrittenLog:
+    scene = _pandaset(folder).ingest(folder / "store")
+    return WrittenLog("canonical", scene.parent, scene.name)
+
+
+def _nuscenes(folder: Path) -> WrittenLog:
+    street = street_like_nuscenes(folder / "street")
+    small = reduced(street, num_frames=4, cameras=("CAM_FRONT", "CAM_BACK_LEFT"), num_actors=6)
+    write_nuscenes_log(small, folder / "nuscenes", key_every=3)
+    return WrittenLog("nuscenes", folder / "nuscenes", SCENE_NAME)
+
+
+def _waymo(folder: Path, write: Callable[..., object]) -> WrittenLog:
+    config = street_config(
+        num_frames=2,
+        width_px=32,
+        height_px=24,
+        cameras=tuple(rig for rig in street_config().cameras if rig.name in ("FRONT", "SIDE_LEFT")),
+        lidar=RigLidar(name="TOP", beams=32, columns=360, up_m=2.18),
+    )
+    street = drawn_street(config)
+    truth = write_truth(
+        street, folder / "truth", near_lidars=("REAR",), near_size=(6, 20), reach_m=22.0
+    )
+    write(truth, folder / "waymo")
+    return WrittenLog("waymo", folder / "waymo", SEGMENT)
+
+
+WRITERS: dict[str, Callable[[Path], WrittenLog]] = {
+    "pandaset": _pandaset,
+    "nuscenes": _nuscenes,
+    "waymo, version 1": lambda folder: _waymo(folder, write_v1),
+    "waymo, version 2": lambda folder: _waymo(folder, write_v2),
+    "canonical": _canonical,
+}
+"""Writes a log into a folder, by what it is called in tests: the dataset, and its version."""
