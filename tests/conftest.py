@@ -5,11 +5,12 @@ left out of it.
 """
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
-from jaxtyping import install_import_hook
+from jaxtyping import config, install_import_hook
 
 from flows.environment import THREADS
 
@@ -23,17 +24,19 @@ settings.register_profile("shared machine", deadline=None)  # time says nothing 
 settings.load_profile("shared machine")
 
 
-def checked_modules() -> list[str]:
-    """Every library module whose annotations can be checked at run time."""
-    paths = sorted((ROOT / "lidarpainter_models").rglob("*.py"))
-    return [
-        ".".join(path.relative_to(ROOT).with_suffix("").parts)
+def checked_modules() -> frozenset[str]:
+    """Every library module and package whose annotations can be checked at run time."""
+    paths = (ROOT / "lidarpainter_models").rglob("*.py")
+    return frozenset(
+        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
         for path in paths
-        if path.name != "__init__.py" and "import numba" not in path.read_text("utf-8")
-    ]
+        if "import numba" not in path.read_text("utf-8")
+    )
 
 
-install_import_hook(checked_modules(), "shape_checking.check")
+# the hook takes a package's name for all that is below it, numba code included
+_finder = install_import_hook([], "shape_checking.check").hook
+_finder.should_instrument = checked_modules().__contains__
 
 pytest_plugins = ["board_world", "small_pandaset"]  # fixtures that several rooms share
 
@@ -45,3 +48,11 @@ def shared_folder() -> Path:
     if not (folder / "data").is_dir():
         pytest.skip(f"no real data at {folder} (set {SHARED_ENVIRONMENT})")
     return folder
+
+
+@pytest.fixture(autouse=True)
+def _own_refusals(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Users run without the checker: what a test says is refused, the library refuses itself."""
+    config.update("jaxtyping_disable", "refused" in request.node.name)
+    yield
+    config.update("jaxtyping_disable", False)
