@@ -1,3 +1,3 @@
 """LidarPainter's library: scenes, kernels, Gaussians and painters; tensors in, tensors out."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
