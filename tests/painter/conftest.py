@@ -4,8 +4,8 @@ import hashlib
 
 import pytest
 import torch
-from tiny_diffusion import write_model
 from random_conditions import random_conditions
+from tiny_diffusion import write_model
 
 from lidarpainter_models.painter.examples import PaintingPair
 from lidarpainter_models.painter.filters import blur
