@@ -159,13 +159,13 @@ def test_pose_refinement_recovers_a_known_rotation(world):
     assert angle_rad < 0.1 * float(twist.norm())
 
 
-def with_guidance_gradients(world, view, config):
+def with_guidance_gradients(world, view, config, perceptual=None):
     """A state and its leaves after the gradients of one painted view."""
     state = FitState.begin(world.scene, config)
     poses = state.scene.actors.corrected_poses(view.timestamp_ns)
     bodies = camera_from_body(view.camera.world_from_camera, *poses)
     seen = state.seen([(view.camera, bodies)])
-    add_guidance_gradients(state, seen, view, config)
+    add_guidance_gradients(state, seen, view, config, perceptual)
     return state, seen
 
 
@@ -206,6 +206,28 @@ def test_untrusted_painted_view_changes_nothing(world):
     config = short_fit(guidance=GuidanceConfig(depth=0.0))
     _, seen = with_guidance_gradients(world, painted_view(world, weight=0.0), config)
     assert float(seen.sh.grad.abs().sum()) == 0
+
+
+def squared_distance(image, truth):
+    return 100.0 * (image - truth).square().mean()
+
+
+def test_perceptual_distance_counts_on_painted_views_as_far_as_they_are_trusted(world):
+    config = short_fit(guidance=GuidanceConfig(depth=0.0, perceptual=1.0))
+    gradients = []
+    for weight, perceptual in ((1.0, None), (1.0, squared_distance), (0.0, squared_distance)):
+        view = painted_view(world, weight=weight)
+        _, seen = with_guidance_gradients(world, view, config, perceptual)
+        gradients.append(float(seen.sh.grad.abs().sum()))
+    assert gradients[1] > 1.5 * gradients[0] > 0
+    assert gradients[2] == 0
+
+
+def test_perceptual_distance_counts_on_recorded_views(world, undisturbed):
+    config = short_fit(losses=replace(short_fit().losses, perceptual=1.0))
+    fitted = fit_gaussians(world.observations, config, perceptual=squared_distance)
+    assert fitted.history[0]["loss"] > 1.1 * undisturbed.history[0]["loss"]
+    assert fitted.scene.num_gaussians > 0
 
 
 def test_start_of_other_views_is_refused(world):

@@ -10,6 +10,8 @@ from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
 
 BLOCKS, PASSES = 4, 6
+EPS = torch.finfo(torch.float32).eps
+HUNDREDTH = 0.01
 
 
 def steps_of(fit, count):
@@ -46,12 +48,21 @@ def test_what_is_out_of_view_changes_nothing_beyond_rounding(monkeypatch):
         lambda blocks, _views, **_slack: torch.arange(len(blocks.block_of_row)),
     )
     steps_of(everything, BLOCKS * PASSES)
-    truth = parameters_of(everything)
+    truth, steps = parameters_of(everything), BLOCKS * PASSES
+    longer = truth["log_scale"].sort(dim=1).values[:, 1:]
+    size_m = longer.mean(dim=1, keepdim=True).exp()
     for name, value in parameters_of(fit).items():
-        assert torch.allclose(value, truth[name], rtol=1e-5, atol=1e-5), name
-    # rounding of the pose gradients, summed in other groups
+        if name == "body_index":
+            continue
+        # Adam makes steps of one length out of gradients of any: where one cancels to a rounding
+        # of its terms, so does its step. A row left out or taken twice is a whole step off.
+        step = fit.config.learning_rates.at(name, 0.0) * (size_m if name == "means" else 1.0)
+        most = EPS * steps * truth[name].abs() + HUNDREDTH * step
+        assert bool(((value - truth[name]).abs() <= most).all()), name
+    # the pose gradients of a view, summed in other groups, and Adam's steps of them
     tangent, expected = (f.state.scene.cameras.view_tangent for f in (fit, everything))
-    assert torch.allclose(tangent, expected, rtol=1e-6, atol=1e-12)
+    step = fit.config.learning_rates.at("camera_rotation_rad", 0.0)
+    assert float((tangent - expected).abs().max()) <= HUNDREDTH * step
     assert torch.equal(fit.state.tally.visits, everything.state.tally.visits)
 
 
