@@ -49,6 +49,8 @@ MAX_SWEEP_OFFSET_M = 0.15
 MAX_GROUND_SLOPE_RAD = 0.15
 _NON_COMMERCIAL = ("non-commercial", "noncommercial", "-nc-", " nc ", "-nc ")
 _COVERAGE_CELLS = (9, 16)
+_GROUND_THICKNESS_M = 0.3
+_NUM_GROUND_TRIES = 1000
 _NUM_SAMPLED_FRAMES = 4
 _POINT_STRIDE = 3
 """Every third point tells as well which cells of an image are covered."""
@@ -199,14 +201,8 @@ def check_ground(scene: DrivingScene) -> tuple[Verdict, str]:
     near = xyz_m[(xyz_m[:, :2].norm(dim=1) < NEIGHBOURHOOD_M) & (xyz_m[:, 2].abs() < 4)].numpy()
     if len(near) < 100:
         return "warn", f"only {len(near)} points within {NEIGHBOURHOOD_M:.0f} m of the car"
-    cells = np.floor(near[:, :2] / 2.0).astype(int)
-    order = np.lexsort((near[:, 2], cells[:, 1], cells[:, 0]))
-    first = np.ones(len(order), dtype=bool)
-    first[1:] = (np.diff(cells[order], axis=0) != 0).any(axis=1)
-    lowest = near[order[first]]
-    plane = _robust_plane(lowest)
-    slope_rad = float(np.arctan(np.hypot(plane[0], plane[1])))
-    detail = f"{plane[2]:+.2f} m from the ego origin, slope {np.degrees(slope_rad):.1f} degrees"
+    slope_rad, height_m = _ground_plane(_lowest_in_cells(near))
+    detail = f"{height_m:+.2f} m from the ego origin, slope {np.degrees(slope_rad):.1f} degrees"
     if slope_rad > MAX_GROUND_SLOPE_RAD:
         return "fail", f"{detail}: is z up?"
     return "ok", detail
@@ -262,17 +258,24 @@ def _points_near_ego(scene: DrivingScene, frame_index: int) -> np.ndarray:
     return points_near(scene.read_points(frame_index).xyz_m, centre_m)
 
 
-def _robust_plane(points_m: np.ndarray) -> np.ndarray:
-    """Coefficients (a, b, c) of z = a x + b y + c, by least squares with outliers dropped."""
-    design = np.column_stack([points_m[:, :2], np.ones(len(points_m))])
-    keep = points_m[:, 2] <= np.median(points_m[:, 2]) + 0.5
-    plane = np.zeros(3)
-    for _ in range(5):
-        plane, *_ = np.linalg.lstsq(design[keep], points_m[keep, 2], rcond=None)
-        keep = np.abs(design @ plane - points_m[:, 2]) < 0.3
-        if keep.sum() < 3:
-            break
-    return plane
+def _lowest_in_cells(points_m: np.ndarray, cell_m: float = 2.0) -> np.ndarray:
+    """The lowest point over every square cell of the ground."""
+    cells = np.floor(points_m[:, :2] / cell_m).astype(int)
+    order = np.lexsort((points_m[:, 2], cells[:, 1], cells[:, 0]))
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = (np.diff(cells[order], axis=0) != 0).any(axis=1)
+    return points_m[order[first]]
+
+
+def _ground_plane(points_m: np.ndarray) -> tuple[float, float]:
+    """Slope (rad) of the plane that most points lie on, and its height below the origin (m)."""
+    import open3d
+
+    open3d.utility.random.seed(0)
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points_m))
+    plane, _ = cloud.segment_plane(_GROUND_THICKNESS_M, 3, _NUM_GROUND_TRIES)
+    slope_rad = np.arctan2(np.hypot(plane[0], plane[1]), abs(plane[2]))
+    return float(slope_rad), float(-plane[3] / np.copysign(max(abs(plane[2]), 1e-9), plane[2]))
 
 
 def _turn_rad(first: Tensor, second: Tensor) -> Tensor:

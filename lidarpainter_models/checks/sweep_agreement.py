@@ -45,7 +45,7 @@ def nearest_gap_m(
     """Median distance from points of one sweep to the nearest of another; None without any."""
     if len(first_m) == 0 or len(second_m) == 0:
         return None
-    return float(np.median(KDTree(second_m).query(_some(first_m))[0]))
+    return float(np.median(KDTree(second_m).query(some_of(first_m))[0]))
 
 
 def sweep_offset_m(
@@ -74,7 +74,8 @@ def sweep_offset_m(
     return float(np.median(np.linalg.norm(motion_m, axis=1)))
 
 
-def _some(points_m: np.ndarray) -> np.ndarray:
+def some_of(points_m: np.ndarray) -> np.ndarray:
+    """An even sample of the points."""
     return points_m[:: max(1, len(points_m) // _NUM_SAMPLED_POINTS)]
 
 
@@ -88,7 +89,11 @@ class _PlaneResiduals(NamedTuple):
 
 
 def _plane_residuals(from_m: np.ndarray, to_m: np.ndarray) -> _PlaneResiduals:
-    patch_m, some_m = _one_per_cell(to_m), _some(from_m)
+    import open3d
+
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(to_m))
+    patch_m = np.asarray(cloud.voxel_down_sample(_PATCH_CELL_M).points)
+    some_m = some_of(from_m)
     if len(patch_m) < _PATCH_POINTS or len(some_m) == 0:
         return _PlaneResiduals(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
     reached_m, neighbours = KDTree(patch_m).query(
@@ -119,11 +124,6 @@ def _least_absolute_motion(
         weights = 1.0 / np.maximum(np.abs(residuals_m - columns @ along), _LEAST_RESIDUAL_M)
     motion = ways @ along
     return motion[:3] / reach_m, motion[3:]
-
-
-def _one_per_cell(points_m: np.ndarray) -> np.ndarray:
-    cells = np.floor(points_m / _PATCH_CELL_M).astype(np.int64)
-    return points_m[np.unique(cells, axis=0, return_index=True)[1]]
 
 
 def _is_plane(variances: Float[np.ndarray, "patches 3"]) -> Bool[np.ndarray, " patches"]:

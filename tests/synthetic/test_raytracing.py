@@ -2,6 +2,7 @@
 
 import numba
 import numpy as np
+import open3d
 import pytest
 
 from lidarpainter_models.synthetic.raytracing.lidar import cast_sweep
@@ -96,7 +97,7 @@ def test_an_empty_world_is_all_sky():
 
 
 @pytest.mark.parametrize("num_primitives", [1, 4, 5, 300])
-def test_the_tree_finds_what_trying_every_primitive_finds(num_primitives):
+def test_the_tree_finds_what_another_ray_tracer_finds(num_primitives):
     rng = np.random.default_rng(num_primitives)
     world = World()
     corner = rng.uniform([4, -6, -4], [30, 6, 7], (num_primitives, 3))
@@ -109,31 +110,25 @@ def test_the_tree_finds_what_trying_every_primitive_finds(num_primitives):
     arrays, _, _ = world.arrays()
     view = looking_ahead(offsets=np.array([[0.5, 0.5]]))
     _, depth_m, _, _ = render(arrays, nothing_moving(), view)
-    assert np.allclose(depth_m, every_primitive(corners, is_parallelogram), rtol=1e-4)
+    assert np.allclose(depth_m, nearest_by_open3d(corners, is_parallelogram), rtol=1e-4)
 
 
-def every_primitive(corners, is_parallelogram):
-    """Depth by solving corner + a first + b second = t direction for each ray and primitive."""
+def nearest_by_open3d(corners, is_parallelogram):
+    """Depth of the same rays by another ray tracer."""
+    first, second, third = corners.swapaxes(0, 1)
+    triangles = [np.stack([first, second, third], axis=1)]
+    if is_parallelogram:
+        triangles.append(np.stack([second, second + third - first, third], axis=1))
+    vertices = np.concatenate(triangles).reshape(-1, 3).astype(np.float32)
+    scene = open3d.t.geometry.RaycastingScene()
+    scene.add_triangles(vertices, np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3))
     u = (np.arange(WIDTH_PX) + 0.5 - WIDTH_PX / 2) / FOCAL_PX
     v = (np.arange(HEIGHT_PX) + 0.5 - HEIGHT_PX / 2) / FOCAL_PX
     grid_v, grid_u = np.meshgrid(v, u, indexing="ij")
-    rays = np.stack([np.ones_like(grid_u), -grid_u, -grid_v], axis=-1).reshape(-1, 3)
-    nearest = np.full(len(rays), np.inf)
-    for corner, first, second in corners:
-        matrix = np.stack(
-            [
-                np.broadcast_to(first - corner, rays.shape),
-                np.broadcast_to(second - corner, rays.shape),
-                -rays,
-            ],
-            axis=-1,
-        )
-        right = np.broadcast_to(np.array([0, 0, 1.5]) - corner, rays.shape)
-        a, b, t = np.linalg.solve(matrix, right[..., None])[..., 0].T
-        most = np.maximum(a, b) if is_parallelogram else a + b
-        hits = (a >= 0) & (b >= 0) & (most <= 1) & (t > 0)
-        nearest = np.where(hits & (t < nearest), t, nearest)
-    return np.where(np.isfinite(nearest), nearest, 0.0).reshape(HEIGHT_PX, WIDTH_PX)
+    along = np.stack([np.ones_like(grid_u), -grid_u, -grid_v], axis=-1)
+    rays = np.concatenate([np.broadcast_to([0, 0, 1.5], along.shape), along], axis=-1)
+    depth_m = scene.cast_rays(open3d.core.Tensor(rays.astype(np.float32)))["t_hit"].numpy()
+    return np.where(np.isfinite(depth_m), depth_m, 0.0)
 
 
 def test_rays_pass_through_the_holes_of_a_cut_out():
