@@ -1,6 +1,8 @@
 """`lidarpainter catalog`: what the store holds."""
 
 import json
+import sys
+from collections.abc import Iterator
 from typing import Annotated, Any
 
 import typer
@@ -58,6 +60,57 @@ def show_record(
         print_json({"table": table, **_open(row)})
         return
     print_pairs(f"{table}: {name}", {column: _cell(column, row[column]) for column in row})
+
+
+@app.command("explain")
+def explain(
+    name: Annotated[str, typer.Argument(help="A run id or `latest`, or kind/digest; or a prefix.")],
+    as_json: AsJson = False,
+) -> None:
+    """Show what a run or an artefact was made from, and what makes it stale."""
+    from catalog.artefacts import ArtefactRef
+    from catalog.errors import UnknownRecordError
+    from catalog.explain import Explainer
+    from catalog.store import open_store
+    from tasks.stages import project_source
+
+    store = open_store()
+    table, row = _find(store, name)
+    explainer = Explainer(store, project_source().code_from)
+    if table == "runs":
+        found = explainer.run(row)
+    elif table == "artefacts":
+        found = explainer.artefact(ArtefactRef.of_id(row["artefact_id"]))
+    else:
+        raise UnknownRecordError(f"{name!r} is in {table}, expected a run or an artefact")
+    if as_json:
+        print_json(found.to_dict())
+    else:
+        sys.stdout.write("\n".join(_tree("", found, set())) + "\n")
+
+
+def _tree(part: str, found: Any, shown: set[str], depth: int = 0) -> Iterator[str]:  # noqa: ANN401
+    """An explanation as indented lines; what was explained above is only named."""
+    indent = "  " * depth
+    state = f"STALE: {'; '.join(found.stale)}" if found.stale else ""
+    again = "see above" if found.name in shown and found.facts else ""
+    title = f"{part}: {found.name}" if part else found.name
+    yield indent + "  ".join(text for text in (title, state, again) if text)
+    if again:
+        return
+    shown.add(found.name)
+    for fact, value in found.facts.items():
+        if value:
+            yield f"{indent}  {fact}: {_short(value)}"
+    for what, value in (found.newest or {}).items():
+        yield f"{indent}  newest {what}: {_short(value)}"
+    for name, made in found.inputs.items():
+        yield from _tree("" if name == made.name else name, made, shown, depth + 1)
+
+
+def _short(value: Any) -> str:  # noqa: ANN401 - any JSON value
+    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+    return f"{text[:LONGEST_JSON]}... (--json shows all)" if len(text) > LONGEST_JSON else text
 
 
 def _find(store: Any, name: str) -> tuple[str, dict[str, Any]]:  # noqa: ANN401 - imported late

@@ -45,6 +45,7 @@ def test_asking_for_help_is_no_error(command, capsys):
         (["catalog", "list", "nope"], "no table 'nope'"),
         (["catalog", "show", "nothing"], "nothing is called 'nothing'"),
         (["catalog", "show", "latest"], "no complete run"),
+        (["catalog", "explain", "nothing"], "nothing is called 'nothing'"),
         (["ingest", "pandaset", "/nowhere", "002", "--frames", "5"], "expected A:B"),
         (["ingest", "pandaset", "/nowhere", "002", "--frames", "5:5"], "expected A < B"),
         (["ingest", "pandaset", "/nowhere", "002", "--cameras", "a,,b"], "names with commas"),

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 from dataclasses import replace
 
 import cv2
@@ -9,9 +10,11 @@ import pytest
 import torch
 from toy_store import TOY_SCENE, small_parameters, write_toy_scene
 
+from catalog.artefacts import ArtefactStore
 from catalog.errors import DamagedArtefactError
 from catalog.schemas import TABLES
-from catalog.store import open_store
+from catalog.store import STORE_ENVIRONMENT, open_store
+from flows.cli.main import main
 from lidarpainter_models.conditioning.sequences import SequenceConfig
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.evaluation.scene_scores import ScoringConfig
@@ -50,7 +53,33 @@ def parameters():
 
 
 @pytest.fixture(scope="module")
-def stages(store, parameters):
+def ran():
+    """Modules whose functions were called while a stage was built, by its artefact's digest."""
+    produce, ran = ArtefactStore.produce, {}
+
+    def watched(store, recipe, build, **options):
+        called = ran.setdefault(recipe.digest, set())
+
+        def watch(frame, event, _argument):
+            if event == "call":
+                called.add(frame.f_globals.get("__name__", ""))
+
+        def watched_build(place):
+            sys.setprofile(watch)
+            try:
+                return build(place)
+            finally:
+                sys.setprofile(None)
+
+        return produce(store, recipe, watched_build, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ArtefactStore, "produce", watched)
+        yield ran
+
+
+@pytest.fixture(scope="module")
+def stages(store, parameters, ran):  # noqa: ARG001 - it watches them being built
     """Every stage's result by its name."""
     run = parameters.run_spec(store.root)
     seen = prepare.fn(run, parameters.observation)
@@ -119,6 +148,28 @@ def test_every_stage_leaves_an_artefact_with_a_manifest(store, stages):
     for stage in stages.values():
         assert store.artefacts.verified(stage.ref).kind == stage.ref.kind
     assert len(store.tables.rows("artefacts")) == len(stages)
+
+
+def test_the_code_of_a_stage_holds_every_module_that_ran(store, stages, ran):
+    for name, stage in stages.items():
+        project = {
+            one for one in ran[stage.ref.digest] if one.startswith(("tasks", "lidarpainter"))
+        }
+        harness = {"tasks.stages", "tasks.measuring"}
+        assert len(project) > 10, name
+        assert project - harness <= store.artefacts.manifest(stage.ref).code.keys(), name
+
+
+def test_an_artefact_is_explained_back_to_its_scene(run, store, capsys, monkeypatch):
+    monkeypatch.setenv(STORE_ENVIRONMENT, str(store.root))
+    assert main(["catalog", "explain", run.run_id]) == 0
+    page = capsys.readouterr().out
+    assert f"scene: {TOY_SCENE}" in page
+    assert "STALE" not in page
+    assert main(["catalog", "explain", run.final.gaussians.artefact_id, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["inputs"]["guidance"]["inputs"]["scene"]["name"] == TOY_SCENE
+    assert not found["is_stale"]
 
 
 def test_a_stage_asked_again_is_not_computed_again(store, parameters, stages):
