@@ -197,7 +197,8 @@ class SourceTree:
         if isinstance(build, (MethodType, BuiltinFunctionType)):
             raise IdentityError(f"{build.__qualname__} is no function of a module, as a build must")
         what = build if isinstance(build, (FunctionType, type)) else type(build)
-        # a function inside another one starts as the other, whose names it can use
+        if "<locals>" in what.__qualname__:
+            raise IdentityError(f"{what.__qualname__} stands inside a function, as no build may")
         place = Place(what.__module__, what.__qualname__.partition(".")[0])
         if isinstance(build, FunctionType) or place.module.partition(".")[0] in self._roots:
             yield ":".join(place)

@@ -1,11 +1,13 @@
 """The code of every stage is found from the source, and is that of no other concern."""
 
 import ast
+import shutil
 from pathlib import Path
 
 import pytest
 
 import tasks
+from catalog.code_closure import SourceTree
 from tasks.stages import project_source
 
 LIBRARY = "lidarpainter_models"
@@ -15,13 +17,13 @@ FOLDER = Path(tasks.__file__).parent
 def builds_of(path):
     """Where the builds given to `run_stage` in a module start, `module:name`."""
     module = ".".join(path.relative_to(FOLDER.parent).with_suffix("").parts)
-    top = {node.name: node for node in ast.parse(path.read_text()).body if hasattr(node, "name")}
-    for name, function in top.items():
+    top = [node for node in ast.parse(path.read_text()).body if hasattr(node, "name")]
+    for function in top:
         for call in ast.walk(function):
             if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "run_stage":
                 (build,) = (word.value for word in call.keywords if word.arg == "build")
-                given = {node.id for node in ast.walk(build) if isinstance(node, ast.Name)}
-                yield from (f"{module}:{one}" for one in sorted(given & top.keys()) or [name])
+                bound = build.args[0] if isinstance(build, ast.Call) else build
+                yield f"{module}:{bound.id}"
 
 
 BUILDS = sorted({start for path in FOLDER.rglob("*.py") for start in builds_of(path)})
@@ -71,9 +73,9 @@ def test_preparing_follows_the_colouring_and_no_reader_and_no_fit():
 
 
 def test_evaluation_follows_the_scores_and_no_reader():
-    modules = modules_of(*builds_in("evaluation.scene"))
+    modules = modules_of(*builds_in("evaluation.views"))
     assert {
-        "tasks.evaluation.judging",
+        f"{LIBRARY}.evaluation.judging",
         f"{LIBRARY}.evaluation.scene_scores",
         f"{LIBRARY}.metrics.images",
         f"{LIBRARY}.kernels.point_blend.cpu",
@@ -90,3 +92,54 @@ def test_training_follows_what_its_students_are_made_of():
         f"{LIBRARY}.painter.one_step.training",
         f"{LIBRARY}.evaluation.held_back",
     } <= modules.keys()
+
+
+@pytest.fixture
+def copied(tmp_path):
+    """A copy of the project, to be changed."""
+    roots = {name: tmp_path / name for name in ("flows", "tasks", LIBRARY)}
+    for name, folder in roots.items():
+        shutil.copytree(FOLDER.parent / name, folder)
+    return roots
+
+
+def digests_of(roots):
+    tree = SourceTree(roots)
+    return {start: tree.code_from([start]).digest for start in BUILDS}
+
+
+def changed_by(roots, module, old, new):
+    """The task modules whose builds run what was changed."""
+    before = digests_of(roots)
+    root, *parts = module.split(".")
+    path = roots[root].joinpath(*parts).with_suffix(".py")
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new, 1))
+    after = digests_of(roots)
+    return {start.partition(":")[0] for start in BUILDS if before[start] != after[start]}
+
+
+def test_a_comment_in_every_file_changes_no_stage(copied):
+    before = digests_of(copied)
+    for folder in copied.values():
+        for path in folder.rglob("*.py"):
+            path.write_text(f"{path.read_text()}\n# one comment\n")
+    assert digests_of(copied) == before
+
+
+def test_scoring_code_changes_what_scores_and_nothing_else(copied):
+    changed = changed_by(copied, f"{LIBRARY}.evaluation.judging", "sum(weights)", "sum(weights[:])")
+    assert changed == {"tasks.evaluation.views"}
+
+
+def test_the_rasteriser_changes_the_fit_and_all_after_it_but_not_what_it_is_fitted_to(copied):
+    module = f"{LIBRARY}.kernels.gaussian_raster.cpu"
+    changed = changed_by(copied, module, "return ", "return None or ")
+    after = ("reconstruction.fit", "reconstruction.paint", "reconstruction.report")
+    assert changed >= {f"tasks.{name}" for name in (*after, "evaluation.views")}
+    assert "tasks.reconstruction.prepare" not in changed
+
+
+def test_a_reader_changes_nothing_of_a_stored_scene(copied):
+    module = f"{LIBRARY}.readers.waymo.v1"
+    assert changed_by(copied, module, "return ", "return None or ") == set()

@@ -31,9 +31,9 @@ class Heard:
         self.events.append(("finished", stage, is_new))
 
 
-def write_number(place):
+def write_number(place, progress):
     (place.output / "number.txt").write_text("7")
-    listener().advanced("fit", 1, 2, "")
+    progress(1, 2)
     return {"num_gaussians": 3}
 
 
@@ -63,7 +63,7 @@ def test_a_stage_is_computed_once_and_entered_into_the_catalog(tmp_path):
 
 def test_changed_code_is_never_served_a_stale_result(tmp_path, monkeypatch):
     source = tmp_path / "stage_code.py"
-    source.write_text("def build(place):\n    return {'version': 1}\n")
+    source.write_text("def build(place, progress):\n    return {'version': 1}\n")
     monkeypatch.syspath_prepend(tmp_path)
     build = import_module("stage_code").build
     store, found = open_store(tmp_path / "store"), []
@@ -91,7 +91,7 @@ def test_who_listens_hears_a_stage_from_start_to_end(tmp_path):
     assert len(heard.events) == 5
 
 
-def fail(place):
+def fail(place, _progress):
     (place.output / "half.txt").write_text("1")
     raise DataError("no such image")
 
