@@ -56,7 +56,7 @@ def open_tensors(
     Gives safetensors' own handle and the header, which is empty in a file of someone else.
     """
     if not path.is_file():
-        raise damaged(f"{path} is not a readable safetensors file: there is none")
+        raise damaged(f"{path} is not there: expected a .safetensors file")
     try:
         with safe_open(path, framework="pt") as file:
             header = json.loads((file.metadata() or {}).get(HEADER_KEY, "{}"))

@@ -55,7 +55,7 @@ def test_a_file_of_something_else_is_damaged(tmp_path, content):
     path = tmp_path / "x.safetensors"
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(DataError, match=r"x\.safetensors (is not a readable|has a damaged)"):
+    with pytest.raises(DataError, match=r"x\.safetensors (is not|has a damaged)"):
         read_tensors(path)
     with pytest.raises(WeightsError):
         read_tensors(path, damaged=WeightsError)

@@ -4,20 +4,16 @@ One safetensors file holds every tensor; its header carries the numbers, as JSON
 beside the old one and renamed over it, so that there is always one whole checkpoint or none.
 """
 
-import contextlib
-import json
-import os
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
-from lidarpainter_models.errors import ConfigError, SceneError, StorageError
+from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.storage.tensor_files import read_tensors, write_tensors
 
 FILE_NAME = "fit.safetensors"
 
@@ -54,20 +50,8 @@ class CheckpointFolder:
         Raises:
             StorageError: the file cannot be written.
         """
-        target = self.path / FILE_NAME
-        aside = self.path / f".{FILE_NAME}.{os.getpid()}"
-        header = {"identity": self.identity, "numbers": json.dumps(numbers)}
-        contiguous = {name: value.detach().contiguous() for name, value in tensors.items()}
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            save_file(contiguous, aside, metadata=header)
-            with aside.open("rb") as written:
-                os.fsync(written.fileno())
-            aside.replace(target)
-        except (OSError, SafetensorError) as error:
-            with contextlib.suppress(OSError):
-                aside.unlink(missing_ok=True)
-            raise StorageError(f"cannot write the checkpoint {target}: {error}") from error
+        header = {"identity": self.identity, "numbers": numbers}
+        write_tensors(self.path / FILE_NAME, tensors, header)
         self._last_time = time.monotonic()
 
     def load(self) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
@@ -79,17 +63,12 @@ class CheckpointFolder:
         source = self.path / FILE_NAME
         if not source.exists():
             return None
-        try:
-            with safe_open(source, framework="pt", device="cpu") as opened:
-                header = opened.metadata() or {}
-                tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
-        except SafetensorError as error:
-            raise SceneError(f"the checkpoint {source} is damaged: {error}") from error
+        tensors, header = read_tensors(source, damaged=SceneError)
         if header.get("identity") != self.identity:
             raise SceneError(
                 f"the checkpoint {source} belongs to another fit: remove it to start afresh"
             )
-        return tensors, json.loads(header["numbers"])
+        return tensors, header["numbers"]
 
     def clear(self) -> None:
         """Remove the checkpoint, if there is one."""

@@ -4,19 +4,16 @@ The header's metadata carries the format, the network's settings, the licence an
 JSON, so a file says by itself what it is and what it was trained on.
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
 from lidarpainter_models.errors import WeightsError
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.nano.painter import NanoPainter
-from lidarpainter_models.storage.whole_files import write_whole
+from lidarpainter_models.storage.tensor_files import read_tensors, write_tensors
 
 WEIGHTS_FORMAT = "lidarpainter-nano/1"
 CPU = torch.device("cpu")
@@ -43,9 +40,7 @@ def save_weights(
         "licence": licence,
         "provenance": provenance,
     }
-    # one entry, because safetensors writes several in random order
-    metadata = {"lidarpainter": json.dumps(header, sort_keys=True)}
-    write_whole(path, save(tensors, metadata))
+    write_tensors(path, tensors, header)
 
 
 def load_weights(
@@ -77,18 +72,9 @@ def load_weights(
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     if not path.is_file():
         raise WeightsError(f"no painter weights at {path}: expected a .safetensors file")
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise WeightsError(f"{path} is not a readable safetensors file: {error}") from None
-    try:
-        header = {"format": "no format mark"} | json.loads(metadata.get("lidarpainter", "{}"))
-    except (ValueError, TypeError) as error:
-        raise WeightsError(f"weights file {path} has a damaged header: {error}") from None
-    if header["format"] != WEIGHTS_FORMAT:
-        found = header["format"]
+    tensors, header = read_tensors(path, damaged=WeightsError)
+    found = header.get("format", "no format mark")
+    if found != WEIGHTS_FORMAT:
         raise WeightsError(f"weights file {path} has {found!r}, expected {WEIGHTS_FORMAT!r}")
     return header, tensors
 

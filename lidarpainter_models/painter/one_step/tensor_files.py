@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from lidarpainter_models.errors import WeightsError
+from lidarpainter_models.storage.tensor_files import open_tensors
 
 PORTION_NUMBERS = 1 << 25
 """Numbers that are read before the file is opened anew: 128 MB of float32."""
@@ -51,7 +51,7 @@ def fill_from_file(
     # all of it before the first read: read buffers between them would leave holes behind
     weights = {name: torch.empty(shape, dtype=dtype) for name, shape in expected.items()}
     for names in _portions({name: shape for name, (_, shape) in stored.items()}):
-        with open_tensors(path) as file:
+        with open_weights(path) as (file, _):
             for name in names:
                 tensor = file.get_tensor(stored[name][0])
                 check_finite(path, name, tensor)
@@ -110,21 +110,18 @@ def stored_shapes(path: Path) -> dict[str, tuple[int, ...]]:
     Raises:
         WeightsError: the file cannot be read.
     """
-    with open_tensors(path) as file:
+    with open_weights(path) as (file, _):
         return {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
 
 
 @contextmanager
-def open_tensors(path: Path) -> Iterator[Any]:
-    """Open a safetensors file.
+def open_weights(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """Open a safetensors file and read its header, which is empty in a file of someone else.
 
     Raises:
         WeightsError: it is missing or damaged.
     """
     if not path.is_file():
         raise WeightsError(f"no weights at {path}: expected a .safetensors file")
-    try:
-        with safe_open(path, framework="pt") as file:
-            yield file
-    except (SafetensorError, OSError) as error:
-        raise WeightsError(f"{path} is not a readable safetensors file: {error}") from None
+    with open_tensors(path, damaged=WeightsError) as opened:
+        yield opened

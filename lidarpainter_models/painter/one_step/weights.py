@@ -5,14 +5,12 @@ and last layer and the fusion in float32, and the encoded prompts. The model its
 the header names it, with a few of its biases by which another model is found out.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import save
 from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError, WeightsError
@@ -27,14 +25,13 @@ from lidarpainter_models.painter.one_step.network import OneStepNetwork
 from lidarpainter_models.painter.one_step.tensor_files import (
     check_finite,
     check_shapes,
-    open_tensors,
+    open_weights,
 )
-from lidarpainter_models.storage.whole_files import write_whole
+from lidarpainter_models.storage.tensor_files import read_tensors, write_tensors
 
 WEIGHTS_FORMAT = "lidarpainter-one-step/1"
 PROMPT = "prompt:"
 """What names of encoded prompts begin with."""
-METADATA_KEY = "lidarpainter"
 IN_FLOAT32 = (FIRST_LAYER, LAST_LAYER, FUSION)
 
 
@@ -90,8 +87,7 @@ def save_trained(
         "licence": licence,
         "provenance": provenance,
     }
-    # one entry, because safetensors writes several in random order
-    write_whole(path, save(tensors, {METADATA_KEY: json.dumps(header, sort_keys=True)}))
+    write_tensors(path, tensors, header)
 
 
 def _stored(name: str, tensor: Tensor) -> Tensor:
@@ -121,14 +117,10 @@ def read_trained(path: Path) -> TrainedFile:
         raise WeightsError(f"weights file {path} has unusable settings: {error}") from None
     tensors: dict[str, Tensor] = {}
     prompts: dict[str, Tensor] = {}
-    with open_tensors(path) as file:
-        for name in file.keys():  # noqa: SIM118 - the file is no mapping
-            tensor = file.get_tensor(name)
-            check_finite(path, name, tensor)
-            if name.startswith(PROMPT):
-                prompts[name.removeprefix(PROMPT)] = tensor.clone()
-            else:
-                tensors[name] = tensor.clone()
+    for name, tensor in read_tensors(path, damaged=WeightsError)[0].items():
+        check_finite(path, name, tensor)
+        kept = prompts if name.startswith(PROMPT) else tensors
+        kept[name.removeprefix(PROMPT)] = tensor.clone()
     return TrainedFile(
         path=path,
         config=config,
@@ -168,15 +160,8 @@ def painter_header(path: Path) -> dict[str, Any]:
     Raises:
         WeightsError: the file is missing or damaged.
     """
-    with open_tensors(path) as file:
-        metadata = file.metadata() or {}
-    try:
-        header = json.loads(metadata.get(METADATA_KEY, "{}"))
-    except ValueError as error:
-        raise WeightsError(f"weights file {path} has a damaged header: {error}") from None
-    if not isinstance(header, dict):
-        raise WeightsError(f"weights file {path} has a damaged header: no object")
-    return header
+    with open_weights(path) as (_, header):
+        return header
 
 
 @torch.no_grad()

@@ -24,13 +24,13 @@ def test_damaged_checkpoint_is_refused(tmp_path):
     folder.save({"x": torch.zeros(100)}, {})
     whole = (tmp_path / FILE_NAME).read_bytes()
     (tmp_path / FILE_NAME).write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(SceneError, match="damaged"):
+    with pytest.raises(SceneError, match="is not a readable"):
         folder.load()
 
 
 def test_folder_that_cannot_be_written_is_one_clear_error(tmp_path):
     (tmp_path / "taken").write_text("a file")
-    with pytest.raises(StorageError, match="cannot write"):
+    with pytest.raises(StorageError, match="cannot be written"):
         CheckpointFolder(path=tmp_path / "taken").save({"x": torch.zeros(1)}, {})
 
 

@@ -16,8 +16,9 @@ from lidarpainter_models.painter import UnpaintedPainter, load_painter, selectio
 from lidarpainter_models.painter.one_step.assembly import trained_names
 from lidarpainter_models.painter.one_step.loading import load_one_step
 from lidarpainter_models.painter.one_step.presets import PRESETS
-from lidarpainter_models.painter.one_step.weights import METADATA_KEY, read_header, save_trained
+from lidarpainter_models.painter.one_step.weights import read_header, save_trained
 from lidarpainter_models.painter.precision import faster_type
+from lidarpainter_models.storage.tensor_files import HEADER_KEY
 
 FLOAT = torch.float32
 ROOT = Path(__file__).resolve().parents[3]
@@ -135,7 +136,7 @@ def respell(path, change):
     """Change a weights file's header and tensors."""
     header, tensors = read_header(path), load_file(path)
     change(header, tensors)
-    save_file(tensors, path, {METADATA_KEY: json.dumps(header)})
+    save_file(tensors, path, {HEADER_KEY: json.dumps(header)})
 
 
 @pytest.mark.parametrize(
