@@ -19,7 +19,7 @@ from bench_scenes import street_like_splats
 from bench_work import ADAM_BYTES, SSIM_BYTES_PER_VALUE, SSIM_FLOP_PER_VALUE
 from splat_drawing import render
 
-from lidarpainter_models.gaussians.fitting.config import FitConfig
+from lidarpainter_models.gaussians.fitting.config import FitConfig, RefinementConfig
 from lidarpainter_models.gaussians.fitting.images import full_image
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import fit_step
@@ -113,9 +113,9 @@ def training_images(cameras):
 class Fit:
     """A running fit whose steps can be timed."""
 
-    def __init__(self, count, width_px, height_px, *, blocks=1):
+    def __init__(self, count, width_px, height_px, *, blocks=1, start_step=100):
         scene, cameras = street_scene(count, width_px, height_px, blocks=blocks)
-        self.config = FitConfig(steps=10_000)
+        self.config = FitConfig(steps=10_000, refinement=RefinementConfig(start_step=start_step))
         self.state = FitState.begin(scene, self.config)
         self.images = training_images(cameras)
         self.view = 0

@@ -11,7 +11,6 @@ from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
 
 BLOCKS, PASSES = 4, 6
 EPS = torch.finfo(torch.float32).eps
-HUNDREDTH = 0.01
 
 
 def steps_of(fit, count):
@@ -20,8 +19,9 @@ def steps_of(fit, count):
     return fit
 
 
-def street_fit(count=400):
-    return Fit(count, 48, 32, blocks=BLOCKS)
+def street_fit(count=400, *, start_step=100):
+    """`start_step` is that of the refinement of poses."""
+    return Fit(count, 48, 32, blocks=BLOCKS, start_step=start_step)
 
 
 def parameters_of(fit):
@@ -40,8 +40,8 @@ def test_a_step_sees_its_own_part_of_the_street():
 
 def test_what_is_out_of_view_changes_nothing_beyond_rounding(monkeypatch):
     """Against a fit whose every step looks at everything."""
-    fit = steps_of(street_fit(), BLOCKS * PASSES)
-    everything = street_fit()
+    fit, everything = street_fit(start_step=0), street_fit(start_step=0)
+    steps_of(fit, BLOCKS * PASSES)
     monkeypatch.setattr(
         type(everything.state.blocks),
         "rows_in_view",
@@ -54,15 +54,18 @@ def test_what_is_out_of_view_changes_nothing_beyond_rounding(monkeypatch):
     for name, value in parameters_of(fit).items():
         if name == "body_index":
             continue
-        # Adam makes steps of one length out of gradients of any: where one cancels to a rounding
-        # of its terms, so does its step. A row left out or taken twice is a whole step off.
+        # Vector code rounds an exponential by its place in the array, and pose gradients are summed
+        # in other groups. Adam makes steps of one length out of gradients of any: where one cancels
+        # to a rounding of its terms, so does its step (by up to 0.03 of it for a handful, with
+        # every scale and opacity moved by a rounding). A row left out would be a whole step off.
         step = fit.config.learning_rates.at(name, 0.0) * (size_m if name == "means" else 1.0)
-        most = EPS * steps * truth[name].abs() + HUNDREDTH * step
-        assert bool(((value - truth[name]).abs() <= most).all()), name
-    # the pose gradients of a view, summed in other groups, and Adam's steps of them
-    tangent, expected = (f.state.scene.cameras.view_tangent for f in (fit, everything))
+        apart = ((value - truth[name]).abs() - EPS * steps * truth[name].abs()) / step
+        assert float(apart.max()) <= 0.1, name
+        assert float((apart > 1e-3).float().mean()) <= 0.01, name
+    tangent, expected = (f.state.scene.cameras.view_tangent.detach() for f in (fit, everything))
     step = fit.config.learning_rates.at("camera_rotation_rad", 0.0)
-    assert float((tangent - expected).abs().max()) <= HUNDREDTH * step
+    assert float(expected.abs().max()) > 10 * step
+    assert float((tangent - expected).abs().max()) <= 0.01 * step
     assert torch.equal(fit.state.tally.visits, everything.state.tally.visits)
 
 
