@@ -61,16 +61,14 @@ def implementation(
     return getattr(import_module(f"lidarpainter_models.kernels.{kernel}.{chosen}"), function)
 
 
-def float32_implementation(
-    kernel: str, function: str, backend: Backend, like: Tensor
-) -> Callable[..., Any]:
-    """`implementation` of a kernel whose numba version takes float32 alone.
+def float32_backend(kernel: str, backend: Backend, like: Tensor) -> Backend:
+    """The backend of a kernel whose numba version takes float32 alone, for such numbers.
 
     Raises:
-        BackendError: see `implementation`; or numba was asked for another kind of numbers.
+        BackendError: numba was asked for another kind of numbers.
     """
-    if like.dtype != torch.float32 and backend == "auto":
-        backend = "reference"
-    if like.dtype != torch.float32 and backend == "cpu":
+    if like.dtype == torch.float32:
+        return backend
+    if backend == "cpu":
         raise BackendError(f"the numba {kernel} takes float32, got {like.dtype}")
-    return implementation(kernel, function, backend, like.device)
+    return "reference" if backend == "auto" else backend

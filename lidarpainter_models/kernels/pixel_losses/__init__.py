@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import ShapeError
-from lidarpainter_models.kernels.backends import Backend, float32_implementation
+from lidarpainter_models.kernels.backends import Backend, float32_backend, implementation
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
 from lidarpainter_models.kernels.pixel_losses.pixel_facts import (
     NOTHING,
@@ -51,5 +51,10 @@ def pixel_terms(
     for name, tensor in (("sky_rgb", sky_rgb), ("rgb", facts.rgb), ("depth", facts.lidar_depth_m)):
         if tensor.shape[:2] != size:
             raise ShapeError(f"an image of {tuple(size)} needs {name} alike, got {tensor.shape}")
-    terms = float32_implementation("pixel_losses", "pixel_terms", backend, image.rgb)
+    terms = implementation(
+        "pixel_losses",
+        "pixel_terms",
+        float32_backend("pixel_losses", backend, image.rgb),
+        image.rgb.device,
+    )
     return terms(image, sky_rgb, facts, rules)

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.kernels.backends import Backend, float32_implementation, implementation
+from lidarpainter_models.kernels.backends import Backend, float32_backend, implementation
 from lidarpainter_models.kernels.sky_texture.layout import SkyLayout, SkyRays, TexelMoments
 
 __all__ = [
@@ -55,7 +55,9 @@ def sample_sky(
     """
     if texture.shape != (layout.rows, layout.columns, 3):
         raise ShapeError(f"a texture of {layout} has another shape than {tuple(texture.shape)}")
-    sample = float32_implementation("sky_texture", "sample", backend, texture)
+    sample = implementation(
+        "sky_texture", "sample", float32_backend("sky_texture", backend, texture), texture.device
+    )
     return sample(texture.detach(), rays, layout)
 
 
@@ -81,7 +83,9 @@ def scatter_gradient(
             f"need a gradient and a weight for each of {tuple(size)} rays, got "
             f"{tuple(gradient.shape)} and {tuple(weight.shape)}"
         )
-    scatter = float32_implementation("sky_texture", "scatter", backend, gradient)
+    scatter = implementation(
+        "sky_texture", "scatter", float32_backend("sky_texture", backend, gradient), gradient.device
+    )
     return scatter(gradient, weight, rays, layout)
 
 
@@ -106,5 +110,7 @@ def step_texels(
             f"texture, gradient and weight differ in size: {tuple(texture.shape)}, "
             f"{tuple(gradient.shape)}, {tuple(weight.shape)}"
         )
-    step = float32_implementation("sky_texture", "adam", backend, texture)
+    step = implementation(
+        "sky_texture", "adam", float32_backend("sky_texture", backend, texture), texture.device
+    )
     step(texture, moments, gradient, weight, learning_rate)

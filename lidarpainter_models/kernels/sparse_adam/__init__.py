@@ -6,11 +6,13 @@ once. Centres move in units of their Gaussian's own size, the geometric mean of 
 deviations.
 """
 
+from collections.abc import Callable
+
 from jaxtyping import Int
 from torch import Tensor
 
 from lidarpainter_models.errors import ShapeError
-from lidarpainter_models.kernels.backends import Backend, float32_implementation
+from lidarpainter_models.kernels.backends import Backend, float32_backend, implementation
 from lidarpainter_models.kernels.sparse_adam.state import (
     MOST_STEP,
     MOST_UNITS,
@@ -43,9 +45,7 @@ def present_rows(
         ShapeError: the kept parameters or `out` have another number of rows.
     """
     _check(state, kept, rows, out)
-    float32_implementation("sparse_adam", "present_rows", backend, kept.means)(
-        state, kept, rows, out
-    )
+    _chosen("present_rows", kept, backend)(state, kept, rows, out)
 
 
 def step_rows(
@@ -76,9 +76,7 @@ def step_rows(
     _check(state, kept, rows, gradients)
     state.count += 1
     state.missed.append(rates)
-    float32_implementation("sparse_adam", "step_rows", backend, kept.means)(
-        state, kept, rows, seen, gradients, rates
-    )
+    _chosen("step_rows", kept, backend)(state, kept, rows, seen, gradients, rates)
 
 
 def catch_up(state: AdamState, kept: Parameters, *, backend: Backend = "auto") -> None:
@@ -89,7 +87,7 @@ def catch_up(state: AdamState, kept: Parameters, *, backend: Backend = "auto") -
     """
     _check(state, kept)
     if state.missed:
-        float32_implementation("sparse_adam", "catch_up", backend, kept.means)(state, kept)
+        _chosen("catch_up", kept, backend)(state, kept)
     state.missed = []
 
 
@@ -100,3 +98,8 @@ def _check(
         raise ShapeError(f"moments of {len(state.last)} rows, but {len(kept.means)} are kept")
     if rows is not None and seen is not None and len(seen.means) != len(rows):
         raise ShapeError(f"{len(rows)} rows are meant, but {len(seen.means)} are given")
+
+
+def _chosen(function: str, kept: Parameters, backend: Backend) -> Callable[..., None]:
+    backend = float32_backend("sparse_adam", backend, kept.means)
+    return implementation("sparse_adam", function, backend, kept.means.device)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import ShapeError
-from lidarpainter_models.kernels.backends import Backend, float32_implementation
+from lidarpainter_models.kernels.backends import Backend, float32_backend, implementation
 
 
 def ssim_map(
@@ -28,7 +28,9 @@ def ssim_map(
         BackendError: the numba version was asked for and the images are not float32 on the CPU.
     """
     _check_images(first_rgb, second_rgb)
-    compute = float32_implementation("ssim", "ssim_map", backend, first_rgb)
+    compute = implementation(
+        "ssim", "ssim_map", float32_backend("ssim", backend, first_rgb), first_rgb.device
+    )
     return compute(first_rgb, second_rgb.detach())
 
 
@@ -76,7 +78,9 @@ def l1_ssim_loss(
             f"{tuple(rendered.shape)}"
         )
     weight = pixel_weight.detach().to(rendered.dtype)
-    compute = float32_implementation("ssim", "l1_ssim_loss", backend, rendered)
+    compute = implementation(
+        "ssim", "l1_ssim_loss", float32_backend("ssim", backend, rendered), rendered.device
+    )
     return compute(rendered, target.detach(), weight, ssim_weight)
 
 
