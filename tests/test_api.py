@@ -1,0 +1,80 @@
+"""The public names, and the example that the README gives of them."""
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+from catalog.code_closure import SourceTree
+from drawn_streets import drawn_street
+
+import lidarpainter_models as lp
+from lidarpainter_models import api
+from lidarpainter_models.evaluation import judging
+from lidarpainter_models.synthetic import sequence
+
+ROOT = Path(__file__).resolve().parents[1]
+MOST_MS = 50.0
+CLOCK = """
+import sys, time
+begun = time.perf_counter()
+import lidarpainter_models as lp
+print(1000 * (time.perf_counter() - begun), lp.__version__, "torch" in sys.modules)
+"""
+
+
+def test_every_public_name_is_found_and_typed():
+    stub = ast.parse((ROOT / "lidarpainter_models" / "__init__.pyi").read_text("utf-8"))
+    typed = [
+        alias.asname
+        for node in stub.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    ]
+    assert typed == lp.__all__ == api.__all__
+    assert all(getattr(lp, name) is getattr(api, name) for name in lp.__all__)
+
+
+def test_import_is_quick_and_loads_nothing():
+    told = [
+        subprocess.run(
+            [sys.executable, "-c", CLOCK], cwd=ROOT, capture_output=True, text=True, check=True
+        ).stdout.split()
+        for _ in range(3)
+    ]
+    assert min(float(milliseconds) for milliseconds, _version, _torch in told) < MOST_MS
+    assert {(version, torch) for _ms, version, torch in told} == {(lp.__version__, "False")}
+
+
+def test_no_stage_reaches_the_public_names():
+    """Else an edit to any room would make every result stale."""
+    source = SourceTree.of_packages("flows", "tasks", "lidarpainter_models")
+    reached = source.code_from(["flows.reconstruct:reconstruct"]).modules
+    assert "lidarpainter_models.gaussians.fitting.fit" in reached
+    assert "lidarpainter_models.api" not in reached
+
+
+def test_example_of_the_readme_ends_with_an_image(tmp_path, monkeypatch, capsys):
+    # the same street, drawn once for all tests of the process
+    monkeypatch.setattr(sequence, "SyntheticStreet", drawn_street)
+    monkeypatch.setattr(
+        judging, "known_street", lambda scene: drawn_street(street_of(scene.manifest))
+    )
+    monkeypatch.chdir(tmp_path)
+    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.S)
+    assert len(example.splitlines()) < 30
+    exec(compile(example, "README.md", "exec"), {})  # noqa: S102 - our own page
+    assert "psnr" in capsys.readouterr().out
+    image = cv2.imread(str(tmp_path / "lidarpainter-example" / "aside.png"))
+    assert image.shape == (96, 320, 3)
+    render, painted = np.split(image.astype(float), 2, axis=1)
+    assert render.std() > 20
+    assert painted.std() > 20
+    assert 1 < np.abs(render - painted).mean() < 60
+
+
+def street_of(manifest):
+    return lp.SyntheticStreetConfig.from_dict(manifest["generator"]["config"])
