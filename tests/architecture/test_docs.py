@@ -1,0 +1,55 @@
+"""What the prose names is there."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+LIBRARY = "lidarpainter_models"
+PACKAGES = ("flows", "tasks", "catalog", LIBRARY, "tests", "docs", "scripts")
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+HISTORY = "CHANGELOG.md"
+"""Names what was there."""
+LINK = re.compile(r"\]\((?!https?://)([^)#\s]+)(?:#[^)\s]*)?\)")
+NAMED = re.compile(r"`([\w./-]+)`")
+MADE_BY_A_RUN = {"nano.json", "trajectory.json"}
+QUESTION = re.compile(r"^\| (.+\?) \| `([\w./]+)` \| `(\w+)` \|$", re.MULTILINE)
+
+
+def relative(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def path_of(name: str) -> Path:
+    """A file that is named from the root, or from the library as its rooms are."""
+    first = name.split("/")[0]
+    return ROOT / name if first in PACKAGES or "/" not in name else ROOT / LIBRARY / name
+
+
+@pytest.mark.parametrize("page", PAGES, ids=relative)
+def test_every_link_leads_somewhere(page):
+    links = LINK.findall(page.read_text("utf-8"))
+    assert [link for link in links if not (page.parent / link).exists()] == []
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.name != HISTORY], ids=relative)
+def test_every_source_file_that_is_named_is_there(page):
+    rooms = {path.name for path in (ROOT / LIBRARY).iterdir() if path.is_dir()}
+    named = [
+        name
+        for name in NAMED.findall(page.read_text("utf-8"))
+        if "/" in name and name.split("/")[0] in {*PACKAGES, *rooms}
+    ]
+    assert [name for name in named if not path_of(name).exists()] == []
+
+
+def test_ten_questions_are_answered_where_the_page_says():
+    page = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+    questions = QUESTION.findall(page)
+    assert len(questions) == 10
+    for question, file, name in questions:
+        tree = ast.parse(path_of(file).read_text("utf-8"))
+        defined = {node.name for node in tree.body if hasattr(node, "name")}
+        assert name in defined, question
