@@ -51,7 +51,11 @@ def balanced(scene: str) -> ReconstructParameters:
 
 
 def paper(scene: str) -> ReconstructParameters:
-    """The paper's numbers: 7000 steps, then novel views up to step 30000, at 1024 pixels."""
+    """The paper's numbers: 7000 steps, then novel views up to step 30000, at 1024 pixels.
+
+    Its LPIPS counts where weights are given: `--set lpips.backbone=FILE --set lpips.heads=FILE`
+    with `fit.losses.perceptual=1`, `refine.losses.perceptual=1` and `refine.guidance.perceptual=1`.
+    """
     fit = FitConfig(steps=7_000, half_resolution=0.0)
     guidance = GuidanceConfig(probability=0.4, weight=0.2, ssim=0.1, freedom="all")
     return ReconstructParameters(

@@ -16,7 +16,7 @@ from flows.parameters import ReconstructParameters
 from lidarpainter_models.painter.selection import PainterChoice
 from tasks.opened import open_scene
 from tasks.source import code_behind
-from tasks.weights import weights_digests
+from tasks.weights import file_digests
 
 START = "flows.reconstruct:reconstruct"
 """The code of a run is what this flow reaches."""
@@ -25,7 +25,7 @@ START = "flows.reconstruct:reconstruct"
 def run_identity(parameters: ReconstructParameters, store: Store) -> str:
     """The id of a run: the same scene content, parameters, weights and code are the same run."""
     scene = open_scene(store, parameters.scene)
-    weights = weights_digests(parameters.judge_config)
+    weights = file_digests(parameters.judge_config.weight_files)
     return run_id_of(
         scene.content_digest,
         [plain(parameters), PainterChoice.of(parameters.painter).digest, weights],

@@ -15,6 +15,7 @@ from flows.overrides import with_overrides
 from flows.parameters import ReconstructParameters
 from flows.presets import preset as preset_named
 from flows.recall import START, located, recalled, run_identity
+from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.score_tables import Scores
 from lidarpainter_models.export.run_page import GUIDANCE_COLUMNS
 from lidarpainter_models.metrics.perceptual import load_distances
@@ -73,12 +74,16 @@ def check_inputs(parameters: ReconstructParameters, store_path: Path) -> None:
 
     Raises:
         SceneError: the scene is not there, or lacks a camera.
-        ConfigError: the split leaves nothing to train on, or the device is not there.
+        ConfigError: the split leaves nothing to train on, the device is not there, or a fit weighs
+            a distance without weights.
         WeightsError: the painter or the weights of a perceptual distance cannot be used.
     """
     run = opened(parameters.run_spec(store_path))
     run.painter.load(run.device)
     load_distances(parameters.feature_weights, parameters.lpips)
+    missing = parameters.lpips.missing
+    if missing and (parameters.fit.weighs_perceptual or parameters.refine.weighs_perceptual):
+        raise ConfigError(f"a fit weighs a perceptual distance: {missing}")
 
 
 @flow(name="reconstruct-scene")
@@ -101,7 +106,8 @@ def _run(course: Course) -> dict[str, Any]:
     started = time.perf_counter()
     parameters, run = course.parameters, course.run
     seen = course.add("prepare", prepare(run, parameters.observation))
-    first = course.add("fit", fit(run, "fit", seen.ref, parameters.fit))
+    lpips = parameters.lpips
+    first = course.add("fit", fit(run, "fit", seen.ref, parameters.fit, lpips=lpips))
     fitted = FittedRef(seen.ref, first.ref)
     final = _rounds(course, fitted)
     store = open_store(run.store_path)
@@ -149,6 +155,7 @@ def _rounds(course: Course, fitted: FittedRef) -> FittedRef:
             parameters.refine,
             start=fitted.gaussians,
             guidance=guidance,
+            lpips=parameters.lpips,
         )
         fitted = FittedRef(fitted.observations, course.add(stage, refined).ref)
     return fitted

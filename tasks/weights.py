@@ -1,19 +1,19 @@
 """Digests of the weights that users supply for perceptual distances."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from catalog.digests import DIGEST_LENGTH, digest_file
 from lidarpainter_models.errors import WeightsError
-from lidarpainter_models.evaluation.judging import JudgeConfig
 
 
-def weights_digests(config: JudgeConfig) -> dict[str, str]:
-    """What the perceptual distances depend on, by the part each file plays.
+def file_digests(files: Mapping[str, Path]) -> dict[str, str]:
+    """Digests of files, by the part each plays.
 
     Raises:
         WeightsError: a file is not there.
     """
-    return {name: _digest_of(path) for name, path in config.weight_files.items()}
+    return {name: _digest_of(path) for name, path in files.items()}
 
 
 def _digest_of(path: Path) -> str:

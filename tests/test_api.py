@@ -8,10 +8,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from catalog.code_closure import SourceTree
 from drawn_streets import drawn_street
 
 import lidarpainter_models as lp
+from catalog.code_closure import SourceTree
 from lidarpainter_models import api
 from lidarpainter_models.evaluation import judging
 from lidarpainter_models.synthetic import sequence

@@ -43,12 +43,8 @@ class JudgeConfig:
     @property
     def weight_files(self) -> dict[str, Path]:
         """Files that the perceptual distances depend on, by the part they play."""
-        files = {
-            "features": self.feature_weights,
-            "lpips backbone": self.lpips.backbone,
-            "lpips heads": self.lpips.heads,
-        }
-        return {name: path for name, path in files.items() if path is not None}
+        features = {} if self.feature_weights is None else {"features": self.feature_weights}
+        return features | self.lpips.named
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -103,6 +103,12 @@ class LpipsFiles:
     """The linear heads of the same network, version 0.1."""
 
     @property
+    def named(self) -> dict[str, Path]:
+        """The files that are named, by the part they play."""
+        files = {"lpips backbone": self.backbone, "lpips heads": self.heads}
+        return {name: path for name, path in files.items() if path is not None}
+
+    @property
     def missing(self) -> str | None:
         """Why there can be no figure; None where both are named."""
         halves = {"a backbone": self.backbone, "linear heads": self.heads}

@@ -18,7 +18,7 @@ from tasks.opened import OpenedRun, RunSpec, opened
 from tasks.progress import Progress
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
 from tasks.stored import FittedRef
-from tasks.weights import weights_digests
+from tasks.weights import file_digests
 
 SCORES_FILE = "scores.json"
 
@@ -33,7 +33,7 @@ def evaluate(
         this.store,
         stage=stage,
         kind="evaluation",
-        inputs=judged_inputs(this, fitted, view_time=view_time) | weights_digests(config),
+        inputs=judged_inputs(this, fitted, view_time=view_time) | file_digests(config.weight_files),
         config={
             "split": run.split,
             "observation": asdict(config.observation),

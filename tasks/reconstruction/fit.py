@@ -11,14 +11,17 @@ from catalog.artefacts import ArtefactRef, Workplace
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
+from lidarpainter_models.gaussians.fitting.step import Perceptual
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene, describe
 from lidarpainter_models.gaussians.model.stored_scene import copy_scene
+from lidarpainter_models.metrics.lpips import LpipsFiles, load_lpips
 from lidarpainter_models.observations.views import GuidanceView, SceneObservations
 from tasks.opened import RunSpec, opened
 from tasks.progress import Progress
 from tasks.reconstruction.painted_views import load_guidance
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
 from tasks.stored import load_observations, load_scene, save_scene
+from tasks.weights import file_digests
 
 CHECKPOINT_EVERY_S = 10.0
 """A killed fit repeats at most this much."""
@@ -33,6 +36,7 @@ def fit(
     *,
     start: ArtefactRef | None = None,
     guidance: ArtefactRef | None = None,
+    lpips: LpipsFiles | None = None,
 ) -> StageResult:
     """Fit a scene to what was recorded.
 
@@ -43,20 +47,24 @@ def fit(
         config: see there.
         start: the fitted scene to go on from; None starts from the LiDAR map.
         guidance: painted views to go on with; None, for an equally long control, has none.
+        lpips: weights of the perceptual distance that the config may weigh.
     """
     this = opened(run)
+    weighed = lpips if config.weighs_perceptual else None
     inputs = {"observations": observations, "start": start, "guidance": guidance}
     return run_stage(
         this.store,
         stage=stage,
         kind="gaussians",
-        inputs={name: ref.digest for name, ref in inputs.items() if ref is not None},
+        inputs={name: ref.digest for name, ref in inputs.items() if ref is not None}
+        | (file_digests(weighed.named) if weighed is not None else {}),
         config=asdict(config),
         build=partial(
             _build,
             observations=partial(load_observations, this.store, observations),
             start=partial(load_scene, this.store, start) if start is not None else None,
             guidance=partial(load_guidance, this.store, guidance) if guidance is not None else None,
+            perceptual=partial(load_lpips, weighed) if weighed is not None else None,
             config=config,
         ),
     )
@@ -69,6 +77,7 @@ def _build(
     observations: Callable[[], SceneObservations],
     start: Callable[[], GaussianScene] | None,
     guidance: Callable[[], tuple[GuidanceView, ...]] | None,
+    perceptual: Callable[[], Perceptual | None] | None,
     config: FitConfig,
 ) -> dict[str, Any]:
     def told(step: int, steps: int, entry: dict[str, float]) -> None:
@@ -84,6 +93,7 @@ def _build(
             path=place.scratch, identity=place.scratch.name, every_seconds=CHECKPOINT_EVERY_S
         ),
         progress=told,
+        perceptual=perceptual() if perceptual else None,
     )
     save_scene(place.output, result.scene, result.history)
     last = result.history[-1]

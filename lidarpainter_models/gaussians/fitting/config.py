@@ -81,6 +81,11 @@ class FitConfig:
     log_every: int = 50
     """Steps between two entries of the history."""
 
+    @property
+    def weighs_perceptual(self) -> bool:
+        """Whether a perceptual distance takes part, which must then be given."""
+        return max(self.losses.perceptual, self.guidance.perceptual) > 0
+
     def __post_init__(self) -> None:
         """Refuse settings that make no fit."""
         if self.steps < 1 or self.log_every < 1:

@@ -176,7 +176,7 @@ def _check(
             f"the start was fitted to {len(start.cameras.keys)} other training views than the "
             f"{len(keys)} given"
         )
-    if perceptual is None and max(config.losses.perceptual, config.guidance.perceptual) > 0:
+    if perceptual is None and config.weighs_perceptual:
         raise ConfigError(
             "losses.perceptual or guidance.perceptual is positive, but no perceptual distance is "
             "given"
