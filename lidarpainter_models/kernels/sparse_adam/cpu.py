@@ -102,7 +102,7 @@ class _Columns(NamedTuple):
 
 def _columns(parameters: Parameters) -> _Columns:
     """The compiled code's view of parameters; what it writes to contiguous ones is theirs."""
-    arrays = [value.detach().contiguous().numpy() for value in parameters]
+    arrays = [value.contiguous().numpy() for value in parameters]
     flat = [value.reshape(len(value), value.shape[1] * 3) for value in arrays[4:]]
     return _Columns(*arrays[:4], *flat)
 

@@ -20,7 +20,7 @@ ends in single numbers."""
 
 
 class Parameters(NamedTuple):
-    """Parameters of Gaussians (or their gradients), a row each."""
+    """Parameters of Gaussians (or their gradients), a row each, detached."""
 
     means: Tensor
     rotation_wxyz: Tensor
