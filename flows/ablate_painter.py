@@ -1,28 +1,29 @@
 """Painters that differ in one thing, trained on the same pairs at the same budget, judged alike."""
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from prefect import flow
 from pydantic import BaseModel, ConfigDict
 
 from catalog.store import open_store
-from flows.train_painter import named_sets, training_cost
+from flows.train_painter import training_cost
+from lidarpainter_models.devices import Device, chosen_device
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.metrics.lpips import LpipsFiles
 from lidarpainter_models.painter import OverlayPainter, UnpaintedPainter, WarpPainter
 from lidarpainter_models.painter.nano.ablations import REFERENCE, ablation_tables
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
-from lidarpainter_models.painter.one_step.training import OneStepTrainingConfig
-from lidarpainter_models.painter.one_step.variants import ablations, distinct
-from tasks.painter.judge import judge_painters, open_sets
-from tasks.painter.students import PainterTraining, student_of
-from tasks.painter.train import WEIGHTS_SUFFIX, train, weights_path
+from lidarpainter_models.painter.training_jobs import PainterTraining, job_for
+from lidarpainter_models.training_data.pair_sets import named_sets, open_sets
+from tasks.painter.judge import judge_painters
+from tasks.painter.train import TrainingRequest, train, weights_path
 
-_Table = TypeVar("_Table")
 UNLEARNED = (UnpaintedPainter.name, OverlayPainter.name, WarpPainter.name)
+
+Tables = Mapping[str, Mapping[str, PainterTraining]]
 
 
 class AblationParameters(BaseModel):
@@ -32,35 +33,49 @@ class AblationParameters(BaseModel):
 
     train_folders: tuple[Path, ...]
     test_folders: tuple[Path, ...]
-    tables: tuple[str, ...] | None = None
-    """Which choices are varied, see `nano.ablations` and `one_step.variants`; None varies all."""
-    base: str | None = None
-    """Model that one-step painters are trained on; None trains small painters."""
     training: PainterTraining = NanoTrainingConfig()
+    """The recipe in which one thing is varied."""
+    chosen: tuple[str, ...] | None = None
+    """Names of the tables that are made; None makes all."""
+    tables: Tables | None = None
+    """Recipes by table and row; None takes those of the small painter (`nano.ablations`)."""
+    base: str | None = None
+    """Model that one-step painters are trained on."""
     lpips: LpipsFiles = LpipsFiles()
-    """Weights for the loss of the one-step painter."""
+    """Weights for the loss of one-step painters."""
     feature_weights: Path | None = None
+    device: Device = "auto"
 
 
 @flow(name="ablate_painter")
 def ablate_painter(parameters: AblationParameters, store_path: Path) -> dict[str, Any]:
-    """Train every variant once and judge it beside the painters that learn nothing."""
+    """Train every recipe once and judge it beside the painters that learn nothing."""
     learnt = named_sets(parameters.train_folders)
-    tables, variants = _varied(parameters)
+    device = str(chosen_device(parameters.device))
+    rows, recipes = _distinct(_tables(parameters))
     painters = {name: name for name in UNLEARNED}
     costs = {}
-    for label, config in variants.items():
-        stage = f"train {label}"
-        trained = train(store_path, stage, learnt, config, 0.0, parameters.base, parameters.lpips)
+    for label, config in recipes.items():
+        request = TrainingRequest(
+            sets=learnt,
+            config=config,
+            start=parameters.base,
+            lpips=parameters.lpips,
+            device=device,
+        )
+        trained = train(store_path, f"train {label}", request)
         painters[label] = str(weights_path(open_store(store_path), trained.ref))
         costs[label] = training_cost(trained)
     judged = judge_painters(
-        painters, named_sets(parameters.test_folders), parameters.feature_weights
+        painters,
+        named_sets(parameters.test_folders),
+        feature_weights=parameters.feature_weights,
+        device=device,
     )
     rules = {name: name for name in UNLEARNED}
     return {
         **judged,
-        "tables": {name: rules | rows for name, rows in tables.items()},
+        "tables": {name: rules | labels for name, labels in rows.items()},
         "weights": {label: painters[label] for label in costs},
         "training": costs,
     }
@@ -70,16 +85,14 @@ def check_ablation(parameters: AblationParameters) -> None:
     """Find what is missing before an hour of training.
 
     Raises:
-        ConfigError: no such table, a weights file in place of a model, a loss that lacks what it
-            weighs, or pairs without the reference image that a variant is shown.
+        ConfigError: no such table, a loss that lacks what it weighs, or pairs without the reference
+            image that a painter is shown.
         DataError: a folder holds no pairs.
         WeightsError: the model cannot be used.
     """
-    if parameters.base is not None and parameters.base.endswith(WEIGHTS_SUFFIX):
-        raise ConfigError("an ablation wires a model in many ways; a weights file has its own")
-    student_of(parameters.training, parameters.base, parameters.lpips)
-    _, variants = _varied(parameters)
-    shown = [name for name, one in variants.items() if REFERENCE in one.network.inputs]
+    job_for(parameters.training, parameters.base, parameters.lpips)
+    _, recipes = _distinct(_tables(parameters))
+    shown = [name for name, one in recipes.items() if REFERENCE in one.network.inputs]
     for folders in (parameters.train_folders, parameters.test_folders):
         for name, folder in open_sets(named_sets(folders)).items():
             bare = folder.first_without("reference_rgb") if shown else None
@@ -90,31 +103,35 @@ def check_ablation(parameters: AblationParameters) -> None:
                 )
 
 
-def _varied(
-    parameters: AblationParameters,
-) -> tuple[dict[str, dict[str, str]], dict[str, PainterTraining]]:
-    """The painters' labels by table and row, and what is trained by label, each once."""
+def _tables(parameters: AblationParameters) -> Tables:
+    """The recipes of the chosen tables.
+
+    Raises:
+        ConfigError: there is no such table.
+    """
+    tables = parameters.tables
     training = parameters.training
-    if isinstance(training, OneStepTrainingConfig):
-        wirings = _chosen(ablations(training.network), parameters.tables)
-        once = distinct(wirings)
-        labels = {wiring: label for label, wiring in once.items()}
-        rows = {
-            name: {f"{name}: {value}": labels[wiring] for value, wiring in choices.items()}
-            for name, choices in wirings.items()
+    if tables is None and isinstance(training, NanoTrainingConfig):
+        tables = {
+            name: {row: replace(training, network=network) for row, network in networks.items()}
+            for name, networks in ablation_tables(training.network).items()
         }
-        return rows, {label: replace(training, network=one) for label, one in once.items()}
-    networks = _chosen(ablation_tables(training.network), parameters.tables)
-    rows = {name: {label: label for label in variants} for name, variants in networks.items()}
-    return rows, {
-        label: replace(training, network=network)
-        for variants in networks.values()
-        for label, network in variants.items()
-    }
-
-
-def _chosen(tables: dict[str, _Table], names: Iterable[str] | None) -> dict[str, _Table]:
-    for name in names or ():
+    if tables is None:
+        raise ConfigError("an ablation of the one-step painter needs its tables of recipes")
+    for name in parameters.chosen or ():
         if name not in tables:
             raise ConfigError(f"no ablation {name!r}, expected {', '.join(tables)}")
-    return tables if names is None else {name: tables[name] for name in names}
+    return {name: tables[name] for name in parameters.chosen or tables}
+
+
+def _distinct(tables: Tables) -> tuple[dict[str, dict[str, str]], dict[str, PainterTraining]]:
+    """Every recipe once, under the label of its first row; and that label by table and row."""
+    recipes: dict[str, PainterTraining] = {}
+    rows: dict[str, dict[str, str]] = {}
+    for name, table in tables.items():
+        rows[name] = {}
+        for row, recipe in table.items():
+            known = [label for label, one in recipes.items() if one == recipe]
+            rows[name][row] = known[0] if known else row
+            recipes.setdefault(rows[name][row], recipe)
+    return rows, recipes

@@ -1,6 +1,6 @@
 """From scenes to a trained painter: harvest pairs, train, judge on pairs held back, publish."""
 
-from collections.abc import Iterable
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,21 +9,26 @@ from prefect import flow
 from pydantic import BaseModel, ConfigDict
 
 from catalog.store import open_store, split_scene_id
+from lidarpainter_models.devices import Device, chosen_device
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.held_back import (
     FIRST_TRAINING_SEED,
     check_street_seed,
     check_training_pairs,
     check_training_scene,
+    first_targets,
 )
 from lidarpainter_models.metrics.lpips import LpipsFiles
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
+from lidarpainter_models.painter.selection import WEIGHTS_SUFFIX
+from lidarpainter_models.painter.training_jobs import PainterTraining, job_for
+from lidarpainter_models.storage.whole_files import write_whole
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
 from lidarpainter_models.training_data.harvest import HarvestConfig
+from lidarpainter_models.training_data.pair_sets import PairSet, named_sets
 from lidarpainter_models.training_data.street_harvest import StreetPlan, default_street_plans
 from tasks.opened import SplitSpec
 from tasks.painter.harvest import (
-    PairSet,
     harvest_recorded,
     harvest_street,
     keep_street,
@@ -36,8 +41,8 @@ from tasks.painter.judge import (
     load_painting_scores,
     samples_path,
 )
-from tasks.painter.students import PainterTraining, student_of
 from tasks.painter.train import (
+    TrainingRequest,
     publish_painter,
     train,
     training_record,
@@ -81,10 +86,12 @@ class TrainPainterParameters(HarvestParameters):
     training: PainterTraining = NanoTrainingConfig()
     lpips: LpipsFiles = LpipsFiles()
     """Weights for the loss of the one-step painter."""
+    device: Device = "auto"
+    """Where the one-step painter is trained, and what is trained is judged."""
     processes: int = 1
     """In which the one-step painter is trained, each on a GPU of its own."""
     held_back: float = 0.1
-    """Share of the true images that are kept from training, to judge by."""
+    """Share of the true images that are kept from training: the validation split."""
     feature_weights: Path | None = None
     """SqueezeNet 1.1 weights for the feature distance; None leaves it out."""
 
@@ -99,30 +106,33 @@ def harvest_pairs(parameters: HarvestParameters, store_path: Path) -> dict[str, 
 def train_painter(parameters: TrainPainterParameters, store_path: Path) -> dict[str, Any]:
     """Harvest, train, judge on what was held back, and enter the painter into the catalog."""
     check_sources(parameters)
-    store = open_store(store_path)
-    harvested = _harvested(parameters, store_path)
+    harvested, store = _harvested(parameters, store_path), open_store(store_path)
     sets = (*(made for made, _ in harvested), *named_sets(parameters.pair_folders))
-    start = parameters.base or parameters.start
-    trained = train(
-        store_path,
-        "train",
-        sets,
-        parameters.training,
-        parameters.held_back,
-        start,
-        parameters.lpips,
-        parameters.processes,
+    device = str(chosen_device(parameters.device))
+    request = TrainingRequest(
+        sets=sets,
+        config=parameters.training,
+        held_back=parameters.held_back,
+        start=parameters.base or parameters.start,
+        lpips=parameters.lpips,
+        device=device,
+        num_processes=parameters.processes,
     )
+    trained = train(store_path, "train", request)
     scores, samples = None, None
     if parameters.held_back > 0:
         weights = weights_path(store, trained.ref)
         judged = judge_held_back(
-            store_path, "judge", weights, sets, parameters.held_back, parameters.feature_weights
+            store_path,
+            "judge",
+            weights,
+            sets,
+            parameters.held_back,
+            feature_weights=parameters.feature_weights,
+            device=device,
         )
-        scores, samples = (
-            load_painting_scores(store, judged.ref),
-            str(samples_path(store, judged.ref)),
-        )
+        scores = load_painting_scores(store, judged.ref)
+        samples = str(samples_path(store, judged.ref))
     row = publish_painter(store_path, trained.ref, scores)
     return {
         "painter_id": row["painter_id"],
@@ -136,6 +146,16 @@ def train_painter(parameters: TrainPainterParameters, store_path: Path) -> dict[
     }
 
 
+def check_harvest(parameters: HarvestParameters) -> None:
+    """Refuse to harvest nothing.
+
+    Raises:
+        ConfigError: there are neither streets nor scenes.
+    """
+    if not parameters.street_seeds and not parameters.scenes:
+        raise ConfigError("nothing to harvest: expected --seeds or --scene")
+
+
 def check_sources(parameters: TrainPainterParameters) -> None:
     """Refuse to train on nothing, or on what judges painters.
 
@@ -147,7 +167,8 @@ def check_sources(parameters: TrainPainterParameters) -> None:
     """
     feature_distance_of(parameters.feature_weights)
     start = parameters.base or parameters.start
-    student_of(parameters.training, start, parameters.lpips, parameters.processes)
+    job = job_for(parameters.training, start, parameters.lpips, num_processes=parameters.processes)
+    first_targets(job)
     if not (parameters.street_seeds or parameters.scenes or parameters.pair_folders):
         raise ConfigError("nothing to train on: expected street seeds, scenes or folders of pairs")
     for seed in parameters.street_seeds:
@@ -156,17 +177,6 @@ def check_sources(parameters: TrainPainterParameters) -> None:
         check_training_scene(*split_scene_id(scene_id))
     for one in named_sets(parameters.pair_folders):
         check_training_pairs(one.open())
-
-
-def named_sets(folders: Iterable[Path]) -> tuple[PairSet, ...]:
-    """Folders of pairs under the shortest ends of their paths that tell them apart."""
-    paths = [folder.absolute() for folder in folders]
-    if len(set(paths)) != len(paths):
-        raise ConfigError("a folder of pairs is given twice")
-    depth = 1
-    while len({path.parts[-depth:] for path in paths}) < len(paths):
-        depth += 1
-    return tuple(PairSet(name="/".join(path.parts[-depth:]), folder=path) for path in paths)
 
 
 def _harvested(
@@ -204,3 +214,21 @@ def training_cost(result: StageResult) -> dict[str, Any]:
         "peak_memory_bytes": result.peak_memory_bytes,
         "computed_now": result.is_new,
     }
+
+
+def write_painter(weights: Path, record: dict[str, Any], out: Path) -> dict[str, str]:
+    """Copy a painter out of the store; returns where its two files are.
+
+    Args:
+        weights: the file in the store.
+        record: how it was trained.
+        out: a folder, or a `.safetensors` file beside which the record goes.
+
+    Raises:
+        StorageError: the disk refuses.
+    """
+    path = out if out.suffix == WEIGHTS_SUFFIX else out / weights.name
+    record_path = path.with_suffix(".json")
+    write_whole(path, weights.read_bytes())
+    write_whole(record_path, (json.dumps(record, indent=1, sort_keys=True) + "\n").encode())
+    return {"weights": str(path), "record_path": str(record_path)}

@@ -1,20 +1,78 @@
-"""What the options of `lidarpainter painter` mean, and where trained painters are written."""
+"""Options that the commands of `lidarpainter painter` share, and what their texts mean."""
 
-import json
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Literal
+
+import typer
 
 from lidarpainter_models.errors import ConfigError
 
-if TYPE_CHECKING:
-    from tasks.painter.students import PainterTraining
-
-WEIGHTS_SUFFIX = ".safetensors"
 _SIZE = re.compile(r"([1-9]\d{0,4})x([1-9]\d{0,4})")
 _SEEDS = re.compile(r"(\d+)(?::(\d+))?")
+
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Any other setting: training.batch_size=4. May be repeated."),
+]
+Seeds = Annotated[
+    str | None, typer.Option(help="Synthetic streets by seed: 1000:1004 or 1000,1007.")
+]
+Scenes = Annotated[
+    list[str] | None, typer.Option("--scene", help="A stored scene. May be repeated.")
+]
+Split = Annotated[str, typer.Option(help="Split of recorded scenes: forward:17:8, alternate.")]
+Cameras = Annotated[
+    str | None, typer.Option(help="Cameras of recorded scenes, with commas between.")
+]
+Pairs = Annotated[
+    list[str] | None,
+    typer.Option(help="A folder of pairs harvested before. May be repeated."),
+]
+Features = Annotated[
+    Path | None, typer.Option(help="SqueezeNet 1.1 weights for the feature distance.")
+]
+Budget = Annotated[float | None, typer.Option(help="CPU seconds of training.")]
+Steps = Annotated[int | None, typer.Option(help="Optimiser steps of training.")]
+Base = Annotated[
+    str | None,
+    typer.Option(
+        help="Train the one-step painter on this model: a folder in diffusers' layout or an id, "
+        "with a preset after a colon. Without it, the small painter."
+    ),
+]
+Start = Annotated[
+    Path | None, typer.Option(help="Go on from these weights: nano, or a .safetensors file.")
+]
+Inputs = Annotated[
+    str | None,
+    typer.Option(help="What the small painter may see, with commas between; by default all."),
+]
+Prompts = Annotated[
+    str | None,
+    typer.Option(help="clear, and styles to learn beside it: clear,foggy,night,rain."),
+]
+HeldBack = Annotated[
+    float, typer.Option(help="Share of the true images kept from training, to judge by.")
+]
+LpipsBackbone = Annotated[
+    Path | None,
+    typer.Option(help="torchvision's VGG-16, AlexNet or SqueezeNet 1.1, for the loss with --base."),
+]
+LpipsHeads = Annotated[
+    Path | None, typer.Option(help="LPIPS 0.1 heads of the same network, for the loss.")
+]
+Processes = Annotated[
+    int, typer.Option(min=1, help="Train with --base in so many processes, a GPU for each.")
+]
+Out = Annotated[
+    Path | None,
+    typer.Option(help="Folder, or .safetensors file, for the weights and their record."),
+]
+Device = Annotated[
+    Literal["auto", "cpu", "cuda"], typer.Option(help="Where painters run: auto, cpu or cuda.")
+]
 
 
 def parse_seeds(text: str | None) -> tuple[int, ...]:
@@ -75,54 +133,3 @@ def parse_paths(texts: Sequence[str] | None, option: str) -> tuple[Path, ...]:
     if not all(paths) or len(set(paths)) != len(paths):
         raise ConfigError(f"{option} {','.join(texts or ())!r}: expected each once, none empty")
     return tuple(Path(path) for path in paths)
-
-
-def with_length(
-    training: "PainterTraining",
-    inputs: frozenset[str] | None,
-    budget_s: float | None,
-    steps: int | None,
-    prompts: tuple[str, ...] | None = None,
-) -> "PainterTraining":
-    """The settings with other inputs and prompts where given, and as long as asked for.
-
-    Raises:
-        ConfigError: both lengths are given, one is not positive, a prompt is no style, or inputs
-            are given for the one-step painter.
-    """
-    from lidarpainter_models.painter.nano.training import NanoTrainingConfig
-
-    if budget_s is not None and steps is not None:
-        raise ConfigError("give --budget or --steps, not both")
-    steps = training.steps if steps is None else steps
-    changes: dict[str, Any] = {"max_cpu_s": budget_s, "steps": steps}
-    if isinstance(training, NanoTrainingConfig):
-        old = training.network
-        network = replace(old, inputs=inputs or old.inputs, prompts=prompts or old.prompts)
-        return replace(training, network=network, **changes)
-    if inputs is not None:
-        raise ConfigError(
-            "--inputs is for the small painter: the preset after --base wires the other, or "
-            "--set training.network.inputs=render,lidar"
-        )
-    return replace(training, prompts=prompts or training.prompts, **changes)
-
-
-def write_painter(weights: Path, record: dict[str, Any], out: Path) -> dict[str, str]:
-    """Copy a painter out of the store; returns where its two files are.
-
-    Args:
-        weights: the file in the store.
-        record: how it was trained.
-        out: a folder, or a `.safetensors` file beside which the record goes.
-
-    Raises:
-        StorageError: the disk refuses.
-    """
-    from lidarpainter_models.storage.whole_files import write_whole
-
-    path = out if out.suffix == WEIGHTS_SUFFIX else out / weights.name
-    record_path = path.with_suffix(".json")
-    write_whole(path, weights.read_bytes())
-    write_whole(record_path, (json.dumps(record, indent=1, sort_keys=True) + "\n").encode())
-    return {"weights": str(path), "record_path": str(record_path)}

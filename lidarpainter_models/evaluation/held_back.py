@@ -14,6 +14,10 @@ from typing import Any
 
 from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.painter.examples import PaintingPair, Window
+from lidarpainter_models.painter.nano.painter import NanoPainter
+from lidarpainter_models.painter.one_step.painter import OneStepPainter
+from lidarpainter_models.painter.protocol import Painter
+from lidarpainter_models.painter.training.job import TrainingJob
 from lidarpainter_models.training_data.pairs import PairFolder
 
 FIRST_TRAINING_SEED = 1000
@@ -111,6 +115,27 @@ def trained_targets(provenance: Mapping[str, Any]) -> frozenset[str] | None:
     return frozenset(
         target_name(pair, known) for pairs in described for pair, known in pairs.items()
     )
+
+
+def learnt_targets(painter: Painter) -> frozenset[str] | None:
+    """What a painter was trained on; nothing for one that learns nothing, None if unknown."""
+    if isinstance(painter, NanoPainter | OneStepPainter):
+        return trained_targets(painter.provenance)
+    return frozenset()
+
+
+def first_targets(job: TrainingJob) -> frozenset[str]:
+    """What the first weights of a training have learnt.
+
+    Raises:
+        ConfigError: they do not say.
+    """
+    if job.first_provenance is None:
+        return frozenset()
+    learnt = trained_targets(job.first_provenance)
+    if learnt is None:
+        raise ConfigError("the first weights: expected such as say what they have learnt")
+    return learnt
 
 
 def check_street_seed(seed: int) -> None:

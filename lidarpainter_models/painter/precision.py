@@ -12,6 +12,8 @@ from functools import cache
 import torch
 import torch.nn.functional as F  # noqa: N812
 
+from lidarpainter_models.painter.protocol import Painter
+
 CHANNELS, ROWS, COLUMNS = 64, 32, 24
 """Of the convolution, like those of the small painter's middle layers."""
 REPEATS = 3
@@ -43,6 +45,12 @@ def convolution_s(dtype: torch.dtype) -> float:
         F.conv2d(image, weight, padding=1)
         taken_s.append(time.process_time() - started_s)
     return min(taken_s[1:])
+
+
+def precision_of(painter: Painter) -> str | None:
+    """What records call the type that a learned painter computes in; None for a rule."""
+    dtype = getattr(painter, "precision", None)
+    return None if dtype is None else type_name(dtype)
 
 
 def type_name(dtype: torch.dtype) -> str:

@@ -98,7 +98,7 @@ class PainterChoice:
         """
         if self.kind == "rule":
             return self.name
-        digests = [_file_digest(path) for path in self.files]
+        digests = [file_digest(path) for path in self.files]
         if self.kind == "nano":
             return digests[0][:DIGEST_LENGTH]
         _, preset = split_preset(self.name)
@@ -144,7 +144,12 @@ def load_painter(name_or_path: str | Path, device: torch.device | None = None) -
     return choice.load(device)
 
 
-def _file_digest(path: Path) -> str:
+def file_digest(path: Path) -> str:
+    """SHA-256 of a weights file; 64 hexadecimal digits.
+
+    Raises:
+        WeightsError: it is not there.
+    """
     try:
         found = path.stat()
         return _remembered_digest(path.absolute(), found.st_size, found.st_mtime_ns)
@@ -154,6 +159,6 @@ def _file_digest(path: Path) -> str:
 
 @lru_cache(maxsize=64)
 def _remembered_digest(path: Path, size: int, changed_ns: int) -> str:  # noqa: ARG001 - the key
-    """SHA-256 of a file, perhaps of gigabytes: read again only once it has changed."""
+    """Read again only once the file, perhaps of gigabytes, has changed."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -5,8 +5,8 @@ own inside the artefact, which any command that takes pairs can be given.
 """
 
 import json
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,38 +16,24 @@ from catalog.artefacts import ArtefactRef, Workplace
 from catalog.store import Store, open_store
 from lidarpainter_models.errors import DataError, SceneError
 from lidarpainter_models.evaluation.held_back import target_of
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.splits import ViewSplit
 from lidarpainter_models.synthetic.config import SyntheticStreetConfig
 from lidarpainter_models.synthetic.street import WORLD_VERSION, SyntheticStreet
 from lidarpainter_models.training_data.harvest import (
     HarvestConfig,
-    HarvestProgress,
     default_plans,
     harvest_left_out,
 )
+from lidarpainter_models.training_data.pair_sets import PairSet
 from lidarpainter_models.training_data.pairs import PairFolder, PairWriter
 from lidarpainter_models.training_data.street_harvest import StreetPlan, harvest_shifted_street
 from tasks.ingest.ingest import ingest_street
 from tasks.opened import SplitSpec, open_scene, open_split
-from tasks.progress import Progress, listener
+from tasks.progress import Progress
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
 
 PAIRS_FOLDER = "pairs"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PairSet:
-    """A folder of pairs and what tables call it."""
-
-    name: str
-    folder: Path
-
-    def open(self) -> PairFolder:
-        """The pairs.
-
-        Raises:
-            DataError: there are none.
-        """
-        return PairFolder(self.folder)
 
 
 @task(**STAGE_OPTIONS)
@@ -67,18 +53,13 @@ def harvest_recorded(
     """Judge weak fits of a log at training frames they left out; test frames are never read."""
     store = open_store(store_path)
     scene, views = open_split(store, split)
-
-    def harvest(writer: PairWriter, told: HarvestProgress) -> None:
-        plans = default_plans(views.train_frames)
-        harvest_left_out(scene, views, plans, writer, config=config, progress=told)
-
     return run_stage(
         store,
         stage=stage,
         kind="pairs",
         inputs={"scene": scene.content_digest},
         config={"split": split.spec, "cameras": split.cameras, "harvest": asdict(config)},
-        build=_writing_pairs(stage, harvest),
+        build=partial(_build_recorded, scene=scene, views=views, config=config),
     )
 
 
@@ -93,18 +74,13 @@ def harvest_street(
     """Pair shifted renders of fits to a synthetic street with the exact truth."""
     store = open_store(store_path)
     scene = open_scene(store, scene_id)
-
-    def harvest(writer: PairWriter, told: HarvestProgress) -> None:
-        street = SyntheticStreet.from_manifest(scene.manifest)
-        harvest_shifted_street(street, scene, plans, writer, config=config, progress=told)
-
     return run_stage(
         store,
         stage=stage,
         kind="pairs",
         inputs={"scene": scene.content_digest},
         config={"plans": [asdict(plan) for plan in plans], "harvest": asdict(config)},
-        build=_writing_pairs(stage, harvest),
+        build=partial(_build_street, scene=scene, plans=plans, config=config),
     )
 
 
@@ -127,22 +103,46 @@ def _has_street(store: Store, scene_id: str, config: SyntheticStreetConfig) -> b
     return generator.get("config") == wanted and generator.get("world_version") == WORLD_VERSION
 
 
-def _writing_pairs(
-    stage: str, harvest: Callable[[PairWriter, HarvestProgress], None]
-) -> Callable[[Workplace, Progress], dict[str, Any]]:
-    """A stage that keeps finished pairs in its scratch folder until all are there."""
+def _build_recorded(
+    place: Workplace,
+    progress: Progress,
+    *,
+    scene: DrivingScene,
+    views: ViewSplit,
+    config: HarvestConfig,
+) -> dict[str, Any]:
+    plans = default_plans(views.train_frames)
+    harvest_left_out(scene, views, plans, _unfinished(place), config=config, progress=progress)
+    return _finished(place, scene)
 
-    def build(place: Workplace, _progress: Progress) -> dict[str, Any]:
-        unfinished = place.scratch / PAIRS_FOLDER
-        harvest(
-            PairWriter(unfinished), lambda done, total: listener().advanced(stage, done, total, "")
-        )
-        if not unfinished.exists():
-            raise DataError(f"{stage}: no view could be made into a pair")
-        finished = place.output / PAIRS_FOLDER
-        unfinished.rename(finished)
-        folder = PairFolder(finished)
-        targets = {target_of(folder, index) for index in range(len(folder))}
-        return {"num_pairs": len(folder), "num_targets": len(targets)}
 
-    return build
+def _build_street(
+    place: Workplace,
+    progress: Progress,
+    *,
+    scene: DrivingScene,
+    plans: tuple[StreetPlan, ...],
+    config: HarvestConfig,
+) -> dict[str, Any]:
+    street, pairs = SyntheticStreet.from_manifest(scene.manifest), _unfinished(place)
+    harvest_shifted_street(street, scene, plans, pairs, config=config, progress=progress)
+    return _finished(place, scene)
+
+
+def _unfinished(place: Workplace) -> PairWriter:
+    """Keeps finished pairs in the scratch folder of a stage until all are there."""
+    return PairWriter(place.scratch / PAIRS_FOLDER)
+
+
+def _finished(place: Workplace, scene: DrivingScene) -> dict[str, Any]:
+    """Move the pairs to where they stay, and count them.
+
+    Raises:
+        DataError: there are none.
+    """
+    unfinished = place.scratch / PAIRS_FOLDER
+    if not unfinished.exists():
+        raise DataError(f"{scene.path}: no view could be made into a pair")
+    folder = PairFolder(unfinished.rename(place.output / PAIRS_FOLDER))
+    targets = {target_of(folder, index) for index in range(len(folder))}
+    return {"num_pairs": len(folder), "num_targets": len(targets)}

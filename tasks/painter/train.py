@@ -4,11 +4,14 @@ Training is a stage like any other: keyed on the pairs and every setting, resume
 checkpoint when it was killed.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
+from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 from prefect import task
 
 import lidarpainter_models
@@ -19,20 +22,22 @@ from lidarpainter_models.evaluation.held_back import (
     TARGETS_KEY,
     PairSubset,
     check_training_pairs,
+    first_targets,
     hold_back,
 )
 from lidarpainter_models.metrics.lpips import LpipsFiles
+from lidarpainter_models.painter.one_step.job import NO_FILES
+from lidarpainter_models.painter.selection import WEIGHTS_SUFFIX
+from lidarpainter_models.painter.training.job import TrainingJob
 from lidarpainter_models.painter.training.loop import TrainingProgress
+from lidarpainter_models.painter.training_jobs import PainterTraining, job_for
 from lidarpainter_models.readers.pandaset.reader import LICENCE as PANDASET_LICENCE
+from lidarpainter_models.training_data.pair_sets import PairSet, open_sets
 from lidarpainter_models.training_data.pairs import PairFolder
 from tasks.json_files import finite_or_none, read_json, write_json
-from tasks.painter.harvest import PairSet
-from tasks.painter.judge import open_sets
-from tasks.painter.students import NO_FILES, PainterTraining, student_of
-from tasks.progress import Progress, listener
+from tasks.progress import Progress
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
 
-WEIGHTS_SUFFIX = ".safetensors"
 RECORD_SUFFIX = ".json"
 LICENCE = "Apache-2.0"
 ATTRIBUTIONS = {
@@ -42,80 +47,103 @@ ATTRIBUTIONS = {
 """Whom to name for data sets whose terms let trained weights be given on."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class TrainingRequest:
+    """What is trained, on what, and how."""
+
+    sets: tuple[PairSet, ...]
+    """Pairs to learn from and to judge by."""
+    config: PainterTraining
+    """The recipe."""
+    held_back: float = 0.0
+    """Share of the true images kept as the validation split."""
+    start: str | Path | None = None
+    """Weights to go on from, a name or a file; for the one-step painter also its model."""
+    lpips: LpipsFiles = NO_FILES
+    """Weights for the loss of the one-step painter."""
+    device: str = "cpu"
+    """Where the one-step painter is trained in one process."""
+    num_processes: int = 1
+    """In which the one-step painter is trained, each on a GPU."""
+
+    def job(self) -> TrainingJob:
+        """The painter in training; see `job_for`."""
+        return job_for(
+            self.config,
+            self.start,
+            self.lpips,
+            device=torch.device(self.device),
+            num_processes=self.num_processes,
+        )
+
+    def split(self, job: TrainingJob) -> tuple[dict[str, PairSubset], dict[str, PairSubset]]:
+        """Pairs to learn from and the validation split, by name.
+
+        Raises:
+            ConfigError: pairs of a street that is kept for judging, nothing left to learn from, or
+                first weights that do not say what they have learnt.
+        """
+        folders = open_sets(self.sets)
+        for folder in folders.values():
+            check_training_pairs(folder)
+        return hold_back(folders, self.held_back, known=first_targets(job))
+
+
 @task(**STAGE_OPTIONS)
-def train(  # noqa: PLR0913 - what a training stands on
-    store_path: Path,
-    stage: str,
-    sets: Sequence[PairSet],
-    config: PainterTraining,
-    held_back: float,
-    start: str | Path | None = None,
-    lpips: LpipsFiles = NO_FILES,
-    num_processes: int = 1,
-) -> StageResult:
+def train(store_path: Path, stage: str, request: TrainingRequest) -> StageResult:
     """Train on all pairs but those held back.
 
-    Args:
-        store_path: the store.
-        stage: its name for the listener.
-        sets: pairs to learn from and to judge by.
-        config: the recipe.
-        held_back: share of the true images kept to judge by.
-        start: weights to go on from, a name or a file; for the one-step painter also its model.
-        lpips: weights for the loss of the one-step painter.
-        num_processes: in which the one-step painter is trained, each on a GPU.
-
     Raises:
-        ConfigError: pairs of a street that is kept for judging, nothing left to learn from, a loss
-            that lacks what it weighs, or first weights that do not say what they have learnt.
+        ConfigError: see `TrainingRequest.split` and `job_for`.
         WeightsError: the model or the first weights cannot be used.
     """
-    folders = open_sets(sets)
-    for folder in folders.values():
-        check_training_pairs(folder)
-    student = student_of(config, start, lpips, num_processes)
-    learnt, judged = hold_back(folders, held_back, known=student.learnt)
-
-    def told(progress: TrainingProgress) -> None:
-        loss = progress.losses.get("total")
-        note = f"step {progress.step}" + ("" if loss is None else f", loss {loss:.4f}")
-        listener().advanced(stage, progress.share_done, 1.0, note)
-
-    def build(place: Workplace, _progress: Progress) -> dict[str, Any]:
-        for folder in folders.values():
-            folder.verify()
-        trained = student.learn(list(learnt.values()), place.scratch, told)
-        of_pairs, attribution = _terms(folders.values())
-        licence = student.licence(of_pairs)
-        record = {
-            "licence": licence,
-            "attribution": attribution,
-            "held_back": {name: sorted(subset.targets) for name, subset in judged.items()},
-            "software_version": lidarpainter_models.__version__,
-            **trained,
-            **student.origin,
-        }
-        provenance = _provenance(record, learnt.values()) | student.origin
-        provenance[TARGETS_KEY] = sorted({*provenance[TARGETS_KEY], *student.learnt})
-        student.save(
-            place.output / f"{student.name}{WEIGHTS_SUFFIX}", licence=licence, provenance=provenance
-        )
-        write_json(place.output / f"{student.name}{RECORD_SUFFIX}", record)
-        return {key: record[key] for key in ("num_pairs", "steps", "cpu_s")}
-
+    job = request.job()
+    learnt, _ = request.split(job)
     inputs = {f"pairs {name}": subset.digest for name, subset in learnt.items()}
     return run_stage(
         open_store(store_path),
         stage=stage,
         kind="painter",
-        inputs=inputs | student.inputs,
+        inputs=inputs | job.inputs,
         config={
-            "training": config.to_dict(),
-            "held_back": held_back,
-            "num_processes": num_processes,
+            "training": request.config.to_dict(),
+            "held_back": request.held_back,
+            "num_processes": request.num_processes,
         },
-        build=build,
+        build=partial(_build_painter, request=request),
     )
+
+
+def _build_painter(
+    place: Workplace, progress: Progress, *, request: TrainingRequest
+) -> dict[str, Any]:
+    job = request.job()
+    learnt, judged = request.split(job)
+    folders = open_sets(request.sets).values()
+    for folder in folders:
+        folder.verify()
+    trained = job.train(list(learnt.values()), place.scratch, partial(_tell, progress))
+    of_pairs, attribution = _terms(folders)
+    licence = job.licence(of_pairs)
+    record = {
+        "licence": licence,
+        "attribution": attribution,
+        "held_back": {name: sorted(subset.targets) for name, subset in judged.items()},
+        "software_version": lidarpainter_models.__version__,
+        **trained,
+        **job.origin,
+    }
+    provenance = _provenance(record, learnt.values()) | job.origin
+    provenance[TARGETS_KEY] = sorted({*provenance[TARGETS_KEY], *first_targets(job)})
+    job.save(place.output / f"{job.name}{WEIGHTS_SUFFIX}", licence=licence, provenance=provenance)
+    write_json(place.output / f"{job.name}{RECORD_SUFFIX}", record)
+    return {key: record[key] for key in ("num_pairs", "steps", "cpu_s")}
+
+
+def _tell(progress: Progress, training: TrainingProgress) -> None:
+    loss = training.losses.get("total")
+    note = f"step {training.step}" + ("" if loss is None else f", loss {loss:.4f}")
+    progress(training.share_done, 1.0, note)
 
 
 @task(**STAGE_OPTIONS)

@@ -12,7 +12,8 @@ from tiny_diffusion import write_model
 
 from catalog.store import STORE_ENVIRONMENT, open_store
 from flows.cli.main import main
-from flows.cli.painter_options import parse_seeds, with_length
+from flows.cli.painter_options import parse_seeds
+from flows.painter_recipes import shaped
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.painter.nano.weights import load_weights, save_weights
@@ -84,16 +85,14 @@ def test_seeds_may_be_listed_and_ranged():
         (["train", "--seeds", "1000", "--base", "m"], "the loss weighs LPIPS by 0.2"),
         (["train", "--seeds", "1000", "--lpips-heads", "h.pth"], "are for training with --base"),
         (["train", "--seeds", "1000", "--processes", "2"], "in one process"),
-        (["ablate", "--base", "a.safetensors", "--pairs-train", "a", "--pairs-test", "b"], "a.saf"),
         (["harvest"], "nothing to harvest"),
         (["harvest", "--scene", "toy/street", "--set", "harvest.wrong=1"], "no setting"),
         (["info", "--painter", "picasso"], "no painter 'picasso'"),
         (["info", "--painter", "none.safetensors"], "no painter weights at none.safetensors"),
-        (["info", "--preset", "cubist"], "no painter preset 'cubist'"),
-        (["info", "--preset", "fast", "--size", "big"], "expected such as 1024x576"),
-        (["info", "--preset", "fast", "--painter", "a.safetensors"], "has its own wiring"),
-        (["info", "--preset", "fast", "--painter", "/nowhere"], "no painter '/nowhere'"),
+        (["info", "--painter", "/nowhere:fast"], "no painter '/nowhere:fast'"),
+        (["benchmark", "--painter", "picasso"], "no painter 'picasso'"),
         (["benchmark", "--size", "0x5"], "expected such as 1024x576"),
+        (["evaluate", "--painter", "none", "--pairs", "/a", "--device", "cuda"], "has no GPU"),
         (["evaluate", "--painter", "none", "--pairs", "/nowhere"], "no training pairs in /nowhere"),
         (["evaluate", "--painter", "none"], "nothing to judge by: expected --pairs or --run"),
         (["evaluate", "--painter", "none", "--run", "latest"], "no complete run in"),
@@ -147,17 +146,16 @@ def test_info_of_a_rule_says_that_nothing_is_learnt(capsys):
     assert found["architecture"]["summary"].startswith("Averages the render")
 
 
-def test_info_of_a_preset_tells_what_it_costs(capsys):
-    words = ["painter", "info", "--preset", "fast", "--size", "128x64"]
+def test_a_benchmark_times_both_precisions_and_says_which_is_used(tmp_path, capsys):
+    path = tmp_path / "own.safetensors"
+    save_weights(NanoNetwork(SMALL), path, licence="MIT", provenance={})
+    words = ["painter", "benchmark", "--painter", str(path), "--size", "24x16", "--repeats", "1"]
     assert main([*words, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["parameters"]["unet"] == 865_910_724
-    assert found["size_px"] == [128, 64]
-    assert 0 < found["tflop"]["total"] < 0.1
-    assert found["bytes"]["trained_file"] < 20e6
-    assert "Stability AI" in found["licence"]
+    assert [row["precision"] for row in found["times"]] == ["float32", "bfloat16"]
+    assert sum(row["is_chosen"] for row in found["times"]) == 1
     assert main(words) == 0
-    assert "brought by the user" in capsys.readouterr().out
+    assert ", chosen" in capsys.readouterr().out
 
 
 def test_a_model_in_diffusers_layout_is_described_and_judged(make_pairs, tmp_path, capsys):
@@ -202,9 +200,9 @@ def test_evaluate_prints_every_painter_on_the_same_pairs(make_pairs, tmp_path, c
 def test_length_and_inputs_change_nothing_else():
     default = NanoTrainingConfig()
     both = default.network.inputs
-    assert with_length(default, both, None, None) == default
-    assert with_length(default, both, 60.0, None).max_cpu_s == 60.0
-    fewer = with_length(default, frozenset({"render"}), None, 5)
+    assert shaped(default, inputs=both) == default
+    assert shaped(default, inputs=both, budget_s=60.0).max_cpu_s == 60.0
+    fewer = shaped(default, inputs=frozenset({"render"}), steps=5)
     assert (fewer.steps, fewer.network.inputs) == (5, {"render"})
     assert replace(fewer.network, inputs=both) == default.network
 
@@ -300,21 +298,6 @@ def test_a_one_step_painter_is_trained_on_a_model(make_pairs, tmp_path, own_stor
     assert own_store.tables.row("painters", found["painter_id"])["name"] == "one-step"
     judged = run_command("evaluate", "--painter", str(weights), "--pairs", folder)
     assert judged["pairs"]["a"]["num_judged"] == 2
-
-
-@pytest.mark.slow
-def test_ablate_trains_every_wiring_of_a_model(make_pairs, tmp_path):
-    model = write_model(tmp_path / "small-turbo")
-    learn = make_pairs("learn", range(2), height_px=64, width_px=80)
-    judge = make_pairs("judge", range(5, 6), height_px=64, width_px=80)
-    words = ["--base", str(model), "--pairs-train", learn, "--pairs-test", judge, "--steps", "1"]
-    found = run_command("ablate", *words, *SMALL_ONE_STEP)
-    assert list(found["tables"]) == ["inputs", "t", "step", "skips", "fusion", "lidar"]
-    times = [label for label in found["tables"]["t"] if label.startswith("t: ")]
-    assert times == ["t: 999", "t: 200", "t: 199"]
-    for labels in found["tables"].values():
-        assert set(labels.values()) <= set(found["painters"])
-    assert set(found["weights"]) == set(found["painters"]) - {"none", "overlay", "warp"}
 
 
 @pytest.mark.slow

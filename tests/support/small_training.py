@@ -1,22 +1,22 @@
 """A short training of a small one-step network that processes of their own can run."""
 
-import os
 from dataclasses import replace
 
 import torch
+import torch.distributed
 from quiet_augmentation import QUIET
+from random_diffusion import random_network
 from tiny_diffusion import TEXT_WIDTH, TINY
 
 from lidarpainter_models.painter.adversarial import DiscriminatorConfig
 from lidarpainter_models.painter.losses import PaperLossWeights
-from lidarpainter_models.painter.one_step.assembly import random_network
 from lidarpainter_models.painter.one_step.training import (
     OneStepTrainee,
     OneStepTrainingConfig,
     train_one_step,
 )
 from lidarpainter_models.painter.training.loop import ALONE
-from lidarpainter_models.painter.training.processes import AcceleratedProcesses
+from lidarpainter_models.painter.training.processes import DistributedProcesses
 from lidarpainter_models.training_data.pairs import PairFolder
 
 CONTEST = OneStepTrainingConfig(
@@ -62,17 +62,10 @@ def train_small(pairs, config, checkpoints=None, processes=ALONE):
 
 def train_as_one_of_two(index, port, pairs, config, out):
     """Train together with another process; writes the weights and the record."""
-    os.environ |= {
-        "RANK": str(index),
-        "LOCAL_RANK": str(index),
-        "WORLD_SIZE": "2",
-        "MASTER_ADDR": "127.0.0.1",
-        "MASTER_PORT": str(port),
-        "ACCELERATE_USE_CPU": "true",
-    }
-    from accelerate import Accelerator
-
-    processes = AcceleratedProcesses(Accelerator(cpu=True))
+    torch.distributed.init_process_group(
+        "gloo", init_method=f"tcp://127.0.0.1:{port}", rank=index, world_size=2
+    )
+    processes = DistributedProcesses(torch.device("cpu"))
     weights, record = train_small(pairs, config, out, processes)
     torch.save({"weights": weights, "history": record["history"]}, out / f"trained-{index}.pt")
     processes.meet()

@@ -3,6 +3,7 @@
 import json
 
 import torch
+from random_diffusion import fill_randomly
 
 from lidarpainter_models.painter.one_step.architectures import (
     Architecture,
@@ -11,7 +12,6 @@ from lidarpainter_models.painter.one_step.architectures import (
     build_unet,
     build_vae,
 )
-from lidarpainter_models.painter.one_step.assembly import fill_randomly
 
 TEXT_WIDTH = 16
 TINY = Architecture(

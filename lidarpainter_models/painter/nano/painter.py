@@ -63,6 +63,12 @@ class NanoPainter:
         self.provenance = provenance or {}
         self.tiles = tiles
 
+    def sparing(self, tiles: TileConfig) -> "NanoPainter":
+        """The same painter, painting only tiles that need it."""
+        return NanoPainter(
+            self.network, provenance=self.provenance, precision=self.precision, tiles=tiles
+        )
+
     @torch.inference_mode()
     def paint(self, conditions: PaintingConditions) -> Painting:
         """Repair one view of any size.

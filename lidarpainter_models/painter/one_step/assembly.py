@@ -1,19 +1,10 @@
-"""Putting the parts of a one-step network together, with trained, random or no weights."""
+"""Putting the parts of a one-step network together, and what of it training changes."""
 
-import math
-from functools import lru_cache
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
-from lidarpainter_models.painter.one_step.architectures import (
-    SD_TURBO,
-    Architecture,
-    build_tiny,
-    build_unet,
-    build_vae,
-)
 from lidarpainter_models.painter.one_step.autoencoder import SkipAutoencoder, TinyAutoencoder
 from lidarpainter_models.painter.one_step.config import OneStepConfig
 from lidarpainter_models.painter.one_step.denoiser import Denoiser
@@ -32,8 +23,6 @@ FIRST_LAYER = "denoiser.unet.conv_in."
 LAST_LAYER = "denoiser.unet.conv_out."
 SKIPS = "autoencoder.decoder.skip_convs."
 FUSION = "fusion."
-_POOL = 1 << 20
-"""Random numbers that are drawn; larger weights repeat them."""
 
 
 def assemble(
@@ -100,65 +89,3 @@ def trained_in_float32(network: OneStepNetwork) -> dict[str, nn.Parameter]:
     for parameter in trained.values():
         parameter.data = parameter.data.float()
     return trained
-
-
-def random_network(
-    config: OneStepConfig,
-    *,
-    architecture: Architecture = SD_TURBO,
-    dtype: torch.dtype = torch.bfloat16,
-    seed: int = 0,
-    has_adapters: bool = False,
-) -> OneStepNetwork:
-    """A network of the true size whose weights follow from the seed, for measuring and testing.
-
-    Adapters are random too, so that merging them changes something.
-    """
-    with torch.device("meta"):
-        unet = build_unet(architecture, config.first_layer_channels)
-        build = build_vae if config.autoencoder == "sd" else build_tiny
-        autoencoder = build(architecture)
-    for part in (unet, autoencoder):
-        nn.Module.to(part, dtype).to_empty(device="cpu")
-        fill_randomly(part, seed=seed)
-    network = assemble(config, unet, autoencoder, has_adapters=has_adapters, seed=seed)
-    pool = _pool(seed)
-    for name, parameter in network.named_parameters():
-        if ADAPTER_MARK in name:
-            _fill(parameter, pool, scale=0.02)
-    return network.requires_grad_(False)
-
-
-def empty_network(
-    config: OneStepConfig, *, architecture: Architecture = SD_TURBO, has_adapters: bool = False
-) -> OneStepNetwork:
-    """A network on the meta device: shapes without weights, for counting."""
-    with torch.device("meta"):
-        unet = build_unet(architecture, config.first_layer_channels)
-        build = build_vae if config.autoencoder == "sd" else build_tiny
-        return assemble(config, unet, build(architecture), has_adapters=has_adapters)
-
-
-@torch.no_grad()
-def fill_randomly(module: nn.Module, *, seed: int) -> None:
-    """Weights that keep activations near one: scaled by their inputs, norms one, biases zero."""
-    pool = _pool(seed)
-    for name, parameter in module.named_parameters():
-        if parameter.dim() > 1:
-            _fill(parameter, pool, scale=1 / math.sqrt(parameter[0].numel()))
-        else:
-            parameter.fill_(1.0 if name.endswith("weight") else 0.0)
-
-
-@lru_cache(maxsize=2)
-def _pool(seed: int) -> Tensor:
-    return torch.randn(_POOL, generator=torch.Generator().manual_seed(seed))
-
-
-@torch.no_grad()
-def _fill(parameter: Tensor, pool: Tensor, *, scale: float) -> None:
-    flat = parameter.view(-1)
-    scaled = (pool[: flat.numel()] * scale).to(parameter.dtype)
-    for first in range(0, flat.numel(), _POOL):
-        part = flat[first : first + _POOL]
-        part.copy_(scaled[: part.numel()])

@@ -6,9 +6,10 @@ exchange a step does what a wrapper around the network would do, and leaves the 
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
+import torch.distributed
 from torch import Tensor
 
 
@@ -43,7 +44,10 @@ class OneProcess:
     """Trains alone: nothing is exchanged, and nothing is rounded on the way."""
 
     index = 0
-    count = 1
+
+    def __init__(self, count: int = 1) -> None:
+        """Take up what so many processes have trained."""
+        self.count = count
 
     def average(self, tensors: Sequence[Tensor]) -> None:
         """Leave them."""
@@ -56,29 +60,29 @@ class OneProcess:
         """Go on."""
 
 
-class AcceleratedProcesses:
-    """The processes that `accelerate` has started, on whatever lies between them."""
+class DistributedProcesses:
+    """The processes of torch's process group, which has been opened before."""
 
-    def __init__(self, accelerator: Any) -> None:  # noqa: ANN401 - accelerate's Accelerator
-        """Take an `Accelerator`; of it, only its exchange of tensors is used."""
-        self._accelerator = accelerator
-        self.index = int(accelerator.process_index)
-        self.count = int(accelerator.num_processes)
+    def __init__(self, device: torch.device) -> None:
+        """Take the device of this process, on which numbers are exchanged."""
+        self._device = device
+        self.index = torch.distributed.get_rank()
+        self.count = torch.distributed.get_world_size()
 
     def average(self, tensors: Sequence[Tensor]) -> None:
         """Replace tensors by their means, all in one exchange."""
         flat = torch.cat([tensor.flatten() for tensor in tensors])
-        means = self._accelerator.reduce(flat, reduction="mean")
-        parts = means.split([tensor.numel() for tensor in tensors])
+        torch.distributed.all_reduce(flat)
+        parts = (flat / self.count).split([tensor.numel() for tensor in tensors])
         for tensor, part in zip(tensors, parts, strict=True):
             tensor.copy_(part.view(tensor.shape))
 
     def mean(self, values: Mapping[str, float]) -> dict[str, float]:
         """Means of named numbers, taken in float32."""
-        found = torch.tensor(list(values.values()), device=self._accelerator.device)
+        found = torch.tensor(list(values.values()), device=self._device)
         self.average([found])
         return dict(zip(values, found.tolist(), strict=True))
 
     def meet(self) -> None:
         """Wait until every process is here."""
-        self._accelerator.wait_for_everyone()
+        torch.distributed.barrier()

@@ -2,9 +2,8 @@
 
 import pytest
 import torch
+from random_diffusion import random_network
 from tiny_diffusion import TEXT_WIDTH, TINY
-
-from lidarpainter_models.painter.one_step.assembly import random_network
 
 
 @pytest.fixture

@@ -183,9 +183,8 @@ def test_masks_are_two_more_channels(inputs, channels, make_network, make_inputs
 
 
 def test_the_last_layer_and_the_step_stay_in_float32(make_inputs):
+    from random_diffusion import random_network
     from tiny_diffusion import TINY
-
-    from lidarpainter_models.painter.one_step.assembly import random_network
 
     network = random_network(paper(), architecture=TINY, has_adapters=True)
     images, text = make_inputs()

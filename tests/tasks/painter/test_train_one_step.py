@@ -1,12 +1,10 @@
 """Training the one-step painter as a stage: what it refuses, keeps and leaves."""
 
 import json
-import multiprocessing
-import os
-import signal
 from dataclasses import replace
 from pathlib import Path
 
+import psutil
 import pytest
 import torch
 from killer import Killer
@@ -24,10 +22,16 @@ from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.painter.one_step.presets import fast
 from lidarpainter_models.painter.one_step.training import OneStepTrainingConfig
 from lidarpainter_models.painter.one_step.weights import read_trained
-from tasks.painter.harvest import PairSet
+from lidarpainter_models.painter.training_jobs import job_for, recipe_for
+from lidarpainter_models.training_data.pair_sets import PairSet
 from tasks.painter.judge import judge_held_back, load_painting_scores, samples_path
-from tasks.painter.students import recipe_for, student_of
-from tasks.painter.train import publish_painter, train, training_record, weights_path
+from tasks.painter.train import (
+    TrainingRequest,
+    publish_painter,
+    train,
+    training_record,
+    weights_path,
+)
 from tasks.progress import listening
 
 CONFIG = OneStepTrainingConfig(
@@ -57,23 +61,27 @@ def store(tmp_path):
     return open_store(tmp_path / "store")
 
 
+def request(sets, config, held_back, start, **options):
+    return TrainingRequest(sets=sets, config=config, held_back=held_back, start=start, **options)
+
+
 def test_a_one_step_painter_is_trained_judged_published_and_trained_on(pairs, store, model):
-    trained = train.fn(store.root, "train", pairs, CONFIG, 0.3, model)
-    weights = weights_path(store, trained.ref)
+    trained = train.fn(store.root, "train", request(pairs, CONFIG, 0.3, model))
+    weights = weights_path(trained.ref)
     assert weights.name == "one-step.safetensors"
     painter = load_painter(weights)
     assert painter.provenance["licence"].startswith("that of the model underneath (unknown), and")
     assert painter.provenance["base"] == model
     assert len(painter.provenance["trained_targets"]) == 2
-    record = training_record(store, trained.ref, None)
+    record = training_record(trained.ref, None)
     assert record["base_licence"] == "unknown"
     assert record["config"]["network"]["autoencoder"] == "taesd"
     assert [entry["step"] for entry in record["history"]] == [1, 2]
     assert set(record["pairs"][0]["pairs"]) <= {f"pair-{frame}" for frame in range(4)}
 
     judged = judge_held_back.fn(store.root, "judge", weights, pairs, 0.3)
-    assert load_painting_scores(store, judged.ref)["total"]["num_pairs"] == 2
-    assert samples_path(store, judged.ref).stat().st_size > 1000
+    assert load_painting_scores(judged.ref)["total"]["num_pairs"] == 2
+    assert samples_path(judged.ref).stat().st_size > 1000
     row = publish_painter.fn(store.root, trained.ref, None)
     assert row["name"] == "one-step"
     assert json.loads(row["record"])["training_digest"] == record["training_digest"]
@@ -81,23 +89,22 @@ def test_a_one_step_painter_is_trained_judged_published_and_trained_on(pairs, st
     on = recipe_for(str(weights))
     assert on.network == fast()
     further = replace(CONFIG, steps=1)
-    then = train.fn(store.root, "train", pairs, further, 0.3, weights)
-    told = load_painter(weights_path(store, then.ref)).provenance
+    then = train.fn(store.root, "train", request(pairs, further, 0.3, weights))
+    told = load_painter(weights_path(then.ref)).provenance
     assert told["started_from"]["steps"] == 2
     assert told["base"] == model
 
 
-def tensors_of(store, trained):
-    return read_trained(weights_path(store, trained.ref)).tensors
+def tensors_of(trained):
+    return read_trained(weights_path(trained.ref)).tensors
 
 
 def test_a_killed_training_goes_on_and_ends_bit_for_bit(pairs, store, model, tmp_path):
     with listening(Killer()), pytest.raises(KeyboardInterrupt):
-        train.fn(store.root, "train", pairs, CONFIG, 0.3, model)
-    resumed = train.fn(store.root, "train", pairs, CONFIG, 0.3, model)
-    other = open_store(tmp_path / "other")
-    straight = tensors_of(other, train.fn(other.root, "train", pairs, CONFIG, 0.3, model))
-    for name, tensor in tensors_of(store, resumed).items():
+        train.fn(store.root, "train", request(pairs, CONFIG, 0.3, model))
+    resumed = train.fn(store.root, "train", request(pairs, CONFIG, 0.3, model))
+    straight = tensors_of(train.fn(tmp_path / "other", "train", request(pairs, CONFIG, 0.3, model)))
+    for name, tensor in tensors_of(resumed).items():
         assert torch.equal(tensor, straight[name])
     assert not list((store.root / "work").glob("*"))
 
@@ -108,7 +115,7 @@ def test_a_changed_pair_stops_the_training(pairs, store, model):
     content[-1] ^= 1
     path.write_bytes(content)
     with pytest.raises(DataError, match="has SHA-256"):
-        train.fn(store.root, "train", pairs, CONFIG, 0.3, model)
+        train.fn(store.root, "train", request(pairs, CONFIG, 0.3, model))
 
 
 @pytest.mark.parametrize(
@@ -126,20 +133,20 @@ def test_a_changed_pair_stops_the_training(pairs, store, model):
 def test_what_cannot_be_trained_is_refused_at_once(model, changes, start, options, expected):
     start = model if start == "MODEL" else start
     with pytest.raises((ConfigError, WeightsError), match=expected) as caught:
-        student_of(replace(CONFIG, **changes), start, **options)
+        job_for(replace(CONFIG, **changes), start, **options)
     assert "\n" not in str(caught.value)
 
 
 def test_lpips_enters_the_loss_and_lends_its_features(pairs, store, model, tmp_path, monkeypatch):
     heads = [torch.rand(channels) for channels in SQUEEZENET.channels]
     lpips = Lpips(SQUEEZENET.build(), heads).requires_grad_(False)
-    monkeypatch.setattr("tasks.painter.training_processes.load_lpips", lambda _files: lpips)
+    monkeypatch.setattr("lidarpainter_models.painter.one_step.job.load_lpips", lambda _files: lpips)
     files = LpipsFiles(backbone=tmp_path / "backbone", heads=tmp_path / "heads")
     for path in (files.backbone, files.heads):
         path.write_bytes(b"stands for weights")
     config = replace(CONFIG, steps=1, loss=PaperLossWeights())
-    trained = train.fn(store.root, "train", pairs, config, 0.0, model, files)
-    record = training_record(store, trained.ref, None)
+    trained = train.fn(store.root, "train", request(pairs, config, 0.0, model, lpips=files))
+    record = training_record(trained.ref, None)
     assert record["discriminator"] == "FeatureDiscriminator"
     assert record["history"][0]["lpips"] > 0
     assert {"lpips backbone", "lpips heads"} <= set(record)
@@ -147,36 +154,67 @@ def test_lpips_enters_the_loss_and_lends_its_features(pairs, store, model, tmp_p
 
 def test_the_small_painter_is_trained_alone():
     with pytest.raises(ConfigError, match="one process"):
-        student_of(NanoTrainingConfig(), None, num_processes=2)
+        job_for(NanoTrainingConfig(), None, num_processes=2)
 
 
 @pytest.mark.slow
 def test_two_processes_train_one_painter(pairs, store, model):
     config = replace(CONFIG, half_precision=False)
-    two = train.fn(store.root, "train", pairs, config, 0.0, model, num_processes=2)
+    two = train.fn(store.root, "train", request(pairs, config, 0.0, model, num_processes=2))
     one = replace(config, accumulated_batches=2)
-    alone = train.fn(store.root, "train", pairs, one, 0.0, model)
-    records = [training_record(store, made.ref, None) for made in (two, alone)]
+    alone = train.fn(store.root, "train", request(pairs, one, 0.0, model))
+    records = [training_record(made.ref, None) for made in (two, alone)]
     assert [record["processes"] for record in records] == [2, 1]
     for ours, theirs in zip(*(record["history"] for record in records), strict=True):
         assert ours["total"] == pytest.approx(theirs["total"], rel=1e-4)
 
 
-class ChildKiller(Killer):
-    """Kills every process that this one has started."""
+class WorkerKiller(Killer):
+    """Kills one of the processes that torchrun has started, once there is a checkpoint."""
 
-    def advanced(self, _stage, _done, _total, _note):
-        for child in multiprocessing.active_children():
-            os.kill(child.pid, signal.SIGKILL)
+    def __init__(self):
+        self.processes = []
+
+    def advanced(self, _stage, _done, _total, note):
+        if note.startswith("step 2"):
+            self.processes = psutil.Process().children(recursive=True)
+            next(one for one in self.processes if not one.children()).kill()
 
 
 @pytest.mark.slow
 def test_a_lost_process_ends_the_training_with_one_line(pairs, store, model):
     config = replace(CONFIG, steps=50)
+    killer = WorkerKiller()
     with (
-        listening(ChildKiller()),
+        listening(killer),
         pytest.raises(TrainingError, match="in several processes broke off") as caught,
     ):
-        train.fn(store.root, "train", pairs, config, 0.0, model, num_processes=2)
+        train.fn(store.root, "train", request(pairs, config, 0.0, model, num_processes=2))
     assert "\n" not in str(caught.value)
     assert list((store.root / "work").glob("*/training.pt"))
+    assert not any(one.is_running() for one in killer.processes)
+
+
+@pytest.mark.slow
+def test_an_interrupted_training_leaves_no_process_behind(pairs, store, model):
+    started = []
+
+    class Interrupter(Killer):
+        def advanced(self, _stage, _done, _total, _note):
+            started.extend(psutil.Process().children(recursive=True))
+            raise KeyboardInterrupt
+
+    config = replace(CONFIG, steps=50)
+    with listening(Interrupter()), pytest.raises(KeyboardInterrupt):
+        train.fn(store.root, "train", request(pairs, config, 0.0, model, num_processes=2))
+    assert started
+    assert not any(one.is_running() for one in started)
+
+
+@pytest.mark.slow
+def test_what_stops_several_processes_is_said_in_one_line(pairs, store, model):
+    beyond_float32 = PaperLossWeights(lpips=0, adversarial=0, squared=1e39)
+    config = replace(CONFIG, loss=beyond_float32)
+    with pytest.raises(TrainingError, match="the training stops") as caught:
+        train.fn(store.root, "train", request(pairs, config, 0.0, model, num_processes=2))
+    assert "\n" not in str(caught.value)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import torch
+from random_diffusion import random_network
 
 from lidarpainter_models.painter.augmentation import TrainingBatch
 from lidarpainter_models.painter.batches import ConditionBatch
@@ -16,7 +17,6 @@ from lidarpainter_models.painter.one_step.architectures import (
     TEXT_TOKENS,
     Architecture,
 )
-from lidarpainter_models.painter.one_step.assembly import random_network
 from lidarpainter_models.painter.one_step.config import OneStepConfig
 from lidarpainter_models.painter.one_step.painter import NUM_WARPS
 from lidarpainter_models.painter.one_step.training import OneStepTrainee, OneStepTrainingConfig
@@ -26,7 +26,7 @@ from lidarpainter_models.painter.training.checkpoints import TrainingState
 _SEED = 0
 
 
-def build_trial(
+def build_training_step(
     network: OneStepConfig, height_px: int, width_px: int, architecture: Architecture = SD_TURBO
 ) -> Callable[[], float]:
     """A function that takes one step and returns its loss.

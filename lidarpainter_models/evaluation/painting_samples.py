@@ -1,35 +1,32 @@
 """Images of what a painter makes of some pairs, for a person to look at."""
 
 from collections.abc import Mapping
-from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from lidarpainter_models.export.images import write_png
 from lidarpainter_models.painter.examples import PairSource
 from lidarpainter_models.painter.protocol import Painter
 
 NUM_SAMPLES = 4
 
 
-def write_samples(painter: Painter, sources: Mapping[str, PairSource], path: Path) -> Path:
-    """Write a PNG with a row per pair: render, LiDAR, painted, true image.
-
-    The pairs lie evenly over all sources.
+def painting_samples(
+    painter: Painter, sources: Mapping[str, PairSource]
+) -> Float[Tensor, "height width 3"]:
+    """A row per pair: render, LiDAR, painted, true image; the pairs lie evenly over all sources.
 
     Raises:
         DataError: a pair is damaged.
-        StorageError: the file cannot be written.
     """
     known = [(source, index) for source in sources.values() for index in range(len(source))]
     count = min(NUM_SAMPLES, len(known))
     chosen = [known[rank * len(known) // count] for rank in range(count)]
     rows = [_row(painter, source, index) for source, index in chosen]
     width_px = max(row.shape[1] for row in rows)
-    return write_png(torch.cat([_widened(row, width_px) for row in rows]), path)
+    return torch.cat([_widened(row, width_px) for row in rows])
 
 
 def _row(painter: Painter, source: PairSource, index: int) -> Float[Tensor, "height width 3"]:

@@ -9,6 +9,7 @@ from functools import lru_cache
 from typing import Any
 
 import torch
+from random_diffusion import empty_network
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -23,7 +24,6 @@ from lidarpainter_models.painter.one_step.assembly import (
     FIRST_LAYER,
     FUSION,
     SKIPS,
-    empty_network,
     trained_names,
 )
 from lidarpainter_models.painter.one_step.autoencoder import CELL_PX
@@ -125,7 +125,7 @@ def count_bytes(config: OneStepConfig, architecture: Architecture = SD_TURBO) ->
     return {"weights": two * _num_parameters(merged), "trained_file": trained + two * prompts}
 
 
-def describe_preset(config: OneStepConfig, *, height_px: int, width_px: int) -> dict[str, Any]:
+def describe_wiring(config: OneStepConfig, *, height_px: int, width_px: int) -> dict[str, Any]:
     """All of it as JSON types."""
     return {
         "architecture": {

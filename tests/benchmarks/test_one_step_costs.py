@@ -2,16 +2,12 @@
 
 import pytest
 import torch
+from one_step_costs import count_bytes, count_parameters, count_tflop, describe_wiring
+from random_diffusion import random_network
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.one_step.architectures import SD_TURBO, build_tiny
-from lidarpainter_models.painter.one_step.assembly import random_network, trained_names
-from lidarpainter_models.painter.one_step.cost import (
-    count_bytes,
-    count_parameters,
-    count_tflop,
-    describe_preset,
-)
+from lidarpainter_models.painter.one_step.assembly import trained_names
 from lidarpainter_models.painter.one_step.presets import PRESETS, fast, paper
 from lidarpainter_models.painter.one_step.weights import save_trained
 
@@ -64,7 +60,7 @@ def test_a_full_size_weights_file_is_under_20_mb_and_holds_every_bit(tmp_path):
         torch.equal(state[name], stored[name].to(state[name].dtype))
         for name in trained_names(network)
     )
-    described = describe_preset(paper(), height_px=576, width_px=1024)
+    described = describe_wiring(paper(), height_px=576, width_px=1024)
     assert described["bytes"]["trained_file"] == sum(
         tensor.numel() * tensor.element_size() for tensor in stored.values()
     )

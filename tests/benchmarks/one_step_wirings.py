@@ -13,6 +13,7 @@ from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float
+from random_diffusion import fill_randomly, random_network
 from torch import Tensor, nn
 
 from lidarpainter_models.painter.one_step.architectures import (
@@ -21,11 +22,7 @@ from lidarpainter_models.painter.one_step.architectures import (
     Architecture,
     build_text_encoder,
 )
-from lidarpainter_models.painter.one_step.assembly import (
-    fill_randomly,
-    made_lean,
-    random_network,
-)
+from lidarpainter_models.painter.one_step.assembly import made_lean
 from lidarpainter_models.painter.one_step.presets import fast, paper
 from lidarpainter_models.painter.one_step.prompts import run_text_encoder
 

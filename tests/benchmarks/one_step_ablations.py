@@ -15,6 +15,7 @@ from lidarpainter_models.painter.one_step.config import (
 )
 from lidarpainter_models.painter.one_step.latent_fusion import FusionConfig
 from lidarpainter_models.painter.one_step.schedule import Denoise
+from lidarpainter_models.painter.one_step.training import OneStepTrainingConfig
 
 TIMESTEPS = (999, 200, 199)
 """SD-Turbo's own, that of the authors' program, and DIFIX's."""
@@ -31,7 +32,7 @@ GUIDANCE = (
 Wirings = dict[str, OneStepConfig]
 
 
-def ablations(config: OneStepConfig) -> dict[str, Wirings]:
+def wirings_by_choice(config: OneStepConfig) -> dict[str, Wirings]:
     """Tables of wirings by the choice that is varied; each holds `config` under its own value.
 
     A choice that the wiring does not leave open (skips of the tiny autoencoder, the fusion of a
@@ -54,14 +55,17 @@ def ablations(config: OneStepConfig) -> dict[str, Wirings]:
     return {choice: wirings for choice, wirings in tables.items() if len(wirings) > 1}
 
 
-def distinct(tables: dict[str, Wirings]) -> Wirings:
-    """Every wiring once, under the label of the first table that has it."""
-    found: Wirings = {}
-    for choice, wirings in tables.items():
-        for label, wiring in wirings.items():
-            if wiring not in found.values():
-                found[f"{choice}: {label}"] = wiring
-    return found
+def ablation_tables(
+    training: OneStepTrainingConfig,
+) -> dict[str, dict[str, OneStepTrainingConfig]]:
+    """The recipes of each table by row, as `flows.ablate_painter` takes them."""
+    return {
+        choice: {
+            f"{choice}: {value}": replace(training, network=wiring)
+            for value, wiring in wirings.items()
+        }
+        for choice, wirings in wirings_by_choice(training.network).items()
+    }
 
 
 def _with_inputs(config: OneStepConfig, inputs: tuple[str, ...]) -> OneStepConfig:

@@ -1,0 +1,76 @@
+"""Which training job a recipe and a start make, and which recipe a start asks for."""
+
+from pathlib import Path
+
+import torch
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.metrics.lpips import LpipsFiles
+from lidarpainter_models.painter.nano.job import NanoJob
+from lidarpainter_models.painter.nano.painter import NanoPainter
+from lidarpainter_models.painter.nano.training import NanoTrainingConfig
+from lidarpainter_models.painter.one_step.job import NO_FILES, OneStepJob, OneStepRecipe
+from lidarpainter_models.painter.one_step.loading import SUFFIX, split_preset
+from lidarpainter_models.painter.one_step.presets import preset_named
+from lidarpainter_models.painter.one_step.training import OneStepTrainingConfig
+from lidarpainter_models.painter.one_step.weights import read_trained
+from lidarpainter_models.painter.selection import PainterChoice
+from lidarpainter_models.painter.training.job import TrainingJob
+
+CPU = torch.device("cpu")
+
+PainterTraining = NanoTrainingConfig | OneStepTrainingConfig
+
+
+def job_for(
+    config: PainterTraining,
+    start: str | Path | None,
+    lpips: LpipsFiles = NO_FILES,
+    *,
+    device: torch.device = CPU,
+    num_processes: int = 1,
+) -> TrainingJob:
+    """The job of a recipe; what it needs is checked, and not yet read whole.
+
+    Args:
+        config: the recipe.
+        start: for the small painter weights to go on from, or None; for the one-step painter its
+            model or weights to go on from.
+        lpips: weights for the loss of the one-step painter.
+        device: where the one-step painter is trained in one process; the small one takes the CPU.
+        num_processes: in which the one-step painter is trained.
+
+    Raises:
+        ConfigError: the one-step painter has no model, its loss lacks what it weighs, several
+            processes that cannot train together, or a start that learns nothing.
+        WeightsError: the model or the first weights cannot be used.
+    """
+    if num_processes < 1 or (num_processes > 1 and config.max_cpu_s is not None):
+        raise ConfigError(f"{num_processes} processes cannot share a budget: give --steps")
+    if isinstance(config, NanoTrainingConfig):
+        if num_processes > 1:
+            raise ConfigError("the small painter is trained in one process")
+        return NanoJob(config, None if start is None else _first_nano(Path(start)))
+    if start is None:
+        raise ConfigError("the one-step painter is trained on a model: give --base")
+    recipe = OneStepRecipe(start=str(start), config=config, lpips=lpips)
+    return OneStepJob(recipe, device, num_processes)
+
+
+def recipe_for(start: str) -> OneStepTrainingConfig:
+    """The recipe for a model with a preset after a colon, or for a weights file to go on from.
+
+    Raises:
+        WeightsError: it is not there.
+    """
+    if start.endswith(SUFFIX):
+        return OneStepTrainingConfig(network=read_trained(Path(start)).config)
+    return OneStepTrainingConfig(network=preset_named(split_preset(start)[1]))
+
+
+def _first_nano(start: Path) -> NanoPainter:
+    choice = PainterChoice.of(start)
+    painter = choice.load(CPU) if choice.kind == "nano" else None
+    if not isinstance(painter, NanoPainter):
+        raise ConfigError(f"{start}: expected a trained painter that says what it has learnt")
+    return painter
