@@ -23,7 +23,6 @@ from lidarpainter_models.evaluation.painting_samples import painting_samples
 from lidarpainter_models.export.images import write_png
 from lidarpainter_models.metrics.squeezenet import SqueezeNetDistance, load_squeezenet_distance
 from lidarpainter_models.painter.nano.painter import NanoPainter
-from lidarpainter_models.painter.nano.tiles import TileConfig
 from lidarpainter_models.painter.precision import precision_of
 from lidarpainter_models.painter.protocol import Painter
 from lidarpainter_models.painter.selection import PainterChoice
@@ -63,7 +62,6 @@ def judge_painters(
         `painters`: scores by label; `pairs`: how many of every set were judged and left out;
         `training_unknown`: learned painters whose weights do not say what they were trained on.
     """
-    tiles = None if keep_below is None else TileConfig(keep_below=keep_below)
     distance = feature_distance_of(feature_weights)
     choices = {label: PainterChoice.of(name) for label, name in painters.items()}
     place = torch.device(device)
@@ -76,9 +74,9 @@ def judge_painters(
     for label, choice in choices.items():
         painter = choice.load(place)
         scores[label] = _told_scores(painter, unseen, distance, f"judge {label}")
-        if tiles is not None and isinstance(painter, NanoPainter):
+        if keep_below is not None and isinstance(painter, NanoPainter):
             twice = f"{label}, tiles kept"
-            again = painter.sparing(tiles)
+            again = painter.sparing(keep_below)
             sparing[twice] = _told_scores(again, unseen, distance, f"judge {twice}")
     return {
         "painters": scores | sparing,

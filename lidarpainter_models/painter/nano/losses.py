@@ -24,7 +24,7 @@ from lidarpainter_models.painter.nano.network import NanoOutput
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LossWeights:
+class NanoLossWeights:
     """How much each term counts."""
 
     absolute: float = 1.0
@@ -72,7 +72,7 @@ def painting_loss(
     conditions: ConditionBatch,
     target: Float[Tensor, "batch 3 height width"],
     target_valid: Float[Tensor, "batch height width"],
-    weights: LossWeights,
+    weights: NanoLossWeights,
     *,
     restyled: Bool[Tensor, " batch"] | None = None,
     sees_render: bool = True,

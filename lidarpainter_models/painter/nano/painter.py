@@ -8,12 +8,12 @@ from typing import Any
 
 import torch
 
+from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.batches import in_planes, stack_conditions
 from lidarpainter_models.painter.examples import Window
 from lidarpainter_models.painter.input_hull import input_hull
 from lidarpainter_models.painter.nano.network import NanoNetwork
 from lidarpainter_models.painter.nano.tiles import (
-    TileConfig,
     doubt,
     doubtful_tiles,
     grown_to_pixels,
@@ -43,7 +43,7 @@ class NanoPainter:
         *,
         provenance: dict[str, Any] | None = None,
         precision: torch.dtype | None = None,
-        tiles: TileConfig | None = None,
+        keep_below: float | None = None,
     ) -> None:
         """Take a trained network.
 
@@ -52,7 +52,11 @@ class NanoPainter:
                 precision, and a copy of it paints.
             provenance: where its weights come from, as stored beside them.
             precision: of the convolutions, bfloat16 or float32; None takes the faster one.
-            tiles: paint only tiles that need it; None paints the whole image.
+            keep_below: leave tiles unpainted on which what is known differs from the render by less
+                than this on average; None paints the whole image.
+
+        Raises:
+            ConfigError: a negative limit.
         """
         frozen = network.eval().requires_grad_(False)
         # torch's stub lacks memory_format
@@ -61,12 +65,17 @@ class NanoPainter:
         is_halved = self.precision == torch.bfloat16
         self._network = self.network.halved() if is_halved else self.network
         self.provenance = provenance or {}
-        self.tiles = tiles
+        if keep_below is not None and not keep_below >= 0:
+            raise ConfigError(f"keep_below must not be negative, got {keep_below}")
+        self.keep_below = keep_below
 
-    def sparing(self, tiles: TileConfig) -> "NanoPainter":
+    def sparing(self, keep_below: float) -> "NanoPainter":
         """The same painter, painting only tiles that need it."""
         return NanoPainter(
-            self.network, provenance=self.provenance, precision=self.precision, tiles=tiles
+            self.network,
+            provenance=self.provenance,
+            precision=self.precision,
+            keep_below=keep_below,
         )
 
     @torch.inference_mode()
@@ -78,18 +87,18 @@ class NanoPainter:
         """
         self.network.prompt_index(conditions.prompt)
         # a style changes every pixel
-        if self.tiles is None or conditions.prompt != DEFAULT_PROMPT:
+        if self.keep_below is None or conditions.prompt != DEFAULT_PROMPT:
             return self._painted(conditions)
-        return self._painted_where_needed(conditions, self.tiles)
+        return self._painted_where_needed(conditions, self.keep_below)
 
-    def _painted_where_needed(self, conditions: PaintingConditions, config: TileConfig) -> Painting:
+    def _painted_where_needed(self, conditions: PaintingConditions, keep_below: float) -> Painting:
         """Paint the doubtful tiles; a kept one is as sure as what is known agrees with it."""
         height_px, width_px = conditions.height_width_px
-        tiles = doubtful_tiles(conditions, config)
-        is_doubtful = grown_to_pixels(tiles, height_px, width_px, config)
+        tiles = doubtful_tiles(conditions, keep_below)
+        is_doubtful = grown_to_pixels(tiles, height_px, width_px)
         rgb = conditions.render_rgb.clone()
         confidence = torch.exp(-doubt(conditions) / self.network.config.confidence_error)
-        for seen, changed in painted_parts(tiles, height_px, width_px, config):
+        for seen, changed in painted_parts(tiles, height_px, width_px):
             part = self._painted(conditions.cropped(*seen.slices))
             inside = Window(
                 changed.top_px - seen.top_px,

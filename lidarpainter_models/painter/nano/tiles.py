@@ -6,7 +6,6 @@ something, so such pixels count as doubtful. The other tiles are painted in rect
 around for the network to see, or, if that is less work, the whole image at once.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -16,7 +15,6 @@ import torch.nn.functional as F  # noqa: N812
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.examples import Window
 from lidarpainter_models.painter.protocol import PaintingConditions
 
@@ -24,26 +22,9 @@ UNKNOWN_DOUBT = 0.05
 """Of a pixel that neither LiDAR nor warp shows: an error at which it would count as wrong."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TileConfig:
-    """Which tiles keep the render."""
-
-    keep_below: float = 0.01
-    """Mean absolute rgb difference of a tile under which it is kept."""
-    side_px: int = 32
-    """Of a tile."""
-    border_px: int = 32
-    """Seen around what is painted; a multiple of the network's 16 px, as is the tile."""
-
-    def __post_init__(self) -> None:
-        """Refuse tiles that are not made of whole cells."""
-        if not self.keep_below >= 0:
-            raise ConfigError(f"keep_below must not be negative, got {self.keep_below}")
-        if self.side_px < 16 or self.side_px % 16 or self.border_px < 0 or self.border_px % 16:
-            raise ConfigError(
-                f"tiles and borders must be multiples of 16 px, got {self.side_px} and "
-                f"{self.border_px}"
-            )
+TILE_PX = 32
+BORDER_PX = 32
+"""Seen around what is painted; both are multiples of the network's 16 px."""
 
 
 class PaintedPart(NamedTuple):
@@ -65,36 +46,35 @@ def doubt(conditions: PaintingConditions) -> Float[Tensor, "height width"]:
 
 
 def doubtful_tiles(
-    conditions: PaintingConditions, config: TileConfig
+    conditions: PaintingConditions, keep_below: float
 ) -> Bool[Tensor, "rows columns"]:
-    """Tiles that are worth painting; those at the right and lower edge may be cut."""
+    """Tiles whose mean doubt is not below a limit; those at the right and lower edge may be cut."""
     found = F.avg_pool2d(
-        doubt(conditions)[None, None], config.side_px, ceil_mode=True, count_include_pad=False
+        doubt(conditions)[None, None], TILE_PX, ceil_mode=True, count_include_pad=False
     )
-    return found[0, 0] >= config.keep_below
+    return found[0, 0] >= keep_below
 
 
 def painted_parts(
-    tiles: Bool[Tensor, "rows columns"], height_px: int, width_px: int, config: TileConfig
+    tiles: Bool[Tensor, "rows columns"], height_px: int, width_px: int
 ) -> list[PaintedPart]:
     """Rectangles that hold every doubtful tile, or the whole image where that is less work."""
     whole = Window(0, 0, height_px, width_px)
     boxes = _boxes(tiles.numpy())
     parts = []
     for top, left, rows, columns in boxes:
-        changed = _clipped(top, left, rows, columns, config.side_px, 0, whole)
-        seen = _clipped(top, left, rows, columns, config.side_px, config.border_px, whole)
+        changed = _clipped(top, left, rows, columns, 0, whole)
+        seen = _clipped(top, left, rows, columns, BORDER_PX, whole)
         parts.append(PaintedPart(seen, changed))
     work_px = sum(part.seen.height_px * part.seen.width_px for part in parts)
     return parts if work_px < height_px * width_px else [PaintedPart(whole, whole)]
 
 
 def grown_to_pixels(
-    tiles: Bool[Tensor, "rows columns"], height_px: int, width_px: int, config: TileConfig
+    tiles: Bool[Tensor, "rows columns"], height_px: int, width_px: int
 ) -> Bool[Tensor, "height width"]:
     """The tile mask on the image's grid."""
-    side = config.side_px
-    return tiles.repeat_interleave(side, 0).repeat_interleave(side, 1)[:height_px, :width_px]
+    return tiles.repeat_interleave(TILE_PX, 0).repeat_interleave(TILE_PX, 1)[:height_px, :width_px]
 
 
 def _boxes(tiles: np.ndarray) -> list[tuple[int, int, int, int]]:
@@ -112,12 +92,10 @@ def _boxes(tiles: np.ndarray) -> list[tuple[int, int, int, int]]:
         mask = filled
 
 
-def _clipped(
-    top: int, left: int, rows: int, columns: int, side_px: int, border_px: int, whole: Window
-) -> Window:
+def _clipped(top: int, left: int, rows: int, columns: int, border_px: int, whole: Window) -> Window:
     """A box of tiles in pixels, with a border where the image goes on."""
-    first_row = max(0, top * side_px - border_px)
-    first_column = max(0, left * side_px - border_px)
-    last_row = min(whole.height_px, (top + rows) * side_px + border_px)
-    last_column = min(whole.width_px, (left + columns) * side_px + border_px)
+    first_row = max(0, top * TILE_PX - border_px)
+    first_column = max(0, left * TILE_PX - border_px)
+    last_row = min(whole.height_px, (top + rows) * TILE_PX + border_px)
+    last_column = min(whole.width_px, (left + columns) * TILE_PX + border_px)
     return Window(first_row, first_column, last_row - first_row, last_column - first_column)

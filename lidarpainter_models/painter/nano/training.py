@@ -11,7 +11,7 @@ from torch import nn
 from lidarpainter_models.errors import TrainingError
 from lidarpainter_models.painter.augmentation import TrainingBatch
 from lidarpainter_models.painter.examples import PairSource
-from lidarpainter_models.painter.nano.losses import LossWeights, painting_loss
+from lidarpainter_models.painter.nano.losses import NanoLossWeights, painting_loss
 from lidarpainter_models.painter.nano.more_prompts import with_more_prompts
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.training.checkpoints import training_digest
@@ -30,7 +30,7 @@ class NanoTrainingConfig(TrainingConfig):
     """How the small painter is trained."""
 
     network: NanoConfig = field(default_factory=NanoConfig)
-    loss: LossWeights = field(default_factory=LossWeights)
+    loss: NanoLossWeights = field(default_factory=NanoLossWeights)
     steps: int = 20_000
     batch_size: int = 6
     learning_rate: float = 2e-3

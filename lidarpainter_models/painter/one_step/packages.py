@@ -11,7 +11,7 @@ from lidarpainter_models.errors import MissingPackageError
 
 
 def diffusion_package(name: str) -> Any:  # noqa: ANN401 - a module without type stubs
-    """Import `diffusers`, `transformers`, `peft`, `accelerate` or `huggingface_hub`.
+    """Import `diffusers`, `transformers`, `peft` or `huggingface_hub`.
 
     Raises:
         MissingPackageError: the package is not installed or cannot be imported.

@@ -8,7 +8,7 @@ import torch
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.batches import stack_conditions
 from lidarpainter_models.painter.nano.losses import (
-    LossWeights,
+    NanoLossWeights,
     expected_error_loss,
     harm_loss,
     painting_loss,
@@ -57,7 +57,7 @@ def test_total_is_the_weighted_sum_and_pulls_every_head(make_conditions):
     log_error = torch.zeros(2, 16, 20, requires_grad=True)
     output = replace(output_of(rgb), log_error=log_error, base=target)
     batch = stack_conditions([make_conditions(16, 20, seed=s) for s in (0, 1)], num_sources=2)
-    weights = LossWeights(
+    weights = NanoLossWeights(
         absolute=1, squared=2, structure=3, gradient=4, expected_error=5, keep=6, harm=7
     )
     terms = painting_loss(output, batch, target, torch.ones(2, 16, 20), weights)
@@ -73,7 +73,7 @@ def test_total_is_the_weighted_sum_and_pulls_every_head(make_conditions):
 
 def test_negative_weights_are_refused():
     with pytest.raises(ConfigError, match="gradient"):
-        LossWeights(gradient=-1)
+        NanoLossWeights(gradient=-1)
 
 
 def test_harm_counts_pixels_worse_than_all_before_and_no_others():
@@ -95,7 +95,7 @@ def test_harm_is_measured_against_the_base_alone_where_the_render_is_not_shown(m
     image, target = images()
     output = replace(output_of(image), base=target + 0.1)
     batch = stack_conditions([make_conditions(16, 20, seed=s) for s in (0, 1)], num_sources=2)
-    known, weights = torch.ones(2, 16, 20), LossWeights(harm=1)
+    known, weights = torch.ones(2, 16, 20), NanoLossWeights(harm=1)
     shown = painting_loss(output, batch, target, known, weights).harm
     blind = painting_loss(output, batch, target, known, weights, sees_render=False).harm
     both = [batch.render, target + 0.1]
@@ -108,5 +108,7 @@ def test_a_restyled_view_cannot_be_harmed(make_conditions):
     image, target = images()
     batch = stack_conditions([make_conditions(16, 20, seed=s) for s in (0, 1)], num_sources=2)
     known, restyled = torch.ones(2, 16, 20), torch.ones(2, dtype=torch.bool)
-    terms = painting_loss(output_of(image), batch, target, known, LossWeights(), restyled=restyled)
+    terms = painting_loss(
+        output_of(image), batch, target, known, NanoLossWeights(), restyled=restyled
+    )
     assert float(terms.harm) == 0

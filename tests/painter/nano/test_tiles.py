@@ -11,13 +11,12 @@ from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.nano.painter import NanoPainter
 from lidarpainter_models.painter.nano.tiles import (
     UNKNOWN_DOUBT,
-    TileConfig,
     doubt,
     doubtful_tiles,
     painted_parts,
 )
 
-TILES = TileConfig(side_px=16, border_px=16)
+KEEP_BELOW = 0.01
 
 
 @pytest.fixture(scope="module")
@@ -32,10 +31,10 @@ def network():
 @pytest.fixture
 def one_doubt(make_conditions):
     """All that is known agrees, but for one pixel of the LiDAR in the second row of tiles."""
-    old = make_conditions(80, 96)
+    old = make_conditions(160, 192)
     everywhere = torch.ones_like(old.warp_valid)
     lidar = old.render_rgb.clone()
-    lidar[20, 40] = 1 - lidar[20, 40].round()
+    lidar[40, 80] = 1 - lidar[40, 80].round()
     return replace(
         old,
         lidar_rgb=lidar,
@@ -61,29 +60,30 @@ def test_doubt_is_the_mean_difference_of_what_is_known(make_conditions):
 
 
 def test_only_the_tile_with_a_doubt_is_painted(network, one_doubt):
-    config = replace(TILES, keep_below=1e-4)
-    assert doubtful_tiles(one_doubt, config).nonzero().tolist() == [[1, 2]]
-    painter = NanoPainter(network, precision=torch.float32, tiles=config)
+    assert doubtful_tiles(one_doubt, 1e-4).nonzero().tolist() == [[1, 2]]
+    painter = NanoPainter(network, precision=torch.float32, keep_below=1e-4)
     painting = painter.paint(one_doubt)
-    inside = torch.zeros(80, 96, dtype=torch.bool)
-    inside[16:32, 32:48] = True
+    inside = torch.zeros(160, 192, dtype=torch.bool)
+    inside[32:64, 64:96] = True
     assert torch.equal(painting.rgb[~inside], one_doubt.render_rgb[~inside])
     assert not torch.allclose(painting.rgb[inside], one_doubt.render_rgb[inside], atol=0.01)
-    assert painting.kept_share == pytest.approx(1 - 256 / (80 * 96))
+    assert painting.kept_share == pytest.approx(1 - 32**2 / (160 * 192))
     assert float(painting.confidence[~inside].min()) == 1
 
 
 def test_doubt_everywhere_paints_as_without_tiles(network, make_conditions):
     conditions = make_conditions(40, 56)
     whole = NanoPainter(network, precision=torch.float32).paint(conditions)
-    tiled = NanoPainter(network, precision=torch.float32, tiles=TILES).paint(conditions)
+    tiled = NanoPainter(network, precision=torch.float32, keep_below=KEEP_BELOW).paint(conditions)
     assert torch.equal(whole.rgb, tiled.rgb)
     assert tiled.kept_share == 0
 
 
 def test_what_agrees_everywhere_is_not_painted_at_all(network, one_doubt):
     conditions = replace(one_doubt, lidar_rgb=one_doubt.render_rgb)
-    painting = NanoPainter(network, precision=torch.float32, tiles=TILES).paint(conditions)
+    painting = NanoPainter(network, precision=torch.float32, keep_below=KEEP_BELOW).paint(
+        conditions
+    )
     assert torch.equal(painting.rgb, conditions.render_rgb)
     assert painting.kept_share == 1
 
@@ -91,10 +91,10 @@ def test_what_agrees_everywhere_is_not_painted_at_all(network, one_doubt):
 def test_a_part_has_a_border_that_ends_at_the_image():
     tiles = torch.zeros(6, 10, dtype=torch.bool)
     tiles[0, 0] = tiles[5, 9] = True
-    parts = painted_parts(tiles, 90, 160, TILES)
+    parts = painted_parts(tiles, 180, 320)
     assert parts == [
-        (Window(0, 0, 32, 32), Window(0, 0, 16, 16)),
-        (Window(64, 128, 26, 32), Window(80, 144, 10, 16)),
+        (Window(0, 0, 64, 64), Window(0, 0, 32, 32)),
+        (Window(128, 256, 52, 64), Window(160, 288, 20, 32)),
     ]
 
 
@@ -102,26 +102,23 @@ def test_pieces_whose_boxes_overlap_become_one():
     tiles = torch.zeros(8, 20, dtype=torch.bool)
     tiles[1, 1:4] = tiles[1:4, 1] = True
     tiles[3, 3] = True
-    assert [part.changed for part in painted_parts(tiles, 128, 320, TILES)] == [
-        Window(16, 16, 48, 48)
-    ]
+    assert [part.changed for part in painted_parts(tiles, 256, 640)] == [Window(32, 32, 96, 96)]
 
 
 def test_many_parts_cost_more_than_the_whole_image():
     tiles = torch.zeros(6, 6, dtype=torch.bool)
     tiles[::2, ::2] = True
-    assert painted_parts(tiles, 96, 96, TILES) == [(Window(0, 0, 96, 96), Window(0, 0, 96, 96))]
+    assert painted_parts(tiles, 192, 192) == [(Window(0, 0, 192, 192), Window(0, 0, 192, 192))]
 
 
 def test_a_style_paints_every_pixel(one_doubt):
     torch.manual_seed(0)
     config = NanoConfig(widths=(8, 8, 8), blocks=(1, 1, 1), prompts=("clear", "foggy"))
-    painter = NanoPainter(NanoNetwork(config), precision=torch.float32, tiles=TILES)
+    painter = NanoPainter(NanoNetwork(config), precision=torch.float32, keep_below=KEEP_BELOW)
     assert painter.paint(replace(one_doubt, prompt="foggy")).kept_share == 0
     assert painter.paint(replace(one_doubt, prompt="clear")).kept_share == 1
 
 
-@pytest.mark.parametrize("settings", [{"side_px": 20}, {"border_px": 8}, {"keep_below": -1}])
-def test_impossible_tiles_are_refused(settings):
-    with pytest.raises(ConfigError):
-        TileConfig(**settings)
+def test_a_negative_limit_is_refused(network):
+    with pytest.raises(ConfigError, match="keep_below"):
+        NanoPainter(network, keep_below=-1)
