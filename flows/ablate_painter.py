@@ -12,6 +12,7 @@ from catalog.store import open_store
 from flows.train_painter import training_cost
 from lidarpainter_models.devices import Device, chosen_device
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.evaluation.painter_training import TrainingRequest
 from lidarpainter_models.metrics.lpips import LpipsFiles
 from lidarpainter_models.painter import OverlayPainter, UnpaintedPainter, WarpPainter
 from lidarpainter_models.painter.nano.ablations import REFERENCE, ablation_tables
@@ -19,7 +20,7 @@ from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.painter.training_jobs import PainterTraining, job_for
 from lidarpainter_models.training_data.pair_sets import named_sets, open_sets
 from tasks.painter.judge import judge_painters
-from tasks.painter.train import TrainingRequest, train, weights_path
+from tasks.painter.train import train, weights_path
 
 UNLEARNED = (UnpaintedPainter.name, OverlayPainter.name, WarpPainter.name)
 

@@ -18,6 +18,7 @@ from lidarpainter_models.evaluation.held_back import (
     check_training_scene,
     first_targets,
 )
+from lidarpainter_models.evaluation.painter_training import TrainingRequest
 from lidarpainter_models.metrics.lpips import LpipsFiles
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.painter.selection import WEIGHTS_SUFFIX
@@ -42,7 +43,6 @@ from tasks.painter.judge import (
     samples_path,
 )
 from tasks.painter.train import (
-    TrainingRequest,
     publish_painter,
     train,
     training_record,

@@ -11,12 +11,11 @@ from prefect import task
 from catalog.artefacts import ArtefactRef, Workplace
 from catalog.digests import DIGEST_LENGTH, digest_file
 from catalog.store import Store, open_store
-from lidarpainter_models.errors import ConfigError, DataError
+from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.held_back import (
     PairSubset,
     hold_back,
     learnt_targets,
-    unseen_pairs,
 )
 from lidarpainter_models.evaluation.painting import JudgingPairs, score_painter
 from lidarpainter_models.evaluation.painting_samples import painting_samples
@@ -29,7 +28,7 @@ from lidarpainter_models.painter.selection import PainterChoice
 from lidarpainter_models.training_data.pair_sets import PairSet, open_sets
 from tasks.json_files import read_json, write_json
 from tasks.measuring import measured
-from tasks.painter.judged_fits import JudgedFit, open_fits
+from tasks.painter.judged_fits import JudgedFit, unseen_sources
 from tasks.progress import Progress, listener, progress_of
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
 
@@ -68,7 +67,7 @@ def judge_painters(
     # one at a time: several at full size do not fit into memory
     known = {label: learnt_targets(choice.load(place)) for label, choice in choices.items()}
     learnt = [targets for targets in known.values() if targets is not None]
-    unseen, pairs = _unseen_sources(sets, fits, learnt)
+    unseen, pairs = unseen_sources(sets, fits, learnt)
     scores: dict[str, Any] = {}
     sparing: dict[str, Any] = {}
     for label, choice in choices.items():
@@ -83,38 +82,6 @@ def judge_painters(
         "pairs": pairs,
         "training_unknown": [label for label, targets in known.items() if targets is None],
     }
-
-
-def _unseen_sources(
-    sets: Sequence[PairSet], fits: Sequence[JudgedFit], learnt: Sequence[frozenset[str]]
-) -> tuple[dict[str, JudgingPairs], dict[str, Any]]:
-    """Pairs that no painter was trained on, and how many of every set those are.
-
-    Raises:
-        ConfigError: neither pairs nor runs.
-        DataError: a painter was trained on all of them.
-    """
-    sources: dict[str, JudgingPairs] = {}
-    counts: dict[str, Any] = {}
-    if sets or not fits:
-        folders = open_sets(sets)
-        unseen = unseen_pairs(folders, learnt)
-        sources |= unseen
-        for name, folder in folders.items():
-            judged = len(unseen.get(name, ()))
-            counts[name] = _counted(judged, len(folder) - judged, folder=str(folder.folder))
-    for fit in open_fits(fits, frozenset().union(*learnt)):
-        for name, views in fit.pairs.items():
-            counts[name] = _counted(len(views), fit.num_left_out, run_id=fit.run_id)
-            if len(views):
-                sources[name] = views
-    if not sources:
-        raise DataError(f"a painter was trained on every held-out view of {', '.join(counts)}")
-    return sources, counts
-
-
-def _counted(num_judged: int, num_left_out: int, **origin: str) -> dict[str, Any]:
-    return {**origin, "num_judged": num_judged, "num_left_out": num_left_out}
 
 
 @task(**STAGE_OPTIONS)

@@ -1,16 +1,20 @@
-"""Finished runs whose held-out views judge painters."""
+"""What judges painters: pairs, and held-out views of finished runs, that none was trained on."""
 
 from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from catalog.store import open_store
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
-from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.errors import ConfigError, DataError
+from lidarpainter_models.evaluation.held_back import unseen_pairs
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.judged_pairs import JudgedPairs, judged_pairs, unseen_views
 from lidarpainter_models.evaluation.judging import JudgeConfig, known_street
+from lidarpainter_models.evaluation.painting import JudgingPairs
+from lidarpainter_models.training_data.pair_sets import PairSet, open_sets
 from tasks.opened import SplitSpec, open_split
 from tasks.stored import FittedRef, load_observations, load_scene
 
@@ -70,3 +74,35 @@ def open_fits(fits: Sequence[JudgedFit], trained: AbstractSet[str]) -> list[Open
     if twice:
         raise ConfigError(f"judge by one run of each scene, got two of {', '.join(twice)}")
     return [fit.open(trained) for fit in fits]
+
+
+def unseen_sources(
+    sets: Sequence[PairSet], fits: Sequence[JudgedFit], learnt: Sequence[frozenset[str]]
+) -> tuple[dict[str, JudgingPairs], dict[str, Any]]:
+    """Pairs that no painter was trained on, and how many of every set those are.
+
+    Raises:
+        ConfigError: neither pairs nor runs.
+        DataError: a painter was trained on all of them.
+    """
+    sources: dict[str, JudgingPairs] = {}
+    counts: dict[str, Any] = {}
+    if sets or not fits:
+        folders = open_sets(sets)
+        unseen = unseen_pairs(folders, learnt)
+        sources |= unseen
+        for name, folder in folders.items():
+            judged = len(unseen.get(name, ()))
+            counts[name] = _counted(judged, len(folder) - judged, folder=str(folder.folder))
+    for fit in open_fits(fits, frozenset().union(*learnt)):
+        for name, views in fit.pairs.items():
+            counts[name] = _counted(len(views), fit.num_left_out, run_id=fit.run_id)
+            if len(views):
+                sources[name] = views
+    if not sources:
+        raise DataError(f"a painter was trained on every held-out view of {', '.join(counts)}")
+    return sources, counts
+
+
+def _counted(num_judged: int, num_left_out: int, **origin: str) -> dict[str, Any]:
+    return {**origin, "num_judged": num_judged, "num_left_out": num_left_out}

@@ -14,6 +14,7 @@ from tiny_diffusion import write_model
 
 from catalog.store import open_store
 from lidarpainter_models.errors import ConfigError, DataError, TrainingError, WeightsError
+from lidarpainter_models.evaluation.painter_training import TrainingRequest
 from lidarpainter_models.metrics.backbones import SQUEEZENET
 from lidarpainter_models.metrics.lpips import Lpips, LpipsFiles
 from lidarpainter_models.painter import load_painter
@@ -26,7 +27,6 @@ from lidarpainter_models.painter.training_jobs import job_for, recipe_for
 from lidarpainter_models.training_data.pair_sets import PairSet
 from tasks.painter.judge import judge_held_back, load_painting_scores, samples_path
 from tasks.painter.train import (
-    TrainingRequest,
     publish_painter,
     train,
     training_record,

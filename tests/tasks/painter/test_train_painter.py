@@ -10,6 +10,7 @@ from random_pairs import write_pairs
 
 from catalog.store import open_store
 from lidarpainter_models.errors import ConfigError, DataError
+from lidarpainter_models.evaluation.painter_training import TrainingRequest
 from lidarpainter_models.painter.augmentation import AugmentationConfig
 from lidarpainter_models.painter.nano.network import NanoConfig
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
@@ -17,7 +18,6 @@ from lidarpainter_models.painter.nano.weights import load_weights
 from lidarpainter_models.training_data.pair_sets import PairSet
 from tasks.painter.judge import judge_held_back, judge_painters, load_painting_scores
 from tasks.painter.train import (
-    TrainingRequest,
     publish_painter,
     train,
     training_record,
