@@ -10,7 +10,7 @@ SYSTEM := $(VENV)/.system-libraries
 export OMP_WAIT_POLICY := passive
 export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba-cache
 
-.PHONY: demo test lint slow bench clean
+.PHONY: demo test lint nightly bench clean
 
 demo: $(INSTALLED) $(SYSTEM)
 	$(BIN)/lidarpainter demo --out demo
@@ -18,7 +18,8 @@ demo: $(INSTALLED) $(SYSTEM)
 test: lint
 	$(BIN)/python -m pytest
 
-slow: $(INSTALLED) $(SYSTEM)
+# what takes too long for every change: runs killed and resumed, thousands of damaged logs
+nightly: $(INSTALLED) $(SYSTEM)
 	$(BIN)/python -m pytest -m slow
 
 lint: $(INSTALLED) $(SYSTEM)

@@ -1,0 +1,314 @@
+"""Every command gets a tiny street to its end, and says and writes what it should."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import call, seen_image, settings, succeed
+from tiny_street import FRONT, HEIGHT_PX, NUM_FRAMES, SCENE, SETTINGS, SIDE, WIDTH_PX
+
+from flows.cli.catalog import app as catalog_app
+from flows.cli.evaluate import PROTOCOLS
+from lidarpainter_models.painter.styles import STYLE_PROMPTS
+
+ROOT = Path(__file__).resolve().parents[2]
+STAGES = ("prepare", "fit", "paint-1", "refine-1", "evaluate-unpainted", "evaluate", "report")
+SHIFTS = {"left-2m", "up-1.5m"}
+TINY = settings(*SETTINGS)
+
+
+def reconstructed(tiny_run, *words):
+    """`reconstruct` of the tiny street, with other words behind."""
+    return succeed("reconstruct", SCENE, *TINY, *words, store=tiny_run.store)
+
+
+def numbers_below(value):
+    """Every number in a JSON object."""
+    if isinstance(value, dict):
+        return [number for part in value.values() for number in numbers_below(part)]
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return [value] if is_number else []
+
+
+# --- demo and reconstruct
+
+
+def test_demo_tells_what_the_contract_of_the_command_lists(tiny_run):
+    result = tiny_run.result
+    assert (result["scene"], result["preset"], result["painter"]) == (SCENE, "preview", "nano")
+    assert set(result["seconds"]) == {*STAGES, "total"}
+    assert all(seconds >= 0 for seconds in result["seconds"].values())
+    assert set(STAGES) - {"report"} <= set(result["computed_now"])
+    assert all(result["computed_now"].values())
+    assert result["peak_memory_bytes"] > 1e8
+    assert 500 < result["num_gaussians"] <= 2000
+    for scores in (result, result["unpainted"]):
+        recorded = scores["recorded"]
+        assert recorded["num_views"] == NUM_FRAMES // 2
+        assert recorded["psnr"] > 15  # a grey image has 10
+        assert recorded["recorded_poses"]["psnr"] > 15
+        assert 0.3 < recorded["ssim"] <= 1
+        assert recorded["lpips"] is None
+        assert "weights" in recorded["lpips_reason"]
+        assert set(scores["novel"]) == SHIFTS
+        for novel in scores["novel"].values():
+            assert 10 < novel["psnr"] < recorded["psnr"] + 3
+    assert result["novel"] != result["unpainted"]["novel"]
+
+
+def test_demo_ends_with_a_page_and_progress_for_every_stage(tiny_run):
+    page = Path(tiny_run.result["report"])
+    assert page == tiny_run.out / "report.html"
+    text = page.read_text("utf-8")
+    assert text.startswith("<!doctype html>")
+    assert tiny_run.run_id in text
+    for stage in STAGES:
+        assert f"\n{stage}: " in f"\n{tiny_run.progress}"
+
+
+def test_catalog_holds_what_the_demo_made_and_nothing_else(tiny_run):
+    rows = tiny_run.rows
+    (scene,), (run,) = rows["scenes"], rows["runs"]
+    assert (scene["scene_id"], scene["num_frames"]) == (SCENE, NUM_FRAMES)
+    assert set(scene["cameras"]) == {FRONT, SIDE}
+    assert (run["run_id"], run["status"]) == (tiny_run.run_id, "complete")
+    assert json.loads(run["result"])["recorded"] == tiny_run.result["recorded"]
+    assert len(rows["artefacts"]) == len(STAGES)
+    assert rows["painters"] == []
+    judged = {(row["variant"], row["trajectory"]) for row in rows["metrics"]}
+    assert {(variant, shift) for variant in ("painted", "unpainted") for shift in SHIFTS} <= judged
+    for row in rows["metrics"]:
+        assert row["run_id"] == tiny_run.run_id
+        if row["name"] == "psnr":
+            assert (row["value"] is None) == bool(row["reason"])
+
+
+def test_the_same_again_computes_nothing(tiny_run):
+    again = reconstructed(tiny_run, "--json").json
+    assert again["run_id"] == tiny_run.run_id
+    assert not any(again["computed_now"].values())
+    for name in ("recorded", "novel", "unpainted", "num_gaussians", "artefacts"):
+        assert again[name] == tiny_run.result[name], name
+
+
+def test_the_installed_command_finds_the_run_in_a_process_of_its_own(tiny_run, tmp_path):
+    """The entry point, its environment and a Prefect server that it starts and ends itself."""
+    words = ["--store", tiny_run.store.root, "reconstruct", SCENE, "--json", *TINY]
+    environment = {**os.environ, "PREFECT_HOME": str(tmp_path)}
+    environment.pop("PREFECT_API_URL", None)
+    answer = subprocess.run(
+        [sys.executable, "-m", "flows.cli", *map(str, words)],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert answer.returncode == 0, answer.stderr
+    again = json.loads(answer.stdout)
+    assert again["run_id"] == tiny_run.run_id
+    assert not any(again["computed_now"].values())
+
+
+@pytest.mark.parametrize(
+    ("words", "painted"),
+    [
+        (("--painter", "none"), 0),
+        (("--painter", "overlay"), 1),
+        (("--painter", "warp", "--shift", "2"), 1),
+        (("--rounds", "0", "--set", "rounds=0"), 0),
+    ],
+    ids=["none", "overlay", "warp, other shifts", "no round"],
+)
+def test_another_painter_goes_on_from_the_fit_that_is_there(tiny_run, words, painted):
+    result = reconstructed(tiny_run, *words, "--json").json
+    assert result["run_id"] != tiny_run.run_id
+    assert not result["computed_now"]["fit"]
+    assert result["artefacts"]["fit"] == tiny_run.result["artefacts"]["fit"]
+    assert sum(stage.startswith("paint") for stage in result["seconds"]) == painted
+    assert result["recorded"]["psnr"] > 15
+    assert set(result["guidance"]) == ({"paint-1"} if painted else set())
+    is_refined = "refine-1" in result["seconds"]
+    assert (result["novel"] != result["unpainted"]["novel"]) == is_refined
+    assert tiny_run.store.tables.row("runs", result["run_id"])["status"] == "complete"
+
+
+def test_a_person_is_shown_tables(tiny_run):
+    shown = reconstructed(tiny_run).out
+    for text in (SCENE, tiny_run.run_id, "left-2m", "Gaussians", "report.html"):
+        assert text in shown
+    assert f"{tiny_run.result['recorded']['psnr']:.3f}" in shown
+
+
+# --- seeing and judging a run
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "words", "painter"),
+    [
+        ("recorded", ("--camera", FRONT), None),
+        ("lateral:1", ("--postpaint", "--previous", "mixed"), "nano"),
+        ("up:0.5+yaw:5", ("--painter", "overlay"), "overlay"),
+    ],
+)
+def test_render_writes_images_along_the_path(tiny_run, tmp_path, trajectory, words, painter):
+    words = ("--trajectory", trajectory, "--frames", "1:4", "--out", tmp_path, *words)
+    result = succeed("render", tiny_run.run_id, *words, "--json", store=tiny_run.store).json
+    assert (result["run_id"], result["trajectory"]) == (tiny_run.run_id, trajectory)
+    assert (result["painter"], result["num_images"]) == (painter, 3)
+    described = json.loads((tmp_path / "trajectory.json").read_text())["images"]
+    images = [seen_image(tmp_path / row["file"], WIDTH_PX, HEIGHT_PX) for row in described]
+    assert not np.array_equal(images[0], images[2])
+
+
+def test_a_shifted_camera_stands_where_it_was_asked_to(tiny_run, tmp_path):
+    poses = {}
+    for trajectory in ("recorded", "lateral:2"):
+        out = tmp_path / trajectory
+        words = ("--trajectory", trajectory, "--frames", "2:3", "--out", out)
+        assert f"images of {SCENE}" in succeed("render", "latest", *words, store=tiny_run.store).out
+        (row,) = json.loads((out / "trajectory.json").read_text())["images"]
+        poses[trajectory] = np.array(row["world_from_camera"]).reshape(4, 4)
+    moved_m = poses["lateral:2"][:3, 3] - poses["recorded"][:3, 3]
+    assert np.linalg.norm(moved_m) == pytest.approx(2.0, abs=1e-3)
+    assert poses["recorded"][:3, 0] @ moved_m == pytest.approx(-2.0, abs=0.02)  # x is to the right
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_evaluate_judges_by_every_protocol_and_only_once(tiny_run, protocol):
+    words = ("evaluate", tiny_run.run_id, "--protocol", protocol)
+    first, again = (succeed(*words, "--json", store=tiny_run.store) for _ in range(2))
+    result = first.json
+    assert again.json == result
+    assert (result["run_id"], result["scene"]) == (tiny_run.run_id, SCENE)
+    assert result["protocol"] == protocol
+    found = numbers_below(result)
+    assert len(found) > 3
+    assert all(math.isfinite(number) for number in found)
+    shown = succeed(*words, store=tiny_run.store)
+    assert tiny_run.run_id in shown.out
+    assert "was there" in shown.err
+
+
+def test_paper_protocol_gives_the_figures_of_the_run(tiny_run):
+    words = ("evaluate", tiny_run.run_id, "--protocol", "paper", "--json")
+    result = succeed(*words, store=tiny_run.store).json
+    assert result["painted"]["recorded"] == tiny_run.result["recorded"]
+    assert result["unpainted"] == tiny_run.result["unpainted"]
+
+
+def test_cross_camera_judges_by_the_camera_that_was_left_out(tiny_run):
+    words = ("evaluate", tiny_run.run_id, "--protocol", "cross-camera", "--json")
+    result = succeed(*words, store=tiny_run.store).json
+    for variant in ("unpainted", "painted"):
+        assert list(result[variant]) == [SIDE]
+        scores = result[variant][SIDE]
+        assert scores["num_views"] == NUM_FRAMES // 2
+        assert scores["num_pixels"] > 500
+        assert scores["psnr"] > 15
+        assert scores["psnr"] > scores["uncalibrated_psnr"] - 0.5
+
+
+def test_flicker_compares_what_was_rendered_painted_and_true(tiny_run):
+    words = ("evaluate", tiny_run.run_id, "--protocol", "flicker", "--painter", "overlay")
+    result = succeed(*words, "--previous", "mixed", "--json", store=tiny_run.store).json
+    for images in result["flicker"].values():
+        assert {"render", "painted", "truth", "painted, previous mixed"} <= set(images)
+        assert 0 < images["render"]["flicker"] < images["painted"]["flicker"]
+
+
+def test_view_time_painting_is_judged_beside_the_run(tiny_run):
+    words = ("evaluate", tiny_run.run_id, "--painter", "overlay", "--json")
+    result = succeed(*words, store=tiny_run.store).json
+    assert result["view-time"]["novel"] != result["painted"]["novel"]
+    assert set(result["view-time"]["novel"]) == SHIFTS
+
+
+@pytest.mark.parametrize("prompt", STYLE_PROMPTS)
+def test_stylize_shows_every_style_beside_the_clear_image(tiny_run, tmp_path, prompt):
+    words = ("--prompt", prompt, "--frames", "2:3", "--out", tmp_path)
+    result = succeed("stylize", tiny_run.run_id, *words, "--json", store=tiny_run.store).json
+    assert (result["prompt"], result["num_images"]) == (prompt, 1)
+    (row,) = json.loads((tmp_path / "trajectory.json").read_text())["images"]
+    styled = seen_image(tmp_path / row["file"], WIDTH_PX, HEIGHT_PX)
+    clear = seen_image(tmp_path / "clear" / row["file"], WIDTH_PX, HEIGHT_PX)
+    assert np.array_equal(styled, clear) == (prompt == "clear")
+    brightness = {"night": (0, 0.7), "foggy": (0.7, 3), "rain": (0.3, 1.5), "clear": (1, 1)}
+    low, high = brightness[prompt]
+    assert low <= styled.mean() / clear.mean() <= high
+
+
+# --- what the store holds
+
+
+@pytest.mark.parametrize("table", ["scenes", "runs", "artefacts", "metrics", "painters"])
+def test_catalog_lists_every_table(tiny_run, table):
+    found = succeed("catalog", "list", table, "--json", store=tiny_run.store).json
+    assert found["table"] == table
+    assert len(found["rows"]) >= len(tiny_run.rows[table])
+    assert f"{table} in " in succeed("catalog", "list", table, store=tiny_run.store).out
+
+
+def test_catalog_shows_a_scene_a_run_and_an_artefact_by_prefix(tiny_run):
+    artefact = tiny_run.rows["artefacts"][0]["artefact_id"]
+    names = {"scenes": SCENE, "runs": tiny_run.run_id[:10], "artefacts": artefact}
+    for table, name in names.items():
+        found = succeed("catalog", "show", name, "--json", store=tiny_run.store).json
+        assert found["table"] == table
+        assert name in succeed("catalog", "show", name, store=tiny_run.store).out
+
+
+@pytest.mark.parametrize("command", [command.name for command in catalog_app.registered_commands])
+def test_every_command_of_the_catalog_answers_about_the_run(tiny_run, command):
+    names = {"list": "runs"}
+    words = ("catalog", command, names.get(command, tiny_run.run_id))
+    assert tiny_run.run_id in succeed(*words, store=tiny_run.store).out
+    assert tiny_run.run_id in json.dumps(succeed(*words, "--json", store=tiny_run.store).json)
+
+
+# --- the likeliest failures
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("render", "ffff", "--trajectory", "recorded", "--out", "x"), "'ffff'"),
+        (("render", "latest", "--trajectory", "sideways", "--out", "x"), "sideways"),
+        (
+            ("render", "latest", "--trajectory", "recorded", "--camera", "roof", "--out", "x"),
+            "no camera 'roof'",
+        ),
+        (
+            ("render", "latest", "--trajectory", "recorded", "--frames", "70:80", "--out", "x"),
+            "no frame of front_camera is left to render",
+        ),
+        (
+            ("render", "latest", "--trajectory", "recorded", "--painter", "miro", "--out", "x"),
+            "no painter 'miro'",
+        ),
+        (("stylize", "latest", "--prompt", "snow", "--out", "x"), "no style 'snow'"),
+        (("stylize", "latest", "--prompt", "rain", "--images", "drawn", "--out", "x"), "drawn"),
+        (("evaluate", "ffff"), "'ffff'"),
+        (("evaluate", "latest", "--protocol", "flicker", "--previous", "next"), "mixed"),
+        (("evaluate", "latest", "--lpips-heads", "gone.pth"), "gone.pth"),
+        (("doctor", "synthetic/street-0006"), "no scene synthetic/street-0006"),
+        (("catalog", "show", "ffff"), "nothing is called 'ffff'"),
+    ],
+)
+def test_what_cannot_be_done_with_a_run_is_one_line_and_code_two(
+    tiny_run, tmp_path, monkeypatch, words, expected
+):
+    monkeypatch.chdir(tmp_path)
+    answer = call(*words, store=tiny_run.store)
+    assert answer.code == 2
+    assert answer.out == ""
+    assert expected in answer.err
+    complaints = [line for line in answer.err.splitlines() if line.startswith("lidarpainter: ")]
+    assert len(complaints) == 1
+    assert "Traceback" not in answer.err
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,54 @@
+"""The `lidarpainter` command inside the test's own process: imports are paid once."""
+
+import io
+import json
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+
+from flows.cli.main import main
+
+
+@dataclass(frozen=True)
+class Answer:
+    """How a command ended and what it said."""
+
+    code: int
+    out: str
+    err: str
+
+    @cached_property
+    def json(self):
+        """The one object on stdout."""
+        return json.loads(self.out)
+
+
+def call(*words, store=None):
+    """Run a command to whatever end."""
+    out, err = io.StringIO(), io.StringIO()
+    place = [] if store is None else ["--store", str(store.root)]
+    with redirect_stdout(out), redirect_stderr(err):
+        code = main([*place, *map(str, words)])
+    return Answer(code, out.getvalue(), err.getvalue())
+
+
+def succeed(*words, store=None):
+    """Run a command that must end well."""
+    answer = call(*words, store=store)
+    assert answer.code == 0, answer.err
+    return answer
+
+
+def settings(*assignments):
+    """The words of `--set`."""
+    return [word for assignment in assignments for word in ("--set", assignment)]
+
+
+def seen_image(path, width_px, height_px):
+    """An image on disk, of the size it should have, that shows something."""
+    bgr_u8 = cv2.imread(str(path))
+    assert bgr_u8.shape == (height_px, width_px, 3)
+    assert bgr_u8.std() > 5
+    return bgr_u8
