@@ -132,10 +132,16 @@ def test_streets_of_low_seeds_never_train(seed):
         check_training_scene("synthetic", f"street-{seed:04d}")
 
 
-def test_training_streets_and_logs_may_train():
-    check_street_seed(1000)
-    check_training_scene("synthetic", "street-1000")
-    check_training_scene("pandaset", "002")
+def test_of_streets_and_logs_only_those_kept_for_judging_may_not_train():
+    scenes = [("synthetic", f"street-{seed:04d}") for seed in (998, 999, 1000, 1001)]
+    scenes += [("pandaset", "002"), ("pandaset", "street-0007")]
+    refused = []
+    for dataset, sequence in scenes:
+        try:
+            check_training_scene(dataset, sequence)
+        except ConfigError:
+            refused.append((dataset, sequence))
+    assert refused == scenes[:2]
 
 
 def test_pairs_of_a_street_that_judges_never_train(make_folder):

@@ -1,9 +1,9 @@
 """The command ends as it promises: codes, one line, and JSON alone on stdout."""
 
 import json
+import resource
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -25,12 +25,17 @@ def test_help_is_fast_and_imports_nothing_heavy():
         "import sys; from flows.cli.main import main; main(['--help']); "
         "print(sorted({'torch', 'prefect', 'numba', 'cv2', 'open3d'} & set(sys.modules)))"
     )
-    started = time.process_time(), time.perf_counter()
+    before_s = children_cpu_s()
     answer = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
     )
     assert answer.stdout.splitlines()[-1] == "[]"
-    assert time.perf_counter() - started[1] < 10  # 0.6 s alone; others may use the machine
+    assert children_cpu_s() - before_s < 3  # 0.5 s on a fast core with warm files
+
+
+def children_cpu_s():
+    spent = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return spent.ru_utime + spent.ru_stime
 
 
 @pytest.mark.parametrize("command", [[], ["--version"], ["ingest", "--help"]])

@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 import torch
+import zarr
 
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.transforms import is_rigid
@@ -38,8 +39,16 @@ def test_poses_come_back_as_float64(small_scene):
     assert all(pose.dtype == torch.float64 and bool(is_rigid(pose).all()) for pose in poses)
 
 
-def test_whole_content_is_what_was_written(small_scene):
-    small_scene.verify_content()
+def test_whole_content_is_what_was_written_until_one_number_changes(copied_scene):
+    DrivingScene.open(copied_scene).verify_content()
+    array = zarr.open_array(copied_scene / "scene.zarr/point_intensity", mode="r+")
+    array[0] = array[0] + 1
+    manifest = json.loads((copied_scene / "manifest.json").read_text())
+    for name in manifest["files"]:  # as if the file had always been so
+        manifest["files"][name] = (copied_scene / name).stat().st_size
+    (copied_scene / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(SceneError, match="array point_intensity is not what was written"):
+        DrivingScene.open(copied_scene).verify_content()
 
 
 def test_view_sweep_and_camera_are_found_by_name(small_scene):

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from camera_rows import camera_rows
 from scipy.spatial.transform import Rotation
 from waymo_truth import NEAR_LIMITS_RAD, TURN_S, moved, top_column
 
@@ -56,16 +57,18 @@ def frame_numbers(truth, frame_index):
 def camera_numbers(truth, name):
     """The calibration of one camera."""
     view = truth.scene.views_of(name)[0]
-    lens, distortion = truth.scene._lenses[view.index]
+    row = camera_rows(truth.scene)[view.index]
     vehicle_from_sensor = truth.vehicle_from_camera[name].numpy() @ _SENSOR_FROM_CAMERA.T
-    readout = truth.scene._stored.table("cameras")["rolling_shutter_direction"][view.index].as_py()
     return {
         "name": name,
-        "intrinsic": [lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, *distortion.terms],
+        "intrinsic": [
+            *(row[term] for term in ("fx_px", "fy_px", "cx_px", "cy_px")),
+            *row["distortion_terms"],
+        ],
         "extrinsic": vehicle_from_sensor.reshape(16).tolist(),
-        "width": lens.width_px,
-        "height": lens.height_px,
-        "readout": READOUTS[readout],
+        "width": row["width_px"],
+        "height": row["height_px"],
+        "readout": READOUTS[row["rolling_shutter_direction"]],
     }
 
 
@@ -90,8 +93,7 @@ def _image(truth, view, timestamp_ns, global_from_ego):
     velocity, turn = truth.velocities[view.frame_index]
     exposure_s = (view.timestamp_ns - timestamp_ns) / 1e9
     pose_s = 0.0 if view.camera_name == "FRONT" else exposure_s - 0.003
-    table = truth.scene._stored.table("cameras")
-    readout_s = table["rolling_shutter_s"][view.index].as_py()
+    readout_s = camera_rows(truth.scene)[view.index]["rolling_shutter_s"]
     middle_s = view.timestamp_ns / 1e9
     half_s = (readout_s + SHUTTER_S) / 2
     return {

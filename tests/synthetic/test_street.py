@@ -96,11 +96,7 @@ def test_larger_images_average_to_smaller_ones_with_as_many_rays(street):
     camera, timestamp_ns = front(street)
     fine = street.render(camera, timestamp_ns).rgb
     half = camera.resized(width_px=120, height_px=68)
-    many = SyntheticStreet.__new__(SyntheticStreet)  # the same city, more rays per pixel
-    many.config, many._city = (
-        dataclasses.replace(street.config, samples_per_axis=4),
-        street._city,
-    )
+    many = drawn_street(dataclasses.replace(street.config, samples_per_axis=4))
     coarse = many.render(half, timestamp_ns).rgb
     averaged = torch.nn.functional.avg_pool2d(fine.permute(2, 0, 1), 2).permute(1, 2, 0)
     assert float((averaged - coarse).abs().mean()) < 0.01  # the rays stand at other places

@@ -1,8 +1,11 @@
 """A known scene, written as Waymo's files of either release, comes back as it was."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from camera_rows import camera_rows
 from scene_differences import scene_differences
 from scipy.spatial import cKDTree
 from waymo_components import write_v2
@@ -92,16 +95,11 @@ def test_frames_and_images_keep_their_moments(truth, scene):
 
 
 def test_lens_and_shutter_are_kept(scene):
-    table = scene._stored.table("cameras")
-    for camera, direction, duration_s in zip(
-        table["camera"].to_pylist(),
-        table["rolling_shutter_direction"].to_pylist(),
-        table["rolling_shutter_s"].to_pylist(),
-        strict=True,
-    ):
-        assert direction == CAMERAS[camera].readout
-        assert duration_s == pytest.approx(0.044, abs=2e-6)
-    assert {lens[1] for lens in scene._lenses} == {Distortion("brown", LENS_TERMS)}
+    for row in camera_rows(scene):
+        assert row["rolling_shutter_direction"] == CAMERAS[row["camera"]].readout
+        assert row["rolling_shutter_s"] == pytest.approx(0.044, abs=2e-6)
+        assert row["distortion_model"] == "brown"
+        assert tuple(row["distortion_terms"]) == LENS_TERMS
 
 
 def test_camera_synced_box_holds_when_its_camera_reads_the_centre(scene):
@@ -124,7 +122,9 @@ def test_camera_synced_box_holds_when_its_camera_reads_the_centre(scene):
 
 def lens_of(scene, view):
     """The lens as calibrated, its distortion aside, where the image was taken."""
-    return scene._lenses[view.index][0]
+    row = camera_rows(scene)[view.index]
+    pinhole = {name: row[name] for name in ("fx_px", "fy_px", "cx_px", "cy_px")}
+    return replace(view.camera, **pinhole)
 
 
 def test_other_box_holds_when_the_lidar_saw_the_actor(scene):
@@ -200,4 +200,4 @@ def test_pinhole_camera_stays_one(tiny_truth, tmp_path):
         plain = [record.replace(term.tobytes(), bytes(8)) for record in plain]
     file.write_bytes(tfrecord(plain))
     scene = DrivingScene.open(ingest_scene("waymo", tmp_path, "x", tmp_path / "store"))
-    assert {lens[1] for lens in scene._lenses} == {Distortion()}
+    assert {row["distortion_model"] for row in camera_rows(scene)} == {Distortion().model}
