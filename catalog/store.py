@@ -7,11 +7,14 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from catalog.artefacts import ArtefactStore
 from catalog.errors import CatalogError, UnknownRecordError
 from catalog.locks import held_lock
-from catalog.tables import CatalogTables, Row
+
+if TYPE_CHECKING:
+    from catalog.tables import CatalogTables, Row
 
 STORE_ENVIRONMENT = "LIDARPAINTER_STORE"
 DEFAULT_STORE = "lidarpainter-store"
@@ -32,8 +35,10 @@ class Store:
         return ArtefactStore(self.root)
 
     @cached_property
-    def tables(self) -> CatalogTables:
+    def tables(self) -> "CatalogTables":
         """The catalog's tables."""
+        from catalog.tables import CatalogTables  # Arrow and Delta: help does without
+
         return CatalogTables(str(self.root / "tables"))
 
     def scene_folder(self, scene_id: str) -> Path:
@@ -65,7 +70,7 @@ class Store:
         """Folder for what a user may look for by run: reports, rendered trajectories."""
         return self.root / "runs" / run_id
 
-    def run(self, run_id: str) -> Row:
+    def run(self, run_id: str) -> "Row":
         """The row of a run by id, unique prefix, or `latest` (the last that completed).
 
         Raises:
