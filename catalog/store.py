@@ -66,10 +66,6 @@ class Store:
         dataset, sequence = split_scene_id(scene_id)
         return held_lock(self.root / "locks" / f"scene-{dataset}-{sequence}.lock", on_wait=on_wait)
 
-    def run_folder(self, run_id: str) -> Path:
-        """Folder for what a user may look for by run: reports, rendered trajectories."""
-        return self.root / "runs" / run_id
-
     def run(self, run_id: str) -> "Row":
         """The row of a run by id, unique prefix, or `latest` (the last that completed).
 

@@ -6,7 +6,7 @@ named whose exposure all of them then take.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
@@ -14,15 +14,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.conditioning.references import WarpTarget, warped_references
-from lidarpainter_models.conditioning.surface_depth import SurfaceDepthConfig, surface_depth
-from lidarpainter_models.conditioning.warping import SourceImage, WarpConfig, source_cost_m
+from lidarpainter_models.conditioning.surface_depth import surface_depth
+from lidarpainter_models.conditioning.warping import SKY_ALPHA, SourceImage, source_cost_m
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.scene_rendering import SceneRender
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.lidar_images import (
     LidarImage,
-    LidarImageConfig,
     render_lidar,
 )
 from lidarpainter_models.lidar.lidar_map import LidarMap
@@ -40,9 +39,6 @@ class ConditionConfig:
     """Warped references given to the painter."""
     num_sources: int = 6
     """Recorded images they are patched together from: the nearest, then ever sparser ones."""
-    lidar: LidarImageConfig = field(default_factory=LidarImageConfig)
-    surface: SurfaceDepthConfig = field(default_factory=SurfaceDepthConfig)
-    warp: WarpConfig = field(default_factory=WarpConfig)
 
     def __post_init__(self) -> None:
         """Refuse fewer sources than references."""
@@ -72,7 +68,7 @@ class ConditionBuilder:
         self.lidar_map = lidar_map
         self.config = config or ConditionConfig()
         self.tracks = scene.tracks
-        self.boxes = MovingBoxes(self.tracks, self.config.warp.boxes)
+        self.boxes = MovingBoxes(self.tracks)
         self._views = {view.key: view for view in training_views}
         self._cameras = {
             view.key: scene.corrected_camera(
@@ -128,7 +124,6 @@ class ConditionBuilder:
                 timestamp_ns,
                 self._cameras[key],
                 self._views[key].timestamp_ns,
-                self.config.warp,
             )
         )
         near = min(self.config.num_references, len(allowed))
@@ -157,7 +152,7 @@ class ConditionBuilder:
         """
         render = self.scene.render(camera, timestamp_ns)
         lidar = self.lidar_image(camera, timestamp_ns)
-        is_sky = (render.alpha < self.config.warp.sky_alpha) & (lidar.depth_m == 0)
+        is_sky = (render.alpha < SKY_ALPHA) & (lidar.depth_m == 0)
         sources = self.sources_for(camera, timestamp_ns, exclude=exclude)
         references = warped_references(
             WarpTarget(
@@ -169,7 +164,6 @@ class ConditionBuilder:
             sources,
             self.boxes,
             count=self.config.num_references,
-            config=self.config.warp,
         )
         expose = self.scene.exposure.apply
         references_rgb = torch.stack([expose(rgb, camera_name) for rgb in references.rgb])
@@ -189,16 +183,14 @@ class ConditionBuilder:
 
     def lidar_image(self, camera: Camera, timestamp_ns: int) -> LidarImage:
         """What the LiDAR knows of a view."""
-        return render_lidar(
-            self.lidar_map, self.tracks, camera, timestamp_ns, config=self.config.lidar
-        )
+        return render_lidar(self.lidar_map, self.tracks, camera, timestamp_ns)
 
     def surface_m(
         self, render: SceneRender, lidar: LidarImage, camera: Camera
     ) -> Float[Tensor, "height width"]:
         """The best known depth of a view."""
         focal_px = (camera.fx_px + camera.fy_px) / 2
-        return surface_depth(render.depth_m, lidar.depth_m, focal_px, self.config.surface)
+        return surface_depth(render.depth_m, lidar.depth_m, focal_px)
 
     def _without_exposure(
         self, rgb: Float[Tensor, "height width 3"], camera_name: str

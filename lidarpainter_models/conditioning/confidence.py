@@ -29,60 +29,23 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from lidarpainter_models.conditioning.warping import SKY_DEPTH_M
-from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.painter.protocol import Painting, PaintingConditions
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ConfidenceConfig:
-    """What each kind of evidence is worth, and when painting counts as harm."""
-
-    warp_weight: float = 0.9
-    """Support of a pixel that two recorded images show alike."""
-    single_warp_share: float = 0.7
-    """What a single recorded image is worth, of two."""
-    warp_slack: float = 0.05
-    """Mean difference of two warped images that is put down to sampling."""
-    warp_scale: float = 0.1
-    """Further difference at which their worth has fallen to 1/e."""
-    lidar_weight: float = 0.6
-    """Support of a pixel with a coloured LiDAR point in it."""
-    surface_weight: float = 0.3
-    """Support of an opaque render with nothing else to confirm it."""
-    lidar_reach_rad: float = 0.006
-    """Angle at which LiDAR support has fallen to 1/e: 3 px at 500 px focal length."""
-    alpha_range: tuple[float, float] = (0.5, 0.95)
-    """Opacity where a surface starts to count, and where it counts fully."""
-    gate_window_px: int = 11
-    """Side of the square over which painting and evidence are compared; odd."""
-    gate_slack: float = 0.01
-    """Mean difference by which a painting may exceed the render unpunished."""
-    gate_scale: float = 0.03
-    """Further difference at which the weight has fallen to 1/e."""
-    refuse_excess: float = 0.05
-    """A view that exceeds the render by this mean difference is refused."""
-    min_evidence: float = 0.02
-    """Share of pixels with evidence under which no view is gated as a whole."""
-
-    def __post_init__(self) -> None:
-        """Refuse weights outside [0, 1] and empty ranges."""
-        for name in (
-            "warp_weight",
-            "single_warp_share",
-            "lidar_weight",
-            "surface_weight",
-            "min_evidence",
-        ):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"{name} must be in [0, 1], got {getattr(self, name)}")
-        if not 0 <= self.alpha_range[0] < self.alpha_range[1] <= 1:
-            raise ConfigError(f"alpha_range must rise within [0, 1], got {self.alpha_range}")
-        if self.gate_window_px < 1 or self.gate_window_px % 2 == 0:
-            raise ConfigError(f"gate_window_px must be odd, got {self.gate_window_px}")
-        for name in ("lidar_reach_rad", "warp_scale", "gate_scale", "refuse_excess"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
+WARP_WEIGHT = 0.9  # support of a pixel that two recorded images show alike
+SINGLE_WARP_SHARE = 0.7  # what a single recorded image is worth, of two
+WARP_SLACK = 0.05  # mean difference of two warped images that is put down to sampling
+WARP_SCALE = 0.1  # further difference at which their worth has fallen to 1/e
+LIDAR_WEIGHT = 0.6  # support of a pixel with a coloured LiDAR point in it
+SURFACE_WEIGHT = 0.3  # support of an opaque render with nothing else to confirm it
+LIDAR_REACH_RAD = 0.006
+"""Angle at which LiDAR support has fallen to 1/e: 3 px at 500 px focal length."""
+ALPHA_RANGE = (0.5, 0.95)  # opacity where a surface starts to count, and where it counts fully
+GATE_WINDOW_PX = 11  # side of the square over which painting and evidence are compared; odd
+GATE_SLACK = 0.01  # mean difference by which a painting may exceed the render unpunished
+GATE_SCALE = 0.03  # further difference at which the weight has fallen to 1/e
+REFUSE_EXCESS = 0.05  # a view that exceeds the render by this mean difference is refused
+MIN_EVIDENCE = 0.02  # share of pixels with evidence under which no view is gated as a whole
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -117,49 +80,36 @@ def is_seen(
 
 
 def geometric_confidence(
-    conditions: PaintingConditions,
-    camera: Camera,
-    seen: Bool[Tensor, "height width"],
-    *,
-    config: ConfidenceConfig | None = None,
+    conditions: PaintingConditions, camera: Camera, seen: Bool[Tensor, "height width"]
 ) -> Float[Tensor, "height width"]:
     """`support * seen` of the module's formula, in [0, 1]."""
-    config = config or ConfidenceConfig()
-    warp = _vouched(conditions, config)
+    warp = _vouched(conditions)
     distance_px = torch.full_like(conditions.render_alpha, torch.inf)
     if bool(conditions.lidar_hit.any()):
         distance = distance_transform_edt(~conditions.lidar_hit.cpu().numpy())
         distance_px = torch.as_tensor(distance).to(conditions.render_alpha)
-    lidar = torch.exp(-distance_px / (config.lidar_reach_rad * camera.fx_px))
-    low, high = config.alpha_range
+    lidar = torch.exp(-distance_px / (LIDAR_REACH_RAD * camera.fx_px))
+    low, high = ALPHA_RANGE
     rise = ((conditions.render_alpha - low) / (high - low)).clamp(0, 1)
     surface = rise * rise * (3 - 2 * rise)
-    doubt = (1 - config.warp_weight * warp) * (1 - config.lidar_weight * lidar)
-    return (1 - doubt * (1 - config.surface_weight * surface)) * seen
+    doubt = (1 - WARP_WEIGHT * warp) * (1 - LIDAR_WEIGHT * lidar)
+    return (1 - doubt * (1 - SURFACE_WEIGHT * surface)) * seen
 
 
-def _vouched(
-    conditions: PaintingConditions, config: ConfidenceConfig
-) -> Float[Tensor, "height width"]:
+def _vouched(conditions: PaintingConditions) -> Float[Tensor, "height width"]:
     """V of the module's formula."""
     num_valid = conditions.warp_valid.sum(dim=0)
-    vouched = config.single_warp_share * (num_valid == 1).to(torch.float32)
+    vouched = SINGLE_WARP_SHARE * (num_valid == 1).to(torch.float32)
     if len(conditions.warp_valid) < 2:
         return vouched
     first, second = conditions.warp_rgb[:2]
     difference = _box_sum((first - second).abs().mean(dim=-1), 3) / 9
-    agreement = torch.exp(-(difference - config.warp_slack).clamp(min=0) / config.warp_scale)
+    agreement = torch.exp(-(difference - WARP_SLACK).clamp(min=0) / WARP_SCALE)
     return torch.where(num_valid >= 2, agreement, vouched)
 
 
-def guidance_gate(
-    painting: Painting,
-    conditions: PaintingConditions,
-    *,
-    config: ConfidenceConfig | None = None,
-) -> GuidanceGate:
+def guidance_gate(painting: Painting, conditions: PaintingConditions) -> GuidanceGate:
     """Weigh a painting down where it departs from recorded pixels more than the render did."""
-    config = config or ConfidenceConfig()
     evidence, known = _evidence(conditions)
     share = float(known.to(torch.float32).mean())
     painted = (painting.rgb - evidence).abs().mean(dim=-1) * known
@@ -169,13 +119,13 @@ def guidance_gate(
     count = known.sum()
     painted_mean, render_mean = float(painted.sum() / count), float(rendered.sum() / count)
     view_weight = 1.0
-    if share >= config.min_evidence:
+    if share >= MIN_EVIDENCE:
         excess = painted_mean - render_mean
-        view_weight = 0.0 if excess > config.refuse_excess else _falloff(excess, config)
-    local = _box_sum(painted - rendered, config.gate_window_px) / _box_sum(
-        known.to(torch.float32), config.gate_window_px
+        view_weight = 0.0 if excess > REFUSE_EXCESS else _falloff(excess)
+    local = _box_sum(painted - rendered, GATE_WINDOW_PX) / _box_sum(
+        known.to(torch.float32), GATE_WINDOW_PX
     ).clamp(min=1.0)
-    fall = torch.exp(-(local - config.gate_slack).clamp(min=0) / config.gate_scale)
+    fall = torch.exp(-(local - GATE_SLACK).clamp(min=0) / GATE_SCALE)
     return _gate(view_weight * fall, painted_mean, render_mean, share)
 
 
@@ -191,10 +141,10 @@ def _evidence(
     return rgb, known
 
 
-def _falloff(excess: float, config: ConfidenceConfig) -> float:
+def _falloff(excess: float) -> float:
     """1 up to the slack, then an exponential fall."""
-    beyond = torch.tensor(max(excess - config.gate_slack, 0.0))
-    return float(torch.exp(-beyond / config.gate_scale))
+    beyond = torch.tensor(max(excess - GATE_SLACK, 0.0))
+    return float(torch.exp(-beyond / GATE_SCALE))
 
 
 def _box_sum(image: Float[Tensor, "height width"], side_px: int) -> Float[Tensor, "height width"]:

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.confidence import (
-    ConfidenceConfig,
     GuidanceGate,
     geometric_confidence,
     guidance_gate,
@@ -39,6 +38,8 @@ DEFAULT_SHIFTS = (
     Shift(lateral_m=-3.0),
     Shift(up_m=1.5),
 )
+ROOM_M = 0.6  # no surface may be nearer to a moved camera than this
+MAX_POINTS_IN_ROOM = 10  # LiDAR points nearer than that which still count as noise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,11 +52,6 @@ class NovelGuidanceConfig:
     """Of the training frames, every n-th is painted at every shift."""
     camera_names: tuple[str, ...] | None = None
     """Cameras that are moved; None moves every training camera."""
-    room_m: float = 0.6
-    """No surface may be nearer to a moved camera than this."""
-    max_points_in_room: int = 10
-    """LiDAR points nearer than `room_m` that still count as noise."""
-    confidence: ConfidenceConfig = field(default_factory=ConfidenceConfig)
     sequence: SequenceConfig = field(default_factory=SequenceConfig)
     """What becomes of the frame painted before along the same path."""
 
@@ -65,8 +61,6 @@ class NovelGuidanceConfig:
             raise ConfigError("novel guidance needs at least one shift")
         if self.every_nth < 1:
             raise ConfigError(f"every_nth must be at least 1, got {self.every_nth}")
-        if not self.room_m > 0:
-            raise ConfigError(f"room_m must be positive, got {self.room_m}")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -156,23 +150,16 @@ def _check_names(names: tuple[str, ...] | None, views: Sequence[TrainingView]) -
         )
 
 
-def has_room(
-    novel: NovelCamera,
-    lidar_map: LidarMap,
-    tracks: Sequence[ActorTrack],
-    *,
-    config: NovelGuidanceConfig | None = None,
-) -> bool:
+def has_room(novel: NovelCamera, lidar_map: LidarMap, tracks: Sequence[ActorTrack]) -> bool:
     """Whether a camera stands in free space: not in or at a moving actor, a parked car, a wall."""
-    config = config or NovelGuidanceConfig()
     centre = novel.camera.centre_world.to(lidar_map.street.xyz_m)
     for track in tracks:
         if track.is_present(novel.timestamp_ns):
             box = track.pose_at(novel.timestamp_ns)
-            if bool(is_inside_box(centre[None], box, track.size_m, margin_m=config.room_m)):
+            if bool(is_inside_box(centre[None], box, track.size_m, margin_m=ROOM_M)):
                 return False
     distance_m = (lidar_map.street.xyz_m - centre).norm(dim=-1)
-    return int((distance_m < config.room_m).sum()) <= config.max_points_in_room
+    return int((distance_m < ROOM_M).sum()) <= MAX_POINTS_IN_ROOM
 
 
 def paint_novel_views(
@@ -189,19 +176,19 @@ def paint_novel_views(
         builder: Gives conditions of the scene as it is now.
         painter: Repairs the views.
         cameras: Where from, see `novel_cameras`.
-        config: Room and confidence.
+        config: What becomes of previous frames.
         progress: Told after each camera how many of how many are done.
     """
     config = config or NovelGuidanceConfig()
     paintings = []
     paths: dict[tuple[Shift, str], SequencePainter] = {}
     for done, novel in enumerate(cameras, start=1):
-        if has_room(novel, builder.lidar_map, builder.tracks, config=config):
+        if has_room(novel, builder.lidar_map, builder.tracks):
             path = paths.setdefault(
                 (novel.shift, novel.key[1]),
                 SequencePainter(builder, painter, config=config.sequence),
             )
-            paintings.append(_paint(builder, path, novel, config.confidence))
+            paintings.append(_paint(builder, path, novel))
         if progress is not None:
             progress(done, len(cameras))
     return paintings
@@ -212,16 +199,14 @@ def guidance_views(paintings: Sequence[NovelPainting]) -> list[GuidanceView]:
     return [painting.guidance for painting in paintings if not painting.gate.is_refused]
 
 
-def _paint(
-    builder: ConditionBuilder, path: SequencePainter, novel: NovelCamera, config: ConfidenceConfig
-) -> NovelPainting:
+def _paint(builder: ConditionBuilder, path: SequencePainter, novel: NovelCamera) -> NovelPainting:
     conditions, painting = path.paint(novel.camera, novel.timestamp_ns)
-    gate = guidance_gate(painting, conditions, config=config)
+    gate = guidance_gate(painting, conditions)
     depth_m = torch.where(
         conditions.render_depth_m > 0, conditions.render_depth_m, conditions.lidar_depth_m
     )
     seen = is_seen(novel.camera, depth_m, builder.recorded_cameras)
-    geometric = geometric_confidence(conditions, novel.camera, seen, config=config)
+    geometric = geometric_confidence(conditions, novel.camera, seen)
     weight = (painting.confidence * geometric * gate.weight).clamp(0, 1)
     guidance = GuidanceView(
         camera=novel.camera,

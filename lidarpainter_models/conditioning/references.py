@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.conditioning.warping import (
+    SKY_ALPHA,
     SKY_DEPTH_M,
     SourceImage,
-    WarpConfig,
     sample_source,
 )
 from lidarpainter_models.geometry.cameras import Camera
@@ -40,10 +40,9 @@ class WarpTarget(NamedTuple):
         timestamp_ns: int,
         depth_m: Float[Tensor, "height width"],
         alpha: Float[Tensor, "height width"],
-        config: WarpConfig,
     ) -> "WarpTarget":
         """A view of which the render alone is known; what has no depth and is clear is sky."""
-        return cls(camera, timestamp_ns, [depth_m], alpha < config.sky_alpha)
+        return cls(camera, timestamp_ns, [depth_m], alpha < SKY_ALPHA)
 
 
 class WarpedReferences(NamedTuple):
@@ -64,15 +63,9 @@ class _Search(NamedTuple):
 
 
 def warped_references(
-    target: WarpTarget,
-    sources: Sequence[SourceImage],
-    boxes: MovingBoxes,
-    *,
-    count: int,
-    config: WarpConfig | None = None,
+    target: WarpTarget, sources: Sequence[SourceImage], boxes: MovingBoxes, *, count: int
 ) -> WarpedReferences:
     """Patch `count` references together from sources given best first."""
-    config = config or WarpConfig()
     height_px, width_px = target.is_sky.shape
     num_pixels = height_px * width_px
     rgb = torch.zeros(count, num_pixels, 3)
@@ -87,7 +80,7 @@ def warped_references(
             rgb=rgb,
             num_found=num_found,
         )
-        _look_up(search, target.timestamp_ns, sources, boxes, config)
+        _look_up(search, target.timestamp_ns, sources, boxes)
     found = torch.arange(count)[:, None] < num_found
     return WarpedReferences(
         rgb=rgb.reshape(count, height_px, width_px, 3),
@@ -96,11 +89,7 @@ def warped_references(
 
 
 def _look_up(
-    search: _Search,
-    timestamp_ns: int,
-    sources: Sequence[SourceImage],
-    boxes: MovingBoxes,
-    config: WarpConfig,
+    search: _Search, timestamp_ns: int, sources: Sequence[SourceImage], boxes: MovingBoxes
 ) -> None:
     """Fill the search's colours in place with what the sources show."""
     count = len(search.rgb)
@@ -113,7 +102,7 @@ def _look_up(
             from_ns=timestamp_ns,
             to_ns=source.timestamp_ns,
         )
-        rgb, seen = sample_source(source, points, search.is_sky[open_pixels], config=config)
+        rgb, seen = sample_source(source, points, search.is_sky[open_pixels])
         shown = seen & present
         filled = open_pixels[shown]
         search.rgb[search.num_found[filled], filled] = rgb[shown]

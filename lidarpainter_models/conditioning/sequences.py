@@ -14,7 +14,6 @@ import torch
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.references import WarpTarget, warped_references
 from lidarpainter_models.conditioning.warping import SourceImage
-from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.painter.protocol import (
     DEFAULT_PROMPT,
@@ -25,6 +24,8 @@ from lidarpainter_models.painter.protocol import (
 
 PreviousUse = Literal["unused", "mixed", "shown"]
 PREVIOUS_KEY = (-1, "previous")
+SHARE = 0.5  # of the previous frame in a mixed pixel on which both agree
+AGREEMENT = 0.05  # mean absolute rgb difference of both at which that share has fallen to 1/e
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,18 +35,6 @@ class SequenceConfig:
     previous: PreviousUse = "unused"
     """`mixed`: into the painting, as far as both agree; `shown`: to the painter, before the other
     warped images, of which it was trained to expect recorded ones only."""
-    share: float = 0.5
-    """Of the previous frame in a mixed pixel on which both agree."""
-    agreement: float = 0.05
-    """Mean absolute rgb difference of both at which that share has fallen to 1/e."""
-
-    def __post_init__(self) -> None:
-        """Refuse shares that forget the present."""
-        if not 0 <= self.share < 1 or not self.agreement > 0:
-            raise ConfigError(
-                "a mix needs 0 <= share < 1 and a positive agreement, got "
-                f"{self.share} and {self.agreement}"
-            )
 
 
 class PaintedFrame(NamedTuple):
@@ -113,13 +102,10 @@ class SequencePainter:
     ) -> Painting:
         if self._previous is None:
             return self._painter.paint(conditions)
-        config = self._builder.config.warp
         target = WarpTarget.of_render(
-            camera, timestamp_ns, conditions.render_depth_m, conditions.render_alpha, config
+            camera, timestamp_ns, conditions.render_depth_m, conditions.render_alpha
         )
-        carried, valid = warped_references(
-            target, [self._previous], self._builder.boxes, count=1, config=config
-        )
+        carried, valid = warped_references(target, [self._previous], self._builder.boxes, count=1)
         if self._config.previous == "shown":
             shown = replace(
                 conditions,
@@ -129,6 +115,6 @@ class SequencePainter:
             return self._painter.paint(shown)
         painting = self._painter.paint(conditions)
         difference = (carried[0] - painting.rgb).abs().mean(dim=-1)
-        agreed = torch.exp(-difference / self._config.agreement) * valid[0]
-        share = (self._config.share * agreed)[..., None]
+        agreed = torch.exp(-difference / AGREEMENT) * valid[0]
+        share = (SHARE * agreed)[..., None]
         return replace(painting, rgb=painting.rgb + share * (carried[0] - painting.rgb))

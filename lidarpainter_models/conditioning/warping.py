@@ -8,40 +8,20 @@ Frames: world z up; camera x right, y down, z forward; depth is camera z in metr
 pixel centres at half-integers.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.lidar.moving_boxes import BoxConfig
 
 SKY_DEPTH_M = 1e5
 """Far enough for any parallax to vanish, near enough for float32."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WarpConfig:
-    """When a recorded pixel may stand for one of another view."""
-
-    depth_tolerance: float = 0.04
-    """Relative difference of depth up to which two views see the same surface."""
-    sky_alpha: float = 0.5
-    """A pixel more transparent than this, and without depth, is sky."""
-    boxes: BoxConfig = field(default_factory=BoxConfig)
-    time_weight_m_s: float = 2.0
-    """Metres a source may stand nearer for each second it is older."""
-    angle_weight_m_rad: float = 8.0
-    """Metres a source may stand nearer for each radian it looks elsewhere."""
-
-    def __post_init__(self) -> None:
-        """Refuse tolerances that accept nothing or everything."""
-        if not 0 < self.depth_tolerance < 1:
-            raise ConfigError(f"depth_tolerance must be in (0, 1), got {self.depth_tolerance}")
-        if not 0 < self.sky_alpha < 1:
-            raise ConfigError(f"sky_alpha must be in (0, 1), got {self.sky_alpha}")
+DEPTH_TOLERANCE = 0.04  # relative difference of depth up to which two views see the same surface
+SKY_ALPHA = 0.5  # a pixel more transparent than this, and without depth, is sky
+TIME_WEIGHT_M_S = 2.0  # metres a source may stand nearer for each second it is older
+ANGLE_WEIGHT_M_RAD = 8.0  # metres a source may stand nearer for each radian it looks elsewhere
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,25 +37,17 @@ class SourceImage:
     alpha: Float[Tensor, "height width"]
 
 
-def source_cost_m(
-    target_camera: Camera, timestamp_ns: int, camera: Camera, taken_ns: int, config: WarpConfig
-) -> float:
+def source_cost_m(target_camera: Camera, timestamp_ns: int, camera: Camera, taken_ns: int) -> float:
     """How far a recorded view is from a target in place, direction and time, as metres."""
     distance_m = (camera.centre_world - target_camera.centre_world).norm()
     axis, target_axis = camera.world_from_camera[:3, 2], target_camera.world_from_camera[:3, 2]
     angle_rad = torch.arccos((axis @ target_axis).clamp(-1, 1))
     seconds = abs(taken_ns - timestamp_ns) * 1e-9
-    return float(
-        distance_m + config.angle_weight_m_rad * angle_rad + config.time_weight_m_s * seconds
-    )
+    return float(distance_m + ANGLE_WEIGHT_M_RAD * angle_rad + TIME_WEIGHT_M_S * seconds)
 
 
 def sample_source(
-    source: SourceImage,
-    points_world: Float[Tensor, "points 3"],
-    is_sky: Bool[Tensor, " points"],
-    *,
-    config: WarpConfig,
+    source: SourceImage, points_world: Float[Tensor, "points 3"], is_sky: Bool[Tensor, " points"]
 ) -> tuple[Float[Tensor, "points 3"], Bool[Tensor, " points"]]:
     """Colour of world points in a source, and whether the source saw just these points.
 
@@ -90,12 +62,12 @@ def sample_source(
     grid = torch.where(inside[:, None], pixels_uv / size * 2 - 1, 0)
     has_depth = source.depth_m > 0
     inverse = torch.where(has_depth, 1 / source.depth_m.clamp(min=1e-3), 0)
-    is_source_sky = (~has_depth & (source.alpha < config.sky_alpha)).to(source.rgb)
+    is_source_sky = (~has_depth & (source.alpha < SKY_ALPHA)).to(source.rgb)
     layers = torch.cat([source.rgb, inverse[..., None], is_source_sky[..., None]], dim=-1)
     sampled = torch.nn.functional.grid_sample(
         layers.permute(2, 0, 1)[None], grid[None, None], padding_mode="border", align_corners=False
     )[0, :, 0].T
-    same = (sampled[:, 3] * depth_m - 1).abs() <= config.depth_tolerance
-    same_surface = same & (sampled[:, 4] < config.sky_alpha)
+    same = (sampled[:, 3] * depth_m - 1).abs() <= DEPTH_TOLERANCE
+    same_surface = same & (sampled[:, 4] < SKY_ALPHA)
     same_sky = sampled[:, 4] > 1 - 1e-3
     return sampled[:, :3], inside & torch.where(is_sky, same_sky, same_surface)

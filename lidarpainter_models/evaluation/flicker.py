@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarpainter_models.conditioning.references import WarpTarget, warped_references
-from lidarpainter_models.conditioning.warping import SourceImage, WarpConfig
+from lidarpainter_models.conditioning.warping import SourceImage
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.moving_boxes import BACKGROUND, MovingBoxes
 from lidarpainter_models.metrics.images import psnr_from_error, squared_error
@@ -62,10 +62,8 @@ class _ImageTally:
 class FlickerTally:
     """Counts the frames of one path in their order."""
 
-    def __init__(self, tracks: Sequence[ActorTrack], config: WarpConfig | None = None) -> None:
-        """Take the moving actors, and when two views show the same surface."""
-        self._config = config or WarpConfig()
-        self._boxes = MovingBoxes(tracks, self._config.boxes)
+    def __init__(self, tracks: Sequence[ActorTrack]) -> None:
+        self._boxes = MovingBoxes(tracks)
         self._images: dict[str, _ImageTally] = {}
         self._previous: FlickerFrame | None = None
         self._num_pixels = self._num_valid = self._num_moving = self._num_pairs = 0
@@ -108,13 +106,8 @@ class FlickerTally:
             )
             for name, rgb in before.images.items()
         ]
-        target = WarpTarget.of_render(
-            now.camera, now.timestamp_ns, now.depth_m, now.alpha, self._config
-        )
-        carried = [
-            warped_references(target, [source], self._boxes, count=1, config=self._config)
-            for source in sources
-        ]
+        target = WarpTarget.of_render(now.camera, now.timestamp_ns, now.depth_m, now.alpha)
+        carried = [warped_references(target, [source], self._boxes, count=1) for source in sources]
         compared = carried[0].valid[0]  # of depth alone, so the same for all images
         moving = compared & self._on_actors(now)
         self._num_pairs += 1

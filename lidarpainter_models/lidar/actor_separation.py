@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.transforms import interpolate_rigid
 from lidarpainter_models.lidar.ground_heights import GroundHeights
 from lidarpainter_models.scenes.tracks import ActorTrack
@@ -21,36 +20,15 @@ _TICK_NS = 1_000_000
 """Points of one millisecond share a pose: at 40 m/s it is 2 cm wrong."""
 _LONGEST_EXTRAPOLATION_S = 0.1
 """One sweep: a point may be measured before the first or after the last box of its actor."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SeparationConfig:
-    """Where an actor ends and the street begins."""
-
-    actor_margin_m: float = 0.1
-    """Points up to this far outside the box still belong to the actor: mirrors, tight boxes."""
-    street_margin_m: float = 0.3
-    """Points up to this far outside the box are kept out of the street."""
-    lag_s: float = 0.02
-    """Box times may be off by so much: lengthwise the street margin grows by it times the speed."""
-    road_height_m: float = 0.08
-    """What is lower than this above the ground is road, also below an actor."""
-    clearance_m: float = 0.15
-    """What is lower than this above the ground is no part of an actor."""
-    most_ground_offset_m: float = 0.6
-    """Ground further from the bottom of the box than this is not believed; the bottom is."""
-
-    def __post_init__(self) -> None:
-        """Refuse margins that contradict one another."""
-        if not 0 <= self.actor_margin_m <= self.street_margin_m:
-            raise ConfigError(
-                "margins must satisfy 0 <= actor_margin_m <= street_margin_m, got "
-                f"{self.actor_margin_m} and {self.street_margin_m}"
-            )
-        if self.road_height_m > self.clearance_m:
-            raise ConfigError(
-                f"road_height_m {self.road_height_m} must not exceed clearance_m {self.clearance_m}"
-            )
+ACTOR_MARGIN_M = 0.1
+"""Points up to this far outside the box still belong to the actor: mirrors, tight boxes."""
+STREET_MARGIN_M = 0.3  # points up to this far outside the box are kept out of the street
+LAG_S = 0.02
+"""Box times may be off by so much: lengthwise the street margin grows by it times the speed."""
+ROAD_HEIGHT_M = 0.08  # what is lower than this above the ground is road, also below an actor
+CLEARANCE_M = 0.15  # what is lower than this above the ground is no part of an actor
+MOST_GROUND_OFFSET_M = 0.6
+"""Ground further from the bottom of the box than this is not believed; the bottom is."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,13 +51,12 @@ def near_actors(
     xyz_m: Float[Tensor, "points 3"],
     timestamp_ns: Int[Tensor, " points"],
     tracks: Sequence[ActorTrack],
-    config: SeparationConfig,
 ) -> NearActors:
     """Find the points that moving actors keep out of the street."""
     parts = [
         part
         for index, track in enumerate(tracks)
-        if (part := _near_one(xyz_m, timestamp_ns, index, track, config)) is not None
+        if (part := _near_one(xyz_m, timestamp_ns, index, track)) is not None
     ]
     if not parts:
         none, zero = torch.zeros(0, dtype=torch.int64), torch.zeros(0)
@@ -104,14 +81,11 @@ def near_actors(
 
 
 def height_above_ground(
-    xyz_m: Float[Tensor, "near 3"],
-    bottom_m: Float[Tensor, " near"],
-    ground: GroundHeights,
-    config: SeparationConfig,
+    xyz_m: Float[Tensor, "near 3"], bottom_m: Float[Tensor, " near"], ground: GroundHeights
 ) -> Float[Tensor, " near"]:
     """Height of points near actors above the ground, or above the box where that is unknown."""
     ground_m = ground.at(xyz_m[:, :2])
-    is_believed = (ground_m - bottom_m).abs() <= config.most_ground_offset_m  # False for NaN
+    is_believed = (ground_m - bottom_m).abs() <= MOST_GROUND_OFFSET_M  # False for NaN
     return xyz_m[:, 2] - torch.where(is_believed, ground_m, bottom_m)
 
 
@@ -140,7 +114,6 @@ def _near_one(
     timestamp_ns: Int[Tensor, " points"],
     index: int,
     track: ActorTrack,
-    config: SeparationConfig,
 ) -> NearActors | None:
     """The points in or beside one actor, None where there are none."""
     if xyz_m.shape[0] == 0:
@@ -149,8 +122,8 @@ def _near_one(
     if not track.is_present(middle_ns, margin_ns=round(_LONGEST_EXTRAPOLATION_S * 1e9)):
         return None
     speed_mps = _speed(track, middle_ns)
-    margin_m = torch.full((3,), config.street_margin_m)
-    margin_m[0] += config.lag_s * speed_mps
+    margin_m = torch.full((3,), STREET_MARGIN_M)
+    margin_m[0] += LAG_S * speed_mps
     half_m = track.size_m / 2
     reach_m = float((half_m + margin_m).norm()) + _LONGEST_EXTRAPOLATION_S * speed_mps
     centre = track.pose_at(middle_ns)[:3, 3].to(xyz_m)

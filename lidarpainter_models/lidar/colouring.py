@@ -8,7 +8,7 @@ are brought to one exposure and combined robustly.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.colour_sampling import BestSamples, combine_samples, insert_samples
 from lidarpainter_models.lidar.exposure_matching import match_exposure
@@ -36,62 +36,33 @@ from lidarpainter_models.lidar.points_in_view import (
     place_actors,
     points_in_view,
 )
-from lidarpainter_models.lidar.rim_colours import ImageLevels, RimConfig, rim_samples
+from lidarpainter_models.lidar.rim_colours import EDGE_TOLERANCE, ImageLevels, rim_samples
 from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.scenes.tracks import ActorTrack
 
 _FINE_ENOUGH_PX = 2.0
 """An image with more pixels than this across a point's footprint is no better for it."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ColouringConfig:
-    """Where a point's colour comes from. Angles make lengths follow the resolution."""
-
-    width_px: int = 960
-    """Images are shrunk to this width before they are sampled."""
-    footprint_rad: float = 0.002
-    """Angle of the surface patch that a point stands for, as seen from the LiDAR."""
-    recency_s: float = 0.2
-    """An image this much before or after the point weighs half."""
-    grid_rad: float = 0.002
-    """Angle of a cell of the grid on which occlusion is judged."""
-    beam_spacing_rad: float = 0.004
-    """Angle between neighbouring returns: the width of a disc that closes a surface."""
-    surface_window_s: float = 0.5
-    """Points measured this near in time to an image hide others in it."""
-    gap_rad: float = 0.012
-    """Gaps between scan lines up to this angle are closed to the background."""
-    hidden_tolerance: float = 0.05
-    """A point is behind a surface when further by this share of its depth."""
-    edge_rad: float = 0.004
-    """Nearer surface within this angle spoils a sample: errors of pose and calibration."""
-    rim_rad: float = 0.008
-    """A surface that ends within this angle may show what is beyond it."""
-    rims: RimConfig = field(default_factory=RimConfig)
-    standing_box_share: float = 0.85
-    """Share of each side of a standing actor's box that hides what is behind it."""
-    near_m: float = 0.5
-    """Points nearer to the camera plane than this are not sampled."""
-
-    def __post_init__(self) -> None:
-        """Refuse settings that no image can be sampled with."""
-        if self.width_px < 32:
-            raise ConfigError(f"width_px must be at least 32, got {self.width_px}")
-        for name in ("footprint_rad", "recency_s", "grid_rad", "beam_spacing_rad", "near_m"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
+FOOTPRINT_RAD = 0.002  # angle of the surface patch that a point stands for, as seen from the LiDAR
+RECENCY_S = 0.2  # an image this much before or after the point weighs half
+GRID_RAD = 0.002  # angle of a cell of the grid on which occlusion is judged
+BEAM_SPACING_RAD = 0.004
+"""Angle between neighbouring returns: the width of a disc that closes a surface."""
+SURFACE_WINDOW_S = 0.5  # points measured this near in time to an image hide others in it
+GAP_RAD = 0.012  # gaps between scan lines up to this angle are closed to the background
+HIDDEN_TOLERANCE = 0.05  # a point is behind a surface when further by this share of its depth
+EDGE_RAD = 0.004  # nearer surface within this angle spoils a sample: errors of pose and calibration
+RIM_RAD = 0.008  # a surface that ends within this angle may show what is beyond it
+STANDING_BOX_SHARE = 0.85
+"""Share of each side of a standing actor's box that hides what is behind it."""
+NEAR_M = 0.5  # points nearer to the camera plane than this are not sampled
+WIDTH_PX = 960  # images are shrunk to this width before they are sampled
 
 
 class MapColouring:
     """Colours the points of a map, one image after another."""
 
     def __init__(
-        self,
-        lidar_map: LidarMap,
-        tracks: Sequence[ActorTrack],
-        views: Sequence[RecordedView],
-        config: ColouringConfig,
+        self, lidar_map: LidarMap, tracks: Sequence[ActorTrack], views: Sequence[RecordedView]
     ) -> None:
         """Take the points, all actors of the scene, and the views whose images will be added.
 
@@ -102,7 +73,6 @@ class MapColouring:
         unknown = sorted(set(lidar_map.actors) - set(known))
         if unknown:
             raise SceneError(f"points of actors without a track: {', '.join(unknown)}")
-        self._config = config
         self._actor_ids = list(lidar_map.actors)
         actors = [Body(known[name], points) for name, points in lidar_map.actors.items()]
         self._bodies = [Body(None, lidar_map.street), *actors]
@@ -112,24 +82,24 @@ class MapColouring:
 
     def add(self, view: RecordedView, image: UInt8[Tensor, "height width 3"]) -> None:
         """Take samples from the recorded image of one of the views."""
-        config, actors = self._config, self._placed[view.key]
-        image = _shrunk(image, config)
+        actors = self._placed[view.key]
+        image = _shrunk(image)
         camera = view.camera.resized(width_px=image.shape[1], height_px=image.shape[0])
-        grid = CellGrid.over(camera, config.grid_rad)
+        grid = CellGrid.over(camera, GRID_RAD)
         inside = points_in_view(
-            self._bodies, camera, view.timestamp_ns, actors, grid, near_m=config.near_m
+            self._bodies, camera, view.timestamp_ns, actors, grid, near_m=NEAR_M
         )
         if len(inside) == 0:
             return
-        visibility = _visibility(inside, grid.camera, actors, config)
+        visibility = _visibility(inside, grid.camera, actors)
         is_visible = visible_points(
-            inside.cells_uv, inside.depth_m, visibility, tolerance=config.hidden_tolerance
+            inside.cells_uv, inside.depth_m, visibility, tolerance=HIDDEN_TOLERANCE
         )
         seen = inside.keep(is_visible.nonzero()[:, 0])
-        footprint_px = seen.range_m * config.footprint_rad * camera.fx_px / seen.depth_m
+        footprint_px = seen.range_m * FOOTPRINT_RAD * camera.fx_px / seen.depth_m
         levels = ImageLevels(image, footprint_px)
-        rgb, trust = rim_samples(levels, seen, visibility, grid.cells_per_pixel, config.rims)
-        weight = trust / (1 + (seen.age_s / config.recency_s) ** 2)
+        rgb, trust = rim_samples(levels, seen, visibility, grid.cells_per_pixel)
+        weight = trust / (1 + (seen.age_s / RECENCY_S) ** 2)
         weight *= footprint_px.clamp(max=_FINE_ENOUGH_PX) ** 2
         number = self._view_numbers[view.key]
         insert_samples(self._samples, seen.rows.numpy(), weight.numpy(), rgb.numpy(), number)
@@ -157,15 +127,13 @@ class MapColouring:
         return LidarMap(street=street, actors=dict(zip(self._actor_ids, actors, strict=True)))
 
 
-def _visibility(
-    inside: PointsInView, cells: Camera, actors: PlacedActors, config: ColouringConfig
-) -> Visibility:
+def _visibility(inside: PointsInView, cells: Camera, actors: PlacedActors) -> Visibility:
     """What stood before and around each cell when the image was taken."""
-    is_solid = inside.is_actor | (inside.age_s <= config.surface_window_s)
+    is_solid = inside.is_actor | (inside.age_s <= SURFACE_WINDOW_S)
     solid = inside.keep(is_solid.nonzero()[:, 0])
-    footprint_px = solid.range_m * config.beam_spacing_rad * cells.fx_px / solid.depth_m
+    footprint_px = solid.range_m * BEAM_SPACING_RAD * cells.fx_px / solid.depth_m
     boxes = [
-        (world_from_box, track.size_m * _solid_share(track, config))
+        (world_from_box, track.size_m * _solid_share(track))
         for track, world_from_box in actors.values()
     ]
     return surface_visibility(
@@ -174,25 +142,23 @@ def _visibility(
         (footprint_px / 2).round().long().clamp(max=2),
         cells,
         Neighbourhood(
-            gap_px=max(1, round(config.gap_rad * cells.fx_px)),
-            edge_px=max(1, round(config.edge_rad * cells.fx_px)),
-            rim_px=max(1, round(config.rim_rad * cells.fx_px)),
-            edge_tolerance=config.rims.edge_tolerance,
+            gap_px=max(1, round(GAP_RAD * cells.fx_px)),
+            edge_px=max(1, round(EDGE_RAD * cells.fx_px)),
+            rim_px=max(1, round(RIM_RAD * cells.fx_px)),
+            edge_tolerance=EDGE_TOLERANCE,
         ),
         box_far_ends(boxes, cells),
     )
 
 
-def _solid_share(track: ActorTrack, config: ColouringConfig) -> float:
+def _solid_share(track: ActorTrack) -> float:
     """A moving actor's whole box hides, as its colours must not reach the street."""
-    return 1.0 if track.is_moving else config.standing_box_share
+    return 1.0 if track.is_moving else STANDING_BOX_SHARE
 
 
-def _shrunk(
-    rgb_u8: UInt8[Tensor, "height width 3"], config: ColouringConfig
-) -> UInt8[Tensor, "rows columns 3"]:
+def _shrunk(rgb_u8: UInt8[Tensor, "height width 3"]) -> UInt8[Tensor, "rows columns 3"]:
     height_px, width_px = rgb_u8.shape[:2]
-    if width_px <= config.width_px:
+    if width_px <= WIDTH_PX:
         return rgb_u8
-    size = (config.width_px, round(height_px * config.width_px / width_px))
+    size = (WIDTH_PX, round(height_px * WIDTH_PX / width_px))
     return torch.from_numpy(cv2.resize(rgb_u8.numpy(), size, interpolation=cv2.INTER_AREA))

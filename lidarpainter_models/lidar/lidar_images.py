@@ -20,12 +20,10 @@ import torch
 from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Tensor
 
-from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.point_blend import blend_points
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.lidar.point_surfaces import (
-    DIRECTIONS,
     curtain,
     disc_surface,
     spread,
@@ -33,58 +31,29 @@ from lidarpainter_models.lidar.point_surfaces import (
 )
 from lidarpainter_models.scenes.driving_scene import ActorTrack
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LidarImageConfig:
-    """How LiDAR points become an image. Angles make every length follow the resolution."""
-
-    window_s: float = 1.0
-    """Street points measured this long before or after the image are drawn first; where no
-    sweep is so near in time, counted from the nearest."""
-    reach_s: float = 10.0
-    """Street points up to this much older or newer fill what the window leaves open: the street
-    stands still, but what moved through it unboxed does not."""
-    recency_s: float = 0.4
-    """A point this much older weighs e times less in the blend."""
-    beam_spacing_rad: float = 0.004
-    """Angle between neighbouring returns; times the range of a point, its footprint."""
-    max_radius_rad: float = 0.006
-    """No disc is wider than this angle to each side: 3 px at 500 px focal length."""
-    min_radius_px: float = 0.75
-    """Just over half a diagonal, so that a point always covers the pixel it falls into."""
-    hidden_reach_rad: float = 0.012
-    """How far around a pixel nearer surface is looked for: 6 px at 500 px focal length."""
-    hidden_directions: int = 8
-    """Of the 8 directions, how many must meet nearer surface to hide a point."""
-    hidden_tolerance: float = 0.1
-    """Nearer means by more than this share of the depth."""
-    surface_tolerance: float = 0.06
-    """A point is blended where it meets the surface of a pixel within this share of its depth."""
-    gap_widening: float = 2.5
-    """Discs grow by this factor where covered pixels surround a gap, and only there."""
-    gap_directions: int = 6
-    """Of the 8 directions, how many must meet covered pixels to make a gap."""
-    gap_depth_range: float = 0.15
-    """The pixels met around a gap differ in depth by at most this share: one surface."""
-    near_m: float = 0.5
-    """Points nearer to the camera plane than this are dropped."""
-
-    def __post_init__(self) -> None:
-        """Refuse settings that no image can be made with."""
-        for name in (
-            "window_s",
-            "reach_s",
-            "recency_s",
-            "beam_spacing_rad",
-            "max_radius_rad",
-            "near_m",
-        ):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
-        if self.min_radius_px < 0.71:
-            raise ConfigError(f"min_radius_px must be at least 0.71, got {self.min_radius_px}")
-        if not 1 <= self.hidden_directions <= len(DIRECTIONS):
-            raise ConfigError(f"hidden_directions must be 1 to 8, got {self.hidden_directions}")
+WINDOW_S = 1.0
+"""Street points measured this long before or after the image are drawn first; where no
+sweep is so near in time, counted from the nearest."""
+REACH_S = 10.0
+"""Street points up to this much older or newer fill what the window leaves open: the street
+stands still, but what moved through it unboxed does not."""
+RECENCY_S = 0.4  # a point this much older weighs e times less in the blend
+BEAM_SPACING_RAD = 0.004
+"""Angle between neighbouring returns; times the range of a point, its footprint."""
+MAX_RADIUS_RAD = 0.006  # no disc is wider than this angle to each side: 3 px at 500 px focal length
+MIN_RADIUS_PX = 0.75
+"""Just over half a diagonal, so that a point always covers the pixel it falls into."""
+HIDDEN_REACH_RAD = 0.012
+"""How far around a pixel nearer surface is looked for: 6 px at 500 px focal length."""
+HIDDEN_DIRECTIONS = 8  # of the 8 directions, how many must meet nearer surface to hide a point
+HIDDEN_TOLERANCE = 0.1  # nearer means by more than this share of the depth
+SURFACE_TOLERANCE = 0.06
+"""A point is blended where it meets the surface of a pixel within this share of its depth."""
+GAP_WIDENING = 2.5  # discs grow by this factor where covered pixels surround a gap, and only there
+GAP_DIRECTIONS = 6  # of the 8 directions, how many must meet covered pixels to make a gap
+GAP_DEPTH_RANGE = 0.15
+"""The pixels met around a gap differ in depth by at most this share: one surface."""
+NEAR_M = 0.5  # points nearer to the camera plane than this are dropped
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,20 +88,14 @@ class ViewPoints(NamedTuple):
 
 
 def render_lidar(
-    lidar_map: LidarMap,
-    tracks: Sequence[ActorTrack],
-    camera: Camera,
-    timestamp_ns: int,
-    *,
-    config: LidarImageConfig | None = None,
+    lidar_map: LidarMap, tracks: Sequence[ActorTrack], camera: Camera, timestamp_ns: int
 ) -> LidarImage:
     """Splat the street around a time and the actors present then into a camera.
 
     Only tracks whose actor has points in the map and that are present at `timestamp_ns` are drawn.
     """
-    config = config or LidarImageConfig()
     # what stands just outside the image hides and covers pixels inside
-    margin_px = max(2, round(config.hidden_reach_rad * camera.fx_px))
+    margin_px = max(2, round(HIDDEN_REACH_RAD * camera.fx_px))
     wide = replace(
         camera,
         width_px=camera.width_px + 2 * margin_px,
@@ -140,8 +103,8 @@ def render_lidar(
         cx_px=camera.cx_px + margin_px,
         cy_px=camera.cy_px + margin_px,
     )
-    points = view_points(lidar_map, tracks, wide, timestamp_ns, config)
-    image = _image(points, wide, margin_px, config)
+    points = view_points(lidar_map, tracks, wide, timestamp_ns)
+    image = _image(points, wide, margin_px)
     image = image[margin_px:-margin_px, margin_px:-margin_px]
     hit = image[..., 3] > 0
     return LidarImage(
@@ -152,30 +115,24 @@ def render_lidar(
     )
 
 
-def _image(
-    points: ViewPoints, camera: Camera, reach_px: int, config: LidarImageConfig
-) -> Float[Tensor, "height width 6"]:
+def _image(points: ViewPoints, camera: Camera, reach_px: int) -> Float[Tensor, "height width 6"]:
     """Recent points first, older ones where those leave the image open, then gaps closed."""
     recent, older = points.keep(points.is_recent), points.keep(~points.is_recent)
     surface = _surface(recent, camera, recent.radius_px.round())
-    recent = recent.keep(~_hidden(recent, surface, reach_px, config))
+    recent = recent.keep(~_hidden(recent, surface, reach_px))
     everywhere = torch.ones(camera.height_px, camera.width_px, dtype=torch.bool)
-    image = _blend(recent, everywhere, camera, config)
+    image = _blend(recent, everywhere, camera)
     is_open = image[..., 4] == 0
     older = older.keep(_at(spread(is_open, reach_px), older))
     surface = torch.minimum(surface, _surface(older, camera, older.radius_px.round()))
-    older = older.keep(~_hidden(older, surface, reach_px, config))
-    image = image + _blend(older, is_open, camera, config)
+    older = older.keep(~_hidden(older, surface, reach_px))
+    image = image + _blend(older, is_open, camera)
     seen = ViewPoints(*(torch.cat(pair) for pair in zip(recent, older, strict=True)))
-    return image + _fill_gaps(image[..., 4], seen, camera, config)
+    return image + _fill_gaps(image[..., 4], seen, camera)
 
 
 def view_points(
-    lidar_map: LidarMap,
-    tracks: Sequence[ActorTrack],
-    camera: Camera,
-    timestamp_ns: int,
-    config: LidarImageConfig,
+    lidar_map: LidarMap, tracks: Sequence[ActorTrack], camera: Camera, timestamp_ns: int
 ) -> ViewPoints:
     """Every map point within reach of the time that falls into the image, hidden or not.
 
@@ -184,17 +141,17 @@ def view_points(
     street = lidar_map.street
     age_ns = (street.timestamp_ns - timestamp_ns).abs()
     newest_ns = int(age_ns.min()) if len(age_ns) else 0
-    used = age_ns <= newest_ns + round(config.reach_s * 1e9)
+    used = age_ns <= newest_ns + round(REACH_S * 1e9)
     identity = torch.eye(4, dtype=torch.float64)
-    placed = _project(street, used, identity, camera, timestamp_ns, config)
-    parts = [placed._replace(is_recent=placed.age_s <= newest_ns * 1e-9 + config.window_s)]
+    placed = _project(street, used, identity, camera, timestamp_ns)
+    parts = [placed._replace(is_recent=placed.age_s <= newest_ns * 1e-9 + WINDOW_S)]
     for track in tracks:
         points = lidar_map.actors.get(track.actor_id)
         if points is None or not track.is_present(timestamp_ns):
             continue
         everything = torch.ones_like(points.has_colour)
         world_from_box = track.pose_at(timestamp_ns)
-        parts.append(_project(points, everything, world_from_box, camera, timestamp_ns, config))
+        parts.append(_project(points, everything, world_from_box, camera, timestamp_ns))
     return ViewPoints(*(torch.cat(fields) for fields in zip(*parts, strict=True)))
 
 
@@ -204,7 +161,6 @@ def _project(
     world_from_points: Float[Tensor, "4 4"],
     camera: Camera,
     timestamp_ns: int,
-    config: LidarImageConfig,
 ) -> ViewPoints:
     """Bring points into the image; those outside it are dropped."""
     camera_from_points = camera.camera_from_world @ world_from_points.to(torch.float64)
@@ -215,7 +171,7 @@ def _project(
     pixels_from_points = (lens @ camera_from_points[:3]).to(points.xyz_m)
     columns = torch.addmm(pixels_from_points[:, 3:], pixels_from_points[:, :3], points.xyz_m.T)
     u_depth, v_depth, depth_m = columns
-    inside = used & (depth_m > config.near_m) & (u_depth >= 0) & (v_depth >= 0)
+    inside = used & (depth_m > NEAR_M) & (u_depth >= 0) & (v_depth >= 0)
     inside &= (u_depth < camera.width_px * depth_m) & (v_depth < camera.height_px * depth_m)
     chosen = inside.nonzero()[:, 0]
     depth_m = depth_m[chosen]
@@ -224,12 +180,12 @@ def _project(
     positions_uv[:, 0].clamp_(max=camera.width_px - 1e-3)
     positions_uv[:, 1].clamp_(max=camera.height_px - 1e-3)
     focal_px = (camera.fx_px + camera.fy_px) / 2
-    footprint_px = points.range_m[chosen] * config.beam_spacing_rad * focal_px / depth_m
-    max_radius_px = max(config.max_radius_rad * focal_px, config.min_radius_px)
+    footprint_px = points.range_m[chosen] * BEAM_SPACING_RAD * focal_px / depth_m
+    max_radius_px = max(MAX_RADIUS_RAD * focal_px, MIN_RADIUS_PX)
     return ViewPoints(
         positions_uv=positions_uv,
         depth_m=depth_m,
-        radius_px=(footprint_px / 2).clamp(config.min_radius_px, max_radius_px),
+        radius_px=(footprint_px / 2).clamp(MIN_RADIUS_PX, max_radius_px),
         rgb_u8=points.rgb_u8.index_select(0, chosen),
         has_colour=points.has_colour[chosen],
         age_s=(points.timestamp_ns[chosen] - timestamp_ns).abs().to(torch.float32) * 1e-9,
@@ -238,44 +194,33 @@ def _project(
 
 
 def _hidden(
-    points: ViewPoints,
-    surface: Float[Tensor, "height width"],
-    reach_px: int,
-    config: LidarImageConfig,
+    points: ViewPoints, surface: Float[Tensor, "height width"], reach_px: int
 ) -> Bool[Tensor, " points"]:
     """Whether nearer surface surrounds a point in its neighbourhood."""
-    behind = curtain(surface, reach_px, config.hidden_directions)
-    return _at(behind, points) < points.depth_m * (1 - config.hidden_tolerance)
+    behind = curtain(surface, reach_px, HIDDEN_DIRECTIONS)
+    return _at(behind, points) < points.depth_m * (1 - HIDDEN_TOLERANCE)
 
 
 def _blend(
-    points: ViewPoints,
-    wanted: Bool[Tensor, "height width"],
-    camera: Camera,
-    config: LidarImageConfig,
+    points: ViewPoints, wanted: Bool[Tensor, "height width"], camera: Camera
 ) -> Float[Tensor, "height width 6"]:
     """Mean of the points on the surface of each wanted pixel: the columns of `_means_on`."""
     direct = _surface(points, camera, torch.zeros_like(points.radius_px))
     covered = _surface(points, camera, points.radius_px.ceil())
     surface = torch.where(direct.isfinite(), direct, covered)
-    return _means_on(torch.where(wanted & surface.isfinite(), surface, 0), points, config)
+    return _means_on(torch.where(wanted & surface.isfinite(), surface, 0), points)
 
 
 def _fill_gaps(
-    depth_m: Float[Tensor, "height width"],
-    points: ViewPoints,
-    camera: Camera,
-    config: LidarImageConfig,
+    depth_m: Float[Tensor, "height width"], points: ViewPoints, camera: Camera
 ) -> Float[Tensor, "height width 6"]:
     """What wider discs give in the gaps of a surface; 0 elsewhere."""
-    reach_px = math.ceil(config.gap_widening * config.max_radius_rad * camera.fx_px)
-    gaps = surface_gaps(
-        depth_m, reach_px, config.gap_directions, depth_range=config.gap_depth_range
-    )
+    reach_px = math.ceil(GAP_WIDENING * MAX_RADIUS_RAD * camera.fx_px)
+    gaps = surface_gaps(depth_m, reach_px, GAP_DIRECTIONS, depth_range=GAP_DEPTH_RANGE)
     wide = points.keep(_at(spread(gaps, reach_px), points))
-    wide = wide._replace(radius_px=wide.radius_px * config.gap_widening)
+    wide = wide._replace(radius_px=wide.radius_px * GAP_WIDENING)
     surface = _surface(wide, camera, wide.radius_px.ceil())
-    return _means_on(torch.where(gaps & surface.isfinite(), surface, 0), wide, config)
+    return _means_on(torch.where(gaps & surface.isfinite(), surface, 0), wide)
 
 
 def _surface(
@@ -293,11 +238,11 @@ def _at(image: Shaped[Tensor, "height width"], points: ViewPoints) -> Shaped[Ten
 
 
 def _means_on(
-    surface_depth_m: Float[Tensor, "height width"], points: ViewPoints, config: LidarImageConfig
+    surface_depth_m: Float[Tensor, "height width"], points: ViewPoints
 ) -> Float[Tensor, "height width 6"]:
     """Means of coloured rgb, share of coloured points, depth and age on a surface; 0 off it."""
     newest_s = points.age_s.min() if len(points.age_s) else 0.0
-    recent = torch.exp(-(points.age_s - newest_s) / config.recency_s).clamp(min=1e-6)
+    recent = torch.exp(-(points.age_s - newest_s) / RECENCY_S).clamp(min=1e-6)
     coloured = points.has_colour.to(torch.float32)[:, None]
     rgb = points.rgb_u8.to(torch.float32) / 255 * coloured
     columns = [rgb, coloured, points.depth_m[:, None], points.age_s[:, None]]
@@ -308,6 +253,6 @@ def _means_on(
         surface_depth_m,
         weight=recent,
         radius_px=points.radius_px,
-        tolerance=config.surface_tolerance,
+        tolerance=SURFACE_TOLERANCE,
     )
     return image

@@ -7,19 +7,21 @@ they are then, is decided when one is rendered. Colours come from the given imag
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.errors import SceneError
 from lidarpainter_models.lidar.actor_separation import (
+    ACTOR_MARGIN_M,
+    CLEARANCE_M,
+    ROAD_HEIGHT_M,
     NearActors,
-    SeparationConfig,
     height_above_ground,
     near_actors,
 )
-from lidarpainter_models.lidar.colouring import ColouringConfig, MapColouring
+from lidarpainter_models.lidar.colouring import MapColouring
 from lidarpainter_models.lidar.ground_heights import GroundHeights
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -28,38 +30,15 @@ from lidarpainter_models.scenes.tracks import ActorTrack
 
 _GROUND_SAMPLE = 400_000
 """Points that the ground is estimated from; more do not change it."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LidarMapConfig:
-    """Which points enter the map, and how they are told apart and coloured."""
-
-    min_range_m: float = 1.0
-    """Nearer returns come from the LiDAR's own housing."""
-    ego_range_m: float = 2.6
-    """Returns nearer than this are the ego vehicle's own body..."""
-    ego_half_width_m: float = 1.2
-    """... when also less than this to the left or right of the LiDAR; a car beside it is not."""
-    max_range_m: float = 300.0
-    """Further returns are left out: there a beam is a metre wide."""
-    separation: SeparationConfig = field(default_factory=SeparationConfig)
-    colouring: ColouringConfig = field(default_factory=ColouringConfig)
-
-    def __post_init__(self) -> None:
-        """Refuse an empty interval of ranges."""
-        if not 0 <= self.min_range_m < self.max_range_m:
-            raise ConfigError(
-                f"ranges must satisfy 0 <= min < max, got {self.min_range_m} and "
-                f"{self.max_range_m} m"
-            )
+MIN_RANGE_M = 1.0  # nearer returns come from the LiDAR's own housing
+EGO_RANGE_M = 2.6  # returns nearer than this are the ego vehicle's own body
+EGO_HALF_WIDTH_M = 1.2
+"""... when also less than this to the left or right of the LiDAR; a car beside it is not."""
+MAX_RANGE_M = 300.0  # further returns are left out: there a beam is a metre wide
 
 
 def build_lidar_map(
-    scene: DrivingScene,
-    *,
-    split_frames: Collection[int],
-    colour_views: Sequence[RecordedView],
-    config: LidarMapConfig | None = None,
+    scene: DrivingScene, *, split_frames: Collection[int], colour_views: Sequence[RecordedView]
 ) -> LidarMap:
     """Gather the sweeps of some frames into one map, coloured by some images.
 
@@ -67,22 +46,18 @@ def build_lidar_map(
         scene: where sweeps, images and tracks are read from.
         split_frames: frames whose sweeps may be used.
         colour_views: images that may give colours: those of the training set, no others.
-        config: see there.
 
     Raises:
         SceneError: the frames hold no point in range.
     """
-    config = config or LidarMapConfig()
-    points = gather_points(scene, split_frames, config)
-    colouring = MapColouring(points, scene.tracks, colour_views, config.colouring)
+    points = gather_points(scene, split_frames)
+    colouring = MapColouring(points, scene.tracks, colour_views)
     for view in colour_views:
         colouring.add(view, scene.read_image(view))
     return colouring.coloured()
 
 
-def gather_points(
-    scene: DrivingScene, split_frames: Collection[int], config: LidarMapConfig
-) -> LidarMap:
+def gather_points(scene: DrivingScene, split_frames: Collection[int]) -> LidarMap:
     """The sweeps of some frames in one map that has no colours yet.
 
     Raises:
@@ -90,20 +65,20 @@ def gather_points(
     """
     tracks = [track for track in scene.tracks if track.is_moving]
     sweeps = [
-        _place_sweep(scene, sweep, tracks, config)
+        _place_sweep(scene, sweep, tracks)
         for sweep in scene.sweeps
         if sweep.frame_index in set(split_frames)
     ]
     street_parts = [placed.points.keep(~placed.is_near) for placed in sweeps]
     if sum(len(part) for part in street_parts) == 0:
         raise SceneError(
-            f"{scene.dataset}/{scene.sequence}: no LiDAR point within {config.max_range_m:g} m in "
+            f"{scene.dataset}/{scene.sequence}: no LiDAR point within {MAX_RANGE_M:g} m in "
             f"frames {sorted(split_frames)}"
         )
     ground = _ground(street_parts)
     actor_parts: dict[str, list[MapPoints]] = {}
     for placed in sweeps:
-        road, of_actors = _sort_near_points(placed, tracks, ground, config.separation)
+        road, of_actors = _sort_near_points(placed, tracks, ground)
         street_parts.append(road)
         for actor_id, points in of_actors.items():
             actor_parts.setdefault(actor_id, []).append(points)
@@ -127,16 +102,14 @@ class _PlacedSweep:
         return marks
 
 
-def _place_sweep(
-    scene: DrivingScene, sweep: Sweep, tracks: Sequence[ActorTrack], config: LidarMapConfig
-) -> _PlacedSweep:
+def _place_sweep(scene: DrivingScene, sweep: Sweep, tracks: Sequence[ActorTrack]) -> _PlacedSweep:
     """Read a sweep, drop what is out of range, and find what lies near actors."""
     read = scene.read_sweep(sweep)
     away = read.xyz_m - sweep.world_from_lidar[:3, 3].to(read.xyz_m)
     range_m = away.norm(dim=-1)
     left = scene.world_from_ego[scene.frame_position(sweep.frame_index), :3, 1].to(away)
-    is_ego = (range_m < config.ego_range_m) & ((away @ left).abs() < config.ego_half_width_m)
-    used = (range_m >= config.min_range_m) & (range_m <= config.max_range_m) & ~is_ego
+    is_ego = (range_m < EGO_RANGE_M) & ((away @ left).abs() < EGO_HALF_WIDTH_M)
+    used = (range_m >= MIN_RANGE_M) & (range_m <= MAX_RANGE_M) & ~is_ego
     timestamp_ns = sweep.timestamp_ns + read.time_offset_ns[used].to(torch.int64)
     points = MapPoints.uncoloured(
         xyz_m=read.xyz_m[used],
@@ -144,7 +117,7 @@ def _place_sweep(
         timestamp_ns=timestamp_ns,
         range_m=range_m[used],
     )
-    near = near_actors(points.xyz_m, timestamp_ns, tracks, config.separation)
+    near = near_actors(points.xyz_m, timestamp_ns, tracks)
     return _PlacedSweep(points=points, near=near)
 
 
@@ -156,19 +129,16 @@ def _ground(street_parts: Sequence[MapPoints]) -> GroundHeights:
 
 
 def _sort_near_points(
-    placed: _PlacedSweep,
-    tracks: Sequence[ActorTrack],
-    ground: GroundHeights,
-    config: SeparationConfig,
+    placed: _PlacedSweep, tracks: Sequence[ActorTrack], ground: GroundHeights
 ) -> tuple[MapPoints, dict[str, MapPoints]]:
     """Of the points near actors: the road under them, and the points of each actor.
 
     What is neither (the margin around an actor, tyres where they touch the road) is dropped.
     """
     near, beside = placed.near, placed.points.keep(placed.near.rows)
-    height_m = height_above_ground(beside.xyz_m, near.bottom_m, ground, config)
-    road = beside.keep(height_m < config.road_height_m)
-    is_actor = (height_m >= config.clearance_m) & (near.outside_m <= config.actor_margin_m)
+    height_m = height_above_ground(beside.xyz_m, near.bottom_m, ground)
+    road = beside.keep(height_m < ROAD_HEIGHT_M)
+    is_actor = (height_m >= CLEARANCE_M) & (near.outside_m <= ACTOR_MARGIN_M)
     of_actors = {}
     for index in torch.unique(near.track[is_actor]).tolist():
         rows = (is_actor & (near.track == index)).nonzero()[:, 0]

@@ -4,7 +4,6 @@ World: x forward, y left, z up; box frame: x along the length, origin at the cen
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,25 +14,17 @@ from lidarpainter_models.scenes.tracks import ActorTrack
 
 BACKGROUND = -1
 """Actor index of a point that no moving box holds."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BoxConfig:
-    """How far an actor reaches beyond its box."""
-
-    margin_m: float = 0.15
-    """Boxes are grown by this much to the sides and upwards before points are tested."""
-    floor_m: float = 0.1
-    """Points lower than this over the bottom of a box are road, unless inside the true box."""
+MARGIN_M = 0.15  # boxes are grown by this much to the sides and upwards before points are tested
+FLOOR_M = 0.1
+"""Points lower than this over the bottom of a box are road, unless inside the true box."""
 
 
 class MovingBoxes:
     """The boxes of all moving actors of a log; poses are kept for every time asked for."""
 
-    def __init__(self, tracks: Sequence[ActorTrack], config: BoxConfig | None = None) -> None:
+    def __init__(self, tracks: Sequence[ActorTrack]) -> None:
         """Take the tracks; their order gives the actor indices."""
         self.tracks = tuple(tracks)
-        self.config = config or BoxConfig()
         self._poses: dict[tuple[int, int], Tensor | None] = {}
 
     def pose(self, index: int, timestamp_ns: int) -> Float[Tensor, "4 4"] | None:
@@ -59,7 +50,7 @@ class MovingBoxes:
             if world_from_box is None:
                 continue
             half_m = track.size_m.to(points_world) / 2
-            reach_m = float(half_m.norm()) + 2 * self.config.margin_m
+            reach_m = float(half_m.norm()) + 2 * MARGIN_M
             near = ((x_m - float(world_from_box[0, 3])).abs() <= reach_m).nonzero()[:, 0]
             box_from_world = invert_rigid(world_from_box).to(points_world)
             held = self._holds(transform_points(box_from_world, points_world[near]), half_m)
@@ -92,6 +83,6 @@ class MovingBoxes:
         self, points_box: Float[Tensor, "points 3"], half_m: Float[Tensor, "3"]
     ) -> Bool[Tensor, " points"]:
         over_floor_m = points_box[:, 2] + half_m[2]
-        grown = (points_box.abs() <= half_m + self.config.margin_m).all(dim=-1)
+        grown = (points_box.abs() <= half_m + MARGIN_M).all(dim=-1)
         inside = (points_box[:, :2].abs() <= half_m[:2]).all(dim=-1) & (over_floor_m > 0)
-        return grown & (inside | (over_floor_m > self.config.floor_m))
+        return grown & (inside | (over_floor_m > FLOOR_M))

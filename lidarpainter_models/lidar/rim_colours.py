@@ -1,7 +1,5 @@
 """Colours at the rims of surfaces, where a small error of pose shows what is beside them."""
 
-from dataclasses import dataclass
-
 import cv2
 import torch
 from jaxtyping import Float, Int, UInt8
@@ -11,23 +9,14 @@ from lidarpainter_models.kernels.colour_sampling import sample_levels, steps_ins
 from lidarpainter_models.lidar.point_visibility import Visibility
 from lidarpainter_models.lidar.points_in_view import PointsInView
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RimConfig:
-    """When the colour at a rim is not believed. Colour distances are Euclidean, of 255."""
-
-    edge_tolerance: float = 0.15
-    """A neighbour nearer or further by this share of the depth makes an edge."""
-    behind_edge_weight: float = 0.2
-    """Weight of a sample beside a nearer surface."""
-    rim_weight: float = 0.4
-    """Weight of a sample on the rim of a surface."""
-    foreign_likeness: float = 30.0
-    """A rim's colour is foreign when nearer than this (RGB distance of 255) to that beyond..."""
-    foreign_contrast: float = 60.0
-    """... and further than this from that inside."""
-    inner_reach: int = 6
-    """How many cells away the inner part of a surface is looked for from its rim."""
+EDGE_TOLERANCE = 0.15  # a neighbour nearer or further by this share of the depth makes an edge
+BEHIND_EDGE_WEIGHT = 0.2  # weight of a sample beside a nearer surface
+RIM_WEIGHT = 0.4  # weight of a sample on the rim of a surface
+FOREIGN_LIKENESS = 30.0
+"""A rim's colour is foreign when nearer than this (RGB distance of 255) to that beyond..."""
+FOREIGN_CONTRAST = 60.0
+"""... and further than this from that inside."""
+INNER_REACH = 6  # how many cells away the inner part of a surface is looked for from its rim
 
 
 class ImageLevels:
@@ -58,7 +47,6 @@ def rim_samples(
     points: PointsInView,
     visibility: Visibility,
     cells_per_pixel: Float[Tensor, "2"],
-    config: RimConfig,
 ) -> tuple[UInt8[Tensor, "points 3"], Float[Tensor, " points"]]:
     """Colours of visible points, and how far the place of each is to be trusted.
 
@@ -71,25 +59,24 @@ def rim_samples(
         points: those that nothing hides.
         visibility: what stands around.
         cells_per_pixel: of the grid, in u and v.
-        config: see there.
     """
     rgb = levels.sample(points.pixels_uv)
     trust = torch.ones_like(points.depth_m)
     column, row = points.cells_uv.unbind(-1)
     nearest_m, furthest_m = visibility.nearest_m[row, column], visibility.furthest_m[row, column]
-    is_behind = nearest_m < points.depth_m * (1 - config.edge_tolerance)
-    is_before = furthest_m > points.depth_m * (1 + config.edge_tolerance)
-    trust[is_behind] = config.behind_edge_weight
+    is_behind = nearest_m < points.depth_m * (1 - EDGE_TOLERANCE)
+    is_before = furthest_m > points.depth_m * (1 + EDGE_TOLERANCE)
+    trust[is_behind] = BEHIND_EDGE_WEIGHT
     on_rim = is_before.nonzero()[:, 0]
-    trust[on_rim] *= config.rim_weight
+    trust[on_rim] *= RIM_WEIGHT
     steps, has_inner = map(
         torch.from_numpy,
         steps_inside(
             points.cells_uv[on_rim].numpy(),
             points.depth_m[on_rim].numpy(),
             visibility.inner_m.numpy(),
-            config.inner_reach,
-            config.edge_tolerance,
+            INNER_REACH,
+            EDGE_TOLERANCE,
         ),
     )
     moved, steps_px = on_rim[has_inner], steps[has_inner] / cells_per_pixel
@@ -97,6 +84,6 @@ def rim_samples(
     inner = levels.sample(points.pixels_uv[moved] + steps_px, moved)
     beyond = levels.sample(points.pixels_uv[moved] - steps_px, moved)
     to_inner, to_beyond = (own - inner.float()).norm(dim=-1), (own - beyond.float()).norm(dim=-1)
-    is_foreign = (to_beyond < config.foreign_likeness) & (to_inner > config.foreign_contrast)
+    is_foreign = (to_beyond < FOREIGN_LIKENESS) & (to_inner > FOREIGN_CONTRAST)
     rgb[moved[is_foreign]] = inner[is_foreign]
     return rgb, trust

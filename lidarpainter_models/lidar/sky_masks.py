@@ -10,55 +10,31 @@ sure sky around them.
 Doubt is settled as not sky: wires, foliage, far towers, and overcast skies behind white walls.
 """
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from lidarpainter_models.errors import ConfigError, ShapeError
+from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.geometry.cameras import Camera
 
 _GROWTH_ROUNDS = 3
 _SMALL_PIECE_PX = 30
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SkyMaskConfig:
-    """When a pixel is believed to be sky. Colours are of 255; angles follow the resolution."""
-
-    least_elevation_rad: float = 0.0
-    """Sky is above the horizon."""
-    clear_rad: float = 0.008
-    """Sure sky has no return nearer than this angle."""
-    least_log_ratio: float = 1.5
-    """Sure sky has a colour that is e to this times more frequent without returns than with."""
-    most_texture: float = 6.0
-    """Largest standard deviation of a colour channel in a neighbourhood of sure sky."""
-    least_area: float = 0.002
-    """Smallest connected piece of sure sky, as a share of the image."""
-    piece_tolerance: float = 25.0
-    """A piece of sure sky may differ so much from the largest one, in any channel."""
-    colour_tolerance: float = 10.0
-    """A pixel may differ so much from the sure sky around it, in any channel."""
-    around_rad: float = 0.06
-    """How far around a pixel the sure sky is averaged."""
-
-    def __post_init__(self) -> None:
-        """Refuse angles without extent."""
-        for name in ("clear_rad", "around_rad", "least_area"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
+LEAST_ELEVATION_RAD = 0.0  # sky is above the horizon
+CLEAR_RAD = 0.008  # sure sky has no return nearer than this angle
+LEAST_LOG_RATIO = 1.5
+"""Sure sky has a colour that is e to this times more frequent without returns than with."""
+MOST_TEXTURE = 6.0  # largest standard deviation of a colour channel in a neighbourhood of sure sky
+LEAST_AREA = 0.002  # smallest connected piece of sure sky, as a share of the image
+PIECE_TOLERANCE = 25.0
+"""A piece of sure sky may differ so much from the largest one, in any channel."""
+COLOUR_TOLERANCE = 10.0  # a pixel may differ so much from the sure sky around it, in any channel
+AROUND_RAD = 0.06  # how far around a pixel the sure sky is averaged
 
 
 def sky_mask(
-    rgb_u8: UInt8[Tensor, "height width 3"],
-    points_world: Float[Tensor, "points 3"],
-    camera: Camera,
-    *,
-    config: SkyMaskConfig | None = None,
+    rgb_u8: UInt8[Tensor, "height width 3"], points_world: Float[Tensor, "points 3"], camera: Camera
 ) -> Bool[Tensor, "height width"]:
     """Sky in a recorded image.
 
@@ -66,21 +42,18 @@ def sky_mask(
         rgb_u8: the image.
         points_world: LiDAR points of the same frame.
         camera: on the same grid as the image.
-        config: see there.
     """
     pixels_uv, depth_m = camera.project(points_world)
     column, row = pixels_uv[camera.contains(pixels_uv, depth_m)].long().unbind(-1)
     has_return = torch.zeros(camera.height_px, camera.width_px, dtype=torch.bool)
     has_return[row, column] = True
-    return sky_from_returns(rgb_u8, has_return, camera, config=config)
+    return sky_from_returns(rgb_u8, has_return, camera)
 
 
 def sky_from_returns(
     rgb_u8: UInt8[Tensor, "height width 3"],
     has_return: Bool[Tensor, "height width"],
     camera: Camera,
-    *,
-    config: SkyMaskConfig | None = None,
 ) -> Bool[Tensor, "height width"]:
     """Sky in an image whose LiDAR returns are known.
 
@@ -88,12 +61,10 @@ def sky_from_returns(
         rgb_u8: the image.
         has_return: pixels that a LiDAR point falls into.
         camera: on the same grid; the world's z is up.
-        config: see there.
 
     Raises:
         ShapeError: image, returns and camera differ in size.
     """
-    config = config or SkyMaskConfig()
     size = (camera.height_px, camera.width_px)
     if tuple(rgb_u8.shape) != (*size, 3) or tuple(has_return.shape) != size:
         raise ShapeError(
@@ -101,21 +72,21 @@ def sky_from_returns(
             f"{tuple(has_return.shape)}"
         )
     image, returns = rgb_u8.numpy(), has_return.numpy().astype(np.uint8)
-    above = _elevation(camera) > config.least_elevation_rad
-    clear_px = max(1, round(config.clear_rad * camera.fx_px))
+    above = _elevation(camera) > LEAST_ELEVATION_RAD
+    clear_px = max(1, round(CLEAR_RAD * camera.fx_px))
     open_sky = above & (_grown(returns, clear_px) == 0)
     surface = _grown(returns, 2) > 0
-    sure = open_sky & (_log_ratio(image, open_sky, surface) > config.least_log_ratio)
-    sure &= _texture(image) < config.most_texture
-    around_px = config.around_rad * camera.fx_px
-    pieces = _large_pieces(sure, config.least_area * sure.size)
-    sky = _like_the_largest(image, pieces, around_px, config.piece_tolerance)
+    sure = open_sky & (_log_ratio(image, open_sky, surface) > LEAST_LOG_RATIO)
+    sure &= _texture(image) < MOST_TEXTURE
+    around_px = AROUND_RAD * camera.fx_px
+    pieces = _large_pieces(sure, LEAST_AREA * sure.size)
+    sky = _like_the_largest(image, pieces, around_px, PIECE_TOLERANCE)
     candidates = above & (_grown(returns, 1) == 0)
     for _ in range(_GROWTH_ROUNDS):
         if not sky.any():
             break
         differs = _differs(image, sky, around_px)
-        like_sky = sky | (candidates & (differs < config.colour_tolerance))
+        like_sky = sky | (candidates & (differs < COLOUR_TOLERANCE))
         # small pieces between wires and branches count once the large ones say what sky looks like
         seeds = _large_pieces(like_sky & (sure | sky), _SMALL_PIECE_PX)
         sky = _connected_to(like_sky, seeds)

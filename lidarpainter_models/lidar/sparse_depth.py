@@ -6,7 +6,6 @@ Nearer returns below it hide nothing: that is how a road looks.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -19,42 +18,31 @@ from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.scenes.tracks import ActorTrack
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SparseDepthConfig:
-    """How sweeps become depth images."""
-
-    min_depth_m: float = 1.0
-    """Nearer returns are the car itself or noise."""
-    max_depth_m: float = 250.0
-    """Beyond the reach of the sensors in use."""
-    occlusion_window_px: int = 5
-    """Gaps between beams are a few pixels wide: look for nearer returns in the upper half of a
-    window of this width."""
-    occlusion_margin: float = 0.05
-    """A point further behind than this part of its depth is hidden ..."""
-    occlusion_margin_m: float = 0.3
-    """... plus this much, so that walls seen at a grazing angle survive."""
+MIN_DEPTH_M = 1.0  # nearer returns are the car itself or noise
+MAX_DEPTH_M = 250.0  # beyond the reach of the sensors in use
+OCCLUSION_WINDOW_PX = 5
+"""Gaps between beams are a few pixels wide: look for nearer returns in the upper half of a
+window of this width."""
+OCCLUSION_MARGIN = 0.05  # a point further behind than this part of its depth is hidden
+OCCLUSION_MARGIN_M = 0.3
+"""... plus this much, so that walls seen at a grazing angle survive."""
 
 
 def sparse_lidar_depth(
-    points_world: Float[Tensor, "points 3"],
-    camera: Camera,
-    *,
-    config: SparseDepthConfig,
+    points_world: Float[Tensor, "points 3"], camera: Camera
 ) -> Float[Tensor, "height width"]:
     """Nearest visible LiDAR depth of every pixel, 0 where there is none."""
     pixels_uv, depth_m = camera.project(points_world)
-    inside = camera.contains(pixels_uv, depth_m, near_m=config.min_depth_m)
-    inside &= depth_m < config.max_depth_m
+    inside = camera.contains(pixels_uv, depth_m, near_m=MIN_DEPTH_M)
+    inside &= depth_m < MAX_DEPTH_M
     column, row = pixels_uv[inside].long().unbind(-1)
     nearest = torch.full((camera.height_px * camera.width_px,), torch.inf)
     nearest.scatter_reduce_(0, row * camera.width_px + column, depth_m[inside], reduce="amin")
     nearest = nearest.view(camera.height_px, camera.width_px)
-    reach = config.occlusion_window_px // 2
+    reach = OCCLUSION_WINDOW_PX // 2
     padded = torch.nn.functional.pad(-nearest[None], (reach, reach, reach, 0), value=-torch.inf)
     front = -torch.nn.functional.max_pool2d(padded, (reach + 1, 2 * reach + 1), 1)[0]
-    is_visible = nearest <= front * (1 + config.occlusion_margin) + config.occlusion_margin_m
+    is_visible = nearest <= front * (1 + OCCLUSION_MARGIN) + OCCLUSION_MARGIN_M
     return torch.where(is_visible & nearest.isfinite(), nearest, torch.zeros_like(nearest))
 
 

@@ -29,11 +29,6 @@ class DepthScores:
     inliers: int
     points: int
 
-    @property
-    def inlier_fraction(self) -> float | None:
-        """The part of visible LiDAR pixels met within the tolerance."""
-        return self.inliers / self.points if self.points else None
-
 
 def visible_points(
     camera: Camera, points_world: Float[Tensor, "points 3"]

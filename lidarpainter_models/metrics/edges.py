@@ -19,36 +19,17 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lidarpainter_models.errors import ConfigError, ShapeError
+from lidarpainter_models.errors import ShapeError
 
 _GREY = np.array([0.2126, 0.7152, 0.0722], np.float32)
 _LEAST_GRADIENT = 1e-3  # of display white per pixel: below it is rounding and sensor noise
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EdgeConfig:
-    """What counts as an edge and as found again."""
-
-    strongest_share: float = 0.1
-    """Share of the pixels judged that may be edges, before thinning."""
-    smoothing_px: float = 1.2
-    """Blur before the gradient; lifts edges above noise and rain."""
-    around_px: float = 12.0
-    """Reach of the mean gradient that a pixel's own is compared with."""
-    tolerance_px: int = 2
-    """An edge is found again if the other image has one within this distance."""
-    support_px: int = 3
-    """Pixels within this distance of a LiDAR hit are judged."""
-    farthest_m: float = 40.0
-    """Hits beyond this are left out: fog may hide what is there, which is what fog does."""
-
-    def __post_init__(self) -> None:
-        """Refuse shares and reaches that find nothing."""
-        if not 0 < self.strongest_share < 1:
-            raise ConfigError(f"strongest_share must be in (0, 1), got {self.strongest_share}")
-        for name in ("smoothing_px", "around_px", "farthest_m"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
+STRONGEST_SHARE = 0.1  # share of the pixels judged that may be edges, before thinning
+SMOOTHING_PX = 1.2  # blur before the gradient; lifts edges above noise and rain
+AROUND_PX = 12.0  # reach of the mean gradient that a pixel's own is compared with
+TOLERANCE_PX = 2  # an edge is found again if the other image has one within this distance
+SUPPORT_PX = 3  # pixels within this distance of a LiDAR hit are judged
+FARTHEST_M = 40.0
+"""Hits beyond this are left out: fog may hide what is there, which is what fog does."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,27 +49,25 @@ def edge_agreement(
     styled: Float[Tensor, "height width 3"],
     clear: Float[Tensor, "height width 3"],
     lidar_depth_m: Float[Tensor, "rows columns"],
-    config: EdgeConfig | None = None,
 ) -> EdgeScores | None:
     """Compare edges near LiDAR hits; None where the clear image has none to keep.
 
     Raises:
         ShapeError: the images or the depth differ in size.
     """
-    config = config or EdgeConfig()
     if styled.shape != clear.shape or lidar_depth_m.shape != clear.shape[:2]:
         raise ShapeError(
             f"need images and depth of one size, got {tuple(styled.shape)}, "
             f"{tuple(clear.shape)} and {tuple(lidar_depth_m.shape)}"
         )
-    judged = supported_pixels(lidar_depth_m, config).numpy()
+    judged = supported_pixels(lidar_depth_m).numpy()
     if not judged.any():
         return None
-    found, wanted = (_edges(image, judged, config) for image in (styled, clear))
+    found, wanted = (_edges(image, judged) for image in (styled, clear))
     if not wanted.any():
         return None
-    precision = _share_near(found, wanted, config.tolerance_px)
-    recall = _share_near(wanted, found, config.tolerance_px)
+    precision = _share_near(found, wanted, TOLERANCE_PX)
+    recall = _share_near(wanted, found, TOLERANCE_PX)
     total = precision + recall
     return EdgeScores(
         f1=2 * precision * recall / total if total else 0.0,
@@ -98,24 +77,20 @@ def edge_agreement(
     )
 
 
-def supported_pixels(
-    lidar_depth_m: Float[Tensor, "height width"], config: EdgeConfig
-) -> Bool[Tensor, "height width"]:
+def supported_pixels(lidar_depth_m: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
     """Pixels near a LiDAR hit that is not too far."""
-    hits = ((lidar_depth_m > 0) & (lidar_depth_m <= config.farthest_m)).numpy().astype(np.uint8)
-    return torch.from_numpy(_grown(hits, config.support_px) > 0)
+    hits = ((lidar_depth_m > 0) & (lidar_depth_m <= FARTHEST_M)).numpy().astype(np.uint8)
+    return torch.from_numpy(_grown(hits, SUPPORT_PX) > 0)
 
 
-def _edges(
-    image: Float[Tensor, "height width 3"], judged: np.ndarray, config: EdgeConfig
-) -> np.ndarray:
+def _edges(image: Float[Tensor, "height width 3"], judged: np.ndarray) -> np.ndarray:
     """The thinned strongest edges among the pixels judged."""
     grey = image.detach().clamp(0, 1).numpy().astype(np.float32) @ _GREY
-    smooth = cv2.GaussianBlur(grey, (0, 0), config.smoothing_px)
+    smooth = cv2.GaussianBlur(grey, (0, 0), SMOOTHING_PX)
     across, down = (cv2.Sobel(smooth, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1)))
     strength = np.hypot(across, down)
-    relative = strength / (cv2.GaussianBlur(strength, (0, 0), config.around_px) + _LEAST_GRADIENT)
-    threshold = np.quantile(relative[judged], 1 - config.strongest_share)
+    relative = strength / (cv2.GaussianBlur(strength, (0, 0), AROUND_PX) + _LEAST_GRADIENT)
+    threshold = np.quantile(relative[judged], 1 - STRONGEST_SHARE)
     strong = judged & (relative > max(threshold, 1e-6)) & (strength > _LEAST_GRADIENT)
     return strong & _is_ridge(strength, across, down)
 

@@ -70,12 +70,3 @@ def pooled_psnr(scores: Sequence[ImageScores]) -> float | None:
     if pixels == 0:
         return None
     return psnr_from_error(sum(score.masked_squared_error for score in scores) / pixels)
-
-
-def masked_psnr(
-    image: Float[Tensor, "height width 3"],
-    truth: Float[Tensor, "height width 3"],
-    mask: Bool[Tensor, "height width"],
-) -> float | None:
-    """PSNR of the masked pixels of one view; None where the mask is empty."""
-    return pooled_psnr([score_image(image, truth, mask)])

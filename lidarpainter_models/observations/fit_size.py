@@ -1,6 +1,6 @@
 """At which size a fit sees recorded images."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import torch
@@ -9,7 +9,6 @@ from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.lidar.sparse_depth import SparseDepthConfig
 from lidarpainter_models.scenes.records import RecordedView
 
 
@@ -19,7 +18,6 @@ class ObservationConfig:
 
     width_px: int = 480
     """Fit width; the height keeps each camera's aspect ratio."""
-    depth: SparseDepthConfig = field(default_factory=SparseDepthConfig)
 
     def __post_init__(self) -> None:
         """Refuse images too small for the SSIM window."""

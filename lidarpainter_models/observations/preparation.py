@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.lidar.colouring import MapColouring
-from lidarpainter_models.lidar.map_building import LidarMapConfig, gather_points
+from lidarpainter_models.lidar.map_building import gather_points
 from lidarpainter_models.lidar.sky_masks import sky_mask
 from lidarpainter_models.lidar.sparse_depth import points_at_exposure, sparse_lidar_depth
 from lidarpainter_models.observations.fit_size import ObservationConfig, fit_camera, shrink_image
@@ -40,12 +40,10 @@ def prepare_observations(
     """
     if not split.train:
         raise SceneError(f"the split of {scene.dataset}/{scene.sequence} has no training views")
-    map_config = LidarMapConfig()
     colouring = MapColouring(
-        gather_points(scene, split.train_frames, map_config),
+        gather_points(scene, split.train_frames),
         scene.tracks,
         split.train,
-        map_config.colouring,
     )
     views = []
     for done, recorded in enumerate(split.train, start=1):
@@ -77,5 +75,5 @@ def _training_view(
         timestamp_ns=recorded.timestamp_ns,
         rgb_u8=rgb_u8,
         sky_mask=sky_mask(rgb_u8, scene.read_points(recorded.frame_index).xyz_m, camera),
-        lidar_depth_m=sparse_lidar_depth(points_world, camera, config=config.depth),
+        lidar_depth_m=sparse_lidar_depth(points_world, camera),
     )

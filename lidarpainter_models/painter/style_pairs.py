@@ -13,12 +13,10 @@ from torch import Generator, Tensor
 
 from lidarpainter_models.painter.examples import PaintingPair
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT, PaintingConditions
-from lidarpainter_models.painter.styles import StyleConfig, StyleView, apply_style
+from lidarpainter_models.painter.styles import StyleView, apply_style
 
 
-def styled_pair(
-    pair: PaintingPair, prompt: str, generator: Generator, config: StyleConfig | None = None
-) -> PaintingPair:
+def styled_pair(pair: PaintingPair, prompt: str, generator: Generator) -> PaintingPair:
     """The pair with a styled target and the prompt that asks for it; whole images only.
 
     Raises:
@@ -27,7 +25,7 @@ def styled_pair(
     conditions = replace(pair.conditions, prompt=prompt)
     if prompt == DEFAULT_PROMPT:
         return replace(pair, conditions=conditions)
-    target = apply_style(target_view(pair), prompt, generator, config)
+    target = apply_style(target_view(pair), prompt, generator)
     return replace(pair, conditions=conditions, target_rgb=target)
 
 

@@ -8,110 +8,73 @@ damage needs no place.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
-from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.model.gaussian_set import SH_CONSTANT, GaussianSet
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 
 LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CorruptionConfig:
-    """How strong the damage may be; each value is drawn between the two ends."""
-
-    kinds: tuple[int, int] = (2, 4)
-    """Different kinds of damage in one scene."""
-    reach_m: float = 40.0
-    """Balls are drawn around Gaussians at most this far from the point of interest."""
-    balls: tuple[int, int] = (6, 30)
-    """Places of one kind of damage."""
-    radius_share: tuple[float, float] = (0.02, 0.09)
-    """Radius of a ball, as a share of its distance from the point of interest."""
-    jitter_m: tuple[float, float] = (0.03, 0.25)
-    needle_share: tuple[float, float] = (0.001, 0.01)
-    """Gaussians that become needles."""
-    needle_stretch: tuple[float, float] = (4.0, 12.0)
-    recolour_share: tuple[float, float] = (0.02, 0.15)
-    """Gaussians that take a false colour."""
-
-    def __post_init__(self) -> None:
-        """Refuse ranges that run backwards."""
-        for name in self.__slots__:
-            value = getattr(self, name)
-            if isinstance(value, tuple) and not 0 <= value[0] <= value[1]:
-                raise ConfigError(f"{name} must rise from 0 or more, got {value}")
+KINDS = (2, 4)  # different kinds of damage in one scene
+REACH_M = 40.0  # balls are drawn around Gaussians at most this far from the point of interest
+BALLS = (6, 30)  # places of one kind of damage
+RADIUS_SHARE = (0.02, 0.09)
+"""Radius of a ball, as a share of its distance from the point of interest."""
+JITTER_M = (0.03, 0.25)
+NEEDLE_SHARE = (0.001, 0.01)  # Gaussians that become needles
+NEEDLE_STRETCH = (4.0, 12.0)
+RECOLOUR_SHARE = (0.02, 0.15)  # Gaussians that take a false colour
 
 
 def corrupt_gaussians(
-    gaussians: GaussianSet,
-    around_world: Float[Tensor, "3"],
-    *,
-    seed: int,
-    config: CorruptionConfig | None = None,
+    gaussians: GaussianSet, around_world: Float[Tensor, "3"], *, seed: int
 ) -> GaussianSet:
     """A copy with several random kinds of damage around a point; follows from the seed."""
-    config = config or CorruptionConfig()
     generator = torch.Generator().manual_seed(seed)
-    low, high = config.kinds
+    low, high = KINDS
     number = low + int(torch.randint(high - low + 1, (), generator=generator))
     order = torch.randperm(len(_KINDS), generator=generator)[:number].tolist()
     damaged = gaussians.select(torch.arange(len(gaussians)))
     for index in sorted(order, reverse=True):  # dropping rows comes last
         if len(damaged) > 0:
-            damaged = _KINDS[index](damaged, around_world, generator, config)
+            damaged = _KINDS[index](damaged, around_world, generator)
     return damaged
 
 
 def drop_balls(
-    gaussians: GaussianSet,
-    around_world: Float[Tensor, "3"],
-    generator: Generator,
-    config: CorruptionConfig,
+    gaussians: GaussianSet, around_world: Float[Tensor, "3"], generator: Generator
 ) -> GaussianSet:
     """Leave out everything in some balls: holes through which the background shows."""
-    inside = random_balls(gaussians, around_world, generator, config)
+    inside = random_balls(gaussians, around_world, generator)
     return gaussians.select((~inside).nonzero()[:, 0])
 
 
 def fade_balls(
-    gaussians: GaussianSet,
-    around_world: Float[Tensor, "3"],
-    generator: Generator,
-    config: CorruptionConfig,
+    gaussians: GaussianSet, around_world: Float[Tensor, "3"], generator: Generator
 ) -> GaussianSet:
     """Make balls translucent."""
-    inside = random_balls(gaussians, around_world, generator, config)
+    inside = random_balls(gaussians, around_world, generator)
     loss = _between((1.0, 4.0), generator)
     return _with(gaussians, opacity_logit=gaussians.opacity_logit - loss * inside)
 
 
 def thin_balls(
-    gaussians: GaussianSet,
-    around_world: Float[Tensor, "3"],
-    generator: Generator,
-    config: CorruptionConfig,
+    gaussians: GaussianSet, around_world: Float[Tensor, "3"], generator: Generator
 ) -> GaussianSet:
     """Shrink the Gaussians of some balls, so that a surface shows gaps as from nearby."""
-    inside = random_balls(gaussians, around_world, generator, config)
+    inside = random_balls(gaussians, around_world, generator)
     loss = _between((0.3, 0.9), generator)
     return _with(gaussians, log_scale=gaussians.log_scale - loss * inside[:, None])
 
 
 def shake_balls(
-    gaussians: GaussianSet,
-    around_world: Float[Tensor, "3"],
-    generator: Generator,
-    config: CorruptionConfig,
+    gaussians: GaussianSet, around_world: Float[Tensor, "3"], generator: Generator
 ) -> GaussianSet:
     """Move the Gaussians of some balls at random: surfaces crumble."""
-    inside = random_balls(gaussians, around_world, generator, config)
-    spread_m = _between(config.jitter_m, generator)
+    inside = random_balls(gaussians, around_world, generator)
+    spread_m = _between(JITTER_M, generator)
     noise = spread_m * torch.randn(gaussians.means.shape, generator=generator)
     return _with(gaussians, means=gaussians.means + noise * inside[:, None])
 
@@ -120,11 +83,10 @@ def grow_needles(
     gaussians: GaussianSet,
     around_world: Float[Tensor, "3"],  # noqa: ARG001 - one signature for all kinds
     generator: Generator,
-    config: CorruptionConfig,
 ) -> GaussianSet:
     """Stretch some Gaussians along their longest axis and turn them anywhere."""
-    chosen = _some(gaussians, config.needle_share, generator)
-    stretch = torch.tensor(_between(config.needle_stretch, generator)).log()
+    chosen = _some(gaussians, NEEDLE_SHARE, generator)
+    stretch = torch.tensor(_between(NEEDLE_STRETCH, generator)).log()
     longest = gaussians.log_scale.argmax(dim=1, keepdim=True)
     is_longest = torch.zeros_like(gaussians.log_scale).scatter_(1, longest, 1.0)
     change = stretch * (is_longest - 0.25 * (1 - is_longest)) * chosen[:, None]
@@ -137,10 +99,9 @@ def recolour(
     gaussians: GaussianSet,
     around_world: Float[Tensor, "3"],  # noqa: ARG001
     generator: Generator,
-    config: CorruptionConfig,
 ) -> GaussianSet:
     """Give some Gaussians a colour of their own: rainbow speckle."""
-    chosen = _some(gaussians, config.recolour_share, generator)
+    chosen = _some(gaussians, RECOLOUR_SHARE, generator)
     noise = _between((0.1, 0.5), generator) * torch.randn(
         gaussians.sh_dc.shape, generator=generator
     )
@@ -152,7 +113,6 @@ def tear_lane_paint(
     gaussians: GaussianSet,
     around_world: Float[Tensor, "3"],  # noqa: ARG001
     generator: Generator,
-    config: CorruptionConfig,  # noqa: ARG001
 ) -> GaussianSet:
     """Give bright flat ground the colour of the road in stripes: lines break into dashes."""
     paint = is_bright_ground(gaussians)
@@ -168,22 +128,19 @@ def tear_lane_paint(
 
 
 def random_balls(
-    gaussians: GaussianSet,
-    around_world: Float[Tensor, "3"],
-    generator: Generator,
-    config: CorruptionConfig,
+    gaussians: GaussianSet, around_world: Float[Tensor, "3"], generator: Generator
 ) -> Bool[Tensor, " gaussians"]:
     """Marks the street's Gaussians inside random balls around the point of interest."""
     distance_m = (gaussians.means - around_world.to(gaussians.means)).norm(dim=1)
     is_street = gaussians.body_index == 0
-    near = (is_street & (distance_m < config.reach_m)).nonzero()[:, 0]
+    near = (is_street & (distance_m < REACH_M)).nonzero()[:, 0]
     inside = torch.zeros_like(is_street)
     if len(near) == 0:
         return inside
-    low, high = config.balls
+    low, high = BALLS
     for _ in range(low + int(torch.randint(high - low + 1, (), generator=generator))):
         centre = near[int(torch.randint(len(near), (), generator=generator))]
-        radius_m = float(distance_m[centre]) * _between(config.radius_share, generator)
+        radius_m = float(distance_m[centre]) * _between(RADIUS_SHARE, generator)
         apart_m = (gaussians.means - gaussians.means[centre]).norm(dim=1)
         inside |= is_street & (apart_m < radius_m)
     return inside

@@ -23,7 +23,7 @@ from lidarpainter_models.observations.fit_size import ObservationConfig
 from lidarpainter_models.observations.views import SceneObservations
 from lidarpainter_models.painter.examples import PaintingPair
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.training_data.corruptions import CorruptionConfig, corrupt_gaussians
+from lidarpainter_models.training_data.corruptions import corrupt_gaussians
 from lidarpainter_models.training_data.pairs import PairWriter
 
 HarvestProgress = Callable[[int, int], None]
@@ -48,7 +48,6 @@ class HarvestConfig:
 
     observations: ObservationConfig = field(default_factory=ObservationConfig)
     conditions: ConditionConfig = field(default_factory=ConditionConfig)
-    corruption: CorruptionConfig = field(default_factory=CorruptionConfig)
     corrupted_per_view: int = 1
     """Pairs with damaged Gaussians beside the one that is as the fit left it."""
     reference_fit: FitConfig = field(default_factory=lambda: FitConfig(steps=1200))
@@ -153,7 +152,6 @@ def _damaged_builder(
         scene.gaussians,
         target.camera.centre_world.float(),
         seed=seed,
-        config=config.corruption,
     )
     return ConditionBuilder(
         scene.with_gaussians(damaged),

@@ -34,29 +34,16 @@ from lidarpainter_models.training_data.pairs import PairWriter
 
 MOST_DRAWS = 20
 """Shifts tried per view before it is given up: the camera may stand in a wall every time."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ShiftDraw:
-    """From where a street is looked at; ranges are uniform, sides equally likely."""
-
-    lateral_m: tuple[float, float] = (1.0, 3.5)
-    up_m: tuple[float, float] = (0.5, 2.0)
-    yaw_rad: float = 0.12
-    """Largest turn of a view that is turned."""
-    lateral_share: float = 0.7
-    """Views moved sideways; the shares are independent, so some are moved in both ways or none."""
-    up_share: float = 0.35
-    yaw_share: float = 0.25
-    clear_m: float = 1.2
-    """A view is drawn again if more than `crowded_share` of its pixels are nearer than this."""
-    crowded_share: float = 0.03
-
-    def __post_init__(self) -> None:
-        """Refuse ranges that run backwards."""
-        for low, high in (self.lateral_m, self.up_m):
-            if not 0 <= low <= high:
-                raise ConfigError(f"shifts must rise from 0 or more, got {low} to {high} m")
+LATERAL_M = (1.0, 3.5)
+UP_M = (0.5, 2.0)
+YAW_RAD = 0.12  # largest turn of a view that is turned
+LATERAL_SHARE = 0.7
+"""Views moved sideways; the shares are independent, so some are moved in both ways or none."""
+UP_SHARE = 0.35
+YAW_SHARE = 0.25
+CLEAR_M = 1.2
+"""A view is drawn again if more than `CROWDED_SHARE` of its pixels are nearer than this."""
+CROWDED_SHARE = 0.03
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,7 +56,6 @@ class StreetPlan:
     cameras: tuple[str, ...] = ("front_camera",)
     """Cameras fitted; the first is the one that is shifted."""
     num_views: int = 20
-    shifts: ShiftDraw = field(default_factory=ShiftDraw)
 
     def __post_init__(self) -> None:
         """Refuse a plan without a camera or a view."""
@@ -129,16 +115,16 @@ def harvest_shifted_street(
     return added
 
 
-def draw_shift(draw: ShiftDraw, generator: Generator) -> Shift:
+def draw_shift(generator: Generator) -> Shift:
     """A random shift; the recorded pose itself if no kind of shift was drawn."""
     lateral, up, yaw, side, amount, height, angle = torch.rand(7, generator=generator).tolist()
-    low, high = draw.lateral_m
+    low, high = LATERAL_M
     lateral_m = (low + (high - low) * amount) * (1 if side < 0.5 else -1)
-    low, high = draw.up_m
+    low, high = UP_M
     return Shift(
-        lateral_m=lateral_m if lateral < draw.lateral_share else 0.0,
-        up_m=low + (high - low) * height if up < draw.up_share else 0.0,
-        yaw_rad=draw.yaw_rad * (2 * angle - 1) if yaw < draw.yaw_share else 0.0,
+        lateral_m=lateral_m if lateral < LATERAL_SHARE else 0.0,
+        up_m=low + (high - low) * height if up < UP_SHARE else 0.0,
+        yaw_rad=YAW_RAD * (2 * angle - 1) if yaw < YAW_SHARE else 0.0,
     )
 
 
@@ -159,7 +145,7 @@ def _draw_targets(
     for index in range(plan.num_views):
         view = recorded[order[index % len(order)]]
         row = scene.frame_indices.index(view.frame_index)
-        found = _clear_view(street, view, directions[row], plan.shifts, generator, config)
+        found = _clear_view(street, view, directions[row], generator, config)
         if found is not None:
             targets.append(_target(found, view, scene, plan, f"{label}-{index:03d}"))
     if not targets:
@@ -178,18 +164,17 @@ def _clear_view(
     street: SyntheticStreet,
     view: RecordedView,
     road_direction: torch.Tensor,
-    draw: ShiftDraw,
     generator: Generator,
     config: HarvestConfig,
 ) -> _ClearView | None:
     """A shifted view that does not stand inside something, or None."""
     recorded = fit_camera(view, config.observations)
     for _ in range(MOST_DRAWS):
-        shift = draw_shift(draw, generator)
+        shift = draw_shift(generator)
         camera = recorded.at(shift_pose(recorded.world_from_camera, road_direction, shift))
         truth = street.render(camera, view.timestamp_ns)
-        near = (truth.depth_m > 0) & (truth.depth_m < draw.clear_m)
-        if float(near.float().mean()) <= draw.crowded_share:
+        near = (truth.depth_m > 0) & (truth.depth_m < CLEAR_M)
+        if float(near.float().mean()) <= CROWDED_SHARE:
             return _ClearView(camera=camera, shift=shift, true_rgb=truth.rgb.clamp(0, 1))
     return None
 

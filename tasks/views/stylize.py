@@ -1,6 +1,6 @@
 """Images of a finished run in another weather or at night."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,9 +13,9 @@ from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.export.images import write_png
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.sky_masks import sky_mask
-from lidarpainter_models.metrics.edges import EdgeConfig, edge_agreement, mean_edge_scores
+from lidarpainter_models.metrics.edges import edge_agreement, mean_edge_scores
 from lidarpainter_models.observations.fit_size import shrink_image
-from lidarpainter_models.painter.styles import StyleConfig, StyleView, apply_style, check_prompt
+from lidarpainter_models.painter.styles import StyleView, apply_style, check_prompt
 from lidarpainter_models.scenes.records import RecordedView
 from tasks.json_files import write_json
 from tasks.opened import RunSpec
@@ -41,8 +41,6 @@ class StylizeRequest:
     images: Images = "rendered"
     """Style what the scene shows, or what the camera recorded where it stood."""
     seed: int = 0
-    style: StyleConfig = field(default_factory=StyleConfig)
-    edges: EdgeConfig = field(default_factory=EdgeConfig)
 
     def __post_init__(self) -> None:
         """Refuse styles that are none, and recorded images from where nobody stood.
@@ -77,10 +75,10 @@ def stylize(run: RunSpec, fitted: FittedRef, request: StylizeRequest, out: Path)
         view, lidar_depth_m = _view(path, camera, moment, request.images)
         # every frame has its own drops and noise, and the same ones each time
         generator = torch.Generator().manual_seed((request.seed << 32) + moment.frame_index)
-        styled = apply_style(view, request.prompt, generator, request.style)
+        styled = apply_style(view, request.prompt, generator)
         file = write_png(styled, out / f"{moment.frame_index:04d}.png")
         write_png(view.rgb, out / CLEAR_FOLDER / file.name)
-        agreement = edge_agreement(styled, view.rgb, lidar_depth_m, request.edges)
+        agreement = edge_agreement(styled, view.rgb, lidar_depth_m)
         kept = None if agreement is None else asdict(agreement)
         rows.append({**image_record(file.name, camera, moment), "edges": kept})
         scores += [] if agreement is None else [agreement]

@@ -28,7 +28,7 @@ from lidarpainter_models.gaussians.model.corrections import CameraCorrections, E
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
-from lidarpainter_models.gaussians.model.sky import SkyTexture, SkyTextureConfig, sky_layout
+from lidarpainter_models.gaussians.model.sky import SkyTexture, sky_layout
 from lidarpainter_models.geometry.transforms import rigid_from_rotation
 from lidarpainter_models.kernels.ssim import l1_ssim_loss
 from lidarpainter_models.observations.views import TrainingView
@@ -77,9 +77,7 @@ def _scene(gaussians, cameras):
     times = torch.arange(len(cameras)) * 100_000_000
     return GaussianScene(
         gaussians=gaussians,
-        sky=SkyTexture.constant(
-            sky_layout(cameras, SkyTextureConfig()), torch.tensor([0.6, 0.7, 0.9])
-        ),
+        sky=SkyTexture.constant(sky_layout(cameras), torch.tensor([0.6, 0.7, 0.9])),
         cameras=CameraCorrections.none(
             [(frame, "front") for frame in range(len(cameras))],
             times,

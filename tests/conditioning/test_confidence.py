@@ -3,13 +3,12 @@ import math
 import pytest
 import torch
 
+from lidarpainter_models.conditioning import confidence as confidences
 from lidarpainter_models.conditioning.confidence import (
-    ConfidenceConfig,
     geometric_confidence,
     guidance_gate,
     is_seen,
 )
-from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.painter.protocol import Painting, PaintingConditions
 
@@ -53,12 +52,12 @@ def painting(rgb):
 EVERYWHERE = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
 
 
-def test_confidence_follows_its_formula():
+def test_confidence_follows_its_formula(monkeypatch):
     hit = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     hit[10, 10] = True
     given = conditions(lidar_hit=hit, warp_valid=torch.zeros(2, HEIGHT, WIDTH, dtype=torch.bool))
-    config = ConfidenceConfig(lidar_reach_rad=0.04)  # 2 px
-    confidence = geometric_confidence(given, camera(), EVERYWHERE, config=config)
+    monkeypatch.setattr(confidences, "LIDAR_REACH_RAD", 0.04)  # 2 px
+    confidence = geometric_confidence(given, camera(), EVERYWHERE)
     expected = 1 - (1 - 0.6 * math.exp(-3 / 2)) * (1 - 0.3)
     assert confidence[10, 13] == pytest.approx(expected, rel=1e-5)
     assert confidence[10, 10] == pytest.approx(1 - 0.4 * 0.7, rel=1e-5)
@@ -113,10 +112,11 @@ def test_the_gate_lets_a_better_painting_pass():
     assert not gate.is_refused
 
 
-def test_the_gate_finds_a_hallucinated_block():
+def test_the_gate_finds_a_hallucinated_block(monkeypatch):
+    monkeypatch.setattr(confidences, "GATE_SLACK", 0.1)
     painted = conditions().warp_rgb[0].clone()
     painted[:15, :15] = 1 - painted[:15, :15]
-    gate = guidance_gate(painting(painted), conditions(), config=ConfidenceConfig(gate_slack=0.1))
+    gate = guidance_gate(painting(painted), conditions())
     assert (gate.weight[3:12, 3:12] < 0.01).all()
     assert (gate.weight[25:, 30:] == 1).all()
 
@@ -133,8 +133,3 @@ def test_without_evidence_nothing_is_gated():
     gate = guidance_gate(painting(torch.zeros(HEIGHT, WIDTH, 3)), conditions(warp_valid=nothing))
     assert (gate.weight == 1).all()
     assert math.isnan(gate.painted_difference)
-
-
-def test_impossible_weights_are_refused():
-    with pytest.raises(ConfigError, match="warp_weight"):
-        ConfidenceConfig(warp_weight=1.5)

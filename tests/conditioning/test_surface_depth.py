@@ -1,12 +1,9 @@
 """The depth that recorded images are carried by."""
 
-import pytest
 import torch
 
-from lidarpainter_models.conditioning.surface_depth import SurfaceDepthConfig, surface_depth
-from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.conditioning.surface_depth import surface_depth
 
-CONFIG = SurfaceDepthConfig()
 FOCAL_PX = 500.0
 
 
@@ -20,29 +17,24 @@ def render_and_lidar(*, wrong_by=1.02):
 
 def test_lidar_stands_where_it_hit_and_corrects_the_render_around_it():
     true_m, render_m, lidar_m = render_and_lidar()
-    found_m = surface_depth(render_m, lidar_m, FOCAL_PX, CONFIG)
+    found_m = surface_depth(render_m, lidar_m, FOCAL_PX)
     assert torch.equal(found_m[lidar_m > 0], lidar_m[lidar_m > 0])
     assert torch.allclose(found_m, true_m, rtol=1e-3)
 
 
 def test_lidar_that_looked_past_an_edge_is_not_believed():
     _, render_m, lidar_m = render_and_lidar(wrong_by=0.5)
-    assert torch.equal(surface_depth(render_m, lidar_m, FOCAL_PX, CONFIG), render_m)
+    assert torch.equal(surface_depth(render_m, lidar_m, FOCAL_PX), render_m)
 
 
 def test_a_correction_reaches_no_further_than_its_neighbourhood():
     _, render_m, lidar_m = render_and_lidar()
     lidar_m[:, 4:] = 0
-    found_m = surface_depth(render_m, lidar_m, FOCAL_PX, CONFIG)
+    found_m = surface_depth(render_m, lidar_m, FOCAL_PX)
     assert torch.equal(found_m[:, 20:], render_m[:, 20:])
 
 
 def test_nothing_stays_nothing():
     nothing = torch.zeros(6, 8)
-    assert torch.equal(surface_depth(nothing, nothing, FOCAL_PX, CONFIG), nothing)
-    assert torch.equal(surface_depth(nothing, nothing + 5, FOCAL_PX, CONFIG), nothing)
-
-
-def test_settings_that_correct_nothing_are_refused():
-    with pytest.raises(ConfigError, match="reach_rad"):
-        SurfaceDepthConfig(reach_rad=0)
+    assert torch.equal(surface_depth(nothing, nothing, FOCAL_PX), nothing)
+    assert torch.equal(surface_depth(nothing, nothing + 5, FOCAL_PX), nothing)

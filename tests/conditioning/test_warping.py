@@ -2,17 +2,14 @@ import pytest
 import torch
 
 from lidarpainter_models.conditioning.references import WarpTarget, warped_references
-from lidarpainter_models.conditioning.warping import WarpConfig
-from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.lidar.moving_boxes import BACKGROUND, MovingBoxes
 
 SECOND_NS = 1_000_000_000
 
 
 def warp(target, timestamp_ns, depth_m, alpha, source, tracks=()):
-    config = WarpConfig()
-    wanted = WarpTarget.of_render(target, timestamp_ns, depth_m, alpha, config)
-    return warped_references(wanted, [source], MovingBoxes(tracks), count=1, config=config)
+    wanted = WarpTarget.of_render(target, timestamp_ns, depth_m, alpha)
+    return warped_references(wanted, [source], MovingBoxes(tracks), count=1)
 
 
 def warp_one(target, boards, source, draw, tracks=(), *, timestamp_ns=0):
@@ -135,8 +132,3 @@ def test_no_sources_give_no_colours(camera_at):
     warped = warped_references(nowhere, [], MovingBoxes([]), count=2)
     assert warped.rgb.shape == (2, 48, 64, 3)
     assert not warped.valid.any()
-
-
-def test_a_tolerance_of_everything_is_refused():
-    with pytest.raises(ConfigError, match="depth_tolerance"):
-        WarpConfig(depth_tolerance=1.0)

@@ -3,9 +3,7 @@ import pytest
 import torch
 from toy_street import BLUE, CAR_X_M, GREEN, GROUND, RED, WALL_X_M, ToyStreet
 
-from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.kernels.colour_sampling import BestSamples
-from lidarpainter_models.lidar.colouring import ColouringConfig
 from lidarpainter_models.lidar.exposure_matching import match_exposure
 from lidarpainter_models.lidar.map_building import build_lidar_map
 
@@ -88,10 +86,3 @@ def test_a_camera_without_shared_points_keeps_its_exposure():
     view = np.repeat(np.array([[0, 1], [2, 3]]), 250, axis=0)
     gains = match_exposure(BestSamples(weight, rgb, view), np.array([0, 0, 1, 1]))
     np.testing.assert_array_equal(gains, 1)
-
-
-def test_settings_that_make_no_image_are_refused():
-    with pytest.raises(ConfigError, match="width_px"):
-        ColouringConfig(width_px=4)
-    with pytest.raises(ConfigError, match="recency_s"):
-        ColouringConfig(recency_s=0)

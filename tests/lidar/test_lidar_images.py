@@ -1,8 +1,7 @@
-import pytest
 import torch
 
-from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.lidar.lidar_images import LidarImageConfig, render_lidar
+from lidarpainter_models.lidar import lidar_images
+from lidarpainter_models.lidar.lidar_images import render_lidar
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 
 SECOND_NS = 1_000_000_000
@@ -58,12 +57,12 @@ def test_an_empty_map_gives_a_black_image(camera_at):
     assert (image.depth_m == 0).all()
 
 
-def test_background_does_not_show_between_foreground_points(camera_at):
+def test_background_does_not_show_between_foreground_points(camera_at, monkeypatch):
     # foreground points 4 px apart, each a disc of 1 px: most of its pixels have no point
     near = wall(5.0, left_m=1.0, right_m=-1.0, bottom_m=0.5, top_m=2.5, spacing_m=0.33)
     far = points(whole_wall(20.0), GREEN)
-    config = LidarImageConfig(hidden_reach_rad=0.1)
-    image = render_lidar(street(points(near), far), [], camera_at(), 0, config=config)
+    monkeypatch.setattr(lidar_images, "HIDDEN_REACH_RAD", 0.1)
+    image = render_lidar(street(points(near), far), [], camera_at(), 0)
     inside = image.rgb[16:32, 24:40]  # well within the foreground
     assert (inside[..., 1] == 0).all()
     assert inside[..., 0].max() == 1
@@ -110,9 +109,8 @@ def test_older_points_fill_only_what_newer_ones_leave_open(camera_at):
 
 def test_points_out_of_reach_in_time_are_not_drawn(camera_at):
     new = points(half_wall(10.0))
-    old = points(whole_wall(8.0), BLUE, timestamp_ns=-3 * SECOND_NS)
-    config = LidarImageConfig(reach_s=2.0)
-    image = render_lidar(street(new, old), [], camera_at(), 0, config=config)
+    old = points(whole_wall(8.0), BLUE, timestamp_ns=-11 * SECOND_NS)
+    image = render_lidar(street(new, old), [], camera_at(), 0)
     assert not image.hit[:, 34:].any()
 
 
@@ -153,24 +151,11 @@ def test_points_without_colour_hide_and_give_depth_but_are_no_hit(camera_at):
     assert (image.rgb == 0).all()
 
 
-def test_a_gap_in_one_surface_is_closed_but_its_outside_is_not(camera_at):
+def test_a_gap_in_one_surface_is_closed_but_its_outside_is_not(camera_at, monkeypatch):
     wall_m = wall(10.0, left_m=2.0, right_m=-2.0, bottom_m=-0.5, top_m=3.5, spacing_m=0.1)
     gap = ((wall_m[:, 1].abs() < 0.25) & ((wall_m[:, 2] - 1.5).abs() < 0.25))[:, None]
-    image = render_lidar(
-        street(points(wall_m[~gap[:, 0]])),
-        [],
-        camera_at(),
-        0,
-        config=LidarImageConfig(beam_spacing_rad=0.04, max_radius_rad=0.03),
-    )
+    monkeypatch.setattr(lidar_images, "BEAM_SPACING_RAD", 0.04)
+    monkeypatch.setattr(lidar_images, "MAX_RADIUS_RAD", 0.03)
+    image = render_lidar(street(points(wall_m[~gap[:, 0]])), [], camera_at(), 0)
     assert image.hit[20:28, 28:36].all()
     assert not image.hit[:, :17].any()
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"window_s": 0.0}, {"reach_s": -1.0}, {"min_radius_px": 0.5}, {"hidden_directions": 9}],
-)
-def test_impossible_settings_are_refused(change):
-    with pytest.raises(ConfigError, match=next(iter(change))):
-        LidarImageConfig(**change)

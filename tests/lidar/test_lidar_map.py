@@ -4,11 +4,12 @@ import pytest
 import torch
 from toy_street import CAR_SIZE_M, CAR_X_M, WALL_X_M, ToyStreet
 
-from lidarpainter_models.errors import ConfigError, SceneError
-from lidarpainter_models.lidar.actor_separation import SeparationConfig, poses_at
+from lidarpainter_models.errors import SceneError
+from lidarpainter_models.lidar import map_building
+from lidarpainter_models.lidar.actor_separation import CLEARANCE_M, ROAD_HEIGHT_M, poses_at
 from lidarpainter_models.lidar.ground_heights import GroundHeights
 from lidarpainter_models.lidar.lidar_map import MapPoints
-from lidarpainter_models.lidar.map_building import LidarMapConfig, build_lidar_map
+from lidarpainter_models.lidar.map_building import build_lidar_map
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +24,7 @@ def lidar_map(street):
 
 def test_a_passing_car_leaves_nothing_in_the_street(lidar_map):
     xyz_m = lidar_map.street.xyz_m
-    is_ground = xyz_m[:, 2].abs() < SeparationConfig().road_height_m
+    is_ground = xyz_m[:, 2].abs() < ROAD_HEIGHT_M
     is_wall = (xyz_m[:, 0] - WALL_X_M).abs() < 0.01
     assert bool((is_ground | is_wall).all())
     assert int(is_wall.sum()) > 1000
@@ -42,7 +43,7 @@ def test_points_of_a_moving_car_fall_onto_its_box(lidar_map):
 
 def test_the_road_beside_a_car_stays_street_and_is_no_part_of_it(lidar_map):
     lowest_m = lidar_map.actors["car"].xyz_m[:, 2].min() + CAR_SIZE_M[2] / 2
-    assert float(lowest_m) >= SeparationConfig().clearance_m - 1e-3
+    assert float(lowest_m) >= CLEARANCE_M - 1e-3
     street = lidar_map.street
     near_car = (street.xyz_m[:, 0] - (CAR_X_M - 1.0)).abs() < 0.1
     assert int((near_car & (street.xyz_m[:, 1].abs() < 2)).sum()) > 10
@@ -57,9 +58,9 @@ def test_a_point_remembers_when_and_from_how_far_it_was_measured(lidar_map):
     torch.testing.assert_close(street.range_m, (street.xyz_m - eye).norm(dim=-1))
 
 
-def test_ranges_out_of_bounds_are_left_out(street):
-    config = LidarMapConfig(max_range_m=15.0)
-    lidar_map = build_lidar_map(street, split_frames=(0,), colour_views=(), config=config)
+def test_ranges_out_of_bounds_are_left_out(street, monkeypatch):
+    monkeypatch.setattr(map_building, "MAX_RANGE_M", 15.0)
+    lidar_map = build_lidar_map(street, split_frames=(0,), colour_views=())
     assert float(lidar_map.street.range_m.max()) <= 15
 
 
@@ -77,8 +78,6 @@ def test_the_ego_vehicle_itself_leaves_no_points():
 def test_no_points_is_an_error(street):
     with pytest.raises(SceneError, match="no LiDAR point"):
         build_lidar_map(street, split_frames=(), colour_views=())
-    with pytest.raises(ConfigError, match="ranges"):
-        LidarMapConfig(min_range_m=10, max_range_m=5)
 
 
 def test_no_parts_make_no_points():

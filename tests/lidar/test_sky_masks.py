@@ -2,10 +2,10 @@ import pytest
 import torch
 from toy_street import EYE, LOOK_FORWARD, SKY, ToyStreet
 
-from lidarpainter_models.errors import ConfigError, ShapeError
+from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_rotation
-from lidarpainter_models.lidar.sky_masks import SkyMaskConfig, sky_from_returns, sky_mask
+from lidarpainter_models.lidar.sky_masks import sky_from_returns, sky_mask
 from lidarpainter_models.observations.fit_size import shrink_image
 
 HEIGHT, WIDTH, HORIZON = 120, 200, 80
@@ -129,5 +129,3 @@ def test_inputs_that_do_not_fit_are_refused(camera):
     small = camera.resized(width_px=100, height_px=60)
     with pytest.raises(ShapeError, match="image and returns"):
         sky_from_returns(image_of([]), returns_in(), small)
-    with pytest.raises(ConfigError, match="clear_rad"):
-        SkyMaskConfig(clear_rad=0)

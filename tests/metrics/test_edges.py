@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from lidarpainter_models.errors import ConfigError, ShapeError
-from lidarpainter_models.metrics.edges import EdgeConfig, edge_agreement, supported_pixels
+from lidarpainter_models.errors import ShapeError
+from lidarpainter_models.metrics import edges
+from lidarpainter_models.metrics.edges import edge_agreement, supported_pixels
 
 HEIGHT_PX, WIDTH_PX = 120, 160
 
@@ -20,8 +21,8 @@ def blocks(seed=0, side_px=10):
 EVERYWHERE = torch.full((HEIGHT_PX, WIDTH_PX), 10.0)
 
 
-def f1_of(styled, clear, depth_m=EVERYWHERE, **settings):
-    return edge_agreement(styled, clear, depth_m, EdgeConfig(**settings)).f1
+def f1_of(styled, clear, depth_m=EVERYWHERE):
+    return edge_agreement(styled, clear, depth_m).f1
 
 
 def test_a_image_agrees_with_itself():
@@ -33,15 +34,16 @@ def test_smooth_fading_keeps_the_structure():
     assert f1_of(blocks() * fade + 0.8 * (1 - fade), blocks()) > 0.9
 
 
-def test_another_image_is_near_chance():
+def test_another_image_is_near_chance(monkeypatch):
+    monkeypatch.setattr(edges, "TOLERANCE_PX", 1)
     other = torch.roll(blocks(5), (5, 5), (0, 1))
-    assert f1_of(other, blocks(), tolerance_px=1) < 0.4
+    assert f1_of(other, blocks()) < 0.4
 
 
 @pytest.mark.parametrize(("shift_px", "is_found"), [(1, True), (5, False)])
 def test_edges_are_found_again_within_the_tolerance(shift_px, is_found):
     moved = torch.roll(blocks(), shift_px, dims=1)
-    assert (f1_of(moved, blocks(), tolerance_px=2) > 0.9) is is_found
+    assert (f1_of(moved, blocks()) > 0.9) is is_found
 
 
 def test_a_blank_image_keeps_nothing():
@@ -51,10 +53,9 @@ def test_a_blank_image_keeps_nothing():
 def test_only_pixels_near_a_hit_that_is_not_too_far_are_judged():
     depth_m = torch.zeros(HEIGHT_PX, WIDTH_PX)
     depth_m[40, 40], depth_m[80, 80] = 10.0, 90.0
-    config = EdgeConfig(support_px=2, farthest_m=40.0)
-    judged = supported_pixels(depth_m, config)
-    assert bool(judged[40, 42])
-    assert not bool(judged[40, 43])
+    judged = supported_pixels(depth_m)
+    assert bool(judged[40, 43])
+    assert not bool(judged[40, 44])
     assert not bool(judged[80, 80])
     depth_m = torch.zeros(HEIGHT_PX, WIDTH_PX)
     depth_m[:, : WIDTH_PX // 2] = 10.0
@@ -70,8 +71,6 @@ def test_nothing_to_judge_gives_no_figure():
     assert edge_agreement(blocks(), blank, EVERYWHERE) is None
 
 
-def test_sizes_and_shares_that_do_not_fit_are_refused():
+def test_sizes_that_do_not_fit_are_refused():
     with pytest.raises(ShapeError, match="one size"):
         edge_agreement(blocks(), blocks(), torch.zeros(3, 3))
-    with pytest.raises(ConfigError, match="strongest_share"):
-        EdgeConfig(strongest_share=1.0)

@@ -9,7 +9,6 @@ from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.gaussians.fitting.images import full_image, half_image, shrink_depth
 from lidarpainter_models.kernels.pixel_losses import OPEN, SKY, SOLID
 from lidarpainter_models.lidar.sparse_depth import (
-    SparseDepthConfig,
     move_actor_points,
     sparse_lidar_depth,
 )
@@ -66,7 +65,7 @@ def test_tiny_fit_images_are_refused():
 def test_nearest_point_of_a_pixel_gives_its_depth():
     camera = camera_at(0.0)
     points = torch.tensor([[10.0, 0.05, 1.05], [5.0, 0.025, 1.025], [-5.0, 0, 1.0]])
-    depth_m = sparse_lidar_depth(points, camera, config=SparseDepthConfig())
+    depth_m = sparse_lidar_depth(points, camera)
     assert int((depth_m > 0).sum()) == 1
     assert abs(float(depth_m.max()) - 5.0) < 1e-5
 
@@ -75,22 +74,22 @@ def test_point_seen_past_the_edge_of_a_nearer_thing_is_dropped():
     camera = camera_at(0.0)
     wall = torch.tensor([[20.0, 0.8, 0.9]])  # two pixels beside the post
     post = torch.tensor([[5.0, 0.025, 1.025]])
-    both = sparse_lidar_depth(torch.cat([wall, post]), camera, config=SparseDepthConfig())
+    both = sparse_lidar_depth(torch.cat([wall, post]), camera)
     assert both[both > 0].tolist() == pytest.approx([5.0])
-    alone = sparse_lidar_depth(wall, camera, config=SparseDepthConfig())
+    alone = sparse_lidar_depth(wall, camera)
     assert alone[alone > 0].tolist() == pytest.approx([20.0])
 
 
 def test_grazing_surface_keeps_its_points():
     camera = camera_at(0.0)
     road = torch.stack([torch.arange(4, 40, 0.25), torch.zeros(144), torch.zeros(144)], dim=1)
-    depth_m = sparse_lidar_depth(road, camera, config=SparseDepthConfig())
+    depth_m = sparse_lidar_depth(road, camera)
     rows = (depth_m > 0).any(dim=1)
     assert int(rows.sum()) >= 8
 
 
 def test_empty_sweep_gives_empty_depth():
-    depth_m = sparse_lidar_depth(torch.zeros(0, 3), camera_at(0.0), config=SparseDepthConfig())
+    depth_m = sparse_lidar_depth(torch.zeros(0, 3), camera_at(0.0))
     assert float(depth_m.abs().max()) == 0
 
 

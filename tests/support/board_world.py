@@ -12,7 +12,7 @@ from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
-from lidarpainter_models.gaussians.model.sky import SkyTexture, SkyTextureConfig, sky_layout
+from lidarpainter_models.gaussians.model.sky import SkyTexture, sky_layout
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_rotation, rotation_from_vector
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
@@ -170,7 +170,7 @@ def scene(views, board):
     keys = [view.key for view in views]
     times = torch.tensor([view.timestamp_ns for view in views])
     poses = torch.stack([view.camera.world_from_camera for view in views])
-    layout = sky_layout([view.camera for view in views], SkyTextureConfig())
+    layout = sky_layout([view.camera for view in views])
     return GaussianScene(
         gaussians=gaussians,
         sky=SkyTexture.constant(layout, torch.tensor([0.5, 0.7, 0.9])),

@@ -12,9 +12,9 @@ from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
-from lidarpainter_models.gaussians.model.sky import SkyTexture, SkyTextureConfig, sky_layout
+from lidarpainter_models.gaussians.model.sky import SkyTexture, sky_layout
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.geometry.transforms import rigid_from_rotation
+from lidarpainter_models.geometry.transforms import rigid_from_rotation, rotation_from_vector
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
 from lidarpainter_models.scenes.driving_scene import ActorTrack
@@ -86,7 +86,7 @@ def scene_of(gaussians, cameras, tracks=(), *, sky_rgb=SKY_RGB, timestamps_ns=No
     times = torch.arange(len(cameras)) * FRAME_NS if timestamps_ns is None else timestamps_ns
     return GaussianScene(
         gaussians=gaussians,
-        sky=SkyTexture.constant(sky_layout(cameras, SkyTextureConfig()), sky_rgb),
+        sky=SkyTexture.constant(sky_layout(cameras), sky_rgb),
         cameras=CameraCorrections.none(
             [(frame, "front") for frame in range(len(cameras))],
             times,

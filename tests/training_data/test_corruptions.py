@@ -3,10 +3,9 @@
 import pytest
 import torch
 
-from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
+from lidarpainter_models.training_data import corruptions
 from lidarpainter_models.training_data.corruptions import (
-    CorruptionConfig,
     corrupt_gaussians,
     drop_balls,
     fade_balls,
@@ -21,7 +20,6 @@ from lidarpainter_models.training_data.corruptions import (
 )
 
 HERE = torch.tensor([0.0, 0.0, 1.5])
-CONFIG = CorruptionConfig()
 
 
 def street(count=2000, seed=0):
@@ -59,7 +57,7 @@ def street(count=2000, seed=0):
 def test_a_kind_of_damage_touches_its_columns_alone(damage, columns):
     before = street()
     kept = {name: value.clone() for name, value in before.columns().items()}
-    after = damage(before, HERE, torch.Generator().manual_seed(1), CONFIG)
+    after = damage(before, HERE, torch.Generator().manual_seed(1))
     for name, value in kept.items():
         assert torch.equal(getattr(before, name), value), "the input stays as it was"
         assert torch.equal(getattr(after, name), value) == (name not in columns), name
@@ -70,25 +68,26 @@ def test_a_kind_of_damage_touches_its_columns_alone(damage, columns):
 
 def test_dropped_balls_leave_the_rest_as_it_was():
     before = street()
-    after = drop_balls(before, HERE, torch.Generator().manual_seed(1), CONFIG)
-    inside = random_balls(before, HERE, torch.Generator().manual_seed(1), CONFIG)
+    after = drop_balls(before, HERE, torch.Generator().manual_seed(1))
+    inside = random_balls(before, HERE, torch.Generator().manual_seed(1))
     assert 0 < len(after) < len(before)
     assert torch.equal(after.means, before.means[~inside])
 
 
-def test_balls_lie_near_and_spare_actors():
-    config = CorruptionConfig(reach_m=5.0, balls=(50, 50))
+def test_balls_lie_near_and_spare_actors(monkeypatch):
+    monkeypatch.setattr(corruptions, "REACH_M", 5.0)
+    monkeypatch.setattr(corruptions, "BALLS", (50, 50))
     gaussians = street()
-    inside = random_balls(gaussians, HERE, torch.Generator().manual_seed(0), config)
+    inside = random_balls(gaussians, HERE, torch.Generator().manual_seed(0))
     assert bool(inside.any())
     assert not bool(inside[gaussians.body_index > 0].any())
     distance_m = (gaussians.means - HERE).norm(dim=1)
-    assert float(distance_m[inside].max()) < 5.0 * (1 + config.radius_share[1])
+    assert float(distance_m[inside].max()) < 5.0 * (1 + corruptions.RADIUS_SHARE[1])
 
 
 def test_no_gaussian_near_means_no_damage():
     far = HERE + 1000
-    assert not bool(random_balls(street(), far, torch.Generator(), CONFIG).any())
+    assert not bool(random_balls(street(), far, torch.Generator()).any())
 
 
 def test_paint_is_bright_and_lies_flat():
@@ -121,8 +120,3 @@ def test_every_seed_gives_finite_gaussians():
 def test_nothing_stays_nothing():
     empty = street().select(torch.zeros(0, dtype=torch.int64))
     assert len(corrupt_gaussians(empty, HERE, seed=0)) == 0
-
-
-def test_ranges_must_rise():
-    with pytest.raises(ConfigError, match="jitter_m"):
-        CorruptionConfig(jitter_m=(0.2, 0.1))

@@ -23,7 +23,6 @@ from lidarpainter_models.training_data.harvest import (
 from lidarpainter_models.training_data.harvest_targets import AS_GIVEN, HarvestConfig, weak_fit
 from lidarpainter_models.training_data.pairs import PairFolder, PairWriter
 from lidarpainter_models.training_data.street_harvest import (
-    ShiftDraw,
     StreetPlan,
     draw_shift,
     harvest_shifted_street,
@@ -159,9 +158,8 @@ def test_default_plans_judge_every_frame_and_never_what_they_fit(num_frames):
 
 
 def test_drawn_shifts_lie_in_their_ranges_on_both_sides():
-    draw = ShiftDraw()
     generator = torch.Generator().manual_seed(0)
-    shifts = [draw_shift(draw, generator) for _ in range(300)]
+    shifts = [draw_shift(generator) for _ in range(300)]
     sideways = [shift.lateral_m for shift in shifts if shift.lateral_m]
     assert 0.6 < len(sideways) / 300 < 0.8
     assert all(1.0 <= abs(lateral_m) <= 3.5 for lateral_m in sideways)
@@ -182,8 +180,6 @@ def test_a_log_is_not_taken_for_a_street(write_wall, tmp_path):
 def test_settings_that_make_no_pairs_are_refused():
     with pytest.raises(ConfigError):
         StreetPlan(num_views=0)
-    with pytest.raises(ConfigError):
-        ShiftDraw(lateral_m=(3.0, 1.0))
     with pytest.raises(ConfigError):
         HarvestConfig(corrupted_per_view=-1)
 

@@ -20,7 +20,11 @@ from lidarpainter_models.gaussians.model.scene_rendering import (
     draw_gaussians,
 )
 from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
-from lidarpainter_models.gaussians.model.sky import FINAL_LEARNING_RATE, LEARNING_RATE
+from lidarpainter_models.gaussians.model.sky import (
+    FINAL_LEARNING_RATE,
+    LEARNING_RATE,
+    MIN_TRANSMITTANCE,
+)
 from lidarpainter_models.geometry.box_masks import project_boxes
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
@@ -142,7 +146,7 @@ def _pixel_rules(config: FitConfig) -> PixelRules:
     return PixelRules(
         sky_tolerance=config.losses.sky_tolerance,
         depth_tolerance=config.losses.depth_tolerance,
-        min_transmittance=config.initialisation.sky.min_transmittance,
+        min_transmittance=MIN_TRANSMITTANCE,
     )
 
 
@@ -175,7 +179,7 @@ def _step_sky(
     if sky_rgb.grad is None:
         return
     clear = 1 - alpha
-    learns = clear > config.initialisation.sky.min_transmittance
+    learns = clear > MIN_TRANSMITTANCE
     if config.sky_in_mask_only:
         learns &= image.facts.kind == SKY
     ratio = FINAL_LEARNING_RATE / LEARNING_RATE

@@ -6,7 +6,7 @@ what the recorded views never show still needs geometry once the camera leaves i
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -23,14 +23,14 @@ from lidarpainter_models.gaussians.initialisation.surfels import (
     surfels_from_points,
 )
 from lidarpainter_models.gaussians.initialisation.unreached import (
-    UnreachedConfig,
+    MOST_SHARE,
     unreached_gaussians,
 )
 from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.gaussians.model.sky import SkyTextureConfig, sky_from_images, sky_layout
+from lidarpainter_models.gaussians.model.sky import sky_from_images, sky_layout
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import transform_points
 from lidarpainter_models.lidar.lidar_map import MapPoints
@@ -43,6 +43,9 @@ LEAST_ACTOR_POINTS = 20
 """An actor with fewer points is not modelled."""
 ACTOR_VOXEL_M = 0.05
 """Smallest voxel on an actor; its points come from the whole log."""
+MOST_ACTOR_SHARE = 0.4  # actors get at most this part of the start size
+UNSEEN_SHARE = 0.2
+"""Part of the street's share for points that only a camera moved aside would see."""
 _MOST_VIEWS_PER_ACTOR = 24
 _APART_M = 64.0  # longer than any vehicle, short enough for float32 to stay exact
 
@@ -53,18 +56,12 @@ class InitialisationConfig:
 
     num_gaussians: int = 55_000
     """Start size; densification brings it to the budget of the fit."""
-    most_actor_share: float = 0.4
-    """Actors get at most this part of the start size."""
-    unseen_share: float = 0.2
-    """Part of the street's share for points that only a camera moved aside would see."""
     aside_m: float = 3.5
     """How far aside such a camera may stand."""
     sh_degree: int = 1
     """One degree: few views see a surface from far-apart directions."""
     street_voxel_m: float = 0.03
     """Smallest voxel on the street."""
-    unreached: UnreachedConfig = field(default_factory=UnreachedConfig)
-    sky: SkyTextureConfig = field(default_factory=SkyTextureConfig)
 
     def __post_init__(self) -> None:
         """Refuse a start without Gaussians."""
@@ -82,21 +79,19 @@ def initialise_scene(
     """
     views = observations.views
     actors = _actor_gaussians(observations, config)
-    for_unreached = int(config.num_gaussians * config.unreached.most_share)
+    for_unreached = int(config.num_gaussians * MOST_SHARE)
     for_street = config.num_gaussians - for_unreached - sum(len(part) for part in actors)
     gaussians = _street_gaussians(observations.lidar_map.street, views, config, max(for_street, 1))
     for part in actors:
         gaussians = gaussians.append(part)
     if len(gaussians) == 0:
         raise ConfigError("no LiDAR point lies where a training camera could see it")
-    scene = _scene_around(gaussians, observations, config)
-    seeds = unreached_gaussians(scene, views, config.unreached, budget=for_unreached)
+    scene = _scene_around(gaussians, observations)
+    seeds = unreached_gaussians(scene, views, budget=for_unreached)
     return scene.with_gaussians(gaussians.append(seeds))
 
 
-def _scene_around(
-    gaussians: GaussianSet, observations: SceneObservations, config: InitialisationConfig
-) -> GaussianScene:
+def _scene_around(gaussians: GaussianSet, observations: SceneObservations) -> GaussianScene:
     """The Gaussians with a mean sky, and nothing corrected yet."""
     views = observations.views
     timestamps_ns = torch.tensor([view.timestamp_ns for view in views], dtype=torch.int64)
@@ -105,7 +100,7 @@ def _scene_around(
         gaussians=gaussians,
         actors=Actors.uncorrected(observations.tracks, _frame_times(views)),
         sky=sky_from_images(
-            sky_layout(cameras, config.sky),
+            sky_layout(cameras),
             cameras,
             [view.rgb for view in views],
             [view.sky_mask for view in views],
@@ -156,7 +151,7 @@ def _street_gaussians(
     cameras = [view.camera for view in views]
     footprint, in_image = pixel_footprint(points.xyz_m, cameras, aside_m=config.aside_m)
     is_aside = ~in_image & footprint.isfinite()
-    for_aside = int(budget * config.unseen_share)
+    for_aside = int(budget * UNSEEN_SHARE)
     seen = _street_voxels(points, footprint, in_image, config, max(budget - for_aside, 1))
     aside = _street_voxels(points, footprint, is_aside, config, max(for_aside, 1))
     # no image will ever shrink a lone blob there, and beside the lane it is large in the view
@@ -214,7 +209,7 @@ def _actor_gaussians(
         torch.cat([part.rgb_u8 for _, part, _ in clouds]).float() / 255,
         torch.cat([part.has_colour for _, part, _ in clouds]),
         torch.cat([footprint for _, _, footprint in clouds]),
-        budget=max(int(config.num_gaussians * config.most_actor_share), 1),
+        budget=max(int(config.num_gaussians * MOST_ACTOR_SHARE), 1),
         least_m=ACTOR_VOXEL_M,
     )
     owner = torch.round(voxels.xyz_m[:, 0] / _APART_M).long()

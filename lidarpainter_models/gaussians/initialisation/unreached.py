@@ -6,7 +6,6 @@ whatever is near into these places, or leave them to the sky texture, which has 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -34,30 +33,16 @@ PRIOR = 0.03
 """Colour difference for which a depth far from the surroundings' is believed."""
 OPACITY = 0.6
 """First opacity."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class UnreachedConfig:
-    """Where and how densely such Gaussians are put."""
-
-    views_per_camera: int = 4
-    """Training views that are looked at, evenly over the log."""
-    most_share: float = 0.12
-    """At most this part of the start size; a larger stride is taken if need be."""
-    nearest_m: float = 8.0
-    """Nearer things are within every LiDAR's reach."""
-    farthest_m: float = 800.0
-    """Beyond it a lane's width moves nothing by a pixel."""
-    most_below_ground_m: float = 1.0
-    """Deeper ones are dropped; roads fall away further than the LiDAR sees them."""
+VIEWS_PER_CAMERA = 4  # training views that are looked at, evenly over the log
+MOST_SHARE = 0.12  # at most this part of the start size; a larger stride is taken if need be
+NEAREST_M = 8.0  # nearer things are within every LiDAR's reach
+FARTHEST_M = 800.0  # beyond it a lane's width moves nothing by a pixel
+MOST_BELOW_GROUND_M = 1.0
+"""Deeper ones are dropped; roads fall away further than the LiDAR sees them."""
 
 
 def unreached_gaussians(
-    scene: GaussianScene,
-    views: Sequence[TrainingView],
-    config: UnreachedConfig,
-    *,
-    budget: int,
+    scene: GaussianScene, views: Sequence[TrainingView], *, budget: int
 ) -> GaussianSet:
     """Gaussians that close the clear places of the training views which are not sky."""
     found = GaussianSet.empty(sh_degree=scene.gaussians.sh_degree)
@@ -68,24 +53,19 @@ def unreached_gaussians(
         (view, of_camera)
         for name in cameras
         for of_camera in [[view for view in views if view.key[1] == name]]
-        for view in _evenly(of_camera, config.views_per_camera)
+        for view in _evenly(of_camera, VIEWS_PER_CAMERA)
     ]
     for done, (view, of_camera) in enumerate(chosen):
         rest = budget - len(found)
         share = rest // (len(chosen) - done)
         grown = scene.with_gaussians(scene.gaussians.append(found))
-        seeds = _seeds_of_view(grown, view, of_camera, config, budget=share)
-        found = found.append(_above_ground(seeds, ground, config))
+        seeds = _seeds_of_view(grown, view, of_camera, budget=share)
+        found = found.append(_above_ground(seeds, ground))
     return found
 
 
 def _seeds_of_view(
-    scene: GaussianScene,
-    view: TrainingView,
-    of_camera: Sequence[TrainingView],
-    config: UnreachedConfig,
-    *,
-    budget: int,
+    scene: GaussianScene, view: TrainingView, of_camera: Sequence[TrainingView], *, budget: int
 ) -> GaussianSet:
     """The Gaussians that one view asks for."""
     render = scene.render(view.camera, view.timestamp_ns)
@@ -97,23 +77,21 @@ def _seeds_of_view(
     stride = max(STRIDE_PX, int((count / budget) ** 0.5) + 1)
     others = [other for other in of_camera if other.key != view.key]
     compared = _evenly(others, COMPARED_VIEWS)
-    depths_m = sweep_depths(config.nearest_m, config.farthest_m, NUM_DEPTHS)
+    depths_m = sweep_depths(NEAREST_M, FARTHEST_M, NUM_DEPTHS)
     cost = sweep_cost(
         view.camera, view.rgb, [(other.camera, other.rgb) for other in compared], depths_m
     )
-    expected_m = depth_from_below(render.depth_m, fallback_m=config.farthest_m)
+    expected_m = depth_from_below(render.depth_m, fallback_m=FARTHEST_M)
     depth_m = choose_depth(cost, depths_m, expected_m, prior=PRIOR)
     grid = torch.zeros_like(is_open)
     grid[stride // 2 :: stride, stride // 2 :: stride] = True
     return _facing_discs(view, depth_m, is_open & grid, stride, scene.gaussians)
 
 
-def _above_ground(
-    seeds: GaussianSet, ground: GroundHeights, config: UnreachedConfig
-) -> GaussianSet:
+def _above_ground(seeds: GaussianSet, ground: GroundHeights) -> GaussianSet:
     """Without those that a gap in the road let through to the underworld."""
     height_m = ground.around(seeds.means[:, :2])
-    is_below = seeds.means[:, 2] < height_m - config.most_below_ground_m
+    is_below = seeds.means[:, 2] < height_m - MOST_BELOW_GROUND_M
     return seeds.select((~is_below).nonzero()[:, 0])
 
 

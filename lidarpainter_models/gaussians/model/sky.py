@@ -32,16 +32,9 @@ MARGIN_RAD = math.radians(6)
 """Room left and right of the training views before the edge colour goes on."""
 LEARNING_RATE, FINAL_LEARNING_RATE = 0.01, 0.001
 """First and last Adam step, in colour units."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SkyTextureConfig:
-    """How the sky texture is laid out and fitted."""
-
-    max_texels: int = 2_000_000
-    """The texture is coarsened to stay below this (a full turn of sharp cameras is 8 million)."""
-    min_transmittance: float = 0.2
-    """A texel learns only through pixels clearer than this."""
+MAX_TEXELS = 2_000_000
+"""The texture is coarsened to stay below this (a full turn of sharp cameras is 8 million)."""
+MIN_TRANSMITTANCE = 0.2  # A texel learns only through pixels clearer than this
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -96,7 +89,7 @@ class SkyTexture:
         return replace(self, rgb=push_pull(self.rgb, known, wraps=self.layout.wraps))
 
 
-def sky_layout(cameras: Sequence[Camera], config: SkyTextureConfig) -> SkyLayout:
+def sky_layout(cameras: Sequence[Camera]) -> SkyLayout:
     """The patch of sky that the cameras can see, or all of it where they look all round."""
     azimuth, elevation = _border_directions(cameras)
     middle = torch.atan2(azimuth.sin().mean(), azimuth.cos().mean())
@@ -107,7 +100,7 @@ def sky_layout(cameras: Sequence[Camera], config: SkyTextureConfig) -> SkyLayout
     texel = 1.0 / max(camera.fx_px for camera in cameras)  # finer could not be seen
     is_full = left + right > _FULL_TURN_FROM_RAD
     width = 2 * math.pi if is_full else left + right
-    texel *= max(1.0, math.sqrt(width * (top - LOWEST_RAD) / texel**2 / config.max_texels))
+    texel *= max(1.0, math.sqrt(width * (top - LOWEST_RAD) / texel**2 / MAX_TEXELS))
     columns = max(math.ceil(width / texel), 2)
     if is_full:
         texel = 2 * math.pi / columns

@@ -77,8 +77,3 @@ def merge_lora(module: nn.Module) -> None:
 def is_adapted(module: nn.Module) -> bool:
     """Whether peft has wrapped a layer."""
     return hasattr(module, "get_base_layer") and hasattr(module, "lora_A")
-
-
-def adapter_names(module: nn.Module) -> list[str]:
-    """Names of all weights of adapters."""
-    return [name for name, _ in module.named_parameters() if ADAPTER_MARK in f".{name}"]

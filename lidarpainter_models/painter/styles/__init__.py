@@ -1,30 +1,19 @@
 """Weather and time of day for an image whose depth is known, without another learned model."""
 
-from dataclasses import dataclass, field
-
 from jaxtyping import Float
 from torch import Generator, Tensor
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
-from lidarpainter_models.painter.styles.fog import FogConfig, add_fog
-from lidarpainter_models.painter.styles.night import NightConfig, turn_to_night
-from lidarpainter_models.painter.styles.rain import RainConfig, add_rain
+from lidarpainter_models.painter.styles.fog import add_fog
+from lidarpainter_models.painter.styles.night import turn_to_night
+from lidarpainter_models.painter.styles.rain import add_rain
 from lidarpainter_models.painter.styles.view import StyleView
 
-__all__ = ["STYLE_PROMPTS", "StyleConfig", "StyleView", "apply_style", "check_prompt"]
+__all__ = ["STYLE_PROMPTS", "StyleView", "apply_style", "check_prompt"]
 
 STYLE_PROMPTS = (DEFAULT_PROMPT, "foggy", "night", "rain")
 """Prompts that a style stands behind; the first changes nothing."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StyleConfig:
-    """How every style looks."""
-
-    foggy: FogConfig = field(default_factory=FogConfig)
-    night: NightConfig = field(default_factory=NightConfig)
-    rain: RainConfig = field(default_factory=RainConfig)
 
 
 def check_prompt(prompt: str) -> str:
@@ -39,19 +28,18 @@ def check_prompt(prompt: str) -> str:
 
 
 def apply_style(
-    view: StyleView, prompt: str, generator: Generator, config: StyleConfig | None = None
+    view: StyleView, prompt: str, generator: Generator
 ) -> Float[Tensor, "height width 3"]:
     """The view in a style, as displayed; the same for the same state of the generator.
 
     Raises:
         ConfigError: there is no such style.
     """
-    config = config or StyleConfig()
     check_prompt(prompt)
     if prompt == "foggy":
-        return add_fog(view, config.foggy)
+        return add_fog(view)
     if prompt == "night":
-        return turn_to_night(view, generator, config.night)
+        return turn_to_night(view, generator)
     if prompt == "rain":
-        return add_rain(view, generator, config.rain)
+        return add_rain(view, generator)
     return view.rgb

@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.styles.light import luminance, to_display, to_linear
 from lidarpainter_models.painter.styles.view import StyleView, distances, elevations
 
@@ -35,16 +34,6 @@ class FogConfig:
     """How far the airlight's colour goes from that of the sky to grey."""
     brightness: float = 0.8
     """Airlight against the light of the horizon in the clear image."""
-
-    def __post_init__(self) -> None:
-        """Refuse fog that is no fog."""
-        if not (self.visibility_m > 0 and self.layer_m > 0 and self.brightness > 0):
-            raise ConfigError(
-                "fog needs positive visibility_m, layer_m and brightness, got "
-                f"{self.visibility_m}, {self.layer_m} and {self.brightness}"
-            )
-        if not 0 <= self.greyness <= 1:
-            raise ConfigError(f"greyness must be in [0, 1], got {self.greyness}")
 
 
 def add_fog(view: StyleView, config: FogConfig | None = None) -> Float[Tensor, "height width 3"]:

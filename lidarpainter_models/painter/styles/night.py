@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.painter.styles.lamps import Lamp, LampKind, Place, find_lamps
 from lidarpainter_models.painter.styles.light import luminance, to_display, to_linear
@@ -58,6 +57,9 @@ POWER: dict[LampKind, float] = {"signal": 0.02, "window": 0.25, "street": 4.0}
 MOST_SOURCES = 60
 NEAREST_M2 = 2.0
 """Square of a distance that is added to all: a lamp lights what stands beside it little more."""
+AMBIENT = 0.055  # skylight against daylight; a camera at night is exposed far longer than the eye
+SKY_GLOW = 0.022  # radiance of the sky at the horizon, in units of display white
+SHADOW_SOFTENING = 0.75  # power of reflectance: below 1 the sun's shadows fade
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,27 +68,12 @@ class NightConfig:
 
     strength: float = 1.0
     """0 is day and leaves the image as it is; between, day and night light are mixed."""
-    ambient: float = 0.055
-    """Skylight against daylight; a camera at night is exposed far longer than the eye."""
-    sky_glow: float = 0.022
-    """Radiance of the sky at the horizon, in units of display white."""
     beam: float = 280.0
     """Irradiance of the low beam at a metre, in the same units; 0 turns it off."""
     lit_windows: float = 0.4
     """Share of the windows found that are lit."""
-    shadow_softening: float = 0.75
-    """Power of reflectance: below 1 the sun's shadows fade."""
     noise: float = 0.012
     """Deviation of the sensor's noise at a tenth of display white."""
-
-    def __post_init__(self) -> None:
-        """Refuse shares outside [0, 1] and light that darkens."""
-        for name in ("strength", "lit_windows"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"{name} must be in [0, 1], got {getattr(self, name)}")
-        for name in ("ambient", "sky_glow", "beam", "noise"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"{name} must not be negative, got {getattr(self, name)}")
 
 
 def turn_to_night(
@@ -120,24 +107,22 @@ def _relit(
         focal_px=view.focal_px,
     )
     lamps = find_lamps(place, lit_share=config.lit_windows, generator=generator)
-    reflectance = _reflectance(day, view, config.shadow_softening)
-    surface = _by_skylight(reflectance, config)
+    reflectance = _reflectance(day, view)
+    surface = _by_skylight(reflectance)
     irradiance = torch.zeros_like(day)
     if view.camera is not None and points_m is not None and place.height_m is not None:
         irradiance += config.beam * low_beam(view.camera, points_m, place.height_m)
     irradiance += lamp_irradiance(lamps, points_m, place)
     surface = surface + reflectance * irradiance
-    light = surface + open_sky(view)[..., None] * (_night_sky(view, config) - surface)
+    light = surface + open_sky(view)[..., None] * (_night_sky(view) - surface)
     glowing = add_glare(light + _emission(lamps, day), view.focal_px)
     return _with_noise(glowing, config.noise, generator)
 
 
-def _by_skylight(
-    reflectance: Float[Tensor, "height width 3"], config: NightConfig
-) -> Float[Tensor, "height width 3"]:
+def _by_skylight(reflectance: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 3"]:
     """Surfaces under the sky alone; so little light has hardly any colour of its own."""
     grey = luminance(reflectance)[..., None]
-    return config.ambient * torch.tensor(SKYLIGHT_RGB) * (grey + COLOUR_LEFT * (reflectance - grey))
+    return AMBIENT * torch.tensor(SKYLIGHT_RGB) * (grey + COLOUR_LEFT * (reflectance - grey))
 
 
 def _without_specks(
@@ -148,17 +133,17 @@ def _without_specks(
 
 
 def _reflectance(
-    day: Float[Tensor, "height width 3"], view: StyleView, softening: float
+    day: Float[Tensor, "height width 3"], view: StyleView
 ) -> Float[Tensor, "height width 3"]:
     """Daylight over that of the brightest tenth of the surfaces, contrast softened."""
     grey = luminance(day)
     seen = grey[view.surface] if bool(view.surface.any()) else grey.flatten()
     white = seen.kthvalue(max(1, round(0.9 * len(seen)))).values.clamp_min(1e-3)
     relative = (grey / white).clamp(1e-4, 1.5)
-    return day / white * (relative ** (softening - 1))[..., None] * 0.8
+    return day / white * (relative ** (SHADOW_SOFTENING - 1))[..., None] * 0.8
 
 
-def _night_sky(view: StyleView, config: NightConfig) -> Float[Tensor, "height width 3"]:
+def _night_sky(view: StyleView) -> Float[Tensor, "height width 3"]:
     """Glow that fades upwards over a dark blue; without a camera the image's rows stand in."""
     if view.camera is None:
         rows = torch.linspace(0.6, 0.0, len(view.rgb))[:, None]
@@ -166,7 +151,7 @@ def _night_sky(view: StyleView, config: NightConfig) -> Float[Tensor, "height wi
     else:
         elevation = elevations(view.camera).clamp_min(0)
     glow = torch.exp(-elevation / 0.15)[..., None] * torch.tensor(SKYGLOW_RGB)
-    return config.sky_glow * glow + 0.2 * config.ambient * torch.tensor(SKYLIGHT_RGB)
+    return SKY_GLOW * glow + 0.2 * AMBIENT * torch.tensor(SKYLIGHT_RGB)
 
 
 def low_beam(

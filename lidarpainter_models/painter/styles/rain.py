@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.styles.light import luminance, to_display, to_linear
 from lidarpainter_models.painter.styles.view import (
     StyleView,
@@ -53,6 +52,7 @@ COLOUR_LEFT = 0.75
 FILM_SHINE = 0.55
 """Of a thin film against a puddle, whose surface is whole."""
 _LINE_BITS = 3  # of a pixel's fraction in drawn lines
+OVERCAST = 0.62  # daylight under rain clouds against that of the image
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,20 +63,10 @@ class RainConfig:
     """0 leaves the image as it is; between, dry and wet light are mixed."""
     rain_mm_per_h: float = 25.0
     """Heavy rain; veil and number of streaks follow it."""
-    overcast: float = 0.62
-    """Daylight under rain clouds against that of the image."""
     wetness: float = 0.8
     """How far surfaces darken like wet ones; the road wholly, walls half as much."""
     puddle_share: float = 0.35
     """Part of the road where water stands still and mirrors clearly."""
-
-    def __post_init__(self) -> None:
-        """Refuse shares outside [0, 1] and negative rain."""
-        for name in ("strength", "wetness", "puddle_share", "overcast"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"{name} must be in [0, 1], got {getattr(self, name)}")
-        if not self.rain_mm_per_h >= 0:
-            raise ConfigError(f"rain_mm_per_h must not be negative, got {self.rain_mm_per_h}")
 
 
 def add_rain(
@@ -108,7 +98,7 @@ def _wet(
     """Everything but the streaks."""
     tint = torch.tensor(OVERCAST_TINT)
     grey = luminance(dry)[..., None]
-    dull = config.overcast * (grey + COLOUR_LEFT * (dry - grey)) * tint
+    dull = OVERCAST * (grey + COLOUR_LEFT * (dry - grey)) * tint
     walls = wet_reflectance(dull, 0.5 * config.wetness)
     light = walls + open_sky(view)[..., None] * (CLOUD_LIGHT * tint - walls)
     distance_m = distances(view)

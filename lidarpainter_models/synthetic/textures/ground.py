@@ -54,12 +54,6 @@ class GroundCanvas:
         pixels = (pixels * self.per_m - 0.5) * (1 << SUBPIXEL_BITS)
         return np.rint(pixels).astype(np.int32)
 
-    def polygon_mask(self, places: np.ndarray) -> np.ndarray:
-        """Coverage 0..1 of a polygon."""
-        mask = np.zeros(self.paint.shape, np.uint8)
-        cv2.fillPoly(mask, [self.pixels(places)], 255, cv2.LINE_AA, SUBPIXEL_BITS)
-        return mask.astype(np.float32) / 255
-
     def window(self, places: np.ndarray, margin_m: float = 0.2) -> tuple[slice, slice]:
         """Rows and columns around places."""
         low = self.pixels(places).min(0) / (1 << SUBPIXEL_BITS) - margin_m * self.per_m

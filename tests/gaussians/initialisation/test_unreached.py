@@ -3,13 +3,13 @@ from dataclasses import replace
 import torch
 from gaussian_world import FRAME_NS, camera_at, round_gaussians, scene_of
 
+from lidarpainter_models.gaussians.initialisation import unreached
 from lidarpainter_models.gaussians.initialisation.plane_sweep import (
     choose_depth,
     sweep_cost,
     sweep_depths,
 )
 from lidarpainter_models.gaussians.initialisation.unreached import (
-    UnreachedConfig,
     depth_from_below,
     unreached_gaussians,
 )
@@ -80,17 +80,19 @@ def views_of_wall(cameras):
     ]
 
 
-def test_places_without_lidar_are_filled_at_their_depth():
+def test_places_without_lidar_are_filled_at_their_depth(monkeypatch):
     cameras = sideways_cameras()
     views = views_of_wall(cameras)
     scene = scene_of(GaussianSet.empty(), cameras)
-    config = UnreachedConfig(nearest_m=4.0, farthest_m=100.0, views_per_camera=3)
-    seeds = unreached_gaussians(scene, views, config, budget=900)
+    monkeypatch.setattr(unreached, "NEAREST_M", 4.0)
+    monkeypatch.setattr(unreached, "FARTHEST_M", 100.0)
+    monkeypatch.setattr(unreached, "VIEWS_PER_CAMERA", 3)
+    seeds = unreached_gaussians(scene, views, budget=900)
     assert 200 < len(seeds) <= 900
     assert abs(float(seeds.means[:, 0].median()) - 10.0) < 1.0
     closed = scene.with_gaussians(seeds).render(cameras[1], FRAME_NS)
     assert float((closed.alpha > 0.5).float().mean()) > 0.9
-    again = unreached_gaussians(scene.with_gaussians(seeds), views, config, budget=900)
+    again = unreached_gaussians(scene.with_gaussians(seeds), views, budget=900)
     assert len(again) < 0.1 * len(seeds)
 
 
@@ -99,15 +101,15 @@ def test_sky_and_covered_places_ask_for_nothing():
     views = views_of_wall(cameras)
     sky = [replace(view, sky_mask=torch.ones(64, 96, dtype=torch.bool)) for view in views]
     scene = scene_of(GaussianSet.empty(), cameras)
-    assert len(unreached_gaussians(scene, sky, UnreachedConfig(), budget=100)) == 0
+    assert len(unreached_gaussians(scene, sky, budget=100)) == 0
     y, z = torch.meshgrid(torch.linspace(-9, 9, 60), torch.linspace(-5, 7, 40), indexing="ij")
     wall_m = torch.stack([torch.full_like(y, 10.0), y, z], -1).flatten(0, 1)
     wall = round_gaussians(wall_m, torch.rand(2400, 3), sigma_m=0.3)
     covered = scene_of(wall, cameras)
-    assert len(unreached_gaussians(covered, views, UnreachedConfig(), budget=100)) == 0
+    assert len(unreached_gaussians(covered, views, budget=100)) == 0
 
 
-def test_nothing_is_put_under_the_ground():
+def test_nothing_is_put_under_the_ground(monkeypatch):
     """A gap in the road is clear and no sky; what is seen through it would be far below."""
     camera = camera_at(0.0, width_px=96, height_px=64)
     x, y = torch.meshgrid(torch.arange(2.0, 40, 0.5), torch.arange(-12.0, 12, 0.5), indexing="ij")
@@ -128,10 +130,9 @@ def test_nothing_is_put_under_the_ground():
         for index, (one, image) in enumerate(zip(cameras, images, strict=True))
     ]
     scene = scene_of(gaussians, cameras)
-    put = unreached_gaussians(scene, views, UnreachedConfig(), budget=500)
-    all_put = unreached_gaussians(
-        scene, views, UnreachedConfig(most_below_ground_m=1e6), budget=500
-    )
+    put = unreached_gaussians(scene, views, budget=500)
+    monkeypatch.setattr(unreached, "MOST_BELOW_GROUND_M", 1e6)
+    all_put = unreached_gaussians(scene, views, budget=500)
     assert float(all_put.means[:, 2].min()) < -1.5
     assert len(put) == 0 or float(put.means[:, 2].min()) > -1.2
 

@@ -2,7 +2,6 @@ import torch
 from gaussian_world import camera_at, turned_camera
 
 from lidarpainter_models.gaussians.model.sky import (
-    SkyTextureConfig,
     push_pull,
     seen_as_sky,
     sky_from_images,
@@ -15,7 +14,7 @@ from lidarpainter_models.kernels.sky_texture import sky_rays
 
 def test_crop_holds_every_ray_of_its_cameras():
     cameras = [camera_at(0.0), camera_at(2.0)]
-    layout = sky_layout(cameras, SkyTextureConfig())
+    layout = sky_layout(cameras)
     assert not layout.wraps
     places = sky_rays(cameras[0], layout).places
     assert float(places[..., 0].min()) > 0
@@ -25,7 +24,7 @@ def test_crop_holds_every_ray_of_its_cameras():
 
 def test_cameras_all_round_get_the_whole_turn():
     cameras = [turned_camera(yaw) for yaw in (0.0, 1.5, 3.0, -1.5)]
-    assert sky_layout(cameras, SkyTextureConfig()).wraps
+    assert sky_layout(cameras).wraps
 
 
 def test_unseen_texels_are_filled_from_seen_ones():
@@ -40,7 +39,7 @@ def test_unseen_texels_are_filled_from_seen_ones():
 
 def test_sky_of_images_shows_their_colours():
     camera = camera_at(0.0)
-    layout = sky_layout([camera], SkyTextureConfig())
+    layout = sky_layout([camera])
     image = torch.full((camera.height_px, camera.width_px, 3), 0.25)
     mask = torch.zeros(camera.height_px, camera.width_px, dtype=torch.bool)
     mask[:20] = True
@@ -55,14 +54,14 @@ def test_camera_below_the_horizon_gets_a_small_texture():
     tilt = rotation_from_vector(torch.tensor([0.0, 1.2, 0.0]).double())
     pose = rigid_from_rotation(tilt @ down.world_from_camera[:3, :3], torch.zeros(3).double())
     camera: Camera = down.at(pose)
-    layout = sky_layout([camera], SkyTextureConfig())
+    layout = sky_layout([camera])
     assert layout.rows >= 2
     assert layout.columns >= 2
 
 
 def test_a_direction_is_sky_for_all_views_if_it_is_for_one():
     ahead, turned = turned_camera(0.0), turned_camera(0.2)
-    layout = sky_layout([ahead, turned], SkyTextureConfig())
+    layout = sky_layout([ahead, turned])
     mask = torch.zeros(ahead.height_px, ahead.width_px, dtype=torch.bool)
     mask[:20] = True
     nothing = torch.zeros_like(mask)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lidarpainter_models.lidar.sky_masks import sky_mask
-from lidarpainter_models.lidar.sparse_depth import SparseDepthConfig, sparse_lidar_depth
+from lidarpainter_models.lidar.sparse_depth import sparse_lidar_depth
 from lidarpainter_models.metrics.edges import edge_agreement
 from lidarpainter_models.observations.fit_size import ObservationConfig, fit_camera, shrink_image
 from lidarpainter_models.painter.styles import StyleView, apply_style
@@ -25,7 +25,7 @@ def recorded(shared_folder, tmp_path_factory):
     image = shrink_image(scene.read_image(moment), **size)
     return StyleView(
         rgb=image.float() / 255,
-        depth_m=sparse_lidar_depth(points, camera, config=SparseDepthConfig()),
+        depth_m=sparse_lidar_depth(points, camera),
         sky=sky_mask(image, points, camera).float(),
         camera=camera,
     )

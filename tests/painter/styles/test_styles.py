@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from lidarpainter_models.errors import ConfigError, ShapeError
-from lidarpainter_models.painter.styles import STYLE_PROMPTS, StyleConfig, apply_style
-from lidarpainter_models.painter.styles.fog import FogConfig
+from lidarpainter_models.painter.styles import STYLE_PROMPTS, apply_style
+from lidarpainter_models.painter.styles.fog import FogConfig, add_fog
 from lidarpainter_models.painter.styles.light import to_display, to_linear
-from lidarpainter_models.painter.styles.night import NightConfig
-from lidarpainter_models.painter.styles.rain import RainConfig
+from lidarpainter_models.painter.styles.night import NightConfig, turn_to_night
+from lidarpainter_models.painter.styles.rain import RainConfig, add_rain
 from lidarpainter_models.painter.styles.view import (
     StyleView,
     distances,
@@ -19,9 +19,11 @@ from lidarpainter_models.painter.styles.view import (
     surface_points,
 )
 
-NO_STRENGTH = StyleConfig(
-    foggy=FogConfig(visibility_m=inf), night=NightConfig(strength=0), rain=RainConfig(strength=0)
-)
+NO_STRENGTH = {
+    "foggy": lambda view: add_fog(view, FogConfig(visibility_m=inf)),
+    "night": lambda view: turn_to_night(view, generator_of(0), NightConfig(strength=0)),
+    "rain": lambda view: add_rain(view, generator_of(0), RainConfig(strength=0)),
+}
 STYLES = STYLE_PROMPTS[1:]
 
 
@@ -36,9 +38,9 @@ def test_light_is_the_curve_of_srgb_and_back():
     assert float(grey[0, 0]) == pytest.approx(0.21404, abs=1e-5)  # ((0.5 + 0.055) / 1.055)^2.4
 
 
-@pytest.mark.parametrize("prompt", STYLE_PROMPTS)
+@pytest.mark.parametrize("prompt", STYLES)
 def test_a_style_without_strength_changes_nothing(street, prompt):
-    styled = apply_style(street, prompt, generator_of(0), NO_STRENGTH)
+    styled = NO_STRENGTH[prompt](street)
     torch.testing.assert_close(styled, street.rgb, atol=1e-5, rtol=0)  # of the display curve
 
 
@@ -76,22 +78,6 @@ def test_a_style_works_without_a_camera_and_without_depth(street_without_camera,
 def test_an_unknown_style_is_one_clear_line(street):
     with pytest.raises(ConfigError, match="no style 'snow', expected clear, foggy, night, rain"):
         apply_style(street, "snow", generator_of(0))
-
-
-@pytest.mark.parametrize(
-    ("make", "name"),
-    [
-        (lambda: FogConfig(visibility_m=0), "visibility_m"),
-        (lambda: FogConfig(greyness=2), "greyness"),
-        (lambda: NightConfig(strength=1.5), "strength"),
-        (lambda: NightConfig(beam=-1), "beam"),
-        (lambda: RainConfig(rain_mm_per_h=-1), "rain_mm_per_h"),
-        (lambda: RainConfig(puddle_share=2), "puddle_share"),
-    ],
-)
-def test_impossible_weather_is_refused(make, name):
-    with pytest.raises(ConfigError, match=name):
-        make()
 
 
 def test_maps_of_another_size_are_refused(street):
