@@ -13,6 +13,9 @@ PACKAGES = ("flows", "tasks", "catalog", "lidarpainter_models")
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 LAZY = {"open3d", "diffusers", "transformers", "peft", "gsplat"}
 MAX_LINES = 350
+MAX_FUNCTION_LINES = 60
+COMPILED = ("lidarpainter_models/kernels/", "lidarpainter_models/synthetic/raytracing/")
+"""A compiled loop may stand in one long function."""
 
 
 def relative(path: Path) -> str:
@@ -36,6 +39,28 @@ def test_module_is_short_documented_and_imports_heavy_things_late(path):
     assert ast.get_docstring(tree), "a module says what it does"
     assert len(text.splitlines()) <= MAX_LINES, "a reader cannot hold it in mind"
     assert not top_level_imports(tree) & LAZY, "heavy packages are imported inside functions"
+
+
+@pytest.mark.parametrize(
+    "path", [path for path in SOURCES if not relative(path).startswith(COMPILED)], ids=relative
+)
+def test_no_function_is_longer_than_a_screen(path):
+    functions = [
+        node
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    ]
+    long = {
+        node.name: lines
+        for node in functions
+        if (lines := node.end_lineno - first_line(node) + 1) > MAX_FUNCTION_LINES
+    }
+    assert long == {}
+
+
+def first_line(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """Where it begins, decorators included."""
+    return min([function.lineno, *(decorator.lineno for decorator in function.decorator_list)])
 
 
 def test_no_module_is_named_for_nothing():
