@@ -92,7 +92,10 @@ def test_seeds_may_be_listed_and_ranged():
         (["info", "--painter", "/nowhere:fast"], "no painter '/nowhere:fast'"),
         (["benchmark", "--painter", "picasso"], "no painter 'picasso'"),
         (["benchmark", "--size", "0x5"], "expected such as 1024x576"),
-        (["evaluate", "--painter", "none", "--pairs", "/a", "--device", "cuda"], "has no GPU"),
+        (
+            ["evaluate", "--painter", "none", "--pairs", "/a", "--device", "cuda"],
+            "no CUDA device",
+        ),
         (["evaluate", "--painter", "none", "--pairs", "/nowhere"], "no training pairs in /nowhere"),
         (["evaluate", "--painter", "none"], "nothing to judge by: expected --pairs or --run"),
         (["evaluate", "--painter", "none", "--run", "latest"], "no complete run in"),

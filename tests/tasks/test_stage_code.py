@@ -86,8 +86,8 @@ def test_evaluation_follows_the_scores_and_no_reader():
 def test_training_follows_what_its_students_are_made_of():
     modules = modules_of(*builds_in("painter.train"))
     assert {
-        "tasks.painter.students",
-        "tasks.painter.training_processes",
+        f"{LIBRARY}.evaluation.painter_training",
+        f"{LIBRARY}.painter.training_jobs",
         f"{LIBRARY}.painter.nano.training",
         f"{LIBRARY}.painter.one_step.training",
         f"{LIBRARY}.evaluation.held_back",

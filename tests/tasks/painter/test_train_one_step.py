@@ -67,21 +67,21 @@ def request(sets, config, held_back, start, **options):
 
 def test_a_one_step_painter_is_trained_judged_published_and_trained_on(pairs, store, model):
     trained = train.fn(store.root, "train", request(pairs, CONFIG, 0.3, model))
-    weights = weights_path(trained.ref)
+    weights = weights_path(store, trained.ref)
     assert weights.name == "one-step.safetensors"
     painter = load_painter(weights)
     assert painter.provenance["licence"].startswith("that of the model underneath (unknown), and")
     assert painter.provenance["base"] == model
     assert len(painter.provenance["trained_targets"]) == 2
-    record = training_record(trained.ref, None)
+    record = training_record(store, trained.ref, None)
     assert record["base_licence"] == "unknown"
     assert record["config"]["network"]["autoencoder"] == "taesd"
     assert [entry["step"] for entry in record["history"]] == [1, 2]
     assert set(record["pairs"][0]["pairs"]) <= {f"pair-{frame}" for frame in range(4)}
 
     judged = judge_held_back.fn(store.root, "judge", weights, pairs, 0.3)
-    assert load_painting_scores(judged.ref)["total"]["num_pairs"] == 2
-    assert samples_path(judged.ref).stat().st_size > 1000
+    assert load_painting_scores(store, judged.ref)["total"]["num_pairs"] == 2
+    assert samples_path(store, judged.ref).stat().st_size > 1000
     row = publish_painter.fn(store.root, trained.ref, None)
     assert row["name"] == "one-step"
     assert json.loads(row["record"])["training_digest"] == record["training_digest"]
@@ -90,21 +90,23 @@ def test_a_one_step_painter_is_trained_judged_published_and_trained_on(pairs, st
     assert on.network == fast()
     further = replace(CONFIG, steps=1)
     then = train.fn(store.root, "train", request(pairs, further, 0.3, weights))
-    told = load_painter(weights_path(then.ref)).provenance
+    told = load_painter(weights_path(store, then.ref)).provenance
     assert told["started_from"]["steps"] == 2
     assert told["base"] == model
 
 
-def tensors_of(trained):
-    return read_trained(weights_path(trained.ref)).tensors
+def tensors_of(store, trained):
+    return read_trained(weights_path(store, trained.ref)).tensors
 
 
 def test_a_killed_training_goes_on_and_ends_bit_for_bit(pairs, store, model, tmp_path):
     with listening(Killer()), pytest.raises(KeyboardInterrupt):
         train.fn(store.root, "train", request(pairs, CONFIG, 0.3, model))
     resumed = train.fn(store.root, "train", request(pairs, CONFIG, 0.3, model))
-    straight = tensors_of(train.fn(tmp_path / "other", "train", request(pairs, CONFIG, 0.3, model)))
-    for name, tensor in tensors_of(resumed).items():
+    other = open_store(tmp_path / "other")
+    trained = train.fn(other.root, "train", request(pairs, CONFIG, 0.3, model))
+    straight = tensors_of(other, trained)
+    for name, tensor in tensors_of(store, resumed).items():
         assert torch.equal(tensor, straight[name])
     assert not list((store.root / "work").glob("*"))
 
@@ -146,7 +148,7 @@ def test_lpips_enters_the_loss_and_lends_its_features(pairs, store, model, tmp_p
         path.write_bytes(b"stands for weights")
     config = replace(CONFIG, steps=1, loss=PaperLossWeights())
     trained = train.fn(store.root, "train", request(pairs, config, 0.0, model, lpips=files))
-    record = training_record(trained.ref, None)
+    record = training_record(store, trained.ref, None)
     assert record["discriminator"] == "FeatureDiscriminator"
     assert record["history"][0]["lpips"] > 0
     assert {"lpips backbone", "lpips heads"} <= set(record)
@@ -163,7 +165,7 @@ def test_two_processes_train_one_painter(pairs, store, model):
     two = train.fn(store.root, "train", request(pairs, config, 0.0, model, num_processes=2))
     one = replace(config, accumulated_batches=2)
     alone = train.fn(store.root, "train", request(pairs, one, 0.0, model))
-    records = [training_record(made.ref, None) for made in (two, alone)]
+    records = [training_record(store, made.ref, None) for made in (two, alone)]
     assert [record["processes"] for record in records] == [2, 1]
     for ours, theirs in zip(*(record["history"] for record in records), strict=True):
         assert ours["total"] == pytest.approx(theirs["total"], rel=1e-4)

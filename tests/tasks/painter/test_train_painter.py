@@ -51,8 +51,8 @@ def request(sets, config=CONFIG, held_back=0.3):
     return TrainingRequest(sets=sets, config=config, held_back=held_back)
 
 
-def weights_of(result):
-    network = load_weights(weights_path(result.ref)).network
+def weights_of(store, result):
+    network = load_weights(weights_path(store, result.ref)).network
     return torch.cat([parameter.flatten() for parameter in network.parameters()])
 
 
@@ -60,11 +60,11 @@ def test_training_is_done_once_and_says_what_it_saw(pairs, store):
     first = train.fn(store.root, "train", request(pairs, CONFIG, held_back=0.3))
     again = train.fn(store.root, "train", request(pairs, CONFIG, held_back=0.3))
     assert (first.is_new, again.is_new) == (True, False)
-    provenance = load_weights(weights_path(first.ref)).provenance
+    provenance = load_weights(weights_path(store, first.ref)).provenance
     assert provenance["licence"] == "Apache-2.0"
     assert provenance["attribution"] == ["CC BY 4.0, PandaSet by Hesai and Scale AI"]
     assert provenance["pairs"]["log"]["num_pairs"] == 4
-    record = training_record(first.ref, None)
+    record = training_record(store, first.ref, None)
     held = set(record["held_back"]["log"])
     assert len(held) == 2
     assert len(provenance["trained_targets"]) == 4
@@ -79,15 +79,16 @@ def test_a_killed_training_goes_on_and_ends_bit_for_bit(pairs, store, tmp_path):
         train.fn(store.root, "train", request(pairs, CONFIG, held_back=0.3))
     assert list((store.root / "work").glob("*/training.pt"))
     resumed = train.fn(store.root, "train", request(pairs, CONFIG, held_back=0.3))
-    straight = train.fn(tmp_path / "other", "train", request(pairs, CONFIG, held_back=0.3))
-    assert torch.equal(weights_of(resumed), weights_of(straight))
+    other = open_store(tmp_path / "other")
+    straight = train.fn(other.root, "train", request(pairs, CONFIG, held_back=0.3))
+    assert torch.equal(weights_of(store, resumed), weights_of(other, straight))
     assert not list((store.root / "work").glob("*"))
 
 
 def test_a_trained_painter_is_judged_and_catalogued(pairs, store):
     trained = train.fn(store.root, "train", request(pairs, CONFIG, held_back=0.3))
-    judged = judge_held_back.fn(store.root, "judge", weights_path(trained.ref), pairs, 0.3)
-    scores = load_painting_scores(judged.ref)
+    judged = judge_held_back.fn(store.root, "judge", weights_path(store, trained.ref), pairs, 0.3)
+    scores = load_painting_scores(store, judged.ref)
     assert scores["total"]["num_pairs"] == judged.summary["num_pairs"] == 2
     row = publish_painter.fn(store.root, trained.ref, scores)
     publish_painter.fn(store.root, trained.ref, scores)
@@ -95,7 +96,7 @@ def test_a_trained_painter_is_judged_and_catalogued(pairs, store):
     assert stored["painter_id"] == row["painter_id"]
     record = json.loads(stored["record"])
     assert record["held_back_scores"]["total"]["num_pairs"] == 2
-    assert stored["num_bytes"] == weights_path(trained.ref).stat().st_size
+    assert stored["num_bytes"] == weights_path(store, trained.ref).stat().st_size
     # what it learnt from judges it never, nor those it is compared with
     painters = {"none": "none", "nano": stored["path"]}
     found = judge_painters.fn(painters, pairs)
@@ -109,7 +110,7 @@ def test_pairs_without_known_terms_give_weights_without_a_free_licence(store, tm
     write_pairs(tmp_path / "odd", range(2), dataset="nuscenes", sequence="1")
     sets = (PairSet(name="odd", folder=tmp_path / "odd"),)
     trained = train.fn(store.root, "train", request(sets, replace(CONFIG, steps=1), held_back=0.0))
-    licence = load_weights(weights_path(trained.ref)).provenance["licence"]
+    licence = load_weights(weights_path(store, trained.ref)).provenance["licence"]
     assert licence == "terms of the training data: nuscenes"
 
 
@@ -132,4 +133,4 @@ def test_sets_need_names_of_their_own(pairs, store, number):
 def test_judging_needs_something_held_back(pairs, store):
     trained = train.fn(store.root, "train", request(pairs, replace(CONFIG, steps=1), held_back=0.0))
     with pytest.raises(ConfigError, match="nothing to judge by"):
-        judge_held_back.fn(store.root, "judge", weights_path(trained.ref), pairs, 0.0)
+        judge_held_back.fn(store.root, "judge", weights_path(store, trained.ref), pairs, 0.0)
