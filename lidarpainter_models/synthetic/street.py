@@ -25,8 +25,6 @@ from lidarpainter_models.synthetic.lidar_sensor import (
     intensities,
     returns_mask,
 )
-from lidarpainter_models.synthetic.raytracing.lidar import cast_sweep
-from lidarpainter_models.synthetic.raytracing.render import render_image
 from lidarpainter_models.synthetic.raytracing.scene_arrays import InstanceArrays, ViewArrays
 from lidarpainter_models.synthetic.textures.surfaces import StreetClass
 from lidarpainter_models.synthetic.world.city import City, build_city
@@ -162,6 +160,8 @@ class SyntheticStreet:
 
     def render(self, camera: Camera, timestamp_ns: int) -> TrueImage:
         """The true image of any pinhole camera at any time."""
+        from lidarpainter_models.synthetic.raytracing.render import render_image  # numba
+
         view = ViewArrays(
             world_from_camera=camera.world_from_camera[:3].to(torch.float64).contiguous().numpy(),
             intrinsics=np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px], float),
@@ -181,6 +181,8 @@ class SyntheticStreet:
 
     def sweep(self, frame_index: int) -> SimulatedSweep:
         """One turn of the LiDAR, every ray cast at its own time and stored in the world."""
+        from lidarpainter_models.synthetic.raytracing.lidar import cast_sweep  # numba
+
         config, lidar = self.config, self.config.lidar
         timestamp_ns = self.timestamps_ns[frame_index]
         firing = firings(lidar, config.frame_interval_s)

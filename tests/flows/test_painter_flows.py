@@ -103,7 +103,7 @@ def test_evaluate_judges_painters_on_pairs_and_on_views_of_a_run(
 
     words = ("painter", "evaluate", "--painter", "none,overlay", "--run", tiny_run.run_id)
     sources = succeed(*words, "--json", store=tiny_run.store).json["pairs"]
-    assert set(sources) == {f"{SCENE} {name}" for name in ("recorded", "left-2m", "up-1.5m")}
+    assert set(sources) == {f"{SCENE} {name}" for name in ("left-2m", "up-1.5m")}
     assert all(source["num_judged"] > 0 for source in sources.values())
     assert "overlay" in succeed(*words, store=tiny_run.store).out
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarpainter_models.synthetic.raytracing import scene_arrays as layout
-from lidarpainter_models.synthetic.raytracing.bvh import build_tree
 from lidarpainter_models.synthetic.textures.surfaces import (
     SurfaceSet,
     linear_from_srgb,
@@ -92,6 +91,8 @@ def _pack_tree(
     """Nodes and primitives of one mesh, numbered on from what is there."""
     corners = mesh.corners()
     margin = 1e-4
+    from lidarpainter_models.synthetic.raytracing.bvh import build_tree  # numba
+
     bounds, children, order = build_tree(
         (corners.min(1) - margin).astype(np.float32), (corners.max(1) + margin).astype(np.float32)
     )

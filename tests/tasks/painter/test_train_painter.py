@@ -98,7 +98,7 @@ def test_a_trained_painter_is_judged_and_catalogued(pairs, store):
     assert record["held_back_scores"]["total"]["num_pairs"] == 2
     assert stored["num_bytes"] == weights_path(store, trained.ref).stat().st_size
     # what it learnt from judges it never, nor those it is compared with
-    painters = {"none": "none", "nano": stored["path"]}
+    painters = {"none": "none", "nano": str(store.path_of(stored["path"]))}
     found = judge_painters.fn(painters, pairs)
     assert found["pairs"]["log"]["num_left_out"] == 4
     none = found["painters"]["none"]["total"]
