@@ -3,13 +3,18 @@
 Box frame: x along the length, y to the left, z up, origin at the centre.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
-from lidarpainter_models.geometry.transforms import interpolate_rigid_track
+from lidarpainter_models.geometry.transforms import interpolate_rigid, interpolate_rigid_track
+
+PRESENCE_MARGIN_NS = 50_000_000
+"""An actor is there for half a 10 Hz frame before its first and after its last box."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,10 +38,66 @@ class ActorTrack:
         """`world_from_box` (float64) between its boxes; beyond its ends the end pose holds."""
         return interpolate_rigid_track(self.timestamps_ns, self.world_from_box, timestamp_ns)
 
-    def is_present(self, timestamp_ns: int, margin_ns: int = 50_000_000) -> bool:
+    def is_present(self, timestamp_ns: int, margin_ns: int = PRESENCE_MARGIN_NS) -> bool:
         """Whether a time lies between the first and the last box, give or take a margin."""
         first_ns, last_ns = int(self.timestamps_ns[0]), int(self.timestamps_ns[-1])
         return first_ns - margin_ns <= timestamp_ns <= last_ns + margin_ns
+
+
+@dataclass(frozen=True, eq=False)
+class TrackPoses:
+    """The poses of many tracks, asked for all at once; rows are the tracks in their order."""
+
+    timestamps_ns: Int[Tensor, "tracks times"]
+    """Ascending; a shorter track repeats its last time."""
+    world_from_box: Float[Tensor, "tracks times 4 4"]
+    """float64."""
+
+    @classmethod
+    def of(cls, tracks: Sequence[ActorTrack]) -> "TrackPoses":
+        """Take the tracks as they are."""
+        if not tracks:
+            none = torch.zeros(0, 1, dtype=torch.int64)
+            return cls(none, torch.zeros(0, 1, 4, 4, dtype=torch.float64))
+        times_ns = pad_sequence([track.timestamps_ns for track in tracks], batch_first=True)
+        poses = pad_sequence([track.world_from_box.double() for track in tracks], batch_first=True)
+        counts = torch.tensor([len(track.timestamps_ns) for track in tracks])
+        last = torch.minimum(torch.arange(times_ns.shape[1]), counts[:, None] - 1)
+        rows = torch.arange(len(tracks))[:, None]
+        return cls(times_ns[rows, last], poses[rows, last])
+
+    def __len__(self) -> int:
+        return self.timestamps_ns.shape[0]
+
+    def present(
+        self, timestamp_ns: int | Tensor, margin_ns: int = PRESENCE_MARGIN_NS
+    ) -> Bool[Tensor, " *tracks"]:
+        """Whether each track is there at a time; times (queries, 1) give (queries, tracks)."""
+        first_ns, last_ns = self.timestamps_ns[:, 0], self.timestamps_ns[:, -1]
+        return (first_ns - margin_ns <= timestamp_ns) & (timestamp_ns <= last_ns + margin_ns)
+
+    def at(
+        self, rows: Int[Tensor, " queries"], times_ns: Int[Tensor, " queries"]
+    ) -> Float[Tensor, "queries 4 4"]:
+        """Poses of some tracks, each at its time; see `ActorTrack.pose_at`."""
+        known_ns = self.timestamps_ns[rows]
+        inside_ns = times_ns.clamp(known_ns[:, 0], known_ns[:, -1])
+        after = torch.searchsorted(known_ns, inside_ns[:, None])[:, 0].clamp(min=1)
+        after = after.clamp(max=known_ns.shape[1] - 1)
+        before = (after - 1).clamp(min=0)
+        queries = torch.arange(len(rows))
+        start_ns, end_ns = known_ns[queries, before], known_ns[queries, after]
+        span_ns = (end_ns - start_ns).clamp(min=1)  # a track of one box has nothing between
+        return interpolate_rigid(
+            self.world_from_box[rows, before],
+            self.world_from_box[rows, after],
+            (inside_ns - start_ns).double() / span_ns,
+        )
+
+    def all_at(self, timestamp_ns: int) -> Float[Tensor, "tracks 4 4"]:
+        """Poses of all tracks at one time."""
+        rows = torch.arange(len(self))
+        return self.at(rows, torch.full_like(rows, timestamp_ns))
 
 
 def tracks_from_boxes(

@@ -7,14 +7,15 @@ training times. Box frame: x along the length, y left, z up, origin at the centr
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lidarpainter_models.gaussians.model.pose_blending import RefinedTrack
+from lidarpainter_models.gaussians.model.pose_blending import RefinedTracks
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
-from lidarpainter_models.scenes.driving_scene import ActorTrack
+from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses
 
 PRESENCE_MARGIN_NS = 60_000_000
 """An actor stays for half a 10 Hz frame (and a little) beyond its first and last box."""
@@ -28,8 +29,8 @@ class _Motions:
     """What follows from the corrections as they are."""
 
     tangent: Float[Tensor, "actors knots 6"]
-    refined: tuple[RefinedTrack | None, ...]
-    """Poses at the training times; None for an actor that is never present at one."""
+    refined: RefinedTracks
+    """Poses at the training times of the actors that are present at one, in their order."""
     likely_at: dict[int, Float[Tensor, "actors 4 4"]] = field(default_factory=dict)
     """By time: all views of a time, and all shifts of a view, show the actors alike."""
 
@@ -84,67 +85,74 @@ class Actors:
         recorded, present = self._recorded_poses(timestamp_ns)
         known = self._motions().likely_at
         if timestamp_ns not in known:
+            actors = present.nonzero()[:, 0]
             poses = recorded.clone()
-            for index in present.nonzero()[:, 0].tolist():
-                poses[index] = self._likely_pose(index, timestamp_ns)
+            times_ns = torch.full_like(actors, timestamp_ns)
+            poses[actors] = self._likely(actors, times_ns, recorded[actors])
             known[timestamp_ns] = poses
         return known[timestamp_ns], present
 
     def refined_tracks(self) -> tuple[ActorTrack, ...]:
         """The tracks with the most likely poses at their own times."""
+        tracks = self.recorded_tracks
+        if not tracks:
+            return ()
+        counts = [len(track.timestamps_ns) for track in tracks]
+        poses = self._likely(
+            torch.arange(len(tracks)).repeat_interleave(torch.tensor(counts)),
+            torch.cat([track.timestamps_ns for track in tracks]),
+            torch.cat([track.world_from_box.double() for track in tracks]),
+        ).split(counts)
         return tuple(
-            replace(
-                track,
-                world_from_box=torch.stack(
-                    [self._likely_pose(index, int(time_ns)) for time_ns in track.timestamps_ns]
-                ),
-            )
-            for index, track in enumerate(self.recorded_tracks)
+            replace(track, world_from_box=own) for track, own in zip(tracks, poses, strict=True)
         )
+
+    @cached_property
+    def _recorded(self) -> TrackPoses:
+        return TrackPoses.of(self.recorded_tracks)
 
     def _recorded_poses(self, timestamp_ns: int) -> ActorPoses:
         if timestamp_ns not in self._recorded_at:
-            self._recorded_at[timestamp_ns] = _poses_at(self.recorded_tracks, timestamp_ns)
+            poses = self._recorded.all_at(timestamp_ns)
+            present = self._recorded.present(timestamp_ns, PRESENCE_MARGIN_NS)
+            self._recorded_at[timestamp_ns] = (poses, present.double())
         return self._recorded_at[timestamp_ns]
 
-    def _likely_pose(self, index: int, timestamp_ns: int) -> Float[Tensor, "4 4"]:
-        recorded = self.recorded_tracks[index].pose_at(timestamp_ns).double()
-        refined = self._motions().refined[index]
-        return recorded if refined is None else refined.pose_at(timestamp_ns * 1e-9, recorded)
+    @cached_property
+    def _present_at_knots(self) -> Bool[Tensor, "actors knots"]:
+        return self._recorded.present(self.knots_ns[:, None], PRESENCE_MARGIN_NS).T
+
+    def _likely(
+        self,
+        actors: Int[Tensor, " queries"],
+        times_ns: Int[Tensor, " queries"],
+        recorded: Float[Tensor, "queries 4 4"],
+    ) -> Float[Tensor, "queries 4 4"]:
+        """Refined poses of actors at times; as recorded for one that no training time saw."""
+        is_refined = self._present_at_knots.any(dim=1)
+        chosen = is_refined[actors].nonzero()[:, 0]
+        bodies = (is_refined.cumsum(0) - 1)[actors[chosen]]
+        poses = recorded.clone()
+        poses[chosen] = self._motions().refined.poses_at(
+            bodies, times_ns[chosen].double() * 1e-9, recorded[chosen]
+        )
+        return poses
 
     def _motions(self) -> _Motions:
         """Made again when the corrections changed."""
         tangent = self.tangent.detach()
         if not self._made or not torch.equal(self._made[0].tangent, tangent):
             kept = tangent.clone()
-            tracks = zip(self.recorded_tracks, kept, strict=True)
-            refined = tuple(_refined_track(track, self.knots_ns, own) for track, own in tracks)
-            self._made[:] = [_Motions(kept, refined)]
+            self._made[:] = [_Motions(kept, self._refined(kept))]
         return self._made[0]
 
-
-def _refined_track(
-    track: ActorTrack, knots_ns: Int[Tensor, " knots"], tangent: Float[Tensor, "knots 6"]
-) -> RefinedTrack | None:
-    rows = [row for row, knot_ns in enumerate(knots_ns.tolist()) if _is_present(track, knot_ns)]
-    if not rows:
-        return None
-    recorded = torch.stack([track.pose_at(int(knots_ns[row])).double() for row in rows])
-    return RefinedTrack(
-        times_s=knots_ns[rows].double() * 1e-9,
-        recorded=recorded,
-        refined=recorded @ rigid_from_tangent(tangent[rows]),
-    )
-
-
-def _poses_at(tracks: tuple[ActorTrack, ...], timestamp_ns: int) -> ActorPoses:
-    """Recorded poses at a time and 1 where the actor is present."""
-    if not tracks:
-        return torch.zeros(0, 4, 4, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
-    poses = torch.stack([track.pose_at(timestamp_ns).double() for track in tracks])
-    present = [_is_present(track, timestamp_ns) for track in tracks]
-    return poses, torch.tensor(present, dtype=torch.float64)
-
-
-def _is_present(track: ActorTrack, timestamp_ns: int) -> bool:
-    return track.is_present(timestamp_ns, PRESENCE_MARGIN_NS)
+    def _refined(self, tangent: Float[Tensor, "actors knots 6"]) -> RefinedTracks:
+        actors, knots = self._present_at_knots.nonzero().unbind(1)
+        recorded = self._recorded.at(actors, self.knots_ns[knots])
+        counts = self._present_at_knots.sum(dim=1)
+        parts = counts[counts > 0].tolist()
+        return RefinedTracks.of(
+            (self.knots_ns[knots].double() * 1e-9).split(parts),
+            recorded.split(parts),
+            (recorded @ rigid_from_tangent(tangent[actors, knots])).split(parts),
+        )

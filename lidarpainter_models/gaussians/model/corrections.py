@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidarpainter_models.gaussians.model.pose_blending import RefinedTrack
+from lidarpainter_models.gaussians.model.pose_blending import RefinedTracks
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.scenes.records import ViewKey
@@ -61,7 +61,7 @@ class CameraCorrections:
         """A training view's refined pose; differentiable."""
         return self.recorded_world_from_camera[row] @ rigid_from_tangent(self.tangent(row))
 
-    def track_of(self, camera_name: str) -> RefinedTrack | None:
+    def track_of(self, camera_name: str) -> RefinedTracks | None:
         """Recorded and refined poses of one camera in order of time; None if never trained on."""
         rows = [row for row, key in enumerate(self.keys) if key[1] == camera_name]
         if not rows:
@@ -69,11 +69,8 @@ class CameraCorrections:
         rows.sort(key=lambda row: int(self.timestamps_ns[row]))
         with torch.no_grad():
             refined = torch.stack([self.world_from_camera(row) for row in rows])
-        return RefinedTrack(
-            times_s=self.timestamps_ns[rows].double() * 1e-9,
-            recorded=self.recorded_world_from_camera[rows],
-            refined=refined,
-        )
+        times_s = self.timestamps_ns[rows].double() * 1e-9
+        return RefinedTracks.of([times_s], [self.recorded_world_from_camera[rows]], [refined])
 
     def corrected(
         self, camera: Camera, *, key: ViewKey | None, timestamp_ns: int, camera_name: str
@@ -86,7 +83,7 @@ class CameraCorrections:
         track = self.track_of(camera_name)
         if track is None:
             return camera
-        return camera.at(track.pose_at(timestamp_ns * 1e-9, camera.world_from_camera.double()))
+        return camera.at(track.pose_at(0, timestamp_ns * 1e-9, camera.world_from_camera.double()))
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything to be stored besides keys and names."""
