@@ -67,8 +67,7 @@ class ConditionBuilder:
         self.scene = scene
         self.lidar_map = lidar_map
         self.config = config or ConditionConfig()
-        self.tracks = scene.tracks
-        self.boxes = MovingBoxes(self.tracks)
+        self.boxes = MovingBoxes(scene.tracks)
         self._views = {view.key: view for view in training_views}
         self._cameras = {
             view.key: scene.corrected_camera(
@@ -183,7 +182,7 @@ class ConditionBuilder:
 
     def lidar_image(self, camera: Camera, timestamp_ns: int) -> LidarImage:
         """What the LiDAR knows of a view."""
-        return render_lidar(self.lidar_map, self.tracks, camera, timestamp_ns)
+        return render_lidar(self.lidar_map, self.boxes, camera, timestamp_ns)
 
     def surface_m(
         self, render: SceneRender, lidar: LidarImage, camera: Camera

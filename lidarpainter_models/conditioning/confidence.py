@@ -73,9 +73,13 @@ def is_seen(
     Pixels without depth (0) are taken as sky: only their direction counts.
     """
     points_world = camera.unproject(torch.where(depth_m > 0, depth_m, SKY_DEPTH_M)).reshape(-1, 3)
-    seen = torch.zeros_like(depth_m, dtype=torch.bool).reshape(-1)
+    unseen = torch.arange(len(points_world))
     for recorded in recorded_cameras:
-        seen |= recorded.contains(*recorded.project(points_world))
+        unseen = unseen[~recorded.contains(*recorded.project(points_world[unseen]))]
+        if not len(unseen):
+            break
+    seen = torch.ones_like(depth_m, dtype=torch.bool).reshape(-1)
+    seen[unseen] = False
     return seen.reshape(depth_m.shape)
 
 

@@ -26,10 +26,10 @@ from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectories import Shift, road_directions, shift_pose
 from lidarpainter_models.lidar.lidar_map import LidarMap
+from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.observations.views import GuidanceView, TrainingView
 from lidarpainter_models.painter.protocol import Painter, Painting, PaintingConditions
 from lidarpainter_models.scenes.records import ViewKey
-from lidarpainter_models.scenes.tracks import ActorTrack
 
 DEFAULT_SHIFTS = (
     Shift(lateral_m=2.0),
@@ -150,15 +150,14 @@ def _check_names(names: tuple[str, ...] | None, views: Sequence[TrainingView]) -
         )
 
 
-def has_room(novel: NovelCamera, lidar_map: LidarMap, tracks: Sequence[ActorTrack]) -> bool:
+def has_room(novel: NovelCamera, lidar_map: LidarMap, actors: MovingBoxes) -> bool:
     """Whether a camera stands in free space: not in or at a moving actor, a parked car, a wall."""
     centre = novel.camera.centre_world.to(lidar_map.street.xyz_m)
-    for track in tracks:
-        if track.is_present(novel.timestamp_ns):
-            box = track.pose_at(novel.timestamp_ns)
-            if bool(is_inside_box(centre[None], box, track.size_m, margin_m=ROOM_M)):
-                return False
-    distance_m = (lidar_map.street.xyz_m - centre).norm(dim=-1)
+    for track, box in actors.placed(novel.timestamp_ns):
+        if bool(is_inside_box(centre[None], box, track.size_m, margin_m=ROOM_M)):
+            return False
+    near = ((lidar_map.street.xyz_m[:, 0] - centre[0]).abs() < ROOM_M).nonzero()[:, 0]
+    distance_m = (lidar_map.street.xyz_m[near] - centre).norm(dim=-1)
     return int((distance_m < ROOM_M).sum()) <= MAX_POINTS_IN_ROOM
 
 
@@ -183,7 +182,7 @@ def paint_novel_views(
     paintings = []
     paths: dict[tuple[Shift, str], SequencePainter] = {}
     for done, novel in enumerate(cameras, start=1):
-        if has_room(novel, builder.lidar_map, builder.tracks):
+        if has_room(novel, builder.lidar_map, builder.boxes):
             path = paths.setdefault(
                 (novel.shift, novel.key[1]),
                 SequencePainter(builder, painter, config=config.sequence),

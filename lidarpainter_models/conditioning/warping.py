@@ -9,6 +9,7 @@ pixel centres at half-integers.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
@@ -36,6 +37,18 @@ class SourceImage:
     depth_m: Float[Tensor, "height width"]
     alpha: Float[Tensor, "height width"]
 
+    @cached_property
+    def is_sky(self) -> Bool[Tensor, "height width"]:
+        """What is clear and has no depth."""
+        return (self.depth_m <= 0) & (self.alpha < SKY_ALPHA)
+
+    @cached_property
+    def layers(self) -> Float[Tensor, "1 5 height width"]:
+        """Colour, inverse depth (0 where there is none) and sky, for sampling."""
+        inverse = torch.where(self.depth_m > 0, 1 / self.depth_m.clamp(min=1e-3), 0)
+        planes = [*self.rgb.unbind(-1), inverse, self.is_sky.to(self.rgb)]
+        return torch.stack(planes)[None]
+
 
 def source_cost_m(target_camera: Camera, timestamp_ns: int, camera: Camera, taken_ns: int) -> float:
     """How far a recorded view is from a target in place, direction and time, as metres."""
@@ -60,12 +73,8 @@ def sample_source(
     rim_px = 0.49  # half a pixel less rounding: outside it nothing can be interpolated
     inside = ((pixels_uv >= rim_px) & (pixels_uv <= size - rim_px)).all(dim=-1) & (depth_m > 0.1)
     grid = torch.where(inside[:, None], pixels_uv / size * 2 - 1, 0)
-    has_depth = source.depth_m > 0
-    inverse = torch.where(has_depth, 1 / source.depth_m.clamp(min=1e-3), 0)
-    is_source_sky = (~has_depth & (source.alpha < SKY_ALPHA)).to(source.rgb)
-    layers = torch.cat([source.rgb, inverse[..., None], is_source_sky[..., None]], dim=-1)
     sampled = torch.nn.functional.grid_sample(
-        layers.permute(2, 0, 1)[None], grid[None, None], padding_mode="border", align_corners=False
+        source.layers, grid[None, None], padding_mode="border", align_corners=False
     )[0, :, 0].T
     same = (sampled[:, 3] * depth_m - 1).abs() <= DEPTH_TOLERANCE
     same_surface = same & (sampled[:, 4] < SKY_ALPHA)

@@ -48,7 +48,7 @@ class FlickerJudgement:
             )
             for config in (SequenceConfig(), *self.previous)
         }
-        tally = FlickerTally(builder.tracks)
+        tally = FlickerTally(builder.boxes.tracks)
         for view in self.held_out.scene.views_of(self.camera_name):
             tally.add(self._frame(view, shift, painting, painters))
         return {name: asdict(found) for name, found in tally.scores().items()}

@@ -7,6 +7,7 @@ the log's own. The two are reported side by side and never mixed.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal
 
 from jaxtyping import Float, UInt8
@@ -16,6 +17,7 @@ from lidarpainter_models.evaluation.judged_views import JudgedView, actor_mask
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectories import Shift, road_directions, shift_pose
+from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.observations.fit_size import ObservationConfig, fit_camera, shrink_image
 from lidarpainter_models.scenes.driving_scene import DrivingScene, RecordedView
 from lidarpainter_models.scenes.records import ViewKey
@@ -34,6 +36,10 @@ class HeldOut:
     _images_u8: dict[ViewKey, UInt8[Tensor, "height width 3"]] = field(
         default_factory=dict, repr=False, compare=False
     )
+
+    @cached_property
+    def _moving(self) -> MovingBoxes:
+        return MovingBoxes([track for track in self.scene.tracks if track.is_moving])
 
     def image_of(self, view: RecordedView) -> Float[Tensor, "height width 3"]:
         """The recorded image at fit size, decoded at the first call."""
@@ -71,7 +77,7 @@ class HeldOut:
                     camera=camera,
                     timestamp_ns=view.timestamp_ns,
                     truth_rgb=self.image_of(view),
-                    actor_mask=actor_mask(camera, self.scene.tracks, view.timestamp_ns),
+                    actor_mask=actor_mask(camera, self._moving, view.timestamp_ns),
                 )
             )
         return judged
@@ -89,7 +95,7 @@ class HeldOut:
                     camera=camera,
                     timestamp_ns=view.timestamp_ns,
                     truth_rgb=street.render(camera, view.timestamp_ns).rgb,
-                    actor_mask=actor_mask(camera, self.scene.tracks, view.timestamp_ns),
+                    actor_mask=actor_mask(camera, self._moving, view.timestamp_ns),
                 )
             )
         return judged

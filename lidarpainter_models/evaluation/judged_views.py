@@ -15,9 +15,9 @@ from torch import Tensor
 
 from lidarpainter_models.geometry.box_masks import FARTHEST_PX, project_box
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.metrics.images import ImageScores, pooled_psnr, score_image
 from lidarpainter_models.metrics.perceptual import PerceptualDistances
-from lidarpainter_models.scenes.driving_scene import ActorTrack
 
 Renderer = Callable[[Camera, int], Float[Tensor, "height width 3"]]
 """Image of a camera (fit resolution) at a time in nanoseconds."""
@@ -51,14 +51,12 @@ class ViewScores:
 
 
 def actor_mask(
-    camera: Camera, tracks: Sequence[ActorTrack], timestamp_ns: int
+    camera: Camera, actors: MovingBoxes, timestamp_ns: int
 ) -> Bool[Tensor, "height width"]:
-    """Pixels inside the projected boxes of the moving tracks present at that time."""
+    """Pixels inside the projected boxes of the actors present at that time."""
     mask = np.zeros((camera.height_px, camera.width_px), np.uint8)
-    for track in tracks:
-        if not track.is_moving or not track.is_present(timestamp_ns):
-            continue
-        pixels_uv = project_box(camera, track.pose_at(timestamp_ns), track.size_m)
+    for track, world_from_box in actors.placed(timestamp_ns):
+        pixels_uv = project_box(camera, world_from_box, track.size_m)
         if len(pixels_uv):
             clamped = pixels_uv.clamp(-FARTHEST_PX, FARTHEST_PX).numpy().astype(np.float32)
             hull = cv2.convexHull(clamped)

@@ -5,7 +5,7 @@ carried by the pose of their track. Frames: world x forward, y left, z up; camer
 z forward; depth is camera z in metres.
 
 Visibility takes three steps. A z-buffer of discs as large as the beams are apart gives a closed
-surface. A point is hidden when nearer surface surrounds it in most directions around its pixel
+surface. A point is hidden when nearer surface surrounds it in all directions around its pixel
 (after Pintus et al. 2011, who open a cone instead), which culls background between the scan lines
 of a foreground yet keeps a road seen at a grazing angle. The points left are blended where they
 meet the nearest direct hit of a pixel, so silhouettes stay sharp and discs do not show.
@@ -17,19 +17,20 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Shaped, UInt8
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.kernels.colour_sampling import project_inside
 from lidarpainter_models.kernels.point_blend import blend_points
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
+from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.lidar.point_surfaces import (
     curtain,
     disc_surface,
     spread,
     surface_gaps,
 )
-from lidarpainter_models.scenes.driving_scene import ActorTrack
 
 WINDOW_S = 1.0
 """Street points measured this long before or after the image are drawn first; where no
@@ -45,7 +46,6 @@ MIN_RADIUS_PX = 0.75
 """Just over half a diagonal, so that a point always covers the pixel it falls into."""
 HIDDEN_REACH_RAD = 0.012
 """How far around a pixel nearer surface is looked for: 6 px at 500 px focal length."""
-HIDDEN_DIRECTIONS = 8  # of the 8 directions, how many must meet nearer surface to hide a point
 HIDDEN_TOLERANCE = 0.1  # nearer means by more than this share of the depth
 SURFACE_TOLERANCE = 0.06
 """A point is blended where it meets the surface of a pixel within this share of its depth."""
@@ -79,20 +79,28 @@ class ViewPoints(NamedTuple):
     rgb_u8: UInt8[Tensor, "points 3"]
     has_colour: Bool[Tensor, " points"]
     age_s: Float[Tensor, " points"]
-    is_recent: Bool[Tensor, " points"]
 
     def keep(self, kept: Bool[Tensor, " points"]) -> "ViewPoints":
         """The points that are marked."""
         rows = kept.nonzero()[:, 0]
         return ViewPoints(*(field.index_select(0, rows) for field in self))
 
+    def without(self, hidden: Bool[Tensor, " points"]) -> "ViewPoints":
+        """The same points, those that are marked at no depth, where nothing draws them."""
+        return self._replace(depth_m=torch.where(hidden, torch.inf, self.depth_m))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["ViewPoints"]) -> "ViewPoints":
+        """All points of several parts, in their order."""
+        return cls(*(torch.cat(fields) for fields in zip(*parts, strict=True)))
+
 
 def render_lidar(
-    lidar_map: LidarMap, tracks: Sequence[ActorTrack], camera: Camera, timestamp_ns: int
+    lidar_map: LidarMap, actors: MovingBoxes, camera: Camera, timestamp_ns: int
 ) -> LidarImage:
     """Splat the street around a time and the actors present then into a camera.
 
-    Only tracks whose actor has points in the map and that are present at `timestamp_ns` are drawn.
+    Only actors that have points in the map and are present at `timestamp_ns` are drawn.
     """
     # what stands just outside the image hides and covers pixels inside
     margin_px = max(2, round(HIDDEN_REACH_RAD * camera.fx_px))
@@ -103,8 +111,8 @@ def render_lidar(
         cx_px=camera.cx_px + margin_px,
         cy_px=camera.cy_px + margin_px,
     )
-    points = view_points(lidar_map, tracks, wide, timestamp_ns)
-    image = _image(points, wide, margin_px)
+    recent, older = view_points(lidar_map, actors, wide, timestamp_ns)
+    image = _image(recent, older, wide, margin_px)
     image = image[margin_px:-margin_px, margin_px:-margin_px]
     hit = image[..., 3] > 0
     return LidarImage(
@@ -115,89 +123,101 @@ def render_lidar(
     )
 
 
-def _image(points: ViewPoints, camera: Camera, reach_px: int) -> Float[Tensor, "height width 6"]:
+def _image(
+    recent: ViewPoints, older: ViewPoints, camera: Camera, reach_px: int
+) -> Float[Tensor, "height width 6"]:
     """Recent points first, older ones where those leave the image open, then gaps closed."""
-    recent, older = points.keep(points.is_recent), points.keep(~points.is_recent)
     surface = _surface(recent, camera, recent.radius_px.round())
-    recent = recent.keep(~_hidden(recent, surface, reach_px))
+    recent = recent.without(_hidden(recent, surface, reach_px))
     everywhere = torch.ones(camera.height_px, camera.width_px, dtype=torch.bool)
     image = _blend(recent, everywhere, camera)
     is_open = image[..., 4] == 0
     older = older.keep(_at(spread(is_open, reach_px), older))
     surface = torch.minimum(surface, _surface(older, camera, older.radius_px.round()))
-    older = older.keep(~_hidden(older, surface, reach_px))
+    older = older.without(_hidden(older, surface, reach_px))
     image = image + _blend(older, is_open, camera)
-    seen = ViewPoints(*(torch.cat(pair) for pair in zip(recent, older, strict=True)))
-    return image + _fill_gaps(image[..., 4], seen, camera)
+    return image + _fill_gaps(image[..., 4], (recent, older), camera)
 
 
 def view_points(
-    lidar_map: LidarMap, tracks: Sequence[ActorTrack], camera: Camera, timestamp_ns: int
-) -> ViewPoints:
+    lidar_map: LidarMap, actors: MovingBoxes, camera: Camera, timestamp_ns: int
+) -> tuple[ViewPoints, ViewPoints]:
     """Every map point within reach of the time that falls into the image, hidden or not.
 
-    Recent are street points within the window of the newest sweep at that time, and all actors'.
+    First the recent ones: street points within the window of the newest sweep at that time, and
+    all actors'.
     """
-    street = lidar_map.street
-    age_ns = (street.timestamp_ns - timestamp_ns).abs()
-    newest_ns = int(age_ns.min()) if len(age_ns) else 0
-    used = age_ns <= newest_ns + round(REACH_S * 1e9)
-    identity = torch.eye(4, dtype=torch.float64)
-    placed = _project(street, used, identity, camera, timestamp_ns)
-    parts = [placed._replace(is_recent=placed.age_s <= newest_ns * 1e-9 + WINDOW_S)]
-    for track in tracks:
-        points = lidar_map.actors.get(track.actor_id)
-        if points is None or not track.is_present(timestamp_ns):
-            continue
-        everything = torch.ones_like(points.has_colour)
-        world_from_box = track.pose_at(timestamp_ns)
-        parts.append(_project(points, everything, world_from_box, camera, timestamp_ns))
-    return ViewPoints(*(torch.cat(fields) for fields in zip(*parts, strict=True)))
+    newest_ns = lidar_map.newest_age_ns(timestamp_ns)
+    window_ns, reach_ns = (newest_ns + round(limit_s * 1e9) for limit_s in (WINDOW_S, REACH_S))
+    world = torch.eye(4, dtype=torch.float64)
+    street = _Projected.of(lidar_map.street, world, camera, timestamp_ns)
+    recent = [street.points(street.age_ns <= window_ns)]
+    older = street.points((street.age_ns > window_ns) & (street.age_ns <= reach_ns))
+    for track, world_from_box in actors.placed(timestamp_ns):
+        if (points := lidar_map.actors.get(track.actor_id)) is not None:
+            actor = _Projected.of(points, world_from_box, camera, timestamp_ns)
+            recent.append(actor.points(torch.ones_like(actor.age_ns, dtype=torch.bool)))
+    return ViewPoints.concatenate(recent), older
 
 
-def _project(
-    points: MapPoints,
-    used: Bool[Tensor, " points"],
-    world_from_points: Float[Tensor, "4 4"],
-    camera: Camera,
-    timestamp_ns: int,
-) -> ViewPoints:
-    """Bring points into the image; those outside it are dropped."""
-    camera_from_points = camera.camera_from_world @ world_from_points.to(torch.float64)
-    lens = torch.tensor(
-        [[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]],
-        dtype=torch.float64,
-    )
-    pixels_from_points = (lens @ camera_from_points[:3]).to(points.xyz_m)
-    columns = torch.addmm(pixels_from_points[:, 3:], pixels_from_points[:, :3], points.xyz_m.T)
-    u_depth, v_depth, depth_m = columns
-    inside = used & (depth_m > NEAR_M) & (u_depth >= 0) & (v_depth >= 0)
-    inside &= (u_depth < camera.width_px * depth_m) & (v_depth < camera.height_px * depth_m)
-    chosen = inside.nonzero()[:, 0]
-    depth_m = depth_m[chosen]
-    positions_uv = torch.stack([u_depth[chosen], v_depth[chosen]], dim=-1) / depth_m[:, None]
-    # rounding in the division may reach the far edge
-    positions_uv[:, 0].clamp_(max=camera.width_px - 1e-3)
-    positions_uv[:, 1].clamp_(max=camera.height_px - 1e-3)
-    focal_px = (camera.fx_px + camera.fy_px) / 2
-    footprint_px = points.range_m[chosen] * BEAM_SPACING_RAD * focal_px / depth_m
-    max_radius_px = max(MAX_RADIUS_RAD * focal_px, MIN_RADIUS_PX)
-    return ViewPoints(
-        positions_uv=positions_uv,
-        depth_m=depth_m,
-        radius_px=(footprint_px / 2).clamp(MIN_RADIUS_PX, max_radius_px),
-        rgb_u8=points.rgb_u8.index_select(0, chosen),
-        has_colour=points.has_colour[chosen],
-        age_s=(points.timestamp_ns[chosen] - timestamp_ns).abs().to(torch.float32) * 1e-9,
-        is_recent=torch.ones_like(chosen, dtype=torch.bool),
-    )
+class _Projected(NamedTuple):
+    """Points of the street or an actor in the image: which, and where."""
+
+    body: MapPoints
+    rows: Int[Tensor, " points"]
+    positions_uv: Float[Tensor, "points 2"]
+    depth_m: Float[Tensor, " points"]
+    age_ns: Int[Tensor, " points"]
+    focal_px: float
+
+    @classmethod
+    def of(
+        cls,
+        body: MapPoints,
+        world_from_body: Float[Tensor, "4 4"],
+        camera: Camera,
+        timestamp_ns: int,
+    ) -> "_Projected":
+        """Bring points into the image; those outside it are dropped."""
+        camera_from_body = camera.camera_from_world @ world_from_body.to(torch.float64)
+        lens = torch.tensor(
+            [[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]],
+            dtype=torch.float64,
+        )
+        found = project_inside(
+            body.xyz_m.contiguous().numpy(),
+            (lens @ camera_from_body[:3]).numpy(),
+            camera.width_px,
+            camera.height_px,
+            NEAR_M,
+        )
+        rows, positions_uv, depth_m = (torch.from_numpy(column) for column in found)
+        age_ns = (body.timestamp_ns.index_select(0, rows) - timestamp_ns).abs()
+        focal_px = (camera.fx_px + camera.fy_px) / 2
+        return cls(body, rows, positions_uv, depth_m, age_ns, focal_px)
+
+    def points(self, chosen: Bool[Tensor, " points"]) -> ViewPoints:
+        """Those that are marked, with what they carry."""
+        places = chosen.nonzero()[:, 0]
+        rows, depth_m = self.rows.index_select(0, places), self.depth_m.index_select(0, places)
+        range_m = self.body.range_m.index_select(0, rows)
+        max_radius_px = max(MAX_RADIUS_RAD * self.focal_px, MIN_RADIUS_PX)
+        half_footprint_px = range_m * (BEAM_SPACING_RAD * self.focal_px / 2) / depth_m
+        return ViewPoints(
+            positions_uv=self.positions_uv.index_select(0, places),
+            depth_m=depth_m,
+            radius_px=half_footprint_px.clamp(MIN_RADIUS_PX, max_radius_px),
+            rgb_u8=self.body.rgb_u8.index_select(0, rows),
+            has_colour=self.body.has_colour.index_select(0, rows),
+            age_s=self.age_ns.index_select(0, places).to(torch.float32) * 1e-9,
+        )
 
 
 def _hidden(
     points: ViewPoints, surface: Float[Tensor, "height width"], reach_px: int
 ) -> Bool[Tensor, " points"]:
     """Whether nearer surface surrounds a point in its neighbourhood."""
-    behind = curtain(surface, reach_px, HIDDEN_DIRECTIONS)
+    behind = curtain(surface, reach_px)
     return _at(behind, points) < points.depth_m * (1 - HIDDEN_TOLERANCE)
 
 
@@ -212,12 +232,15 @@ def _blend(
 
 
 def _fill_gaps(
-    depth_m: Float[Tensor, "height width"], points: ViewPoints, camera: Camera
+    depth_m: Float[Tensor, "height width"], parts: Sequence[ViewPoints], camera: Camera
 ) -> Float[Tensor, "height width 6"]:
     """What wider discs give in the gaps of a surface; 0 elsewhere."""
     reach_px = math.ceil(GAP_WIDENING * MAX_RADIUS_RAD * camera.fx_px)
     gaps = surface_gaps(depth_m, reach_px, GAP_DIRECTIONS, depth_range=GAP_DEPTH_RANGE)
-    wide = points.keep(_at(spread(gaps, reach_px), points))
+    around = spread(gaps, reach_px)
+    wide = ViewPoints.concatenate(
+        [part.keep(_at(around, part) & part.depth_m.isfinite()) for part in parts]
+    )
     wide = wide._replace(radius_px=wide.radius_px * GAP_WIDENING)
     surface = _surface(wide, camera, wide.radius_px.ceil())
     return _means_on(torch.where(gaps & surface.isfinite(), surface, 0), wide)
@@ -233,8 +256,8 @@ def _surface(
 
 def _at(image: Shaped[Tensor, "height width"], points: ViewPoints) -> Shaped[Tensor, " points"]:
     """The values of an image in the pixels of the points."""
-    column, row = points.positions_uv.floor().long().unbind(-1)
-    return image[row, column]
+    column, row = points.positions_uv.int().unbind(-1)
+    return image.reshape(-1).index_select(0, row * image.shape[1] + column)
 
 
 def _means_on(

@@ -4,7 +4,7 @@ The street stands in the world, each moving actor in the frame of its box; metre
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -84,3 +84,11 @@ class LidarMap:
     """In the world."""
     actors: dict[str, MapPoints]
     """By actor id, in the box frame, from the whole log; only moving actors with points."""
+    _newest_age_ns: dict[int, int] = field(default_factory=dict, init=False, repr=False)
+
+    def newest_age_ns(self, timestamp_ns: int) -> int:
+        """How far in time the nearest street point is; kept, as many views share a time."""
+        if timestamp_ns not in self._newest_age_ns:
+            age_ns = (self.street.timestamp_ns - timestamp_ns).abs()
+            self._newest_age_ns[timestamp_ns] = int(age_ns.min()) if len(age_ns) else 0
+        return self._newest_age_ns[timestamp_ns]

@@ -9,10 +9,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
-from lidarpainter_models.scenes.tracks import ActorTrack
+from lidarpainter_models.geometry.transforms import invert_rigid
+from lidarpainter_models.kernels.box_owners import NO_BOX, box_owners
+from lidarpainter_models.scenes.tracks import PRESENCE_MARGIN_NS, ActorTrack, TrackPoses
 
-BACKGROUND = -1
+BACKGROUND = NO_BOX
 """Actor index of a point that no moving box holds."""
 MARGIN_M = 0.15  # boxes are grown by this much to the sides and upwards before points are tested
 FLOOR_M = 0.1
@@ -20,42 +21,45 @@ FLOOR_M = 0.1
 
 
 class MovingBoxes:
-    """The boxes of all moving actors of a log; poses are kept for every time asked for."""
+    """The boxes of all moving actors of a log."""
 
     def __init__(self, tracks: Sequence[ActorTrack]) -> None:
         """Take the tracks; their order gives the actor indices."""
         self.tracks = tuple(tracks)
-        self._poses: dict[tuple[int, int], Tensor | None] = {}
+        self._poses = TrackPoses.of(tracks)
+        self._size_m = torch.stack([track.size_m for track in tracks]) if tracks else None
 
-    def pose(self, index: int, timestamp_ns: int) -> Float[Tensor, "4 4"] | None:
-        """`world_from_box` (float64) of an actor, None while it is absent."""
-        place = (index, timestamp_ns)
-        if place not in self._poses:
-            track = self.tracks[index]
-            is_present = track.is_present(timestamp_ns)
-            self._poses[place] = track.pose_at(timestamp_ns).double() if is_present else None
-        return self._poses[place]
+    def placed(self, timestamp_ns: int) -> list[tuple[ActorTrack, Float[Tensor, "4 4"]]]:
+        """The actors that are there at a time, each with its `world_from_box` (float64)."""
+        present = self._poses.present(timestamp_ns).tolist()
+        poses = self._poses.all_at(timestamp_ns).unbind()
+        everybody = zip(present, self.tracks, poses, strict=True)
+        return [(track, pose) for is_there, track, pose in everybody if is_there]
 
     def owners(
-        self, points_world: Float[Tensor, "points 3"], timestamp_ns: int
+        self,
+        points_world: Float[Tensor, "points 3"],
+        timestamp_ns: int,
+        *,
+        floor_m: float = FLOOR_M,
+        presence_margin_ns: int = PRESENCE_MARGIN_NS,
     ) -> Int[Tensor, " points"]:
         """Index of the actor that holds each point at a time, or `BACKGROUND`.
 
-        Boxes are grown a little, but not into the road beside and under the actor.
+        Boxes are grown a little, but not into the road beside and under the actor: what is lower
+        than `floor_m` over the bottom of a box must be inside the true box.
         """
-        owners = torch.full(points_world.shape[:1], BACKGROUND, device=points_world.device)
-        x_m = points_world[:, 0].contiguous()
-        for index, track in enumerate(self.tracks):
-            world_from_box = self.pose(index, timestamp_ns)
-            if world_from_box is None:
-                continue
-            half_m = track.size_m.to(points_world) / 2
-            reach_m = float(half_m.norm()) + 2 * MARGIN_M
-            near = ((x_m - float(world_from_box[0, 3])).abs() <= reach_m).nonzero()[:, 0]
-            box_from_world = invert_rigid(world_from_box).to(points_world)
-            held = self._holds(transform_points(box_from_world, points_world[near]), half_m)
-            owners[near[held]] = index
-        return owners
+        present = self._poses.present(timestamp_ns, presence_margin_ns).nonzero()[:, 0]
+        if self._size_m is None or not len(present):
+            return torch.full(points_world.shape[:1], BACKGROUND)
+        boxes = box_owners(
+            points_world,
+            invert_rigid(self._poses.all_at(timestamp_ns)[present]),
+            self._size_m[present],
+            margin_m=MARGIN_M,
+            floor_m=floor_m,
+        )
+        return torch.where(boxes == NO_BOX, BACKGROUND, present[boxes])
 
     def moved(
         self,
@@ -66,23 +70,15 @@ class MovingBoxes:
         to_ns: int,
     ) -> tuple[Float[Tensor, "points 3"], Bool[Tensor, " points"]]:
         """Where the points are at another time, and whether their actor is there then."""
-        moved = points_world.clone()
-        present = torch.ones_like(owners, dtype=torch.bool)
         carried = (owners != BACKGROUND).nonzero()[:, 0]
-        for index in owners[carried].unique().tolist():
-            rows = carried[owners[carried] == index]
-            before, after = self.pose(index, from_ns), self.pose(index, to_ns)
-            if before is None or after is None:
-                present[rows] = False
-                continue
-            later_from_world = (after @ invert_rigid(before)).to(points_world)
-            moved[rows] = transform_points(later_from_world, points_world[rows])
+        if not len(carried):
+            return points_world, torch.ones_like(owners, dtype=torch.bool)
+        before, after = self._poses.all_at(from_ns), self._poses.all_at(to_ns)
+        later_from_world = (after @ invert_rigid(before)).to(points_world)[owners[carried]]
+        turned = (later_from_world[:, :3, :3] @ points_world[carried, :, None])[..., 0]
+        moved = points_world.clone()
+        moved[carried] = turned + later_from_world[:, :3, 3]
+        present = torch.ones_like(owners, dtype=torch.bool)
+        is_there = self._poses.present(from_ns) & self._poses.present(to_ns)
+        present[carried] = is_there[owners[carried]]
         return moved, present
-
-    def _holds(
-        self, points_box: Float[Tensor, "points 3"], half_m: Float[Tensor, "3"]
-    ) -> Bool[Tensor, " points"]:
-        over_floor_m = points_box[:, 2] + half_m[2]
-        grown = (points_box.abs() <= half_m + MARGIN_M).all(dim=-1)
-        inside = (points_box[:, :2].abs() <= half_m[:2]).all(dim=-1) & (over_floor_m > 0)
-        return grown & (inside | (over_floor_m > FLOOR_M))

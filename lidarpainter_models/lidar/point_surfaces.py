@@ -23,7 +23,7 @@ def disc_surface(
 ) -> Float[Tensor, "height width"]:
     """Depth of the nearest disc in each pixel, infinity where there is none."""
     nearest = splat_points(
-        positions_uv.floor().to(torch.int64),
+        positions_uv,
         depth_m,
         height_px=height_px,
         width_px=width_px,
@@ -33,10 +33,8 @@ def disc_surface(
     return torch.cat([depth_m, beyond])[nearest]  # index -1 takes infinity
 
 
-def curtain(
-    surface: Float[Tensor, "height width"], reach_px: int, num_directions: int
-) -> Float[Tensor, "height width"]:
-    """The depth beyond which `num_directions` of the 8 directions meet nearer surface.
+def curtain(surface: Float[Tensor, "height width"], reach_px: int) -> Float[Tensor, "height width"]:
+    """The depth beyond which each of the 8 directions meets nearer surface.
 
     A direction is a wedge, not a ray: beyond its first pixel it is three pixels wide, so that it
     does not slip between the points of a sparse surface.
@@ -45,15 +43,15 @@ def curtain(
     wide = -torch.nn.functional.max_pool2d(-surface[None], 3, 1, 1)[0]
     narrow = torch.nn.functional.pad(surface, [reach_px] * 4, value=torch.inf)
     wide = torch.nn.functional.pad(wide, [reach_px] * 4, value=torch.inf)
-    nearest = []
+    behind = torch.zeros_like(surface)
     for step_v, step_u in DIRECTIONS:
         best = torch.full_like(surface, torch.inf)
         for step in range(1, reach_px + 1):
             top, left = reach_px + step * step_v, reach_px + step * step_u
             layer = narrow if step == 1 else wide
             torch.minimum(best, layer[top : top + height_px, left : left + width_px], out=best)
-        nearest.append(best)
-    return torch.stack(nearest).kthvalue(num_directions, dim=0).values
+        torch.maximum(behind, best, out=behind)
+    return behind
 
 
 def surface_gaps(

@@ -5,18 +5,14 @@ sees over roofs and behind posts; a point with nearer returns above or beside it
 Nearer returns below it hide nothing: that is how a road looks.
 """
 
-from collections.abc import Sequence
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
+from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
-from lidarpainter_models.scenes.tracks import ActorTrack
 
 MIN_DEPTH_M = 1.0  # nearer returns are the car itself or noise
 MAX_DEPTH_M = 250.0  # beyond the reach of the sensors in use
@@ -46,35 +42,13 @@ def sparse_lidar_depth(
     return torch.where(is_visible & nearest.isfinite(), nearest, torch.zeros_like(nearest))
 
 
-def move_actor_points(
-    points_world: Float[Tensor, "points 3"],
-    tracks: Sequence[ActorTrack],
-    *,
-    from_ns: int,
-    to_ns: int,
-    margin_m: float = 0.15,
-) -> Float[Tensor, "points 3"]:
-    """Carry the points inside moving boxes from where they were scanned to another time."""
-    moved = points_world.clone()
-    for track in tracks:
-        if not (track.is_present(from_ns, 0) and track.is_moving):
-            continue
-        world_from_box = track.pose_at(from_ns).double()
-        inside = is_inside_box(points_world, world_from_box, track.size_m, margin_m=margin_m)
-        step = track.pose_at(to_ns).double() @ invert_rigid(world_from_box)
-        moved[inside] = transform_points(step, points_world[inside].double()).float()
-    return moved
-
-
 def points_at_exposure(scene: DrivingScene, view: RecordedView) -> Float[Tensor, "points 3"]:
     """The sweeps of a view's frame in the world, moving actors where they are in its image."""
-    clouds = [
-        move_actor_points(
-            scene.read_sweep(sweep).xyz_m,
-            scene.tracks,
-            from_ns=sweep.timestamp_ns,
-            to_ns=view.timestamp_ns,
-        )
-        for sweep in scene.sweeps_of(view.frame_index)
-    ]
+    boxes = MovingBoxes([track for track in scene.tracks if track.is_moving])
+    clouds = []
+    for sweep in scene.sweeps_of(view.frame_index):
+        points_world, taken_ns = scene.read_sweep(sweep).xyz_m, sweep.timestamp_ns
+        owners = boxes.owners(points_world, taken_ns, floor_m=-torch.inf, presence_margin_ns=0)
+        moved, _ = boxes.moved(points_world, owners, from_ns=taken_ns, to_ns=view.timestamp_ns)
+        clouds.append(moved)
     return torch.cat(clouds) if clouds else torch.zeros(0, 3)

@@ -152,8 +152,8 @@ def test_a_painter_that_makes_things_worse_gives_no_guidance(builder, views):
 def test_no_view_is_painted_from_inside_a_wall_or_a_car(lidar_map, views, camera_at, moving_track):
     config = NovelGuidanceConfig()
     novel = novel_cameras(views, range(10), ego_path(), config=config)[0]
-    assert has_room(novel, lidar_map, [])
+    assert has_room(novel, lidar_map, MovingBoxes([]))
     in_wall = replace(novel, camera=camera_at(WALL_X_M, 2.0))
-    assert not has_room(in_wall, lidar_map, [])
+    assert not has_room(in_wall, lidar_map, MovingBoxes([]))
     car = moving_track((0.0, 2.0, 1.0), (5.0, 2.0, 1.0))
-    assert not has_room(novel, lidar_map, [car])
+    assert not has_room(novel, lidar_map, MovingBoxes([car]))

@@ -16,7 +16,9 @@ from torch import Tensor
 
 from lidarpainter_models import kernels
 from lidarpainter_models.errors import BackendError
+from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.kernels.backends import available_backends
+from lidarpainter_models.kernels.box_owners import box_owners
 from lidarpainter_models.kernels.point_blend import blend_points
 from lidarpainter_models.kernels.point_splat import splat_points
 from lidarpainter_models.kernels.ssim import l1_ssim_loss, ssim_map
@@ -75,7 +77,23 @@ def random_images(side_px: int, generator: torch.Generator) -> dict[str, Any]:
     }
 
 
+def random_boxes(count: int, generator: torch.Generator) -> dict[str, Any]:
+    tangents = 2 * torch.randn(7, 6, generator=generator).double()
+    return {
+        "points_m": 3 * torch.randn(count, 3, generator=generator),
+        "box_from_points": rigid_from_tangent(tangents),
+        "size_m": 1 + 3 * torch.rand(7, 3, generator=generator),
+    }
+
+
 CASES = {
+    "box_owners": Case(
+        random_boxes,
+        lambda points_m, box_from_points, size_m, backend: box_owners(
+            points_m, box_from_points, size_m, margin_m=0.2, floor_m=0.3, backend=backend
+        ),
+        tolerance=0.0,
+    ),
     "point_splat": Case(random_points, splat, tolerance=0.0),
     "point_blend": Case(random_discs, blend_points, tolerance=2e-5),
     "ssim": Case(

@@ -4,7 +4,7 @@ import torch
 
 from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.kernels.point_splat import splat_points
-from lidarpainter_models.kernels.point_splat.cpu import PIECE
+from lidarpainter_models.kernels.point_splat.cpu import LEAST_RUN
 
 
 def random_splat(num_points, seed, *, height_px=37, width_px=53, max_radius_px=3):
@@ -33,16 +33,16 @@ def test_fast_splat_keeps_the_same_points(num_points):
 
 
 def test_points_of_different_pieces_compete_for_a_pixel():
-    count = PIECE + 1000
+    count = LEAST_RUN + 1000
     inputs = random_splat(count, seed=1, max_radius_px=0)
     inputs["depth_m"] = torch.rand(count, generator=torch.Generator().manual_seed(2))
     inputs["depth_m"][::2] = 0.5  # ties across pieces go to the lower index
-    inputs["depth_m"][PIECE:] *= 1e-4
-    inputs["depth_m"][PIECE - 7] = 1e-9
+    inputs["depth_m"][LEAST_RUN:] *= 1e-4
+    inputs["depth_m"][LEAST_RUN - 7] = 1e-9
     expected = splat_points(**inputs, backend="reference")
     actual = splat_points(**inputs, backend="cpu")
     assert torch.equal(actual, expected)
-    assert set((actual.unique() >= PIECE).tolist()) == {False, True}
+    assert set((actual.unique() >= LEAST_RUN).tolist()) == {False, True}
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])

@@ -3,6 +3,7 @@ import torch
 from lidarpainter_models.lidar import lidar_images
 from lidarpainter_models.lidar.lidar_images import render_lidar
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
+from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 
 SECOND_NS = 1_000_000_000
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
@@ -43,7 +44,7 @@ def whole_wall(x_m, spacing_m=0.1):
 
 
 def test_a_dense_wall_fills_the_image(camera_at):
-    image = render_lidar(street(points(whole_wall(10.0))), [], camera_at(), 0)
+    image = render_lidar(street(points(whole_wall(10.0))), MovingBoxes([]), camera_at(), 0)
     assert image.hit.all()
     assert torch.allclose(image.rgb, torch.tensor([1.0, 0, 0]).expand_as(image.rgb))
     assert torch.allclose(image.depth_m, torch.tensor(10.0))
@@ -51,7 +52,7 @@ def test_a_dense_wall_fills_the_image(camera_at):
 
 
 def test_an_empty_map_gives_a_black_image(camera_at):
-    image = render_lidar(street(points(torch.zeros(0, 3))), [], camera_at(), 0)
+    image = render_lidar(street(points(torch.zeros(0, 3))), MovingBoxes([]), camera_at(), 0)
     assert not image.hit.any()
     assert (image.rgb == 0).all()
     assert (image.depth_m == 0).all()
@@ -62,7 +63,7 @@ def test_background_does_not_show_between_foreground_points(camera_at, monkeypat
     near = wall(5.0, left_m=1.0, right_m=-1.0, bottom_m=0.5, top_m=2.5, spacing_m=0.33)
     far = points(whole_wall(20.0), GREEN)
     monkeypatch.setattr(lidar_images, "HIDDEN_REACH_RAD", 0.1)
-    image = render_lidar(street(points(near), far), [], camera_at(), 0)
+    image = render_lidar(street(points(near), far), MovingBoxes([]), camera_at(), 0)
     inside = image.rgb[16:32, 24:40]  # well within the foreground
     assert (inside[..., 1] == 0).all()
     assert inside[..., 0].max() == 1
@@ -71,7 +72,9 @@ def test_background_does_not_show_between_foreground_points(camera_at, monkeypat
 
 def test_dense_foreground_keeps_its_silhouette(camera_at):
     near = wall(5.0, left_m=1.0, right_m=-1.0, bottom_m=-5.0, top_m=5.0, spacing_m=0.05)
-    image = render_lidar(street(points(near), points(whole_wall(20.0), GREEN)), [], camera_at(), 0)
+    image = render_lidar(
+        street(points(near), points(whole_wall(20.0), GREEN)), MovingBoxes([]), camera_at(), 0
+    )
     # the wall spans columns 20..44; its discs would reach one pixel further
     assert (image.rgb[:, 21:43, 0] == 1).all()
     assert (image.rgb[:, :19, 1] == 1).all()
@@ -85,7 +88,7 @@ def test_a_road_at_a_grazing_angle_is_not_culled(camera_at):
         indexing="ij",
     )
     road = torch.stack([x_m, y_m, torch.zeros_like(x_m)], dim=-1)
-    image = render_lidar(street(points(road)), [], camera_at(), 0)
+    image = render_lidar(street(points(road)), MovingBoxes([]), camera_at(), 0)
     # rows 27 (30 m) to 47 (4 m) see it, and depths grow by up to a third from row to row
     rows = torch.arange(27, 48)
     assert image.hit[rows, 31].all()
@@ -100,7 +103,7 @@ def half_wall(x_m):
 def test_older_points_fill_only_what_newer_ones_leave_open(camera_at):
     new = points(half_wall(10.0))
     old = points(whole_wall(8.0), BLUE, timestamp_ns=-3 * SECOND_NS)
-    image = render_lidar(street(new, old), [], camera_at(), 0)
+    image = render_lidar(street(new, old), MovingBoxes([]), camera_at(), 0)
     # the older wall stands in front, but the newer one was seen through it
     assert (image.rgb[:, :30, 0] == 1).all()
     assert (image.rgb[:, 34:, 2] == 1).all()
@@ -110,14 +113,14 @@ def test_older_points_fill_only_what_newer_ones_leave_open(camera_at):
 def test_points_out_of_reach_in_time_are_not_drawn(camera_at):
     new = points(half_wall(10.0))
     old = points(whole_wall(8.0), BLUE, timestamp_ns=-11 * SECOND_NS)
-    image = render_lidar(street(new, old), [], camera_at(), 0)
+    image = render_lidar(street(new, old), MovingBoxes([]), camera_at(), 0)
     assert not image.hit[:, 34:].any()
 
 
 def test_ahead_of_the_log_the_newest_points_are_drawn(camera_at):
     newest = points(whole_wall(10.0), timestamp_ns=-5 * SECOND_NS)
     older = points(whole_wall(9.0), BLUE, timestamp_ns=-8 * SECOND_NS)
-    image = render_lidar(street(older, newest), [], camera_at(), 0)
+    image = render_lidar(street(older, newest), MovingBoxes([]), camera_at(), 0)
     assert (image.rgb[..., 0] == 1).all()
     assert torch.allclose(image.age_s, torch.tensor(5.0))
 
@@ -125,7 +128,7 @@ def test_ahead_of_the_log_the_newest_points_are_drawn(camera_at):
 def test_newer_points_outweigh_older_ones(camera_at):
     wall_m = whole_wall(10.0)
     old, new = points(wall_m, BLUE, timestamp_ns=-SECOND_NS), points(wall_m, RED)
-    image = render_lidar(street(old, new), [], camera_at(), 0)
+    image = render_lidar(street(old, new), MovingBoxes([]), camera_at(), 0)
     assert image.rgb[..., 0].min() > 0.9  # e^-2.5 of blue
 
 
@@ -134,18 +137,20 @@ def test_actors_are_carried_by_their_track_and_absent_ones_left_out(camera_at, m
     actor = points(side, BLUE, timestamp_ns=40 * SECOND_NS, range_m=10.0)
     lidar_map = street(points(torch.zeros(0, 3)), actors={"car": actor})
     track = moving_track((10.0, 3.0, 1.5), (10.0, -3.0, 1.5))
-    image = render_lidar(lidar_map, [track], camera_at(), SECOND_NS)
+    image = render_lidar(lidar_map, MovingBoxes([track]), camera_at(), SECOND_NS)
     columns = image.hit.any(dim=0).nonzero()[:, 0]
     assert columns.min() in (43, 44)  # u = 32 + 60 * (3 -+ 1) / 10
     assert columns.max() in (55, 56)
     assert (image.rgb[image.hit] == torch.tensor([0, 0, 1.0])).all()
-    assert not render_lidar(lidar_map, [track], camera_at(), 9 * SECOND_NS).hit.any()
-    assert not render_lidar(lidar_map, [], camera_at(), SECOND_NS).hit.any()
+    assert not render_lidar(lidar_map, MovingBoxes([track]), camera_at(), 9 * SECOND_NS).hit.any()
+    assert not render_lidar(lidar_map, MovingBoxes([]), camera_at(), SECOND_NS).hit.any()
 
 
 def test_points_without_colour_hide_and_give_depth_but_are_no_hit(camera_at):
     bare = points(whole_wall(5.0), has_colour=False)
-    image = render_lidar(street(bare, points(whole_wall(20.0), GREEN)), [], camera_at(), 0)
+    image = render_lidar(
+        street(bare, points(whole_wall(20.0), GREEN)), MovingBoxes([]), camera_at(), 0
+    )
     assert torch.allclose(image.depth_m, torch.tensor(5.0))
     assert not image.hit.any()
     assert (image.rgb == 0).all()
@@ -156,6 +161,6 @@ def test_a_gap_in_one_surface_is_closed_but_its_outside_is_not(camera_at, monkey
     gap = ((wall_m[:, 1].abs() < 0.25) & ((wall_m[:, 2] - 1.5).abs() < 0.25))[:, None]
     monkeypatch.setattr(lidar_images, "BEAM_SPACING_RAD", 0.04)
     monkeypatch.setattr(lidar_images, "MAX_RADIUS_RAD", 0.03)
-    image = render_lidar(street(points(wall_m[~gap[:, 0]])), [], camera_at(), 0)
+    image = render_lidar(street(points(wall_m[~gap[:, 0]])), MovingBoxes([]), camera_at(), 0)
     assert image.hit[20:28, 28:36].all()
     assert not image.hit[:, :17].any()

@@ -8,10 +8,8 @@ from toy_street import ToyStreet
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.gaussians.fitting.images import full_image, half_image, shrink_depth
 from lidarpainter_models.kernels.pixel_losses import OPEN, SKY, SOLID
-from lidarpainter_models.lidar.sparse_depth import (
-    move_actor_points,
-    sparse_lidar_depth,
-)
+from lidarpainter_models.lidar.moving_boxes import MovingBoxes
+from lidarpainter_models.lidar.sparse_depth import sparse_lidar_depth
 from lidarpainter_models.observations.fit_size import ObservationConfig, shrink_image
 from lidarpainter_models.observations.preparation import prepare_observations
 from lidarpainter_models.observations.stored_form import (
@@ -94,9 +92,9 @@ def test_empty_sweep_gives_empty_depth():
 
 
 def test_points_inside_a_moving_box_go_with_it():
-    track = car_track(4)
+    boxes = MovingBoxes([car_track(4)])
     points = torch.tensor([[6.0, -2.0, 0.6], [6.0, 3.0, 0.6]])
-    moved = move_actor_points(points, [track], from_ns=0, to_ns=2 * FRAME_NS)
+    moved, _ = boxes.moved(points, boxes.owners(points, 0), from_ns=0, to_ns=2 * FRAME_NS)
     assert torch.allclose(moved, torch.tensor([[6.0, 0.0, 0.6], [6.0, 3.0, 0.6]]), atol=1e-5)
 
 

@@ -6,7 +6,7 @@ pixel for r = 0, 3 x 3 for r = 1, rounder from there on.
 """
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from lidarpainter_models.errors import ShapeError
@@ -14,7 +14,7 @@ from lidarpainter_models.kernels.backends import Backend, implementation
 
 
 def splat_points(
-    pixels_uv: Int[Tensor, "points 2"],
+    pixels_uv: Shaped[Tensor, "points 2"],
     depth_m: Float[Tensor, " points"],
     *,
     height_px: int,
@@ -25,8 +25,8 @@ def splat_points(
     """Index (int64) of the nearest point in each pixel, or -1; ties go to the lower index.
 
     Args:
-        pixels_uv: Column and row of each point's pixel. A point outside the image still covers
-            what its disc reaches of it.
+        pixels_uv: Column and row of each point's pixel; continuous positions are floored. A point
+            outside the image still covers what its disc reaches of it.
         depth_m: Camera z. Points at or behind the camera (<= 0) and at no finite depth are skipped.
         height_px: Rows of the image.
         width_px: Columns of the image.

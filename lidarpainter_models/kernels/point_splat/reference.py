@@ -5,12 +5,12 @@ first, then the lowest index among the points at that depth.
 """
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 
 def splat_points(
-    pixels_uv: Int[Tensor, "points 2"],
+    pixels_uv: Shaped[Tensor, "points 2"],
     depth_m: Float[Tensor, " points"],
     radius_px: Int[Tensor, " points"],
     height_px: int,
@@ -18,7 +18,7 @@ def splat_points(
 ) -> Int[Tensor, "height width"]:
     """Index of the nearest point in each pixel, or -1."""
     points = depth_m.shape[0]
-    pixels = pixels_uv.to(torch.int64)
+    pixels = pixels_uv.floor().to(torch.int64)
     index = torch.arange(points, device=depth_m.device)
     is_seen = depth_m.isfinite() & (depth_m > 0)
     nearest_m = depth_m.new_full((height_px * width_px,), torch.inf)
