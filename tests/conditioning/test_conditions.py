@@ -13,6 +13,7 @@ from lidarpainter_models.conditioning.novel_guidance import (
 )
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.trajectories import Shift
+from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.painter.protocol import Painting
 
 WALL_X_M = 12.0
