@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 import torch
 
+from lidarpainter_models.checks.lidar_reach import LidarReach, could_any_hit
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.tracks import ActorTrack
@@ -27,23 +28,23 @@ _NUM_RECOUNTED = 20
 
 
 def check_box_points(scene: DrivingScene) -> tuple[Verdict, str]:
-    """Whether near moving boxes hold LiDAR points, and as many as stated."""
-    held = total = 0
-    for track in scene.tracks:
-        if track.is_moving:
-            for position, frame_index in enumerate(track.frame_indices.tolist()):
-                ego = scene.world_from_ego[scene.frame_position(frame_index), :3, 3]
-                if (track.world_from_box[position, :3, 3] - ego).norm() < NEAR_M:
-                    total += 1
-                    held += int(track.num_points[position] > 0)
-    if total == 0:
+    """Whether near moving boxes that a LiDAR could hit hold points, and as many as stated."""
+    near = _near_moving_boxes(scene)
+    if not near:
         return "ok", f"no moving box within {NEAR_M:.0f} m"
-    detail = f"{held} of {total} moving boxes within {NEAR_M:.0f} m hold points"
+    held = [holds_points for could_be_hit, holds_points in near if could_be_hit]
+    left_out = len(near) - len(held)
+    where = "in the sector and range that a LiDAR covered"
+    if not held:
+        return "warn", f"none of {left_out} moving boxes within {NEAR_M:.0f} m lies {where}"
+    detail = f"{sum(held)} of {len(held)} moving boxes within {NEAR_M:.0f} m hold points"
+    if left_out:
+        detail += f" ({left_out} more left out: not {where})"
     worst = _largest_miscount(scene)
     if worst:
         return "warn", f"{detail}; {worst}"
-    if held < MIN_HELD_SHARE * total:
-        return "fail" if held < total / 2 else "warn", detail
+    if sum(held) < MIN_HELD_SHARE * len(held):
+        return "fail" if sum(held) < len(held) / 2 else "warn", detail
     return "ok", detail
 
 
@@ -79,6 +80,31 @@ def check_duplicate_tracks(scene: DrivingScene) -> tuple[Verdict, str]:
     if twins:
         return "warn", f"{len(twins)} pairs stand in the same place: {', '.join(twins[:3])}"
     return "ok", f"{len(scene.tracks)} tracks, each in a place of its own"
+
+
+def _near_moving_boxes(scene: DrivingScene) -> list[tuple[bool, bool]]:
+    """Of each box of a moving actor near the car: could a LiDAR hit it, does it hold points."""
+    reaches: dict[int, list[LidarReach]] = {}
+    found = []
+    for track in scene.tracks:
+        if not track.is_moving:
+            continue
+        for row, frame_index in enumerate(track.frame_indices.tolist()):
+            world_from_box = track.world_from_box[row]
+            ego_m = scene.world_from_ego[scene.frame_position(frame_index), :3, 3]
+            if (world_from_box[:3, 3] - ego_m).norm() < NEAR_M:
+                if frame_index not in reaches:
+                    reaches[frame_index] = _reaches(scene, frame_index)
+                could_be_hit = could_any_hit(reaches[frame_index], world_from_box, track.size_m)
+                found.append((could_be_hit, bool(track.num_points[row] > 0)))
+    return found
+
+
+def _reaches(scene: DrivingScene, frame_index: int) -> list[LidarReach]:
+    return [
+        LidarReach.of(scene.read_sweep(sweep).xyz_m, sweep.world_from_lidar)
+        for sweep in scene.sweeps_of(frame_index)
+    ]
 
 
 def _are_twins(first: ActorTrack, second: ActorTrack) -> bool:

@@ -95,6 +95,17 @@ class CameraTurn:
         is_turned = self.peak >= MIN_PEAK and turned_deg > MAX_TURN_DEG
         return is_turned or (self.roll_peak >= MIN_PEAK and abs(self.roll_deg) > MAX_TURN_DEG)
 
+    def __str__(self) -> str:
+        yaw_pitch = f"yaw {self.yaw_deg:+.2f} pitch {self.pitch_deg:+.2f}"
+        roll = f"roll {self.roll_deg:+.2f}"
+        return f"{yaw_pitch} {_trust(self.peak)}, {roll} {_trust(self.roll_peak)}"
+
+
+def _trust(peak: float) -> str:
+    if peak >= MIN_PEAK:
+        return "trusted"
+    return f"not trusted (stands out by {peak:.1f} deviations from other turns, not {MIN_PEAK})"
+
 
 def check_calibration(scene: DrivingScene) -> tuple[Verdict, str]:
     """Whether depth edges lie on image edges without turning any camera."""
@@ -105,14 +116,14 @@ def check_calibration(scene: DrivingScene) -> tuple[Verdict, str]:
     wrong, unsure, details = [], [], []
     for name, turn in found.items():
         if turn is None:
-            details.append(f"{name} cannot be told (small image or few edges)")
+            details.append(f"{name} cannot be told ({_why_untold(scene, name)})")
             continue
-        details.append(f"{name} {turn.yaw_deg:+.2f} {turn.pitch_deg:+.2f} {turn.roll_deg:+.2f}")
+        details.append(f"{name} {turn}")
         if turn.is_wrong:
             wrong.append(name)
         elif turn.peak < MIN_PEAK:
             unsure.append(name)
-    detail = f"degrees of yaw, pitch and roll off: {', '.join(details)}"
+    detail = f"degrees off: {'; '.join(details)}"
     if wrong:
         return "fail", f"{', '.join(wrong)} turned on its mount; {detail}"
     if unsure:
@@ -176,7 +187,18 @@ def _reduced(camera: Camera) -> Camera:
 
 
 def _is_fine_enough(camera: Camera) -> bool:
-    return camera.fx_px * math.radians(1.0) >= _MIN_PX_PER_DEG
+    return _px_per_deg(camera) >= _MIN_PX_PER_DEG
+
+
+def _px_per_deg(camera: Camera) -> float:
+    return camera.fx_px * math.radians(1.0)
+
+
+def _why_untold(scene: DrivingScene, camera_name: str) -> str:
+    px_per_deg = min(_px_per_deg(_reduced(view.camera)) for view in scene.views_of(camera_name))
+    if px_per_deg < _MIN_PX_PER_DEG:
+        return f"images of {px_per_deg:.1f} pixels a degree, {_MIN_PX_PER_DEG} are needed"
+    return f"fewer than {MIN_EDGE_POINTS} points at depth edges in its images"
 
 
 def depth_edges(scene: DrivingScene, frame_index: int) -> dict[str, EdgePoints]:

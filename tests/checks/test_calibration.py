@@ -1,12 +1,13 @@
 """A camera that looks a degree aside is found, on a street and on the real log; sound ones pass."""
 
+import re
 from dataclasses import replace
 
 import pytest
 import torch
 from drawn_streets import drawn_street
 
-from lidarpainter_models.checks.calibration import check_calibration
+from lidarpainter_models.checks.calibration import CameraTurn, check_calibration
 from lidarpainter_models.checks.doctor import check_licence
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.readers import ingest_scene
@@ -44,9 +45,23 @@ def turned(path, camera_name, axis, angle_deg):
     return scene
 
 
-def test_sound_cameras_of_a_street_pass(street):
-    verdict, detail = check_calibration(DrivingScene.open(street))
+def test_sound_cameras_of_a_street_pass_and_each_figure_says_whether_it_is_trusted(street):
+    scene = DrivingScene.open(street)
+    verdict, detail = check_calibration(scene)
     assert verdict == "ok", detail
+    figures = re.findall(r"(?:roll|pitch) [+-]\d\.\d\d (trusted|not trusted)", detail)
+    assert len(figures) == 2 * len(scene.camera_names), detail
+
+
+def test_roll_that_does_not_stand_out_is_said_to_be_not_trusted():
+    turn = CameraTurn(
+        yaw_deg=0.25, pitch_deg=0.0, peak=5.2, roll_deg=-2.25, roll_peak=2.13, num_points=900
+    )
+    assert not turn.is_wrong
+    assert str(turn) == (
+        "yaw +0.25 pitch +0.00 trusted, roll -2.25 not trusted (stands out by 2.1 deviations from "
+        "other turns, not 3.5)"
+    )
 
 
 @pytest.mark.parametrize("axis", [PITCH, YAW, ROLL])
@@ -65,7 +80,7 @@ def test_camera_turned_beyond_the_search_is_not_called_sound(street):
 def test_small_images_cannot_tell(small_scene):
     verdict, detail = check_calibration(small_scene)
     assert verdict == "ok"
-    assert "front_camera cannot be told" in detail
+    assert "front_camera cannot be told (images of 0.7 pixels a degree" in detail
 
 
 @pytest.mark.slow

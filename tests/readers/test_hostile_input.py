@@ -14,6 +14,7 @@ from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.readers.pandaset import dataframe_pickle
 from lidarpainter_models.readers.pandaset.dataframe_pickle import read_table_bytes
 from lidarpainter_models.scenes import array_writer
+from lidarpainter_models.scenes.driving_scene import DrivingScene
 
 
 def refusal(log, store, **options):
@@ -41,7 +42,12 @@ def test_missing_camera_folder(pandaset, store):
     shutil.rmtree(pandaset.path / "camera/left_camera")
     kind, message = refusal(pandaset, store)
     assert kind is DataError
-    assert message.endswith("camera/left_camera: the camera folder is missing")
+    place, expected = message.split("; to read the others alone: --cameras ")
+    assert place.endswith("camera/left_camera: the camera folder is missing")
+    cameras = tuple(expected.split(","))
+    scene = DrivingScene.open(pandaset.ingest(store, cameras=cameras))
+    assert set(scene.camera_names) == set(cameras)
+    assert len(cameras) == 5
 
 
 def test_missing_image(pandaset, store):
@@ -90,12 +96,14 @@ def test_negative_focal_length(pandaset, store):
 
 def test_json_of_another_shape(pandaset, store):
     pandaset.write("lidar/poses.json", {"not": "a list"})
-    assert refusal(pandaset, store)[1].endswith("lidar/poses.json: holds no list")
+    assert refusal(pandaset, store)[1].endswith(
+        "lidar/poses.json: holds JSON object, expected list"
+    )
 
 
 def test_json_cut_off(pandaset, store):
     pandaset.write("lidar/poses.json", b'[{"position"')
-    assert "lidar/poses.json: not a JSON file" in refusal(pandaset, store)[1]
+    assert "lidar/poses.json: expected a JSON list, cannot be read (" in refusal(pandaset, store)[1]
 
 
 def empty_points(num_points=0):

@@ -148,9 +148,11 @@ class _RowStream:
                 break
             except (ValueError, RecursionError):
                 if len(self._text) - self._position > MAX_ROW_BYTES or not self._fill():
-                    raise self._damage("not a complete JSON row") from None
+                    raise self._damage(
+                        "not a complete JSON row, expected [{...}, {...}, ...]"
+                    ) from None
         if not isinstance(row, dict):
-            raise self._damage("an entry of the array is no row")
+            raise self._damage("an entry of the array is no row, expected [{...}, {...}, ...]")
         start, self._position = self._position, end
         if end - start > MAX_ROW_BYTES:
             raise self._damage(f"a row of more than {MAX_ROW_BYTES} bytes ends")

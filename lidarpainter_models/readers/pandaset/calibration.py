@@ -51,7 +51,11 @@ def read_camera(source: SourceFolder, name: str, num_frames: int) -> PandasetCam
     """
     folder = f"camera/{name}"
     if not (source.root / folder).is_dir():
-        raise DataError(f"{source.root / folder}: the camera folder is missing")
+        there = ",".join(
+            known for known in CAMERA_NAMES if (source.root / "camera" / known).is_dir()
+        )
+        hint = f"; to read the others alone: --cameras {there}" if there else ""
+        raise DataError(f"{source.root / folder}: the camera folder is missing{hint}")
     file = f"{folder}/intrinsics.json"
     values, where = source.read_json(file, dict), str(source.root / file)
     intrinsics = {f"{key}_px": _number(values, key, where) for key in ("fx", "fy", "cx", "cy")}

@@ -18,6 +18,7 @@ from lidarpainter_models.checks.doctor import (
     MAX_TURN_RADPS,
     sampled_positions,
 )
+from lidarpainter_models.checks.lidar_reach import LidarReach, could_any_hit
 from lidarpainter_models.checks.sweep_agreement import nearest_gap_m, points_near
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation
@@ -92,16 +93,30 @@ class DriveChecks:
         """
         if self._num_boxes >= MIN_BOXES and self._num_held == 0:
             raise DataError(
-                f"none of {self._num_boxes} boxes of moving actors within {NEAR_M:.0f} m holds a "
-                "LiDAR point, expected the poses of LiDARs and boxes to agree"
+                f"none of {self._num_boxes} boxes of moving actors within {NEAR_M:.0f} m that a "
+                "LiDAR could hit holds a point, expected the poses of LiDARs and boxes to agree"
             )
 
     def _count_boxes(self, content: FrameContent) -> None:
-        for box in content.boxes:
-            away_m = box.world_from_box[:3, 3] - content.world_from_ego[:3, 3]
-            if box.is_moving and float(away_m.norm()) < NEAR_M:
-                self._num_boxes += 1
-                self._num_held += box.num_points > 0
+        """Count boxes that a LiDAR could hit, until one that holds a point settles the matter."""
+        if self._num_held:
+            return
+        near = [
+            box
+            for box in content.boxes
+            if box.is_moving
+            and float((box.world_from_box - content.world_from_ego)[:3, 3].norm()) < NEAR_M
+        ]
+        self._num_held = sum(box.num_points > 0 for box in near)
+        if near and not self._num_held:
+            reaches = [
+                LidarReach.of(sweep.points.xyz_m, sweep.world_from_lidar)
+                for sweep in content.sweeps
+                if sweep.points.num_points
+            ]
+            self._num_boxes += sum(
+                could_any_hit(reaches, box.world_from_box, torch.tensor(box.size_m)) for box in near
+            )
 
     def _require_image(self, image: SourceImage, content: FrameContent) -> None:
         name, exposure_ns = image.record.camera_name, image.record.timestamp_ns

@@ -11,6 +11,7 @@ from lidarpainter_models.errors import DataError
 
 MAX_FILE_BYTES = 256 * 1024 * 1024
 """A file that is read whole may be no larger; the largest of PandaSet has 4 MB."""
+_JSON_KINDS: dict[type, str] = {dict: "object", list: "list"}
 
 
 class SourceFolder:
@@ -43,9 +44,11 @@ class SourceFolder:
         except (ValueError, RecursionError) as error:
             if isinstance(error, DataError):
                 raise
-            raise DataError(f"{self.root / name}: not a JSON file ({error})") from None
+            what = f"expected a JSON {_JSON_KINDS[kind]}, cannot be read ({error})"
+            raise DataError(f"{self.root / name}: {what}") from None
         if not isinstance(value, kind):
-            raise DataError(f"{self.root / name}: holds no {kind.__name__}")
+            found = _JSON_KINDS.get(type(value), type(value).__name__)
+            raise DataError(f"{self.root / name}: holds JSON {found}, expected {_JSON_KINDS[kind]}")
         return value
 
     def provenance(self) -> dict[str, object]:

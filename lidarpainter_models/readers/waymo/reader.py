@@ -16,8 +16,8 @@ the frame's timestamp. The points of the other LiDARs have been moved to the fra
 dataset, which does not say when they were measured: their time offsets are 0. The ring is the row
 of the range image, the highest beam is 0. Points in no-label zones are kept.
 
-A frame without a point or without an image, and a TOP image without its pixel poses (some
-derived files have none of these), is refused.
+A frame without a point or without an image of each camera that is read, and a TOP image without
+its pixel poses (some derived files have none of these), is refused.
 """
 
 import re
@@ -97,6 +97,11 @@ class WaymoLog:
             self.frame_indices = chosen_frames(self._segment.num_frames, frames, self.place)
             self._frames = {index: self._segment.read_frame(index) for index in self.frame_indices}
             self._cameras = chosen_cameras(cameras, CAMERA_NAMES.values(), self.place)
+            self._expected = [
+                name
+                for name in self._cameras
+                if cameras is not None or name in self._segment.cameras
+            ]
             require_drive(list(self._frames.values()))
             self._turn_s = _turn_s(self._frames)
             first = self._frames[self.frame_indices[0]]
@@ -117,6 +122,7 @@ class WaymoLog:
             if not sensors.images:
                 raise DataError("zero images, expected at least one")
             images = {image.camera_name: image for image in sensors.images}
+            self._require_images(images)
             time_s = self._time_s(frame, images)
             world_from_vehicle = self._world_from_global @ frame.global_from_vehicle
             points = FramePoints(time_s, self._top_position_m())
@@ -137,6 +143,14 @@ class WaymoLog:
                 sweeps=sweeps,
                 boxes=list(boxes),
             )
+
+    def _require_images(self, images: dict[str, WaymoImage]) -> None:
+        """Every camera takes an image a frame: a file that lacks one has lost it."""
+        missing = [name for name in self._expected if name not in images]
+        if missing:
+            others = ",".join(name for name in self._expected if name in images)
+            hint = f"; to read the others alone: --cameras {others}" if others else ""
+            raise DataError(f"no image of {', '.join(missing)}, expected one of each camera{hint}")
 
     def _time_s(self, frame: WaymoFrame, images: dict[str, WaymoImage]) -> float:
         """When the frame's pose holds: with the FRONT image, or in the middle of the turn."""

@@ -7,6 +7,7 @@ import pytest
 
 from lidarpainter_models.errors import DataError, LidarPainterError
 from lidarpainter_models.readers import ingest_scene
+from lidarpainter_models.readers.nuscenes.reader import list_nuscenes_scenes
 from lidarpainter_models.readers.nuscenes.tables import MAX_ROW_BYTES, NuscenesTable
 
 
@@ -77,7 +78,7 @@ CASES = [
     ("sample_data", set_sweep("is_key_frame", False), "no key frame of LIDAR_TOP"),
     ("sensor", set_in("channel", ["LIDAR_TOP"]), "channel is ['LIDAR_TOP'], expected a text"),
     ("sample_data", lambda _: {"rows": 1}, "byte 0: expected '['"),
-    ("sample_data", lambda _: [1, 2], "byte 1: an entry of the array is no row"),
+    ("sample_data", lambda _: [1, 2], "byte 1: an entry of the array is no row, expected [{"),
     ("sample_data", lambda _: [{"token": 3}], "row 0: sample_token is no text but None"),
 ]
 
@@ -113,6 +114,17 @@ def test_two_key_sweeps_of_one_sample(log, store):
 
     log.edit("sample_data", change)
     assert "another key frame of LIDAR_TOP" in refusal(log, store)
+
+
+@pytest.mark.parametrize("content", ['[{"token": "a", "name"', "[{]", "[nothing]"])
+def test_table_that_breaks_off_is_named_with_what_was_expected(log, store, content):
+    path = log.folder / "scene.json"
+    path.write_text(content)
+    for ask in (lambda: list_nuscenes_scenes(log.root), lambda: log.ingest(store)):
+        with pytest.raises(DataError) as raised:
+            ask()
+        line = f"{path}, byte 1: not a complete JSON row, expected [{{...}}, {{...}}, ...]"
+        assert str(raised.value) == line
 
 
 @pytest.mark.parametrize("table", ["sample_data", "ego_pose", "sample_annotation", "instance"])

@@ -34,11 +34,19 @@ def test_column_that_is_missing(components, tmp_path):
     assert line.endswith(f"no column {name}")
 
 
+def test_frame_that_lacks_the_image_of_a_camera(components, tmp_path):
+    path = components.root / "camera_image" / f"{SEGMENT}.parquet"
+    pq.write_table(pq.read_table(path).take(pa.array([0, 1, 2])), path)
+    line = refused_line(components, tmp_path / "store", f"{SEGMENT}.parquet, row 1: no image of S")
+    expected = "no image of SIDE_LEFT, expected one of each camera; to read the others alone: "
+    assert line.endswith(f"{expected}--cameras FRONT")
+
+
 def test_rows_that_are_not_in_the_order_of_time(components, tmp_path):
     line = component_refusal(
         components,
         tmp_path / "store",
-        "camera_image",
+        "lidar",
         lambda table: table.take(pa.array([0, 2, 1, 3])),
     )
     assert "row 2, key.frame_timestamp_micros: not in the order of time" in line

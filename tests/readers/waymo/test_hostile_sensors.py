@@ -10,11 +10,27 @@ from waymo_records import matrix, message, whole
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.readers.waymo.range_images import MAX_PIXELS, unpack_matrix
+from lidarpainter_models.scenes.driving_scene import DrivingScene
 
 
 def test_frame_without_images(refusal, messages):
     bare = [field for field in split(messages[1]) if field[0] != IMAGES]
     assert "zero images, expected at least one" in refusal([messages[0], joined(bare)])
+
+
+def test_frame_that_lacks_the_image_of_a_camera(refusal, messages, records, tmp_path):
+    lacking = with_frame(messages, [(IMAGES, 1)], lambda _: None)
+    line = refusal(lacking)
+    assert "record 1 at byte" in line
+    expected = "no image of SIDE_LEFT, expected one of each camera; to read the others alone: "
+    assert line.endswith(f"{expected}--cameras FRONT")
+    scene = DrivingScene.open(records.ingest(tmp_path / "store", cameras=("FRONT",)))
+    assert (scene.camera_names, len(scene.views)) == (("FRONT",), 2)
+
+
+def test_camera_asked_for_that_no_frame_has(records, tmp_path):
+    with pytest.raises(DataError, match="no image of SIDE_RIGHT, expected one of each camera"):
+        records.ingest(tmp_path / "store", cameras=("FRONT", "SIDE_RIGHT"))
 
 
 @pytest.mark.parametrize("kept", [0, 2, 100, -2])
