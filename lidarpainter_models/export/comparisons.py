@@ -44,16 +44,18 @@ def _comparison(subject: Subject, view: RecordedView, shift: Shift) -> Compariso
         "painted at view time": painting.rgb,
         "confidence": painting.confidence[..., None].expand(-1, -1, 3),
     }
+    truth_rgb = None
     street = known_street(held_out.scene)
     if street is not None:
-        inputs = {"truth": street.render(camera, view.timestamp_ns).rgb, **inputs}
+        truth_rgb = street.render(camera, view.timestamp_ns).rgb
     elif shift == Shift():  # nobody took an image elsewhere
-        inputs = {"truth": held_out.image_of(view), **inputs}
+        truth_rgb = held_out.image_of(view)
     return Comparison(
         title=f"{shift.name}, {view.camera_name}, frame {view.frame_index}",
         before_label="before painting",
         before_rgb=before.rgb.clamp(0, 1),
         after_label="after painting",
         after_rgb=conditions.render_rgb.clamp(0, 1),
+        truth_rgb=truth_rgb,
         inputs=inputs,
     )

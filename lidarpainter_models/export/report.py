@@ -1,4 +1,4 @@
-"""One self-contained HTML page about a run: images, curves, tables, provenance.
+"""One self-contained HTML page about a run: images beside the truth, curves, tables, facts.
 
 Nothing is loaded from elsewhere: styles, script and images stand in the page. Every text is
 escaped by the template, since names come from datasets.
@@ -16,6 +16,7 @@ from lidarpainter_models.export.images import jpeg_data_url
 
 PLOT_WIDTH, PLOT_HEIGHT = 460, 240
 PLOT_MARGIN = 46
+MOST_SHOWN_FACTS = 20
 SERIES_COLOURS = ("#0b6e99", "#d1495b", "#5c8001", "#8f5db7")
 
 Cell = str | float | int | None
@@ -23,15 +24,17 @@ Cell = str | float | int | None
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Comparison:
-    """One view before and after, with the images it was made from."""
+    """One view before and after beside the truth, with the images it was made from."""
 
     title: str
     before_label: str
     before_rgb: Float[Tensor, "height width 3"]
     after_label: str
     after_rgb: Float[Tensor, "height width 3"]
+    truth_rgb: Float[Tensor, "height width 3"] | None = None
+    """None where nobody took an image."""
     inputs: Mapping[str, Tensor] = field(default_factory=dict)
-    """Label to rgb image: LiDAR image, warped reference, confidence, truth."""
+    """Label to rgb image: LiDAR image, warped reference, confidence."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,11 +62,13 @@ class Report:
     """Everything the page shows, in order."""
 
     title: str
-    summary: str
+    summary: Sequence[str]
+    """Paragraphs below the title."""
     comparisons: Sequence[Comparison] = ()
     tables: Sequence[Table] = ()
     plots: Sequence[Plot] = ()
-    provenance: Mapping[str, str] = field(default_factory=dict)
+    facts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    """Names and values under a title; long ones are folded up."""
 
 
 def format_cell(value: str | float | int | None) -> str:
@@ -92,8 +97,8 @@ def plot_geometry(plot: Plot) -> dict[str, object]:
         "title": plot.title,
         "x_label": plot.x_label,
         "y_label": plot.y_label,
-        "x_range": (format_cell(float(low_x)), format_cell(float(high_x))),
-        "y_range": (format_cell(float(low_y)), format_cell(float(high_y))),
+        "x_range": (_mark(low_x), _mark(high_x)),
+        "y_range": (_mark(low_y), _mark(high_y)),
         "lines": [
             {"label": label, "colour": colour, "points": " ".join(place(*p) for p in line)}
             for (label, line), colour in zip(plot.series.items(), SERIES_COLOURS, strict=False)
@@ -102,6 +107,10 @@ def plot_geometry(plot: Plot) -> dict[str, object]:
         "height": PLOT_HEIGHT,
         "margin": PLOT_MARGIN,
     }
+
+
+def _mark(value: float) -> str:
+    return format_cell(int(value) if float(value).is_integer() else value)
 
 
 def render_report(report: Report) -> str:
@@ -115,6 +124,7 @@ def render_report(report: Report) -> str:
             "after_label": item.after_label,
             "before": jpeg_data_url(item.before_rgb),
             "after": jpeg_data_url(item.after_rgb),
+            "truth": None if item.truth_rgb is None else jpeg_data_url(item.truth_rgb),
             "inputs": {label: jpeg_data_url(rgb) for label, rgb in item.inputs.items()},
         }
         for item in report.comparisons
@@ -134,5 +144,6 @@ def render_report(report: Report) -> str:
         comparisons=comparisons,
         tables=tables,
         plots=[plot_geometry(plot) for plot in report.plots],
-        provenance=report.provenance,
+        facts=report.facts,
+        most_shown_facts=MOST_SHOWN_FACTS,
     )

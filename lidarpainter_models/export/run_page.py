@@ -6,9 +6,15 @@ from typing import Any
 
 from lidarpainter_models.evaluation.score_tables import SCORE_COLUMNS, SCORE_NOTE, score_rows
 from lidarpainter_models.export.report import Cell, Comparison, Plot, Report, Table
+from lidarpainter_models.scenes.driving_scene import DrivingScene
 
 MEGABYTE = 1e6
 GUIDANCE_COLUMNS = ("num_cameras", "num_without_room", "num_refused", "num_views", "mean_weight")
+
+GUIDANCE_NOTE = (
+    "Cameras beside the path; of them those that would stand in a car or a wall, and those whose "
+    "painting was refused; views that the fit went on with, and how much a pixel of them counts."
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,21 +37,52 @@ class RunPage:
     """What `reconstruct` prints."""
     costs: Sequence[StageCost]
     provenance: Mapping[str, str]
+    settings: Mapping[str, str]
+    """Every setting of the run by its dotted name, as `--set` takes it."""
 
     def report(
         self,
+        scene: DrivingScene,
         comparisons: Sequence[Comparison],
         histories: Mapping[str, Sequence[Mapping[str, float]]],
+        machine: Mapping[str, str],
     ) -> Report:
-        """The page, with images and the course of every fit by stage."""
+        """The page, with images and the course of every fit by stage.
+
+        Args:
+            scene: what the run is about.
+            comparisons: views of it.
+            histories: of every fit, by stage.
+            machine: names and values of what the page is made on.
+        """
         return Report(
             title=f"LidarPainter: {self.result['scene']}",
-            summary=_summary(self.result),
+            summary=[_scene_in_words(scene), _summary(self.result)],
             comparisons=comparisons,
             tables=_tables(self.result, self.costs),
             plots=_plots(histories),
-            provenance=self.provenance,
+            facts={
+                "Provenance": self.provenance,
+                "Machine": machine,
+                "Settings": self.settings,
+            },
         )
+
+
+def _scene_in_words(scene: DrivingScene) -> str:
+    counts = scene.manifest["counts"]
+    seconds = float(scene.frame_timestamps_ns[-1] - scene.frame_timestamps_ns[0]) / 1e9
+    num_moving = sum(track.is_moving for track in scene.tracks)
+    return (
+        f"Sequence {scene.sequence} of the dataset {scene.dataset}: {counts['frames']} frames in "
+        f"{seconds:.1f} s; {counts['images']} images of {_named('camera', scene.camera_names)}; "
+        f"{counts['points'] / 1e6:.1f} million points of {_named('LiDAR', scene.lidar_names)}; "
+        f"{len(scene.tracks)} labelled actors, of which {num_moving} move."
+    )
+
+
+def _named(kind: str, names: Sequence[str]) -> str:
+    return f"{len(names)} {kind}{'s' if len(names) != 1 else ''} ({', '.join(names)})"
 
 
 def _summary(result: Mapping[str, Any]) -> str:
@@ -89,9 +126,18 @@ def _tables(result: Mapping[str, Any], costs: Sequence[StageCost]) -> list[Table
     ]
     if guidance:
         tables.append(
-            Table(title="Painted views", columns=["round", *GUIDANCE_COLUMNS], rows=guidance)
+            Table(
+                title="Painted views",
+                columns=["round", *map(_in_words, GUIDANCE_COLUMNS)],
+                rows=guidance,
+                note=GUIDANCE_NOTE,
+            )
         )
     return tables
+
+
+def _in_words(name: str) -> str:
+    return name.removeprefix("num_").replace("_", " ")
 
 
 def _plots(histories: Mapping[str, Sequence[Mapping[str, float]]]) -> list[Plot]:

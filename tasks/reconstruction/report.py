@@ -1,6 +1,7 @@
-"""Write the page about a run: images, tables, curves, provenance."""
+"""Write the page about a run: images, tables, curves, provenance, machine, settings."""
 
-from collections.abc import Callable, Mapping, Sequence
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -19,6 +20,7 @@ from lidarpainter_models.export.run_page import RunPage, StageCost
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.trajectories import Shift
 from tasks.evaluation.shown import view_time_painting
+from tasks.machine import machine
 from tasks.opened import OpenedRun, RunSpec, opened
 from tasks.progress import Progress
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
@@ -59,6 +61,7 @@ def write_report(run: RunSpec, inputs: ReportInputs, config: JudgeConfig) -> Sta
                 result=inputs.result,
                 costs=[_cost(name, made) for name, made in stages.items()],
                 provenance=_provenance(this, inputs),
+                settings=_settings(this.store, inputs.result["run_id"]),
             ),
             histories=partial(_histories, this.store, fits),
             held_out=this.held_out(config.observation, or_train=True),
@@ -88,7 +91,9 @@ def _build(
     painting: Callable[[], ViewTimePainting],
 ) -> dict[str, Any]:
     subject = Subject(held_out=held_out, unpainted=unpainted(), painting=painting())
-    report = page.report(comparisons(subject, shifts), histories())
+    report = page.report(
+        held_out.scene, comparisons(subject, shifts), histories(), machine(subject.painting.device)
+    )
     (place.output / REPORT_FILE).write_text(render_report(report), "utf-8")
     return {}
 
@@ -105,6 +110,19 @@ def _cost(name: str, stage: StageResult) -> StageCost:
 
 def _histories(store: Store, fits: Mapping[str, ArtefactRef]) -> dict[str, History]:
     return {name: load_history(store, ref) for name, ref in fits.items()}
+
+
+def _settings(store: Store, run_id: str) -> dict[str, str]:
+    """The settings of a run by dotted name, as they were entered into the catalog."""
+    return dict(_flat("", json.loads(store.run(run_id)["parameters"])))
+
+
+def _flat(name: str, value: Any) -> Iterator[tuple[str, str]]:  # noqa: ANN401 - any JSON value
+    if isinstance(value, dict) and value:
+        for key, inner in value.items():
+            yield from _flat(f"{name}.{key}" if name else key, inner)
+    else:
+        yield name, value if isinstance(value, str) else json.dumps(value)
 
 
 def _provenance(this: OpenedRun, inputs: ReportInputs) -> dict[str, str]:

@@ -1,7 +1,16 @@
-"""The report is one safe, self-contained page."""
+"""The report is one safe, self-contained page that fits a desk and a telephone."""
+
+import html
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
 
 import pytest
 import torch
+from drawn_streets import drawn_street
+from tiny_street import tiny_street
 
 from lidarpainter_models.errors import StorageError
 from lidarpainter_models.export.images import to_bytes, write_png
@@ -13,33 +22,157 @@ from lidarpainter_models.export.report import (
     format_cell,
     render_report,
 )
+from lidarpainter_models.export.run_page import RunPage
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.synthetic import record_street
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+WIDTHS_PX = (1400, 400)
+INPUTS = ("LiDAR", "warped recording", "painted at view time", "confidence")
 
 
 def sample_report(title: str = "run") -> Report:
-    image = torch.rand(8, 12, 3, generator=torch.Generator().manual_seed(0))
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(90, 160, 3, generator=generator)
+    views = [
+        Comparison(
+            title=f"{name}, front_camera, frame 3",
+            before_label="before painting",
+            before_rgb=image,
+            after_label="after painting",
+            after_rgb=1 - image,
+            truth_rgb=truth,
+            inputs=dict.fromkeys(INPUTS, image),
+        )
+        for name, truth in (("recorded", image), ("left-2m", None))
+    ]
+    columns = ["view", *(f"unpainted figure {number}" for number in range(12))]
+    scores = Table(
+        title="scores", columns=columns, rows=[["a" * 32, *[29.5] * 12], ["b", *[None] * 12]]
+    )
     return Report(
         title=title,
-        summary="a summary",
-        comparisons=[
-            Comparison(
-                title="left-2m",
-                before_label="render",
-                before_rgb=image,
-                after_label="painted",
-                after_rgb=1 - image,
-                inputs={"lidar": image},
-            )
-        ],
-        tables=[Table(title="scores", columns=["view", "psnr"], rows=[["a", 29.5], ["b", None]])],
+        summary=["what the scene is", "what was done with it"],
+        comparisons=views,
+        tables=[scores],
         plots=[Plot(title="fit", x_label="step", y_label="dB", series={"train": [(0, 1), (5, 2)]})],
-        provenance={"software": "0.1.0"},
+        facts={
+            "Provenance": {"scene content": "0" * 64},
+            "Settings": {f"fit.setting_{number}": "1" for number in range(125)},
+        },
     )
+
+
+class Elements(HTMLParser):
+    """Start tags of a page with their attributes, by name."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.found: dict[str, list[dict[str, str]]] = {}
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self.found.setdefault(tag, []).append(dict(attrs))
+
+
+def test_every_picture_is_named_and_no_two_alike():
+    found = Elements(render_report(sample_report())).found
+    names = [image.get("alt") for image in found["img"]]
+    assert len(names) == 2 * (2 + len(INPUTS)) + 1
+    assert all(names)
+    assert len(set(names)) == len(names)
+    assert "recorded, front_camera, frame 3: truth" in names
+    assert "left-2m, front_camera, frame 3: truth" not in names
+    assert len(found["figcaption"]) == len(found["figure"])
+    assert all(plot["aria-label"] for plot in found["svg"])
+
+
+def test_confidence_is_as_large_as_the_images_beside_it():
+    page = render_report(sample_report())
+    (grid,) = set(re.findall(r"\.inputs { grid-template-columns: (repeat\(4[^;]*);", page))
+    assert grid == "repeat(4, minmax(0, 1fr))"
+    for row in re.findall(r'<div class="inputs">(.*?)</div>', page, re.DOTALL):
+        assert row.count("<figure>") == len(INPUTS)
+
+
+def test_view_that_nobody_recorded_says_that_it_has_no_truth():
+    page = render_report(sample_report())
+    assert page.count("Nobody took an image here") == 1
+
+
+def test_many_settings_are_folded_up_and_few_facts_are_not():
+    page = render_report(sample_report())
+    assert page.count("<details>") == 1
+    assert "<summary>125 entries</summary>" in page
+    assert page.index("Provenance") < page.index("<details>") < page.index("fit.setting_124")
+
+
+def test_page_begins_with_what_the_scene_is(tmp_path):
+    scene = DrivingScene.open(record_street(drawn_street(tiny_street()), tmp_path))
+    scores = {"psnr": 1.0}
+    judged = {"recorded": scores, "novel": {}}
+    result = {
+        "scene": "synthetic/street-0005",
+        "preset": "preview",
+        "painter": "nano",
+        "split": "alternate",
+        "rounds": 1,
+        "num_gaussians": 5,
+        "guidance": {},
+        **judged,
+        "unpainted": judged,
+    }
+    page = RunPage(result=result, costs=[], provenance={}, settings={"fit.steps": "40"})
+    report = page.report(scene, [], {}, {"processor": "abacus"})
+    assert report.summary[0].startswith(
+        "Sequence street-0005 of the dataset synthetic: 6 frames in 0.5 s; 12 images of 2 cameras "
+        "(front_camera, side_camera); "
+    )
+    text = render_report(report)
+    assert text.index("Sequence street-0005") < text.index("<h2>")
+    assert "abacus" in text
+    assert "fit.steps" in text
+
+
+@pytest.fixture(scope="session")
+def browser():
+    found = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    if found is None:
+        pytest.skip(f"no browser here to lay the page out: none of {', '.join(BROWSERS)}")
+    return found
+
+
+def laid_out(browser, page, folder):
+    """Width of the content and how many images do not show, for each width of a window."""
+    frames = "".join(
+        f'<iframe width="{width_px}" height="900" srcdoc="{html.escape(page)}"></iframe>'
+        for width_px in WIDTHS_PX
+    )
+    script = """
+      const measured = [...document.querySelectorAll("iframe")].map(frame => {
+        const page = frame.contentDocument, images = [...page.images];
+        return [page.documentElement.scrollWidth, images.filter(i => !i.naturalWidth).length];
+      });
+      document.body.textContent = "measured" + JSON.stringify(measured) + "!";
+    """
+    file = folder / "frames.html"
+    file.write_text(f"<body>{frames}<script>onload = () => {{ {script} }}</script>", "utf-8")
+    command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom", file.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    return json.loads(re.search(r"measured(\[.*\])!", done.stdout)[1])
+
+
+def test_nothing_overflows_on_a_desk_or_a_telephone(browser, tmp_path):
+    measured = laid_out(browser, render_report(sample_report("run " + "x" * 60)), tmp_path)
+    for width_px, (content_px, num_broken) in zip(WIDTHS_PX, measured, strict=True):
+        assert content_px <= width_px
+        assert num_broken == 0
 
 
 def test_page_loads_nothing_from_elsewhere():
     page = render_report(sample_report())
     assert "http" not in page
-    assert page.count("data:image/jpeg;base64,") == 3
+    assert page.count("data:image/jpeg;base64,") == 13
 
 
 def test_hostile_names_are_escaped():

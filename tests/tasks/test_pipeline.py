@@ -1,6 +1,7 @@
 """The stages of a reconstruction, one after the other, without a server."""
 
 import json
+import re
 import shutil
 import sys
 from dataclasses import replace
@@ -26,6 +27,7 @@ from lidarpainter_models.metrics.backbones import SQUEEZENET
 from tasks.evaluation.flicker import evaluate_flicker
 from tasks.evaluation.views import evaluate, load_scores
 from tasks.ingest.ingest import record_scene
+from tasks.opened import open_scene
 from tasks.painter.judge import judge_painters
 from tasks.painter.judged_fits import JudgedFit
 from tasks.reconstruction.fit import fit
@@ -272,6 +274,24 @@ def test_neighbouring_frames_are_compared_along_every_shift(store, parameters, f
         for image, values in flicker_by_image(scores["flicker"]).items()
     }
     assert by_name["painted"]["flicker"] == found["painted"]["flicker"]
+
+
+def test_a_report_says_what_was_run_when_and_on_what(store, run, parameters):
+    page = (store.root / run.result["report"]).read_text("utf-8")
+    scene = open_scene(store, TOY_SCENE)
+    assert f"Sequence {scene.sequence} of the dataset {scene.dataset}: " in page
+    known, settings = (
+        dict(re.findall(r'<th scope="row">(.*?)</th><td>(.*?)</td>', part))
+        for part in page.split("<h2>Settings</h2>")
+    )
+    assert settings["fit.steps"] == str(parameters.fit.steps)
+    assert known["scene content"] == scene.content_digest
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d UTC", known["date"])
+    assert known["processor"]
+    assert known["cores"][0].isdigit()
+    assert known["memory"].endswith(" GB")
+    assert known["device"] == "cpu"
+    assert f"torch {torch.__version__.split('+')[0]}" in known["versions"]
 
 
 def test_a_report_stands_alone(store, run):
