@@ -9,7 +9,7 @@ import fcntl
 import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from catalog.errors import storage_errors
@@ -41,6 +41,30 @@ def held_lock(path: Path, *, on_wait: Callable[[str], None] | None = None) -> It
         yield waited
     finally:
         os.close(descriptor)  # closing the only descriptor releases the lock
+
+
+@contextmanager
+def shared_lock(path: Path) -> Iterator[None]:
+    """Hold a lock that others may hold too while the block runs; see `is_held`.
+
+    Raises:
+        StorageError: the lock file cannot be made.
+    """
+    with storage_errors(f"cannot lock {path}"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDONLY | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def is_held(path: Path) -> bool:
+    """Whether any process holds the lock."""
+    with suppress(FileNotFoundError), path.open("rb") as file:
+        return not _try_acquire(file.fileno())
+    return False
 
 
 def _acquire(descriptor: int, on_wait: Callable[[str], None] | None) -> bool:

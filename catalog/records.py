@@ -9,7 +9,7 @@ from typing import Any, Literal
 from catalog.artefacts import ArtefactRef, Manifest
 from catalog.digests import canonical_json, digest_text
 
-RunStatus = Literal["running", "complete", "failed"]
+RunStatus = Literal["running", "complete", "failed", "interrupted"]
 RUN_ID_LENGTH = 16
 
 

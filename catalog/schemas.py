@@ -95,7 +95,7 @@ RUNS = TableSchema(
         Column("preset", "text", "name of the preset it started from"),
         Column("painter", "text", "name of the painter, or none"),
         Column("parameters", "text", "all parameters, canonical JSON"),
-        Column("status", "text", "running, complete or failed"),
+        Column("status", "text", "running, complete, failed or interrupted"),
         Column("error", "text", "why it failed"),
         Column("started_at", "time", "when it was last started"),
         Column("finished_at", "time", "when it was last finished"),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from catalog.artefacts import ArtefactStore
 from catalog.errors import CatalogError, UnknownRecordError
-from catalog.locks import held_lock
+from catalog.locks import held_lock, is_held, shared_lock
 
 if TYPE_CHECKING:
     from catalog.tables import CatalogTables, Row
@@ -66,6 +66,31 @@ class Store:
         dataset, sequence = split_scene_id(scene_id)
         return held_lock(self.root / "locks" / f"scene-{dataset}-{sequence}.lock", on_wait=on_wait)
 
+    def run_lock(self, run_id: str) -> AbstractContextManager[None]:
+        """The lock that every process which works on this run holds."""
+        return shared_lock(self._run_lock(run_id))
+
+    def rows(self, table: str) -> "list[Row]":
+        """All rows of a table, by id; a run that was killed does not count as running."""
+        return [self._as_it_is(table, row) for row in self.tables.rows(table)]
+
+    def row(self, table: str, id_or_prefix: str) -> "Row":
+        """The one row with this id, or whose id starts with it; see `rows`.
+
+        Raises:
+            UnknownRecordError: none matches, or more than one.
+        """
+        return self._as_it_is(table, self.tables.row(table, id_or_prefix))
+
+    def _as_it_is(self, table: str, row: "Row") -> "Row":
+        is_over = table == "runs" and row["status"] == "running"
+        if is_over and not is_held(self._run_lock(row["run_id"])):
+            return {**row, "status": "interrupted"}
+        return row
+
+    def _run_lock(self, run_id: str) -> Path:
+        return self.root / "locks" / f"run-{run_id}.lock"
+
     def run(self, run_id: str) -> "Row":
         """The row of a run by id, unique prefix, or `latest` (the last that completed).
 
@@ -73,7 +98,7 @@ class Store:
             UnknownRecordError: there is no such run.
         """
         if run_id != LATEST:
-            return self.tables.row("runs", run_id)
+            return self.row("runs", run_id)
         complete = [row for row in self.tables.rows("runs") if row["status"] == "complete"]
         if not complete:
             raise UnknownRecordError(f"no complete run in {self.root}")

@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from prefect import flow
 
 from catalog.records import RunRecord
 from catalog.store import Store, open_store
+from flows.interruption import at_interruption
 from flows.overrides import with_overrides
 from flows.parameters import ReconstructParameters
 from flows.presets import preset as preset_named
@@ -25,7 +27,7 @@ from tasks.opened import RunSpec, opened
 from tasks.reconstruction.fit import fit
 from tasks.reconstruction.paint import paint
 from tasks.reconstruction.prepare import prepare
-from tasks.reconstruction.publish import begin_run, complete_run, fail_run
+from tasks.reconstruction.publish import begin_run, complete_run, end_run
 from tasks.reconstruction.report import REPORT_FILE, ReportInputs, write_report
 from tasks.source import code_behind
 from tasks.stages import StageResult
@@ -58,15 +60,11 @@ def reconstruct(parameters: ReconstructParameters, store_path: Path) -> dict[str
     check_inputs(parameters, store_path)
     run = parameters.run_spec(store_path)
     store = open_store(store_path)
-    record = begin_run(
-        run,
-        run_identity(parameters, store),
-        code_behind(START).digest,
-        parameters.preset,
-        parameters,
-    )
-    with failure_recorded(store_path, record):
-        return _run(Course(parameters=parameters, run=run, record=record))
+    run_id, source_digest = run_identity(parameters, store), code_behind(START).digest
+    with store.run_lock(run_id):
+        record = begin_run(run, run_id, source_digest, parameters.preset, parameters)
+        with early_end_recorded(store_path, record):
+            return _run(Course(parameters=parameters, run=run, record=record))
 
 
 def check_inputs(parameters: ReconstructParameters, store_path: Path) -> None:
@@ -211,10 +209,12 @@ def _result(course: Course, scores: dict[str, Scores], final: FittedRef) -> dict
 
 
 @contextmanager
-def failure_recorded(store_path: Path, record: RunRecord) -> Iterator[None]:
-    """Enter into the catalog why a run failed, and let the error go on."""
-    try:
-        yield
-    except Exception as error:
-        fail_run(store_path, record, f"{type(error).__name__}: {error}")
-        raise
+def early_end_recorded(store_path: Path, record: RunRecord) -> Iterator[None]:
+    """Enter into the catalog that a run failed or was interrupted, and let the error go on."""
+    interrupted = partial(end_run.fn, store_path, record, "interrupted", None)  # asks no server
+    with at_interruption(interrupted):
+        try:
+            yield
+        except Exception as error:
+            end_run(store_path, record, "failed", f"{type(error).__name__}: {error}")
+            raise

@@ -58,6 +58,7 @@ def prefect_server(log_path: Path) -> Iterator[None]:
     """
     from prefect.settings import (
         PREFECT_API_URL,
+        PREFECT_FLOWS_HEARTBEAT_FREQUENCY,
         PREFECT_LOGGING_TO_API_ENABLED,
         temporary_settings,
     )
@@ -75,9 +76,15 @@ def prefect_server(log_path: Path) -> Iterator[None]:
         own = {
             PREFECT_API_URL: f"http://127.0.0.1:{port}/api",
             PREFECT_LOGGING_TO_API_ENABLED: False,
+            # nobody listens, and flows would end a second late
+            PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None,
         }
         with temporary_settings(own):
             yield
+    except BaseException as error:
+        if not isinstance(error, Exception):
+            process.kill()  # whoever is interrupted waits for nobody
+        raise
     finally:
         _stop(process)
 
@@ -104,6 +111,7 @@ def _start(port: int, log: int) -> subprocess.Popen[bytes]:
         stdout=log,
         stderr=log,
         env=environment,
+        start_new_session=True,  # Ctrl-C is for the flow, which talks to the server on its way out
     )
 
 

@@ -1,5 +1,20 @@
-"""`python -m flows.cli` is `lidarpainter`."""
+"""Where the command begins, as `lidarpainter` and as `python -m flows.cli`.
 
-from flows.cli.main import run
+Signals are answered before anything else is imported.
+"""
 
-run()
+import sys
+
+from flows import interruption
+
+
+def run() -> None:
+    """Run the command that was typed, and end with its exit code."""
+    interruption.watch()
+    from flows.cli.main import main
+
+    interruption.leave(main(sys.argv[1:]))
+
+
+if __name__ == "__main__":
+    run()

@@ -36,7 +36,7 @@ def list_table(
     from catalog.store import open_store
 
     store = open_store()
-    rows = store.tables.rows(table)
+    rows = store.rows(table)
     if as_json:
         print_json({"table": table, "store": str(store.root), "rows": [_open(row) for row in rows]})
         return
@@ -127,7 +127,7 @@ def _find(store: Any, name: str) -> tuple[str, dict[str, Any]]:  # noqa: ANN401 
     complaints = []
     for table in ("scenes", "runs", "artefacts", "painters"):
         try:
-            return table, store.tables.row(table, name)
+            return table, store.row(table, name)
         except UnknownRecordError as error:
             complaints.append(str(error))
             if "not unique" in str(error):

@@ -1,8 +1,8 @@
 """The `lidarpainter` command: global options, groups, and how errors end it.
 
 Exit codes: 0 on success, 2 for input that cannot be used (one line on stderr), 1 for anything
-unexpected, 130 when interrupted. Commands import what they need when they run, so that help is
-fast.
+unexpected, 130 after Ctrl-C and 143 after SIGTERM. Commands import what they need when they run, so
+that help is fast.
 """
 
 import os
@@ -19,6 +19,7 @@ from catalog.store import STORE_ENVIRONMENT
 from flows.cli import catalog, demo, doctor, evaluate, ingest, painter, reconstruct, render, stylize
 from flows.cli.output import complain
 from flows.environment import prepare_environment
+from flows.interruption import MESSAGE, Interrupted
 from lidarpainter_models import __version__
 from lidarpainter_models.errors import LidarPainterError
 
@@ -79,9 +80,11 @@ def main(arguments: Sequence[str]) -> int:
     prepare_environment(is_quiet=not is_debug)
     try:
         app(args=globals_first(arguments), prog_name="lidarpainter")
+    except Interrupted:
+        return INTERRUPTED  # whoever answers signals says so, see `flows.interruption`
     except SystemExit as leaving:  # typer's way out of everything it knows, Ctrl-C included
         if leaving.code == INTERRUPTED:
-            complain("interrupted; the same command goes on where this one stopped")
+            complain(MESSAGE)
         return leaving.code if isinstance(leaving.code, int) else UNEXPECTED
     except (LidarPainterError, CatalogError) as error:
         _explain(error, str(error), is_debug=is_debug)
@@ -91,11 +94,6 @@ def main(arguments: Sequence[str]) -> int:
         _explain(error, f"unexpected {type(error).__name__}: {error}{hint}", is_debug=is_debug)
         return UNEXPECTED
     return 0
-
-
-def run() -> None:
-    """Entry point of the installed command."""
-    sys.exit(main(sys.argv[1:]))
 
 
 def globals_first(arguments: Sequence[str]) -> list[str]:

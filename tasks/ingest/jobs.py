@@ -9,6 +9,7 @@ leaves nothing behind and starts again at its first frame.
 
 import json
 import multiprocessing
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -145,6 +146,8 @@ def _in_processes(
 
 def _in_own_process(request: IngestRequest, name: str, again: bool) -> dict[str, Any]:
     """A process for one sequence alone: one that dies takes no other with it."""
+    # a process inherits what its thread blocks: signals are for whoever has started it
+    signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as pool:
         return pool.submit(ingest_or_recall, request, name, again).result()

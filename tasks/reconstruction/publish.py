@@ -1,4 +1,4 @@
-"""Enter a run into the catalog: when it starts, when it fails, when it is done."""
+"""Enter a run into the catalog: when it starts, when it ends early, when it is done."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -11,7 +11,7 @@ from prefect import task
 import lidarpainter_models
 from catalog.artefacts import ArtefactRef
 from catalog.digests import canonical_json, plain
-from catalog.records import MetricRecord, RunRecord, metric_rows
+from catalog.records import MetricRecord, RunRecord, RunStatus, metric_rows
 from catalog.store import Store, open_store
 from lidarpainter_models.evaluation.score_tables import metric_values
 from tasks.json_files import finite_or_none
@@ -54,10 +54,10 @@ def begin_run(
 
 
 @task(**STAGE_OPTIONS)
-def fail_run(store_path: Path, record: RunRecord, error: str) -> None:
-    """Enter that a run failed, and why."""
-    failed = replace(record, status="failed", error=error, finished_at=datetime.now(UTC))
-    open_store(store_path).tables.merge("runs", [failed.row()])
+def end_run(store_path: Path, record: RunRecord, status: RunStatus, error: str | None) -> None:
+    """Enter that a run failed, and why, or that it was interrupted."""
+    ended = replace(record, status=status, error=error, finished_at=datetime.now(UTC))
+    open_store(store_path).tables.merge("runs", [ended.row()])
 
 
 @task(**STAGE_OPTIONS)

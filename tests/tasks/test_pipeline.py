@@ -34,7 +34,7 @@ from tasks.reconstruction.fit import fit
 from tasks.reconstruction.paint import paint
 from tasks.reconstruction.painted_views import load_guidance
 from tasks.reconstruction.prepare import prepare
-from tasks.reconstruction.publish import begin_run, complete_run, fail_run
+from tasks.reconstruction.publish import begin_run, complete_run, end_run
 from tasks.reconstruction.report import REPORT_FILE, ReportInputs, write_report
 from tasks.runs import open_run
 from tasks.stored import FittedRef, load_history, load_scene
@@ -320,7 +320,7 @@ def test_a_failed_run_says_why(store, parameters):
     asked = parameters.run_spec(store.root)
     record = begin_run.fn(asked, "f" * 16, "b" * 32, "balanced", parameters)
     assert store.tables.row("runs", record.run_id)["status"] == "running"
-    fail_run.fn(store.root, record, "SceneError: no image")
+    end_run.fn(store.root, record, "failed", "SceneError: no image")
     assert store.tables.row("runs", record.run_id)["error"] == "SceneError: no image"
 
 

@@ -35,6 +35,8 @@ LOG_FILE = "processes.log"
 """What the processes complain of; it stays beside the checkpoints of a training that broke off."""
 GRACE_S = 60.0
 """How long the processes may take to end once the pipe is closed."""
+INTERRUPTED_GRACE_S = 0.5
+"""The same where somebody waits for the end."""
 
 
 def run_in_processes(
@@ -66,11 +68,16 @@ def run_in_processes(
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=log,
+            start_new_session=True,  # Ctrl-C is for whoever has started them
         )
+        grace_s = GRACE_S
         try:
             refusal = _followed(running, told)
+        except BaseException as error:
+            grace_s = GRACE_S if isinstance(error, Exception) else INTERRUPTED_GRACE_S
+            raise
         finally:
-            _end(running)
+            _end(running, grace_s)
     if refusal is not None:
         raise refusal
     if running.returncode:
@@ -96,12 +103,12 @@ def _followed(running: "subprocess.Popen[bytes]", told: Told) -> LidarPainterErr
     return refusal
 
 
-def _end(running: "subprocess.Popen[bytes]") -> None:
+def _end(running: "subprocess.Popen[bytes]", grace_s: float) -> None:
     """Close the pipe that they end with, and wait until they have ended."""
     assert running.stdin is not None and running.stdout is not None  # noqa: S101, PT018
     running.stdin.close()
     try:
-        running.wait(GRACE_S)
+        running.wait(grace_s)
     except subprocess.TimeoutExpired:
         running.kill()
         running.wait()
