@@ -140,7 +140,7 @@ METRICS = TableSchema(
         Column("scene_id", "text", "dataset/sequence"),
         Column("protocol", "text", "recorded, recorded-poses, truth, depth or cross-camera"),
         Column("trajectory", "text", "where the camera was: recorded, left-2m, up-1.5m, ..."),
-        Column("variant", "text", "unpainted, painted, or painted at view time"),
+        Column("variant", "text", "unpainted, painted, refined (no painter), or view-time"),
         Column("name", "text", "what was measured: psnr, ssim, ..."),
         Column("value", "number", "the number, or null with a reason", "see name"),
         Column("reason", "text", "why there is no number"),

@@ -2,6 +2,7 @@
 
 import os
 import re
+import tempfile
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from catalog.artefacts import ArtefactStore
-from catalog.errors import CatalogError, UnknownRecordError
+from catalog.errors import CatalogError, StorageError, UnknownRecordError
 from catalog.locks import held_lock, is_held, shared_lock
 
 if TYPE_CHECKING:
@@ -40,6 +41,22 @@ class Store:
         from catalog.tables import CatalogTables  # Arrow and Delta: help does without
 
         return CatalogTables(str(self.root / "tables"))
+
+    def make(self) -> None:
+        """Make the folder of the store where it is not there, and see that it takes a file.
+
+        Raises:
+            StorageError: it cannot be made or written.
+        """
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=self.root) as probe:
+                probe.write(b"-")
+        except OSError as error:
+            raise StorageError(
+                f"the store {self.root} cannot be written: {error.strerror}; expected a folder "
+                "with room, see --store"
+            ) from None
 
     def scene_folder(self, scene_id: str) -> Path:
         """Folder of the scene `<dataset>/<sequence>`, whether it exists or not.
@@ -118,6 +135,18 @@ def open_store(path: Path | str | None = None) -> Store:
     if root.exists() and not root.is_dir():
         raise CatalogError(f"the store {root} is a file, expected a folder")
     return Store(root)
+
+
+def existing_store() -> Store:
+    """The store of `open_store`, for whoever only asks what it holds.
+
+    Raises:
+        CatalogError: there is none, or something that is not a folder is in the way.
+    """
+    store = open_store()
+    if not any((store.root / name).is_dir() for name in ("tables", "scenes")):
+        raise CatalogError(f"no store at {store.root}: `ingest` or `demo` makes one, see --store")
+    return store
 
 
 def split_scene_id(scene_id: str) -> tuple[str, str]:

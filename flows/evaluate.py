@@ -6,7 +6,7 @@ from typing import Any
 
 from catalog.store import Store
 from flows.overrides import with_changes
-from flows.parameters import ViewParameters, view_parameters
+from flows.parameters import ViewParameters, fitted_on, view_parameters
 from lidarpainter_models.conditioning.sequences import SequenceConfig
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.score_tables import FLICKER, Scores, flicker_by_image
@@ -43,7 +43,9 @@ def evaluate_run(store: Store, request: EvaluationRequest) -> dict[str, Any]:
     """Judge a finished run on views it never saw, and enter the scores into the catalog.
 
     Returns:
-        `run_id`, `scene`, `protocol`, and the scores by variant (for flicker by shift).
+        `run_id`, `scene`, `protocol`, and the scores by variant (for flicker by shift):
+        `unpainted` after the first fit; after the last round `painted`, or `refined` where the
+        run had no painter; `view-time` if asked for.
 
     Raises:
         UnknownRecordError: there is no such run, or it did not complete.
@@ -68,7 +70,9 @@ def evaluate_run(store: Store, request: EvaluationRequest) -> dict[str, Any]:
 def _variants(
     store: Store, finished: FinishedRun, parameters: ViewParameters, request: EvaluationRequest
 ) -> dict[str, Scores]:
-    judged: dict[str, FittedRef] = {"unpainted": finished.unpainted, "painted": finished.final}
+    judged: dict[str, FittedRef] = {"unpainted": finished.unpainted}
+    if finished.final != finished.unpainted:
+        judged[fitted_on(parameters.painter)] = finished.final
     if request.is_painted or request.painter:
         judged["view-time"] = finished.final
     judge = evaluate_strips if request.protocol == CROSS_CAMERA else evaluate

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from catalog.store import open_store
+from catalog.store import existing_store
 from flows.parameters import view_parameters
 from lidarpainter_models.devices import Device, chosen_device
 from lidarpainter_models.errors import ConfigError
@@ -54,7 +54,7 @@ def _first_fit(run: str) -> JudgedFit:
     Raises:
         UnknownRecordError: there is no such run, or it did not complete.
     """
-    store = open_store()
+    store = existing_store()
     finished = open_run(store, run)
     parameters = view_parameters(finished)
     return JudgedFit(

@@ -1,6 +1,7 @@
 """What a flow is given: frozen models that hold the library's settings as fields."""
 
 from pathlib import Path
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -13,6 +14,7 @@ from lidarpainter_models.evaluation.scene_scores import ScoringConfig
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.metrics.lpips import LpipsFiles
 from lidarpainter_models.observations.fit_size import ObservationConfig
+from lidarpainter_models.painter.selection import NO_PAINTER
 from tasks.opened import RunSpec, SplitSpec
 from tasks.runs import FinishedRun
 
@@ -81,6 +83,11 @@ class ReconstructParameters(ViewParameters):
     """The fit of one round."""
     judge_view_time: bool = False
     """Also judge what the final scene shows when it is painted at view time."""
+
+
+def fitted_on(painter: str) -> Literal["painted", "refined"]:
+    """What the scene after the last round is called: without a painter it is not painted."""
+    return "refined" if painter == NO_PAINTER else "painted"
 
 
 def view_parameters(run: FinishedRun) -> ViewParameters:

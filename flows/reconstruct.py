@@ -14,13 +14,14 @@ from catalog.records import RunRecord
 from catalog.store import Store, open_store
 from flows.interruption import at_interruption
 from flows.overrides import with_overrides
-from flows.parameters import ReconstructParameters
+from flows.parameters import ReconstructParameters, fitted_on
 from flows.presets import preset as preset_named
 from flows.recall import START, located, recalled, run_identity
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.score_tables import Scores
 from lidarpainter_models.export.run_page import GUIDANCE_COLUMNS
 from lidarpainter_models.metrics.perceptual import load_distances
+from lidarpainter_models.observations.fit_size import require_recorded_width
 from lidarpainter_models.painter.selection import NO_PAINTER
 from tasks.evaluation.views import evaluate, load_scores
 from tasks.opened import RunSpec, opened
@@ -72,11 +73,14 @@ def check_inputs(parameters: ReconstructParameters, store_path: Path) -> None:
 
     Raises:
         SceneError: the scene is not there, or lacks a camera.
-        ConfigError: the split leaves nothing to train on, the device is not there, or a fit weighs
-            a distance without weights.
+        ConfigError: the split leaves nothing to train on, images are wanted wider than recorded,
+            the device is not there, or a fit weighs a distance without weights.
         WeightsError: the painter or the weights of a perceptual distance cannot be used.
     """
     run = opened(parameters.run_spec(store_path))
+    width_px = parameters.observation.width_px
+    if width_px != preset_named(parameters.preset, parameters.scene).observation.width_px:
+        require_recorded_width(width_px, run.views.train, "observation.width_px")
     run.painter.load(run.device)
     load_distances(parameters.feature_weights, parameters.lpips)
     missing = parameters.lpips.missing
@@ -126,6 +130,7 @@ def _run(course: Course) -> dict[str, Any]:
     result["computed_now"]["report"] = report.is_new
     result["seconds"]["total"] = time.perf_counter() - started
     refs = tuple(stage.ref for stage in course.stages.values())
+    scores[fitted_on(parameters.painter)] = scores.pop("painted")  # as the catalog calls it
     return located(complete_run(run.store_path, course.record, result, scores, refs), store)
 
 

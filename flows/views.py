@@ -8,6 +8,8 @@ from catalog.store import Store
 from flows.parameters import view_parameters
 from lidarpainter_models.conditioning.sequences import SequenceConfig
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
+from lidarpainter_models.observations.fit_size import require_recorded_width
+from tasks.opened import open_scene
 from tasks.runs import open_run
 from tasks.views.render import RenderRequest, render
 from tasks.views.stylize import Images, StylizeRequest, stylize
@@ -88,14 +90,19 @@ def stylize_run(
         out: folder for the images.
         prompt: the style.
         images: whether renders are styled, or what the camera recorded.
-        width_px: of the images; None takes that of the fit.
+        width_px: of the images, at most as recorded; None takes that of the fit.
         seed: decides lit windows, drops and noise.
+
+    Raises:
+        ConfigError: no such style, or images wider than recorded.
     """
     finished = open_run(store, path.run)
     parameters = view_parameters(finished)
     observation = parameters.observation
     if width_px is not None:
         observation = replace(observation, width_px=width_px)
+        views = open_scene(store, finished.scene_id).views
+        require_recorded_width(width_px, views, "--width")
     view = RenderRequest(
         trajectory=path.trajectory,
         camera=path.camera,

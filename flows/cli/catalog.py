@@ -33,9 +33,9 @@ def list_table(
     as_json: AsJson = False,
 ) -> None:
     """List a table of the catalog."""
-    from catalog.store import open_store
+    from catalog.store import existing_store
 
-    store = open_store()
+    store = existing_store()
     rows = store.rows(table)
     if as_json:
         print_json({"table": table, "store": str(store.root), "rows": [_open(row) for row in rows]})
@@ -53,9 +53,9 @@ def show_record(
     as_json: AsJson = False,
 ) -> None:
     """Show everything known about one scene, run or artefact."""
-    from catalog.store import open_store
+    from catalog.store import existing_store
 
-    table, row = _find(open_store(), name)
+    table, row = _find(existing_store(), name)
     if as_json:
         print_json({"table": table, **_open(row)})
         return
@@ -71,10 +71,10 @@ def explain(
     from catalog.artefacts import ArtefactRef
     from catalog.errors import UnknownRecordError
     from catalog.explain import Explainer
-    from catalog.store import open_store
+    from catalog.store import existing_store
     from tasks.stages import project_source
 
-    store = open_store()
+    store = existing_store()
     table, row = _find(store, name)
     explainer = Explainer(store, project_source().code_from)
     if table == "runs":

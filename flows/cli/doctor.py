@@ -25,17 +25,16 @@ def doctor(
     as_json: AsJson = False,
 ) -> None:
     """Check the setup, a stored scene, or a dataset on disk."""
-    from catalog.store import open_store
+    from catalog.store import existing_store, open_store
     from tasks import health
     from tasks.ingest import data_checks
 
-    store = open_store()
     if subject is None:
-        findings = health.check_environment(store.root)
+        findings = health.check_environment(open_store().root)
     elif root is not None:
-        findings = data_checks.check_dataset(store, subject, root, out)
+        findings = data_checks.check_dataset(open_store(), subject, root, out)
     else:
-        findings = data_checks.check_stored_scene(store, subject, out)
+        findings = data_checks.check_stored_scene(existing_store(), subject, out)
     is_fit = all(finding.verdict != "fail" for finding in findings)
     if as_json:
         rows = [

@@ -12,7 +12,7 @@ from lidarpainter_models.errors import ConfigError
 FLICKER = "flicker"
 CROSS_CAMERA = "cross-camera"
 PROTOCOLS = ("paper", "truth", CROSS_CAMERA, FLICKER)
-VARIANTS = ("unpainted", "painted", "view-time")
+VARIANTS = ("unpainted", "painted", "refined", "view-time")
 FLICKER_COLUMNS = ("flicker", "moving_flicker", "valid_share", "psnr", "num_pairs")
 
 
@@ -42,7 +42,7 @@ def evaluate(  # noqa: PLR0913 - the options of a command
 ) -> None:
     """Judge a finished run on views it never saw."""
     _check(protocol, previous)
-    from catalog.store import open_store
+    from catalog.store import existing_store
     from flows.cli.progress import shown_progress
     from flows.evaluate import EvaluationRequest, evaluate_run
 
@@ -55,7 +55,7 @@ def evaluate(  # noqa: PLR0913 - the options of a command
         previous=parse_previous(previous),
     )
     with shown_progress():
-        result = evaluate_run(open_store(), request)
+        result = evaluate_run(existing_store(), request)
     if as_json:
         print_json(result)
     elif protocol == FLICKER:

@@ -27,21 +27,24 @@ def ingest(  # noqa: PLR0913 - one per option
         int, typer.Option(min=1, help="Sequences read at once, each in a process of its own.")
     ] = 1,
     again: Annotated[
-        bool, typer.Option("--again", help="Read sequences anew that are in the store unchanged.")
+        bool, typer.Option("--again", help="Read anew, and replace what is in the store.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Bring sequences of a dataset into the store."""
+    """Bring sequences of a dataset into the store.
+
+    A sequence that is there as asked for is not read again. With other cameras, other frames or
+    from another root it is refused, and --again replaces what is there.
+    """
     chosen_frames = parse_frames(frames)
     chosen_cameras = parse_names(cameras)
 
     from catalog.store import open_store
     from flows.cli.progress import shown_progress
-    from lidarpainter_models.readers import list_sequences
-    from tasks.ingest.jobs import IngestRequest, ingest_sequences
+    from tasks.ingest.jobs import IngestRequest, find_sequences, ingest_sequences
 
     store = open_store()
-    names = list(dict.fromkeys(sequences or list_sequences(dataset, root)))
+    names = find_sequences(dataset, root, sequences or ())
     request = IngestRequest(store.root, dataset, root, chosen_frames, chosen_cameras)
     with shown_progress():
         done = ingest_sequences(request, names, jobs=jobs, again=again, on_failure=complain)

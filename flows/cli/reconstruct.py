@@ -1,5 +1,6 @@
 """`lidarpainter reconstruct`: fit, paint, judge and report one scene."""
 
+import re
 from typing import Annotated, Any
 
 import typer
@@ -29,7 +30,7 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     as_json: AsJson = False,
 ) -> None:
     """Turn a stored scene into a fitted, painted, judged and reported one."""
-    from catalog.store import open_store
+    from catalog.store import existing_store
     from flows.cli.running import run_reconstruction
     from flows.overrides import with_changes, with_overrides
     from flows.presets import preset as preset_named
@@ -46,7 +47,7 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     if shift is not None or up is not None:
         changes["novel"] = shifted(parameters.novel, shift, up)
     parameters = with_overrides(with_changes(parameters, changes), settings or [])
-    result = run_reconstruction(parameters, open_store())
+    result = run_reconstruction(parameters, existing_store())
     if as_json:
         print_json(result)
     else:
@@ -69,10 +70,13 @@ def shifted(novel: Any, shift: str | None, up: str | None) -> Any:  # noqa: ANN4
 
 def show(result: dict[str, Any]) -> None:
     """The result as tables."""
+    from flows.parameters import fitted_on
     from lidarpainter_models.evaluation.score_tables import SCORE_COLUMNS, SCORE_NOTE, score_rows
 
     title = f"{result['scene']}, painter {result['painter']}"
-    print_table(title, SCORE_COLUMNS, score_rows(result), SCORE_NOTE)
+    after = fitted_on(result["painter"])
+    columns = [re.sub(r"^painted", after, name) for name in SCORE_COLUMNS]
+    print_table(title, columns, score_rows(result), SCORE_NOTE)
     pairs: dict[str, Cell] = {
         "run": result["run_id"],
         "Gaussians": result["num_gaussians"],

@@ -24,7 +24,8 @@ def render(  # noqa: PLR0913 - the options of a command
     camera: FollowedCamera = None,
     frames: FollowedFrames = None,
     postpaint: Annotated[
-        bool, typer.Option("--postpaint", help="Paint every image as well.")
+        bool,
+        typer.Option("--postpaint", help="Paint every image; renders go to `unpainted/`."),
     ] = False,
     painter: Annotated[
         str | None, typer.Option(help="Painter for --postpaint; the run's own if absent.")
@@ -39,7 +40,7 @@ def render(  # noqa: PLR0913 - the options of a command
     as_json: AsJson = False,
 ) -> None:
     """Render a finished run where nobody drove."""
-    from catalog.store import open_store
+    from catalog.store import existing_store
     from flows.cli.progress import shown_progress
     from flows.views import PathRequest, render_run
     from lidarpainter_models.conditioning.sequences import SequenceConfig
@@ -55,7 +56,7 @@ def render(  # noqa: PLR0913 - the options of a command
     )
     with shown_progress():
         result = render_run(
-            open_store(),
+            existing_store(),
             path,
             out.absolute(),
             prompt=prompt,

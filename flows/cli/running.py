@@ -32,5 +32,6 @@ def run_demo(parameters: ReconstructParameters, seed: int, store: Store) -> dict
 
 @contextmanager
 def _running(store: Store) -> Iterator[None]:
+    store.make()
     with prefect_server(store.root / "logs" / "prefect.log"), shown_progress():
         yield

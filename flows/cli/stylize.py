@@ -36,7 +36,7 @@ def stylize(  # noqa: PLR0913 - the options of a command
     as_json: AsJson = False,
 ) -> None:
     """Show a finished run in another weather or at night, and how well its edges are kept."""
-    from catalog.store import open_store
+    from catalog.store import existing_store
     from flows.cli.progress import shown_progress
     from flows.views import PathRequest, stylize_run
     from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
@@ -52,7 +52,7 @@ def stylize(  # noqa: PLR0913 - the options of a command
     asked: Any = images  # the request says which there are
     with shown_progress():
         result = stylize_run(
-            open_store(),
+            existing_store(),
             path,
             out.absolute(),
             prompt=prompt,

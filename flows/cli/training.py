@@ -39,5 +39,6 @@ def run_ablation(parameters: AblationParameters) -> dict[str, Any]:
 
 def _run(flow: Callable[..., dict[str, Any]], parameters: Parameters) -> dict[str, Any]:
     store = open_store()
+    store.make()
     with prefect_server(store.root / "logs" / "prefect.log"), shown_progress():
         return flow(parameters, store.root)

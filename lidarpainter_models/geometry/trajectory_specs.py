@@ -51,9 +51,14 @@ def parse_trajectory(spec: str) -> Trajectory:
     Lateral is to the left of the driving direction; a turn is counter-clockwise seen from above.
 
     Raises:
-        ConfigError: the text is no trajectory.
+        ConfigError: the text is no trajectory, or one that leads too far away.
     """
-    return Trajectory(spec, tuple(_part(text.strip(), spec) for text in spec.split("+")))
+    found = Trajectory(spec, tuple(_part(text.strip(), spec) for text in spec.split("+")))
+    try:
+        found.shift_at(1.0)  # every part goes farthest at its end
+    except ConfigError as error:
+        raise ConfigError(f"trajectory {spec!r}: {error}") from None
+    return found
 
 
 def _part(text: str, spec: str) -> _Part:

@@ -1,5 +1,6 @@
 """At which size a fit sees recorded images."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -17,12 +18,26 @@ class ObservationConfig:
     """How recordings are prepared for a fit."""
 
     width_px: int = 480
-    """Fit width; the height keeps each camera's aspect ratio."""
+    """Fit width; the height keeps each camera's aspect ratio. Narrower recordings keep theirs."""
 
     def __post_init__(self) -> None:
         """Refuse images too small for the SSIM window."""
         if self.width_px < 32:
             raise ConfigError(f"width_px must be at least 32, got {self.width_px}")
+
+
+def require_recorded_width(width_px: int, views: Iterable[RecordedView], what: str) -> None:
+    """Refuse a width that was asked for and that no camera recorded.
+
+    Raises:
+        ConfigError: the widest of the images is narrower.
+    """
+    widest_px = max(view.camera.width_px for view in views)
+    if width_px > widest_px:
+        raise ConfigError(
+            f"{what} {width_px} px: expected at most the {widest_px} px that were recorded, "
+            "images are never enlarged"
+        )
 
 
 def shrink_image(

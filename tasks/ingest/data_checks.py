@@ -10,9 +10,10 @@ from catalog.store import Store
 from lidarpainter_models.checks.doctor import check_scene, draw_overlay
 from lidarpainter_models.errors import LidarPainterError
 from lidarpainter_models.export.images import write_png
-from lidarpainter_models.readers import ingest_scene, list_sequences
+from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from tasks.health import Finding
+from tasks.ingest.jobs import find_sequences
 from tasks.opened import open_scene
 
 TRIAL_FRAMES = slice(0, 6)
@@ -45,7 +46,7 @@ def check_dataset(store: Store, dataset: str, root: Path, out: Path | None) -> l
         out: another folder for them.
     """
     findings = []
-    for sequence in list_sequences(dataset, root):
+    for sequence in find_sequences(dataset, root):
         with tempfile.TemporaryDirectory(prefix="lidarpainter-doctor-") as trial:
             try:
                 path = ingest_scene(dataset, root, sequence, Path(trial), frames=TRIAL_FRAMES)

@@ -33,6 +33,7 @@ def ingest_sequence(
 ) -> dict[str, Any]:
     """Read one sequence of a dataset into the store; returns its row in `scenes`."""
     store = open_store(store_path)
+    store.make()
     with _writing(store, f"{dataset}/{sequence}"):
         path = ingest_scene(
             dataset,
@@ -50,6 +51,7 @@ def ingest_sequence(
 def ingest_street(store_path: Path, config: SyntheticStreetConfig) -> dict[str, Any]:
     """Render a synthetic street into the store; returns its row in `scenes`."""
     store = open_store(store_path)
+    store.make()
     with _writing(store, f"synthetic/street-{config.seed:04d}"):
         path = write_street(
             config,

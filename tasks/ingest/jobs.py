@@ -2,17 +2,19 @@
 
 What was asked for and what came of it is noted below `<store>/ingested/` once a sequence is in the
 store and the catalog. The same request for a scene that still has the content noted is answered
-from there; a changed request, another version or a changed scene is read anew. Whether the source
-files changed since is not looked at: `again` reads them anew. A sequence that was interrupted
-leaves nothing behind and starts again at its first frame.
+from there; another version or a changed scene is read anew. Other cameras, frames or another root
+than the scene that is there was read with, fewer ones too, are refused: runs stand on it, and
+`again` alone replaces it. Whether the source files changed since is not looked at. A sequence that
+was interrupted leaves nothing behind and starts again at its first frame.
 """
 
 import json
 import multiprocessing
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,9 +22,11 @@ from typing import Any
 import lidarpainter_models
 from catalog.errors import CatalogError
 from catalog.store import open_store
-from lidarpainter_models.errors import LidarPainterError
-from lidarpainter_models.scenes.stored import stored_digest
+from lidarpainter_models.errors import ConfigError, DataError, LidarPainterError
+from lidarpainter_models.readers import known_datasets, list_sequences
+from lidarpainter_models.scenes.stored import read_manifest
 from lidarpainter_models.storage.whole_files import write_whole
+from tasks.ingest.ingest import STAGE as ONE_SEQUENCE
 from tasks.ingest.ingest import ingest_sequence
 from tasks.progress import listener
 
@@ -56,6 +60,29 @@ class Ingested:
 
     rows: list[dict[str, Any]] = field(default_factory=list)
     failures: list[dict[str, str]] = field(default_factory=list)
+
+
+def find_sequences(dataset: str, root: Path, named: Sequence[str] = ()) -> list[str]:
+    """The sequences that were named, each once, or all that are found below a root.
+
+    Raises:
+        DataError: the dataset is not known, none is found, or the root is part of a dataset: then
+            the folder above is named.
+    """
+    found: tuple[str, ...] = ()
+    with suppress(DataError):
+        found = list_sequences(dataset, root)
+    parent = Path(root).absolute().parent
+    if not found and dataset in known_datasets() and parent != parent.parent:
+        above: tuple[str, ...] = ()
+        with suppress(LidarPainterError, OSError):
+            above = list_sequences(dataset, parent)
+        if above:
+            raise DataError(
+                f"{root}: expected the root of {dataset}, use its parent {parent}, "
+                f"which holds {_some(above)}"
+            )
+    return list(dict.fromkeys(named or found or list_sequences(dataset, root)))
 
 
 def ingest_sequences(
@@ -98,9 +125,15 @@ def ingest_sequences(
 
 
 def ingest_or_recall(request: IngestRequest, name: str, again: bool) -> dict[str, Any]:
-    """The row of one sequence: noted when it was done before, else made now and noted."""
+    """The row of one sequence: noted when it was done before, else made now and noted.
+
+    Raises:
+        ConfigError: the scene is in the store, read with another choice than this.
+    """
     note = request.store_path / "ingested" / request.dataset / f"{name}.json"
-    if not again and (row := _noted(note, request)) is not None:
+    if not again and (row := _known(note, request, name)) is not None:
+        listener().started(ONE_SEQUENCE)
+        listener().finished(ONE_SEQUENCE, 0.0, is_new=False)
         return row
     row = ingest_sequence.fn(
         request.store_path, request.dataset, request.root, name, request.frames, request.cameras
@@ -109,16 +142,63 @@ def ingest_or_recall(request: IngestRequest, name: str, again: bool) -> dict[str
     return row
 
 
-def _noted(note: Path, request: IngestRequest) -> dict[str, Any] | None:
+def _known(note: Path, request: IngestRequest, name: str) -> dict[str, Any] | None:
+    """The row of the scene if it is there as asked for; None where it has to be read.
+
+    Raises:
+        ConfigError: it is there, with other cameras, other frames or from another root.
+    """
+    asked, row, earlier = request.key(), {}, {}
     try:
         noted = json.loads(note.read_text("utf-8"))
-        row = noted["row"]
-        if noted["request"] != request.key():
-            return None
-        folder = open_store(request.store_path).scene_folder(row["scene_id"])
-        return row if stored_digest(folder) == row["content_digest"] else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None  # no note, or one that cannot be read: the sequence is read anew
+        row, earlier = dict(noted["row"]), dict(noted["request"])
+        scene_id, digest = row["scene_id"], row["content_digest"]
+    except (OSError, ValueError, KeyError, TypeError):  # no note, or one that cannot be read
+        scene_id, digest = f"{request.dataset}/{name}", None
+    try:
+        stored = read_manifest(open_store(request.store_path).scene_folder(scene_id))
+    except (LidarPainterError, CatalogError):
+        return None
+    if stored["content_digest"] != digest:
+        earlier = {}  # nothing is noted of the scene that is there, but it has its cameras
+    there = {**asked, **earlier, "cameras": sorted(stored["camera_names"])}
+    if asked["cameras"] is None and earlier.get("cameras") is None:
+        there["cameras"] = None
+    differing = [what for what, say in WORDS.items() if say(there[what]) != say(asked[what])]
+    if differing:
+        raise ConfigError(_refusal(scene_id, differing, there, asked))
+    is_same = earlier.get("software_version") == asked["software_version"]
+    return row if is_same else None
+
+
+def _some(names: Sequence[str], most: int = 5) -> str:
+    return ", ".join([*names[:most], *(["..."] if len(names) > most else [])])
+
+
+def _frames(chosen: Sequence[int | None] | None) -> str:
+    start, stop = chosen or (None, None)
+    return "all frames" if not start and stop is None else f"frames {start or 0}:{stop or ''}"
+
+
+WORDS: dict[str, Callable[[Any], str]] = {
+    "cameras": lambda names: f"cameras {', '.join(sorted(set(names)))}" if names else "all cameras",
+    "frames": _frames,
+    "root": lambda root: f"root {root}",
+}
+"""How a choice is said, part by part; choices that are said alike are the same."""
+
+
+def _refusal(
+    scene_id: str, differing: Sequence[str], there: Mapping[str, Any], asked: Mapping[str, Any]
+) -> str:
+    before, now = ("; ".join(WORDS[one](each[one]) for one in differing) for each in (there, asked))
+    hint = ""
+    if "cameras" in differing and set(asked["cameras"] or ("all",)) < set(there["cameras"]):
+        hint = " (`reconstruct --train-cameras` takes some of its cameras)"
+    return (
+        f"scene {scene_id} is in the store with {before}, asked for: {now}; it was kept, "
+        f"--again replaces it{hint}"
+    )
 
 
 def _in_turn(

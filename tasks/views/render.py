@@ -27,6 +27,7 @@ from tasks.stored import FittedRef, load_observations
 
 STAGE = "render"
 POSES_FILE = "trajectory.json"
+UNPAINTED_FOLDER = "unpainted"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +60,9 @@ class RenderRequest:
 def render(run: RunSpec, fitted: FittedRef, request: RenderRequest, out: Path) -> dict[str, Any]:
     """Write an image for every recorded moment, and where each was taken.
 
+    What is painted lies at `0007.png`, the render that it was painted from at
+    `unpainted/0007.png`.
+
     Raises:
         SceneError: the run did not train on that camera, or no frame is left.
     """
@@ -67,8 +71,17 @@ def render(run: RunSpec, fitted: FittedRef, request: RenderRequest, out: Path) -
     rows = []
     for number, view in enumerate(path.views):
         camera = path.camera(number)
-        file = write_png(path.image(camera, view), out / f"{view.frame_index:04d}.png")
-        rows.append(image_record(file.name, camera, view))
+        name = f"{view.frame_index:04d}.png"
+        row = image_record(name, camera, view)
+        if path.painter is None:
+            rgb = path.image(camera, view)
+        else:
+            painted = path.painter.paint(camera, view.timestamp_ns)
+            rgb = painted.painting.rgb
+            row["unpainted"] = f"{UNPAINTED_FOLDER}/{name}"
+            write_png(painted.conditions.render_rgb, out / row["unpainted"])
+        write_png(rgb, out / name)
+        rows.append(row)
         listener().advanced(STAGE, number + 1, len(path.views), "")
     write_json(out / POSES_FILE, {"trajectory": request.trajectory.spec, "images": rows})
     return {"folder": str(out), "num_images": len(rows), "camera": path.views[0].camera_name}

@@ -17,6 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.fixture(autouse=True)
 def own_store(tmp_path, monkeypatch):
     monkeypatch.setenv(STORE_ENVIRONMENT, str(tmp_path / "store"))
+    (tmp_path / "store" / "tables").mkdir(parents=True)
     return open_store(tmp_path / "store")
 
 

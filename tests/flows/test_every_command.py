@@ -136,6 +136,13 @@ def test_another_painter_goes_on_from_the_fit_that_is_there(tiny_run, words, pai
     is_refined = "refine-1" in result["seconds"]
     assert (result["novel"] != result["unpainted"]["novel"]) == is_refined
     assert tiny_run.store.tables.row("runs", result["run_id"])["status"] == "complete"
+    last = {"none": "refined"}.get(result["painter"], "painted")
+    judged = succeed("evaluate", result["run_id"], "--json", store=tiny_run.store).json
+    assert (last in judged) == is_refined
+    assert "unpainted" in judged
+    rows = tiny_run.store.tables.rows("metrics")
+    variants = {row["variant"] for row in rows if row["run_id"] == result["run_id"]}
+    assert variants == {"unpainted", last}
 
 
 def test_a_person_is_shown_tables(tiny_run):
@@ -164,6 +171,11 @@ def test_render_writes_images_along_the_path(tiny_run, tmp_path, trajectory, wor
     described = json.loads((tmp_path / "trajectory.json").read_text())["images"]
     images = [seen_image(tmp_path / row["file"], WIDTH_PX, HEIGHT_PX) for row in described]
     assert not np.array_equal(images[0], images[2])
+    for row, image in zip(described, images, strict=True):
+        assert ("unpainted" in row) == (painter is not None)
+        if painter:
+            render = seen_image(tmp_path / row["unpainted"], WIDTH_PX, HEIGHT_PX)
+            assert not np.array_equal(render, image)
 
 
 def test_a_shifted_camera_stands_where_it_was_asked_to(tiny_run, tmp_path):

@@ -1,6 +1,7 @@
 """Trajectories are read as they are written."""
 
 import math
+import re
 
 import pytest
 
@@ -34,6 +35,12 @@ def test_a_lane_change_starts_here_and_ends_a_lane_to_the_left():
 
 def test_names_can_be_folders():
     assert parse_trajectory("lateral:2+up:1.5").name == "lateral-2_up-1.5"
+
+
+@pytest.mark.parametrize("spec", ["lateral:200", "up:-9", "lateral:5+lane-change:4"])
+def test_a_path_farther_off_than_a_scene_can_show_is_refused(spec):
+    with pytest.raises(ConfigError, match=f"'{re.escape(spec)}': .* at most 8 metres from the rec"):
+        parse_trajectory(spec)
 
 
 @pytest.mark.parametrize("spec", ["", "lateral", "lateral:", "up:x", "up:nan", "orbit", "a+b"])

@@ -2,14 +2,21 @@
 
 import os
 import shutil
+from dataclasses import replace
 
 import pytest
 from toy_store import write_toy_scene
 
 from catalog.store import open_store
-from lidarpainter_models.errors import LidarPainterError
+from lidarpainter_models.errors import ConfigError, DataError, LidarPainterError
+from lidarpainter_models.scenes.stored import stored_digest
 from tasks.ingest import jobs as ingest_jobs
-from tasks.ingest.jobs import IngestRequest, ingest_or_recall, ingest_sequences
+from tasks.ingest.jobs import (
+    IngestRequest,
+    find_sequences,
+    ingest_or_recall,
+    ingest_sequences,
+)
 
 
 @pytest.fixture
@@ -58,14 +65,64 @@ def test_what_is_done_is_not_done_again(request_of, monkeypatch):
     assert read == ["a", "a"]
 
 
-def test_another_request_or_a_scene_that_is_gone_is_read_anew(request_of, monkeypatch):
+def test_a_scene_that_is_gone_is_read_anew(request_of, monkeypatch):
     read = count_reads(monkeypatch)
     row = ingest_or_recall(request_of, "a", False)
-    fewer = IngestRequest(
-        request_of.store_path, request_of.dataset, request_of.root, frames=slice(0, 1)
-    )
-    ingest_or_recall(fewer, "a", False)
-    ingest_or_recall(request_of, "a", False)
     shutil.rmtree(open_store(request_of.store_path).scene_folder(row["scene_id"]))
     ingest_or_recall(request_of, "a", False)
-    assert read == ["a"] * 4
+    assert read == ["a"] * 2
+
+
+@pytest.mark.parametrize(
+    ("first", "then", "expected"),
+    [
+        ({}, {"cameras": ("front",)}, None),  # all there are, in other words
+        ({"cameras": ("front",)}, {}, "with cameras front, asked for: all cameras; it was kept"),
+        ({}, {"frames": slice(0, 1)}, "with all frames, asked for: frames 0:1; it was kept"),
+        ({"frames": slice(None, 2)}, {"frames": slice(0, 2)}, None),
+        ({"frames": slice(0, 2)}, {"frames": slice(1, 3)}, "with frames 0:2, asked for: frames 1:"),
+    ],
+)
+def test_another_choice_of_a_stored_scene_is_refused(
+    request_of, monkeypatch, first, then, expected
+):
+    read = count_reads(monkeypatch)
+    row = ingest_or_recall(replace(request_of, **first), "a", False)
+    if expected is None:
+        assert ingest_or_recall(replace(request_of, **then), "a", False) == row
+        assert read == ["a"]
+        return
+    with pytest.raises(ConfigError, match=f"scene toy/street is in the store {expected}"):
+        ingest_or_recall(replace(request_of, **then), "a", False)
+    folder = open_store(request_of.store_path).scene_folder("toy/street")
+    assert stored_digest(folder) == row["content_digest"]
+    ingest_or_recall(replace(request_of, **then), "a", True)
+    assert read == ["a", "a"]
+
+
+def test_the_same_sequence_of_another_root_is_refused(request_of, tmp_path):
+    ingest_or_recall(request_of, "a", False)
+    shutil.copytree(request_of.root, tmp_path / "other")
+    with pytest.raises(ConfigError, match=r"root .*/root, asked for: root .*/other"):
+        ingest_or_recall(replace(request_of, root=tmp_path / "other"), "a", False)
+
+
+def test_cameras_are_compared_where_nothing_is_noted(request_of):
+    row = ingest_or_recall(request_of, "a", False)
+    scene = open_store(request_of.store_path).root / "scenes"
+    (scene / "canonical").mkdir()
+    shutil.copytree(scene / "toy/street", scene / "canonical/c")  # as if read by other software
+    with pytest.raises(ConfigError, match="with cameras front, asked for: cameras back; it was"):
+        ingest_or_recall(replace(request_of, cameras=("back",)), "c", False)
+    assert ingest_or_recall(request_of, "c", False) == row
+
+
+@pytest.mark.parametrize("named", [(), ("lidar",)])
+def test_a_part_of_a_dataset_is_no_root(tmp_path, named):
+    for place in ("002/lidar", "103/lidar"):
+        (tmp_path / place).mkdir(parents=True)
+        (tmp_path / place / "poses.json").write_text("[]")
+    with pytest.raises(DataError, match=f"use its parent {tmp_path}, which holds 002, 103"):
+        find_sequences("pandaset", tmp_path / "002", named)
+    assert find_sequences("pandaset", tmp_path) == ["002", "103"]
+    assert find_sequences("pandaset", tmp_path, ("103", "7", "103")) == ["103", "7"]
