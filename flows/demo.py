@@ -10,7 +10,8 @@ from flows.parameters import ReconstructParameters
 from flows.presets import preview
 from flows.reconstruct import reconstruct
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
-from tasks.painter.harvest import keep_street, street_id
+from tasks.painter.harvest import keep_street
+from tasks.specs import street_id
 
 DEMO_SEED = 1
 """Kept apart from the seeds that painters are trained and tested on."""
@@ -21,11 +22,6 @@ DEMO_CAMERAS = DEFAULT_CAMERAS[:1]
 def demo_street(seed: int = DEMO_SEED) -> SyntheticStreetConfig:
     """The street of the demo, or another one of its kind."""
     return SyntheticStreetConfig(seed=seed, width_px=640, height_px=360, cameras=DEMO_CAMERAS)
-
-
-def demo_parameters(seed: int = DEMO_SEED) -> ReconstructParameters:
-    """The preview preset on that street."""
-    return preview(street_id(seed))
 
 
 @flow(name="demo")
@@ -40,4 +36,4 @@ def demo(
 @flow(name="demo-scene")
 def demo_scene(store: str | None = None) -> dict[str, Any]:
     """Run the demo as a worker is asked to, in the worker's store."""
-    return demo.fn(demo_street(), demo_parameters(), open_store(store).root)
+    return demo.fn(demo_street(), preview(street_id(DEMO_SEED)), open_store(store).root)

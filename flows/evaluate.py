@@ -7,7 +7,7 @@ from typing import Any
 from catalog.store import Store
 from flows.overrides import with_changes
 from flows.parameters import ViewParameters, fitted_on, view_parameters
-from lidarpainter_models.conditioning.sequences import SequenceConfig
+from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.score_tables import FLICKER, Scores, flicker_by_image
 from tasks.evaluation.flicker import evaluate_flicker
@@ -15,7 +15,7 @@ from tasks.evaluation.strips import evaluate_strips
 from tasks.evaluation.views import evaluate, load_scores
 from tasks.reconstruction.publish import record_scores
 from tasks.runs import FinishedRun, open_run
-from tasks.stored import FittedRef
+from tasks.specs import FittedRef
 
 CROSS_CAMERA = "cross-camera"
 TRUTH = "truth"

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.metrics.lpips import LpipsFiles
+from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.painter.selection import PainterChoice
 from lidarpainter_models.painter.training_jobs import PainterTraining, recipe_for

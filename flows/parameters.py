@@ -5,18 +5,16 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from lidarpainter_models.conditioning.conditions import ConditionConfig
-from lidarpainter_models.conditioning.novel_guidance import NovelGuidanceConfig
+from lidarpainter_models.conditioning.settings import ConditionConfig, NovelGuidanceConfig
 from lidarpainter_models.devices import Device
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.evaluation.judging import JudgeConfig
-from lidarpainter_models.evaluation.scene_scores import ScoringConfig
+from lidarpainter_models.evaluation.settings import JudgeConfig, ScoringConfig
 from lidarpainter_models.gaussians.fitting.config import FitConfig
-from lidarpainter_models.metrics.lpips import LpipsFiles
-from lidarpainter_models.observations.fit_size import ObservationConfig
+from lidarpainter_models.metrics.lpips_files import LpipsFiles
+from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.painter.selection import NO_PAINTER
-from tasks.opened import RunSpec, SplitSpec
 from tasks.runs import FinishedRun
+from tasks.specs import RunSpec, SplitSpec
 
 
 class ViewParameters(BaseModel):

@@ -4,12 +4,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from flows.parameters import ReconstructParameters
-from lidarpainter_models.conditioning.conditions import ConditionConfig
-from lidarpainter_models.conditioning.novel_guidance import NovelGuidanceConfig
+from lidarpainter_models.conditioning.settings import ConditionConfig, NovelGuidanceConfig
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.evaluation.scene_scores import ScoringConfig
+from lidarpainter_models.evaluation.settings import ScoringConfig
 from lidarpainter_models.gaussians.fitting.config import FitConfig, GuidanceConfig, continuation
-from lidarpainter_models.observations.fit_size import ObservationConfig
+from lidarpainter_models.observations.settings import ObservationConfig
 
 SHORT_REFINE_STEPS = 500
 """A round of the CPU preset: fourteen looks at each of 35 painted views."""

@@ -24,15 +24,15 @@ from lidarpainter_models.metrics.perceptual import load_distances
 from lidarpainter_models.observations.fit_size import require_recorded_width
 from lidarpainter_models.painter.selection import NO_PAINTER
 from tasks.evaluation.views import evaluate, load_scores
-from tasks.opened import RunSpec, opened
+from tasks.opened import opened
 from tasks.reconstruction.fit import fit
 from tasks.reconstruction.paint import paint
 from tasks.reconstruction.prepare import prepare
 from tasks.reconstruction.publish import begin_run, complete_run, end_run
 from tasks.reconstruction.report import REPORT_FILE, ReportInputs, write_report
 from tasks.source import code_behind
+from tasks.specs import FittedRef, RunSpec
 from tasks.stages import StageResult
-from tasks.stored import FittedRef
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,35 +6,27 @@ from pathlib import Path
 from typing import Any
 
 from prefect import flow
-from pydantic import BaseModel, ConfigDict
 
 from catalog.store import open_store, split_scene_id
-from lidarpainter_models.devices import Device, chosen_device
+from flows.painter_parameters import HarvestParameters, TrainPainterParameters
+from lidarpainter_models.devices import chosen_device
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.held_back import (
-    FIRST_TRAINING_SEED,
     check_street_seed,
     check_training_pairs,
     check_training_scene,
     first_targets,
 )
 from lidarpainter_models.evaluation.painter_training import TrainingRequest
-from lidarpainter_models.metrics.lpips import LpipsFiles
-from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.painter.selection import WEIGHTS_SUFFIX
-from lidarpainter_models.painter.training_jobs import PainterTraining, job_for
+from lidarpainter_models.painter.training_jobs import job_for
 from lidarpainter_models.storage.whole_files import write_whole
-from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
-from lidarpainter_models.training_data.harvest import HarvestConfig
 from lidarpainter_models.training_data.pair_sets import PairSet, named_sets
-from lidarpainter_models.training_data.street_harvest import StreetPlan, default_street_plans
-from tasks.opened import SplitSpec
 from tasks.painter.harvest import (
     harvest_recorded,
     harvest_street,
     keep_street,
     pair_set,
-    street_id,
 )
 from tasks.painter.judge import (
     feature_distance_of,
@@ -48,52 +40,10 @@ from tasks.painter.train import (
     training_record,
     weights_path,
 )
+from tasks.specs import SplitSpec, street_id
 from tasks.stages import StageResult
 
 SYNTHETIC = "synthetic/"
-
-
-class HarvestParameters(BaseModel):
-    """Where pairs come from."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    street_seeds: tuple[int, ...] = ()
-    """Synthetic streets to draw and to harvest."""
-    street: SyntheticStreetConfig = SyntheticStreetConfig(
-        seed=FIRST_TRAINING_SEED, width_px=640, height_px=360, cameras=DEFAULT_CAMERAS[:1]
-    )
-    """What the streets have in common; each has its own seed. The plans fit the front camera."""
-    street_plans: tuple[StreetPlan, ...] = default_street_plans()
-    scenes: tuple[str, ...] = ()
-    """Stored scenes to harvest, `<dataset>/<sequence>`."""
-    split: str = "alternate"
-    """Split of the recorded scenes; only their training frames are used."""
-    cameras: tuple[str, ...] | None = None
-    """Cameras of the recorded scenes; None takes all."""
-    harvest: HarvestConfig = HarvestConfig()
-
-
-class TrainPainterParameters(HarvestParameters):
-    """What a painter is trained on, and how."""
-
-    pair_folders: tuple[Path, ...] = ()
-    """Pairs that were harvested before."""
-    start: Path | None = None
-    """Weights to go on from, a name or a file; None starts from nothing."""
-    base: str | None = None
-    """Model that the one-step painter is trained on; None trains the small painter."""
-    training: PainterTraining = NanoTrainingConfig()
-    lpips: LpipsFiles = LpipsFiles()
-    """Weights for the loss of the one-step painter."""
-    device: Device = "auto"
-    """Where the one-step painter is trained, and what is trained is judged."""
-    processes: int = 1
-    """In which the one-step painter is trained, each on a GPU of its own."""
-    held_back: float = 0.1
-    """Share of the true images that are kept from training: the validation split."""
-    feature_weights: Path | None = None
-    """SqueezeNet 1.1 weights for the feature distance; None leaves it out."""
 
 
 @flow(name="harvest_pairs")

@@ -6,7 +6,7 @@ from typing import Any
 
 from catalog.store import Store
 from flows.parameters import view_parameters
-from lidarpainter_models.conditioning.sequences import SequenceConfig
+from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
 from lidarpainter_models.observations.fit_size import require_recorded_width
 from tasks.opened import open_scene

@@ -8,20 +8,22 @@ never computed twice are the `lidarpainter` command's.
 from collections.abc import Sequence
 from pathlib import Path
 
-from lidarpainter_models.conditioning.conditions import ConditionBuilder, ConditionConfig
+from lidarpainter_models.conditioning.conditions import ConditionBuilder
+from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.judging import JudgeConfig, Judgement
-from lidarpainter_models.evaluation.scene_scores import JUDGED_SHIFTS, ScoringConfig
+from lidarpainter_models.evaluation.judging import Judgement
 from lidarpainter_models.evaluation.score_tables import Scores
+from lidarpainter_models.evaluation.settings import JUDGED_SHIFTS, JudgeConfig, ScoringConfig
 from lidarpainter_models.evaluation.shown import ShownScene
 from lidarpainter_models.export.images import write_png
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.geometry.trajectories import Shift, road_directions, shift_pose
-from lidarpainter_models.observations.fit_size import ObservationConfig
+from lidarpainter_models.geometry.shifts import Shift
+from lidarpainter_models.geometry.trajectories import road_directions, shift_pose
 from lidarpainter_models.observations.preparation import prepare_observations
+from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.painter import load_painter
 from lidarpainter_models.scenes.driving_scene import DrivingScene

@@ -12,36 +12,15 @@ from pathlib import Path
 import torch
 
 from catalog.store import Store, open_store
-from lidarpainter_models.devices import Device, chosen_device
+from lidarpainter_models.devices import chosen_device
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.observations.fit_size import ObservationConfig
-from lidarpainter_models.painter.selection import NO_PAINTER, PainterChoice
+from lidarpainter_models.observations.settings import ObservationConfig
+from lidarpainter_models.painter.selection import PainterChoice
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.schema import MANIFEST_NAME
 from lidarpainter_models.scenes.splits import ViewSplit, split_views
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SplitSpec:
-    """Which views of a scene may be seen."""
-
-    scene_id: str
-    spec: str = "alternate"
-    """`alternate`, `forward:17:8` or `all`; see `lidarpainter_models.scenes.splits`."""
-    cameras: tuple[str, ...] | None = None
-    """Cameras to train on and to judge; None takes all."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RunSpec:
-    """What a run works on, in words that any process understands."""
-
-    store_path: Path
-    split: SplitSpec
-    painter: str = NO_PAINTER
-    """Name of a painter, or path of its weights or model."""
-    device: Device = "auto"
+from tasks.specs import RunSpec, SplitSpec
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

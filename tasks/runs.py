@@ -7,7 +7,7 @@ from typing import Any
 from catalog.artefacts import ArtefactRef
 from catalog.errors import UnknownRecordError
 from catalog.store import Store
-from tasks.stored import FittedRef
+from tasks.specs import FittedRef
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,7 +3,6 @@
 Each kind has one file of tensors (`FILES`); reading one checks every byte first.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -22,14 +21,6 @@ from tasks.json_files import read_json, write_json
 OBSERVATIONS_FILE = "observations.safetensors"
 SCENE_FILE = "scene.safetensors"
 HISTORY_FILE = "history.json"
-
-
-@dataclass(frozen=True, slots=True)
-class FittedRef:
-    """A fitted scene and what it was fitted to."""
-
-    observations: ArtefactRef
-    gaussians: ArtefactRef
 
 
 History = list[dict[str, float]]

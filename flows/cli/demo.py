@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from flows.cli.output import print_json
-from flows.cli.shared_options import AsJson, Painter, Settings
+from flows.cli.output import print_json, say_status
+from flows.cli.shared_options import AsJson, Painter, Settings, check_painter
 
 REPORT_NAME = "report.html"
 
@@ -26,13 +26,16 @@ def demo(
     from catalog.store import open_store
     from flows.cli.reconstruct import show
     from flows.cli.running import run_demo
-    from flows.demo import demo_parameters
     from flows.overrides import with_changes, with_overrides
+    from flows.presets import preview
+    from tasks.specs import street_id
 
-    parameters = demo_parameters(seed)
+    parameters = preview(street_id(seed))
     if painter is not None:
         parameters = with_changes(parameters, {"painter": painter})
     parameters = with_overrides(parameters, settings or [])
+    say_status(f"drawing the street of seed {seed}")
+    check_painter(painter)
     result = run_demo(parameters, seed, open_store(out / "store"))
     report = out.absolute() / REPORT_NAME
     with storage_errors(f"cannot write {report}"):

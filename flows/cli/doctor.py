@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from flows.cli.output import print_json, print_table
+from flows.cli.output import print_json, print_table, say_status
 from flows.cli.shared_options import AsJson
 
 UNFIT = 2
@@ -25,6 +25,7 @@ def doctor(
     as_json: AsJson = False,
 ) -> None:
     """Check the setup, a stored scene, or a dataset on disk."""
+    say_status(f"looking at {subject or 'the environment'}")
     from catalog.store import existing_store, open_store
     from tasks import health
     from tasks.ingest import data_checks

@@ -5,8 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
-from flows.cli.output import print_json, print_table
-from flows.cli.shared_options import AsJson, RunName, parse_previous
+from flows.cli.output import print_json, print_table, say_status
+from flows.cli.shared_options import AsJson, RunName, check_painter, parse_previous
 from lidarpainter_models.errors import ConfigError
 
 FLICKER = "flicker"
@@ -44,6 +44,12 @@ def evaluate(  # noqa: PLR0913 - the options of a command
     _check(protocol, previous)
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
+    from tasks.runs import open_run
+
+    previously = parse_previous(previous)
+    open_run(existing_store(), run)
+    say_status(f"opening run {run}")
+    check_painter(painter)
     from flows.evaluate import EvaluationRequest, evaluate_run
 
     request = EvaluationRequest(
@@ -52,7 +58,7 @@ def evaluate(  # noqa: PLR0913 - the options of a command
         is_painted=postpaint,
         painter=painter,
         changes=_weights(feature_weights, lpips_backbone, lpips_heads),
-        previous=parse_previous(previous),
+        previous=previously,
     )
     with shown_progress():
         result = evaluate_run(existing_store(), request)
@@ -80,7 +86,7 @@ def _check(protocol: str, previous: str | None) -> None:
 
 def _weights(features: Path | None, backbone: Path | None, heads: Path | None) -> dict[str, Any]:
     """The weights that are given; the run's own stay otherwise."""
-    from lidarpainter_models.metrics.lpips import LpipsFiles
+    from lidarpainter_models.metrics.lpips_files import LpipsFiles
 
     changes: dict[str, Any] = {} if features is None else {"feature_weights": features}
     if backbone is not None or heads is not None:

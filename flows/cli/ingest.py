@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from flows.cli.output import complain, format_bytes, print_json, print_table
+from flows.cli.output import complain, format_bytes, print_json, print_table, say_status
 from flows.cli.shared_options import AsJson, parse_frames, parse_names
 
 SOME_FAILED = 2
@@ -39,6 +39,7 @@ def ingest(  # noqa: PLR0913 - one per option
     chosen_frames = parse_frames(frames)
     chosen_cameras = parse_names(cameras)
 
+    say_status(f"looking for sequences in {root}")
     from catalog.store import open_store
     from flows.cli.progress import shown_progress
     from tasks.ingest.jobs import IngestRequest, find_sequences, ingest_sequences

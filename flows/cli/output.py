@@ -13,10 +13,31 @@ from tasks.json_files import finite_or_none
 Cell = str | int | float | bool | None
 FILE_WIDTH = 200
 """Columns of a table that is not written to a terminal."""
+CLEAR_LINE = "\r\x1b[K"
+
+_status: list[str] = []
+"""What a terminal shows until something takes its place."""
+
+
+def say_status(text: str) -> None:
+    """Say on a terminal what is being done, before anything slow is imported for it."""
+    if sys.stderr.isatty():
+        _status.append(text)
+        sys.stderr.write(f"{CLEAR_LINE}{text} ...")
+        sys.stderr.flush()
+
+
+def clear_status() -> None:
+    """Take back what `say_status` has said."""
+    if _status:
+        _status.clear()
+        sys.stderr.write(CLEAR_LINE)
+        sys.stderr.flush()
 
 
 def print_json(result: Mapping[str, Any]) -> None:
     """One JSON object on stdout; numbers that JSON lacks (infinite, not a number) become null."""
+    clear_status()
     text = json.dumps(finite_or_none(result), indent=2, allow_nan=False, ensure_ascii=False)
     sys.stdout.write(text + "\n")
 
@@ -30,6 +51,7 @@ def print_table(
     num_text_columns: int = 1,
 ) -> None:
     """A table on stdout; an absent value is a dash, columns after the text ones stand right."""
+    clear_status()
     console = Console()
     if not console.is_terminal:
         console = Console(width=FILE_WIDTH)
@@ -52,6 +74,7 @@ def print_pairs(title: str, pairs: Mapping[str, Cell], note: str = "") -> None:
 
 def complain(message: str) -> None:
     """One line on stderr."""
+    clear_status()
     line = " ".join(message.split())
     sys.stderr.write(f"lidarpainter: {line}\n")
 

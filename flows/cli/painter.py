@@ -8,8 +8,8 @@ import typer
 
 from flows.cli import painter_options as options
 from flows.cli import painting_tables as tables
-from flows.cli.output import print_json
-from flows.cli.shared_options import AsJson
+from flows.cli.output import print_json, say_status
+from flows.cli.shared_options import AsJson, check_painter, parse_names
 
 app = typer.Typer(help="Train painters, judge them, say what they are.", no_args_is_help=True)
 
@@ -24,10 +24,9 @@ def harvest(
     as_json: AsJson = False,
 ) -> None:
     """Make pairs for training or judging; seeds below 1000 can only judge."""
-    from flows.cli.ingest import parse_names
-    from flows.cli.training import run_harvest
+    say_status("reading settings")
     from flows.overrides import with_overrides
-    from flows.train_painter import HarvestParameters
+    from flows.painter_parameters import HarvestParameters
 
     parameters = HarvestParameters(
         street_seeds=options.parse_seeds(seeds),
@@ -35,7 +34,10 @@ def harvest(
         split=split,
         cameras=parse_names(cameras),
     )
-    result = run_harvest(with_overrides(parameters, settings or []))
+    parameters = with_overrides(parameters, settings or [])
+    from flows.cli.training import run_harvest
+
+    result = run_harvest(parameters)
     _print(result, lambda found: tables.show_pairs(found["pairs"]), as_json=as_json)
 
 
@@ -66,14 +68,12 @@ def train(  # noqa: PLR0913 - the options of a command
 
     A killed training goes on where it stopped.
     """
-    from flows.cli.ingest import parse_names
-    from flows.cli.training import run_training
+    say_status("reading settings")
     from flows.overrides import with_overrides
+    from flows.painter_parameters import TrainPainterParameters
     from flows.painter_recipes import shaped, started_at
-    from flows.train_painter import TrainPainterParameters, write_painter
-    from lidarpainter_models.metrics.lpips import LpipsFiles
+    from lidarpainter_models.metrics.lpips_files import LpipsFiles
 
-    lpips = LpipsFiles(backbone=lpips_backbone, heads=lpips_heads)
     parameters = TrainPainterParameters(
         street_seeds=options.parse_seeds(seeds),
         scenes=tuple(scenes or ()),
@@ -84,7 +84,7 @@ def train(  # noqa: PLR0913 - the options of a command
         feature_weights=feature_weights,
         device=device,
         processes=processes,
-        **started_at(base, start, lpips),
+        **started_at(base, start, LpipsFiles(backbone=lpips_backbone, heads=lpips_heads)),
     )
     training = shaped(
         parameters.training,
@@ -94,7 +94,11 @@ def train(  # noqa: PLR0913 - the options of a command
         steps=steps,
     )
     parameters = parameters.model_copy(update={"training": training})
-    result = run_training(with_overrides(parameters, settings or []))
+    parameters = with_overrides(parameters, settings or [])
+    from flows.cli.training import run_training
+    from flows.train_painter import write_painter
+
+    result = run_training(parameters)
     if out is not None:
         result |= write_painter(Path(result["weights"]), result["record"], out)
     _print(result, tables.show_training, as_json=as_json)
@@ -126,6 +130,7 @@ def evaluate(
     as_json: AsJson = False,
 ) -> None:
     """Judge painters on pairs, or views of a finished run, that none of them was trained on."""
+    say_status("opening painters")
     from flows.cli.progress import shown_progress
     from flows.evaluate_painter import evaluate_painters
 
@@ -149,6 +154,8 @@ def info(
     as_json: AsJson = False,
 ) -> None:
     """Say what a painter is, in which precision it runs here, and how it was trained."""
+    say_status(f"opening {painter}")
+    check_painter(painter)
     from flows.evaluate_painter import describe
 
     _print(describe(painter), tables.show_info, as_json=as_json)
@@ -165,6 +172,8 @@ def benchmark(
     as_json: AsJson = False,
 ) -> None:
     """Time a painter's view on this machine, in float32 and in bfloat16."""
+    say_status(f"opening {painter}")
+    check_painter(painter)
     from flows.evaluate_painter import benchmark_painter
 
     found = benchmark_painter(painter, options.parse_size(size), repeats, device)
@@ -190,8 +199,8 @@ def ablate(  # noqa: PLR0913 - the options of a command
     as_json: AsJson = False,
 ) -> None:
     """Train small painters that differ in one input or part and judge all alike, in tables."""
+    say_status("reading settings")
     from flows.ablate_painter import AblationParameters
-    from flows.cli.ingest import parse_names
     from flows.cli.training import run_ablation
     from flows.overrides import with_overrides
     from flows.painter_recipes import shaped

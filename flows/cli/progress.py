@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
+from flows.cli.output import clear_status
 from tasks.progress import ProgressListener, listening
 
 LINE_EVERY_S = 30.0
@@ -68,6 +69,7 @@ class Lines:
 @contextmanager
 def shown_progress() -> Iterator[ProgressListener]:
     """Draw the progress of every stage that runs inside the block."""
+    clear_status()
     console = Console(stderr=True)
     if not console.is_terminal:
         lines = Lines()

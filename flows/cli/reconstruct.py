@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from flows.cli.output import Cell, format_bytes, print_json, print_pairs, print_table
+from flows.cli.output import Cell, format_bytes, print_json, print_pairs, print_table, say_status
 from flows.cli.shared_options import AsJson, DeviceName, Painter, Settings, parse_names
 from lidarpainter_models.errors import ConfigError
 
@@ -47,6 +47,7 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     if shift is not None or up is not None:
         changes["novel"] = shifted(parameters.novel, shift, up)
     parameters = with_overrides(with_changes(parameters, changes), settings or [])
+    say_status(f"opening {scene}")
     result = run_reconstruction(parameters, existing_store())
     if as_json:
         print_json(result)
@@ -62,7 +63,7 @@ def shifted(novel: Any, shift: str | None, up: str | None) -> Any:  # noqa: ANN4
     """
     from dataclasses import replace
 
-    from lidarpainter_models.geometry.trajectories import Shift
+    from lidarpainter_models.geometry.shifts import Shift
 
     sideways = [Shift(lateral_m=side * metres) for metres in _distances(shift) for side in (1, -1)]
     return replace(novel, shifts=(*sideways, *(Shift(up_m=metres) for metres in _distances(up))))

@@ -5,13 +5,14 @@ from typing import Annotated
 
 import typer
 
-from flows.cli.output import print_json, print_pairs
+from flows.cli.output import print_json, print_pairs, say_status
 from flows.cli.shared_options import (
     AsJson,
     FollowedCamera,
     FollowedFrames,
     RunName,
     TrajectorySpec,
+    check_painter,
     parse_frames,
     parse_previous,
 )
@@ -42,15 +43,22 @@ def render(  # noqa: PLR0913 - the options of a command
     """Render a finished run where nobody drove."""
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
-    from flows.views import PathRequest, render_run
-    from lidarpainter_models.conditioning.sequences import SequenceConfig
+    from lidarpainter_models.conditioning.settings import SequenceConfig
     from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+    from tasks.runs import open_run
+
+    followed, chosen = parse_trajectory(trajectory), parse_frames(frames)
+    sequence = SequenceConfig() if previous is None else parse_previous(previous)[0]
+    open_run(existing_store(), run)
+    say_status(f"opening run {run}")
+    check_painter(painter)
+    from flows.views import PathRequest, render_run
 
     path = PathRequest(
         run=run,
-        trajectory=parse_trajectory(trajectory),
+        trajectory=followed,
         camera=camera,
-        frames=parse_frames(frames),
+        frames=chosen,
         is_painted=postpaint or painter is not None,
         painter=painter,
     )
@@ -60,7 +68,7 @@ def render(  # noqa: PLR0913 - the options of a command
             path,
             out.absolute(),
             prompt=prompt,
-            sequence=SequenceConfig() if previous is None else parse_previous(previous)[0],
+            sequence=sequence,
         )
     if as_json:
         print_json(result)

@@ -2,17 +2,21 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from catalog.store import Store
+from flows.cli.output import say_status
 from flows.cli.progress import shown_progress
-from flows.parameters import ReconstructParameters
-from flows.recall import recalled
 from flows.server import prefect_server
 
+if TYPE_CHECKING:
+    from flows.parameters import ReconstructParameters
 
-def run_reconstruction(parameters: ReconstructParameters, store: Store) -> dict[str, Any]:
+
+def run_reconstruction(parameters: "ReconstructParameters", store: Store) -> dict[str, Any]:
     """Reconstruct one scene of the store; what is known already is not asked of a server."""
+    from flows.recall import recalled
+
     if (known := recalled(parameters, store.root)) is not None:
         return known
     from flows.reconstruct import check_inputs, reconstruct
@@ -22,7 +26,7 @@ def run_reconstruction(parameters: ReconstructParameters, store: Store) -> dict[
         return reconstruct(parameters, store.root)
 
 
-def run_demo(parameters: ReconstructParameters, seed: int, store: Store) -> dict[str, Any]:
+def run_demo(parameters: "ReconstructParameters", seed: int, store: Store) -> dict[str, Any]:
     """Make the street of a seed in the store and reconstruct it."""
     from flows.demo import demo, demo_street
 
@@ -33,5 +37,6 @@ def run_demo(parameters: ReconstructParameters, seed: int, store: Store) -> dict
 @contextmanager
 def _running(store: Store) -> Iterator[None]:
     store.make()
+    say_status("starting Prefect's server")
     with prefect_server(store.root / "logs" / "prefect.log"), shown_progress():
         yield

@@ -8,7 +8,7 @@ import typer
 from lidarpainter_models.errors import ConfigError
 
 if TYPE_CHECKING:
-    from lidarpainter_models.conditioning.sequences import SequenceConfig
+    from lidarpainter_models.conditioning.settings import SequenceConfig
 
 RANGE = re.compile(r"(\d*):(\d*)")
 
@@ -67,13 +67,25 @@ def parse_names(text: str | None) -> tuple[str, ...] | None:
     return names
 
 
+def check_painter(name: str | None) -> None:
+    """Refuse what no painter is called, before anything else is loaded.
+
+    Raises:
+        WeightsError: it cannot be the name of a painter.
+    """
+    if name is not None:
+        from lidarpainter_models.painter.selection import PainterChoice
+
+        PainterChoice.of(name)
+
+
 def parse_previous(text: str | None) -> tuple["SequenceConfig", ...]:
     """What becomes of the frame before: `mixed`, `shown`, or both with a comma between.
 
     Raises:
         ConfigError: the text says something else.
     """
-    from lidarpainter_models.conditioning.sequences import PreviousUse, SequenceConfig
+    from lidarpainter_models.conditioning.settings import PreviousUse, SequenceConfig
 
     if text is None:
         return ()

@@ -5,13 +5,14 @@ from typing import Annotated, Any
 
 import typer
 
-from flows.cli.output import print_json, print_pairs
+from flows.cli.output import print_json, print_pairs, say_status
 from flows.cli.shared_options import (
     AsJson,
     FollowedCamera,
     FollowedFrames,
     RunName,
     TrajectorySpec,
+    check_painter,
     parse_frames,
 )
 
@@ -38,14 +39,23 @@ def stylize(  # noqa: PLR0913 - the options of a command
     """Show a finished run in another weather or at night, and how well its edges are kept."""
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
-    from flows.views import PathRequest, stylize_run
     from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+    from tasks.runs import open_run
+
+    followed, chosen = parse_trajectory(trajectory), parse_frames(frames)
+    open_run(existing_store(), run)
+    say_status(f"opening run {run}")
+    check_painter(painter)
+    from lidarpainter_models.painter.styles import check_prompt
+
+    check_prompt(prompt)
+    from flows.views import PathRequest, stylize_run
 
     path = PathRequest(
         run=run,
-        trajectory=parse_trajectory(trajectory),
+        trajectory=followed,
         camera=camera,
-        frames=parse_frames(frames),
+        frames=chosen,
         is_painted=painter is not None,
         painter=painter,
     )

@@ -5,16 +5,11 @@ from typing import Any, TypeVar
 
 from catalog.store import open_store
 from flows.ablate_painter import AblationParameters, ablate_painter, check_ablation
+from flows.cli.output import say_status
 from flows.cli.progress import shown_progress
+from flows.painter_parameters import HarvestParameters, TrainPainterParameters
 from flows.server import prefect_server
-from flows.train_painter import (
-    HarvestParameters,
-    TrainPainterParameters,
-    check_harvest,
-    check_sources,
-    harvest_pairs,
-    train_painter,
-)
+from flows.train_painter import check_harvest, check_sources, harvest_pairs, train_painter
 
 Parameters = TypeVar("Parameters")
 
@@ -40,5 +35,6 @@ def run_ablation(parameters: AblationParameters) -> dict[str, Any]:
 def _run(flow: Callable[..., dict[str, Any]], parameters: Parameters) -> dict[str, Any]:
     store = open_store()
     store.make()
+    say_status("starting Prefect's server")
     with prefect_server(store.root / "logs" / "prefect.log"), shown_progress():
         return flow(parameters, store.root)

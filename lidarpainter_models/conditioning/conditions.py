@@ -6,7 +6,7 @@ named whose exposure all of them then take.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
@@ -14,9 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.conditioning.references import WarpTarget, warped_references
+from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.conditioning.surface_depth import surface_depth
 from lidarpainter_models.conditioning.warping import SKY_ALPHA, SourceImage, source_cost_m
-from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.scene_rendering import SceneRender
 from lidarpainter_models.geometry.cameras import Camera
@@ -29,24 +29,6 @@ from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT, PaintingConditions
 from lidarpainter_models.scenes.records import ViewKey
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ConditionConfig:
-    """What is gathered for a painter."""
-
-    num_references: int = 2
-    """Warped references given to the painter."""
-    num_sources: int = 6
-    """Recorded images they are patched together from: the nearest, then ever sparser ones."""
-
-    def __post_init__(self) -> None:
-        """Refuse fewer sources than references."""
-        if not 1 <= self.num_references <= self.num_sources:
-            raise ConfigError(
-                f"need 1 <= num_references <= num_sources, got {self.num_references} and "
-                f"{self.num_sources}"
-            )
 
 
 class ConditionBuilder:

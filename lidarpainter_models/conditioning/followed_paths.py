@@ -13,7 +13,8 @@ from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectories import road_directions, shift_pose
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
-from lidarpainter_models.observations.fit_size import ObservationConfig, fit_camera
+from lidarpainter_models.observations.fit_size import fit_camera
+from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
 

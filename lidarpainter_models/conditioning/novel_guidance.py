@@ -7,7 +7,7 @@ result, for the report, but give no guidance. World: x forward, y left, z up; me
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, UInt8
@@ -20,47 +20,21 @@ from lidarpainter_models.conditioning.confidence import (
     guidance_gate,
     is_seen,
 )
-from lidarpainter_models.conditioning.sequences import SequenceConfig, SequencePainter
+from lidarpainter_models.conditioning.sequences import SequencePainter
+from lidarpainter_models.conditioning.settings import NovelGuidanceConfig
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.geometry.trajectories import Shift, road_directions, shift_pose
+from lidarpainter_models.geometry.shifts import Shift
+from lidarpainter_models.geometry.trajectories import road_directions, shift_pose
 from lidarpainter_models.lidar.lidar_map import LidarMap
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.observations.views import GuidanceView, TrainingView
 from lidarpainter_models.painter.protocol import Painter, Painting, PaintingConditions
 from lidarpainter_models.scenes.records import ViewKey
 
-DEFAULT_SHIFTS = (
-    Shift(lateral_m=2.0),
-    Shift(lateral_m=-2.0),
-    Shift(lateral_m=3.0),
-    Shift(lateral_m=-3.0),
-    Shift(up_m=1.5),
-)
 ROOM_M = 0.6  # no surface may be nearer to a moved camera than this
 MAX_POINTS_IN_ROOM = 10  # LiDAR points nearer than that which still count as noise
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NovelGuidanceConfig:
-    """Which views are painted and what becomes of them."""
-
-    shifts: tuple[Shift, ...] = DEFAULT_SHIFTS
-    """Where the recorded cameras are moved to; the paper's 2 and 3 m to both sides and 1.5 m up."""
-    every_nth: int = 2
-    """Of the training frames, every n-th is painted at every shift."""
-    camera_names: tuple[str, ...] | None = None
-    """Cameras that are moved; None moves every training camera."""
-    sequence: SequenceConfig = field(default_factory=SequenceConfig)
-    """What becomes of the frame painted before along the same path."""
-
-    def __post_init__(self) -> None:
-        """Refuse to paint nothing."""
-        if not self.shifts:
-            raise ConfigError("novel guidance needs at least one shift")
-        if self.every_nth < 1:
-            raise ConfigError(f"every_nth must be at least 1, got {self.every_nth}")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -6,13 +6,14 @@ carried over by the rendered depth (`warping`): where both views show the same s
 mixed into the painting, or shown to the painter as the best of the warped images.
 """
 
-from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.references import WarpTarget, warped_references
+from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.conditioning.warping import SourceImage
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.painter.protocol import (
@@ -22,19 +23,9 @@ from lidarpainter_models.painter.protocol import (
     PaintingConditions,
 )
 
-PreviousUse = Literal["unused", "mixed", "shown"]
 PREVIOUS_KEY = (-1, "previous")
 SHARE = 0.5  # of the previous frame in a mixed pixel on which both agree
 AGREEMENT = 0.05  # mean absolute rgb difference of both at which that share has fallen to 1/e
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SequenceConfig:
-    """What becomes of the frame painted before."""
-
-    previous: PreviousUse = "unused"
-    """`mixed`: into the painting, as far as both agree; `shown`: to the painter, before the other
-    warped images, of which it was trained to expect recorded ones only."""
 
 
 class PaintedFrame(NamedTuple):

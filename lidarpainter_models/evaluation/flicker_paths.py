@@ -7,12 +7,13 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.conditioning.sequences import SequenceConfig, SequencePainter
+from lidarpainter_models.conditioning.sequences import SequencePainter
+from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.evaluation.flicker import TRUTH, FlickerFrame, FlickerTally
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.judging import known_street
 from lidarpainter_models.evaluation.shown import ViewTimePainting
-from lidarpainter_models.geometry.trajectories import Shift
+from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.scenes.records import RecordedView
 
 RENDER = "render"

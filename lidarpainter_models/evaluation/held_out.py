@@ -16,9 +16,11 @@ from torch import Tensor
 from lidarpainter_models.evaluation.judged_views import JudgedView, actor_mask
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.geometry.trajectories import Shift, road_directions, shift_pose
+from lidarpainter_models.geometry.shifts import Shift
+from lidarpainter_models.geometry.trajectories import road_directions, shift_pose
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
-from lidarpainter_models.observations.fit_size import ObservationConfig, fit_camera, shrink_image
+from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
+from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene, RecordedView
 from lidarpainter_models.scenes.records import ViewKey
 from lidarpainter_models.synthetic.street import SyntheticStreet

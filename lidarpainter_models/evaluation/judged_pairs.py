@@ -14,7 +14,7 @@ from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.evaluation.held_back import target_view
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.judged_views import JudgedView
-from lidarpainter_models.geometry.trajectories import Shift
+from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.painter.examples import PaintingPair
 from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.synthetic.street import SyntheticStreet

@@ -1,24 +1,20 @@
 """Every figure of one fitted scene under one way of rendering it, camera by camera."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
-from lidarpainter_models.conditioning.conditions import ConditionConfig
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.scene_scores import (
-    ScoringConfig,
     score_geometry,
     score_recorded,
     score_synthetic,
 )
 from lidarpainter_models.evaluation.score_tables import DEPTH, Scores
+from lidarpainter_models.evaluation.settings import JudgeConfig
 from lidarpainter_models.evaluation.shown import ShownScene
-from lidarpainter_models.metrics.lpips import LpipsFiles
 from lidarpainter_models.metrics.perceptual import PerceptualDistances, load_distances
-from lidarpainter_models.observations.fit_size import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.synthetic.street import SyntheticStreet
 
@@ -26,25 +22,6 @@ GENERATOR_ENTRY = "generator"
 """Entry of a scene's manifest by which the synthetic street is built again."""
 NO_IMAGES = "nobody took images there"
 NO_INCEPTION = "Inception weights are user-supplied and none were given"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class JudgeConfig:
-    """How a fitted scene is judged."""
-
-    observation: ObservationConfig
-    scoring: ScoringConfig
-    conditions: ConditionConfig
-    feature_weights: Path | None = None
-    """SqueezeNet 1.1 weights for the feature distance; None leaves it out."""
-    lpips: LpipsFiles = field(default_factory=LpipsFiles)
-    """Weights for LPIPS; without both files it is left out."""
-
-    @property
-    def weight_files(self) -> dict[str, Path]:
-        """Files that the perceptual distances depend on, by the part they play."""
-        features = {} if self.feature_weights is None else {"features": self.feature_weights}
-        return features | self.lpips.named
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

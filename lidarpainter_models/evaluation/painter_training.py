@@ -15,7 +15,7 @@ from lidarpainter_models.evaluation.held_back import (
     first_targets,
     hold_back,
 )
-from lidarpainter_models.metrics.lpips import LpipsFiles
+from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.painter.one_step.job import NO_FILES
 from lidarpainter_models.painter.selection import WEIGHTS_SUFFIX
 from lidarpainter_models.painter.training.job import TrainingJob

@@ -1,13 +1,13 @@
 """All the figures of one fitted scene, each under the truth it was taken against."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.judged_views import Renderer, ViewScores, score_views
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.geometry.trajectories import Shift
+from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.lidar.sparse_depth import points_at_exposure
 from lidarpainter_models.metrics.depth import (
     DepthScores,
@@ -16,22 +16,6 @@ from lidarpainter_models.metrics.depth import (
 )
 from lidarpainter_models.metrics.perceptual import PerceptualDistances
 from lidarpainter_models.synthetic.street import SyntheticStreet
-
-JUDGED_SHIFTS = (
-    Shift(lateral_m=2.0),
-    Shift(lateral_m=-2.0),
-    Shift(lateral_m=3.0),
-    Shift(lateral_m=-3.0),
-    Shift(up_m=1.5),
-)
-"""The paper's trajectories: 2 m and 3 m to both sides, 1.5 m up."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScoringConfig:
-    """Which trajectories are judged."""
-
-    shifts: tuple[Shift, ...] = JUDGED_SHIFTS
 
 
 def _view_scores(scores: ViewScores | None) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from lidarpainter_models.evaluation.judging import known_street
 from lidarpainter_models.evaluation.shown import ViewTimePainting
 from lidarpainter_models.export.report import Comparison
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.geometry.trajectories import Shift
+from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.scenes.records import RecordedView
 
 

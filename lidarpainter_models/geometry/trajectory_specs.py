@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.geometry.trajectories import Shift
+from lidarpainter_models.geometry.shifts import Shift
 
 LANE_WIDTH_M = 3.5
 """A lane change without a width goes this far to the left."""

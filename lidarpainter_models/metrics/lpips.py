@@ -7,7 +7,6 @@ else. So a backbone counts only if its SHA-256 is that of torchvision's file; no
 ever put in its place.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -23,6 +22,7 @@ from lidarpainter_models.metrics.backbones import (
     load_stack,
     read_tensors,
 )
+from lidarpainter_models.metrics.lpips_files import LpipsFiles
 
 SHIFT_RGB = (-0.030, -0.088, -0.188)
 SCALE_RGB = (0.458, 0.448, 0.450)
@@ -91,31 +91,6 @@ class Lpips(nn.Module):
     ) -> Float[Tensor, "batch 3 height width"]:
         """Images as the backbone expects them."""
         return (2 * views - 1 - self.get_buffer("shift")) / self.get_buffer("scale")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LpipsFiles:
-    """Where the two halves of the weights lie; either may be missing."""
-
-    backbone: Path | None = None
-    """torchvision's VGG-16, AlexNet or SqueezeNet 1.1."""
-    heads: Path | None = None
-    """The linear heads of the same network, version 0.1."""
-
-    @property
-    def named(self) -> dict[str, Path]:
-        """The files that are named, by the part they play."""
-        files = {"lpips backbone": self.backbone, "lpips heads": self.heads}
-        return {name: path for name, path in files.items() if path is not None}
-
-    @property
-    def missing(self) -> str | None:
-        """Why there can be no figure; None where both are named."""
-        halves = {"a backbone": self.backbone, "linear heads": self.heads}
-        lacking = [name for name, path in halves.items() if path is None]
-        if not lacking:
-            return None
-        return f"LPIPS needs weights that the user supplies: {' and '.join(lacking)} not given"
 
 
 def load_lpips(files: LpipsFiles) -> Lpips | None:

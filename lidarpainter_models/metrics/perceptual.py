@@ -7,7 +7,8 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.metrics.lpips import LpipsFiles, load_lpips
+from lidarpainter_models.metrics.lpips import load_lpips
+from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.metrics.squeezenet import load_squeezenet_distance
 
 ImageDistance = Callable[

@@ -1,7 +1,6 @@
 """At which size a fit sees recorded images."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import cv2
 import torch
@@ -10,20 +9,8 @@ from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.records import RecordedView
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ObservationConfig:
-    """How recordings are prepared for a fit."""
-
-    width_px: int = 480
-    """Fit width; the height keeps each camera's aspect ratio. Narrower recordings keep theirs."""
-
-    def __post_init__(self) -> None:
-        """Refuse images too small for the SSIM window."""
-        if self.width_px < 32:
-            raise ConfigError(f"width_px must be at least 32, got {self.width_px}")
 
 
 def require_recorded_width(width_px: int, views: Iterable[RecordedView], what: str) -> None:

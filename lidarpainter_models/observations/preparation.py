@@ -13,7 +13,8 @@ from lidarpainter_models.lidar.colouring import MapColouring
 from lidarpainter_models.lidar.map_building import gather_points
 from lidarpainter_models.lidar.sky_masks import sky_mask
 from lidarpainter_models.lidar.sparse_depth import points_at_exposure, sparse_lidar_depth
-from lidarpainter_models.observations.fit_size import ObservationConfig, fit_camera, shrink_image
+from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
+from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView

@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.metrics.lpips import LpipsFiles
+from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.painter.nano.job import NanoJob
 from lidarpainter_models.painter.nano.painter import NanoPainter
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig

@@ -19,15 +19,14 @@ from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import ViewKey
 from lidarpainter_models.scenes.splits import ViewSplit
 from lidarpainter_models.training_data.harvest_targets import (
-    HarvestConfig,
     HarvestProgress,
     Target,
     harvest_label,
     harvest_targets,
     is_harvested,
-    weak_fit,
 )
 from lidarpainter_models.training_data.pairs import PairWriter
+from lidarpainter_models.training_data.settings import HarvestConfig, weak_fit
 
 
 @dataclass(frozen=True, kw_only=True)

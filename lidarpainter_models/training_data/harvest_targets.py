@@ -6,58 +6,25 @@ from `harvest.py` (recorded logs) and `street_harvest.py` (synthetic streets).
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.conditioning.conditions import ConditionBuilder, ConditionConfig
-from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.gaussians.fitting.config import FitConfig, RefinementConfig
-from lidarpainter_models.gaussians.fitting.densification import DensificationConfig
+from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.observations.fit_size import ObservationConfig
 from lidarpainter_models.observations.views import SceneObservations
 from lidarpainter_models.painter.examples import PaintingPair
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.training_data.corruptions import corrupt_gaussians
 from lidarpainter_models.training_data.pairs import PairWriter
+from lidarpainter_models.training_data.settings import HarvestConfig
 
 HarvestProgress = Callable[[int, int], None]
 """Told after each fit how many of how many are done."""
-
-AS_GIVEN = RefinementConfig(cameras=False, extrinsics=False, actors=False)
-"""Poses are not refined: those given are the best known, and the truth stands in their frame."""
-
-
-def weak_fit(steps: int = 250, *, budget: int = 50_000) -> FitConfig:
-    """A fit stopped early, on poses that are taken as they are."""
-    return FitConfig(
-        steps=steps,
-        refinement=AS_GIVEN,
-        densification=DensificationConfig(budget=budget),
-    )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HarvestConfig:
-    """How pairs are made from a fit."""
-
-    observations: ObservationConfig = field(default_factory=ObservationConfig)
-    conditions: ConditionConfig = field(default_factory=ConditionConfig)
-    corrupted_per_view: int = 1
-    """Pairs with damaged Gaussians beside the one that is as the fit left it."""
-    reference_fit: FitConfig = field(default_factory=lambda: FitConfig(steps=1200))
-    """The long fit to all training views whose refined poses the weak ones are judged at."""
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        """Refuse a negative number of pairs."""
-        if self.corrupted_per_view < 0:
-            raise ConfigError(f"corrupted_per_view must be >= 0, got {self.corrupted_per_view}")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -5,32 +5,31 @@ have other seeds than those of the demo and of the tests. World frame, z up; met
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Generator
 
-from lidarpainter_models.errors import ConfigError, SceneError
-from lidarpainter_models.gaussians.fitting.config import FitConfig
+from lidarpainter_models.errors import SceneError
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.geometry.trajectories import Shift, road_directions, shift_pose
+from lidarpainter_models.geometry.shifts import Shift
+from lidarpainter_models.geometry.trajectories import road_directions, shift_pose
 from lidarpainter_models.observations.fit_size import fit_camera
 from lidarpainter_models.observations.preparation import prepare_observations
 from lidarpainter_models.scenes.driving_scene import DrivingScene, RecordedView
 from lidarpainter_models.scenes.splits import ViewSplit, split_views
 from lidarpainter_models.synthetic.street import SyntheticStreet
 from lidarpainter_models.training_data.harvest_targets import (
-    HarvestConfig,
     HarvestProgress,
     Target,
     harvest_label,
     harvest_targets,
     is_harvested,
-    weak_fit,
 )
 from lidarpainter_models.training_data.pairs import PairWriter
+from lidarpainter_models.training_data.settings import HarvestConfig, StreetPlan
 
 MOST_DRAWS = 20
 """Shifts tried per view before it is given up: the camera may stand in a wall every time."""
@@ -44,32 +43,6 @@ YAW_SHARE = 0.25
 CLEAR_M = 1.2
 """A view is drawn again if more than `CROWDED_SHARE` of its pixels are nearer than this."""
 CROWDED_SHARE = 0.03
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StreetPlan:
-    """One fit to a street, and how many views of it become pairs."""
-
-    fit: FitConfig = field(default_factory=weak_fit)
-    split: str = "alternate"
-    """Its training frames are fitted."""
-    cameras: tuple[str, ...] = ("front_camera",)
-    """Cameras fitted; the first is the one that is shifted."""
-    num_views: int = 20
-
-    def __post_init__(self) -> None:
-        """Refuse a plan without a camera or a view."""
-        if not self.cameras or self.num_views < 1:
-            raise ConfigError("a street plan needs a camera and at least one view")
-
-
-def default_street_plans() -> tuple[StreetPlan, ...]:
-    """A fit stopped early, one nearly done, and one that has to look ahead of what it saw."""
-    return (
-        StreetPlan(fit=weak_fit(300), num_views=14),
-        StreetPlan(fit=weak_fit(1200, budget=80_000), num_views=36),
-        StreetPlan(fit=weak_fit(700, budget=70_000), split="forward:17:8", num_views=16),
-    )
 
 
 def harvest_shifted_street(

@@ -8,18 +8,18 @@ from typing import Any
 from prefect import task
 
 from catalog.artefacts import Workplace
-from lidarpainter_models.conditioning.sequences import SequenceConfig
+from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.evaluation.flicker_paths import FlickerJudgement
-from lidarpainter_models.evaluation.judging import JudgeConfig
 from lidarpainter_models.evaluation.score_tables import FLICKER
+from lidarpainter_models.evaluation.settings import JudgeConfig
 from lidarpainter_models.evaluation.shown import ViewTimePainting
 from tasks.evaluation.shown import view_time_painting
 from tasks.evaluation.views import SCORES_FILE, judged_inputs
 from tasks.json_files import write_json
-from tasks.opened import RunSpec, opened
+from tasks.opened import opened
 from tasks.progress import Progress
+from tasks.specs import FittedRef, RunSpec
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
-from tasks.stored import FittedRef
 
 
 @task(**STAGE_OPTIONS)

@@ -6,12 +6,14 @@ from functools import partial
 import torch
 
 from catalog.store import Store
-from lidarpainter_models.conditioning.conditions import ConditionBuilder, ConditionConfig
-from lidarpainter_models.evaluation.judging import JudgeConfig
+from lidarpainter_models.conditioning.conditions import ConditionBuilder
+from lidarpainter_models.conditioning.settings import ConditionConfig
+from lidarpainter_models.evaluation.settings import JudgeConfig
 from lidarpainter_models.evaluation.shown import ShownScene, ViewTimePainting
 from lidarpainter_models.painter.selection import PainterChoice
 from tasks.opened import OpenedRun
-from tasks.stored import FittedRef, load_observations, load_scene
+from tasks.specs import FittedRef
+from tasks.stored import load_observations, load_scene
 
 
 def shown_by(

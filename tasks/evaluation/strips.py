@@ -9,16 +9,16 @@ from prefect import task
 
 from catalog.artefacts import Workplace
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.evaluation.judging import JudgeConfig
+from lidarpainter_models.evaluation.settings import JudgeConfig
 from lidarpainter_models.evaluation.shown import ShownScene
 from lidarpainter_models.evaluation.strip_views import StripJudgement
 from tasks.evaluation.shown import shown_by
 from tasks.evaluation.views import SCORES_FILE, judged_inputs
 from tasks.json_files import write_json
-from tasks.opened import RunSpec, opened
+from tasks.opened import opened
 from tasks.progress import Progress
+from tasks.specs import FittedRef, RunSpec
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
-from tasks.stored import FittedRef
 
 
 @task(**STAGE_OPTIONS)

@@ -9,15 +9,16 @@ from prefect import task
 
 from catalog.artefacts import ArtefactRef, Workplace
 from catalog.store import Store
-from lidarpainter_models.evaluation.judging import JudgeConfig, Judgement
+from lidarpainter_models.evaluation.judging import Judgement
 from lidarpainter_models.evaluation.score_tables import Scores
+from lidarpainter_models.evaluation.settings import JudgeConfig
 from lidarpainter_models.evaluation.shown import ShownScene
 from tasks.evaluation.shown import shown_by
 from tasks.json_files import read_json, write_json
-from tasks.opened import OpenedRun, RunSpec, opened
+from tasks.opened import OpenedRun, opened
 from tasks.progress import Progress
+from tasks.specs import FittedRef, RunSpec
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
-from tasks.stored import FittedRef
 from tasks.weights import file_digests
 
 SCORES_FILE = "scores.json"

@@ -20,17 +20,15 @@ from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import ViewSplit
 from lidarpainter_models.synthetic.config import SyntheticStreetConfig
 from lidarpainter_models.synthetic.street import WORLD_VERSION, SyntheticStreet
-from lidarpainter_models.training_data.harvest import (
-    HarvestConfig,
-    default_plans,
-    harvest_left_out,
-)
+from lidarpainter_models.training_data.harvest import default_plans, harvest_left_out
 from lidarpainter_models.training_data.pair_sets import PairSet
 from lidarpainter_models.training_data.pairs import PairFolder, PairWriter
-from lidarpainter_models.training_data.street_harvest import StreetPlan, harvest_shifted_street
+from lidarpainter_models.training_data.settings import HarvestConfig, StreetPlan
+from lidarpainter_models.training_data.street_harvest import harvest_shifted_street
 from tasks.ingest.ingest import ingest_street
-from tasks.opened import SplitSpec, open_scene, open_split
+from tasks.opened import open_scene, open_split
 from tasks.progress import Progress
+from tasks.specs import SplitSpec, street_id
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
 
 PAIRS_FOLDER = "pairs"
@@ -82,11 +80,6 @@ def harvest_street(
         config={"plans": [asdict(plan) for plan in plans], "harvest": asdict(config)},
         build=partial(_build_street, scene=scene, plans=plans, config=config),
     )
-
-
-def street_id(seed: int) -> str:
-    """Scene id of the synthetic street of a seed."""
-    return f"synthetic/street-{seed:04d}"
 
 
 def pair_set(store: Store, name: str, ref: ArtefactRef) -> PairSet:

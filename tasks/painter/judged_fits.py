@@ -12,11 +12,13 @@ from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.evaluation.held_back import unseen_pairs
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.judged_pairs import JudgedPairs, judged_pairs, unseen_views
-from lidarpainter_models.evaluation.judging import JudgeConfig, known_street
+from lidarpainter_models.evaluation.judging import known_street
 from lidarpainter_models.evaluation.painting import JudgingPairs
+from lidarpainter_models.evaluation.settings import JudgeConfig
 from lidarpainter_models.training_data.pair_sets import PairSet, open_sets
-from tasks.opened import SplitSpec, open_split
-from tasks.stored import FittedRef, load_observations, load_scene
+from tasks.opened import open_split
+from tasks.specs import FittedRef, SplitSpec
+from tasks.stored import load_observations, load_scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,11 +14,13 @@ from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.gaussians.fitting.step import Perceptual
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene, describe
 from lidarpainter_models.gaussians.model.stored_scene import copy_scene
-from lidarpainter_models.metrics.lpips import LpipsFiles, load_lpips
+from lidarpainter_models.metrics.lpips import load_lpips
+from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.observations.views import GuidanceView, SceneObservations
-from tasks.opened import RunSpec, opened
+from tasks.opened import opened
 from tasks.progress import Progress
 from tasks.reconstruction.painted_views import load_guidance
+from tasks.specs import RunSpec
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
 from tasks.stored import load_observations, load_scene, save_scene
 from tasks.weights import file_digests

@@ -8,21 +8,20 @@ from typing import Any
 from prefect import task
 
 from catalog.artefacts import Workplace
-from lidarpainter_models.conditioning.conditions import ConditionConfig
 from lidarpainter_models.conditioning.novel_guidance import (
-    NovelGuidanceConfig,
     NovelPainting,
     novel_cameras,
     paint_novel_views,
 )
+from lidarpainter_models.conditioning.settings import ConditionConfig, NovelGuidanceConfig
 from lidarpainter_models.evaluation.shown import ViewTimePainting
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from tasks.evaluation.shown import view_time_painting
-from tasks.opened import RunSpec, opened
+from tasks.opened import opened
 from tasks.progress import Progress
 from tasks.reconstruction.painted_views import save_guidance
+from tasks.specs import FittedRef, RunSpec
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
-from tasks.stored import FittedRef
 
 
 @task(**STAGE_OPTIONS)

@@ -7,12 +7,13 @@ from typing import Any
 from prefect import task
 
 from catalog.artefacts import Workplace
-from lidarpainter_models.observations.fit_size import ObservationConfig
 from lidarpainter_models.observations.preparation import prepare_observations
+from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import ViewSplit
-from tasks.opened import RunSpec, opened
+from tasks.opened import opened
 from tasks.progress import Progress
+from tasks.specs import RunSpec
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
 from tasks.stored import save_observations
 

@@ -15,7 +15,8 @@ from catalog.records import MetricRecord, RunRecord, RunStatus, metric_rows
 from catalog.store import Store, open_store
 from lidarpainter_models.evaluation.score_tables import metric_values
 from tasks.json_files import finite_or_none
-from tasks.opened import RunSpec, opened
+from tasks.opened import opened
+from tasks.specs import RunSpec
 from tasks.stages import STAGE_OPTIONS
 
 

@@ -12,19 +12,20 @@ import lidarpainter_models
 from catalog.artefacts import ArtefactRef, Workplace
 from catalog.store import Store
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.judging import JudgeConfig
+from lidarpainter_models.evaluation.settings import JudgeConfig
 from lidarpainter_models.evaluation.shown import ViewTimePainting
 from lidarpainter_models.export.comparisons import Subject, comparisons
 from lidarpainter_models.export.report import render_report
 from lidarpainter_models.export.run_page import RunPage, StageCost
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.geometry.trajectories import Shift
+from lidarpainter_models.geometry.shifts import Shift
 from tasks.evaluation.shown import view_time_painting
 from tasks.machine import machine
-from tasks.opened import OpenedRun, RunSpec, opened
+from tasks.opened import OpenedRun, opened
 from tasks.progress import Progress
+from tasks.specs import FittedRef, RunSpec
 from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
-from tasks.stored import FittedRef, History, load_history, load_scene
+from tasks.stored import History, load_history, load_scene
 
 REPORT_FILE = "report.html"
 

@@ -6,24 +6,25 @@ from typing import Any
 
 from prefect import task
 
-from lidarpainter_models.conditioning.conditions import ConditionConfig
 from lidarpainter_models.conditioning.followed_paths import (
     FollowedPath,
     followed_views,
     image_record,
 )
-from lidarpainter_models.conditioning.sequences import SequenceConfig, SequencePainter
+from lidarpainter_models.conditioning.sequences import SequencePainter
+from lidarpainter_models.conditioning.settings import ConditionConfig, SequenceConfig
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.export.images import write_png
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
-from lidarpainter_models.observations.fit_size import ObservationConfig
+from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
 from tasks.evaluation.shown import condition_builder
 from tasks.json_files import write_json
-from tasks.opened import RunSpec, opened
+from tasks.opened import opened
 from tasks.progress import listener
+from tasks.specs import FittedRef, RunSpec
 from tasks.stages import STAGE_OPTIONS
-from tasks.stored import FittedRef, load_observations
+from tasks.stored import load_observations
 
 STAGE = "render"
 POSES_FILE = "trajectory.json"

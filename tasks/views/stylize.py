@@ -18,10 +18,9 @@ from lidarpainter_models.observations.fit_size import shrink_image
 from lidarpainter_models.painter.styles import StyleView, apply_style, check_prompt
 from lidarpainter_models.scenes.records import RecordedView
 from tasks.json_files import write_json
-from tasks.opened import RunSpec
 from tasks.progress import listener
+from tasks.specs import FittedRef, RunSpec
 from tasks.stages import STAGE_OPTIONS
-from tasks.stored import FittedRef
 from tasks.views.render import POSES_FILE, RenderRequest, followed_path
 
 STAGE = "stylize"

@@ -3,16 +3,16 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lidarpainter_models.conditioning.conditions import ConditionBuilder, ConditionConfig
+from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.novel_guidance import (
-    NovelGuidanceConfig,
     guidance_views,
     has_room,
     novel_cameras,
     paint_novel_views,
 )
+from lidarpainter_models.conditioning.settings import ConditionConfig, NovelGuidanceConfig
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.geometry.trajectories import Shift
+from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.painter.protocol import Painting
 

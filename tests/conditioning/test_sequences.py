@@ -5,13 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lidarpainter_models.conditioning.novel_guidance import (
-    NovelGuidanceConfig,
-    novel_cameras,
-    paint_novel_views,
-)
-from lidarpainter_models.conditioning.sequences import SequenceConfig, SequencePainter
-from lidarpainter_models.geometry.trajectories import Shift
+from lidarpainter_models.conditioning.novel_guidance import novel_cameras, paint_novel_views
+from lidarpainter_models.conditioning.sequences import SequencePainter
+from lidarpainter_models.conditioning.settings import NovelGuidanceConfig, SequenceConfig
+from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.painter.protocol import Painting
 
 STEP_NS = 100_000_000

@@ -15,7 +15,7 @@ from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.strip_views import strip_views
 from lidarpainter_models.evaluation.strips import calibrate_strip, score_strips, strip_mask
 from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_tangent
-from lidarpainter_models.observations.fit_size import ObservationConfig
+from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.synthetic import record_street
 

@@ -9,8 +9,8 @@ from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.judged_pairs import judged_pairs, unseen_views
 from lidarpainter_models.evaluation.judged_views import JudgedView
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.geometry.trajectories import Shift
-from lidarpainter_models.observations.fit_size import ObservationConfig
+from lidarpainter_models.geometry.shifts import Shift
+from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.painter.protocol import PaintingConditions
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView

@@ -8,7 +8,7 @@ from toy_street import ToyStreet
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.strip_views import StripJudgement, strip_views
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
-from lidarpainter_models.observations.fit_size import ObservationConfig
+from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.splits import split_views
 
 SIDE = ("front", 1.0), ("side", 0.8)

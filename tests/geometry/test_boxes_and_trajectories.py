@@ -7,7 +7,8 @@ import torch
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.boxes import box_corners, is_inside_box
-from lidarpainter_models.geometry.trajectories import Shift, road_directions, shift_pose
+from lidarpainter_models.geometry.shifts import Shift
+from lidarpainter_models.geometry.trajectories import road_directions, shift_pose
 from lidarpainter_models.geometry.transforms import rigid_from_tangent, transform_points
 
 

@@ -6,7 +6,7 @@ import re
 import pytest
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.geometry.trajectories import Shift
+from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 
 

@@ -8,13 +8,8 @@ import torch
 from lidarpainter_models.errors import ShapeError, WeightsError
 from lidarpainter_models.metrics import lpips as lpips_module
 from lidarpainter_models.metrics.backbones import BACKBONES, SQUEEZENET, load_stack
-from lidarpainter_models.metrics.lpips import (
-    HEAD_KEY,
-    Lpips,
-    LpipsFiles,
-    load_lpips,
-    read_heads,
-)
+from lidarpainter_models.metrics.lpips import HEAD_KEY, Lpips, load_lpips, read_heads
+from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.metrics.perceptual import load_distances
 from lidarpainter_models.metrics.squeezenet import load_squeezenet_distance
 

@@ -10,8 +10,9 @@ from lidarpainter_models.gaussians.fitting.images import full_image, half_image,
 from lidarpainter_models.kernels.pixel_losses import OPEN, SKY, SOLID
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.lidar.sparse_depth import sparse_lidar_depth
-from lidarpainter_models.observations.fit_size import ObservationConfig, shrink_image
+from lidarpainter_models.observations.fit_size import shrink_image
 from lidarpainter_models.observations.preparation import prepare_observations
+from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.observations.stored_form import (
     observations_from_arrays,
     observations_to_arrays,

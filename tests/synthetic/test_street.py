@@ -11,7 +11,8 @@ from drawn_streets import drawn_street
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.geometry.trajectories import Shift, road_directions, shift_pose
+from lidarpainter_models.geometry.shifts import Shift
+from lidarpainter_models.geometry.trajectories import road_directions, shift_pose
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.synthetic import (
     RigCamera,

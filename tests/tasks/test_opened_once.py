@@ -16,7 +16,7 @@ from tasks.reconstruction.paint import paint
 from tasks.reconstruction.prepare import prepare
 from tasks.reconstruction.publish import begin_run
 from tasks.reconstruction.report import ReportInputs, write_report
-from tasks.stored import FittedRef
+from tasks.specs import FittedRef
 
 
 class Counted:

@@ -16,11 +16,11 @@ from catalog.errors import DamagedArtefactError
 from catalog.schemas import TABLES
 from catalog.store import STORE_ENVIRONMENT, open_store
 from flows.cli.main import main
-from lidarpainter_models.conditioning.sequences import SequenceConfig
+from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.errors import ConfigError, SceneError
-from lidarpainter_models.evaluation.scene_scores import ScoringConfig
 from lidarpainter_models.evaluation.score_tables import flicker_by_image, metric_values
-from lidarpainter_models.geometry.trajectories import Shift
+from lidarpainter_models.evaluation.settings import ScoringConfig
+from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.metrics import lpips
 from lidarpainter_models.metrics.backbones import SQUEEZENET
@@ -37,7 +37,8 @@ from tasks.reconstruction.prepare import prepare
 from tasks.reconstruction.publish import begin_run, complete_run, end_run
 from tasks.reconstruction.report import REPORT_FILE, ReportInputs, write_report
 from tasks.runs import open_run
-from tasks.stored import FittedRef, load_history, load_scene
+from tasks.specs import FittedRef
+from tasks.stored import load_history, load_scene
 from tasks.views.render import RenderRequest, render
 from tasks.views.stylize import StylizeRequest, stylize
 

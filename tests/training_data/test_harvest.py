@@ -8,8 +8,8 @@ import torch
 
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.gaussians.fitting.config import FitConfig
-from lidarpainter_models.gaussians.initialisation.scene import InitialisationConfig
-from lidarpainter_models.observations.fit_size import ObservationConfig
+from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
+from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import ImageRecord, SweepPoints
 from lidarpainter_models.scenes.splits import split_views
@@ -20,13 +20,9 @@ from lidarpainter_models.training_data.harvest import (
     default_plans,
     harvest_left_out,
 )
-from lidarpainter_models.training_data.harvest_targets import AS_GIVEN, HarvestConfig, weak_fit
 from lidarpainter_models.training_data.pairs import PairFolder, PairWriter
-from lidarpainter_models.training_data.street_harvest import (
-    StreetPlan,
-    draw_shift,
-    harvest_shifted_street,
-)
+from lidarpainter_models.training_data.settings import AS_GIVEN, HarvestConfig, StreetPlan, weak_fit
+from lidarpainter_models.training_data.street_harvest import draw_shift, harvest_shifted_street
 
 TINY_FIT = replace(weak_fit(4, budget=400), initialisation=InitialisationConfig(num_gaussians=300))
 TINY = HarvestConfig(

@@ -4,11 +4,13 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.gaussians.fitting.densification import DensificationConfig
-from lidarpainter_models.gaussians.fitting.losses import FitLossWeights
-from lidarpainter_models.gaussians.fitting.optimiser import LearningRates
-from lidarpainter_models.gaussians.fitting.shape_limits import ShapeLimits
-from lidarpainter_models.gaussians.initialisation.scene import InitialisationConfig
+from lidarpainter_models.gaussians.fitting.settings import (
+    DensificationConfig,
+    FitLossWeights,
+    LearningRates,
+    ShapeLimits,
+)
+from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 
 GuidanceFreedom = Literal["all", "appearance"]
 

@@ -13,38 +13,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.gaussians.fitting.settings import DensificationConfig
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 
 BOX_MARGIN, BOX_MARGIN_M = 1.1, 0.1
 """An actor's Gaussian may lie this far out, in half sizes of its box, and this much further:
 mirrors and antennas."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DensificationConfig:
-    """When and how far the number of Gaussians changes."""
-
-    budget: int = 80_000
-    """Never more than this; beyond it the gain per CPU second is small on one front camera."""
-    start: float = 0.1
-    """Fraction of the fit after which splitting begins: gradients must mean something."""
-    stop: float = 0.6
-    """Fraction of the fit after which it ends: new Gaussians need time to settle."""
-    every: int = 100
-    """Steps between two rounds; several passes over the views of a short log."""
-    min_opacity: float = 0.02
-    """Fainter Gaussians are dropped."""
-
-    def __post_init__(self) -> None:
-        """Refuse a schedule that runs backwards."""
-        if not 0 <= self.start <= self.stop <= 1 or self.every < 1 or self.budget < 1:
-            raise ConfigError(
-                f"densification needs 0 <= start <= stop <= 1, every >= 1 and a positive budget, "
-                f"got start {self.start}, stop {self.stop}, every {self.every}, "
-                f"budget {self.budget}"
-            )
 
 
 @dataclass(eq=False, kw_only=True)

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from lidarpainter_models.gaussians.fitting.optimiser import LearningRates
+from lidarpainter_models.gaussians.fitting.settings import LearningRates
 from lidarpainter_models.gaussians.model.gaussian_set import PARAMETERS, GaussianSet
 from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
 from lidarpainter_models.kernels.sparse_adam import (

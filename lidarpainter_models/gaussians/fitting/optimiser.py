@@ -5,44 +5,9 @@ far tower (`gaussian_adam`). Pose corrections step only when their view is drawn
 let them drift on momentum for the dozen steps in between). Rates fall exponentially over the fit.
 """
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LearningRates:
-    """First and last step sizes; each falls exponentially from the one to the other."""
-
-    means: tuple[float, float] = (0.03, 0.002)
-    """In standard deviations of the Gaussian (mean of its two longer axes)."""
-    rotation_wxyz: tuple[float, float] = (2e-3, 4e-4)
-    """Quaternion units."""
-    log_scale: tuple[float, float] = (1e-2, 2e-3)
-    """Logarithm of metres."""
-    opacity_logit: tuple[float, float] = (3e-2, 1e-2)
-    """Logits."""
-    sh_dc: tuple[float, float] = (6e-3, 1e-3)
-    """Harmonics; a colour changes by 0.28 of it."""
-    sh_rest: tuple[float, float] = (6e-4, 2e-4)
-    """Harmonics of degree 1 and more."""
-    camera_rotation_rad: tuple[float, float] = (3e-4, 3e-5)
-    """A pixel of a 480-pixel image is about 2e-3 rad."""
-    camera_translation_m: tuple[float, float] = (3e-3, 3e-4)
-    """Recorded positions are good to centimetres."""
-    actor_rotation_rad: tuple[float, float] = (2e-3, 2e-4)
-    """Boxes are drawn by hand: a degree off is common."""
-    actor_translation_m: tuple[float, float] = (1e-2, 1e-3)
-    """Boxes are drawn by hand: a decimetre off is common."""
-    exposure: tuple[float, float] = (2e-3, 2e-4)
-    """Entries of a camera's colour matrix."""
-
-    def at(self, name: str, fraction: float) -> float:
-        """The rate of one kind after a fraction of the fit."""
-        first, last = getattr(self, name)
-        return first * (last / first) ** min(max(fraction, 0.0), 1.0)
 
 
 class RowAdam:

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lidarpainter_models.gaussians.fitting.settings import ShapeLimits
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
@@ -29,18 +30,6 @@ STEADY_RAY = 0.985
 this length of the mean unit ray the stricter limit is off."""
 LEAST_SIGMA_M = 0.003
 """Thinnest axis; the low-pass of a pixel is wider anyway."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ShapeLimits:
-    """Which shapes a Gaussian may take."""
-
-    most_elongation: float = 12.0
-    """Longest over middle axis: poles and wires need needles."""
-    most_elongation_along_ray: float = 2.0
-    """The same for an axis within 45 degrees of the viewing ray."""
-    most_sigma: float = 0.1
-    """Longest axis in units of the distance to the nearest camera."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidarpainter_models.gaussians.fitting.optimiser import LearningRates
+from lidarpainter_models.gaussians.fitting.settings import LearningRates
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.frustum_culling import (

@@ -6,7 +6,6 @@ what the recorded views never show still needs geometry once the camera leaves i
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,6 +16,7 @@ from lidarpainter_models.gaussians.initialisation.adaptive_voxels import (
     VoxelPoints,
     adaptive_voxels,
 )
+from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.gaussians.initialisation.surfels import (
     SPACING_SIGMA,
     fill_colours,
@@ -48,25 +48,6 @@ UNSEEN_SHARE = 0.2
 """Part of the street's share for points that only a camera moved aside would see."""
 _MOST_VIEWS_PER_ACTOR = 24
 _APART_M = 64.0  # longer than any vehicle, short enough for float32 to stay exact
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class InitialisationConfig:
-    """How many Gaussians a fit starts with, and where."""
-
-    num_gaussians: int = 55_000
-    """Start size; densification brings it to the budget of the fit."""
-    aside_m: float = 3.5
-    """How far aside such a camera may stand."""
-    sh_degree: int = 1
-    """One degree: few views see a surface from far-apart directions."""
-    street_voxel_m: float = 0.03
-    """Smallest voxel on the street."""
-
-    def __post_init__(self) -> None:
-        """Refuse a start without Gaussians."""
-        if self.num_gaussians < 1:
-            raise ConfigError(f"num_gaussians must be positive, got {self.num_gaussians}")
 
 
 def initialise_scene(

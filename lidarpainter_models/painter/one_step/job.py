@@ -11,7 +11,8 @@ from typing import Any
 import torch
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.metrics.lpips import LpipsFiles, load_lpips
+from lidarpainter_models.metrics.lpips import load_lpips
+from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.painter.adversarial import FrozenFeatures
 from lidarpainter_models.painter.examples import PairSource
 from lidarpainter_models.painter.one_step.base_models import open_base

@@ -4,12 +4,12 @@ from gaussian_world import CAR_SIZE_M, round_gaussians
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.fitting.densification import (
-    DensificationConfig,
     GradientTally,
     densify,
     prune,
     split_along_longest_axis,
 )
+from lidarpainter_models.gaussians.fitting.settings import DensificationConfig
 
 CONFIG = DensificationConfig(budget=12)
 

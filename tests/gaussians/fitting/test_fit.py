@@ -12,15 +12,12 @@ from lidarpainter_models.gaussians.fitting.config import (
     RefinementConfig,
     continuation,
 )
-from lidarpainter_models.gaussians.fitting.densification import DensificationConfig
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
-from lidarpainter_models.gaussians.fitting.optimiser import LearningRates
+from lidarpainter_models.gaussians.fitting.settings import DensificationConfig, LearningRates
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import add_guidance_gradients
-from lidarpainter_models.gaussians.initialisation.scene import (
-    InitialisationConfig,
-    initialise_scene,
-)
+from lidarpainter_models.gaussians.initialisation.scene import initialise_scene
+from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
 from lidarpainter_models.gaussians.model.stored_scene import scene_to_arrays
 from lidarpainter_models.geometry.transforms import rigid_from_tangent

@@ -1,6 +1,7 @@
 import torch
 
-from lidarpainter_models.gaussians.fitting.optimiser import LearningRates, RowAdam
+from lidarpainter_models.gaussians.fitting.optimiser import RowAdam
+from lidarpainter_models.gaussians.fitting.settings import LearningRates
 
 
 def test_rates_fall_exponentially_from_first_to_last():

@@ -1,9 +1,9 @@
 import torch
 from gaussian_world import camera_at, car_track, round_gaussians, scene_of
 
+from lidarpainter_models.gaussians.fitting.settings import ShapeLimits
 from lidarpainter_models.gaussians.fitting.shape_limits import (
     LEAST_SIGMA_M,
-    ShapeLimits,
     limit_shapes,
     viewing_rays,
 )

@@ -4,7 +4,7 @@ import pytest
 import torch
 from gaussian_world import camera_at, car_track, round_gaussians, scene_of
 
-from lidarpainter_models.gaussians.fitting.optimiser import LearningRates
+from lidarpainter_models.gaussians.fitting.settings import LearningRates
 from lidarpainter_models.gaussians.fitting.spatial_blocks import SpatialBlocks
 from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body, draw_gaussians
 from lidarpainter_models.geometry.transforms import rigid_from_tangent

@@ -9,11 +9,8 @@ from lidarpainter_models.gaussians.initialisation.adaptive_voxels import (
     adaptive_voxels,
     mean_by_voxel,
 )
-from lidarpainter_models.gaussians.initialisation.scene import (
-    InitialisationConfig,
-    initialise_scene,
-    pixel_footprint,
-)
+from lidarpainter_models.gaussians.initialisation.scene import initialise_scene, pixel_footprint
+from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.gaussians.initialisation.surfels import (
     fill_colours,
     surfels_from_points,

@@ -9,9 +9,9 @@ from toy_store import TOY_SCENE, write_toy_scene
 from catalog.store import open_store
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.synthetic import SyntheticStreetConfig
-from lidarpainter_models.training_data.harvest import HarvestConfig
-from tasks.opened import SplitSpec
+from lidarpainter_models.training_data.settings import HarvestConfig
 from tasks.painter import harvest
+from tasks.specs import SplitSpec
 
 SPLIT = SplitSpec(scene_id=TOY_SCENE, spec="alternate")
 

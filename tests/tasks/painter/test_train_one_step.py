@@ -16,7 +16,8 @@ from catalog.store import open_store
 from lidarpainter_models.errors import ConfigError, DataError, TrainingError, WeightsError
 from lidarpainter_models.evaluation.painter_training import TrainingRequest
 from lidarpainter_models.metrics.backbones import SQUEEZENET
-from lidarpainter_models.metrics.lpips import Lpips, LpipsFiles
+from lidarpainter_models.metrics.lpips import Lpips
+from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.painter import load_painter
 from lidarpainter_models.painter.losses import PaperLossWeights
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig

@@ -1,0 +1,67 @@
+"""What decides which views are painted and what a painter is shown; read without tensors."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.geometry.shifts import Shift
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConditionConfig:
+    """What is gathered for a painter."""
+
+    num_references: int = 2
+    """Warped references given to the painter."""
+    num_sources: int = 6
+    """Recorded images they are patched together from: the nearest, then ever sparser ones."""
+
+    def __post_init__(self) -> None:
+        """Refuse fewer sources than references."""
+        if not 1 <= self.num_references <= self.num_sources:
+            raise ConfigError(
+                f"need 1 <= num_references <= num_sources, got {self.num_references} and "
+                f"{self.num_sources}"
+            )
+
+
+PreviousUse = Literal["unused", "mixed", "shown"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SequenceConfig:
+    """What becomes of the frame painted before."""
+
+    previous: PreviousUse = "unused"
+    """`mixed`: into the painting, as far as both agree; `shown`: to the painter, before the other
+    warped images, of which it was trained to expect recorded ones only."""
+
+
+DEFAULT_SHIFTS = (
+    Shift(lateral_m=2.0),
+    Shift(lateral_m=-2.0),
+    Shift(lateral_m=3.0),
+    Shift(lateral_m=-3.0),
+    Shift(up_m=1.5),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NovelGuidanceConfig:
+    """Which views are painted and what becomes of them."""
+
+    shifts: tuple[Shift, ...] = DEFAULT_SHIFTS
+    """Where the recorded cameras are moved to; the paper's 2 and 3 m to both sides and 1.5 m up."""
+    every_nth: int = 2
+    """Of the training frames, every n-th is painted at every shift."""
+    camera_names: tuple[str, ...] | None = None
+    """Cameras that are moved; None moves every training camera."""
+    sequence: SequenceConfig = field(default_factory=SequenceConfig)
+    """What becomes of the frame painted before along the same path."""
+
+    def __post_init__(self) -> None:
+        """Refuse to paint nothing."""
+        if not self.shifts:
+            raise ConfigError("novel guidance needs at least one shift")
+        if self.every_nth < 1:
+            raise ConfigError(f"every_nth must be at least 1, got {self.every_nth}")

@@ -1,0 +1,102 @@
+"""What the parts of a fit can be told, each setting with its reason; read without tensors."""
+
+from dataclasses import dataclass
+
+from lidarpainter_models.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DensificationConfig:
+    """When and how far the number of Gaussians changes."""
+
+    budget: int = 80_000
+    """Never more than this; beyond it the gain per CPU second is small on one front camera."""
+    start: float = 0.1
+    """Fraction of the fit after which splitting begins: gradients must mean something."""
+    stop: float = 0.6
+    """Fraction of the fit after which it ends: new Gaussians need time to settle."""
+    every: int = 100
+    """Steps between two rounds; several passes over the views of a short log."""
+    min_opacity: float = 0.02
+    """Fainter Gaussians are dropped."""
+
+    def __post_init__(self) -> None:
+        """Refuse a schedule that runs backwards."""
+        if not 0 <= self.start <= self.stop <= 1 or self.every < 1 or self.budget < 1:
+            raise ConfigError(
+                f"densification needs 0 <= start <= stop <= 1, every >= 1 and a positive budget, "
+                f"got start {self.start}, stop {self.stop}, every {self.every}, "
+                f"budget {self.budget}"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitLossWeights:
+    """How much each part of the loss counts."""
+
+    ssim: float = 0.2
+    """Of 1 - SSIM beside the mean absolute difference."""
+    perceptual: float = 0.0
+    """Of the perceptual distance, where one is given to the fit."""
+    sky: float = 0.05
+    """Of the clear-sky term."""
+    sky_tolerance: float = 0.06
+    """A pixel without LiDAR return this close to the sky's colour counts as sky: between wires
+    the fit would otherwise hang sky-coloured needles at any depth."""
+    actors: float = 0.1
+    """Of the term that keeps actors inside their boxes."""
+    depth: float = 0.05
+    """Of the LiDAR depth term."""
+    depth_tolerance: float = 0.05
+    """Relative depth error from which on the pull of the LiDAR weakens."""
+    pose_prior: float = 1e-4
+    """Of squared camera corrections in units of the expected noise."""
+    actor_prior: float = 1e-6
+    """Of squared actor corrections, likewise: an actor fills a small part of the image."""
+    actor_smoothness: float = 1e-5
+    """Of squared jumps between an actor's neighbouring corrections, likewise."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LearningRates:
+    """First and last step sizes; each falls exponentially from the one to the other."""
+
+    means: tuple[float, float] = (0.03, 0.002)
+    """In standard deviations of the Gaussian (mean of its two longer axes)."""
+    rotation_wxyz: tuple[float, float] = (2e-3, 4e-4)
+    """Quaternion units."""
+    log_scale: tuple[float, float] = (1e-2, 2e-3)
+    """Logarithm of metres."""
+    opacity_logit: tuple[float, float] = (3e-2, 1e-2)
+    """Logits."""
+    sh_dc: tuple[float, float] = (6e-3, 1e-3)
+    """Harmonics; a colour changes by 0.28 of it."""
+    sh_rest: tuple[float, float] = (6e-4, 2e-4)
+    """Harmonics of degree 1 and more."""
+    camera_rotation_rad: tuple[float, float] = (3e-4, 3e-5)
+    """A pixel of a 480-pixel image is about 2e-3 rad."""
+    camera_translation_m: tuple[float, float] = (3e-3, 3e-4)
+    """Recorded positions are good to centimetres."""
+    actor_rotation_rad: tuple[float, float] = (2e-3, 2e-4)
+    """Boxes are drawn by hand: a degree off is common."""
+    actor_translation_m: tuple[float, float] = (1e-2, 1e-3)
+    """Boxes are drawn by hand: a decimetre off is common."""
+    exposure: tuple[float, float] = (2e-3, 2e-4)
+    """Entries of a camera's colour matrix."""
+
+    def at(self, name: str, fraction: float) -> float:
+        """The rate of one kind after a fraction of the fit."""
+        first, last = getattr(self, name)
+        return first * (last / first) ** min(max(fraction, 0.0), 1.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShapeLimits:
+    """Which shapes a Gaussian may take."""
+
+    most_elongation: float = 12.0
+    """Longest over middle axis: poles and wires need needles."""
+    most_elongation_along_ray: float = 2.0
+    """The same for an axis within 45 degrees of the viewing ray."""
+    most_sigma: float = 0.1
+    """Longest axis in units of the distance to the nearest camera."""
