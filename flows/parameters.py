@@ -12,7 +12,6 @@ from lidarpainter_models.evaluation.settings import JudgeConfig, ScoringConfig
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.observations.settings import ObservationConfig
-from lidarpainter_models.painter.selection import NO_PAINTER
 from tasks.runs import FinishedRun
 from tasks.specs import RunSpec, SplitSpec
 
@@ -85,6 +84,8 @@ class ReconstructParameters(ViewParameters):
 
 def fitted_on(painter: str) -> Literal["painted", "refined"]:
     """What the scene after the last round is called: without a painter it is not painted."""
+    from lidarpainter_models.painter.selection import NO_PAINTER  # knows tensors
+
     return "refined" if painter == NO_PAINTER else "painted"
 
 

@@ -42,10 +42,12 @@ def ingest(  # noqa: PLR0913 - one per option
     say_status(f"looking for sequences in {root}")
     from catalog.store import open_store
     from flows.cli.progress import shown_progress
-    from tasks.ingest.jobs import IngestRequest, find_sequences, ingest_sequences
+    from tasks.ingest.sequences import find_sequences
 
     store = open_store()
     names = find_sequences(dataset, root, sequences or ())
+    from tasks.ingest.jobs import IngestRequest, ingest_sequences
+
     request = IngestRequest(store.root, dataset, root, chosen_frames, chosen_cameras)
     with shown_progress():
         done = ingest_sequences(request, names, jobs=jobs, again=again, on_failure=complain)

@@ -64,10 +64,7 @@ def train(  # noqa: PLR0913 - the options of a command
     settings: options.Settings = None,
     as_json: AsJson = False,
 ) -> None:
-    """Train the small painter, or with --base the one-step painter on a model.
-
-    A killed training goes on where it stopped.
-    """
+    """Train the small painter, or with --base one on a model; a killed training is taken up."""
     say_status("reading settings")
     from flows.overrides import with_overrides
     from flows.painter_parameters import TrainPainterParameters

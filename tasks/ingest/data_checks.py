@@ -13,7 +13,7 @@ from lidarpainter_models.export.images import write_png
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from tasks.health import Finding
-from tasks.ingest.jobs import find_sequences
+from tasks.ingest.sequences import find_sequences
 from tasks.opened import open_scene
 
 TRIAL_FRAMES = slice(0, 6)

@@ -14,7 +14,6 @@ import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,8 +21,7 @@ from typing import Any
 import lidarpainter_models
 from catalog.errors import CatalogError
 from catalog.store import open_store
-from lidarpainter_models.errors import ConfigError, DataError, LidarPainterError
-from lidarpainter_models.readers import known_datasets, list_sequences
+from lidarpainter_models.errors import ConfigError, LidarPainterError
 from lidarpainter_models.scenes.stored import read_manifest
 from lidarpainter_models.storage.whole_files import write_whole
 from tasks.ingest.ingest import STAGE as ONE_SEQUENCE
@@ -60,29 +58,6 @@ class Ingested:
 
     rows: list[dict[str, Any]] = field(default_factory=list)
     failures: list[dict[str, str]] = field(default_factory=list)
-
-
-def find_sequences(dataset: str, root: Path, named: Sequence[str] = ()) -> list[str]:
-    """The sequences that were named, each once, or all that are found below a root.
-
-    Raises:
-        DataError: the dataset is not known, none is found, or the root is part of a dataset: then
-            the folder above is named.
-    """
-    found: tuple[str, ...] = ()
-    with suppress(DataError):
-        found = list_sequences(dataset, root)
-    parent = Path(root).absolute().parent
-    if not found and dataset in known_datasets() and parent != parent.parent:
-        above: tuple[str, ...] = ()
-        with suppress(LidarPainterError, OSError):
-            above = list_sequences(dataset, parent)
-        if above:
-            raise DataError(
-                f"{root}: expected the root of {dataset}, use its parent {parent}, "
-                f"which holds {_some(above)}"
-            )
-    return list(dict.fromkeys(named or found or list_sequences(dataset, root)))
 
 
 def ingest_sequences(
@@ -169,10 +144,6 @@ def _known(note: Path, request: IngestRequest, name: str) -> dict[str, Any] | No
         raise ConfigError(_refusal(scene_id, differing, there, asked))
     is_same = earlier.get("software_version") == asked["software_version"]
     return row if is_same else None
-
-
-def _some(names: Sequence[str], most: int = 5) -> str:
-    return ", ".join([*names[:most], *(["..."] if len(names) > most else [])])
 
 
 def _frames(chosen: Sequence[int | None] | None) -> str:

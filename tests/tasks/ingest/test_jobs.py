@@ -11,12 +11,8 @@ from catalog.store import open_store
 from lidarpainter_models.errors import ConfigError, DataError, LidarPainterError
 from lidarpainter_models.scenes.stored import stored_digest
 from tasks.ingest import jobs as ingest_jobs
-from tasks.ingest.jobs import (
-    IngestRequest,
-    find_sequences,
-    ingest_or_recall,
-    ingest_sequences,
-)
+from tasks.ingest.jobs import IngestRequest, ingest_or_recall, ingest_sequences
+from tasks.ingest.sequences import find_sequences
 
 
 @pytest.fixture

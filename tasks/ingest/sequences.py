@@ -1,0 +1,35 @@
+"""Which sequences of a dataset are meant."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from lidarpainter_models.errors import DataError, LidarPainterError
+from lidarpainter_models.readers import known_datasets, list_sequences
+
+
+def find_sequences(dataset: str, root: Path, named: Sequence[str] = ()) -> list[str]:
+    """The sequences that were named, each once, or all that are found below a root.
+
+    Raises:
+        DataError: the dataset is not known, none is found, or the root is part of a dataset: then
+            the folder above is named.
+    """
+    found: tuple[str, ...] = ()
+    with suppress(DataError):
+        found = list_sequences(dataset, root)
+    parent = Path(root).absolute().parent
+    if not found and dataset in known_datasets() and parent != parent.parent:
+        above: tuple[str, ...] = ()
+        with suppress(LidarPainterError, OSError):
+            above = list_sequences(dataset, parent)
+        if above:
+            raise DataError(
+                f"{root}: expected the root of {dataset}, use its parent {parent}, "
+                f"which holds {_some(above)}"
+            )
+    return list(dict.fromkeys(named or found or list_sequences(dataset, root)))
+
+
+def _some(names: Sequence[str], most: int = 5) -> str:
+    return ", ".join([*names[:most], *(["..."] if len(names) > most else [])])
