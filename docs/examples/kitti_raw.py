@@ -4,21 +4,28 @@
 
 `DATE_FOLDER` holds calib_*.txt and `DRIVE` (2011_09_26_drive_0001_sync) with oxts, velodyne_points
 and image_02. Images are PNG: they are stored as JPEG of quality 98. A sweep is compensated: each
-point by the pose at its own time, which follows from its azimuth. Boxes are not read: without them
-moving cars would become part of the street, so mask them or choose a quiet drive.
+point by the pose at its own time, which follows from its azimuth. Boxes come from the drive's
+tracklet_labels.xml, each at the time at which the LiDAR looked at it. Without that file there are
+none, and moving cars would become part of the street: choose a quiet drive.
+
+The ego frame is the LiDAR's, 1.7 m above the road.
 """
 
 import sys
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
 import torch
 
+from lidarpainter_models.geometry.boxes import count_points_in_boxes
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import interpolate_rigid, invert_rigid
-from lidarpainter_models.scenes.records import ImageRecord, SweepPoints
+from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, SweepPoints
+from lidarpainter_models.scenes.tracks import does_move
 from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
 
 EARTH_RADIUS_M = 6378137.0
@@ -63,16 +70,96 @@ def global_from_imu(line: str, scale: float) -> torch.Tensor:
     return torch.from_numpy(matrix)
 
 
-def compensated(scan: np.ndarray, before: torch.Tensor, after: torch.Tensor) -> np.ndarray:
-    """Points of a turn in the world; it begins and ends behind, clockwise from above."""
-    share = (np.pi - np.arctan2(scan[:, 1], scan[:, 0])) / (2 * np.pi)
-    xyz_m = np.empty((len(scan), 3))
-    for index in range(NUM_SLICES):
-        rows = np.floor(share * NUM_SLICES).clip(0, NUM_SLICES - 1) == index
-        moment = torch.tensor((index + 0.5) / NUM_SLICES, dtype=torch.float64)
-        pose = interpolate_rigid(before, after, moment).numpy()
-        xyz_m[rows] = scan[rows, :3] @ pose[:3, :3].T + pose[:3, 3]
-    return xyz_m
+@dataclass(frozen=True)
+class Turn:
+    """One turn of the LiDAR: it begins and ends behind the car, clockwise from above."""
+
+    before: torch.Tensor
+    after: torch.Tensor
+    time_ns: int
+    period_ns: int
+
+    @staticmethod
+    def share(x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+        """How much of a turn is over when the LiDAR looks at a place beside it."""
+        return (np.pi - np.arctan2(y_m, x_m)) / (2 * np.pi)
+
+    def pose(self, share: float) -> torch.Tensor:
+        """world_from_velodyne so far into the turn."""
+        return interpolate_rigid(self.before, self.after, torch.tensor(share, dtype=torch.float64))
+
+    def compensated(self, scan: np.ndarray) -> torch.Tensor:
+        """The points of the turn in the world, float32."""
+        slices = np.floor(self.share(scan[:, 0], scan[:, 1]) * NUM_SLICES).clip(0, NUM_SLICES - 1)
+        xyz_m = np.empty((len(scan), 3))
+        for index in range(NUM_SLICES):
+            pose = self.pose((index + 0.5) / NUM_SLICES).numpy()
+            rows = slices == index
+            xyz_m[rows] = scan[rows, :3] @ pose[:3, :3].T + pose[:3, 3]
+        return torch.from_numpy(xyz_m.astype(np.float32))
+
+    def box(self, tracklet: ElementTree.Element, pose: ElementTree.Element) -> BoxRecord:
+        """A tracklet's box in this turn; its place is on the ground, in the LiDAR's frame."""
+        height_m, width_m, length_m = (float(tracklet.findtext(name, "")) for name in "hwl")
+        x_m, y_m, z_m, yaw = (float(pose.findtext(n, "")) for n in ("tx", "ty", "tz", "rz"))
+        velodyne_from_box = np.eye(4)
+        velodyne_from_box[:3, :3] = cv2.Rodrigues(np.array([0.0, 0.0, yaw]))[0]
+        velodyne_from_box[:3, 3] = x_m, y_m, z_m + height_m / 2
+        share = float(self.share(x_m, y_m))
+        return BoxRecord(
+            actor_id="",
+            category=tracklet.findtext("objectType", ""),
+            timestamp_ns=self.time_ns + round((share - 0.5) * self.period_ns),
+            world_from_box=self.pose(share) @ torch.from_numpy(velodyne_from_box),
+            size_m=(length_m, width_m, height_m),
+            is_moving=False,
+            num_points=0,
+        )
+
+
+def turns_of(poses: list[torch.Tensor], times_ns: list[int]) -> list[Turn]:
+    """The turns of a drive; each lasts from half way to its neighbours."""
+    period_ns = round(float(np.median(np.diff(times_ns)))) if len(times_ns) > 1 else 10**8
+    half, last = torch.tensor(0.5, dtype=torch.float64), len(poses) - 1
+    return [
+        Turn(
+            before=interpolate_rigid(poses[max(index - 1, 0)], pose, half),
+            after=interpolate_rigid(pose, poses[min(index + 1, last)], half),
+            time_ns=time_ns,
+            period_ns=period_ns,
+        )
+        for index, (pose, time_ns) in enumerate(zip(poses, times_ns, strict=True))
+    ]
+
+
+def boxes_of(file: Path, turns: list[Turn]) -> dict[int, list[BoxRecord]]:
+    """The boxes of tracklet_labels.xml by frame, their points not yet counted."""
+    found: dict[int, list[BoxRecord]] = {}
+    if not file.is_file():
+        return found
+    tracklets = ElementTree.parse(file).getroot().findall("tracklets/item")  # noqa: S314
+    for number, tracklet in enumerate(tracklets):
+        first = int(tracklet.findtext("first_frame", ""))
+        poses = tracklet.findall("poses/item")  # of a shortened drive some are left over
+        boxes = [turn.box(tracklet, pose) for turn, pose in zip(turns[first:], poses, strict=False)]
+        if not boxes:
+            continue
+        is_moving = does_move(torch.stack([box.world_from_box[:3, 3] for box in boxes]))
+        for index, box in enumerate(boxes, start=first):
+            known = replace(box, actor_id=f"tracklet-{number}", is_moving=is_moving)
+            found.setdefault(index, []).append(known)
+    return found
+
+
+def counted(boxes: list[BoxRecord], xyz_m: torch.Tensor) -> list[BoxRecord]:
+    """The boxes of a frame with the number of points that each holds."""
+    if not boxes:
+        return []
+    poses = torch.stack([box.world_from_box for box in boxes])
+    counts = count_points_in_boxes(xyz_m, poses, torch.tensor([box.size_m for box in boxes]))
+    return [
+        replace(box, num_points=count) for box, count in zip(boxes, counts.tolist(), strict=True)
+    ]
 
 
 def write(date_folder: Path, drive: str, store: Path) -> Path:
@@ -94,6 +181,8 @@ def write(date_folder: Path, drive: str, store: Path) -> Path:
     world_from_global = invert_rigid(velodyne[0])
     poses = [world_from_global @ pose for pose in velodyne]
     times_ns = [nanoseconds(t) for t in (folder / "oxts/timestamps.txt").read_text().splitlines()]
+    turns = turns_of(poses, times_ns)
+    boxes = boxes_of(folder / "tracklet_labels.xml", turns)
     lens = {
         "fx_px": projection[0, 0],
         "fy_px": projection[1, 1],
@@ -116,20 +205,12 @@ def write(date_folder: Path, drive: str, store: Path) -> Path:
             writer.add_image(record, jpeg)
             scan = np.fromfile(folder / f"velodyne_points/data/{index:010d}.bin", "<f4")
             scan = scan.reshape(-1, 4).astype(np.float64)
-            first, last = poses[max(index - 1, 0)], poses[min(index + 1, len(poses) - 1)]
-            half = torch.tensor(0.5, dtype=torch.float64)
-            xyz_m = compensated(
-                scan, interpolate_rigid(first, pose, half), interpolate_rigid(pose, last, half)
+            points = SweepPoints.of(
+                turns[index].compensated(scan),
+                intensity=torch.from_numpy(scan[:, 3].astype(np.float32)),
             )
-            writer.add_sweep(
-                "velodyne",
-                SweepPoints.of(
-                    torch.from_numpy(xyz_m.astype(np.float32)),
-                    intensity=torch.from_numpy(scan[:, 3].astype(np.float32)),
-                ),
-                timestamp_ns=time_ns,
-                world_from_lidar=pose,
-            )
+            writer.add_sweep("velodyne", points, timestamp_ns=time_ns, world_from_lidar=pose)
+            writer.add_boxes(counted(boxes.get(index, []), points.xyz_m))
     return writer.path
 
 

@@ -10,12 +10,14 @@ import cv2
 import numpy as np
 import torch
 
+from lidarpainter_models.geometry.boxes import count_points_in_boxes
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, SweepPoints
 from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
 
 STRAIGHT = np.eye(3)
 CAMERA_AXES = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]  # columns: right, down, forward in the world
+CAR_M = (4.2, 1.8, 1.5)  # length, width, height
 LENS = {"fx_px": 300.0, "fy_px": 300.0, "cx_px": 160.0, "cy_px": 90.0}
 
 
@@ -46,16 +48,18 @@ def write(store: Path) -> Path:
             image = np.full((180, 320, 3), 127, np.uint8)  # yours: the camera's JPEG file
             record = ImageRecord(camera_name="front", timestamp_ns=time_ns, camera=camera)
             writer.add_image(record, cv2.imencode(".jpg", image)[1].tobytes())
-            lidar = pose(x_m + 1.0, 0, 1.9)
-            writer.add_sweep("roof", sweep(x_m), timestamp_ns=time_ns, world_from_lidar=lidar)
+            points, lidar = sweep(x_m), pose(x_m + 1.0, 0, 1.9)
+            writer.add_sweep("roof", points, timestamp_ns=time_ns, world_from_lidar=lidar)
+            car = pose(12, 3.9, 0.8)
+            held = count_points_in_boxes(points.xyz_m, car[None], torch.tensor([CAR_M]))
             box = BoxRecord(
                 actor_id="car-1",
                 category="Car",
                 timestamp_ns=time_ns,
-                world_from_box=pose(12, 3.9, 0.8),
-                size_m=(4.2, 1.8, 1.5),
-                is_moving=False,
-                num_points=480,
+                world_from_box=car,
+                size_m=CAR_M,
+                is_moving=False,  # of several boxes: scenes.tracks.does_move(their centres)
+                num_points=int(held[0]),
             )
             writer.add_box(box)
     return writer.path

@@ -49,6 +49,8 @@ MAX_SWEEP_OFFSET_M = 0.15
 MAX_GROUND_SLOPE_RAD = 0.15
 _NON_COMMERCIAL = ("non-commercial", "noncommercial", "-nc-", " nc ", "-nc ")
 _COVERAGE_CELLS = (9, 16)
+_MIN_STEP_M = 0.2
+"""From frame to frame; the poses of a car that stands jitter by less."""
 _GROUND_THICKNESS_M = 0.3
 _NUM_GROUND_TRIES = 1000
 _NUM_SAMPLED_FRAMES = 4
@@ -125,6 +127,8 @@ def check_ego_poses(scene: DrivingScene) -> tuple[Verdict, str]:
     detail = f"speed {speed.min():.1f} to {speed.max():.1f} m/s, turn up to {turn.max():.2f} rad/s"
     if speed.max() > MAX_SPEED_MPS or turn.max() > MAX_TURN_RADPS:
         return "fail", f"{detail}: a jump at frame {_frame_after(scene, int(speed.argmax()))}"
+    if _drives_across(scene.world_from_ego):
+        return "fail", f"{detail}; the car drives across its x axis: is ego x forward, y left?"
     if len(speed) > 1:
         change = velocity.diff(dim=0).norm(dim=1) / step_s[1:]
         if change.max() > MAX_SPEED_CHANGE_MPS2:
@@ -282,6 +286,15 @@ def _turn_rad(first: Tensor, second: Tensor) -> Tensor:
     """Angle between the rotations of two stacks of poses."""
     cosine = quaternion_from_rotation(first[:, :3, :3].transpose(-1, -2) @ second[:, :3, :3])[:, 0]
     return 2 * torch.arccos(cosine.clamp(max=1.0))
+
+
+def _drives_across(world_from_ego: Float[Tensor, "frames 4 4"]) -> bool:
+    """Whether a car drives beside its own x axis, neither forward nor back."""
+    step_m = world_from_ego[:, :3, 3].diff(dim=0)
+    length_m = step_m.norm(dim=1)
+    along_m = (step_m * world_from_ego[:-1, :3, 0]).sum(dim=1).abs()
+    is_step = length_m > _MIN_STEP_M
+    return bool(along_m[is_step].sum() < 0.5 * length_m[is_step].sum())
 
 
 def _frame_after(scene: DrivingScene, step: int) -> int:

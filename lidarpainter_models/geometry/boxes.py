@@ -5,7 +5,7 @@ width, height) in metres.
 """
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
@@ -26,6 +26,25 @@ def is_inside_box(
     points_box = transform_points(box_from_world, points_world)
     half_m = size_m.to(points_world) / 2 + margin_m
     return (points_box.abs() <= half_m).all(dim=-1)
+
+
+def count_points_in_boxes(
+    points_world: Float[Tensor, "points 3"],
+    world_from_boxes: Float[Tensor, "boxes 4 4"],
+    sizes_m: Float[Tensor, "boxes 3"],
+) -> Int[Tensor, " boxes"]:
+    """How many of the points lie in each box; sorts the points once for all boxes."""
+    sorted_m = points_world[torch.argsort(points_world[:, 0])]
+    reach_m = sizes_m.double().norm(dim=1) / 2
+    ends_m = world_from_boxes[:, 0, 3].double()[:, None] + torch.stack([-reach_m, reach_m], dim=1)
+    rows = torch.searchsorted(sorted_m[:, 0].contiguous(), ends_m.to(sorted_m))
+    counts = [
+        int(is_inside_box(sorted_m[first:last], pose, size_m).sum())
+        for (first, last), pose, size_m in zip(
+            rows.tolist(), world_from_boxes, sizes_m, strict=True
+        )
+    ]
+    return torch.tensor(counts, dtype=torch.int64)
 
 
 def box_corners(size_m: Float[Tensor, "3"]) -> Float[Tensor, "8 3"]:

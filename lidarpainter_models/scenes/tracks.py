@@ -16,6 +16,14 @@ from lidarpainter_models.geometry.transforms import interpolate_rigid, interpola
 PRESENCE_MARGIN_NS = 50_000_000
 """An actor is there for half a 10 Hz frame before its first and after its last box."""
 
+MOVING_M = 1.0
+"""An actor that gets so far from its first box moves; a parked car's boxes jitter by less."""
+
+
+def does_move(centres_m: Float[Tensor, "times 3"]) -> bool:
+    """Whether the centres of an actor's boxes, all of a log, are those of one that moves."""
+    return bool(((centres_m - centres_m[0]).norm(dim=1) >= MOVING_M).any())
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ActorTrack:

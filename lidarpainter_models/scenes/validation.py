@@ -4,6 +4,7 @@ Every check takes `where`, the place to name in the error (dataset, sequence, fr
 raises a one-line `DataError` that says what is wrong there and what was expected.
 """
 
+import math
 from collections.abc import Mapping
 
 import cv2
@@ -20,11 +21,16 @@ from lidarpainter_models.scenes.schema import MAX_NAME_LENGTH, is_safe_name
 from lidarpainter_models.scenes.undistortion import pinhole_of
 
 _JPEG_START = b"\xff\xd8"
+_PNG_START = b"\x89PNG"
 _JPEG_END = b"\xff\xd9"
 # every start-of-frame marker; C4, C8 and CC in the same range mean other things
 _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 MAX_COORDINATE_M = 100_000.0
 """Farther from the first ego pose than this, float32 is no longer exact to a centimetre."""
+MAX_START_M = 10_000.0
+"""Between the origin and the first ego pose; float32 is exact to a millimetre there."""
+MIN_UPRIGHT = math.cos(math.radians(45.0))
+"""Cosine between the ego's z and the world's; no road is as steep."""
 MAX_BOX_M = 1000.0
 """Along a side; a train is shorter."""
 MAX_IMAGE_PIXELS = 64_000_000
@@ -93,6 +99,22 @@ def require_pose(target_from_source: Float[Tensor, "4 4"], where: str) -> Float[
     if float(target_from_source[:3, 3].abs().max()) > MAX_PLACE_M:
         raise DataError(f"{where}: the pose lies farther away than the Earth is wide")
     return target_from_source
+
+
+def require_start(world_from_ego: Float[Tensor, "4 4"], where: str) -> None:
+    """Refuse a world that does not begin near its first ego pose, or whose z is not up."""
+    away_m = float(world_from_ego[:3, 3].norm())
+    if away_m > MAX_START_M:
+        raise DataError(
+            f"{where}: the first ego pose is {away_m:.0f} m from the world's origin, expected at "
+            f"most {MAX_START_M:.0f} m: subtract the first position from all poses and points"
+        )
+    if float(world_from_ego[2, 2]) < MIN_UPRIGHT:
+        lean_deg = math.degrees(math.acos(max(float(world_from_ego[2, 2]), -1.0)))
+        raise DataError(
+            f"{where}: the ego's z axis leans {lean_deg:.0f} degrees from the world's, expected "
+            "both to point up"
+        )
 
 
 def require_lens(camera: Camera, distortion: Distortion, where: str) -> None:
@@ -170,6 +192,10 @@ def jpeg_header_size(jpeg: bytes, where: str) -> tuple[int, int]:
     Segments follow each other as marker, big-endian length, content (ITU-T T.81, annex B); the
     size stands in the start-of-frame segment.
     """
+    if jpeg.startswith(_PNG_START):
+        raise DataError(
+            f"{where}: a PNG image, expected JPEG: convert it, as docs/examples/kitti_raw.py does"
+        )
     if not jpeg.startswith(_JPEG_START):
         raise DataError(f"{where}: not a JPEG image")
     position = len(_JPEG_START)

@@ -36,6 +36,7 @@ from lidarpainter_models.scenes.validation import (
     require_pose,
     require_shutter,
     require_size,
+    require_start,
     require_time,
 )
 from lidarpainter_models.storage.whole_files import storage_errors
@@ -128,6 +129,8 @@ class SceneWriter:
         require_pose(world_from_ego, f"{where}, ego")
         require_time(timestamp_ns, where)
         frames = self._rows["frames"]
+        if not frames:
+            require_start(world_from_ego, f"{where}, ego")
         if frames and (
             frame_index <= frames[-1]["frame_index"] or timestamp_ns <= frames[-1]["timestamp_ns"]
         ):

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from lidarpainter_models.checks.actors import check_box_axes
-from lidarpainter_models.checks.doctor import check_scene, draw_overlay
+from lidarpainter_models.checks.doctor import check_ego_poses, check_scene, draw_overlay
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 
 
@@ -56,6 +56,18 @@ def test_jump_of_the_car_is_found(scene):
     check = finding(scene, "ego poses")
     assert check.verdict == "fail"
     assert "a jump at frame 2" in check.detail
+
+
+def test_ego_whose_x_is_not_forward_is_found(scene):
+    across = torch.tensor(
+        [[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=torch.float64
+    )
+    scene.world_from_ego = scene.world_from_ego @ across
+    check = finding(scene, "ego poses")
+    assert check.verdict == "fail"
+    assert "drives across its x axis: is ego x forward, y left?" in check.detail
+    scene.world_from_ego = scene.world_from_ego @ across  # backwards is a way to drive
+    assert check_ego_poses(scene)[0] == "ok"
 
 
 def test_camera_clock_off_by_half_a_second_is_found(scene):

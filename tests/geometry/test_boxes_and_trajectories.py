@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.geometry.boxes import box_corners, is_inside_box
+from lidarpainter_models.geometry.boxes import box_corners, count_points_in_boxes, is_inside_box
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.geometry.trajectories import road_directions, shift_pose
 from lidarpainter_models.geometry.transforms import rigid_from_tangent, transform_points
@@ -30,6 +30,22 @@ def test_box_holds_its_shrunken_corners_and_not_its_grown_ones():
     assert is_inside_box(inner, world_from_box, size_m).all()
     assert not is_inside_box(outer, world_from_box, size_m).any()
     assert is_inside_box(outer, world_from_box, size_m, margin_m=0.1).all()
+
+
+def test_points_are_counted_in_every_box_as_one_by_one():
+    generator = torch.Generator().manual_seed(0)
+    points = 10 * torch.randn(2000, 3, generator=generator)
+    poses = rigid_from_tangent(torch.randn(7, 6, generator=generator, dtype=torch.float64) * 2)
+    sizes_m = 1 + 6 * torch.rand(7, 3, generator=generator)
+    counts = count_points_in_boxes(points, poses, sizes_m)
+    expected = [
+        int(is_inside_box(points, pose, size_m).sum())
+        for pose, size_m in zip(poses, sizes_m, strict=True)
+    ]
+    assert counts.tolist() == expected
+    assert min(expected) > 0
+    assert count_points_in_boxes(points[:0], poses, sizes_m).tolist() == [0] * 7
+    assert count_points_in_boxes(points, poses[:0], sizes_m[:0]).tolist() == []
 
 
 def test_directions_follow_the_path():

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 import torch
 
 from lidarpainter_models.checks.doctor import check_scene
@@ -70,10 +71,43 @@ def write_kitti(folder, num_frames=4):
         image = np.full((48, 64, 3), 40 * index, np.uint8)
         cv2.imwrite(str(drive / f"image_02/data/{index:010d}.png"), image)
         post = np.tile([20.0 - index, 5.0, 0.0, 0.5], (10, 1))
-        post[:, 0] += 0.5 - np.pi**-1 / 2 * (np.pi - np.arctan2(5.0, 20.0 - index))  # still moving
+        post[:, 0] = post_x_m(index)  # the car is still moving
         post.astype("<f4").tofile(drive / f"velodyne_points/data/{index:010d}.bin")
     (drive / "oxts/timestamps.txt").write_text("\n".join(lines))
+    around_post = [(post_x_m(index), 5.0, -0.75, 0.0) for index in range(num_frames)]
+    ahead = [(10.0, -3.0, -1.5, 0.0)] * 9  # as fast as the car; more than there are frames
+    (drive / "tracklet_labels.xml").write_text(
+        tracklets(
+            ("Car", (1.5, 1.8, 4.0), 0, around_post),
+            ("Van", (2.0, 1.9, 5.0), 1, ahead),
+            ("Tram", (3.0, 2.5, 9.0), num_frames, ahead),  # after the last frame
+        )
+    )
     return drive.name
+
+
+def post_x_m(index):
+    """Where the post stands before the car when the LiDAR looks at it."""
+    return 20.0 - index + 0.5 - np.pi**-1 / 2 * (np.pi - np.arctan2(5.0, 20.0 - index))
+
+
+def tracklets(*actors):
+    """tracklet_labels.xml of actors: type, height width length, first frame, x y z yaw by frame."""
+    items = ""
+    for kind, (height_m, width_m, length_m), first, places in actors:
+        poses = "".join(
+            f"<item><tx>{x}</tx><ty>{y}</ty><tz>{z}</tz><rx>0</rx><ry>0</ry><rz>{yaw}</rz></item>"
+            for x, y, z, yaw in places
+        )
+        items += (
+            f"<item><objectType>{kind}</objectType><h>{height_m}</h><w>{width_m}</w>"
+            f"<l>{length_m}</l><first_frame>{first}</first_frame>"
+            f"<poses><count>{len(places)}</count>{poses}</poses></item>"
+        )
+    return (
+        "<boost_serialization><tracklets><count>3</count><item_version>1</item_version>"
+        f"{items}</tracklets></boost_serialization>"
+    )
 
 
 def test_kitti_drive_becomes_a_scene_in_which_a_post_stands_still(tmp_path):
@@ -85,6 +119,23 @@ def test_kitti_drive_becomes_a_scene_in_which_a_post_stands_still(tmp_path):
     for frame_index in (1, 2):  # the first and the last have a neighbour on one side only
         post_m = scene.read_points(frame_index).xyz_m.mean(dim=0)
         assert torch.allclose(post_m, torch.tensor([20.0, 5.0, 0.0]), atol=0.05)
+    parked, moving = scene.tracks
+    assert (parked.category, parked.is_moving, parked.size_m.tolist()) == (
+        "Car",
+        False,
+        pytest.approx([4.0, 1.8, 1.5]),
+    )
+    assert torch.allclose(
+        parked.world_from_box[1:3, :3, 3], torch.tensor([20.0, 5.0, 0.0]).double(), atol=0.01
+    )
+    assert parked.num_points[1:3].tolist() == [10, 10]
+    assert (moving.category, moving.is_moving) == ("Van", True)
+    assert moving.frame_indices.tolist() == [1, 2, 3]
+    assert moving.num_points.tolist() == [0, 0, 0]
+    seen_s = (moving.timestamps_ns - parked.timestamps_ns[1:]).double() / 1e9
+    assert ((seen_s > 0.005) & (seen_s < 0.02)).all()  # it turns clockwise: left, then right
+    step_m = moving.world_from_box[1, :3, 3] - moving.world_from_box[0, :3, 3]
+    assert torch.allclose(step_m, torch.tensor([1.0, 0.0, 0.0]).double(), atol=0.01)
     camera = scene.views[0].camera
     assert (camera.fx_px, camera.cx_px) == (100.0, 32.0)
     # 6 cm beside camera 0, which is 0.3 m ahead of the LiDAR

@@ -1,7 +1,8 @@
+import pytest
 import torch
 
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
-from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses
+from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses, does_move
 
 
 def track(actor_id, times_ns):
@@ -54,3 +55,18 @@ def test_without_tracks_there_are_no_poses():
     assert len(poses) == 0
     assert poses.all_at(5).shape == (0, 4, 4)
     assert poses.present(5).shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("along_m", "moves"),
+    [
+        ([0.0], False),
+        ([5.0, 5.3, 4.8, 5.9], False),  # a parked car's boxes jitter
+        ([0.0, 0.5, 1.0], True),
+        ([0.0, 2.0, 0.0], True),  # there and back
+    ],
+)
+def test_who_gets_a_metre_from_its_first_box_moves(along_m, moves):
+    centres_m = torch.zeros(len(along_m), 3, dtype=torch.float64)
+    centres_m[:, 1] = torch.tensor(along_m, dtype=torch.float64)
+    assert does_move(centres_m) is moves

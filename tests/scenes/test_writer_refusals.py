@@ -1,7 +1,10 @@
 """The writer refuses what makes no scene, in one line with its place."""
 
+import math
 from dataclasses import replace
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from scene_parts import (
@@ -17,7 +20,9 @@ from scene_parts import (
 )
 
 from lidarpainter_models.errors import DataError, SceneError
+from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.scenes.records import Distortion, SweepPoints
+from lidarpainter_models.scenes.validation import require_jpeg
 from lidarpainter_models.scenes.writer import SceneWriter
 
 
@@ -73,6 +78,49 @@ def test_scene_without_frames_images_or_points_is_refused(tmp_path, missing):
     ):
         write(writer)
     assert files_below(tmp_path) == []
+
+
+def ego_pose(degrees, axis, place_m=(0.0, 0.0, 0.0)):
+    tangent = torch.zeros(6, dtype=torch.float64)
+    tangent[axis] = math.radians(degrees)
+    pose = rigid_from_tangent(tangent)
+    pose[:3, 3] = torch.tensor(place_m, dtype=torch.float64)
+    return pose
+
+
+@pytest.mark.parametrize(
+    ("pose", "complaint"),
+    [
+        (ego_pose(0, 2, (3e4, 0, 0)), "ego pose is 30000 m from the world's origin, expected"),
+        (ego_pose(90, 0), "ego's z axis leans 90 degrees from the world's, expected both to point"),
+        (ego_pose(180, 1), "ego's z axis leans 180 degrees from the world's"),
+    ],
+)
+def test_world_far_from_its_first_pose_or_without_z_up_is_refused(tmp_path, pose, complaint):
+    with (
+        pytest.raises(DataError, match=f"rig/a, frame 0, ego: the (first )?{complaint}"),
+        SceneWriter(tmp_path, "rig", "a", HEADER) as writer,
+    ):
+        writer.add_frame(0, timestamp_ns=0, world_from_ego=pose)
+    assert files_below(tmp_path) == []
+
+
+def test_world_of_any_level_axes_is_taken_and_a_drive_may_lead_far(tmp_path):
+    with SceneWriter(tmp_path, "rig", "a", HEADER) as writer:
+        add_frame(writer)
+        writer.add_frame(1, timestamp_ns=100, world_from_ego=ego_pose(0, 2, (3e4, 0, 0)))
+    with SceneWriter(tmp_path, "rig", "east-north", HEADER) as writer:
+        north = ego_pose(90, 2, (900.0, -900.0, 100.0))
+        writer.add_frame(0, timestamp_ns=0, world_from_ego=north @ ego_pose(15, 1))
+        writer.add_image(some_record(), some_jpeg())
+        add_sweep(writer, some_points())
+    assert writer.path.is_dir()
+
+
+def test_png_is_refused_with_what_was_expected():
+    png = cv2.imencode(".png", np.zeros((24, 32, 3), np.uint8))[1].tobytes()
+    with pytest.raises(DataError, match="front/3: a PNG image, expected JPEG: convert it"):
+        require_jpeg(png, width_px=32, height_px=24, where="front/3")
 
 
 def bad_poses():

@@ -10,9 +10,8 @@ What the dataset does and what is made of it here:
 - Between two neighbouring key frames that both have an instance, it has a box in every sweep, at
   the moment this sweep looked at it: slerp and a straight line between the two. Before the first,
   after the last, and where a key frame between lacks the instance, it has none.
-- An instance moves if any of its boxes stands at least `MOVING_M` from its first; the jitter of a
-  parked car's boxes does not count. The dataset's attributes (`vehicle.moving`) hold for a moment
-  only and are not read.
+- An instance moves as `does_move` says. The dataset's attributes (`vehicle.moving`) hold for a
+  moment only and are not read.
 """
 
 from bisect import bisect_right
@@ -24,7 +23,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.transforms import (
     interpolate_rigid,
     invert_rigid,
@@ -33,9 +31,9 @@ from lidarpainter_models.readers.nuscenes.dataset import NuscenesTables, Sample
 from lidarpainter_models.readers.nuscenes.recordings import LIDAR_NAME, Recording
 from lidarpainter_models.readers.nuscenes.rows import TableRow
 from lidarpainter_models.readers.nuscenes.sweeps import turn_offset_ns
+from lidarpainter_models.scenes.tracks import does_move
 from lidarpainter_models.scenes.validation import require_name, require_size
 
-MOVING_M = 1.0
 _ROUNDS = 4
 """Until a box between key frames and the time it was seen agree to 0.1 mm."""
 
@@ -109,25 +107,6 @@ class _Turn:
         rotation, translation_m = self._lidar_from_global[:2, :3], self._lidar_from_global[:2, 3]
         place_m = rotation @ place_global_m + translation_m
         return self._end_ns + int(turn_offset_ns(place_m[:1], place_m[1:])[0])
-
-
-class PointsByPlace:
-    """Counts the points of a sweep inside boxes."""
-
-    def __init__(self, xyz_m: Float[Tensor, "points 3"]) -> None:
-        self._xyz_m = xyz_m[torch.argsort(xyz_m[:, 0])]
-        self._x_m = self._xyz_m[:, 0].contiguous()
-
-    def count_inside(
-        self, target_from_box: Float[Tensor, "4 4"], size_m: tuple[float, float, float]
-    ) -> int:
-        """Points in a box, both in one frame."""
-        reach_m = float(np.linalg.norm(size_m)) / 2
-        centre_x_m = float(target_from_box[0, 3])
-        ends_m = torch.tensor([centre_x_m - reach_m, centre_x_m + reach_m]).to(self._xyz_m)
-        first, last = torch.searchsorted(self._x_m, ends_m).tolist()
-        near_m = self._xyz_m[first:last]
-        return int(is_inside_box(near_m, target_from_box, torch.tensor(size_m)).sum())
 
 
 def _read_boxes(
@@ -206,12 +185,8 @@ def _moment(
 
 def _moving(frames: list[dict[str, AnnotatedBox]]) -> frozenset[str]:
     """The instances that move at any time of the scene."""
-    begin_m: dict[str, Tensor] = {}
-    moving = set()
+    centres_m: dict[str, list[Tensor]] = {}
     for boxes in frames:
         for actor_id, box in boxes.items():
-            centre_m = box.global_from_box[:3, 3]
-            travelled_m = float((centre_m - begin_m.setdefault(actor_id, centre_m)).norm())
-            if travelled_m >= MOVING_M:
-                moving.add(actor_id)
-    return frozenset(moving)
+            centres_m.setdefault(actor_id, []).append(box.global_from_box[:3, 3])
+    return frozenset(name for name, places in centres_m.items() if does_move(torch.stack(places)))

@@ -19,9 +19,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lidarpainter_models.geometry.boxes import count_points_in_boxes
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
-from lidarpainter_models.readers.nuscenes.boxes import Annotations, PointsByPlace
+from lidarpainter_models.readers.nuscenes.boxes import Annotations
 from lidarpainter_models.readers.nuscenes.dataset import (
     find_scene,
     open_versions,
@@ -161,19 +162,20 @@ class NuscenesLog:
         )
 
     def _boxes(self, frame: RecordedFrame, xyz_m: Float[Tensor, "points 3"]) -> list[BoxRecord]:
-        points = PointsByPlace(xyz_m)
-        records = []
-        for box in self.annotations.boxes_at(frame.sweep):
-            world_from_box = self._world_from_global @ box.global_from_box
-            records.append(
-                BoxRecord(
-                    actor_id=box.actor_id,
-                    category=box.category,
-                    timestamp_ns=box.timestamp_ns,
-                    world_from_box=world_from_box,
-                    size_m=box.size_m,
-                    is_moving=box.actor_id in self.annotations.moving,
-                    num_points=points.count_inside(world_from_box, box.size_m),
-                )
+        boxes = self.annotations.boxes_at(frame.sweep)
+        if not boxes:
+            return []
+        poses = self._world_from_global @ torch.stack([box.global_from_box for box in boxes])
+        counts = count_points_in_boxes(xyz_m, poses, torch.tensor([box.size_m for box in boxes]))
+        return [
+            BoxRecord(
+                actor_id=box.actor_id,
+                category=box.category,
+                timestamp_ns=box.timestamp_ns,
+                world_from_box=pose,
+                size_m=box.size_m,
+                is_moving=box.actor_id in self.annotations.moving,
+                num_points=num_points,
             )
-        return records
+            for box, pose, num_points in zip(boxes, poses, counts.tolist(), strict=True)
+        ]

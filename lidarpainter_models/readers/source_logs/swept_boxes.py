@@ -7,14 +7,16 @@ median time of the points inside it, or of those in its direction.
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+
+from lidarpainter_models.scenes.tracks import does_move
 
 SPINNING, FORWARD = 0, 1
 """Which LiDAR a box was drawn for, and which measured a point; -1 is a box of no particular one."""
-MOVING_M = 1.0
 MOVING_MPS = 1.0
-"""A track moves if it travels at least `MOVING_M`, or if a box is marked as moving and its mean
-speed is at least this (short tracks). Neither a person who stands and gestures nor the jitter of a
-parked car's boxes counts as motion."""
+"""A track moves if it travels as far as `does_move` asks, or if a box is marked as moving and its
+mean speed is at least this (short tracks). Neither a person who stands and gestures nor the jitter
+of a parked car's boxes counts as motion."""
 MIN_POINTS_FOR_TIME = 5
 _AZIMUTH_WINDOW_RAD = np.radians(1.5)
 _NUM_AZIMUTH_SLABS = 360
@@ -130,9 +132,9 @@ def _slab_of_azimuth(azimuth_rad: np.ndarray) -> np.ndarray:
 def _moves(boxes: list[tuple[float, SourceBox]]) -> bool:
     times_s = np.array([time_s for time_s, _ in boxes])
     centres_m = np.array([box.centre_m for _, box in boxes])
-    travelled_m = float(np.linalg.norm(centres_m - centres_m[0], axis=1).max())
-    if travelled_m >= MOVING_M:
+    if does_move(torch.from_numpy(centres_m)):
         return True
+    travelled_m = float(np.linalg.norm(centres_m - centres_m[0], axis=1).max())
     duration_s = float(times_s.max() - times_s.min())
     is_marked = any(not box.is_stationary for _, box in boxes)
     return is_marked and duration_s > 0 and travelled_m / duration_s >= MOVING_MPS
