@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 import torch
 
-from lidarpainter_models.checks.lidar_reach import LidarReach, could_any_hit
+from lidarpainter_models.checks.lidar_reach import LidarReach, could_any_hit, reaches_of
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.tracks import ActorTrack
@@ -94,17 +94,10 @@ def _near_moving_boxes(scene: DrivingScene) -> list[tuple[bool, bool]]:
             ego_m = scene.world_from_ego[scene.frame_position(frame_index), :3, 3]
             if (world_from_box[:3, 3] - ego_m).norm() < NEAR_M:
                 if frame_index not in reaches:
-                    reaches[frame_index] = _reaches(scene, frame_index)
+                    reaches[frame_index] = reaches_of(scene, frame_index)
                 could_be_hit = could_any_hit(reaches[frame_index], world_from_box, track.size_m)
                 found.append((could_be_hit, bool(track.num_points[row] > 0)))
     return found
-
-
-def _reaches(scene: DrivingScene, frame_index: int) -> list[LidarReach]:
-    return [
-        LidarReach.of(scene.read_sweep(sweep).xyz_m, sweep.world_from_lidar)
-        for sweep in scene.sweeps_of(frame_index)
-    ]
 
 
 def _are_twins(first: ActorTrack, second: ActorTrack) -> bool:

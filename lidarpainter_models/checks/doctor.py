@@ -21,6 +21,7 @@ from lidarpainter_models.checks.actors import (
     check_duplicate_tracks,
 )
 from lidarpainter_models.checks.calibration import check_calibration
+from lidarpainter_models.checks.lidar_reach import reaches_of
 from lidarpainter_models.checks.overlay import draw_overlay
 from lidarpainter_models.checks.sweep_agreement import NEIGHBOURHOOD_M, points_near, sweep_offset_m
 from lidarpainter_models.errors import SceneError
@@ -44,6 +45,8 @@ MAX_CAMERA_LAG_S = 0.15
 """A camera takes its image while the LiDAR turns; farther apart is another frame's image."""
 MAX_RIG_SPREAD_M = 0.15
 MIN_COVERAGE = 0.15
+MOST_TILTED = 0.7
+"""Sine of the elevation beyond which no camera of a car looks."""
 MAX_SWEEP_OFFSET_M = 0.15
 """By which a sweep must be moved onto the next."""
 MAX_GROUND_SLOPE_RAD = 0.15
@@ -242,9 +245,21 @@ def check_coverage(scene: DrivingScene) -> tuple[Verdict, str]:
                 covered[view.camera_name].append(_covered_share(view, xyz_m))
     shares = {name: float(np.mean(found or [0.0])) for name, found in covered.items()}
     detail = ", ".join(f"{name} {share:.0%}" for name, share in shares.items())
-    if min(shares.values()) == 0:
+    unseeing = [name for name, share in shares.items() if share == 0]
+    if any(_looks_where_a_lidar_does(scene, name) for name in unseeing):
         return "fail", f"{detail}: a camera sees no point"
+    if unseeing:
+        return "warn", f"{detail}: {', '.join(unseeing)} looks where no LiDAR does"
     return ("ok" if min(shares.values()) >= MIN_COVERAGE else "warn"), detail
+
+
+def _looks_where_a_lidar_does(scene: DrivingScene, camera_name: str) -> bool:
+    """Whether points are due in a camera's images: it looks up, down, or into a LiDAR's sector."""
+    view = scene.views_of(camera_name)[0]
+    axis = view.camera.world_from_camera[:3, 2]
+    if abs(float(axis[2])) > MOST_TILTED:
+        return True
+    return any(reach.covers(axis) for reach in reaches_of(scene, view.frame_index))
 
 
 def _covered_share(view: RecordedView, xyz_m: Float[Tensor, "points 3"]) -> float:

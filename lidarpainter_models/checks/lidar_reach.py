@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
+from lidarpainter_models.scenes.driving_scene import DrivingScene
 
 _NUM_SECTORS = 120
 """Of three degrees: some firings fall into each of them, whatever the LiDAR."""
@@ -50,6 +51,11 @@ class LidarReach:
             range_m=float(np.quantile(range_m, 1 - _FEW)),
         )
 
+    def covers(self, direction_world: Float[Tensor, "3"]) -> bool:
+        """Whether a direction lies in the sector that was covered, at whatever elevation."""
+        direction = self.lidar_from_world[:3, :3] @ direction_world
+        return bool(self.is_covered[_sector(direction[None].numpy())[0]])
+
     def could_hit(self, world_from_box: Float[Tensor, "4 4"], size_m: Float[Tensor, "3"]) -> bool:
         """Whether the middle of a box lies in what was covered, its upper end at least."""
         centre_m = transform_points(self.lidar_from_world, world_from_box[None, :3, 3]).numpy()
@@ -58,6 +64,14 @@ class LidarReach:
         level_m = float(np.hypot(centre_m[0, 0], centre_m[0, 1]))
         top_m = float(centre_m[0, 2]) + float(size_m[2]) / 2
         return math.atan2(top_m, level_m) >= self.lowest_rad
+
+
+def reaches_of(scene: DrivingScene, frame_index: int) -> list[LidarReach]:
+    """What each sweep of a frame covered."""
+    return [
+        LidarReach.of(scene.read_sweep(sweep).xyz_m, sweep.world_from_lidar)
+        for sweep in scene.sweeps_of(frame_index)
+    ]
 
 
 def could_any_hit(

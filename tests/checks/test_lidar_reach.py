@@ -1,5 +1,6 @@
 """Boxes are judged where a LiDAR looked: those elsewhere say nothing, wrong ones there do."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,12 +9,12 @@ import torch
 from drawn_streets import drawn_street
 
 from lidarpainter_models.checks.actors import check_box_points
-from lidarpainter_models.checks.doctor import check_scene
+from lidarpainter_models.checks.doctor import check_coverage, check_scene
 from lidarpainter_models.checks.lidar_reach import LidarReach
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import SyntheticStreetConfig, record_street
+from lidarpainter_models.synthetic import RigCamera, SyntheticStreetConfig, record_street
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
 
 HALF_SECTOR_DEG = 60.0
@@ -21,8 +22,9 @@ HALF_SECTOR_DEG = 60.0
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
+    rear = RigCamera(name="rear_camera", focal_per_width=1.0, yaw_rad=math.pi)
     config = SyntheticStreetConfig(
-        seed=7, num_frames=4, width_px=320, height_px=180, cameras=DEFAULT_CAMERAS[:1]
+        seed=7, num_frames=4, width_px=320, height_px=180, cameras=(DEFAULT_CAMERAS[0], rear)
     )
     return record_street(drawn_street(config), tmp_path_factory.mktemp("street"))
 
@@ -58,6 +60,22 @@ def test_street_of_a_lidar_that_looks_ahead_passes(street):
     boxes = checks["boxes hold points"]
     assert boxes.verdict == "ok", boxes
     assert "more left out: not in the sector" in boxes.detail
+    images = checks["points in images"]
+    assert images.verdict == "warn"
+    assert images.detail.endswith("rear_camera looks where no LiDAR does")
+
+
+def test_camera_that_sees_no_point_where_a_lidar_looks_fails(street):
+    scene = looking_ahead(street)
+    scene.views = tuple(
+        replace(view, camera=replace(view.camera, cx_px=1e5))  # a lens that looks past its image
+        if view.camera_name == "front_camera"
+        else view
+        for view in scene.views
+    )
+    verdict, detail = check_coverage(scene)
+    assert verdict == "fail", detail
+    assert detail.endswith("a camera sees no point")
 
 
 def moved(scene, offset_m):
