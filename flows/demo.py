@@ -3,13 +3,17 @@
 from pathlib import Path
 from typing import Any
 
+from jaxtyping import Float
 from prefect import flow
+from torch import Tensor
 
 from catalog.store import open_store
 from flows.parameters import ReconstructParameters
 from flows.presets import preview
 from flows.reconstruct import reconstruct
+from lidarpainter_models.export.images import write_png
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
+from lidarpainter_models.synthetic.street import SyntheticStreet
 from tasks.painter.harvest import keep_street
 from tasks.specs import street_id
 
@@ -26,11 +30,29 @@ def demo_street(seed: int = DEMO_SEED) -> SyntheticStreetConfig:
 
 @flow(name="demo")
 def demo(
-    street: SyntheticStreetConfig, parameters: ReconstructParameters, store_path: Path
+    street: SyntheticStreetConfig,
+    parameters: ReconstructParameters,
+    store_path: Path,
+    first_image: Path | None = None,
 ) -> dict[str, Any]:
-    """Make the street, then reconstruct it."""
+    """Make the street, then reconstruct it.
+
+    Args:
+        street: what is drawn.
+        parameters: how it is reconstructed.
+        store_path: where both are kept.
+        first_image: file for what the first camera sees at first, long before the rest is done.
+    """
+    if first_image is not None:
+        write_png(_first_view(street), first_image)
     keep_street(store_path, street)
     return reconstruct.fn(parameters, store_path)  # its tasks, without the cost of a subflow
+
+
+def _first_view(config: SyntheticStreetConfig) -> Float[Tensor, "height width 3"]:
+    street = SyntheticStreet(config)
+    first_ns = street.timestamps_ns[0]
+    return street.render(street.camera(config.cameras[0].name, first_ns), first_ns).rgb
 
 
 @flow(name="demo-scene")

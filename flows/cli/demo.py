@@ -9,6 +9,7 @@ import typer
 from flows.cli.output import print_json, say_status
 from flows.cli.shared_options import AsJson, Painter, Settings, check_painter
 
+FIRST_IMAGE_NAME = "street.png"
 REPORT_NAME = "report.html"
 
 
@@ -21,7 +22,11 @@ def demo(
     settings: Settings = None,
     as_json: AsJson = False,
 ) -> None:
-    """Run the built-in street through the whole pipeline; ends with report.html in --out."""
+    """Run the built-in street through the whole pipeline.
+
+    Into --out come street.png, what the camera saw first, after a minute, and report.html in the
+    end.
+    """
     from catalog.errors import storage_errors
     from catalog.store import open_store
     from flows.cli.reconstruct import show
@@ -36,7 +41,8 @@ def demo(
     parameters = with_overrides(parameters, settings or [])
     say_status(f"drawing the street of seed {seed}")
     check_painter(painter)
-    result = run_demo(parameters, seed, open_store(out / "store"))
+    store = open_store(out / "store")
+    result = run_demo(parameters, seed, store, out.absolute() / FIRST_IMAGE_NAME)
     report = out.absolute() / REPORT_NAME
     with storage_errors(f"cannot write {report}"):
         shutil.copyfile(result["report"], report)

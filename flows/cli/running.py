@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from catalog.store import Store
@@ -26,12 +27,14 @@ def run_reconstruction(parameters: "ReconstructParameters", store: Store) -> dic
         return reconstruct(parameters, store.root)
 
 
-def run_demo(parameters: "ReconstructParameters", seed: int, store: Store) -> dict[str, Any]:
+def run_demo(
+    parameters: "ReconstructParameters", seed: int, store: Store, first_image: Path
+) -> dict[str, Any]:
     """Make the street of a seed in the store and reconstruct it."""
     from flows.demo import demo, demo_street
 
     with _running(store):
-        return demo(demo_street(seed), parameters, store.root)
+        return demo(demo_street(seed), parameters, store.root, first_image)
 
 
 @contextmanager

@@ -7,7 +7,7 @@ of its sweep.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -72,12 +72,18 @@ class SimulatedSweep:
     """Index in `SyntheticStreet.actors`, -1 for none."""
 
 
+@lru_cache(maxsize=1)
+def _city(seed: int) -> City:
+    """The last one is kept: whoever records a street judges it later."""
+    return build_city(seed)
+
+
 class SyntheticStreet:
     """A street drawn from a seed. Building one takes some seconds; rendering is then cheap."""
 
     def __init__(self, config: SyntheticStreetConfig) -> None:
         self.config = config
-        self._city: City = build_city(config.seed)
+        self._city = _city(config.seed)
 
     @classmethod
     def from_manifest(cls, manifest: Mapping[str, Any]) -> "SyntheticStreet":
