@@ -48,15 +48,7 @@ class Store:
         Raises:
             StorageError: it cannot be made or written.
         """
-        try:
-            self.root.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=self.root) as probe:
-                probe.write(b"-")
-        except OSError as error:
-            raise StorageError(
-                f"the store {self.root} cannot be written: {error.strerror}; expected a folder "
-                "with room, see --store"
-            ) from None
+        make_writable(self.root, "the store")
 
     def scene_folder(self, scene_id: str) -> Path:
         """Folder of the scene `<dataset>/<sequence>`, whether it exists or not.
@@ -147,6 +139,22 @@ def existing_store() -> Store:
     if not any((store.root / name).is_dir() for name in ("tables", "scenes")):
         raise CatalogError(f"no store at {store.root}: `ingest` or `demo` makes one, see --store")
     return store
+
+
+def make_writable(folder: Path, what: str) -> None:
+    """Make a folder where it is not there, and see that it takes a file.
+
+    Raises:
+        StorageError: it cannot be made or written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as probe:
+            probe.write(b"-")
+    except OSError as error:
+        raise StorageError(
+            f"{what} {folder} cannot be written: {error.strerror}; expected a folder with room"
+        ) from None
 
 
 def split_scene_id(scene_id: str) -> tuple[str, str]:

@@ -38,8 +38,17 @@ def with_changes(parameters: Parameters, changes: Mapping[str, Any]) -> Paramete
         ConfigError: a value does not fit its field.
     """
     values = {field: getattr(parameters, field) for field in type(parameters).model_fields}
+    return checked(type(parameters), {**values, **changes})
+
+
+def checked(model: type[Parameters], values: Mapping[str, Any]) -> Parameters:
+    """A model of values from outside.
+
+    Raises:
+        ConfigError: a value does not fit its field.
+    """
     try:
-        return type(parameters)(**{**values, **changes})
+        return model(**values)
     except ValidationError as error:
         first = error.errors()[0]
         raise ConfigError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from lidarpainter_models.devices import Device
 from lidarpainter_models.evaluation.held_back import FIRST_TRAINING_SEED
@@ -54,7 +54,7 @@ class TrainPainterParameters(HarvestParameters):
     """Where the one-step painter is trained, and what is trained is judged."""
     processes: int = 1
     """In which the one-step painter is trained, each on a GPU of its own."""
-    held_back: float = 0.1
+    held_back: float = Field(default=0.1, ge=0, lt=1)
     """Share of the true images that are kept from training: the validation split."""
     feature_weights: Path | None = None
     """SqueezeNet 1.1 weights for the feature distance; None leaves it out."""

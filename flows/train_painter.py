@@ -22,6 +22,7 @@ from lidarpainter_models.painter.selection import WEIGHTS_SUFFIX
 from lidarpainter_models.painter.training_jobs import job_for
 from lidarpainter_models.storage.whole_files import write_whole
 from lidarpainter_models.training_data.pair_sets import PairSet, named_sets
+from tasks.opened import open_split
 from tasks.painter.harvest import (
     harvest_recorded,
     harvest_street,
@@ -55,7 +56,7 @@ def harvest_pairs(parameters: HarvestParameters, store_path: Path) -> dict[str, 
 @flow(name="train_painter")
 def train_painter(parameters: TrainPainterParameters, store_path: Path) -> dict[str, Any]:
     """Harvest, train, judge on what was held back, and enter the painter into the catalog."""
-    check_sources(parameters)
+    check_sources(parameters, store_path)
     harvested, store = _harvested(parameters, store_path), open_store(store_path)
     sets = (*(made for made, _ in harvested), *named_sets(parameters.pair_folders))
     device = str(chosen_device(parameters.device))
@@ -96,22 +97,33 @@ def train_painter(parameters: TrainPainterParameters, store_path: Path) -> dict[
     }
 
 
-def check_harvest(parameters: HarvestParameters) -> None:
-    """Refuse to harvest nothing.
+def check_harvest(parameters: HarvestParameters, store_path: Path) -> None:
+    """Refuse to harvest nothing, or scenes that are not there or cannot be split.
 
     Raises:
-        ConfigError: there are neither streets nor scenes.
+        ConfigError: there are neither streets nor scenes, or the split leaves nothing to train on.
+        SceneError: a scene is not there, or lacks a camera.
     """
     if not parameters.street_seeds and not parameters.scenes:
         raise ConfigError("nothing to harvest: expected --seeds or --scene")
+    _check_scenes(parameters, store_path)
 
 
-def check_sources(parameters: TrainPainterParameters) -> None:
+def _check_scenes(parameters: HarvestParameters, store_path: Path) -> None:
+    streets = {street_id(seed) for seed in parameters.street_seeds}  # these are drawn
+    for scene_id in parameters.scenes:
+        if scene_id not in streets:
+            split = SplitSpec(scene_id=scene_id, spec=parameters.split, cameras=parameters.cameras)
+            open_split(open_store(store_path), split)
+
+
+def check_sources(parameters: TrainPainterParameters, store_path: Path) -> None:
     """Refuse to train on nothing, or on what judges painters.
 
     Raises:
         ConfigError: no source of pairs, a street whose seed is kept for judging, a loss that lacks
             what it weighs, or first weights that do not say what they have learnt.
+        SceneError: a scene is not there, or lacks a camera.
         DataError: a folder holds no pairs.
         WeightsError: the model, the first weights, or those for a distance cannot be used.
     """
@@ -125,6 +137,7 @@ def check_sources(parameters: TrainPainterParameters) -> None:
         check_street_seed(seed)
     for scene_id in parameters.scenes:
         check_training_scene(*split_scene_id(scene_id))
+    _check_scenes(parameters, store_path)
     for one in named_sets(parameters.pair_folders):
         check_training_pairs(one.open())
 

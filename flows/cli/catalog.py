@@ -122,6 +122,8 @@ def _find(store: Any, name: str) -> tuple[str, dict[str, Any]]:  # noqa: ANN401 
     from catalog.errors import UnknownRecordError
     from catalog.store import LATEST
 
+    if not name:
+        raise UnknownRecordError("'' names nothing, expected an id or the beginning of one")
     if name == LATEST:
         return "runs", store.run(name)
     complaints = []

@@ -18,6 +18,7 @@ from catalog.errors import CatalogError
 from catalog.store import STORE_ENVIRONMENT
 from flows.cli import catalog, demo, doctor, evaluate, ingest, painter, reconstruct, render, stylize
 from flows.cli.output import complain
+from flows.cli.usage import OneLineGroup
 from flows.environment import prepare_environment
 from flows.interruption import MESSAGE, Interrupted
 from lidarpainter_models import __version__
@@ -32,6 +33,7 @@ GLOBAL_FLAGS = ("--debug",)
 app = typer.Typer(
     name="lidarpainter",
     help="Editable 3D Gaussian driving scenes that still look right a lane away.",
+    cls=OneLineGroup,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},

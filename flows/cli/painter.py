@@ -1,7 +1,6 @@
 """`lidarpainter painter`: harvest pairs, train painters, judge them, and say what they are."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -66,23 +65,24 @@ def train(  # noqa: PLR0913 - the options of a command
 ) -> None:
     """Train the small painter, or with --base one on a model; a killed training is taken up."""
     say_status("reading settings")
-    from flows.overrides import with_overrides
+    from flows.overrides import checked, with_overrides
     from flows.painter_parameters import TrainPainterParameters
     from flows.painter_recipes import shaped, started_at
     from lidarpainter_models.metrics.lpips_files import LpipsFiles
 
-    parameters = TrainPainterParameters(
-        street_seeds=options.parse_seeds(seeds),
-        scenes=tuple(scenes or ()),
-        split=split,
-        cameras=parse_names(cameras),
-        pair_folders=options.parse_paths(pairs, "--pairs"),
-        held_back=held_back,
-        feature_weights=feature_weights,
-        device=device,
-        processes=processes,
-        **started_at(base, start, LpipsFiles(backbone=lpips_backbone, heads=lpips_heads)),
-    )
+    asked = {
+        "street_seeds": options.parse_seeds(seeds),
+        "scenes": tuple(scenes or ()),
+        "split": split,
+        "cameras": parse_names(cameras),
+        "pair_folders": options.parse_paths(pairs, "--pairs"),
+        "held_back": held_back,
+        "feature_weights": feature_weights,
+        "device": device,
+        "processes": processes,
+    }
+    start_at = started_at(base, start, LpipsFiles(backbone=lpips_backbone, heads=lpips_heads))
+    parameters = checked(TrainPainterParameters, asked | start_at)
     training = shaped(
         parameters.training,
         inputs=options.parse_inputs(inputs),
@@ -93,12 +93,8 @@ def train(  # noqa: PLR0913 - the options of a command
     parameters = parameters.model_copy(update={"training": training})
     parameters = with_overrides(parameters, settings or [])
     from flows.cli.training import run_training
-    from flows.train_painter import write_painter
 
-    result = run_training(parameters)
-    if out is not None:
-        result |= write_painter(Path(result["weights"]), result["record"], out)
-    _print(result, tables.show_training, as_json=as_json)
+    _print(run_training(parameters, out), tables.show_training, as_json=as_json)
 
 
 @app.command("evaluate")

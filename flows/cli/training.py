@@ -1,29 +1,45 @@
 """Run the flows behind `lidarpainter painter`, with a Prefect server and progress on stderr."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
-from catalog.store import open_store
+from catalog.store import make_writable, open_store
 from flows.ablate_painter import AblationParameters, ablate_painter, check_ablation
 from flows.cli.output import say_status
 from flows.cli.progress import shown_progress
 from flows.painter_parameters import HarvestParameters, TrainPainterParameters
 from flows.server import prefect_server
-from flows.train_painter import check_harvest, check_sources, harvest_pairs, train_painter
+from flows.train_painter import (
+    check_harvest,
+    check_sources,
+    harvest_pairs,
+    train_painter,
+    write_painter,
+)
+from lidarpainter_models.painter.selection import WEIGHTS_SUFFIX
 
 Parameters = TypeVar("Parameters")
 
 
 def run_harvest(parameters: HarvestParameters) -> dict[str, Any]:
     """Harvest into the store."""
-    check_harvest(parameters)
+    check_harvest(parameters, open_store().root)
     return _run(harvest_pairs, parameters)
 
 
-def run_training(parameters: TrainPainterParameters) -> dict[str, Any]:
-    """Train into the store; what cannot be trained on is refused before any work begins."""
-    check_sources(parameters)
-    return _run(train_painter, parameters)
+def run_training(parameters: TrainPainterParameters, out: Path | None) -> dict[str, Any]:
+    """Train into the store, and copy the painter out of it if a place is given.
+
+    What cannot be trained on, or written to, is refused before any work begins.
+    """
+    check_sources(parameters, open_store().root)
+    if out is not None:
+        make_writable(out.parent if out.suffix == WEIGHTS_SUFFIX else out, "--out")
+    result = _run(train_painter, parameters)
+    if out is None:
+        return result
+    return result | write_painter(Path(result["weights"]), result["record"], out)
 
 
 def run_ablation(parameters: AblationParameters) -> dict[str, Any]:

@@ -21,29 +21,6 @@ def test_asking_for_help_is_no_error(command, capsys):
     assert "lidarpainter" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("command", "expected"),
-    [
-        (["catalog", "list", "nope"], "no table 'nope'"),
-        (["catalog", "show", "nothing"], "nothing is called 'nothing'"),
-        (["catalog", "show", "latest"], "no complete run"),
-        (["catalog", "explain", "nothing"], "nothing is called 'nothing'"),
-        (["ingest", "pandaset", "/nowhere", "002", "--frames", "5"], "expected A:B"),
-        (["ingest", "pandaset", "/nowhere", "002", "--frames", "5:5"], "expected A < B"),
-        (["ingest", "pandaset", "/nowhere", "002", "--cameras", "a,,b"], "names with commas"),
-        (["evaluate", "latest", "--protocol", "guess"], "no protocol 'guess'"),
-        (["evaluate", "latest", "--previous", "mixed"], "is judged by --protocol flicker"),
-        (["--store", "/etc/passwd", "catalog", "list"], "is a file, expected a folder"),
-    ],
-)
-def test_bad_input_is_one_line_and_code_two(command, expected, capsys):
-    assert main(command) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert expected in captured.err
-    assert captured.err.count("\n") == 1
-
-
 def test_a_traceback_is_shown_only_when_asked_for(capsys):
     assert main(["catalog", "show", "x"]) == 2
     assert "Traceback" not in capsys.readouterr().err
