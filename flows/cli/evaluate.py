@@ -11,6 +11,11 @@ from lidarpainter_models.errors import ConfigError
 
 FLICKER = "flicker"
 CROSS_CAMERA = "cross-camera"
+STRIP_FIGURES = {
+    "psnr": "seen by both, calibrated",
+    "uncalibrated_psnr": "seen by both, as delivered",
+    "whole_image_psnr": "all, as delivered",
+}
 PROTOCOLS = ("paper", "truth", CROSS_CAMERA, FLICKER)
 VARIANTS = ("unpainted", "painted", "refined", "view-time")
 FLICKER_COLUMNS = ("flicker", "moving_flicker", "valid_share", "psnr", "num_pairs")
@@ -114,11 +119,12 @@ def _show(result: dict[str, Any]) -> None:
 def _show_strips(result: dict[str, Any]) -> None:
     variants = [name for name in VARIANTS if name in result]
     rows = [
-        [name, *(result[variant][name]["psnr"] for variant in variants)]
-        for name in result[variants[0]]
+        [camera, truth, *(result[variant][camera].get(figure) for variant in variants)]
+        for camera in result[variants[0]]
+        for figure, truth in STRIP_FIGURES.items()
     ]
-    title = f"{result['scene']}, run {result['run_id']}: PSNR on strips seen by two cameras"
-    print_table(title, ["judging camera", *variants], rows)
+    title = f"{result['scene']}, run {result['run_id']}: PSNR of cameras that no fit saw"
+    print_table(title, ["judging camera", "pixels", *variants], rows, num_text_columns=2)
 
 
 def _show_flicker(result: dict[str, Any]) -> None:
