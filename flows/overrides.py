@@ -56,7 +56,7 @@ def checked(model: type[Parameters], values: Mapping[str, Any]) -> Parameters:
 
 def _assigned(owner: Any, names: list[str], text: str, path: str) -> Any:  # noqa: ANN401
     """A copy of a model or dataclass with one setting below it changed."""
-    known = _field_names(owner)
+    known = field_names(owner)
     name = names[0]
     if name not in known:
         place = path.split(".")[: -len(names)]
@@ -71,7 +71,8 @@ def _assigned(owner: Any, names: list[str], text: str, path: str) -> Any:  # noq
     return _replaced(owner, name, value)
 
 
-def _field_names(owner: Any) -> list[str]:  # noqa: ANN401 - a model, a dataclass or a plain value
+def field_names(owner: Any) -> list[str]:  # noqa: ANN401 - a model, a dataclass or a plain value
+    """What can be set of a model or a dataclass; nothing of a plain value."""
     if isinstance(owner, BaseModel):
         return list(type(owner).model_fields)
     if is_dataclass(owner):

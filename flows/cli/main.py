@@ -16,7 +16,18 @@ import typer
 
 from catalog.errors import CatalogError
 from catalog.store import STORE_ENVIRONMENT
-from flows.cli import catalog, demo, doctor, evaluate, ingest, painter, reconstruct, render, stylize
+from flows.cli import (
+    catalog,
+    demo,
+    doctor,
+    evaluate,
+    ingest,
+    painter,
+    reconstruct,
+    render,
+    settings,
+    stylize,
+)
 from flows.cli.output import complain
 from flows.cli.usage import OneLineGroup
 from flows.environment import prepare_environment
@@ -42,6 +53,7 @@ app.command("demo")(demo.demo)
 app.command("doctor")(doctor.doctor)
 app.command("ingest")(ingest.ingest)
 app.command("reconstruct")(reconstruct.reconstruct)
+app.command("settings")(settings.settings)
 app.command("render")(render.render)
 app.command("stylize")(stylize.stylize)
 app.command("evaluate")(evaluate.evaluate)
@@ -56,7 +68,7 @@ def _print_version(asked: bool) -> None:
 
 
 @app.callback()
-def settings(
+def options(
     store: Annotated[
         Path | None,
         typer.Option(help="Folder of the store.", envvar=STORE_ENVIRONMENT, show_default=False),

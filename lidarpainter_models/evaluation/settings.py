@@ -23,6 +23,7 @@ class ScoringConfig:
     """Which trajectories are judged."""
 
     shifts: tuple[Shift, ...] = JUDGED_SHIFTS
+    """Where the recorded cameras are moved to, to be judged there."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

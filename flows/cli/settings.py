@@ -1,0 +1,50 @@
+"""`lidarpainter settings`: everything that `--set` knows."""
+
+import json
+from dataclasses import asdict
+from typing import Annotated, Literal
+
+import typer
+
+from flows.cli.output import Cell, print_json, print_table
+from flows.cli.shared_options import AsJson
+
+
+def settings(
+    prefix: Annotated[
+        str, typer.Argument(help="Only these: fit, fit.densification, ...; all if absent.")
+    ] = "",
+    preset: Annotated[
+        str, typer.Option(help="Whose defaults are shown: preview, balanced or paper.")
+    ] = "preview",
+    of: Annotated[
+        Literal["reconstruct", "train"],
+        typer.Option(help="For --set of reconstruct and demo, or of painter train and harvest."),
+    ] = "reconstruct",
+    as_json: AsJson = False,
+) -> None:
+    """List what --set knows: path, type, default and reason.
+
+    Example: lidarpainter settings fit.densification
+
+    Then: lidarpainter reconstruct pandaset/002 --set fit.densification.budget=100000
+    """
+    from flows.setting_lists import known_settings
+
+    if of == "train":
+        from flows.painter_parameters import TrainPainterParameters
+
+        found = known_settings(TrainPainterParameters(), prefix)
+        title = "settings of painter train"
+    else:
+        from flows.presets import preset as preset_named
+
+        found = known_settings(preset_named(preset, "dataset/sequence"), prefix)
+        title = f"settings of reconstruct, preset {preset}"
+    if as_json:
+        print_json({"of": of, "preset": preset, "settings": [asdict(one) for one in found]})
+        return
+    rows: list[list[Cell]] = [
+        [one.path, one.type, json.dumps(one.default), one.reason] for one in found
+    ]
+    print_table(title, ["setting", "type", "default", "reason"], rows, num_text_columns=4)
