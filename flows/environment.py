@@ -21,10 +21,6 @@ THREADS = {
     # numba looks for TBB first and warns where the one it finds is too old
     "NUMBA_THREADING_LAYER_PRIORITY": "omp workqueue tbb",
 }
-QUIET = {"PREFECT_LOGGING_LEVEL": "CRITICAL"}
-"""Errors reach the user as one line of ours, not as Prefect's traceback."""
-
-
 KEPT_BYTES = 32 << 20
 """Largest freed block that the C library keeps for the next use: as far as glibc goes by itself."""
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of malloc.h
@@ -32,15 +28,16 @@ CPU_LIMIT = Path("/sys/fs/cgroup/cpu.max")
 """Quota and period in microseconds, where a container has one."""
 
 
-def prepare_environment(*, is_quiet: bool) -> None:
+def prepare_environment(*, log_level: str | None = "CRITICAL") -> None:
     """Set what Prefect, OpenMP and numba read at import, and keep freed memory.
 
     Args:
-        is_quiet: whether Prefect keeps its log lines to itself.
+        log_level: from which level on Prefect shows its log lines; None leaves it to Prefect.
     """
     threads = str(usable_cores())
     counts = {"NUMBA_NUM_THREADS": threads, "OMP_NUM_THREADS": threads}
-    for name, value in {**PREFECT, **THREADS, **counts, **(QUIET if is_quiet else {})}.items():
+    level = {} if log_level is None else {"PREFECT_LOGGING_LEVEL": log_level}
+    for name, value in {**PREFECT, **THREADS, **counts, **level}.items():
         os.environ.setdefault(name, value)
     _keep_freed_memory()
     if not _has_cache_folder():

@@ -78,8 +78,25 @@ class ReconstructParameters(ViewParameters):
     """How often views are painted and the fit goes on."""
     refine: FitConfig
     """The fit of one round."""
+    judge: bool = True
+    """Judge the scene; one that is not judged has no scores, and `evaluate` can judge it later."""
+    report: bool = True
+    """Write the page about the run."""
     judge_view_time: bool = False
     """Also judge what the final scene shows when it is painted at view time."""
+
+    @property
+    def stages(self) -> dict[str, int | None]:
+        """What a run goes through, in order: the steps of fits, None for all else."""
+        paints = fitted_on(self.painter) == "painted"
+        stages: dict[str, int | None] = {"prepare": None, "fit": self.fit.steps}
+        for number in range(1, self.rounds + 1):
+            stages |= {f"paint-{number}": None} if paints else {}
+            stages[f"refine-{number}"] = self.refine.steps
+        judged = ["evaluate-unpainted", "evaluate"]
+        judged += ["evaluate-view-time"] if self.judge_view_time and paints else []
+        last = [*(judged if self.judge else ()), *(["report"] if self.report else ())]
+        return stages | dict.fromkeys(last)
 
 
 def fitted_on(painter: str) -> Literal["painted", "refined"]:

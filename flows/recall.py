@@ -58,5 +58,5 @@ def located(result: dict[str, Any], store: Store) -> dict[str, Any]:
     return {
         **result,
         "artefacts": {name: str(store.artefacts.folder(ref)) for name, ref in refs.items()},
-        "report": str(store.path_of(result["report"])),
+        "report": result["report"] and str(store.path_of(result["report"])),
     }

@@ -34,6 +34,8 @@ from tasks.source import code_behind
 from tasks.specs import FittedRef, RunSpec
 from tasks.stages import StageResult
 
+UNJUDGED: Scores = {"recorded": None, "novel": None, "recorded_by_camera": None}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Course:
@@ -113,25 +115,36 @@ def _run(course: Course) -> dict[str, Any]:
     fitted = FittedRef(seen.ref, first.ref)
     final = _rounds(course, fitted)
     store = open_store(run.store_path)
-    scores = _judged(course, store, fitted, final)
+    scores = _judged(course, store, fitted, final) if parameters.judge else {}
     result = _result(course, scores, final)
+    if parameters.report:
+        _report(course, result, fitted, final)
+    result["seconds"]["total"] = time.perf_counter() - started
+    refs = tuple(stage.ref for stage in course.stages.values())
+    # the catalog calls it what it is
+    scores = {
+        fitted_on(parameters.painter) if name == "painted" else name: found
+        for name, found in scores.items()
+    }
+    return located(complete_run(run.store_path, course.record, result, scores, refs), store)
+
+
+def _report(course: Course, result: dict[str, Any], unpainted: FittedRef, final: FittedRef) -> None:
+    """Write the page about a run, and enter it into the result."""
+    run, store = course.run, open_store(course.run.store_path)
     page = ReportInputs(
         result=result,
         source_digest=course.record.source_digest,
-        unpainted=fitted,
+        unpainted=unpainted,
         final=final,
         stages=dict(course.stages),
     )
-    report = course.add("report", write_report(run, page, parameters.judge_config))
+    report = course.add("report", write_report(run, page, course.parameters.judge_config))
     result["artefacts"]["report"] = report.ref.artefact_id
     result["report"] = store.name_of(store.artefacts.folder(report.ref) / REPORT_FILE)
     result["seconds"]["report"] = report.seconds
     result["cpu_seconds"]["report"] = report.cpu_seconds
     result["computed_now"]["report"] = report.is_new
-    result["seconds"]["total"] = time.perf_counter() - started
-    refs = tuple(stage.ref for stage in course.stages.values())
-    scores[fitted_on(parameters.painter)] = scores.pop("painted")  # as the catalog calls it
-    return located(complete_run(run.store_path, course.record, result, scores, refs), store)
 
 
 def _rounds(course: Course, fitted: FittedRef) -> FittedRef:
@@ -201,8 +214,8 @@ def _result(course: Course, scores: dict[str, Scores], final: FittedRef) -> dict
         "computed_now": {name: stage.is_new for name, stage in stages.items()},
         "peak_memory_bytes": max(stage.peak_memory_bytes for stage in stages.values()),
         "num_gaussians": last_fit.summary["num_gaussians"],
-        **scores["painted"],
-        "unpainted": scores["unpainted"],
+        **scores.get("painted", UNJUDGED),
+        "unpainted": scores.get("unpainted"),
         "view_time": scores.get("view-time"),
         "guidance": {
             name: {key: stage.summary[key] for key in GUIDANCE_COLUMNS}
@@ -210,6 +223,7 @@ def _result(course: Course, scores: dict[str, Scores], final: FittedRef) -> dict
             if stage.ref.kind == "guidance"
         },
         "artefacts": {name: stage.ref.artefact_id for name, stage in stages.items()},
+        "report": None,
     }
 
 

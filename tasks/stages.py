@@ -5,6 +5,7 @@ runs, found from the source (see `catalog.code_closure`). Prefect's own cache is
 see the thin task only, and what is done is written in the store.
 """
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,7 @@ from prefect.client.schemas.objects import State, TaskRun
 
 import lidarpainter_models
 from catalog.artefacts import ArtefactRef, Recipe, Workplace
+from catalog.digests import canonical_json, digest_text, plain
 from catalog.errors import CatalogError, ConflictError
 from catalog.records import artefact_row
 from catalog.store import Store
@@ -23,6 +25,9 @@ from tasks.measuring import measured
 from tasks.progress import Progress, listener, progress_of
 from tasks.source import project_source
 
+SHOWN_DIGITS = 8
+"""Of a digest, where people read it."""
+_LOG = logging.getLogger("lidarpainter")
 RETRIES = 2
 RETRY_DELAY_S = 3
 
@@ -90,6 +95,15 @@ def run_stage(
     if is_new:
         store.tables.merge("artefacts", [artefact_row(ref, manifest)])
     listener().finished(stage, manifest.seconds, is_new=is_new)
+    _LOG.info(
+        "%s: %s; from %s; settings %s; code %s; lies in %s",
+        stage,
+        "computed now" if is_new else "was there",
+        ", ".join(f"{name} {digest[:SHOWN_DIGITS]}" for name, digest in inputs.items()),
+        digest_text(canonical_json(plain(config)))[:SHOWN_DIGITS],
+        recipe.code.digest[:SHOWN_DIGITS],
+        store.artefacts.folder(ref),
+    )
     return StageResult(
         ref=ref,
         seconds=manifest.seconds,

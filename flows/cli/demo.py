@@ -43,10 +43,11 @@ def demo(
     check_painter(painter)
     store = open_store(out / "store")
     result = run_demo(parameters, seed, store, out.absolute() / FIRST_IMAGE_NAME)
-    report = out.absolute() / REPORT_NAME
-    with storage_errors(f"cannot write {report}"):
-        shutil.copyfile(result["report"], report)
-    result = {**result, "report": str(report)}
+    if result["report"] is not None:
+        report = out.absolute() / REPORT_NAME
+        with storage_errors(f"cannot write {report}"):
+            shutil.copyfile(result["report"], report)
+        result = {**result, "report": str(report)}
     if as_json:
         print_json(result)
     else:

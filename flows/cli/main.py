@@ -28,7 +28,7 @@ from flows.cli import (
     settings,
     stylize,
 )
-from flows.cli.output import complain
+from flows.cli.output import Loudness, complain, loudness, set_loudness
 from flows.cli.usage import OneLineGroup
 from flows.environment import prepare_environment
 from flows.interruption import MESSAGE, Interrupted
@@ -38,8 +38,14 @@ from lidarpainter_models.errors import LidarPainterError
 BAD_INPUT = 2
 UNEXPECTED = 1
 INTERRUPTED = 130
+LOG_LEVELS: dict[Loudness, str] = {
+    "quiet": "CRITICAL",
+    "usual": "CRITICAL",
+    "verbose": "WARNING",
+}
+"""Of Prefect: its errors reach the user as one line of ours, not as its traceback."""
 GLOBAL_OPTIONS = ("--store",)
-GLOBAL_FLAGS = ("--debug",)
+GLOBAL_FLAGS = ("--debug", "--quiet", "--verbose", "-v")
 
 app = typer.Typer(
     name="lidarpainter",
@@ -76,6 +82,15 @@ def options(
     debug: Annotated[  # noqa: ARG001 - `main` reads it; here it is only documented
         bool, typer.Option("--debug", help="Show tracebacks and Prefect's log.")
     ] = False,
+    quiet: Annotated[  # noqa: ARG001 - likewise
+        bool, typer.Option("--quiet", help="Show no progress.")
+    ] = False,
+    verbose: Annotated[  # noqa: ARG001 - likewise
+        bool,
+        typer.Option(
+            "--verbose", "-v", help="Say what each stage depends on and where it lies; warnings."
+        ),
+    ] = False,
     version: Annotated[  # noqa: ARG001 - its callback answers
         bool,
         typer.Option(
@@ -90,10 +105,13 @@ def options(
 
 def main(arguments: Sequence[str]) -> int:
     """Run one command and return its exit code."""
-    is_debug = "--debug" in arguments
-    prepare_environment(is_quiet=not is_debug)
+    words = globals_first(arguments)
+    chosen = {word for word in words if word in GLOBAL_FLAGS}
+    is_debug = "--debug" in chosen
+    set_loudness(_loudness_of(chosen))
+    prepare_environment(log_level=None if is_debug else LOG_LEVELS[loudness()])
     try:
-        app(args=globals_first(arguments), prog_name="lidarpainter")
+        app(args=words, prog_name="lidarpainter")
     except Interrupted:
         return INTERRUPTED  # whoever answers signals says so, see `flows.interruption`
     except SystemExit as leaving:  # typer's way out of everything it knows, Ctrl-C included
@@ -108,6 +126,12 @@ def main(arguments: Sequence[str]) -> int:
         _explain(error, f"unexpected {type(error).__name__}: {error}{hint}", is_debug=is_debug)
         return UNEXPECTED
     return 0
+
+
+def _loudness_of(flags: set[str]) -> Loudness:
+    if flags & {"-v", "--verbose", "--debug"}:
+        return "verbose"
+    return "quiet" if "--quiet" in flags else "usual"
 
 
 def globals_first(arguments: Sequence[str]) -> list[str]:

@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 from rich.console import Console
 from rich.table import Table
@@ -15,13 +15,26 @@ FILE_WIDTH = 200
 """Columns of a table that is not written to a terminal."""
 CLEAR_LINE = "\r\x1b[K"
 
+Loudness = Literal["quiet", "usual", "verbose"]
+
+_loudness: list[Loudness] = ["usual"]
 _status: list[str] = []
 """What a terminal shows until something takes its place."""
 
 
+def set_loudness(chosen: Loudness) -> None:
+    """Choose how much is said on stderr while a command runs; errors always are."""
+    _loudness[0] = chosen
+
+
+def loudness() -> Loudness:
+    """What `set_loudness` chose last."""
+    return _loudness[0]
+
+
 def say_status(text: str) -> None:
     """Say on a terminal what is being done, before anything slow is imported for it."""
-    if sys.stderr.isatty():
+    if sys.stderr.isatty() and loudness() != "quiet":
         _status.append(text)
         sys.stderr.write(f"{CLEAR_LINE}{text} ...")
         sys.stderr.flush()

@@ -1,61 +1,100 @@
-"""Progress bars on stderr; plain lines where stderr is no terminal."""
+"""Progress on stderr: bars on a terminal, plain lines with the same content elsewhere."""
 
+import logging
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn
+from rich.text import Text
 
-from flows.cli.output import clear_status
-from tasks.progress import ProgressListener, listening
+from flows.cli.output import clear_status, loudness
+from flows.cli.stage_times import Clock, as_clock
+from tasks.progress import ProgressListener, Silence, listening
 
 LINE_EVERY_S = 30.0
 """How often a stage says how far it is where no bar can be drawn."""
 
 
+def how_far(clock: Clock, stage: str, done: float, total: float | None, note: str = "") -> str:
+    """What is known of a stage that goes on: `620/1500 41 %, 0:31 gone, 0:48 left; run ...`."""
+    share = f"{100 * done / max(total, 1e-9):.0f} %" if total else ""
+    if total and total > 1:
+        share = f"{done:.0f}/{total:.0f} {share}"
+    times = _times(clock.elapsed(stage), clock.left(stage))
+    if (run_left := clock.run_left(stage)) is not None:
+        times += f"; run {_times(clock.elapsed(), run_left)}"
+    return ", ".join(part for part in (share, times, note) if part)
+
+
+def _times(gone: float, left: float | None) -> str:
+    return f"{as_clock(gone)} gone" + (f", {as_clock(left)} left" if left else "")
+
+
+class HowFar(ProgressColumn):
+    """The figures of a stage, as they are whenever the bar is drawn."""
+
+    def __init__(self, clock: Clock) -> None:
+        super().__init__()
+        self._clock = clock
+
+    def render(self, task: Task) -> Text:
+        """The text beside a bar."""
+        if said := task.fields["said"]:
+            return Text(said)
+        note = task.fields["note"]
+        return Text(how_far(self._clock, task.description, task.completed, task.total, note))
+
+
 class Bars:
     """One bar per stage on a terminal."""
 
-    def __init__(self, progress: Progress) -> None:
-        self._progress = progress
+    def __init__(self, progress: Progress, clock: Clock) -> None:
+        self._progress, self._clock = progress, clock
         self._tasks: dict[str, TaskID] = {}
 
     def started(self, stage: str) -> None:
         """Draw an empty bar."""
-        self._tasks[stage] = self._progress.add_task(stage, total=None, note="")
+        self._clock.started(stage)
+        self._tasks[stage] = self._progress.add_task(stage, total=None, note="", said="")
 
     def advanced(self, stage: str, done: float, total: float, note: str) -> None:
         """Fill the bar."""
-        self._progress.update(self._tasks[stage], completed=done, total=total, note=note)
+        self._clock.advanced(stage, done / max(total, 1e-9))
+        self._progress.update(self._tasks[stage], completed=done, total=total, note=note, said="")
 
     def waiting(self, stage: str, process_id: str) -> None:
         """Say whom the stage waits for."""
-        note = f"waiting for process {process_id}, which computes the same"
-        self._progress.update(self._tasks[stage], note=note)
+        said = f"waiting for process {process_id}, which computes the same"
+        self._progress.update(self._tasks[stage], said=said)
 
     def finished(self, stage: str, seconds: float, *, is_new: bool) -> None:
         """Complete the bar."""
-        note = f"{seconds:.1f} s" if is_new else "was there"
-        self._progress.update(self._tasks[stage], completed=1, total=1, note=note)
+        self._clock.finished(stage, is_new=is_new)
+        said = f"{seconds:.1f} s" if is_new else "was there"
+        self._progress.update(self._tasks[stage], completed=1, total=1, said=said)
 
 
 class Lines:
     """A line per event, and one every half minute within a stage."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
         self._said_s: dict[str, float] = {}
 
     def started(self, stage: str) -> None:
         """Start the clock of the stage."""
+        self._clock.started(stage)
         self._said_s[stage] = time.monotonic()
 
     def advanced(self, stage: str, done: float, total: float, note: str) -> None:
         """Say how far the stage is, not too often."""
+        self._clock.advanced(stage, done / max(total, 1e-9))
         if time.monotonic() - self._said_s[stage] >= LINE_EVERY_S:
             self._said_s[stage] = time.monotonic()
-            sys.stderr.write(f"{stage}: {100 * done / max(total, 1e-9):.0f} % {note}\n")
+            sys.stderr.write(f"{stage}: {how_far(self._clock, stage, done, total, note)}\n")
 
     def waiting(self, stage: str, process_id: str) -> None:
         """Say whom the stage waits for."""
@@ -63,26 +102,46 @@ class Lines:
 
     def finished(self, stage: str, seconds: float, *, is_new: bool) -> None:
         """Say what the stage took."""
+        self._clock.finished(stage, is_new=is_new)
         sys.stderr.write(f"{stage}: {f'{seconds:.1f} s' if is_new else 'was there'}\n")
 
 
+class SaidLines(logging.Handler):
+    """Log lines above the bars, or between the lines."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write one; stderr is looked up each time, as bars take its place while they are drawn."""
+        sys.stderr.write(f"{record.getMessage()}\n")
+
+
 @contextmanager
-def shown_progress() -> Iterator[ProgressListener]:
-    """Draw the progress of every stage that runs inside the block."""
+def shown_progress(expected: Mapping[str, float] | None = None) -> Iterator[ProgressListener]:
+    """Show the progress of every stage that runs inside the block, as loud as was chosen.
+
+    Args:
+        expected: seconds that every stage will take, in order, see `stage_times`.
+    """
     clear_status()
+    if loudness() == "quiet":
+        yield Silence()  # nobody listens
+        return
+    log, lines = logging.getLogger("lidarpainter"), SaidLines()
+    if loudness() == "verbose":
+        log.setLevel(logging.INFO)
+        log.addHandler(lines)
+    try:
+        with _listener(Clock(expected=expected or {})) as listener, listening(listener):
+            yield listener
+    finally:
+        log.removeHandler(lines)
+
+
+@contextmanager
+def _listener(clock: Clock) -> Iterator[ProgressListener]:
     console = Console(stderr=True)
     if not console.is_terminal:
-        lines = Lines()
-        with listening(lines):
-            yield lines
+        yield Lines(clock)
         return
-    columns = [
-        TextColumn("{task.description:<12}"),
-        BarColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
-    ]
+    columns = [TextColumn("{task.description:<12}"), BarColumn(bar_width=20), HowFar(clock)]
     with Progress(*columns, console=console) as progress:
-        bars = Bars(progress)
-        with listening(bars):
-            yield bars
+        yield Bars(progress, clock)

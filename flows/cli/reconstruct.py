@@ -1,6 +1,7 @@
 """`lidarpainter reconstruct`: fit, paint, judge and report one scene."""
 
 import re
+from dataclasses import replace
 from typing import Annotated, Any
 
 import typer
@@ -8,6 +9,8 @@ import typer
 from flows.cli.output import Cell, format_bytes, print_json, print_pairs, print_table, say_status
 from flows.cli.shared_options import AsJson, DeviceName, Painter, Settings, parse_names
 from lidarpainter_models.errors import ConfigError
+
+FITS = ("fit", "refine")
 
 
 def reconstruct(  # noqa: PLR0913 - the options of a command
@@ -26,6 +29,15 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     train_cameras: Annotated[
         str | None, typer.Option(help="Cameras to train on, with commas between.")
     ] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Decides in which order the fit sees its views.")
+    ] = None,
+    evaluate: Annotated[
+        bool, typer.Option("--evaluate/--no-evaluate", help="Judge the scene, or later.")
+    ] = True,
+    report: Annotated[
+        bool, typer.Option("--report/--no-report", help="Write the page about the run.")
+    ] = True,
     settings: Settings = None,
     as_json: AsJson = False,
 ) -> None:
@@ -42,8 +54,12 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
         "rounds": rounds,
         "split": split,
         "train_cameras": parse_names(train_cameras),
+        "judge": evaluate,
+        "report": report,
     }
     changes = {name: value for name, value in changes.items() if value is not None}
+    if seed is not None:
+        changes |= {name: replace(getattr(parameters, name), seed=seed) for name in FITS}
     if shift is not None or up is not None:
         changes["novel"] = shifted(parameters.novel, shift, up)
     parameters = with_overrides(with_changes(parameters, changes), settings or [])
@@ -61,8 +77,6 @@ def shifted(novel: Any, shift: str | None, up: str | None) -> Any:  # noqa: ANN4
     Raises:
         ConfigError: a distance is no positive number.
     """
-    from dataclasses import replace
-
     from lidarpainter_models.geometry.shifts import Shift
 
     sideways = [Shift(lateral_m=side * metres) for metres in _distances(shift) for side in (1, -1)]
@@ -77,7 +91,8 @@ def show(result: dict[str, Any]) -> None:
     title = f"{result['scene']}, painter {result['painter']}"
     after = fitted_on(result["painter"])
     columns = [re.sub(r"^painted", after, name) for name in SCORE_COLUMNS]
-    print_table(title, columns, score_rows(result), SCORE_NOTE)
+    if rows := score_rows(result):
+        print_table(title, columns, rows, SCORE_NOTE)
     pairs: dict[str, Cell] = {
         "run": result["run_id"],
         "Gaussians": result["num_gaussians"],

@@ -75,7 +75,9 @@ def _numbers(values: Mapping[str, Any]) -> list[tuple[str, float | None]]:
 
 
 def score_rows(result: Mapping[str, Any]) -> list[list[ScoreCell]]:
-    """One row per place the camera was at; `result` is that of `reconstruct`."""
+    """One row per place the camera was at; `result` is that of `reconstruct`, perhaps unjudged."""
+    if result["recorded"] is None:
+        return []
     before, after = result["unpainted"], result
     rows = [
         _row("recorded, interpolated poses", before["recorded"], after["recorded"]),

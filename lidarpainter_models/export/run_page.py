@@ -112,18 +112,15 @@ def _tables(result: Mapping[str, Any], costs: Sequence[StageCost]) -> list[Table
     ]
     tables = [
         Table(
-            title="Held-out views",
-            columns=SCORE_COLUMNS,
-            rows=score_rows(result),
-            note=SCORE_NOTE,
-        ),
-        Table(
             title="Stages",
             columns=["stage", "seconds", "CPU seconds", "peak memory, MB", "artefact"],
             rows=stages,
             note="As computed; a stage that was there already keeps the time it took then.",
         ),
     ]
+    if scores := score_rows(result):
+        columns, note = SCORE_COLUMNS, SCORE_NOTE
+        tables.insert(0, Table(title="Held-out views", columns=columns, rows=scores, note=note))
     if guidance:
         tables.append(
             Table(

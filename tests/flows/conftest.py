@@ -38,7 +38,7 @@ def prefect_api(tmp_path_factory):
     folder = tmp_path_factory.mktemp("prefect")
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("PREFECT_HOME", str(folder))
-        prepare_environment(is_quiet=True)
+        prepare_environment()
         from flows.server import prefect_server
 
         with prefect_server(folder / "server.log"):

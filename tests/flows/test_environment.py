@@ -16,14 +16,14 @@ def bare_environment(monkeypatch):
 
 @pytest.mark.usefixtures("bare_environment")
 def test_threads_follow_the_usable_cores():
-    prepare_environment(is_quiet=True)
+    prepare_environment()
     assert os.environ["NUMBA_NUM_THREADS"] == os.environ["OMP_NUM_THREADS"] == str(usable_cores())
 
 
 @pytest.mark.usefixtures("bare_environment")
 def test_thread_count_of_the_user_stays():
     os.environ["NUMBA_NUM_THREADS"] = "7"
-    prepare_environment(is_quiet=True)
+    prepare_environment()
     assert os.environ["NUMBA_NUM_THREADS"] == "7"
 
 

@@ -96,6 +96,49 @@ def test_the_same_again_computes_nothing(tiny_run):
         assert again[name] == tiny_run.result[name], name
 
 
+def test_a_run_may_go_unjudged_and_be_judged_later(tiny_run):
+    answer = reconstructed(tiny_run, "--no-evaluate", "--no-report", "--seed", "3", "--json")
+    result = answer.json
+    assert not {"evaluate", "evaluate-unpainted", "report"} & result["seconds"].keys()
+    for name in ("recorded", "novel", "recorded_by_camera", "unpainted", "view_time", "report"):
+        assert result[name] is None, name
+    assert result["computed_now"]["fit"]  # another order of views
+    assert not result["computed_now"]["prepare"]
+    assert reconstructed(tiny_run, "--no-evaluate", "--no-report", "--seed", "3").code == 0
+    run_id = result["run_id"]
+    assert tiny_run.store.run(run_id)["status"] == "complete"
+    judged = succeed("evaluate", run_id, "--json", store=tiny_run.store).json
+    assert judged["painted"]["recorded"]["psnr"] > 10
+
+
+def test_a_report_does_without_scores(tiny_run):
+    result = reconstructed(tiny_run, "--no-evaluate", "--json").json
+    assert not any(new for name, new in result["computed_now"].items() if name != "report")
+    text = Path(result["report"]).read_text("utf-8")
+    assert "Stages" in text
+    assert "Held-out views" not in text
+
+
+def test_seconds_are_those_of_the_computation_however_often_it_is_asked_for(tiny_run):
+    row = tiny_run.store.run(tiny_run.run_id)
+    again = reconstructed(tiny_run, "--json").json
+    assert tiny_run.store.run(tiny_run.run_id) == row
+    partly = reconstructed(tiny_run, "--no-report", "--json").json  # other parameters, other run
+    assert partly["run_id"] != again["run_id"]
+    for stage, seconds in partly["seconds"].items():
+        if stage != "total":
+            assert seconds == again["seconds"][stage] == tiny_run.result["seconds"][stage], stage
+
+
+def test_verbose_says_what_a_stage_depends_on_and_quiet_nothing(tiny_run):
+    words = ("evaluate", tiny_run.run_id)
+    loud = succeed(*words, "-v", store=tiny_run.store).err
+    assert "was there; from scene " in loud
+    assert str(tiny_run.store.root / "artefacts" / "evaluation") in loud
+    assert succeed(*words, "--quiet", store=tiny_run.store).err == ""
+    assert "lies in" not in succeed(*words, store=tiny_run.store).err
+
+
 def test_the_installed_command_finds_the_run_in_a_process_of_its_own(tiny_run, tmp_path):
     """The entry point, its environment and a Prefect server that it starts and ends itself."""
     words = ["--store", tiny_run.store.root, "reconstruct", SCENE, "--json", *TINY]

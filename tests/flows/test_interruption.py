@@ -124,7 +124,7 @@ WORKER = """
 import sys
 from pathlib import Path
 from flows.environment import prepare_environment
-prepare_environment(is_quiet=True)
+prepare_environment()
 from flows.cli.progress import shown_progress
 from flows.reconstruct import reconstruct_scene
 from flows.server import prefect_server

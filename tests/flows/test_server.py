@@ -17,7 +17,7 @@ FLOW = """
 import sys, time
 from pathlib import Path
 from flows.environment import prepare_environment
-prepare_environment(is_quiet=True)
+prepare_environment()
 from flows import server
 from prefect import flow
 from prefect.settings import PREFECT_API_URL
@@ -79,7 +79,7 @@ def test_what_the_user_set_stays(monkeypatch):
     monkeypatch.setenv("OMP_WAIT_POLICY", "active")
     monkeypatch.delenv("DO_NOT_TRACK", raising=False)
     monkeypatch.setenv("PREFECT_LOGGING_LEVEL", "DEBUG")
-    prepare_environment(is_quiet=True)
+    prepare_environment()
     assert os.environ["OMP_WAIT_POLICY"] == "active"
     assert os.environ["PREFECT_LOGGING_LEVEL"] == "DEBUG"
     assert os.environ["DO_NOT_TRACK"] == "1"

@@ -20,7 +20,7 @@ mean, total = blend_points(torch.tensor([[1.5, 1.5]]), torch.ones(1), torch.full
 assert float(mean[1, 1, 0]) == 3.0
 print(cpu.__file__, sum(cpu._scatter.stats.cache_hits.values()))
 """
-PREPARED = "from flows.environment import prepare_environment\nprepare_environment(is_quiet=True)\n"
+PREPARED = "from flows.environment import prepare_environment\nprepare_environment()\n"
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ FAULTS_OF_A_VIEW = """
 import resource
 import statistics
 from flows.environment import prepare_environment
-prepare_environment(is_quiet=True)
+prepare_environment()
 import torch
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.nano.painter import NanoPainter
