@@ -58,7 +58,7 @@ def _expected(store: Store, parameters: "ReconstructParameters") -> dict[str, fl
 
     past = []
     for row in store.rows("runs"):
-        cameras = json.loads(row["parameters"]).get("train_cameras")
+        cameras = json.loads(row["parameters"] or "{}").get("train_cameras")
         past.append({**row, "num_views": num_views(row["scene_id"], cameras)})
     views = num_views(parameters.scene, parameters.train_cameras)
     if not views:  # the scene is not drawn yet

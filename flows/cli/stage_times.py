@@ -8,7 +8,7 @@ how much faster or slower this run is than that one so far. Where nothing tells,
 import json
 import re
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,7 +29,7 @@ class PlannedStage:
 
 
 def expected_seconds(
-    stages: Iterable[PlannedStage], preset: str, past: Iterable[Mapping[str, Any]]
+    stages: Sequence[PlannedStage], preset: str, past: Iterable[Mapping[str, Any]]
 ) -> dict[str, float] | None:
     """Seconds of every stage in order, by the newest past run that tells; None without one.
 
@@ -40,17 +40,27 @@ def expected_seconds(
     """
     complete = [row for row in past if row["status"] == "complete" and row["preset"] == preset]
     for row in sorted(complete, key=lambda row: row["finished_at"], reverse=True):
-        seconds, parameters = json.loads(row["stage_seconds"]), json.loads(row["parameters"])
-        found: dict[str, float] = {}
-        for stage in stages:
-            kind = _kind(stage.name)
-            took_s = [value for name, value in seconds.items() if _kind(name) == kind]
-            amount = parameters[kind]["steps"] if kind in FITS else row["num_views"]
-            if took_s and amount:
-                found[stage.name] = sum(took_s) / len(took_s) * stage.amount / amount
-        if found.keys() == {stage.name for stage in stages}:
-            return found
+        rates = _rates(row)
+        if all(_kind(stage.name) in rates for stage in stages):
+            return {stage.name: rates[_kind(stage.name)] * stage.amount for stage in stages}
     return None
+
+
+def _rates(row: Mapping[str, Any]) -> dict[str, float]:
+    """Seconds for a step or a view, by kind of stage, as far as the row of a run tells."""
+    parameters = json.loads(row["parameters"] or "{}")
+    took: dict[str, list[float]] = {}
+    for name, seconds in json.loads(row["stage_seconds"] or "{}").items():
+        took.setdefault(_kind(name), []).append(seconds)
+    amounts = {
+        kind: parameters.get(kind, {}).get("steps") if kind in FITS else row["num_views"]
+        for kind in took
+    }
+    return {
+        kind: sum(seconds) / len(seconds) / amount
+        for kind, seconds in took.items()
+        if (amount := amounts[kind])
+    }
 
 
 def _kind(stage: str) -> str:

@@ -1,9 +1,13 @@
 """Every figure of one fitted scene under one way of rendering it, camera by camera."""
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
 
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.scene_scores import (
@@ -14,6 +18,7 @@ from lidarpainter_models.evaluation.scene_scores import (
 from lidarpainter_models.evaluation.score_tables import DEPTH, Scores
 from lidarpainter_models.evaluation.settings import JudgeConfig
 from lidarpainter_models.evaluation.shown import ShownScene
+from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.metrics.perceptual import PerceptualDistances, load_distances
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.synthetic.street import SyntheticStreet
@@ -36,25 +41,43 @@ class Judgement:
         shifts = self.config.scoring.shifts
         distances = load_distances(self.config.feature_weights, self.config.lpips)
         cameras = tuple(dict.fromkeys(view.camera_name for view in self.held_out.test_views))
-        parts = {name: self._of_camera(shown, name, distances) for name in cameras}
+        num_views, is_known = len(self.held_out.test_views), known_street(self.held_out.scene)
+        # every view is rendered at both poses, where truth is known at every shift, and for depth
+        total = num_views * (3 + (len(shifts) if is_known else 0))
+        done = itertools.count(1)
+
+        def told(_done: int = 0, _total: int = 0) -> None:
+            progress(next(done), total)
+
+        parts = {name: self._of_camera(shown, name, distances, told) for name in cameras}
         recorded = _mean([recorded for recorded, _novel in parts.values()])
         novel = {
             shift.name: _mean([novel[shift.name] for _recorded, novel in parts.values()])
             for shift in shifts
         }
-        fractions = score_geometry(self.held_out, shown.scene, shifts, progress=progress)
+        fractions = score_geometry(self.held_out, shown.scene, shifts, progress=told)
         for name, fraction in fractions.items():
             novel.get(name, recorded)[DEPTH] = fraction
         by_camera = {name: recorded for name, (recorded, _novel) in parts.items()}
         return {"recorded": recorded, "novel": novel, "recorded_by_camera": by_camera}
 
     def _of_camera(
-        self, shown: ShownScene, name: str, distances: PerceptualDistances
+        self,
+        shown: ShownScene,
+        name: str,
+        distances: PerceptualDistances,
+        told: Callable[[], None],
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
         shifts = self.config.scoring.shifts
         views = [view for view in self.held_out.test_views if view.camera_name == name]
         part = replace(self.held_out, test_views=views)
-        fitted, render = shown.scene, shown.renderer(name)
+        fitted, shows = shown.scene, shown.renderer(name)
+
+        def render(camera: Camera, timestamp_ns: int) -> Float[Tensor, "height width 3"]:
+            image = shows(camera, timestamp_ns)
+            told()
+            return image
+
         recorded = score_recorded(render, part, fitted, distances=distances)
         street = known_street(part.scene)
         if street is None:

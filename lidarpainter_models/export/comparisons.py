@@ -1,6 +1,6 @@
 """Images for the report: one moment seen from every trajectory, before and after painting."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from lidarpainter_models.evaluation.held_out import HeldOut
@@ -22,10 +22,16 @@ class Subject:
     """Of the final scene."""
 
 
-def comparisons(subject: Subject, shifts: Sequence[Shift]) -> list[Comparison]:
-    """The middle judged view, as recorded and at every shift."""
+def comparisons(
+    subject: Subject, shifts: Sequence[Shift], *, progress: Callable[[int, int], None]
+) -> list[Comparison]:
+    """The middle judged view, as recorded and at every shift; tells how many of them are done."""
     view = subject.held_out.test_views[len(subject.held_out.test_views) // 2]
-    return [_comparison(subject, view, shift) for shift in (Shift(), *shifts)]
+    compared = []
+    for shift in (Shift(), *shifts):
+        compared.append(_comparison(subject, view, shift))
+        progress(len(compared), 1 + len(shifts))
+    return compared
 
 
 def _comparison(subject: Subject, view: RecordedView, shift: Shift) -> Comparison:

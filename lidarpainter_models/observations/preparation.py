@@ -34,7 +34,7 @@ def prepare_observations(
         scene: where it is read from.
         split: its training views give images, its training frames give sweeps.
         config: see there.
-        progress: told after each view how many of how many are done.
+        progress: told how many parts of how many are done: the views, and the colours of the map.
 
     Raises:
         SceneError: the split has no training views.
@@ -52,10 +52,13 @@ def prepare_observations(
         views.append(_training_view(scene, recorded, image, config))
         colouring.add(recorded, image)
         if progress is not None:
-            progress(done, len(split.train))
+            progress(done, len(split.train) + 1)
+    lidar_map = colouring.coloured()
+    if progress is not None:
+        progress(len(split.train) + 1, len(split.train) + 1)
     return SceneObservations(
         views=tuple(views),
-        lidar_map=colouring.coloured(),
+        lidar_map=lidar_map,
         tracks=tuple(track for track in scene.tracks if track.is_moving),
     )
 

@@ -83,7 +83,10 @@ def _build(
     config: FitConfig,
 ) -> dict[str, Any]:
     def told(step: int, steps: int, entry: dict[str, float]) -> None:
-        note = f"{entry['psnr']:.2f} dB, {entry['num_gaussians'] / 1000:.0f}k Gaussians"
+        if "initialised" in entry:
+            note = f"placing Gaussians, {100 * entry['initialised']:.0f} %"
+        else:
+            note = f"{entry['psnr']:.2f} dB, {entry['num_gaussians'] / 1000:.0f}k Gaussians"
         progress(step, steps, note)
 
     result = fit_gaussians(

@@ -80,9 +80,9 @@ def write_report(run: RunSpec, inputs: ReportInputs, config: JudgeConfig) -> Sta
     )
 
 
-def _build(
+def _build(  # noqa: PLR0913 - all that the page is made from
     place: Workplace,
-    _progress: Progress,
+    progress: Progress,
     *,
     page: RunPage,
     histories: Callable[[], dict[str, History]],
@@ -93,7 +93,10 @@ def _build(
 ) -> dict[str, Any]:
     subject = Subject(held_out=held_out, unpainted=unpainted(), painting=painting())
     report = page.report(
-        held_out.scene, comparisons(subject, shifts), histories(), machine(subject.painting.device)
+        held_out.scene,
+        comparisons(subject, shifts, progress=progress),
+        histories(),
+        machine(subject.painting.device),
     )
     (place.output / REPORT_FILE).write_text(render_report(report), "utf-8")
     return {}

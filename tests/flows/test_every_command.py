@@ -111,6 +111,23 @@ def test_a_run_may_go_unjudged_and_be_judged_later(tiny_run):
     assert judged["painted"]["recorded"]["psnr"] > 10
 
 
+def test_every_stage_tells_how_far_it_is_from_its_start_to_its_end(tiny_run, monkeypatch):
+    monkeypatch.setattr("flows.cli.progress.LINE_EVERY_S", 0.0)
+    said = reconstructed(tiny_run, "--seed", "4", "--set", "observation.width_px=90").err
+    told = {
+        stage: [line for line in said.splitlines() if line.startswith(f"{stage}: ")]
+        for stage in STAGES
+    }
+    for stage, lines in told.items():
+        assert len(lines) > 1, stage
+        assert " 100 %, " in lines[-2], stage
+        assert lines[-1].endswith(" s"), stage
+        assert all("; run " in line for line in lines[:-2]), stage
+    assert [line.rpartition(", ")[2] for line in told["fit"][:2]] == ["25 %", "50 %"]
+    assert told["fit"][0].startswith("fit: 0/40 0 %")
+    assert "0:00" not in said
+
+
 def test_a_report_does_without_scores(tiny_run):
     result = reconstructed(tiny_run, "--no-evaluate", "--json").json
     assert not any(new for name, new in result["computed_now"].items() if name != "report")

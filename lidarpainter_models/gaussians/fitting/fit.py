@@ -31,7 +31,8 @@ from lidarpainter_models.gaussians.model.stored_scene import copy_scene
 from lidarpainter_models.observations.views import GuidanceView, SceneObservations
 
 Progress = Callable[[int, int, dict[str, float]], None]
-"""Told the steps done, the steps in all and the newest entry of the history."""
+"""Told the steps done, the steps in all and the newest entry of the history; before the first step
+`initialised`, the part of the first scene that is made."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,8 +75,7 @@ def fit_gaussians(
     if kept is not None:
         state = FitState.resume(*kept, config)
     else:
-        scene = initialise_scene(observations, config.initialisation) if start is None else start
-        state = FitState.begin(scene, config)
+        state = FitState.begin(start or _first_scene(observations, config, progress), config)
     cpu_before_s -= state.cpu_s
     full, half = _images(observations, state.scene, config)
     while state.step < config.steps:
@@ -87,6 +87,16 @@ def fit_gaussians(
         if checkpoints is not None and checkpoints.is_due(state.step):
             checkpoints.save(*state.keep())
     return FitResult(scene=_finished(state, config), history=state.history)
+
+
+def _first_scene(
+    observations: SceneObservations, config: FitConfig, progress: Progress | None
+) -> GaussianScene:
+    def told(share: float) -> None:
+        if progress is not None:
+            progress(0, config.steps, {"initialised": share})
+
+    return initialise_scene(observations, config.initialisation, progress=told)
 
 
 def _images(

@@ -5,7 +5,7 @@ what the recorded views never show still needs geometry once the camera leaves i
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -51,15 +51,24 @@ _APART_M = 64.0  # longer than any vehicle, short enough for float32 to stay exa
 
 
 def initialise_scene(
-    observations: SceneObservations, config: InitialisationConfig
+    observations: SceneObservations,
+    config: InitialisationConfig,
+    *,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> GaussianScene:
     """Build the first scene of a fit; deterministic.
+
+    Args:
+        observations: what was recorded.
+        config: see there.
+        progress: told which part of the work is done, 0 to 1, as far as that is known.
 
     Raises:
         ConfigError: no LiDAR point lies where a training camera could see it.
     """
     views = observations.views
     actors = _actor_gaussians(observations, config)
+    progress(0.25)
     for_unreached = int(config.num_gaussians * MOST_SHARE)
     for_street = config.num_gaussians - for_unreached - sum(len(part) for part in actors)
     gaussians = _street_gaussians(observations.lidar_map.street, views, config, max(for_street, 1))
@@ -67,8 +76,11 @@ def initialise_scene(
         gaussians = gaussians.append(part)
     if len(gaussians) == 0:
         raise ConfigError("no LiDAR point lies where a training camera could see it")
+    progress(0.5)
     scene = _scene_around(gaussians, observations)
-    seeds = unreached_gaussians(scene, views, budget=for_unreached)
+    seeds = unreached_gaussians(
+        scene, views, budget=for_unreached, progress=lambda share: progress(0.5 + share / 2)
+    )
     return scene.with_gaussians(gaussians.append(seeds))
 
 

@@ -5,7 +5,7 @@ is put at a depth found by comparing training images. Without them the fit would
 whatever is near into these places, or leave them to the sky texture, which has no depth.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Bool, Float
@@ -42,7 +42,11 @@ MOST_BELOW_GROUND_M = 1.0
 
 
 def unreached_gaussians(
-    scene: GaussianScene, views: Sequence[TrainingView], *, budget: int
+    scene: GaussianScene,
+    views: Sequence[TrainingView],
+    *,
+    budget: int,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> GaussianSet:
     """Gaussians that close the clear places of the training views which are not sky."""
     found = GaussianSet.empty(sh_degree=scene.gaussians.sh_degree)
@@ -61,6 +65,7 @@ def unreached_gaussians(
         grown = scene.with_gaussians(scene.gaussians.append(found))
         seeds = _seeds_of_view(grown, view, of_camera, budget=share)
         found = found.append(_above_ground(seeds, ground))
+        progress((done + 1) / len(chosen))
     return found
 
 
