@@ -7,7 +7,7 @@ as `s3://bucket/store`.
 
 import random
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import pyarrow as pa
@@ -43,12 +43,28 @@ class CatalogTables:
             return
         schema = _schema(table)
         source = _as_arrow(schema, rows)
+        self._committed(schema, lambda: self._try_merge(schema, source))
+
+    def delete(self, table: str, column: str, values: Sequence[str]) -> None:
+        """Remove the rows with one of these values in a column.
+
+        Raises:
+            ConflictError: other writers won every attempt.
+            StorageError: the table cannot be written.
+        """
+        schema = _schema(table)
+        quoted = ", ".join("'{}'".format(value.replace("'", "''")) for value in values)
+        if values and self.arrow(table).num_rows:
+            self._committed(schema, lambda: self._try_delete(schema, f"{column} IN ({quoted})"))
+
+    def _committed(self, schema: TableSchema, attempted: Callable[[], bool]) -> None:
+        """Attempt a commit until it wins, a bounded number of times."""
         with storage_errors(f"cannot write table {self._uri(schema)}"):
             for attempt in range(COMMIT_ATTEMPTS):
                 if attempt:
                     pause_s = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2**attempt)
                     time.sleep(pause_s * random.random())  # noqa: S311 - jitter, not a secret
-                if self._try_merge(schema, source):
+                if attempted():
                     return
         raise ConflictError(
             f"table {self._uri(schema)} had other writers in {COMMIT_ATTEMPTS} attempts"
@@ -101,6 +117,14 @@ class CatalogTables:
 
     def _uri(self, schema: TableSchema) -> str:
         return f"{self.root}/{schema.name}"
+
+    def _try_delete(self, schema: TableSchema, predicate: str) -> bool:
+        """One commit; whether it won."""
+        try:
+            DeltaTable(self._uri(schema), storage_options=self.storage_options).delete(predicate)
+        except CommitFailedError:
+            return False
+        return True
 
     def _try_merge(self, schema: TableSchema, source: pa.Table) -> bool:
         """One commit; whether it won."""

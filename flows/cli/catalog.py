@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from typing import Annotated, Any
 
@@ -14,11 +15,15 @@ app = typer.Typer(help="What the store holds.", no_args_is_help=True)
 
 SHOWN_COLUMNS = {
     "scenes": ("scene_id", "num_frames", "num_views", "num_actors", "duration_s", "num_bytes"),
-    "runs": ("run_id", "scene_id", "preset", "painter", "status", "seconds", "num_gaussians"),
+    "runs": (
+        *("run_id", "scene_id", "preset", "painter", "status"),
+        *("started_at", "seconds", "num_gaussians"),
+    ),
     "artefacts": ("artefact_id", "num_bytes", "seconds", "created_at"),
     "metrics": ("run_id", "protocol", "trajectory", "variant", "name", "value"),
     "painters": ("painter_id", "name", "num_bytes", "created_at"),
 }
+NEWEST_FIRST = {"runs": "started_at", "artefacts": "created_at", "painters": "created_at"}
 JSON_COLUMNS = ("parameters", "stage_seconds", "result", "inputs", "config", "summary", "record")
 """Columns that hold JSON text: shown as what they hold."""
 LONGEST_JSON = 120
@@ -32,17 +37,33 @@ def list_table(
     ] = "runs",
     as_json: AsJson = False,
 ) -> None:
-    """List a table of the catalog."""
+    """List a table of the catalog: runs, artefacts and painters from the newest on.
+
+    Metrics that have no value are not listed but counted, by the reason why there is none.
+
+    Example: lidarpainter catalog list scenes
+    """
     from catalog.store import existing_store
 
     store = existing_store()
     rows = store.rows(table)
+    if table in NEWEST_FIRST:
+        rows.sort(key=lambda row: str(row[NEWEST_FIRST[table]] or ""), reverse=True)
+    absent = _absent(rows) if table == "metrics" else {}
+    rows = [row for row in rows if table != "metrics" or row["value"] is not None]
     if as_json:
-        print_json({"table": table, "store": str(store.root), "rows": [_open(row) for row in rows]})
+        found = {"table": table, "store": str(store.root), "rows": [_open(row) for row in rows]}
+        missing = [{"names": names, "reason": reason} for reason, names in absent.items()]
+        print_json(found | ({"absent": missing} if table == "metrics" else {}))
         return
     columns = SHOWN_COLUMNS[table]
     cells = [[_cell(name, row[name]) for name in columns] for row in rows]
-    print_table(f"{table} in {store.root}", columns, cells)
+    note = "\n".join(
+        f"without a value: {', '.join(f'{name} ({count})' for name, count in names.items())}: "
+        f"{reason}"
+        for reason, names in absent.items()
+    )
+    print_table(f"{table} in {store.root}", columns, cells, note)
 
 
 @app.command("show")
@@ -87,6 +108,55 @@ def explain(
         print_json(found.to_dict())
     else:
         sys.stdout.write("\n".join(_tree("", found, set())) + "\n")
+
+
+@app.command("delete")
+def delete_record(
+    name: Annotated[
+        str, typer.Argument(help="A run id or `latest`, kind/digest, or a scene id; or a prefix.")
+    ],
+    with_dependents: Annotated[
+        bool, typer.Option("--with-dependents", help="Also what was made from it.")
+    ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only list what would go, and how much.")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Delete a run with the artefacts no other run needs, or an artefact, or a scene.
+
+    What an artefact or a scene was used for is named, and goes with --with-dependents only.
+
+    Example: lidarpainter catalog delete 3f2a --dry-run
+    """
+    from catalog.deletion import delete, plan_deletion
+    from catalog.errors import CatalogError
+    from catalog.store import existing_store
+
+    store = existing_store()
+    plan = plan_deletion(store, *_find(store, name))
+    doomed = (*plan.own, *plan.dependents)
+    if plan.dependents and not with_dependents and not dry_run:
+        named = ", ".join(f"{one.table[:-1]} {one.row_id}" for one in plan.dependents[:5])
+        raise CatalogError(
+            f"{plan.own[0].row_id} is needed by {len(plan.dependents)} others ({named}): nothing "
+            "was deleted, --with-dependents deletes them too"
+        )
+    if not dry_run and not yes and not sys.stdin.isatty():
+        raise CatalogError("nobody can be asked whether to delete this, expected --yes")
+    num_bytes = sum(one.num_bytes for one in doomed)
+    if not as_json:
+        rows = [[one.table[:-1], one.row_id, format_bytes(one.num_bytes)] for one in doomed]
+        title = f"{format_bytes(num_bytes)} of {store.root}"
+        print_table(title, ["what", "name", "size"], rows, num_text_columns=2)
+    if not dry_run:
+        if not yes and not typer.confirm("Delete this?"):
+            raise CatalogError("nothing was deleted")
+        delete(store, doomed)
+    if as_json:
+        going = [{"table": one.table, "id": one.row_id, "bytes": one.num_bytes} for one in doomed]
+        print_json({"is_deleted": not dry_run, "num_bytes": num_bytes, "rows": going})
 
 
 def _tree(part: str, found: Any, shown: set[str], depth: int = 0) -> Iterator[str]:  # noqa: ANN401
@@ -137,6 +207,16 @@ def _find(store: Any, name: str) -> tuple[str, dict[str, Any]]:  # noqa: ANN401 
     raise UnknownRecordError(f"nothing is called {name!r}: {'; '.join(complaints)}")
 
 
+def _absent(rows: list[dict[str, Any]]) -> dict[str, Counter[str]]:
+    """How often which metric has no value, by the reason."""
+    found: dict[str, Counter[str]] = {}
+    for row in rows:
+        if row["value"] is None:
+            reason = row["reason"] or "no reason given"
+            found.setdefault(reason, Counter()).update([row["name"]])
+    return found
+
+
 def _open(row: dict[str, Any]) -> dict[str, Any]:
     """A row with times as text and JSON columns as what they hold."""
     opened = {}
@@ -153,6 +233,6 @@ def _cell(name: str, value: Any) -> Cell:  # noqa: ANN401 - any value of a table
     if isinstance(value, list):
         return ", ".join(value)
     if hasattr(value, "isoformat"):
-        return value.isoformat(timespec="seconds")
+        return value.strftime("%Y-%m-%d %H:%M:%S")  # UTC, as all times of the catalog
     is_long = name in JSON_COLUMNS and len(value) > LONGEST_JSON
     return f"{value[:LONGEST_JSON]}... (--json shows all)" if is_long else str(value)

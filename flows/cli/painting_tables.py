@@ -1,6 +1,6 @@
 """What the commands of `lidarpainter painter` print: pairs, trainings, scores, times."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import typer
@@ -24,6 +24,7 @@ PAINTING_NOTE = (
     "than 0.05 beyond what any input shows within 9x9 pixels; AUC: of the confidence for an error "
     "above 0.05; features: SqueezeNet distance, with --feature-weights; kept: left unpainted."
 )
+DIGEST_SHOWN = 12
 FIGURES = ("psnr", "ssim", "feature_distance", "damaged_psnr", "undamaged_psnr")
 
 
@@ -103,21 +104,48 @@ def show_scores(found: dict[str, Any]) -> None:
 
 
 def show_info(result: dict[str, Any]) -> None:
-    """What a painter is."""
+    """What a painter is, its parts, the trainings that made it and what the last one learnt from.
+
+    Whole digests are in the JSON.
+    """
+    provenance = dict(result["provenance"])
     pairs: dict[str, Cell] = {
         "architecture": result["architecture"]["summary"],
         "size": format_bytes(result["num_bytes"]),
         "parameters": result["num_parameters"],
-        **{f"parameters, {name}": count for name, count in result["parameters"].items()},
         "precision here": result.get("precision"),
         "licence": result["licence"],
     }
-    for name, value in (*result["architecture"].items(), *result["provenance"].items()):
+    learnt, trainings = provenance.pop("pairs", {}), list(_trainings(provenance))
+    provenance.pop("started_from", None)
+    for name, value in (*result["architecture"].items(), *provenance.items()):
         if name == "trained_targets":
             pairs["true images trained on"] = len(value)
-        elif name != "summary":
-            pairs[name] = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+        elif name != "summary" and value is not None:
+            is_list = isinstance(value, (list, tuple))
+            pairs[name] = ", ".join(map(str, value)) if is_list else str(value)
     print_pairs(f"painter {result['painter']}", pairs)
+    if result["parameters"]:
+        print_table("parts", ["part", "parameters"], list(result["parameters"].items()))
+    if len(trainings) > 1:
+        columns = ["digest", "steps", "CPU s", "pairs"]
+        print_table("trainings, each begun with the weights of the next", columns, trainings)
+    if learnt:
+        rows = [[name, one.get("num_pairs"), _short(one)] for name, one in learnt.items()]
+        print_table("pairs that the last training learnt from", ["set", "pairs", "digest"], rows)
+
+
+def _trainings(provenance: Mapping[str, Any]) -> Iterator[list[Cell]]:
+    """A row for every training, the last one first."""
+    one: Mapping[str, Any] | None = provenance
+    while isinstance(one, Mapping):
+        digest = _short({"digest": one.get("training_digest")})
+        yield [digest, *(one.get(name) for name in ("steps", "cpu_s", "num_pairs"))]
+        one = one.get("started_from")
+
+
+def _short(found: Mapping[str, Any]) -> str:
+    return str(found.get("digest") or "")[:DIGEST_SHOWN]
 
 
 def show_times(result: dict[str, Any]) -> None:

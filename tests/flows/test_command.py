@@ -1,6 +1,7 @@
 """The command ends as it promises: codes, one line, and JSON alone on stdout."""
 
 import json
+from datetime import UTC, datetime
 
 import pytest
 
@@ -61,6 +62,49 @@ def test_tables_show_what_is_there(own_store, capsys):
     own_store.tables.merge("runs", [{"run_id": "r1", "status": "complete", "seconds": 12.5}])
     assert main(["catalog", "list"]) == 0
     assert "12.500" in capsys.readouterr().out
+
+
+def test_the_newest_run_stands_first(own_store, capsys):
+    for day, run_id in ((2, "r1"), (3, "r0"), (1, "r2")):
+        started = datetime(2026, 1, day, 12, 30, tzinfo=UTC)
+        own_store.tables.merge("runs", [{"run_id": run_id, "started_at": started}])
+    assert main(["catalog", "list", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert [row["run_id"] for row in rows] == ["r0", "r1", "r2"]
+    assert main(["catalog", "list"]) == 0
+    assert "2026-01-03 12:30:00" in capsys.readouterr().out
+
+
+def test_metrics_without_a_value_are_counted_once_by_reason(own_store, capsys):
+    rows = [
+        {"metric_id": f"m{number}", "name": "lpips", "value": None, "reason": "no weights"}
+        for number in range(40)
+    ]
+    own_store.tables.merge("metrics", [*rows, {"metric_id": "p", "name": "psnr", "value": 30.5}])
+    assert main(["catalog", "list", "metrics", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [row["name"] for row in found["rows"]] == ["psnr"]
+    assert found["absent"] == [{"names": {"lpips": 40}, "reason": "no weights"}]
+    assert main(["catalog", "list", "metrics"]) == 0
+    shown = capsys.readouterr().out
+    assert shown.count("no weights") == 1
+    assert "30.500" in shown
+
+
+def test_deleting_asks_and_does_nothing_by_itself(own_store, capsys, monkeypatch):
+    own_store.tables.merge("runs", [{"run_id": "r1", "status": "complete"}])
+    assert main(["catalog", "delete", "r1", "--dry-run", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert listed["rows"] == [{"table": "runs", "id": "r1", "bytes": 0}]
+    assert not listed["is_deleted"]
+    assert main(["catalog", "delete", "r1"]) == 2
+    assert "nobody can be asked whether to delete this, expected --yes" in capsys.readouterr().err
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("typer.confirm", lambda _question: False)
+    assert main(["catalog", "delete", "r1"]) == 2
+    assert own_store.rows("runs") != []
+    assert main(["catalog", "delete", "r1", "--yes", "--json"]) == 0
+    assert own_store.rows("runs") == []
 
 
 def test_global_options_may_stand_anywhere():

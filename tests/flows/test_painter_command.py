@@ -98,7 +98,7 @@ def test_seeds_may_be_listed_and_ranged():
         ),
         (["evaluate", "--painter", "none", "--pairs", "/nowhere"], "no training pairs in /nowhere"),
         (["evaluate", "--painter", "none"], "nothing to judge by: expected --pairs or --run"),
-        (["evaluate", "--painter", "none", "--run", "latest"], "no complete run in"),
+        (["evaluate", "--painter", "none", "--run", "latest"], "no store at"),
         (["evaluate", "--painter", "none,none", "--pairs", "/nowhere"], "expected each once"),
         (["ablate", "--pairs-train", "/nowhere", "--pairs-test", "/else"], "no training pairs in"),
         (["ablate", "--pairs-train", "/a", "--pairs-test", "/b", "--table", "x"], "no ablation"),
@@ -140,6 +140,14 @@ def test_info_tells_parts_size_licence_and_origin(tmp_path, capsys):
     assert found["architecture"]["inputs"] == ["lidar", "render", "warp"]
     assert main(["painter", "info", "--painter", str(path)]) == 0
     assert "true images trained on" in capsys.readouterr().out
+
+
+def test_info_of_the_bundled_painter_has_its_trainings_in_rows_and_no_dict(capsys):
+    assert main(["painter", "info"]) == 0
+    shown = capsys.readouterr().out
+    assert "{" not in shown
+    for text in ("parts", "encode_coarse", "trainings, each begun", "10500", "pairs that the last"):
+        assert text in shown
 
 
 def test_info_of_a_rule_says_that_nothing_is_learnt(capsys):

@@ -182,6 +182,9 @@ def refused(words, expected, place):
         (("catalog", "show", "latest"), "no complete run in {store}"),
         (("catalog", "explain", "nothing"), "nothing is called 'nothing'"),
         (("catalog", "explain", TOY_SCENE), "is in scenes, expected a run or an artefact"),
+        (("catalog", "delete", "nothing", "--yes"), "nothing is called 'nothing'"),
+        (("catalog", "delete", "../..", "--yes"), "nothing is called '../..'"),
+        (("catalog", "delete", TOY_SCENE), "nobody can be asked whether to delete this"),
         # doctor
         (("doctor", "nonsense"), "is no scene id, expected dataset/sequence such as"),
         (("doctor", "toy/other"), "ingest it first"),
