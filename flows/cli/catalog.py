@@ -73,7 +73,10 @@ def show_record(
     ],
     as_json: AsJson = False,
 ) -> None:
-    """Show everything known about one scene, run or artefact."""
+    """Show everything known about one scene, run or artefact.
+
+    Example: lidarpainter catalog show latest
+    """
     from catalog.store import existing_store
 
     table, row = _find(existing_store(), name)
@@ -88,7 +91,10 @@ def explain(
     name: Annotated[str, typer.Argument(help="A run id or `latest`, or kind/digest; or a prefix.")],
     as_json: AsJson = False,
 ) -> None:
-    """Show what a run or an artefact was made from, and what makes it stale."""
+    """Show what a run or an artefact was made from, and what makes it stale.
+
+    Example: lidarpainter catalog explain latest
+    """
     from catalog.artefacts import ArtefactRef
     from catalog.errors import UnknownRecordError
     from catalog.explain import Explainer

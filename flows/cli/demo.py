@@ -26,6 +26,8 @@ def demo(
 
     Into --out come street.png, what the camera saw first, after a minute, and report.html in the
     end.
+
+    Example: lidarpainter demo --out demo
     """
     from catalog.errors import storage_errors
     from catalog.store import open_store

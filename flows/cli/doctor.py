@@ -20,11 +20,19 @@ def doctor(
         Path | None, typer.Argument(help="With a dataset's name: its folder, as downloaded.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Where the overlay image goes; beside the scene if absent")
+        Path | None,
+        typer.Option(help="Where the overlay image goes; the store's folder doctor if absent."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check the setup, a stored scene, or a dataset on disk."""
+    """Check the setup, a stored scene, or a dataset on disk.
+
+    Examples: lidarpainter doctor
+
+    A log before it is ingested: lidarpainter doctor pandaset /data/pandaset
+
+    A stored scene: lidarpainter doctor pandaset/002 --out overlay.png
+    """
     say_status(f"looking at {subject or 'the environment'}")
     from catalog.store import existing_store, open_store
     from tasks import health

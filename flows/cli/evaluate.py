@@ -45,7 +45,10 @@ def evaluate(  # noqa: PLR0913 - the options of a command
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Judge a finished run on views it never saw."""
+    """Judge a finished run on views it never saw.
+
+    Example: lidarpainter evaluate latest --protocol flicker --previous mixed
+    """
     _check(protocol, previous)
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress

@@ -12,8 +12,10 @@ SOME_FAILED = 2
 
 
 def ingest(  # noqa: PLR0913 - one per option
-    dataset: Annotated[str, typer.Argument(help="pandaset, ...")],
-    root: Annotated[Path, typer.Argument(help="The dataset's folder, as downloaded.")],
+    dataset: Annotated[str, typer.Argument(help="pandaset, nuscenes, waymo or canonical.")],
+    root: Annotated[
+        Path, typer.Argument(help="The folder that holds the sequences, as downloaded.")
+    ],
     sequences: Annotated[
         list[str] | None, typer.Argument(help="Sequences to take; all found if none is named.")
     ] = None,
@@ -35,6 +37,10 @@ def ingest(  # noqa: PLR0913 - one per option
 
     A sequence that is there as asked for is not read again. With other cameras, other frames or
     from another root it is refused, and --again replaces what is there.
+
+    Example: lidarpainter ingest pandaset /data/pandaset 002 --cameras front_camera
+
+    All segments, four at once: lidarpainter ingest waymo /data/waymo --jobs 4
     """
     chosen_frames = parse_frames(frames)
     chosen_cameras = parse_names(cameras)

@@ -22,7 +22,10 @@ def harvest(
     settings: options.Settings = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make pairs for training or judging; seeds below 1000 can only judge."""
+    """Make pairs for training or judging; seeds below 1000 can only judge.
+
+    Example: lidarpainter painter harvest --seeds 1000:1004
+    """
     say_status("reading settings")
     from flows.overrides import with_overrides
     from flows.painter_parameters import HarvestParameters
@@ -63,7 +66,12 @@ def train(  # noqa: PLR0913 - the options of a command
     settings: options.Settings = None,
     as_json: AsJson = False,
 ) -> None:
-    """Train the small painter, or with --base one on a model; a killed training is taken up."""
+    """Train the small painter, or with --base one on a model; a killed training is taken up.
+
+    Example: lidarpainter painter train --seeds 1000:1004 --budget 3600 --out painter
+
+    In fog and at night too: lidarpainter painter train --seeds 1000 --prompts clear,foggy,night
+    """
     say_status("reading settings")
     from flows.overrides import checked, with_overrides
     from flows.painter_parameters import TrainPainterParameters
@@ -122,7 +130,10 @@ def evaluate(
     device: options.Device = "auto",
     as_json: AsJson = False,
 ) -> None:
-    """Judge painters on pairs, or views of a finished run, that none of them was trained on."""
+    """Judge painters on pairs, or views of a finished run, that none of them was trained on.
+
+    Example: lidarpainter painter evaluate --painter nano --painter warp --run latest
+    """
     say_status("opening painters")
     from flows.cli.progress import shown_progress
     from flows.evaluate_painter import evaluate_painters
@@ -146,7 +157,10 @@ def info(
     ] = "nano",
     as_json: AsJson = False,
 ) -> None:
-    """Say what a painter is, in which precision it runs here, and how it was trained."""
+    """Say what a painter is, in which precision it runs here, and how it was trained.
+
+    Example: lidarpainter painter info --painter nano
+    """
     say_status(f"opening {painter}")
     check_painter(painter)
     from flows.evaluate_painter import describe
@@ -164,7 +178,10 @@ def benchmark(
     device: options.Device = "auto",
     as_json: AsJson = False,
 ) -> None:
-    """Time a painter's view on this machine, in float32 and in bfloat16."""
+    """Time a painter's view on this machine, in float32 and in bfloat16.
+
+    Example: lidarpainter painter benchmark --size 1024x576
+    """
     say_status(f"opening {painter}")
     check_painter(painter)
     from flows.evaluate_painter import benchmark_painter
@@ -191,7 +208,10 @@ def ablate(  # noqa: PLR0913 - the options of a command
     settings: options.Settings = None,
     as_json: AsJson = False,
 ) -> None:
-    """Train small painters that differ in one input or part and judge all alike, in tables."""
+    """Train small painters that differ in one input or part and judge all alike, in tables.
+
+    Example: lidarpainter painter ablate --pairs-train DIR --pairs-test DIR --table inputs
+    """
     say_status("reading settings")
     from flows.ablate_painter import AblationParameters
     from flows.cli.training import run_ablation

@@ -14,7 +14,7 @@ _SEEDS = re.compile(r"(\d+)(?::(\d+))?")
 
 Settings = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Any other setting: training.batch_size=4. May be repeated."),
+    typer.Option("--set", help="Any of `lidarpainter settings --of train`. May be repeated."),
 ]
 Seeds = Annotated[
     str | None, typer.Option(help="Synthetic streets by seed: 1000:1004 or 1000,1007.")
@@ -22,7 +22,9 @@ Seeds = Annotated[
 Scenes = Annotated[
     list[str] | None, typer.Option("--scene", help="A stored scene. May be repeated.")
 ]
-Split = Annotated[str, typer.Option(help="Split of recorded scenes: forward:17:8, alternate.")]
+Split = Annotated[
+    str, typer.Option(help="Split of recorded scenes: alternate, forward:17:8 or all.")
+]
 Cameras = Annotated[
     str | None, typer.Option(help="Cameras of recorded scenes, with commas between.")
 ]

@@ -19,15 +19,23 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     painter: Painter = None,
     device: DeviceName = "auto",
     shift: Annotated[
-        str | None, typer.Option(help="Metres to both sides to paint at, such as 2,3.")
+        str | None, typer.Option(help="Metres to both sides to paint at, such as 2,3; at most 8.")
     ] = None,
-    up: Annotated[str | None, typer.Option(help="Metres up to paint at, such as 1.5.")] = None,
-    rounds: Annotated[int | None, typer.Option(help="How often to paint and go on.")] = None,
+    up: Annotated[
+        str | None, typer.Option(help="Metres up to paint at, such as 1.5; at most 8.")
+    ] = None,
+    rounds: Annotated[
+        int | None,
+        typer.Option(help="How often to paint and go on, 0 or more; the preset's if absent."),
+    ] = None,
     split: Annotated[
-        str | None, typer.Option(help="alternate, forward:17:8 (fit:judge), or all.")
+        str | None,
+        typer.Option(
+            help="alternate (every second frame judges), forward:17:8 (so many fit: judge), all."
+        ),
     ] = None,
     train_cameras: Annotated[
-        str | None, typer.Option(help="Cameras to train on, with commas between.")
+        str | None, typer.Option(help="Cameras to train on, with commas between; all if absent.")
     ] = None,
     seed: Annotated[
         int | None, typer.Option(min=0, help="Decides in which order the fit sees its views.")
@@ -41,7 +49,12 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     settings: Settings = None,
     as_json: AsJson = False,
 ) -> None:
-    """Turn a stored scene into a fitted, painted, judged and reported one."""
+    """Turn a stored scene into a fitted, painted, judged and reported one.
+
+    Example: lidarpainter reconstruct pandaset/002 --train-cameras front_camera
+
+    Unpainted, for comparison: lidarpainter reconstruct pandaset/002 --painter none
+    """
     from catalog.store import existing_store
     from flows.cli.running import run_reconstruction
     from flows.overrides import with_changes, with_overrides

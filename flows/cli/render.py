@@ -40,7 +40,12 @@ def render(  # noqa: PLR0913 - the options of a command
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Render a finished run where nobody drove."""
+    """Render a finished run where nobody drove.
+
+    Example: lidarpainter render latest --trajectory lateral:2 --postpaint --out pictures
+
+    Down a lane and up: lidarpainter render latest --trajectory lane-change:-3.5+up:1 --out p
+    """
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
     from lidarpainter_models.conditioning.settings import SequenceConfig

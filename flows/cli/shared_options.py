@@ -21,15 +21,19 @@ DeviceName = Annotated[
 ]
 Settings = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Any other setting: fit.steps=500. May be repeated."),
+    typer.Option("--set", help="Any of `lidarpainter settings`: fit.steps=500. May be repeated."),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 RunName = Annotated[str, typer.Argument(help="A run id, a unique prefix of one, or latest.")]
 TrajectorySpec = Annotated[
-    str, typer.Option(help="recorded, lateral:2, up:1.5, yaw:15, lane-change:3.5; parts with +.")
+    str,
+    typer.Option(
+        help="recorded, lateral:2 and lane-change:3.5 (metres, left is positive), up:1.5 (metres), "
+        "yaw:15 (degrees, left is positive), or several with + between; at most 8 m away."
+    ),
 ]
 FollowedCamera = Annotated[
-    str | None, typer.Option(help="Camera whose path is followed; the first if absent.")
+    str | None, typer.Option(help="Camera whose path is followed; the first trained on if absent.")
 ]
 FollowedFrames = Annotated[
     str | None, typer.Option(help="Recorded frames A:B to follow, B excluded.")

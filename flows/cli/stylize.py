@@ -36,7 +36,12 @@ def stylize(  # noqa: PLR0913 - the options of a command
     seed: Annotated[int, typer.Option(help="Decides lit windows, drops and noise.", min=0)] = 0,
     as_json: AsJson = False,
 ) -> None:
-    """Show a finished run in another weather or at night, and how well its edges are kept."""
+    """Show a finished run in another weather or at night, and how well its edges are kept.
+
+    Example: lidarpainter stylize latest --prompt foggy --out foggy
+
+    What the camera saw: lidarpainter stylize latest --prompt night --images recorded --out n
+    """
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
     from lidarpainter_models.geometry.trajectory_specs import parse_trajectory

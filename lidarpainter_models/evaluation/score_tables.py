@@ -44,17 +44,23 @@ def metric_values(
             for name, value in _numbers(values)
         ]
     found = []
-    for name, value in _numbers(scores["recorded"]):
-        found.append(
-            ("recorded", "recorded", name, value, scores["recorded"].get(f"{name}_reason"))
-        )
-    for name, value in _numbers(scores["recorded"].get("recorded_poses", {})):
-        found.append(("recorded-poses", "recorded", name, value, None))
+    recorded = scores["recorded"]
+    for name, value in _numbers(recorded):
+        found.append(("recorded", "recorded", name, value, _reason(recorded, name, value)))
+    for name, value in _numbers(recorded.get("recorded_poses", {})):
+        found.append(("recorded-poses", "recorded", name, value, _reason(recorded, name, value)))
     for trajectory, values in scores["novel"].items():
         for name, value in _numbers(values):
             protocol = "depth" if name.startswith("depth") else "truth"
-            found.append((protocol, trajectory, name, value, values.get(f"{name}_reason")))
+            found.append((protocol, trajectory, name, value, _reason(values, name, value)))
     return found
+
+
+def _reason(values: Mapping[str, Any], name: str, value: float | None) -> str | None:
+    """Why there is no number."""
+    if value is None and name == "feature_distance":
+        return "the feature distance needs weights: --feature-weights"
+    return values.get(f"{name}_reason") if value is None else None
 
 
 def flicker_by_image(flicker: Mapping[str, Mapping[str, Any]]) -> dict[str, Scores]:

@@ -324,7 +324,10 @@ def test_catalog_lists_every_table(tiny_run, table):
     assert found["table"] == table
     known = [row for row in tiny_run.rows[table] if row.get("value", 0) is not None]
     assert len(found["rows"]) >= len(known) > 0 or table == "painters"
-    assert len(found.get("absent", [])) == (len(known) < len(tiny_run.rows[table]))
+    assert bool(found.get("absent")) == (len(known) < len(tiny_run.rows[table]))
+    reasons = [one["reason"] for one in found.get("absent", [])]
+    assert len(set(reasons)) == len(reasons)
+    assert "no reason given" not in reasons
     assert f"{table} in " in succeed("catalog", "list", table, store=tiny_run.store).out
 
 
