@@ -188,7 +188,7 @@ def write_painter(weights: Path, record: dict[str, Any], out: Path) -> dict[str,
         out: a folder, or a `.safetensors` file beside which the record goes.
 
     Raises:
-        StorageError: the disk refuses.
+        WriteError: the disk refuses.
     """
     path = out if out.suffix == WEIGHTS_SUFFIX else out / weights.name
     record_path = path.with_suffix(".json")

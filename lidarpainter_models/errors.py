@@ -56,5 +56,5 @@ class MissingPackageError(LidarPainterError, ImportError):
     """A part of the package needs an extra that is not installed."""
 
 
-class StorageError(LidarPainterError, OSError):
-    """The store cannot be written or read (disk full, permissions)."""
+class WriteError(LidarPainterError, OSError):
+    """A file cannot be written or read (disk full, permissions)."""

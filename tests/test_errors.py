@@ -2,10 +2,10 @@
 
 import pytest
 
-from lidarpainter_models.errors import BackendError, DataError, MissingPackageError, StorageError
+from lidarpainter_models.errors import BackendError, DataError, MissingPackageError, WriteError
 
 
-@pytest.mark.parametrize("kind", [DataError, BackendError, MissingPackageError, StorageError])
+@pytest.mark.parametrize("kind", [DataError, BackendError, MissingPackageError, WriteError])
 def test_an_error_is_one_line_that_no_terminal_obeys(kind):
     assert str(kind("token a\nb\x1b[2J\u2028\ud800: Grüße")) == (
         "token a\\nb\\x1b[2J\\u2028\\ud800: Grüße"
@@ -13,4 +13,4 @@ def test_an_error_is_one_line_that_no_terminal_obeys(kind):
 
 
 def test_a_system_error_keeps_its_own_words():
-    assert str(StorageError(28, "No space left on device")) == "[Errno 28] No space left on device"
+    assert str(WriteError(28, "No space left on device")) == "[Errno 28] No space left on device"

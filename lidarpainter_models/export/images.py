@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.errors import StorageError
+from lidarpainter_models.errors import WriteError
 
 JPEG_QUALITY = 90
 
@@ -30,7 +30,7 @@ def write_png(rgb: Float[Tensor, "height width 3"], path: Path) -> Path:
     """Write a PNG, folders included.
 
     Raises:
-        StorageError: the file cannot be written.
+        WriteError: the file cannot be written.
     """
     bgr = cv2.cvtColor(to_bytes(rgb), cv2.COLOR_RGB2BGR)
     _, encoded = cv2.imencode(".png", bgr)
@@ -38,5 +38,5 @@ def write_png(rgb: Float[Tensor, "height width 3"], path: Path) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(encoded.tobytes())
     except OSError as error:
-        raise StorageError(f"cannot write {path}: {error.strerror}") from None
+        raise WriteError(f"cannot write {path}: {error.strerror}") from None
     return path

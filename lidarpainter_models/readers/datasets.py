@@ -62,7 +62,7 @@ def ingest_scene(
 
     Raises:
         DataError: the dataset is not known, or the log is missing something, damaged or senseless.
-        StorageError: the store cannot be written.
+        WriteError: the store cannot be written.
     """
     log = open_log(dataset, root, sequence, frames=frames, cameras=cameras)
     return write_log(log, Path(store), progress=progress)

@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save, save_file
 from torch import Tensor
 
-from lidarpainter_models.errors import DataError, LidarPainterError, StorageError
+from lidarpainter_models.errors import DataError, LidarPainterError, WriteError
 from lidarpainter_models.storage.whole_files import whole_file
 
 HEADER_KEY = "lidarpainter"
@@ -29,14 +29,14 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str
     """Write tensors and a JSON-able header, aside and renamed whole.
 
     Raises:
-        StorageError: the disk refuses.
+        WriteError: the disk refuses.
     """
     stored, metadata = _stored(tensors), _metadata(header)
     with whole_file(path) as aside:
         try:
             save_file(stored, aside, metadata)
         except SafetensorError as error:  # its writer reports the disk's errors as text
-            raise StorageError(f"{path}: cannot be written: {error}") from error
+            raise WriteError(f"{path}: cannot be written: {error}") from error
 
 
 def read_tensors(

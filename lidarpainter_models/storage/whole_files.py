@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from lidarpainter_models.errors import LidarPainterError, StorageError
+from lidarpainter_models.errors import LidarPainterError, WriteError
 
 
 @contextmanager
 def storage_errors(path: Path) -> Iterator[None]:
-    """Turn a failed write or read below `path` into a one-line `StorageError`."""
+    """Turn a failed write or read below `path` into a one-line `WriteError`."""
     try:
         yield
     except OSError as error:
@@ -20,7 +20,7 @@ def storage_errors(path: Path) -> Iterator[None]:
             raise
         reason = error.strerror or str(error)
         hint = "; free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
-        raise StorageError(f"{path}: cannot be written: {reason}{hint}") from error
+        raise WriteError(f"{path}: cannot be written: {reason}{hint}") from error
 
 
 @contextmanager
@@ -28,7 +28,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     """Give a path beside `path` to write to, then rename it there; an older file stays till then.
 
     Raises:
-        StorageError: the disk refuses.
+        WriteError: the disk refuses.
     """
     aside = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     with storage_errors(path):
@@ -47,7 +47,7 @@ def write_whole(path: Path, content: bytes) -> None:
     """Write a file aside and rename it; an older file stays if that fails.
 
     Raises:
-        StorageError: the disk refuses.
+        WriteError: the disk refuses.
     """
     with whole_file(path) as aside:
         aside.write_bytes(content)

@@ -124,7 +124,7 @@ class PairWriter:
 
         Raises:
             DataError: the name cannot be a file name or is taken.
-            StorageError: the disk refuses.
+            WriteError: the disk refuses.
         """
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._+-]*", name) or name in self:
             raise DataError(f"pair name {name!r} is taken or not letters, digits and ._+-")

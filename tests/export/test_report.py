@@ -12,7 +12,7 @@ import torch
 from drawn_streets import drawn_street
 from tiny_street import tiny_street
 
-from lidarpainter_models.errors import StorageError
+from lidarpainter_models.errors import WriteError
 from lidarpainter_models.export.images import to_bytes, write_png
 from lidarpainter_models.export.report import (
     Comparison,
@@ -198,5 +198,5 @@ def test_bytes_round_and_clamp():
 
 def test_unwritable_place_is_named(tmp_path):
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(StorageError, match="cannot write"):
+    with pytest.raises(WriteError, match="cannot write"):
         write_png(torch.zeros(2, 2, 3), tmp_path / "file" / "image.png")

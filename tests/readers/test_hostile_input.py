@@ -9,7 +9,7 @@ import shutil
 import numpy as np
 import pytest
 
-from lidarpainter_models.errors import DataError, LidarPainterError, StorageError, UnsafePickleError
+from lidarpainter_models.errors import DataError, LidarPainterError, UnsafePickleError, WriteError
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.readers.pandaset import dataframe_pickle
 from lidarpainter_models.readers.pandaset.dataframe_pickle import read_table_bytes
@@ -252,7 +252,7 @@ def test_full_disk(pandaset, store, monkeypatch):
 
     monkeypatch.setattr(array_writer.ArrayAppender, "_flush", refuse)
     kind, message = refusal(pandaset, store)
-    assert kind is StorageError
+    assert kind is WriteError
     assert "002: cannot be written: No space left on device; free some space" in message
 
 

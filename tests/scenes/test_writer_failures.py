@@ -10,7 +10,7 @@ from scene_parts import (
     files_below,
 )
 
-from lidarpainter_models.errors import StorageError
+from lidarpainter_models.errors import WriteError
 from lidarpainter_models.scenes import array_writer, schema
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.writer import SceneWriter
@@ -39,7 +39,7 @@ def test_full_disk_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, good_wr
 
     monkeypatch.setattr(array_writer.ArrayAppender, "_flush", write_until_full)
     with (
-        pytest.raises(StorageError, match=r"cannot be written: No space left.*free") as raised,
+        pytest.raises(WriteError, match=r"cannot be written: No space left.*free") as raised,
         SceneWriter(tmp_path, "rig", "a", HEADER) as writer,
     ):
         add_frame(writer)
@@ -58,7 +58,7 @@ def test_error_in_the_thread_that_writes_is_raised_and_leaves_nothing(tmp_path, 
 
     monkeypatch.setattr(array_writer.ArrayAppender, "_write", refuse)
     with (
-        pytest.raises(StorageError, match="cannot be written: No space left"),
+        pytest.raises(WriteError, match="cannot be written: No space left"),
         SceneWriter(tmp_path, "rig", "a", HEADER) as writer,
     ):
         add_full_frames(writer)
@@ -74,7 +74,7 @@ def test_full_disk_while_publishing_leaves_the_old_scene(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("lidarpainter_models.scenes.writer.pq.write_table", refuse)
-    with pytest.raises(StorageError), SceneWriter(tmp_path, "rig", "a", HEADER) as writer:
+    with pytest.raises(WriteError), SceneWriter(tmp_path, "rig", "a", HEADER) as writer:
         add_frame(writer, num_points=30)
     assert DrivingScene.open(writer.path).content_digest == before
     assert [path.name for path in writer.path.parent.iterdir()] == ["a"]
@@ -83,7 +83,7 @@ def test_full_disk_while_publishing_leaves_the_old_scene(tmp_path, monkeypatch):
 def test_store_that_cannot_be_written_is_one_line(tmp_path):
     (tmp_path / "scenes").write_text("a file in the way")
     with (
-        pytest.raises(StorageError, match="cannot be written"),
+        pytest.raises(WriteError, match="cannot be written"),
         SceneWriter(tmp_path, "rig", "a", HEADER),
     ):
         pass

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from lidarpainter_models.errors import DataError, StorageError, WeightsError
+from lidarpainter_models.errors import DataError, WeightsError, WriteError
 from lidarpainter_models.storage.tensor_files import (
     open_tensors,
     pack_tensors,
@@ -78,7 +78,7 @@ def test_a_failed_write_leaves_the_older_file_alone(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("lidarpainter_models.storage.whole_files.sync", refuse)
-    with pytest.raises(StorageError, match="No space left on device; free some space"):
+    with pytest.raises(WriteError, match="No space left on device; free some space"):
         write_tensors(path, some_tensors(), {"age": "new"})
     assert read_tensors(path)[1] == {"age": "old"}
     assert list(tmp_path.iterdir()) == [path]

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lidarpainter_models.errors import DataError, ShapeError, StorageError
+from lidarpainter_models.errors import DataError, ShapeError, WriteError
 from lidarpainter_models.painter.examples import PaintingPair, PairSource, Window
 from lidarpainter_models.painter.protocol import PaintingConditions
 from lidarpainter_models.training_data.pairs import PairFolder, PairWriter, load_pair
@@ -173,7 +173,7 @@ def test_a_disk_that_refuses_leaves_the_index_as_it_was(folder, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("pathlib.Path.write_bytes", refuse)
-    with pytest.raises(StorageError, match="No space left"):
+    with pytest.raises(WriteError, match="No space left"):
         PairWriter(folder).add("pair-3", make_pair(), {})
     monkeypatch.undo()
     assert len(PairFolder(folder)) == 3

@@ -48,7 +48,7 @@ class CheckpointFolder:
         """Replace the checkpoint.
 
         Raises:
-            StorageError: the file cannot be written.
+            WriteError: the file cannot be written.
         """
         header = {"identity": self.identity, "numbers": numbers}
         write_tensors(self.path / FILE_NAME, tensors, header)

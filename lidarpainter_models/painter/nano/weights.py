@@ -27,7 +27,7 @@ def save_weights(
 
     Raises:
         WeightsError: a weight is not finite or too large for float16.
-        StorageError: the file cannot be written.
+        WriteError: the file cannot be written.
     """
     tensors: dict[str, Tensor] = {}
     for name, tensor in network.state_dict().items():

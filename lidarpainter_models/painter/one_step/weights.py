@@ -72,7 +72,7 @@ def save_trained(
 
     Raises:
         WeightsError: a weight is not finite.
-        StorageError: the file cannot be written.
+        WriteError: the file cannot be written.
     """
     state = dict(network.named_parameters())
     tensors = {name: _stored(name, state[name]) for name in trained_names(network)}

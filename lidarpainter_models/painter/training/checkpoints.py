@@ -93,7 +93,7 @@ def write_checkpoint(path: Path, state: TrainingState, digest: str) -> None:
     """Write the state of a training.
 
     Raises:
-        StorageError: the disk refuses; the previous checkpoint is kept.
+        WriteError: the disk refuses; the previous checkpoint is kept.
     """
     saved: dict[str, Any] = {
         "digest": digest,

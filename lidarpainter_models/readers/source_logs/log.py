@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol, TypeVar, runtime_checkable
 
-from lidarpainter_models.errors import DataError, LidarPainterError, StorageError
+from lidarpainter_models.errors import DataError, LidarPainterError, WriteError
 from lidarpainter_models.readers.source_logs.drive_checks import DriveChecks
 from lidarpainter_models.readers.source_logs.frame_content import FrameContent
 from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
@@ -65,7 +65,7 @@ def write_log(
 
     Raises:
         DataError: something in the log is missing, damaged or makes no sense.
-        StorageError: the store cannot be written.
+        WriteError: the store cannot be written.
     """
     num_frames = len(log.frame_indices)
     checks = DriveChecks(num_frames) if log.is_drive else None
@@ -96,7 +96,7 @@ def naming(place: str, *, within: str | None = None) -> Iterator[None]:
     """
     try:
         yield
-    except StorageError:
+    except WriteError:
         raise
     except LidarPainterError as error:
         if (within or place) in str(error):

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from lidarpainter_models.errors import ConfigError, SceneError, StorageError
+from lidarpainter_models.errors import ConfigError, SceneError, WriteError
 from lidarpainter_models.gaussians.fitting.checkpoint import FILE_NAME, CheckpointFolder
 
 
@@ -30,7 +30,7 @@ def test_damaged_checkpoint_is_refused(tmp_path):
 
 def test_folder_that_cannot_be_written_is_one_clear_error(tmp_path):
     (tmp_path / "taken").write_text("a file")
-    with pytest.raises(StorageError, match="cannot be written"):
+    with pytest.raises(WriteError, match="cannot be written"):
         CheckpointFolder(path=tmp_path / "taken").save({"x": torch.zeros(1)}, {})
 
 

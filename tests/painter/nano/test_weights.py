@@ -7,7 +7,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from lidarpainter_models.errors import StorageError, WeightsError
+from lidarpainter_models.errors import WeightsError, WriteError
 from lidarpainter_models.painter import load_painter
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.nano.weights import load_weights, save_weights
@@ -119,7 +119,7 @@ def test_infinite_weights_are_not_saved(tmp_path):
 
 def test_a_disk_that_refuses_leaves_nothing(tmp_path):
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(StorageError, match="cannot be written"):
+    with pytest.raises(WriteError, match="cannot be written"):
         save_weights(
             NanoNetwork(SMALL), tmp_path / "file" / "w.safetensors", licence="x", provenance={}
         )
