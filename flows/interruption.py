@@ -22,8 +22,9 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 GRACE_S = 1.0
 """How long the work may take to clean up."""
 MESSAGE = "interrupted; the same command goes on where this one stopped"
-SHOW_CURSOR = "\r\x1b[K\x1b[?25h"
+CLEAN_LINE = "\r\x1b[K\x1b[?25h"
 """Clears the line of a terminal and brings back its cursor, which progress bars hide."""
+STDERR = 2
 
 _ending = threading.Lock()
 _caught: list[int] = []
@@ -54,6 +55,11 @@ def leave(code: int) -> NoReturn:
     if not _caught:
         sys.exit(code)
     _end(is_late=False)
+
+
+def is_interrupted() -> bool:
+    """Whether a signal has come: what fails from then on fails because of it."""
+    return bool(_caught)
 
 
 @contextmanager
@@ -99,17 +105,23 @@ def _end_in_time(told: int) -> None:
 
 def _end(*, is_late: bool) -> NoReturn:
     _ending.acquire()  # never released: one thread ends the process
+    with suppress(Exception):
+        sys.stdout.flush()
+    with Path(os.devnull).open("w") as nowhere:
+        sys.stdout = sys.stderr = nowhere  # what is drawn while the work ends is not seen
+        _end_now(is_late=is_late)
+
+
+def _end_now(*, is_late: bool) -> NoReturn:
     if is_late:
         for action in reversed(_actions):
             _try(action)
-    with suppress(Exception):
-        sys.stdout.flush()
-        clear = SHOW_CURSOR if is_late and sys.stderr.isatty() else ""
-        sys.stderr.write(f"{clear}lidarpainter: {MESSAGE}\n")
-        sys.stderr.flush()
     for process in {*_started, *_descendants()}:
         with suppress(OSError):
             signal.pidfd_send_signal(process, signal.SIGKILL)
+    with suppress(OSError):
+        line = f"{CLEAN_LINE if os.isatty(STDERR) else ''}lidarpainter: {MESSAGE}\n"
+        os.write(STDERR, line.encode())
     os._exit(128 + _caught[0])
 
 

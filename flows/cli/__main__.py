@@ -4,16 +4,20 @@ Signals are answered before anything else is imported.
 """
 
 import sys
+from contextlib import suppress
 
 from flows import interruption
 
 
 def run() -> None:
     """Run the command that was typed, and end with its exit code."""
-    interruption.watch()
-    from flows.cli.main import main
+    code = 0
+    with suppress(interruption.Interrupted):
+        interruption.watch()
+        from flows.cli.main import main
 
-    interruption.leave(main(sys.argv[1:]))
+        code = main(sys.argv[1:])
+    interruption.leave(code)
 
 
 if __name__ == "__main__":

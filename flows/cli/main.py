@@ -31,7 +31,7 @@ from flows.cli import (
 from flows.cli.output import Loudness, complain, loudness, set_loudness
 from flows.cli.usage import OneLineGroup
 from flows.environment import prepare_environment
-from flows.interruption import MESSAGE, Interrupted
+from flows.interruption import MESSAGE, Interrupted, is_interrupted
 from lidarpainter_models import __version__
 from lidarpainter_models.errors import LidarPainterError
 
@@ -122,6 +122,8 @@ def main(arguments: Sequence[str]) -> int:
         _explain(error, str(error), is_debug=is_debug)
         return BAD_INPUT
     except Exception as error:  # noqa: BLE001 - the last resort of a command
+        if is_interrupted():  # in a library that makes an error of it
+            return INTERRUPTED
         hint = "" if is_debug else " (--debug shows where)"
         _explain(error, f"unexpected {type(error).__name__}: {error}{hint}", is_debug=is_debug)
         return UNEXPECTED

@@ -46,7 +46,7 @@ def rendering(folder):
 
 COMMANDS = {
     "ingest": (ingestion, "ingest"),
-    "prepare": (lambda _: reconstruction("observation.width_px=128"), "prepare"),
+    "prepare": (lambda _: reconstruction("observation.width_px=80"), "prepare"),
     "fit": (lambda _: reconstruction("fit.steps=600"), r"fit .*Gaussians"),
     "paint": (lambda _: reconstruction("fit.steps=41"), "paint-1"),
     "evaluate": (lambda _: ["evaluate", "latest", "--postpaint"], "paper-"),
