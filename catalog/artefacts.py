@@ -43,8 +43,15 @@ class ArtefactRef:
 
     @classmethod
     def of_id(cls, artefact_id: str) -> "ArtefactRef":
-        """The artefact with an id of the catalog."""
-        return cls(*artefact_id.split("/", 1))
+        """The artefact with an id of the catalog.
+
+        Raises:
+            UnknownRecordError: that is no such id.
+        """
+        kind, _, digest = artefact_id.partition("/")
+        if not kind or not digest:
+            raise UnknownRecordError(f"{artefact_id!r} is no artefact, expected kind/digest")
+        return cls(kind, digest)
 
     @property
     def artefact_id(self) -> str:
@@ -111,6 +118,17 @@ class Manifest:
     host: str = ""
     """Machine it was made on."""
     manifest_version: int = MANIFEST_VERSION
+
+    def __post_init__(self) -> None:
+        """Refuse what a stranger's JSON may hold in place of objects.
+
+        Raises:
+            TypeError: the inputs, the files or what is known of a file are no objects.
+        """
+        parts = [self.inputs, self.files, self.summary, self.code]
+        parts += self.files.values() if isinstance(self.files, dict) else []
+        if not all(isinstance(one, dict) for one in parts):
+            raise TypeError("an object is something else")
 
     @property
     def num_bytes(self) -> int:

@@ -6,7 +6,6 @@ first, then every folder is renamed aside before its files are removed: whoever 
 leaves nothing half-deleted under a name.
 """
 
-import json
 import re
 import shutil
 import uuid
@@ -18,7 +17,7 @@ from pathlib import Path
 from catalog.artefacts import ArtefactRef
 from catalog.errors import CatalogError, UnknownRecordError, storage_errors
 from catalog.store import Store
-from catalog.tables import Row
+from catalog.tables import Row, json_of
 
 KEYS = {"runs": "run_id", "painters": "painter_id"}
 KEYS |= {"artefacts": "artefact_id", "scenes": "scene_id"}  # these have folders: they go last
@@ -81,7 +80,7 @@ def plan_deletion(store: Store, table: str, row: Row) -> Deletion:
         *_doomed(store, "painters", needs.painters_in(gone)),
         *_doomed(store, "artefacts", made),
     )
-    return Deletion(own=named, dependents=dependents)
+    return Deletion(own=tuple(named), dependents=dependents)
 
 
 def delete(store: Store, doomed: Sequence[Doomed]) -> None:
@@ -112,7 +111,7 @@ class _Needs:
         self.runs = store.rows("runs")
         self._painters = store.rows("painters")
         self._inputs: Mapping[str, set[str]] = {
-            row["artefact_id"]: set(json.loads(row["inputs"]).values())
+            row["artefact_id"]: set(json_of(row, "inputs").values())
             for row in store.rows("artefacts")
         }
 

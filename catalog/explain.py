@@ -8,6 +8,7 @@ no tasks, so whoever asks hands in what the code is today.
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -17,7 +18,7 @@ from catalog.code_closure import Code
 from catalog.digests import DIGEST_LENGTH
 from catalog.errors import IdentityError, UnknownRecordError
 from catalog.store import Store
-from catalog.tables import Row
+from catalog.tables import Row, json_of
 
 CodeToday = Callable[[Iterable[str]], Code]
 """The code that is reached today from symbols, each `module:name`."""
@@ -70,13 +71,13 @@ class Explainer:
             if other["scene_id"] == row["scene_id"] and other["status"] == "complete"
         ]
         newest = max(others, key=lambda other: other["finished_at"], default=row)
-        settings = _changes(json.loads(row["parameters"]), json.loads(newest["parameters"]))
+        settings = _changes(json_of(row, "parameters"), json_of(newest, "parameters"))
         return Explanation(
             name=row["run_id"],
             facts={
                 **{name: row[name] for name in facts},
                 "started_at": row["started_at"].isoformat(),
-                "settings": json.loads(row["parameters"]),
+                "settings": json_of(row, "parameters"),
                 "code": row["source_digest"],
             },
             stale=tuple(f"{name} is stale" for name, one in made.items() if one.stale),
@@ -133,7 +134,9 @@ class Explainer:
                     return Explanation(name=row["artefact_id"], stale=("it is gone",))
         if scene_id := self._scenes.get(digest):
             file = self._store.scene_folder(scene_id) / MANIFEST_NAME
-            provenance = json.loads(file.read_text("utf-8"))["provenance"] if file.exists() else {}
+            provenance = {}
+            with suppress(OSError, ValueError, KeyError, TypeError):  # gone or damaged: not known
+                provenance = json.loads(file.read_text("utf-8"))["provenance"]
             return Explanation(name=scene_id, facts={"content": digest, "read_from": provenance})
         return Explanation(name=digest)
 
@@ -152,7 +155,7 @@ class Explainer:
     def _newest(self, ref: ArtefactRef, manifest: Manifest) -> dict[str, Any] | None:
         """The newest artefact of the same kind and parts that shares an input with this one."""
         rows = [row for row in self._artefacts if row["kind"] == ref.kind]
-        alike = [row for row in rows if _share_an_input(json.loads(row["inputs"]), manifest.inputs)]
+        alike = [row for row in rows if _share_an_input(json_of(row, "inputs"), manifest.inputs)]
         newest = max(alike, key=lambda row: row["created_at"], default=None)
         if newest is None or newest["digest"] == ref.digest:
             return None

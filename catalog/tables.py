@@ -5,16 +5,24 @@ again, a bounded number of times with growing, jittered pauses. The root is a fo
 as `s3://bucket/store`.
 """
 
+import json
 import random
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import pyarrow as pa
 from deltalake import DeltaTable, Field
 from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
 
-from catalog.errors import ConflictError, UnknownRecordError, storage_errors
+from catalog.errors import (
+    CatalogError,
+    ConflictError,
+    StorageError,
+    UnknownRecordError,
+    storage_errors,
+)
 from catalog.schemas import TABLES, TableSchema
 
 COMMIT_ATTEMPTS = 25
@@ -59,7 +67,7 @@ class CatalogTables:
 
     def _committed(self, schema: TableSchema, attempted: Callable[[], bool]) -> None:
         """Attempt a commit until it wins, a bounded number of times."""
-        with storage_errors(f"cannot write table {self._uri(schema)}"):
+        with _damage(f"cannot write table {self._uri(schema)}"):
             for attempt in range(COMMIT_ATTEMPTS):
                 if attempt:
                     pause_s = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2**attempt)
@@ -78,7 +86,7 @@ class CatalogTables:
     def arrow(self, table: str) -> pa.Table:
         """A table as Arrow, with exactly the columns of its schema."""
         schema = _schema(table)
-        with storage_errors(f"cannot read table {self._uri(schema)}"):
+        with _damage(f"cannot read table {self._uri(schema)}"):
             try:
                 found = DeltaTable(self._uri(schema), storage_options=self.storage_options)
             except TableNotFoundError:
@@ -161,6 +169,32 @@ class CatalogTables:
             table.alter.add_columns([Field.from_arrow(column.arrow) for column in missing])
             table = DeltaTable(self._uri(schema), storage_options=self.storage_options)
         return table
+
+
+def json_of(row: Row, column: str) -> Any:  # noqa: ANN401 - any JSON value
+    """What a column with JSON text holds.
+
+    Raises:
+        CatalogError: it is no JSON.
+    """
+    try:
+        return json.loads(row[column])
+    except (TypeError, ValueError):
+        name = next(iter(row.values()))
+        raise CatalogError(f"{column} of {name} is no JSON: its row is damaged") from None
+
+
+@contextmanager
+def _damage(doing: str) -> Iterator[None]:
+    """Turn a table that is not as it was written into one line, as a failing disk."""
+    try:
+        with storage_errors(doing):
+            yield
+    except StorageError:
+        raise
+    except (DeltaError, pa.ArrowException, OSError) as error:
+        found = str(error).splitlines()[0][:200]
+        raise StorageError(f"{doing}: it is damaged ({found})") from None
 
 
 def _schema(table: str) -> TableSchema:

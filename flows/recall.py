@@ -4,7 +4,6 @@ Kept apart from `reconstruct`, so that a command that computes nothing imports n
 what a fit needs.
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from catalog.artefacts import ArtefactRef
 from catalog.digests import plain
 from catalog.records import run_id_of
 from catalog.store import Store, open_store
+from catalog.tables import json_of
 from flows.parameters import ReconstructParameters
 from lidarpainter_models.painter.selection import PainterChoice
 from tasks.opened import open_scene
@@ -47,7 +47,7 @@ def recalled(parameters: ReconstructParameters, store_path: Path) -> dict[str, A
     made = [ArtefactRef.of_id(artefact_id) for artefact_id in row["artefacts"]]
     if not all(store.artefacts.is_complete(ref) for ref in made):
         return None
-    result = json.loads(row["result"])
+    result = json_of(row, "result")
     result["computed_now"] = dict.fromkeys(result["computed_now"], False)
     return located(result, store)
 

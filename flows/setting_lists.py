@@ -10,7 +10,6 @@ import json
 import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass, is_dataclass
-from functools import cache
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel
@@ -64,7 +63,6 @@ def _choices(hint: Any) -> str:  # noqa: ANN401 - any type
     return "|".join(map(str, get_args(hint))) if get_origin(hint) is Literal else ""
 
 
-@cache
 def _described(owner: type) -> dict[str, tuple[str, str]]:
     """Type as written and the text below, by field, of a class and what it inherits."""
     found: dict[str, tuple[str, str]] = {}

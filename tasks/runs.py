@@ -1,12 +1,12 @@
 """What a finished run left in the store."""
 
-import json
 from dataclasses import dataclass
 from typing import Any
 
 from catalog.artefacts import ArtefactRef
-from catalog.errors import UnknownRecordError
+from catalog.errors import CatalogError, UnknownRecordError
 from catalog.store import Store
+from catalog.tables import json_of
 from tasks.specs import FittedRef
 
 
@@ -30,19 +30,22 @@ def open_run(store: Store, run_id: str) -> FinishedRun:
 
     Raises:
         UnknownRecordError: there is no such run, or it did not complete.
+        CatalogError: its row is damaged.
     """
     row = store.run(run_id)
     if row["status"] != "complete":
         why = f": {row['error']}" if row["error"] else ""
         raise UnknownRecordError(f"run {row['run_id']} is {row['status']}, not complete{why}")
-    refs = [ArtefactRef.of_id(artefact_id) for artefact_id in row["artefacts"]]
-    observations = next(ref for ref in refs if ref.kind == "observations")
+    refs = [ArtefactRef.of_id(artefact_id) for artefact_id in row["artefacts"] or ()]
+    seen = [ref for ref in refs if ref.kind == "observations"]
     fits = [ref for ref in refs if ref.kind == "gaussians"]
+    if not seen or not fits:
+        raise CatalogError(f"run {row['run_id']} lists no fit: reconstruct the scene again")
     return FinishedRun(
         run_id=row["run_id"],
         scene_id=row["scene_id"],
-        parameters=json.loads(row["parameters"]),
-        result=json.loads(row["result"]),
-        unpainted=FittedRef(observations, fits[0]),
-        final=FittedRef(observations, fits[-1]),
+        parameters=json_of(row, "parameters"),
+        result=json_of(row, "result"),
+        unpainted=FittedRef(seen[0], fits[0]),
+        final=FittedRef(seen[0], fits[-1]),
     )

@@ -225,10 +225,12 @@ def _absent(rows: list[dict[str, Any]]) -> dict[str, Counter[str]]:
 
 def _open(row: dict[str, Any]) -> dict[str, Any]:
     """A row with times as text and JSON columns as what they hold."""
+    from catalog.tables import json_of
+
     opened = {}
     for name, value in row.items():
         if value is not None and name in JSON_COLUMNS:
-            value = json.loads(value)
+            value = json_of(row, name)
         opened[name] = value.isoformat() if hasattr(value, "isoformat") else value
     return opened
 

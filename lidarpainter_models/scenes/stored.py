@@ -20,6 +20,8 @@ from lidarpainter_models.scenes import schema
 from lidarpainter_models.scenes.validation import shown
 
 _VERIFY_ROWS = 1 << 20
+_ENTRIES = {"files": dict, "arrays": dict, "tables": dict, "camera_names": list}
+_ENTRIES |= {"content_digest": str, "dataset": str, "sequence": str}
 
 
 def content_digest(value: object) -> str:
@@ -55,6 +57,9 @@ def read_manifest(path: Path) -> dict[str, Any]:
             f"{path}: the scene has schema version {manifest.get('schema_version')}, "
             f"expected {schema.SCHEMA_VERSION}; ingest it again"
         )
+    for name, kind in _ENTRIES.items():
+        if not isinstance(manifest.get(name), kind):
+            raise SceneError(f"{file}: {name} is no {kind.__name__}; the scene is damaged")
     for name, num_bytes in manifest["files"].items():
         _require_file(path / name, num_bytes)
     return manifest
@@ -111,7 +116,7 @@ class StoredScene:
             )
         try:
             rows = self._array(name)[offset : offset + num_rows]
-        except (OSError, ValueError, KeyError, RuntimeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
             raise SceneError(
                 f"{self.path}: array {name} cannot be read ({shown(str(error))}); "
                 "ingest the scene again"

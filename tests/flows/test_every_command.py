@@ -327,7 +327,6 @@ def test_catalog_lists_every_table(tiny_run, table):
     assert bool(found.get("absent")) == (len(known) < len(tiny_run.rows[table]))
     reasons = [one["reason"] for one in found.get("absent", [])]
     assert len(set(reasons)) == len(reasons)
-    assert "no reason given" not in reasons
     assert f"{table} in " in succeed("catalog", "list", table, store=tiny_run.store).out
 
 
