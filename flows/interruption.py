@@ -19,7 +19,7 @@ from types import FrameType
 from typing import NoReturn
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-GRACE_S = 1.0
+GRACE_S = 0.7
 """How long the work may take to clean up."""
 MESSAGE = "interrupted; the same command goes on where this one stopped"
 CLEAN_LINE = "\r\x1b[K\x1b[?25h"
