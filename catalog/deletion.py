@@ -16,8 +16,9 @@ from pathlib import Path
 
 from catalog.artefacts import ArtefactRef
 from catalog.errors import CatalogError, UnknownRecordError, storage_errors
+from catalog.records import json_of
 from catalog.store import Store
-from catalog.tables import Row, json_of
+from catalog.tables import Row
 
 KEYS = {"runs": "run_id", "painters": "painter_id"}
 KEYS |= {"artefacts": "artefact_id", "scenes": "scene_id"}  # these have folders: they go last

@@ -17,8 +17,9 @@ from catalog.artefacts import MANIFEST_NAME, ArtefactRef, Manifest
 from catalog.code_closure import Code
 from catalog.digests import DIGEST_LENGTH
 from catalog.errors import IdentityError, UnknownRecordError
+from catalog.records import json_of
 from catalog.store import Store
-from catalog.tables import Row, json_of
+from catalog.tables import Row
 
 CodeToday = Callable[[Iterable[str]], Code]
 """The code that is reached today from symbols, each `module:name`."""

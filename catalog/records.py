@@ -1,5 +1,6 @@
 """Rows of the catalog and their deterministic ids."""
 
+import json
 import platform
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
@@ -8,6 +9,7 @@ from typing import Any, Literal
 
 from catalog.artefacts import ArtefactRef, Manifest
 from catalog.digests import canonical_json, digest_text
+from catalog.errors import CatalogError
 
 RunStatus = Literal["running", "complete", "failed", "interrupted"]
 RUN_ID_LENGTH = 16
@@ -116,3 +118,16 @@ def artefact_row(ref: ArtefactRef, manifest: Manifest) -> dict[str, Any]:
 def metric_rows(records: Iterable[MetricRecord]) -> list[dict[str, Any]]:
     """Rows of many metrics."""
     return [record.row() for record in records]
+
+
+def json_of(row: dict[str, Any], column: str) -> Any:  # noqa: ANN401 - any JSON value
+    """What a column with JSON text holds.
+
+    Raises:
+        CatalogError: it is no JSON.
+    """
+    try:
+        return json.loads(row[column])
+    except (TypeError, ValueError):
+        name = next(iter(row.values()))
+        raise CatalogError(f"{column} of {name} is no JSON: its row is damaged") from None

@@ -5,7 +5,6 @@ again, a bounded number of times with growing, jittered pauses. The root is a fo
 as `s3://bucket/store`.
 """
 
-import json
 import random
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,7 +16,6 @@ from deltalake import DeltaTable, Field
 from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
 
 from catalog.errors import (
-    CatalogError,
     ConflictError,
     StorageError,
     UnknownRecordError,
@@ -169,19 +167,6 @@ class CatalogTables:
             table.alter.add_columns([Field.from_arrow(column.arrow) for column in missing])
             table = DeltaTable(self._uri(schema), storage_options=self.storage_options)
         return table
-
-
-def json_of(row: Row, column: str) -> Any:  # noqa: ANN401 - any JSON value
-    """What a column with JSON text holds.
-
-    Raises:
-        CatalogError: it is no JSON.
-    """
-    try:
-        return json.loads(row[column])
-    except (TypeError, ValueError):
-        name = next(iter(row.values()))
-        raise CatalogError(f"{column} of {name} is no JSON: its row is damaged") from None
 
 
 @contextmanager

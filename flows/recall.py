@@ -9,9 +9,8 @@ from typing import Any
 
 from catalog.artefacts import ArtefactRef
 from catalog.digests import plain
-from catalog.records import run_id_of
+from catalog.records import json_of, run_id_of
 from catalog.store import Store, open_store
-from catalog.tables import json_of
 from flows.parameters import ReconstructParameters
 from lidarpainter_models.painter.selection import PainterChoice
 from tasks.opened import open_scene

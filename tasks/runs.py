@@ -5,8 +5,8 @@ from typing import Any
 
 from catalog.artefacts import ArtefactRef
 from catalog.errors import CatalogError, UnknownRecordError
+from catalog.records import json_of
 from catalog.store import Store
-from catalog.tables import json_of
 from tasks.specs import FittedRef
 
 

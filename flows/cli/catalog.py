@@ -225,7 +225,7 @@ def _absent(rows: list[dict[str, Any]]) -> dict[str, Counter[str]]:
 
 def _open(row: dict[str, Any]) -> dict[str, Any]:
     """A row with times as text and JSON columns as what they hold."""
-    from catalog.tables import json_of
+    from catalog.records import json_of
 
     opened = {}
     for name, value in row.items():

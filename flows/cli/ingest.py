@@ -9,6 +9,14 @@ from flows.cli.output import complain, format_bytes, print_json, print_table, sa
 from flows.cli.shared_options import AsJson, parse_frames, parse_names
 
 SOME_FAILED = 2
+COLUMNS = {
+    "scene_id": "scene",
+    "num_frames": "frames",
+    "num_views": "images",
+    "num_points": "points",
+    "num_actors": "actors",
+    "num_moving_actors": "moving",
+}
 
 
 def ingest(  # noqa: PLR0913 - one per option
@@ -61,19 +69,7 @@ def ingest(  # noqa: PLR0913 - one per option
     if as_json:
         print_json({"store": str(store.root), "scenes": rows, "failures": failures})
     else:
-        columns = ["scene", "frames", "images", "points", "actors", "moving", "size"]
-        cells = [
-            [
-                row["scene_id"],
-                row["num_frames"],
-                row["num_views"],
-                row["num_points"],
-                row["num_actors"],
-                row["num_moving_actors"],
-                format_bytes(row["num_bytes"]),
-            ]
-            for row in rows
-        ]
-        print_table(f"scenes in {store.root}", columns, cells)
+        cells = [[*(row[name] for name in COLUMNS), format_bytes(row["num_bytes"])] for row in rows]
+        print_table(f"scenes in {store.root}", [*COLUMNS.values(), "size"], cells)
     if failures:
         raise typer.Exit(SOME_FAILED)

@@ -11,6 +11,20 @@ from flows.cli.shared_options import AsJson, DeviceName, Painter, Settings, pars
 from lidarpainter_models.errors import ConfigError
 
 FITS = ("fit", "refine")
+Sideways = Annotated[
+    str | None, typer.Option(help="Metres to both sides to paint at, such as 2,3; at most 8.")
+]
+Upwards = Annotated[str | None, typer.Option(help="Metres up to paint at, such as 1.5; at most 8.")]
+Rounds = Annotated[
+    int | None,
+    typer.Option(help="How often to paint and go on, 0 or more; the preset's if absent."),
+]
+Split = Annotated[
+    str | None,
+    typer.Option(
+        help="alternate (every second frame judges), forward:17:8 (so many fit: judge), all."
+    ),
+]
 
 
 def reconstruct(  # noqa: PLR0913 - the options of a command
@@ -18,22 +32,10 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     preset: Annotated[str, typer.Option(help="preview, balanced or paper.")] = "preview",
     painter: Painter = None,
     device: DeviceName = "auto",
-    shift: Annotated[
-        str | None, typer.Option(help="Metres to both sides to paint at, such as 2,3; at most 8.")
-    ] = None,
-    up: Annotated[
-        str | None, typer.Option(help="Metres up to paint at, such as 1.5; at most 8.")
-    ] = None,
-    rounds: Annotated[
-        int | None,
-        typer.Option(help="How often to paint and go on, 0 or more; the preset's if absent."),
-    ] = None,
-    split: Annotated[
-        str | None,
-        typer.Option(
-            help="alternate (every second frame judges), forward:17:8 (so many fit: judge), all."
-        ),
-    ] = None,
+    shift: Sideways = None,
+    up: Upwards = None,
+    rounds: Rounds = None,
+    split: Split = None,
     train_cameras: Annotated[
         str | None, typer.Option(help="Cameras to train on, with commas between; all if absent.")
     ] = None,

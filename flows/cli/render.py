@@ -17,6 +17,10 @@ from flows.cli.shared_options import (
     parse_previous,
 )
 
+Postpaint = Annotated[
+    bool, typer.Option("--postpaint", help="Paint every image; renders go to `unpainted/`.")
+]
+
 
 def render(  # noqa: PLR0913 - the options of a command
     run: RunName,
@@ -24,10 +28,7 @@ def render(  # noqa: PLR0913 - the options of a command
     out: Annotated[Path, typer.Option(help="Folder for the images.")],
     camera: FollowedCamera = None,
     frames: FollowedFrames = None,
-    postpaint: Annotated[
-        bool,
-        typer.Option("--postpaint", help="Paint every image; renders go to `unpainted/`."),
-    ] = False,
+    postpaint: Postpaint = False,
     painter: Annotated[
         str | None, typer.Option(help="Painter for --postpaint; the run's own if absent.")
     ] = None,

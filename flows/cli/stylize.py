@@ -39,8 +39,6 @@ def stylize(  # noqa: PLR0913 - the options of a command
     """Show a finished run in another weather or at night, and how well its edges are kept.
 
     Example: lidarpainter stylize latest --prompt foggy --out foggy
-
-    What the camera saw: lidarpainter stylize latest --prompt night --images recorded --out n
     """
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
