@@ -8,6 +8,7 @@ see the thin task only, and what is done is written in the store.
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from prefect import Task
@@ -95,15 +96,7 @@ def run_stage(
     if is_new:
         store.tables.merge("artefacts", [artefact_row(ref, manifest)])
     listener().finished(stage, manifest.seconds, is_new=is_new)
-    _LOG.info(
-        "%s: %s; from %s; settings %s; code %s; lies in %s",
-        stage,
-        "computed now" if is_new else "was there",
-        ", ".join(f"{name} {digest[:SHOWN_DIGITS]}" for name, digest in inputs.items()),
-        digest_text(canonical_json(plain(config)))[:SHOWN_DIGITS],
-        recipe.code.digest[:SHOWN_DIGITS],
-        store.artefacts.folder(ref),
-    )
+    _log(stage, recipe, store.artefacts.folder(ref), is_new=is_new)
     return StageResult(
         ref=ref,
         seconds=manifest.seconds,
@@ -111,6 +104,19 @@ def run_stage(
         peak_memory_bytes=manifest.summary["peak_memory_bytes"],
         is_new=is_new,
         summary=manifest.summary,
+    )
+
+
+def _log(stage: str, recipe: Recipe, folder: Path, *, is_new: bool) -> None:
+    """Say what a stage is keyed on, whether it was there, and where it lies."""
+    _LOG.info(
+        "%s: %s; from %s; settings %s; code %s; lies in %s",
+        stage,
+        "computed now" if is_new else "was there",
+        ", ".join(f"{name} {digest[:SHOWN_DIGITS]}" for name, digest in recipe.inputs.items()),
+        digest_text(canonical_json(plain(recipe.config)))[:SHOWN_DIGITS],
+        recipe.code.digest[:SHOWN_DIGITS],
+        folder,
     )
 
 

@@ -26,7 +26,7 @@ def test_ingest_brings_every_dataset_into_the_store_once(name, store, tmp_path):
     again = succeed(*words, store=store)
     assert again.json["scenes"] == [row]
     assert manifest.stat().st_mtime_ns == written_ns
-    assert again.err == ""
+    assert again.err == "ingest: was there\n"
     (listed,) = succeed("catalog", "list", "scenes", "--json", store=store).json["rows"]
     assert listed["scene_id"] == row["scene_id"]
     assert listed["num_frames"] == row["num_frames"] > 1
@@ -85,7 +85,7 @@ def test_doctor_looks_at_a_dataset_a_scene_and_the_setup(store, tmp_path):
         (("ingest", "kitti", "."), "dataset 'kitti' is not known"),
         (("ingest", "pandaset", "gone"), "no such folder"),
         (("ingest", "pandaset", "."), "no pandaset sequence found"),
-        (("doctor", "pandaset/404"), "no scene pandaset/404"),
+        (("doctor", "pandaset/404"), "no store at"),
         (("doctor", "waymo", "gone"), "no such folder"),
     ],
 )

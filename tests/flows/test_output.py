@@ -9,6 +9,7 @@ from rich.progress import Progress
 
 from flows.cli.output import format_bytes, format_cell, print_json, print_pairs, print_table
 from flows.cli.progress import Bars, Lines, shown_progress
+from flows.cli.stage_times import Clock
 from tasks.progress import listener
 
 
@@ -46,11 +47,12 @@ def test_a_table_shows_every_cell(capsys):
 
 
 def test_lines_say_how_a_stage_ended(capsys):
-    lines = Lines()
+    lines = Lines(Clock())
     lines.started("fit")
     lines.advanced("fit", 1, 2, "30 dB")  # too soon to say anything
     lines.waiting("fit", "42")
     lines.finished("fit", 12.34, is_new=True)
+    lines.started("paint")
     lines.finished("paint", 12.34, is_new=False)
     assert capsys.readouterr().err.splitlines() == [
         "fit: waiting for process 42, which computes the same",
@@ -61,18 +63,18 @@ def test_lines_say_how_a_stage_ended(capsys):
 
 def test_a_stage_that_takes_long_says_so_now_and_then(capsys, monkeypatch):
     monkeypatch.setattr("flows.cli.progress.LINE_EVERY_S", 0.0)
-    lines = Lines()
+    lines = Lines(Clock())
     lines.started("fit")
     lines.advanced("fit", 1, 4, "30 dB")
-    assert capsys.readouterr().err == "fit: 25 % 30 dB\n"
+    assert capsys.readouterr().err == "fit: 1/4 25 %, 0:01 gone, 30 dB\n"
 
 
 def test_bars_follow_every_stage(capsys):
     console = Console(force_terminal=True, width=80)
     with Progress(
-        "{task.description} {task.percentage:.0f} {task.fields[note]}", console=console
+        "{task.description} {task.percentage:.0f} {task.fields[said]}", console=console
     ) as progress:
-        bars = Bars(progress)
+        bars = Bars(progress, Clock())
         bars.started("fit")
         bars.advanced("fit", 1, 2, "30 dB")
         bars.waiting("fit", "42")
