@@ -6,10 +6,10 @@ from typing import Any
 
 from catalog.store import Store
 from flows.overrides import with_changes
-from flows.parameters import ViewParameters, fitted_on, view_parameters
+from flows.parameters import ViewParameters, view_parameters
 from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.evaluation.score_tables import FLICKER, Scores, flicker_by_image
+from lidarpainter_models.evaluation.score_tables import FLICKER, Scores, fitted_on, flicker_by_image
 from tasks.evaluation.flicker import evaluate_flicker
 from tasks.evaluation.strips import evaluate_strips
 from tasks.evaluation.views import evaluate, load_scores

@@ -51,10 +51,17 @@ def watch() -> None:
 
 
 def leave(code: int) -> NoReturn:
-    """End the process with an exit code; at once, and with that of the signal, after one."""
-    if not _caught:
-        sys.exit(code)
-    _end(is_late=False)
+    """End the process with an exit code, or after a signal with that of the signal.
+
+    The interpreter is not taken down: threads of the libraries, arrow's above all, may abort a
+    process that is on its way out, whose work is done and on the disk.
+    """
+    if _caught:
+        _end(is_late=False)
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(Exception):
+            stream.flush()
+    os._exit(code)
 
 
 def is_interrupted() -> bool:

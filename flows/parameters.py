@@ -1,13 +1,13 @@
 """What a flow is given: frozen models that hold the library's settings as fields."""
 
 from pathlib import Path
-from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from lidarpainter_models.conditioning.settings import ConditionConfig, NovelGuidanceConfig
 from lidarpainter_models.devices import Device
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.evaluation.score_tables import fitted_on
 from lidarpainter_models.evaluation.settings import JudgeConfig, ScoringConfig
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
@@ -97,13 +97,6 @@ class ReconstructParameters(ViewParameters):
         judged += ["evaluate-view-time"] if self.judge_view_time and paints else []
         last = [*(judged if self.judge else ()), *(["report"] if self.report else ())]
         return stages | dict.fromkeys(last)
-
-
-def fitted_on(painter: str) -> Literal["painted", "refined"]:
-    """What the scene after the last round is called: without a painter it is not painted."""
-    from lidarpainter_models.painter.selection import NO_PAINTER  # knows tensors
-
-    return "refined" if painter == NO_PAINTER else "painted"
 
 
 def view_parameters(run: FinishedRun) -> ViewParameters:

@@ -14,11 +14,11 @@ from catalog.records import RunRecord
 from catalog.store import Store, open_store
 from flows.interruption import at_interruption
 from flows.overrides import with_overrides
-from flows.parameters import ReconstructParameters, fitted_on
+from flows.parameters import ReconstructParameters
 from flows.presets import preset as preset_named
 from flows.recall import START, located, recalled, run_identity
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.evaluation.score_tables import Scores
+from lidarpainter_models.evaluation.score_tables import Scores, fitted_on
 from lidarpainter_models.export.run_page import GUIDANCE_COLUMNS
 from lidarpainter_models.metrics.perceptual import load_distances
 from lidarpainter_models.observations.fit_size import require_recorded_width

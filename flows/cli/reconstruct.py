@@ -1,6 +1,5 @@
 """`lidarpainter reconstruct`: fit, paint, judge and report one scene."""
 
-import re
 from dataclasses import replace
 from typing import Annotated, Any
 
@@ -100,12 +99,10 @@ def shifted(novel: Any, shift: str | None, up: str | None) -> Any:  # noqa: ANN4
 
 def show(result: dict[str, Any]) -> None:
     """The result as tables."""
-    from flows.parameters import fitted_on
-    from lidarpainter_models.evaluation.score_tables import SCORE_COLUMNS, SCORE_NOTE, score_rows
+    from lidarpainter_models.evaluation.score_tables import SCORE_NOTE, score_columns, score_rows
 
     title = f"{result['scene']}, painter {result['painter']}"
-    after = fitted_on(result["painter"])
-    columns = [re.sub(r"^painted", after, name) for name in SCORE_COLUMNS]
+    columns = score_columns(result["painter"])
     if rows := score_rows(result):
         print_table(title, columns, rows, SCORE_NOTE)
     pairs: dict[str, Cell] = {

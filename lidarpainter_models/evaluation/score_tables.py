@@ -1,21 +1,12 @@
 """Scores of an evaluation: every number by its name, and the table of them."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 DEPTH = "depth_within_5_percent"
 FLICKER = "flicker"
 """Entry of an evaluation that compared neighbouring frames."""
-SCORE_COLUMNS = (
-    "view",
-    "unpainted PSNR",
-    "painted PSNR",
-    "unpainted SSIM",
-    "painted SSIM",
-    "unpainted depth",
-    "painted depth",
-    "views",
-)
+FIGURES = ("PSNR", "SSIM", "depth")
 SCORE_NOTE = "PSNR in dB; depth: part of unseen LiDAR pixels that the rendered depth meets in 5 %."
 
 ScoreCell = str | float | int | None
@@ -78,6 +69,19 @@ def _numbers(values: Mapping[str, Any]) -> list[tuple[str, float | None]]:
         for name, value in values.items()
         if name != "num_views" and (value is None or isinstance(value, (int, float)))
     ]
+
+
+def fitted_on(painter: str) -> Literal["painted", "refined"]:
+    """What the scene after the last round is called: without a painter it is not painted."""
+    from lidarpainter_models.painter.selection import NO_PAINTER  # knows tensors
+
+    return "refined" if painter == NO_PAINTER else "painted"
+
+
+def score_columns(painter: str) -> list[str]:
+    """The columns of `score_rows`, by what the painter of the run was."""
+    pairs = [(f"unpainted {figure}", f"{fitted_on(painter)} {figure}") for figure in FIGURES]
+    return ["view", *(name for pair in pairs for name in pair), "views"]
 
 
 def score_rows(result: Mapping[str, Any]) -> list[list[ScoreCell]]:

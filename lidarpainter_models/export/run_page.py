@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from lidarpainter_models.evaluation.score_tables import SCORE_COLUMNS, SCORE_NOTE, score_rows
+from lidarpainter_models.evaluation.score_tables import SCORE_NOTE, score_columns, score_rows
 from lidarpainter_models.export.report import Cell, Comparison, Plot, Report, Table
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 
@@ -119,7 +119,7 @@ def _tables(result: Mapping[str, Any], costs: Sequence[StageCost]) -> list[Table
         ),
     ]
     if scores := score_rows(result):
-        columns, note = SCORE_COLUMNS, SCORE_NOTE
+        columns, note = score_columns(result["painter"]), SCORE_NOTE
         tables.insert(0, Table(title="Held-out views", columns=columns, rows=scores, note=note))
     if guidance:
         tables.append(
