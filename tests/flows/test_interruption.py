@@ -93,7 +93,7 @@ def test_a_signal_ends_the_command_soon_and_it_goes_on(stage, number, begin, sto
     command = begin(words)
     command.wait_for(shown)
     started = psutil.Process(command.process.pid).children(recursive=True)
-    assert command.interrupt(number) < LONGEST_S
+    assert command.interrupt(number) < LONGEST_S, command.shown
     assert command.process.returncode == CODES[number]
     assert command.shown.count(MESSAGE) == 1
     assert command.shown.rstrip().endswith(MESSAGE)
