@@ -17,10 +17,8 @@ def splat_points(
     pixels_uv: Tensor, depth_m: Tensor, radius_px: Tensor, height_px: int, width_px: int
 ) -> Tensor:
     """Index of the nearest point in each pixel, or -1."""
-    if not pixels_uv.is_floating_point():
-        pixels_uv = pixels_uv.to(torch.int64)
     winner = _splat(
-        pixels_uv.contiguous().numpy(),
+        pixels_uv.to(torch.float32).contiguous().numpy(),  # what that rounds is in no image
         depth_m.contiguous().numpy(),
         radius_px.to(torch.int64).contiguous().numpy(),
         (height_px, width_px),
