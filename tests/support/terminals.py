@@ -17,6 +17,12 @@ CONTROL_C = b"\x03"
 _COLOURS = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
+def _in_the_foreground():
+    """Be what a terminal interrupts, also where a shell has begun the tests in the background."""
+    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 class TerminalCommand:
     """`lidarpainter`, or other code, with these words, in the foreground of a new terminal."""
 
@@ -30,7 +36,7 @@ class TerminalCommand:
             cwd=ROOT,
             env={**os.environ, "TERM": "xterm", "COLUMNS": "120", **environment},
             start_new_session=True,
-            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+            preexec_fn=_in_the_foreground,
         )
         os.close(terminal)
         self._text = ""
