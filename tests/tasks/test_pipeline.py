@@ -3,148 +3,34 @@
 import json
 import re
 import shutil
-import sys
 from dataclasses import replace
 
-import cv2
 import pytest
 import torch
-from toy_store import TOY_SCENE, small_parameters, write_toy_scene
+from toy_store import TOY_SCENE
 
-from catalog.artefacts import ArtefactStore
 from catalog.errors import DamagedArtefactError
 from catalog.schemas import TABLES
 from catalog.store import STORE_ENVIRONMENT, open_store
 from flows.cli.main import main
 from lidarpainter_models.conditioning.settings import SequenceConfig
-from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.score_tables import flicker_by_image, metric_values
 from lidarpainter_models.evaluation.settings import ScoringConfig
 from lidarpainter_models.geometry.shifts import Shift
-from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.metrics import lpips
 from lidarpainter_models.metrics.backbones import SQUEEZENET
 from tasks.evaluation.flicker import evaluate_flicker
 from tasks.evaluation.views import evaluate, load_scores
-from tasks.ingest.ingest import record_scene
 from tasks.opened import open_scene
 from tasks.painter.judge import judge_painters
 from tasks.painter.judged_fits import JudgedFit
 from tasks.reconstruction.fit import fit
-from tasks.reconstruction.paint import paint
 from tasks.reconstruction.painted_views import load_guidance
 from tasks.reconstruction.prepare import prepare
-from tasks.reconstruction.publish import begin_run, complete_run, end_run
-from tasks.reconstruction.report import REPORT_FILE, ReportInputs, write_report
+from tasks.reconstruction.publish import begin_run, end_run
 from tasks.runs import open_run
-from tasks.specs import FittedRef
 from tasks.stored import load_history, load_scene
-from tasks.views.render import RenderRequest, render
-from tasks.views.stylize import StylizeRequest, stylize
-
-
-@pytest.fixture(scope="module")
-def store(tmp_path_factory):
-    store = open_store(tmp_path_factory.mktemp("store"))
-    record_scene(store, write_toy_scene(store.root))
-    return store
-
-
-@pytest.fixture(scope="module")
-def parameters():
-    return small_parameters()
-
-
-@pytest.fixture(scope="module")
-def ran():
-    """Modules whose functions were called while a stage was built, by its artefact's digest."""
-    produce, ran = ArtefactStore.produce, {}
-
-    def watched(store, recipe, build, **options):
-        called = ran.setdefault(recipe.digest, set())
-
-        def watch(frame, event, _argument):
-            if event == "call":
-                called.add(frame.f_globals.get("__name__", ""))
-
-        def watched_build(place):
-            sys.setprofile(watch)
-            try:
-                return build(place)
-            finally:
-                sys.setprofile(None)
-
-        return produce(store, recipe, watched_build, **options)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ArtefactStore, "produce", watched)
-        yield ran
-
-
-@pytest.fixture(scope="module")
-def stages(store, parameters, ran):  # noqa: ARG001 - it watches them being built
-    """Every stage's result by its name."""
-    run = parameters.run_spec(store.root)
-    seen = prepare.fn(run, parameters.observation)
-    first = fit.fn(run, "fit", seen.ref, parameters.fit)
-    fitted = FittedRef(seen.ref, first.ref)
-    novel, conditions = parameters.novel, parameters.conditions
-    painted = paint.fn(run, "paint-1", fitted, novel, conditions, start_frame=0)
-    refined = fit.fn(
-        run, "refine-1", seen.ref, parameters.refine, start=first.ref, guidance=painted.ref
-    )
-    final, config = FittedRef(seen.ref, refined.ref), parameters.judge_config
-    return {
-        "prepare": seen,
-        "fit": first,
-        "paint-1": painted,
-        "refine-1": refined,
-        "evaluate-unpainted": evaluate.fn(run, "evaluate-unpainted", fitted, config),
-        "evaluate": evaluate.fn(run, "evaluate", final, config),
-        "evaluate-view-time": evaluate.fn(run, "evaluate-view-time", final, config, view_time=True),
-    }
-
-
-@pytest.fixture(scope="module")
-def final(stages):
-    return FittedRef(stages["prepare"].ref, stages["refine-1"].ref)
-
-
-@pytest.fixture(scope="module")
-def run(store, parameters, stages, final):
-    """A complete run with its report."""
-    asked = parameters.run_spec(store.root)
-    record = begin_run.fn(asked, "a" * 16, "b" * 32, "preview", parameters)
-    scores = {
-        "unpainted": load_scores(store, stages["evaluate-unpainted"].ref),
-        "painted": load_scores(store, stages["evaluate"].ref),
-    }
-    result = {
-        "run_id": record.run_id,
-        "scene": TOY_SCENE,
-        "preset": "preview",
-        "painter": "warp",
-        "split": "alternate",
-        "rounds": 1,
-        "seconds": {name: stage.seconds for name, stage in stages.items()},
-        "peak_memory_bytes": 1,
-        "num_gaussians": stages["refine-1"].summary["num_gaussians"],
-        **scores["painted"],
-        "unpainted": scores["unpainted"],
-        "guidance": {"paint-1": stages["paint-1"].summary},
-    }
-    page = ReportInputs(
-        result=result,
-        source_digest=record.source_digest,
-        unpainted=FittedRef(stages["prepare"].ref, stages["fit"].ref),
-        final=final,
-        stages=stages,
-    )
-    report = write_report.fn(asked, page, parameters.judge_config)
-    result["report"] = store.name_of(store.artefacts.folder(report.ref) / REPORT_FILE)
-    refs = tuple(stage.ref for stage in stages.values())
-    complete_run.fn(store.root, record, result, scores, refs)
-    return open_run(store, record.run_id)
 
 
 def test_every_stage_leaves_an_artefact_with_a_manifest(store, stages):
@@ -323,107 +209,6 @@ def test_a_failed_run_says_why(store, parameters):
     assert store.tables.row("runs", record.run_id)["status"] == "running"
     end_run.fn(store.root, record, "failed", "SceneError: no image")
     assert store.tables.row("runs", record.run_id)["error"] == "SceneError: no image"
-
-
-@pytest.mark.parametrize("is_painted", [False, True])
-def test_a_run_is_rendered_where_nobody_drove(store, run, parameters, tmp_path, is_painted):
-    request = RenderRequest(
-        trajectory=parse_trajectory("lane-change:2+up:0.5"),
-        frames=slice(1, 3),
-        is_painted=is_painted,
-        observation=parameters.observation,
-        conditions=parameters.conditions,
-    )
-    made = render.fn(parameters.run_spec(store.root), run.final, request, tmp_path)
-    assert made["num_images"] == 2
-    described = json.loads((tmp_path / "trajectory.json").read_text())
-    assert [row["file"] for row in described["images"]] == ["0001.png", "0002.png"]
-    first, last = (row["world_from_camera"] for row in described["images"])
-    assert last[7] - first[7] == pytest.approx(2.0, abs=0.2)  # y is to the left
-
-
-@pytest.mark.parametrize("images", ["rendered", "recorded"])
-def test_a_run_is_shown_in_fog_beside_the_clear_images(store, run, parameters, tmp_path, images):
-    view = RenderRequest(
-        trajectory=parse_trajectory("recorded"),
-        frames=slice(1, 3),
-        observation=parameters.observation,
-        conditions=parameters.conditions,
-    )
-    request = StylizeRequest(prompt="foggy", view=view, images=images)
-    made = stylize.fn(parameters.run_spec(store.root), run.final, request, tmp_path / "a")
-    assert made["num_images"] == 2
-    assert 0.5 < made["edge_f1"] <= 1
-    described = json.loads((tmp_path / "a" / "trajectory.json").read_text())
-    assert (described["prompt"], len(described["images"])) == ("foggy", 2)
-    foggy, clear = (
-        cv2.imread(str(tmp_path / "a" / name)) for name in ("0001.png", "clear/0001.png")
-    )
-    assert float(foggy.std()) < float(clear.std())
-    stylize.fn(parameters.run_spec(store.root), run.final, request, tmp_path / "b")
-    again = (tmp_path / "b" / "0001.png").read_bytes()
-    assert again == (tmp_path / "a" / "0001.png").read_bytes()
-
-
-def test_a_painter_is_asked_for_the_prompt(store, run, parameters, tmp_path):
-    request = RenderRequest(
-        trajectory=parse_trajectory("recorded"),
-        frames=slice(1, 2),
-        is_painted=True,
-        prompt="foggy",
-        observation=parameters.observation,
-        conditions=parameters.conditions,
-    )
-    with pytest.raises(ConfigError, match="knows no prompt 'foggy', only: clear"):
-        render.fn(parameters.run_spec(store.root, painter="nano"), run.final, request, tmp_path)
-    with pytest.raises(ConfigError, match="prompt 'foggy' needs a painter"):
-        replace(request, is_painted=False)
-
-
-def test_a_path_is_painted_with_the_previous_image_mixed_in(store, run, parameters, tmp_path):
-    plain = RenderRequest(
-        trajectory=parse_trajectory("lateral:1"),
-        frames=slice(0, 3),
-        is_painted=True,
-        observation=parameters.observation,
-        conditions=parameters.conditions,
-    )
-    mixed = replace(plain, sequence=SequenceConfig(previous="mixed"))
-    for name, request in (("plain", plain), ("mixed", mixed)):
-        render.fn(parameters.run_spec(store.root), run.final, request, tmp_path / name)
-    same = [
-        (tmp_path / "plain" / name).read_bytes() == (tmp_path / "mixed" / name).read_bytes()
-        for name in ("0000.png", "0001.png", "0002.png")
-    ]
-    assert same == [True, False, False]
-    with pytest.raises(ConfigError, match="--previous needs a painter"):
-        replace(mixed, is_painted=False)
-
-
-def test_recorded_images_exist_only_where_somebody_stood(parameters):
-    view = RenderRequest(
-        trajectory=parse_trajectory("lateral:2"),
-        observation=parameters.observation,
-        conditions=parameters.conditions,
-    )
-    with pytest.raises(ConfigError, match="on the recorded trajectory"):
-        StylizeRequest(prompt="foggy", view=view, images="recorded")
-    with pytest.raises(ConfigError, match="no images 'drawn'"):
-        StylizeRequest(prompt="foggy", view=view, images="drawn")
-    with pytest.raises(ConfigError, match="no style 'snow'"):
-        StylizeRequest(prompt="snow", view=view)
-
-
-def test_an_unknown_camera_is_named_before_anything_is_drawn(store, run, parameters, tmp_path):
-    request = RenderRequest(
-        trajectory=parse_trajectory("recorded"),
-        camera="back",
-        observation=parameters.observation,
-        conditions=parameters.conditions,
-    )
-    with pytest.raises(SceneError, match="saw no camera 'back', it saw front"):
-        render.fn(parameters.run_spec(store.root), run.final, request, tmp_path)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_damaged_input_is_found_and_not_used(store, parameters, stages):

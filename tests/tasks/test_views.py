@@ -1,0 +1,114 @@
+"""A finished run, shown where nobody drove: as it is, painted, and in another weather."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import pytest
+
+from lidarpainter_models.conditioning.settings import SequenceConfig
+from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+from tasks.views.render import RenderRequest, render
+from tasks.views.stylize import StylizeRequest, stylize
+
+
+@pytest.mark.parametrize("is_painted", [False, True])
+def test_a_run_is_rendered_where_nobody_drove(store, run, parameters, tmp_path, is_painted):
+    request = RenderRequest(
+        trajectory=parse_trajectory("lane-change:2+up:0.5"),
+        frames=slice(1, 3),
+        is_painted=is_painted,
+        observation=parameters.observation,
+        conditions=parameters.conditions,
+    )
+    made = render.fn(parameters.run_spec(store.root), run.final, request, tmp_path)
+    assert made["num_images"] == 2
+    described = json.loads((tmp_path / "trajectory.json").read_text())
+    assert [row["file"] for row in described["images"]] == ["0001.png", "0002.png"]
+    first, last = (row["world_from_camera"] for row in described["images"])
+    assert last[7] - first[7] == pytest.approx(2.0, abs=0.2)  # y is to the left
+
+
+@pytest.mark.parametrize("images", ["rendered", "recorded"])
+def test_a_run_is_shown_in_fog_beside_the_clear_images(store, run, parameters, tmp_path, images):
+    view = RenderRequest(
+        trajectory=parse_trajectory("recorded"),
+        frames=slice(1, 3),
+        observation=parameters.observation,
+        conditions=parameters.conditions,
+    )
+    request = StylizeRequest(prompt="foggy", view=view, images=images)
+    made = stylize.fn(parameters.run_spec(store.root), run.final, request, tmp_path / "a")
+    assert made["num_images"] == 2
+    assert 0.5 < made["edge_f1"] <= 1
+    described = json.loads((tmp_path / "a" / "trajectory.json").read_text())
+    assert (described["prompt"], len(described["images"])) == ("foggy", 2)
+    foggy, clear = (
+        cv2.imread(str(tmp_path / "a" / name)) for name in ("0001.png", "clear/0001.png")
+    )
+    assert float(foggy.std()) < float(clear.std())
+    stylize.fn(parameters.run_spec(store.root), run.final, request, tmp_path / "b")
+    again = (tmp_path / "b" / "0001.png").read_bytes()
+    assert again == (tmp_path / "a" / "0001.png").read_bytes()
+
+
+def test_a_painter_is_asked_for_the_prompt(store, run, parameters, tmp_path):
+    request = RenderRequest(
+        trajectory=parse_trajectory("recorded"),
+        frames=slice(1, 2),
+        is_painted=True,
+        prompt="foggy",
+        observation=parameters.observation,
+        conditions=parameters.conditions,
+    )
+    with pytest.raises(ConfigError, match="knows no prompt 'foggy', only: clear"):
+        render.fn(parameters.run_spec(store.root, painter="nano"), run.final, request, tmp_path)
+    with pytest.raises(ConfigError, match="prompt 'foggy' needs a painter"):
+        replace(request, is_painted=False)
+
+
+def test_a_path_is_painted_with_the_previous_image_mixed_in(store, run, parameters, tmp_path):
+    plain = RenderRequest(
+        trajectory=parse_trajectory("lateral:1"),
+        frames=slice(0, 3),
+        is_painted=True,
+        observation=parameters.observation,
+        conditions=parameters.conditions,
+    )
+    mixed = replace(plain, sequence=SequenceConfig(previous="mixed"))
+    for name, request in (("plain", plain), ("mixed", mixed)):
+        render.fn(parameters.run_spec(store.root), run.final, request, tmp_path / name)
+    same = [
+        (tmp_path / "plain" / name).read_bytes() == (tmp_path / "mixed" / name).read_bytes()
+        for name in ("0000.png", "0001.png", "0002.png")
+    ]
+    assert same == [True, False, False]
+    with pytest.raises(ConfigError, match="--previous needs a painter"):
+        replace(mixed, is_painted=False)
+
+
+def test_recorded_images_exist_only_where_somebody_stood(parameters):
+    view = RenderRequest(
+        trajectory=parse_trajectory("lateral:2"),
+        observation=parameters.observation,
+        conditions=parameters.conditions,
+    )
+    with pytest.raises(ConfigError, match="on the recorded trajectory"):
+        StylizeRequest(prompt="foggy", view=view, images="recorded")
+    with pytest.raises(ConfigError, match="no images 'drawn'"):
+        StylizeRequest(prompt="foggy", view=view, images="drawn")
+    with pytest.raises(ConfigError, match="no style 'snow'"):
+        StylizeRequest(prompt="snow", view=view)
+
+
+def test_an_unknown_camera_is_named_before_anything_is_drawn(store, run, parameters, tmp_path):
+    request = RenderRequest(
+        trajectory=parse_trajectory("recorded"),
+        camera="back",
+        observation=parameters.observation,
+        conditions=parameters.conditions,
+    )
+    with pytest.raises(SceneError, match="saw no camera 'back', it saw front"):
+        render.fn(parameters.run_spec(store.root), run.final, request, tmp_path)
+    assert list(tmp_path.iterdir()) == []
