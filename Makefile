@@ -10,7 +10,7 @@ SYSTEM := $(VENV)/.system-libraries
 export OMP_WAIT_POLICY := passive
 export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba-cache
 
-.PHONY: demo test lint nightly bench clean
+.PHONY: demo test lint nightly bench gpu-check clean
 
 demo: $(INSTALLED) $(SYSTEM)
 	$(BIN)/lidarpainter demo --out demo
@@ -29,7 +29,11 @@ lint: $(INSTALLED) $(SYSTEM)
 	$(BIN)/mypy
 
 bench: $(INSTALLED)
-	$(BIN)/python tests/benchmarks/suite.py
+	PYTHONPATH=tests/support $(BIN)/python tests/benchmarks/suite.py
+
+# five minutes on a machine with a GPU: agreement with the CPU, speed, memory; gpu-check.md
+gpu-check: $(INSTALLED) $(SYSTEM)
+	$(BIN)/python tests/benchmarks/gpu_check.py --out gpu-check.md
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

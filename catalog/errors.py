@@ -64,13 +64,13 @@ def storage_errors(doing: str) -> Iterator[None]:
     except StorageError:
         raise
     except Exception as error:
-        code = _disk_error(error)
+        code = disk_error(error)
         if code is None:
             raise
         raise StorageError(f"{doing}: {REASONS[code]}") from error
 
 
-def _disk_error(error: BaseException) -> int | None:
+def disk_error(error: BaseException) -> int | None:
     """The errno of the failing disk behind an error or its causes, or None."""
     seen: BaseException | None = error
     while seen is not None:

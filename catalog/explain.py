@@ -69,7 +69,9 @@ class Explainer:
         others = [
             other
             for other in self._store.tables.rows("runs")
-            if other["scene_id"] == row["scene_id"] and other["status"] == "complete"
+            if other["scene_id"] == row["scene_id"]
+            and other["status"] == "complete"
+            and other["derived_from"] == row["derived_from"]
         ]
         newest = max(others, key=lambda other: other["finished_at"], default=row)
         settings = _changes(json_of(row, "parameters"), json_of(newest, "parameters"))
@@ -80,6 +82,8 @@ class Explainer:
                 "started_at": row["started_at"].isoformat(),
                 "settings": json_of(row, "parameters"),
                 "code": row["source_digest"],
+                "derived_from": row["derived_from"],
+                "change": json_of(row, "change") if row["change"] else None,
             },
             stale=tuple(f"{name} is stale" for name, one in made.items() if one.stale),
             newest=None

@@ -67,6 +67,8 @@ class RunRecord:
     artefacts: tuple[str, ...] = ()
     result: str | None = None
     report: str | None = None
+    derived_from: str | None = None
+    change: str | None = None
 
     def row(self) -> dict[str, Any]:
         """The row."""

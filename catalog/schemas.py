@@ -87,7 +87,7 @@ SCENES = TableSchema(
 
 RUNS = TableSchema(
     "runs",
-    "Reconstructions: one row for one scene content, parameters and code.",
+    "Reconstructions, and runs derived from them: one row for one input, parameters and code.",
     (
         Column("run_id", "text", "digest of scene content, parameters and code"),
         Column("scene_id", "text", "dataset/sequence"),
@@ -106,10 +106,12 @@ RUNS = TableSchema(
         Column("device", "text", "what the fit ran on"),
         Column("host", "text", "machine it ran on"),
         Column("artefacts", "texts", "kind/digest of everything it made or reused"),
-        Column("result", "text", "what `reconstruct --json` printed, JSON"),
+        Column("result", "text", "what the command that made it printed, JSON"),
         Column("report", "text", "file of the report, from the folder of the store"),
         Column("software_version", "text", "version of lidarpainter"),
         Column("source_digest", "text", "digest of the code of its stages"),
+        Column("derived_from", "text", "run that it was changed from, or null"),
+        Column("change", "text", "what was changed (kind, parameters), JSON, or null"),
     ),
 )
 
@@ -161,6 +163,70 @@ PAINTERS = TableSchema(
     ),
 )
 
+SEQUENCES = TableSchema(
+    "sequences",
+    "What each fleet was asked for, and where it stands: one row for one scene and its cameras.",
+    (
+        Column("sequence_id", "text", "digest of the fleet, the scene and the cameras"),
+        Column("fleet", "text", "name of the manifest"),
+        Column("scene_id", "text", "dataset/sequence"),
+        Column("cameras", "texts", "cameras to train on; null: all"),
+        Column("position", "integer", "place in the manifest, from 0"),
+        Column("priority", "integer", "higher ones go first"),
+        Column("variants", "texts", "styles that are wanted of it"),
+        Column("asked", "text", "source, preset, painter and settings, JSON"),
+        Column("asked_digest", "text", "digest of that and of the weights"),
+        Column("code_digest", "text", "digest of the code of its stages when it was asked for"),
+        Column("budget", "text", "what a worker may take for it, JSON"),
+        Column(
+            "state",
+            "text",
+            "waiting, done, set-aside or failed; running is waiting with a live lease",
+        ),
+        Column("cause", "text", "of the last attempt; see attempts"),
+        Column("reason", "text", "one line about the cause, where it is not done"),
+        Column("run_id", "text", "the run that it became"),
+        Column("tries", "integer", "attempts that failed and count, since it was asked for"),
+        Column("attempts", "integer", "all attempts"),
+        Column("seconds", "number", "wall time of all attempts", "s"),
+        Column("not_before", "time", "earliest time of the next attempt"),
+        Column("asked_at", "time", "when it was asked for"),
+        Column("changed_at", "time", "when this row was written"),
+        Column("fence", "integer", "number of this writing; a lower one is refused"),
+    ),
+)
+
+ATTEMPTS = TableSchema(
+    "attempts",
+    "Every time that a worker took a sequence of a fleet into its hands.",
+    (
+        Column("attempt_id", "text", "sequence_id and fencing number of the lease"),
+        Column("sequence_id", "text", "the sequence"),
+        Column("fleet", "text", "name of the manifest"),
+        Column("scene_id", "text", "dataset/sequence"),
+        Column("run_id", "text", "the run that it became"),
+        Column("worker", "text", "machine and process"),
+        Column("started_at", "time", "when the lease was taken"),
+        Column("ended_at", "time", "when the end was entered, or the last sign of life"),
+        Column("seconds", "number", "wall time", "s"),
+        Column("cpu_seconds", "number", "CPU time of all threads", "s"),
+        Column("peak_memory_bytes", "integer", "largest resident memory", "byte"),
+        Column("num_bytes", "integer", "size of what it made", "byte"),
+        Column(
+            "cause",
+            "text",
+            "why it ended: done, bad-input, disk-full, killed, memory, timeout, system, error, "
+            "interrupted, cancelled or superseded",
+        ),
+        Column("reason", "text", "one line about the cause"),
+        Column("effort", "text", "what its cost grows with, JSON; null where it was recalled"),
+        Column("predicted_seconds", "number", "what the planner said before", "s"),
+        Column("predicted_memory_bytes", "integer", "likewise", "byte"),
+        Column("predicted_num_bytes", "integer", "likewise", "byte"),
+        Column("software_version", "text", "version of lidarpainter"),
+    ),
+)
+
 TABLES: dict[str, TableSchema] = {
-    table.name: table for table in (SCENES, RUNS, ARTEFACTS, METRICS, PAINTERS)
+    table.name: table for table in (SCENES, RUNS, ARTEFACTS, METRICS, PAINTERS, SEQUENCES, ATTEMPTS)
 }

@@ -5,15 +5,20 @@ again, a bounded number of times with growing, jittered pauses. The root is a fo
 as `s3://bucket/store`.
 """
 
+import errno
+import os
 import random
+import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 from deltalake import DeltaTable, Field
 from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
+from deltalake.table import TableMerger
 
 from catalog.errors import (
     ConflictError,
@@ -26,6 +31,11 @@ from catalog.schemas import TABLES, TableSchema
 COMMIT_ATTEMPTS = 25
 FIRST_PAUSE_S = 0.05
 LONGEST_PAUSE_S = 2.0
+MOST_FILES = 24
+"""Of a table, before they are written together: each merge and each query opens all of them."""
+
+LEAST_ROOM_BYTES = 4 << 20
+"""Below this a disk counts as full: more than any commit takes."""
 
 Row = dict[str, Any]
 
@@ -36,6 +46,15 @@ class CatalogTables:
     def __init__(self, root: str, *, storage_options: Mapping[str, str] | None = None) -> None:
         self.root = root.rstrip("/")
         self.storage_options = dict(storage_options or {})
+        self._handles: dict[str, DeltaTable] | None = None
+
+    def keep_open(self) -> None:
+        """From now on read only what is new in the logs of tables: for who asks again and again.
+
+        Not for a process that ends as an interpreter does: threads behind an open table may abort
+        it then, so commands leave otherwise (see `flows.interruption.leave`).
+        """
+        self._handles = self._handles or {}
 
     def merge(self, table: str, rows: Sequence[Row]) -> None:
         """Insert rows, or replace those with the same id; all of them or none.
@@ -45,11 +64,21 @@ class CatalogTables:
             ConflictError: other writers won every attempt.
             StorageError: the table cannot be written.
         """
-        if not rows:
-            return
-        schema = _schema(table)
-        source = _as_arrow(schema, rows)
-        self._committed(schema, lambda: self._try_merge(schema, source))
+        self._merged(
+            table, rows, lambda one: one.when_matched_update_all().when_not_matched_insert_all()
+        )
+
+    def add_absent(self, table: str, rows: Sequence[Row]) -> int:
+        """Insert rows whose id is not there; returns how many. Raises what `merge` raises."""
+        return self._merged(table, rows, lambda one: one.when_not_matched_insert_all())
+
+    def replace_older(self, table: str, rows: Sequence[Row], column: str) -> int:
+        """Replace rows by those with a higher number in a column; returns how many were.
+
+        None is inserted: what was deleted meanwhile stays so. Raises what `merge` raises.
+        """
+        newer = f"source.{column} > target.{column}"
+        return self._merged(table, rows, lambda one: one.when_matched_update_all(predicate=newer))
 
     def delete(self, table: str, column: str, values: Sequence[str]) -> None:
         """Remove the rows with one of these values in a column.
@@ -63,18 +92,41 @@ class CatalogTables:
         if values and self.arrow(table).num_rows:
             self._committed(schema, lambda: self._try_delete(schema, f"{column} IN ({quoted})"))
 
-    def _committed(self, schema: TableSchema, attempted: Callable[[], bool]) -> None:
-        """Attempt a commit until it wins, a bounded number of times."""
+    def _merged(
+        self, table: str, rows: Sequence[Row], rule: Callable[[TableMerger], TableMerger]
+    ) -> int:
+        """Merge rows by a rule in one commit; returns how many were inserted or replaced."""
+        if not rows:
+            return 0
+        schema = _schema(table)
+        source = _as_arrow(schema, rows)
+        return self._committed(schema, lambda: self._try_merge(schema, source, rule))
+
+    def _committed(self, schema: TableSchema, attempted: Callable[[], int | None]) -> int:
+        """Attempt a commit until it wins, a bounded number of times; None is a lost attempt."""
         with _damage(f"cannot write table {self._uri(schema)}"):
+            self._require_room()
             for attempt in range(COMMIT_ATTEMPTS):
                 if attempt:
                     pause_s = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2**attempt)
                     time.sleep(pause_s * random.random())  # noqa: S311 - jitter, not a secret
-                if attempted():
-                    return
+                if (changed := attempted()) is not None:
+                    return changed
         raise ConflictError(
             f"table {self._uri(schema)} had other writers in {COMMIT_ATTEMPTS} attempts"
         )
+
+    def _require_room(self) -> None:
+        """Refuse to begin a commit that the disk would not take: Delta's writer may never return.
+
+        Raises:
+            OSError: less is free than `LEAST_ROOM_BYTES`.
+        """
+        folder = Path(self.root)
+        if "://" in self.root or not folder.is_dir():
+            return
+        if shutil.disk_usage(folder).free < LEAST_ROOM_BYTES:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def rows(self, table: str) -> list[Row]:
         """All rows of a table, by id; none if nothing was ever written."""
@@ -86,7 +138,7 @@ class CatalogTables:
         schema = _schema(table)
         with _damage(f"cannot read table {self._uri(schema)}"):
             try:
-                found = DeltaTable(self._uri(schema), storage_options=self.storage_options)
+                found = self._current(schema)
             except TableNotFoundError:
                 return schema.arrow.empty_table()
             # pyarrow's threads may outlive the read and abort the interpreter as it ends
@@ -101,8 +153,9 @@ class CatalogTables:
 
     def find(self, table: str, row_id: str) -> Row | None:
         """The row with exactly this id, or None."""
-        key = _schema(table).key
-        return next((row for row in self.rows(table) if row[key] == row_id), None)
+        arrow = self.arrow(table)
+        ids = arrow[_schema(table).key].to_pylist()
+        return arrow.slice(ids.index(row_id), 1).to_pylist()[0] if row_id in ids else None
 
     def row(self, table: str, id_or_prefix: str) -> Row:
         """The one row with this id, or whose id starts with it.
@@ -124,16 +177,17 @@ class CatalogTables:
     def _uri(self, schema: TableSchema) -> str:
         return f"{self.root}/{schema.name}"
 
-    def _try_delete(self, schema: TableSchema, predicate: str) -> bool:
-        """One commit; whether it won."""
+    def _try_delete(self, schema: TableSchema, predicate: str) -> int | None:
+        """One commit; how many rows went, or None if it lost."""
         try:
-            DeltaTable(self._uri(schema), storage_options=self.storage_options).delete(predicate)
+            return int(self._current(schema).delete(predicate)["num_deleted_rows"] or 0)
         except CommitFailedError:
-            return False
-        return True
+            return None
 
-    def _try_merge(self, schema: TableSchema, source: pa.Table) -> bool:
-        """One commit; whether it won."""
+    def _try_merge(
+        self, schema: TableSchema, source: pa.Table, rule: Callable[[TableMerger], TableMerger]
+    ) -> int | None:
+        """One commit; how many rows it inserted or replaced, or None if it lost."""
         key = schema.key
         try:
             target = self._opened(schema)
@@ -143,30 +197,57 @@ class CatalogTables:
                 source_alias="source",
                 target_alias="target",
             )
-            merger.when_matched_update_all().when_not_matched_insert_all().execute()
+            counts = rule(merger).execute()
         except CommitFailedError:
-            return False
+            return None
         except DeltaError as error:
             if "version already exists" in str(error).lower():  # lost the race to create it
-                return False
+                return None
             raise
-        return True
+        if len(target.file_uris()) > MOST_FILES:
+            with suppress(CommitFailedError):  # whoever won may do it
+                target.optimize.compact()
+        return int(counts["num_target_rows_inserted"]) + int(counts["num_target_rows_updated"])
 
     def _opened(self, schema: TableSchema) -> DeltaTable:
         """The table, made if absent and given the columns that newer software added."""
-        table = DeltaTable.create(
-            self._uri(schema),
-            schema=schema.arrow,
-            mode="ignore",
-            name=schema.name,
-            description=schema.description,
-            storage_options=self.storage_options,
-        )
+        try:
+            table = self._current(schema)
+        except TableNotFoundError:
+            DeltaTable.create(
+                self._uri(schema),
+                schema=schema.arrow,
+                mode="ignore",
+                name=schema.name,
+                description=schema.description,
+                storage_options=self.storage_options,
+            )
+            table = self._current(schema)
         known = {field.name for field in table.schema().fields}
         if missing := [column for column in schema.columns if column.name not in known]:
             table.alter.add_columns([Field.from_arrow(column.arrow) for column in missing])
-            table = DeltaTable(self._uri(schema), storage_options=self.storage_options)
+            if self._handles is not None:
+                del self._handles[schema.name]
+            table = self._current(schema)
         return table
+
+    def _current(self, schema: TableSchema) -> DeltaTable:
+        """The table as it is now.
+
+        Raises:
+            TableNotFoundError: nothing was ever written.
+        """
+        handles = {} if self._handles is None else self._handles
+        known = handles.pop(schema.name, None)
+        if known is not None:
+            with suppress(DeltaError):  # its folder may be another one by now
+                known.update_incremental()
+                handles[schema.name] = known
+                return known
+        found = handles[schema.name] = DeltaTable(
+            self._uri(schema), storage_options=self.storage_options
+        )
+        return found
 
 
 @contextmanager

@@ -70,8 +70,10 @@ def evaluate_run(store: Store, request: EvaluationRequest) -> dict[str, Any]:
 def _variants(
     store: Store, finished: FinishedRun, parameters: ViewParameters, request: EvaluationRequest
 ) -> dict[str, Scores]:
-    judged: dict[str, FittedRef] = {"unpainted": finished.unpainted}
-    if finished.final != finished.unpainted:
+    judged: dict[str, FittedRef] = {}
+    if finished.derived_from is None:
+        judged["unpainted"] = finished.unpainted
+    if finished.derived_from is not None or finished.final != finished.unpainted:
         judged[fitted_on(parameters.painter)] = finished.final
     if request.is_painted or request.painter:
         judged["view-time"] = finished.final

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from lidarpainter_models.devices import Device
+from lidarpainter_models.devices import check_device
 from lidarpainter_models.evaluation.held_back import FIRST_TRAINING_SEED
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
@@ -50,7 +50,7 @@ class TrainPainterParameters(HarvestParameters):
     training: PainterTraining = NanoTrainingConfig()
     lpips: LpipsFiles = LpipsFiles()
     """Weights for the loss of the one-step painter."""
-    device: Device = "auto"
+    device: str = "auto"
     """Where the one-step painter is trained, and what is trained is judged."""
     processes: int = 1
     """In which the one-step painter is trained, each on a GPU of its own."""
@@ -58,3 +58,5 @@ class TrainPainterParameters(HarvestParameters):
     """Share of the true images that are kept from training: the validation split."""
     feature_weights: Path | None = None
     """SqueezeNet 1.1 weights for the feature distance; None leaves it out."""
+
+    _known_device = field_validator("device")(check_device)

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from lidarpainter_models.conditioning.settings import ConditionConfig, NovelGuidanceConfig
-from lidarpainter_models.devices import Device
+from lidarpainter_models.devices import KernelChoice, check_device
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.score_tables import fitted_on
 from lidarpainter_models.evaluation.settings import JudgeConfig, ScoringConfig
@@ -33,8 +33,10 @@ class ViewParameters(BaseModel):
     painter: str
     """Name of a painter, path of its weights or model, or `none`: then the fit goes on as long
     without painted views, which is the control for the painted one."""
-    device: Device = "auto"
-    """What the painter runs on; `auto` takes the GPU if there is one."""
+    device: str = "auto"
+    """Where fits, painters and judges run: `cpu`, `cuda`, `cuda:1`; `auto` takes a GPU if any."""
+    kernels: KernelChoice = "auto"
+    """`torch` takes plain torch for all but the rasteriser, as a GPU does, to be tried on a CPU."""
     conditions: ConditionConfig
     scoring: ScoringConfig
     feature_weights: Path | None = None
@@ -65,7 +67,10 @@ class ViewParameters(BaseModel):
             split=self.split_spec,
             painter=painter or self.painter,
             device=self.device,
+            kernels=self.kernels,
         )
+
+    _known_device = field_validator("device")(check_device)
 
 
 class ReconstructParameters(ViewParameters):

@@ -40,7 +40,12 @@ def recalled(parameters: ReconstructParameters, store_path: Path) -> dict[str, A
         WeightsError: the painter or the weights of a perceptual distance cannot be used.
     """
     store = open_store(store_path)
-    row = store.tables.find("runs", run_identity(parameters, store))
+    return recalled_run(store, run_identity(parameters, store))
+
+
+def recalled_run(store: Store, run_id: str) -> dict[str, Any] | None:
+    """The result of a run if it is complete and all that it made is there, else None."""
+    row = store.tables.find("runs", run_id)
     if row is None or row["status"] != "complete":
         return None
     made = [ArtefactRef.of_id(artefact_id) for artefact_id in row["artefacts"]]

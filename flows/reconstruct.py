@@ -1,10 +1,7 @@
 """One sequence, from stored scene to a fitted, painted, judged and reported one."""
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +9,11 @@ from prefect import flow
 
 from catalog.records import RunRecord
 from catalog.store import Store, open_store
-from flows.interruption import at_interruption
 from flows.overrides import with_overrides
 from flows.parameters import ReconstructParameters
 from flows.presets import preset as preset_named
 from flows.recall import START, located, recalled, run_identity
+from flows.run_ends import early_end_recorded
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.score_tables import Scores, fitted_on
 from lidarpainter_models.export.run_page import GUIDANCE_COLUMNS
@@ -28,7 +25,7 @@ from tasks.opened import opened
 from tasks.reconstruction.fit import fit
 from tasks.reconstruction.paint import paint
 from tasks.reconstruction.prepare import prepare
-from tasks.reconstruction.publish import begin_run, complete_run, end_run
+from tasks.reconstruction.publish import begin_run, complete_run
 from tasks.reconstruction.report import REPORT_FILE, ReportInputs, write_report
 from tasks.source import code_behind
 from tasks.specs import FittedRef, RunSpec
@@ -225,15 +222,3 @@ def _result(course: Course, scores: dict[str, Scores], final: FittedRef) -> dict
         "artefacts": {name: stage.ref.artefact_id for name, stage in stages.items()},
         "report": None,
     }
-
-
-@contextmanager
-def early_end_recorded(store_path: Path, record: RunRecord) -> Iterator[None]:
-    """Enter into the catalog that a run failed or was interrupted, and let the error go on."""
-    interrupted = partial(end_run.fn, store_path, record, "interrupted", None)  # asks no server
-    with at_interruption(interrupted):
-        try:
-            yield
-        except Exception as error:
-            end_run(store_path, record, "failed", f"{type(error).__name__}: {error}")
-            raise

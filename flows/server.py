@@ -10,11 +10,13 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from catalog.locks import held_lock
+from flows.children import start_child
 
 STARTUP_TIMEOUT_S = 120.0
 STOP_TIMEOUT_S = 5.0
@@ -34,16 +36,6 @@ SERVICES = (
     "TRIGGERS",
 )
 """Of the server, for schedules, workers and its web page: one command has none of them."""
-# prctl(PR_SET_PDEATHSIG): the kernel ends the server when its parent dies, even of SIGKILL
-LAUNCHER = """
-import ctypes, os, signal, sys
-parent = int(sys.argv[1])
-if sys.platform == "linux":
-    ctypes.CDLL(None).prctl(1, signal.SIGTERM)
-    if os.getppid() != parent:
-        sys.exit(1)
-os.execv(sys.executable, [sys.executable, "-m", "uvicorn", *sys.argv[2:]])
-"""
 
 
 @contextmanager
@@ -59,6 +51,7 @@ def prefect_server(log_path: Path) -> Iterator[None]:
     from prefect.settings import (
         PREFECT_API_URL,
         PREFECT_FLOWS_HEARTBEAT_FREQUENCY,
+        PREFECT_HOME,
         PREFECT_LOGGING_TO_API_ENABLED,
         temporary_settings,
     )
@@ -66,12 +59,11 @@ def prefect_server(log_path: Path) -> Iterator[None]:
     if PREFECT_API_URL.value():
         yield
         return
-    port = _free_port()
     log_path.parent.mkdir(parents=True, exist_ok=True)
-    with log_path.open("ab") as log:
-        process = _start(port, log.fileno())
+    # two that make Prefect's database at once would break each other's tables
+    with held_lock(PREFECT_HOME.value() / "lidarpainter-start.lock"):
+        process, port = _started(log_path)
     try:
-        _wait_until_healthy(process, port, log_path)
         # logs are sent in the background, perhaps after the server is gone
         own = {
             PREFECT_API_URL: f"http://127.0.0.1:{port}/api",
@@ -87,6 +79,20 @@ def prefect_server(log_path: Path) -> Iterator[None]:
         raise
     finally:
         _stop(process)
+
+
+def _started(log_path: Path) -> tuple[subprocess.Popen[bytes], int]:
+    """A server that answers, and at which port."""
+    port = _free_port()
+    with log_path.open("ab") as log:
+        process = _start(port, log.fileno())
+    try:
+        _wait_until_healthy(process, port, log_path)
+    except BaseException:
+        process.kill()
+        process.wait()
+        raise
+    return process, port
 
 
 def _free_port() -> int:
@@ -105,14 +111,7 @@ def _start(port: int, log: int) -> subprocess.Popen[bytes]:
         "PREFECT__SERVER_FINAL": "1",
         **{f"PREFECT_SERVER_SERVICES_{name}_ENABLED": "false" for name in SERVICES},
     }
-    return subprocess.Popen(  # noqa: S603 - our own interpreter and arguments
-        [sys.executable, "-c", LAUNCHER, str(os.getpid()), *arguments],
-        stdin=subprocess.DEVNULL,
-        stdout=log,
-        stderr=log,
-        env=environment,
-        start_new_session=True,  # Ctrl-C is for the flow, which talks to the server on its way out
-    )
+    return start_child(["-m", "uvicorn", *arguments], log=log, environment=environment)
 
 
 def _wait_until_healthy(process: subprocess.Popen[bytes], port: int, log_path: Path) -> None:

@@ -2,15 +2,19 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from catalog.store import Store
 from flows.parameters import view_parameters
 from lidarpainter_models.conditioning.settings import SequenceConfig
+from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
 from lidarpainter_models.observations.fit_size import require_recorded_width
+from lidarpainter_models.weather.mix import StyleMix
 from tasks.opened import open_scene
-from tasks.runs import open_run
+from tasks.runs import FinishedRun, open_run
+from tasks.specs import FittedRef
+from tasks.views.files import ViewKinds
 from tasks.views.render import RenderRequest, render
 from tasks.views.stylize import Images, StylizeRequest, stylize
 
@@ -28,6 +32,12 @@ class PathRequest:
     """Whether a painter paints every image."""
     painter: str | None = None
     """Who; None takes the run's own."""
+    allows_collisions: bool = False
+    """Whether the camera may go through walls."""
+    width_px: int | None = None
+    """Of the images, at most as recorded; None takes that of the fit."""
+    beside: str | None = None
+    """What is shown to the left: `recorded`, `unpainted`, or another run of the same scene."""
 
 
 def render_run(
@@ -37,6 +47,7 @@ def render_run(
     *,
     prompt: str,
     sequence: SequenceConfig,
+    kinds: ViewKinds,
 ) -> dict[str, Any]:
     """Render a finished run where nobody drove.
 
@@ -46,20 +57,12 @@ def render_run(
         out: folder for the images.
         prompt: what a painter that was trained for styles is asked for.
         sequence: what becomes of the image painted before.
+        kinds: which files are written.
     """
     finished = open_run(store, path.run)
-    parameters = view_parameters(finished)
-    run = parameters.run_spec(store.root, painter=path.painter)
-    request = RenderRequest(
-        trajectory=path.trajectory,
-        camera=path.camera,
-        frames=path.frames,
-        is_painted=path.is_painted,
-        prompt=prompt,
-        sequence=sequence,
-        observation=parameters.observation,
-        conditions=parameters.conditions,
-    )
+    run = view_parameters(finished).run_spec(store.root, painter=path.painter)
+    request = render_request(store, finished, path, kinds)
+    request = replace(request, prompt=prompt, sequence=sequence)
     made = render.fn(run, finished.final, request, out)
     return {
         "run_id": finished.run_id,
@@ -72,12 +75,56 @@ def render_run(
     }
 
 
+def render_request(
+    store: Store, finished: FinishedRun, path: PathRequest, kinds: ViewKinds
+) -> RenderRequest:
+    """What the stage is asked for.
+
+    Raises:
+        ConfigError: images wider than recorded, or a run beside that shows another scene.
+    """
+    parameters = view_parameters(finished)
+    observation = parameters.observation
+    if path.width_px is not None:
+        observation = replace(observation, width_px=path.width_px)
+        views = open_scene(store, finished.scene_id).views
+        require_recorded_width(path.width_px, views, "--width")
+    return RenderRequest(
+        trajectory=path.trajectory,
+        camera=path.camera,
+        frames=path.frames,
+        is_painted=path.is_painted,
+        observation=observation,
+        conditions=parameters.conditions,
+        allows_collisions=path.allows_collisions,
+        kinds=kinds,
+        beside=_beside(store, finished, path.beside),
+    )
+
+
+def _beside(
+    store: Store, finished: FinishedRun, beside: str | None
+) -> Literal["recorded", "unpainted"] | FittedRef | None:
+    if beside is None:
+        return None
+    if beside == "recorded":
+        return "recorded"
+    if beside == "unpainted":
+        return "unpainted"
+    other = open_run(store, beside)
+    if other.scene_id != finished.scene_id:
+        raise ConfigError(
+            f"--beside {beside}: shows {other.scene_id}, expected a run of {finished.scene_id}"
+        )
+    return other.final
+
+
 def stylize_run(
     store: Store,
     path: PathRequest,
     out: Path,
     *,
-    prompt: str,
+    mix: StyleMix,
     images: Images,
     width_px: int | None,
     seed: int,
@@ -88,13 +135,13 @@ def stylize_run(
         store: where the run is.
         path: where to look from.
         out: folder for the images.
-        prompt: the style.
+        mix: the styles.
         images: whether renders are styled, or what the camera recorded.
         width_px: of the images, at most as recorded; None takes that of the fit.
         seed: decides lit windows, drops and noise.
 
     Raises:
-        ConfigError: no such style, or images wider than recorded.
+        ConfigError: images wider than recorded.
     """
     finished = open_run(store, path.run)
     parameters = view_parameters(finished)
@@ -110,14 +157,15 @@ def stylize_run(
         is_painted=path.is_painted,
         observation=observation,
         conditions=parameters.conditions,
+        allows_collisions=path.allows_collisions,
     )
-    request = StylizeRequest(prompt=prompt, view=view, images=images, seed=seed)
+    request = StylizeRequest(mix=mix, view=view, images=images, seed=seed)
     run = parameters.run_spec(store.root, painter=path.painter)
     made = stylize.fn(run, finished.final, request, out)
     return {
         "run_id": finished.run_id,
         "scene": finished.scene_id,
-        "prompt": prompt,
+        "prompt": mix.text,
         "trajectory": path.trajectory.spec,
         **made,
     }

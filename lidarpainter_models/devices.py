@@ -1,26 +1,77 @@
-"""Which device does the work."""
+"""Which device does the work, and how; names alone are read without torch."""
 
-from typing import TYPE_CHECKING, Literal, get_args
+import re
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Literal, TypeVar
 
-from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.errors import ConfigError, DeviceMemoryError
 
 if TYPE_CHECKING:
     import torch
 
-Device = Literal["auto", "cpu", "cuda"]
+Device = str
+"""`auto`, `cpu`, `cuda` or `cuda:N`; see `check_device`."""
+KernelChoice = Literal["auto", "torch"]
+"""What is fastest on a device, or plain torch for all but the rasteriser: the path of a GPU, which
+can be tried on a CPU."""
+Made = TypeVar("Made")
+_DEVICES = re.compile(r"auto|cpu|cuda(:\d+)?")
+
+
+def check_device(name: Device) -> Device:
+    """The name of a device, if it can be one.
+
+    Raises:
+        ConfigError: it cannot.
+    """
+    if not _DEVICES.fullmatch(name):
+        raise ConfigError(f"no device {name!r}, expected auto, cpu, cuda or cuda:N")
+    return name
 
 
 def chosen_device(name: Device) -> "torch.device":
-    """The device by name; `auto` takes the GPU if there is one.
+    """The device by name; `auto` takes the GPU if there is one, and `cuda` the current one.
 
     Raises:
         ConfigError: no such device, or none that works here.
     """
-    if name not in get_args(Device):
-        raise ConfigError(f"no device {name!r}, expected {', '.join(get_args(Device))}")
+    check_device(name)
     import torch  # whoever only names a device does without
 
     has_gpu = torch.cuda.is_available()
-    if name == "cuda" and not has_gpu:
-        raise ConfigError("device cuda: no CUDA device works here, expected cpu or auto")
-    return torch.device("cuda" if has_gpu and name != "cpu" else "cpu")
+    if name.startswith("cuda") and not has_gpu:
+        raise ConfigError(f"device {name}: no CUDA device works here, expected cpu or auto")
+    if name == "cpu" or not has_gpu:
+        return torch.device("cpu")
+    device = torch.device("cuda" if name == "auto" else name)
+    count = torch.cuda.device_count()
+    if device.index is None:  # a tensor's device has one, and is compared with this
+        return torch.device("cuda", torch.cuda.current_device())
+    if device.index >= count:
+        raise ConfigError(f"device {name}: expected cuda:0 to cuda:{count - 1}, which are here")
+    return device
+
+
+def within_memory(work: Callable[[bool], Made], device: "torch.device", what: str) -> Made:
+    """Do some work; where its device's memory runs out, once more and sparingly.
+
+    Args:
+        work: told whether to spare memory.
+        device: where it runs.
+        what: names the work in the error, with what takes less.
+
+    Raises:
+        DeviceMemoryError: even the second try did not fit.
+    """
+    import torch
+
+    try:
+        return work(False)
+    except torch.OutOfMemoryError:
+        pass  # what the work held is free only once its error is gone
+    if device.type == "cuda":
+        torch.cuda.empty_cache()
+    try:
+        return work(True)
+    except torch.OutOfMemoryError as error:
+        raise DeviceMemoryError(f"{device} has too little memory for {what}") from error

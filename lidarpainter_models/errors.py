@@ -52,6 +52,10 @@ class BackendError(LidarPainterError, RuntimeError):
     """A kernel backend was asked for that cannot run here."""
 
 
+class DeviceMemoryError(LidarPainterError, MemoryError):
+    """A device has too little memory, for a smaller plan too."""
+
+
 class MissingPackageError(LidarPainterError, ImportError):
     """A part of the package needs an extra that is not installed."""
 

@@ -20,6 +20,7 @@ REQUIRED = ("torch", "numpy", "scipy", "numba", "pyarrow", "zarr", "deltalake", 
 MIN_FREE_BYTES = 5_000_000_000
 """A reconstruction of a full sequence keeps a few GB of artefacts."""
 MIN_MEMORY_BYTES = 6_000_000_000
+_DRIVER = Path("/proc/driver/nvidia/version")
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,17 +38,18 @@ def check_environment(store_path: Path) -> list[Finding]:
     Args:
         store_path: folder of the store, which must be writable and have room.
     """
-    checks: list[Callable[[], Finding]] = [
+    packages: list[Callable[[], Finding]] = [
         _python,
         *(_package_check(name) for name in REQUIRED),
         _open3d,
         _numba,
-        _device,
-        _memory,
-        lambda: _disk(store_path),
-        _painter,
     ]
-    return [check() for check in checks]
+    rest: list[Callable[[], Finding]] = [_memory, lambda: _disk(store_path), _painter]
+    return [
+        *(check() for check in packages),
+        *gpu_findings(),
+        *(check() for check in rest),
+    ]
 
 
 def _python() -> Finding:
@@ -88,16 +90,50 @@ def _numba() -> Finding:
     return Finding("kernels", "ok" if is_right else "fail", detail)
 
 
-def _device() -> Finding:
+def gpu_findings() -> list[Finding]:
+    """What there is of a GPU, and what is missing to use it: driver, torch, rasterisers.
+
+    A machine without a GPU is fit; one whose GPU cannot be used is warned.
+    """
     torch = import_module("torch")
-    if not torch.cuda.is_available():
-        return Finding("device", "ok", "cpu (no CUDA device)")
-    name = torch.cuda.get_device_name()
+    driver = _driver()
+    works = torch.cuda.is_available()
+    findings = [Finding("gpu driver", "ok", driver or "none: the CPU does the work")]
+    if torch.version.cuda is None:
+        advice = "; its GPU needs torch's build for CUDA: https://pytorch.org/get-started"
+        detail = f"torch {torch.__version__} is built for the CPU{advice if driver else ''}"
+        findings.append(Finding("torch build", "warn" if driver else "ok", detail))
+    else:
+        findings.append(Finding("torch build", "ok", f"for CUDA {torch.version.cuda}"))
+    if not works:
+        is_odd = driver is not None and torch.version.cuda is not None
+        detail = "cpu (no CUDA device" + (": torch cannot use the driver's)" if is_odd else ")")
+        findings.append(Finding("device", "warn" if is_odd else "ok", detail))
+        return findings
+    findings.append(Finding("device", "ok", torch.cuda.get_device_name()))
+    return [*findings, _rasteriser()]
+
+
+def _driver() -> str | None:
+    """The NVIDIA driver as the kernel or its own program names it."""
     try:
-        gsplat = version("gsplat")
-    except PackageNotFoundError:
-        return Finding("device", "warn", f"{name}, but gsplat is absent: pip install '.[cuda]'")
-    return Finding("device", "ok", f"{name}, gsplat {gsplat}")
+        return _DRIVER.read_text("utf-8", "replace").splitlines()[0].strip()
+    except (OSError, IndexError):
+        found = shutil.which("nvidia-smi")
+        return f"{found} is here" if found else None
+
+
+def _rasteriser() -> Finding:
+    """Which rasteriser a GPU gets, and why not the ones before it."""
+    from lidarpainter_models.kernels.backends import FASTEST, why_missing
+
+    reasons: list[str] = []
+    for backend in FASTEST["cuda"]:
+        reason = why_missing("gaussian_raster", backend)
+        if reason is None:
+            return Finding("rasteriser", "ok", "; ".join([f"{backend} on the GPU", *reasons]))
+        reasons.append(f"not {backend}: {reason}")
+    return Finding("rasteriser", "warn", "; ".join([*reasons, "plain torch is far too slow"]))
 
 
 def _memory() -> Finding:

@@ -88,10 +88,13 @@ def _scene(folder: Path, _inode: int, _changed_ns: int) -> DrivingScene:
 
 @lru_cache(maxsize=1)
 def _opened(spec: RunSpec, scene: DrivingScene) -> OpenedRun:
+    device = chosen_device(spec.device)
+    if device.type == "cuda":
+        torch.cuda.set_device(device)  # kernels are launched on the current one
     return OpenedRun(
         spec=spec,
         store=open_store(spec.store_path),
         scene=scene,
         views=split_views(scene, spec.split.spec, spec.split.cameras),
-        device=chosen_device(spec.device),
+        device=device,
     )

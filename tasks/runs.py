@@ -23,6 +23,11 @@ class FinishedRun:
     """After the first fit."""
     final: FittedRef
     """After the last round."""
+    preset: str
+    derived_from: str | None = None
+    """The run that this one was changed from; None where it was reconstructed."""
+    change: dict[str, Any] | None = None
+    """`kind` and `parameters` of the change."""
 
 
 def open_run(store: Store, run_id: str) -> FinishedRun:
@@ -48,4 +53,7 @@ def open_run(store: Store, run_id: str) -> FinishedRun:
         result=json_of(row, "result"),
         unpainted=FittedRef(seen[0], fits[0]),
         final=FittedRef(seen[0], fits[-1]),
+        preset=row["preset"],
+        derived_from=row["derived_from"],
+        change=json_of(row, "change") if row["change"] else None,
     )

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from catalog.artefacts import ArtefactRef
-from lidarpainter_models.devices import Device
+from lidarpainter_models.devices import Device, KernelChoice
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,6 +27,7 @@ class RunSpec:
     painter: str
     """Name of a painter, or path of its weights or model."""
     device: Device = "auto"
+    kernels: KernelChoice = "auto"
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,11 +9,12 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 from prefect import Task
 from prefect.cache_policies import NO_CACHE
 from prefect.client.schemas.objects import State, TaskRun
+from prefect.context import FlowRunContext
 
 import lidarpainter_models
 from catalog.artefacts import ArtefactRef, Recipe, Workplace
@@ -21,7 +22,9 @@ from catalog.digests import canonical_json, digest_text, plain
 from catalog.errors import CatalogError, ConflictError
 from catalog.records import artefact_row
 from catalog.store import Store
+from lidarpainter_models.devices import KernelChoice
 from lidarpainter_models.errors import LidarPainterError
+from lidarpainter_models.kernels.backends import kernels_chosen
 from tasks.measuring import measured
 from tasks.progress import Progress, listener, progress_of
 from tasks.source import project_source
@@ -31,6 +34,9 @@ SHOWN_DIGITS = 8
 _LOG = logging.getLogger("lidarpainter")
 RETRIES = 2
 RETRY_DELAY_S = 3
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +62,7 @@ def run_stage(
     inputs: Mapping[str, str],
     config: Any,  # noqa: ANN401 - any configuration with a canonical form
     build: Callable[[Workplace, Progress], Mapping[str, Any]],
+    kernels: KernelChoice = "auto",
 ) -> StageResult:
     """Produce the artefact of a stage, or take the one that is there, and catalogue it.
 
@@ -67,6 +74,7 @@ def run_stage(
         config: every setting that its content depends on.
         build: a function of a module, or a `partial` of one, that writes the files and tells how
             far it is.
+        kernels: with which it is built; what is made by another choice has a key of its own.
 
     Raises:
         IdentityError: the code that `build` runs cannot be found from the source.
@@ -74,13 +82,13 @@ def run_stage(
     recipe = Recipe(
         kind=kind,
         inputs=inputs,
-        config=config,
+        config=config if kernels == "auto" else {"kernels": kernels, "stage": config},
         code=project_source().code(build),
         software_version=lidarpainter_models.__version__,
     )
 
     def measured_build(place: Workplace) -> dict[str, Any]:
-        with measured() as cost:
+        with measured() as cost, kernels_chosen(kernels):
             summary = build(place, progress_of(stage))
         return {
             **summary,
@@ -138,3 +146,18 @@ STAGE_OPTIONS: dict[str, Any] = {
     "persist_result": False,
 }
 """Options of every stage's task."""
+
+
+class StageTask(Task[Parameters, Result]):
+    """A task that outside a flow is the plain function: nobody is asked and nothing is recorded."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401 - as Prefect has it
+        """Run the stage, as a task run where there is a flow run."""
+        if FlowRunContext.get() is None:
+            return self.fn(*args, **kwargs)
+        return super().__call__(*args, **kwargs)
+
+
+def stage_task(function: Callable[Parameters, Result]) -> StageTask[Parameters, Result]:
+    """Make a stage a task, with the options that all stages have."""
+    return StageTask(function, **STAGE_OPTIONS)

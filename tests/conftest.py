@@ -1,11 +1,13 @@
 """Check shapes while testing, and find the real log where there is one.
 
-The jaxtyping hook rewrites functions, which numba cannot compile: modules that hold numba code are
-left out of it.
+The jaxtyping hook rewrites functions, which numba and Triton cannot compile: modules that hold such
+code are left out of it. Without a GPU, Triton's kernels run in its interpreter.
 """
 
 import os
+import re
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -16,6 +18,9 @@ from flows.environment import THREADS
 
 for _name, _value in THREADS.items():
     os.environ.setdefault(_name, _value)  # read when a test first imports numba
+
+if not import_module("torch").cuda.is_available():  # not before the threads are set
+    os.environ.setdefault("TRITON_INTERPRET", "1")  # read when its kernels are first imported
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED_ENVIRONMENT = "LIDARPAINTER_SHARED"
@@ -30,7 +35,7 @@ def checked_modules() -> frozenset[str]:
     return frozenset(
         ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
         for path in paths
-        if "import numba" not in path.read_text("utf-8")
+        if not re.search(r"^import (numba|triton)\b", path.read_text("utf-8"), re.MULTILINE)
     )
 
 

@@ -17,14 +17,25 @@ SHOWN_COLUMNS = {
     "scenes": ("scene_id", "num_frames", "num_views", "num_actors", "duration_s", "num_bytes"),
     "runs": (
         *("run_id", "scene_id", "preset", "painter", "status"),
-        *("started_at", "seconds", "num_gaussians"),
+        *("started_at", "seconds", "num_gaussians", "derived_from", "change"),
     ),
     "artefacts": ("artefact_id", "num_bytes", "seconds", "created_at"),
     "metrics": ("run_id", "protocol", "trajectory", "variant", "name", "value"),
     "painters": ("painter_id", "name", "num_bytes", "created_at"),
+    "sequences": ("fleet", "scene_id", "state", "cause", "attempts", "seconds", "run_id"),
+    "attempts": ("fleet", "scene_id", "worker", "started_at", "seconds", "cause", "reason"),
 }
-NEWEST_FIRST = {"runs": "started_at", "artefacts": "created_at", "painters": "created_at"}
-JSON_COLUMNS = ("parameters", "stage_seconds", "result", "inputs", "config", "summary", "record")
+NEWEST_FIRST = {
+    "runs": "started_at",
+    "artefacts": "created_at",
+    "painters": "created_at",
+    "attempts": "started_at",
+}
+JSON_COLUMNS = (
+    *("parameters", "stage_seconds", "result", "change"),
+    *("inputs", "config", "summary", "record"),
+    *("asked", "budget", "effort"),
+)
 """Columns that hold JSON text: shown as what they hold."""
 LONGEST_JSON = 120
 """Characters of such a column in a table."""
@@ -33,7 +44,8 @@ LONGEST_JSON = 120
 @app.command("list")
 def list_table(
     table: Annotated[
-        str, typer.Argument(help="scenes, runs, artefacts, metrics or painters.")
+        str,
+        typer.Argument(help="scenes, runs, artefacts, metrics, painters, sequences, attempts."),
     ] = "runs",
     as_json: AsJson = False,
 ) -> None:
@@ -57,7 +69,7 @@ def list_table(
         print_json(found | ({"absent": missing} if table == "metrics" else {}))
         return
     columns = SHOWN_COLUMNS[table]
-    cells = [[_cell(name, row[name]) for name in columns] for row in rows]
+    cells = [[_listed(name, row[name]) for name in columns] for row in rows]
     note = "\n".join(
         f"without a value: {', '.join(f'{name} ({count})' for name, count in names.items())}: "
         f"{reason}"
@@ -233,6 +245,14 @@ def _open(row: dict[str, Any]) -> dict[str, Any]:
             value = json_of(row, name)
         opened[name] = value.isoformat() if hasattr(value, "isoformat") else value
     return opened
+
+
+def _listed(name: str, value: Any) -> Cell:  # noqa: ANN401 - any value of a table
+    """A cell of a list, where a change is its kind and what was asked for, if that is short."""
+    if name != "change" or value is None:
+        return _cell(name, value)
+    change = json.loads(value)
+    return " ".join(filter(None, (change["kind"], change["parameters"].get("prompt"))))
 
 
 def _cell(name: str, value: Any) -> Cell:  # noqa: ANN401 - any value of a table

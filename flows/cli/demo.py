@@ -1,16 +1,23 @@
 """`lidarpainter demo`: see the whole pipeline work, without any data."""
 
+import shlex
 import shutil
+import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from flows.cli.output import print_json, say_status
 from flows.cli.shared_options import AsJson, Painter, Settings, check_painter
 
+if TYPE_CHECKING:
+    from catalog.store import Store
+
 FIRST_IMAGE_NAME = "street.png"
 REPORT_NAME = "report.html"
+PAGE_NAME = "drive.html"
+STORE_NAME = "store"
 
 
 def demo(
@@ -24,8 +31,8 @@ def demo(
 ) -> None:
     """Run the built-in street through the whole pipeline.
 
-    Into --out come street.png, what the camera saw first, after a minute, and report.html in the
-    end.
+    Into --out come street.png, what the camera saw first, after a minute, and in the end
+    report.html, and drive.html, which plays the drive and the lane beside it in any browser.
 
     Example: lidarpainter demo --out demo
     """
@@ -43,14 +50,32 @@ def demo(
     parameters = with_overrides(parameters, settings or [])
     say_status(f"drawing the street of seed {seed}")
     check_painter(painter)
-    store = open_store(out / "store")
+    store = open_store(out / STORE_NAME)
     result = run_demo(parameters, seed, store, out.absolute() / FIRST_IMAGE_NAME)
     if result["report"] is not None:
         report = out.absolute() / REPORT_NAME
         with storage_errors(f"cannot write {report}"):
             shutil.copyfile(result["report"], report)
         result = {**result, "report": str(report)}
+    page = _written_page(store, result["run_id"], out.absolute() / PAGE_NAME)
+    result = {**result, "page": str(page)}
     if as_json:
         print_json(result)
     else:
         show(result)
+        line = f"lidarpainter --store {shlex.quote(str(out / STORE_NAME))} view latest"
+        sys.stdout.write(f"A lane aside: open {page}, or drive it live: {line}\n")
+
+
+def _written_page(store: "Store", run_id: str, out: Path) -> Path:
+    """The drive and a lane beside it in one file."""
+    from flows.cli.progress import shown_progress
+    from flows.exports import export_request, export_run
+    from flows.views import PathRequest
+    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+    from lidarpainter_models.geometry.trajectory_words import RECORDED
+
+    path = PathRequest(run=run_id, trajectory=parse_trajectory(RECORDED))
+    with shown_progress():
+        export_run(store, export_request("page", {}, path, None), out)
+    return out

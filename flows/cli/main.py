@@ -20,13 +20,17 @@ from flows.cli import (
     catalog,
     demo,
     doctor,
+    edit,
     evaluate,
+    export,
+    fleet,
     ingest,
     painter,
     reconstruct,
     render,
     settings,
     stylize,
+    view,
 )
 from flows.cli.output import Loudness, complain, loudness, set_loudness
 from flows.cli.usage import OneLineGroup
@@ -61,9 +65,13 @@ app.command("ingest")(ingest.ingest)
 app.command("reconstruct")(reconstruct.reconstruct)
 app.command("settings")(settings.settings)
 app.command("render")(render.render)
+app.command("export")(export.export)
 app.command("stylize")(stylize.stylize)
+app.command("edit")(edit.edit)
+app.command("view")(view.view)
 app.command("evaluate")(evaluate.evaluate)
 app.add_typer(painter.app, name="painter")
+app.add_typer(fleet.app, name="fleet")
 app.add_typer(catalog.app, name="catalog")
 
 

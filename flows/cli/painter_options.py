@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -72,9 +72,7 @@ Out = Annotated[
     Path | None,
     typer.Option(help="Folder, or .safetensors file, for the weights and their record."),
 ]
-Device = Annotated[
-    Literal["auto", "cpu", "cuda"], typer.Option(help="Where painters run: auto, cpu or cuda.")
-]
+Device = Annotated[str, typer.Option(help="Where painters run: auto, cpu, cuda or cuda:N.")]
 
 
 def parse_seeds(text: str | None) -> tuple[int, ...]:

@@ -1,24 +1,43 @@
 """`lidarpainter render`: images of a run along a trajectory."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from flows.cli.output import print_json, print_pairs, say_status
 from flows.cli.shared_options import (
+    AllowCollisions,
     AsJson,
-    FollowedCamera,
+    BesideWhat,
+    FollowedCameras,
     FollowedFrames,
+    Fps,
+    ImageWidth,
+    PostpaintPainter,
     RunName,
     TrajectorySpec,
     check_painter,
     parse_frames,
     parse_previous,
+    with_told_collisions,
 )
 
 Postpaint = Annotated[
     bool, typer.Option("--postpaint", help="Paint every image; renders go to `unpainted/`.")
+]
+
+Prompt = Annotated[
+    str, typer.Option(help="What a painter that was trained for styles is asked for.")
+]
+Previous = Annotated[
+    str | None,
+    typer.Option(help="Lean on the image painted before: mixed into the next, or shown."),
+]
+Video = Annotated[bool, typer.Option("--video", help="Add a film of each camera, video.mp4.")]
+Depth = Annotated[bool, typer.Option("--depth", help="Add depth: 16-bit PNG, 256ths of a metre.")]
+Semantics = Annotated[
+    bool, typer.Option("--semantics", help="Add who is where: 16-bit PNG and a legend.")
 ]
 
 
@@ -26,19 +45,19 @@ def render(  # noqa: PLR0913 - the options of a command
     run: RunName,
     trajectory: TrajectorySpec,
     out: Annotated[Path, typer.Option(help="Folder for the images.")],
-    camera: FollowedCamera = None,
+    camera: FollowedCameras = None,
     frames: FollowedFrames = None,
+    width: ImageWidth = None,
     postpaint: Postpaint = False,
-    painter: Annotated[
-        str | None, typer.Option(help="Painter for --postpaint; the run's own if absent.")
-    ] = None,
-    prompt: Annotated[
-        str, typer.Option(help="What a painter that was trained for styles is asked for.")
-    ] = "clear",
-    previous: Annotated[
-        str | None,
-        typer.Option(help="Lean on the image painted before: mixed into the next, or shown."),
-    ] = None,
+    painter: PostpaintPainter = None,
+    prompt: Prompt = "clear",
+    previous: Previous = None,
+    video: Video = False,
+    fps: Fps = None,
+    depth: Depth = False,
+    semantics: Semantics = False,
+    beside: BesideWhat = None,
+    allow_collisions: AllowCollisions = False,
     as_json: AsJson = False,
 ) -> None:
     """Render a finished run where nobody drove.
@@ -46,37 +65,46 @@ def render(  # noqa: PLR0913 - the options of a command
     Example: lidarpainter render latest --trajectory lateral:2 --postpaint --out pictures
 
     Down a lane and up: lidarpainter render latest --trajectory lane-change:-3.5+up:1 --out p
+
+    A film: lidarpainter render latest --trajectory lateral:2 --video --beside recorded --out p
     """
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
     from lidarpainter_models.conditioning.settings import SequenceConfig
-    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+    from lidarpainter_models.geometry.trajectory_words import read_trajectory_words
     from tasks.runs import open_run
 
-    followed, chosen = parse_trajectory(trajectory), parse_frames(frames)
+    read_trajectory_words(trajectory)
+    chosen = parse_frames(frames)
     sequence = SequenceConfig() if previous is None else parse_previous(previous)[0]
     open_run(existing_store(), run)
     say_status(f"opening run {run}")
     check_painter(painter)
     from flows.views import PathRequest, render_run
+    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+    from tasks.views.files import ViewKinds
 
     path = PathRequest(
         run=run,
-        trajectory=followed,
+        trajectory=parse_trajectory(trajectory),
         camera=camera,
         frames=chosen,
         is_painted=postpaint or painter is not None,
         painter=painter,
+        allows_collisions=allow_collisions,
+        width_px=width,
+        beside=beside,
     )
+    kinds = ViewKinds(depth=depth, semantics=semantics, video=video, fps=fps)
     with shown_progress():
         result = render_run(
-            existing_store(),
-            path,
-            out.absolute(),
-            prompt=prompt,
-            sequence=sequence,
+            existing_store(), path, out.absolute(), prompt=prompt, sequence=sequence, kinds=kinds
         )
+    _say(result, as_json=as_json)
+
+
+def _say(result: dict[str, Any], *, as_json: bool) -> None:
     if as_json:
         print_json(result)
     else:
-        print_pairs(f"images of {result['scene']}", result)
+        print_pairs(f"images of {result['scene']}", with_told_collisions(result))

@@ -1,7 +1,7 @@
 """Options that several commands have, with the same meaning in each, and how they are read."""
 
 import re
-from typing import TYPE_CHECKING, Annotated, get_args
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
@@ -17,7 +17,8 @@ Painter = Annotated[
     typer.Option(help="none, overlay, warp, nano, weights or a model; the preset's if absent."),
 ]
 DeviceName = Annotated[
-    str, typer.Option(help="auto, cpu or cuda: what the painter runs on; auto takes a GPU if any.")
+    str,
+    typer.Option(help="auto, cpu, cuda or cuda:N: where fits and painters run; auto takes a GPU."),
 ]
 Settings = Annotated[
     list[str] | None,
@@ -28,16 +29,55 @@ RunName = Annotated[str, typer.Argument(help="A run id, a unique prefix of one, 
 TrajectorySpec = Annotated[
     str,
     typer.Option(
-        help="recorded, lateral:2 and lane-change:3.5 (metres, left is positive), up:1.5 (metres), "
-        "yaw:15 (degrees, left is positive), or several with + between; at most 8 m away."
+        help="recorded; lateral:2 and lane-change:3.5@2s+3s (metres, left is positive), up:1.5, "
+        "along:-5 (metres), yaw:15 (degrees, left is positive), at most 8 m away; or follow:ACTOR, "
+        "orbit:ACTOR, birdseye:30, waypoints:F.csv, which go anywhere; several with + between."
     ),
+]
+AllowCollisions = Annotated[
+    bool, typer.Option("--allow-collisions", help="Let the camera go through walls.")
 ]
 FollowedCamera = Annotated[
     str | None, typer.Option(help="Camera whose path is followed; the first trained on if absent.")
 ]
+FollowedCameras = Annotated[
+    str | None,
+    typer.Option(
+        "--camera",
+        help="Camera whose path is followed, several with commas, or all; also cameras that no "
+        "fit used. The first trained on if absent.",
+    ),
+]
+ImageWidth = Annotated[
+    int | None,
+    typer.Option(
+        "--width", help="Width of the images in pixels, at most as recorded; the fit's if absent."
+    ),
+]
+Fps = Annotated[
+    float | None, typer.Option(help="Images a second of films; those of the recording if absent.")
+]
+PostpaintPainter = Annotated[
+    str | None, typer.Option(help="Painter for --postpaint; the run's own if absent.")
+]
+BesideWhat = Annotated[
+    str | None,
+    typer.Option(
+        "--beside",
+        help="Show to the left: recorded, unpainted, or another run of the same scene.",
+    ),
+]
 FollowedFrames = Annotated[
     str | None, typer.Option(help="Recorded frames A:B to follow, B excluded.")
 ]
+
+
+def with_told_collisions(result: dict[str, Any]) -> dict[str, Any]:
+    """A result for a table: what the camera ran into in one line."""
+    from lidarpainter_models.lidar.collisions import Collision
+
+    told = "; ".join(str(Collision(**found)) for found in result["collisions"])
+    return {**result, "collisions": told or "none"}
 
 
 def parse_frames(text: str | None) -> slice | None:

@@ -34,7 +34,8 @@ from lidarpainter_models.scenes.records import ViewKey
 class ConditionBuilder:
     """Gathers painting conditions at any camera and time of one scene.
 
-    Depth and opacity of a training view are rendered when it first serves as a source and kept.
+    They lie where the scene does. Depth and opacity of a training view are rendered when it first
+    serves as a source and kept.
     """
 
     def __init__(
@@ -47,7 +48,7 @@ class ConditionBuilder:
     ) -> None:
         """Take the scene as it is now; build another one after the fit went on."""
         self.scene = scene
-        self.lidar_map = lidar_map
+        self.lidar_map = lidar_map.to(scene.device)
         self.config = config or ConditionConfig()
         self.boxes = MovingBoxes(scene.tracks)
         self._views = {view.key: view for view in training_views}
@@ -61,6 +62,10 @@ class ConditionBuilder:
             for view in training_views
         }
         self._sources: dict[ViewKey, SourceImage] = {}
+
+    def forget_sources(self) -> None:
+        """Free what was kept of training views; what is asked for again is rendered again."""
+        self._sources.clear()
 
     @property
     def recorded_cameras(self) -> tuple[Camera, ...]:
@@ -76,18 +81,23 @@ class ConditionBuilder:
         """A training image with the surfaces it shows, colours before its exposure."""
         if key not in self._sources:
             view, camera = self._views[key], self._cameras[key]
+            device = self.scene.device
+            rgb, sky_mask = view.rgb_u8.to(device).float() / 255, view.sky_mask.to(device)
             render = self.scene.render(camera, view.timestamp_ns)
             lidar = self.lidar_image(camera, view.timestamp_ns)
             # the sky mask knows better than the render where there is sky; what else is clear in
             # the render is drawn by the sky too, so it stands at infinity in both views
-            self._sources[key] = SourceImage(
+            source = SourceImage(
                 key=key,
                 camera=camera,
                 timestamp_ns=view.timestamp_ns,
-                rgb=self._without_exposure(view.rgb, key[1]),
-                depth_m=torch.where(view.sky_mask, 0.0, self.surface_m(render, lidar, camera)),
-                alpha=torch.where(view.sky_mask, 0.0, render.alpha),
+                rgb=self._without_exposure(rgb, key[1]),
+                depth_m=torch.where(sky_mask, 0.0, self.surface_m(render, lidar, camera)),
+                alpha=torch.where(sky_mask, 0.0, render.alpha),
             )
+            if view.hidden is not None:
+                source = source.without(view.hidden, render.rgb)
+            self._sources[key] = source
         return self._sources[key]
 
     def sources_for(

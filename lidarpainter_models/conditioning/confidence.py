@@ -20,7 +20,8 @@ elsewhere), a painting that departs from them by more than the plain render did 
 locally and, if it does so on the whole, as a view; far beyond that it is refused.
 """
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -30,6 +31,8 @@ from torch import Tensor
 
 from lidarpainter_models.conditioning.warping import SKY_DEPTH_M
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.transforms import invert_rigid
+from lidarpainter_models.kernels.backends import may_run_on_host
 from lidarpainter_models.painter.protocol import Painting, PaintingConditions
 
 WARP_WEIGHT = 0.9  # support of a pixel that two recorded images show alike
@@ -41,6 +44,10 @@ SURFACE_WEIGHT = 0.3  # support of an opaque render with nothing else to confirm
 LIDAR_REACH_RAD = 0.006
 """Angle at which LiDAR support has fallen to 1/e: 3 px at 500 px focal length."""
 ALPHA_RANGE = (0.5, 0.95)  # opacity where a surface starts to count, and where it counts fully
+REACHES = 12  # times its reach beyond which LiDAR supports nothing: exp(-12)
+NEAREST_M = 0.1  # nearer to a camera than this is nothing seen, as in `Camera.contains`
+MOST_PROJECTIONS = 2**24
+"""Points times cameras projected in one go: a few hundred megabytes."""
 GATE_WINDOW_PX = 11  # side of the square over which painting and evidence are compared; odd
 GATE_SLACK = 0.01  # mean difference by which a painting may exceed the render unpunished
 GATE_SCALE = 0.03  # further difference at which the weight has fallen to 1/e
@@ -73,6 +80,8 @@ def is_seen(
     Pixels without depth (0) are taken as sky: only their direction counts.
     """
     points_world = camera.unproject(torch.where(depth_m > 0, depth_m, SKY_DEPTH_M)).reshape(-1, 3)
+    if not may_run_on_host(depth_m.device):
+        return _in_any(points_world, list(recorded_cameras)).reshape(depth_m.shape)
     unseen = torch.arange(len(points_world))
     for recorded in recorded_cameras:
         unseen = unseen[~recorded.contains(*recorded.project(points_world[unseen]))]
@@ -83,21 +92,74 @@ def is_seen(
     return seen.reshape(depth_m.shape)
 
 
+def _in_any(
+    points_world: Float[Tensor, "points 3"], cameras: Sequence[Camera]
+) -> Bool[Tensor, " points"]:
+    """Whether a point falls into the image of any camera: all points against many cameras at once.
+
+    What `Camera.project` and `contains` find one by one.
+    """
+    found = torch.zeros_like(points_world[:, 0], dtype=torch.bool)
+    if not cameras:
+        return found
+    lens = torch.tensor(
+        [
+            [[c.fx_px, 0, c.cx_px, 0], [0, c.fy_px, c.cy_px, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+            for c in cameras
+        ],
+        dtype=torch.float64,
+    )
+    poses = torch.stack([camera.world_from_camera.double() for camera in cameras])
+    matrices = (lens @ invert_rigid(poses)).to(points_world, non_blocking=True)
+    sizes = torch.tensor([[camera.width_px, camera.height_px] for camera in cameras])
+    sizes = sizes.to(points_world, non_blocking=True)
+    each = max(1, MOST_PROJECTIONS // max(len(points_world), 1))
+    for matrix, size in zip(matrices.split(each), sizes.split(each), strict=True):
+        u, v, depth_m = (points_world @ matrix[:, :3, :3].mT + matrix[:, None, :3, 3]).unbind(-1)
+        is_in = (u >= 0) & (u < size[:, :1] * depth_m) & (v >= 0) & (v < size[:, 1:] * depth_m)
+        found |= (is_in & (depth_m > NEAREST_M)).any(dim=0)
+    return found
+
+
 def geometric_confidence(
     conditions: PaintingConditions, camera: Camera, seen: Bool[Tensor, "height width"]
 ) -> Float[Tensor, "height width"]:
     """`support * seen` of the module's formula, in [0, 1]."""
     warp = _vouched(conditions)
-    distance_px = torch.full_like(conditions.render_alpha, torch.inf)
-    if bool(conditions.lidar_hit.any()):
-        distance = distance_transform_edt(~conditions.lidar_hit.cpu().numpy())
-        distance_px = torch.as_tensor(distance).to(conditions.render_alpha)
-    lidar = torch.exp(-distance_px / (LIDAR_REACH_RAD * camera.fx_px))
+    reach_px = LIDAR_REACH_RAD * camera.fx_px
+    lidar = torch.exp(-_distance_px(conditions.lidar_hit, reach_px) / reach_px)
+    lidar = lidar.to(conditions.render_alpha)
     low, high = ALPHA_RANGE
     rise = ((conditions.render_alpha - low) / (high - low)).clamp(0, 1)
     surface = rise * rise * (3 - 2 * rise)
     doubt = (1 - WARP_WEIGHT * warp) * (1 - LIDAR_WEIGHT * lidar)
     return (1 - doubt * (1 - SURFACE_WEIGHT * surface)) * seen
+
+
+def _distance_px(
+    hit: Bool[Tensor, "height width"], reach_px: float
+) -> Float[Tensor, "height width"]:
+    """Distance of each pixel to the nearest hit one; infinite if there is none.
+
+    On a device exact up to many times the reach, where support ends: along columns first, then
+    the best of the rows around.
+    """
+    if may_run_on_host(hit.device):
+        if not bool(hit.any()):
+            return torch.full(hit.shape, torch.inf)
+        return torch.as_tensor(distance_transform_edt(~hit.numpy())).float()
+    height_px = hit.shape[0]
+    row = torch.arange(height_px, device=hit.device, dtype=torch.float32)[:, None]
+    above = torch.where(hit, row, -torch.inf).cummax(dim=0).values
+    below = torch.where(hit, row, torch.inf).flip(0).cummin(dim=0).values.flip(0)
+    along = torch.minimum(row - above, below - row).square()
+    most_px = min(math.ceil(REACHES * reach_px), hit.shape[1] - 1)
+    padded = torch.nn.functional.pad(along, (most_px, most_px), value=torch.inf)
+    nearest = along
+    for step in range(-most_px, most_px + 1):
+        beside = padded[:, most_px + step : most_px + step + hit.shape[1]] + step * step
+        nearest = torch.minimum(nearest, beside)
+    return nearest.sqrt()
 
 
 def _vouched(conditions: PaintingConditions) -> Float[Tensor, "height width"]:

@@ -2,21 +2,37 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
+from lidarpainter_models.conditioning.moved_cameras import MovedCameras
 from lidarpainter_models.conditioning.sequences import SequencePainter
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.geometry.trajectories import road_directions, shift_pose
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
+from lidarpainter_models.lidar.collisions import Collision
 from lidarpainter_models.observations.fit_size import fit_camera
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
+
+ALL_CAMERAS = "all"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ShownMoment:
+    """What a camera on a path shows at a moment."""
+
+    rgb: Float[Tensor, "height width 3"]
+    """In [0, 1], painted if asked for."""
+    unpainted_rgb: Float[Tensor, "height width 3"] | None
+    """What was painted over."""
+    depth_m: Float[Tensor, "height width"]
+    """Camera z as rendered; 0 where there is none."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,49 +48,125 @@ class FollowedPath:
     painter: SequencePainter | None
     """To be asked for the moments in their order; None shows the scene as it is."""
 
+    as_rig: bool = False
+    """Move the car and its cameras on it, not this camera alone: then a turn is the car's."""
+
+    @property
+    def camera_name(self) -> str:
+        """Whose path is followed."""
+        return self.views[0].camera_name
+
     def camera(self, number: int) -> Camera:
         """Where the camera stands at the n-th moment: as the fit found it, then moved."""
-        view, scene = self.views[number], self.builder.scene
-        camera = scene.corrected_camera(
-            fit_camera(view, self.observation),
-            timestamp_ns=view.timestamp_ns,
-            camera_name=view.camera_name,
-            key=view.key,
+        return self._cameras[number]
+
+    def collisions(self) -> list[Collision]:
+        """What the camera runs into where nobody drove."""
+        return self._moving.collisions(self.views, self._cameras, self.builder.lidar_map.street)
+
+    def refuse_walls(self) -> None:
+        """Refuse a path into a wall.
+
+        Raises:
+            ConfigError: it leads into points of the street.
+        """
+        self._moving.refuse_walls(self.collisions())
+
+    @cached_property
+    def _moving(self) -> MovedCameras:
+        return MovedCameras(
+            recorded=self.recorded,
+            tracks=self.builder.boxes.tracks,
+            trajectory=self.trajectory,
+            as_rig=self.as_rig,
         )
-        directions = road_directions(self.recorded.world_from_ego)
-        direction = directions[self.recorded.frame_position(view.frame_index)]
-        shift = self.trajectory.shift_at(number / max(len(self.views) - 1, 1))
-        return camera.at(shift_pose(camera.world_from_camera, direction, shift))
+
+    @cached_property
+    def _cameras(self) -> tuple[Camera, ...]:
+        return self._moving.moved(
+            self.views,
+            [self._found(view, fit_camera(view, self.observation)) for view in self.views],
+        )
 
     def image(self, camera: Camera, view: RecordedView) -> Float[Tensor, "height width 3"]:
         """What is seen there, painted if asked for; in [0, 1]."""
+        return self.shown(camera, view).rgb
+
+    def shown(self, camera: Camera, view: RecordedView) -> ShownMoment:
+        """What is seen there, and what is known beside it."""
         if self.painter is not None:
-            return self.painter.paint(camera, view.timestamp_ns).painting.rgb.clamp(0, 1)
+            painted = self.painter.paint(camera, view.timestamp_ns)
+            return ShownMoment(
+                rgb=painted.painting.rgb.clamp(0, 1),
+                unpainted_rgb=painted.conditions.render_rgb,
+                depth_m=painted.conditions.render_depth_m,
+            )
         scene = self.builder.scene
-        shown = scene.render(camera, view.timestamp_ns, camera_name=view.camera_name)
-        return shown.rgb.clamp(0, 1)
+        seen = scene.render(camera, view.timestamp_ns, camera_name=view.camera_name)
+        return ShownMoment(rgb=seen.rgb.clamp(0, 1), unpainted_rgb=None, depth_m=seen.depth_m)
+
+    def _found(self, view: RecordedView, camera: Camera) -> Camera:
+        """Where the fit found a camera; one that it did not see rides on the rig of one it saw."""
+        scene = self.builder.scene
+        fitted = scene.cameras.camera_names
+        if view.camera_name in fitted or not fitted:
+            return scene.corrected_camera(
+                camera,
+                timestamp_ns=view.timestamp_ns,
+                camera_name=view.camera_name,
+                key=view.key,
+            )
+        other = self._fitted_views.get(view.frame_index)
+        if other is None:
+            return camera
+        found = scene.corrected_camera(
+            other.camera,
+            timestamp_ns=other.timestamp_ns,
+            camera_name=other.camera_name,
+            key=other.key,
+        )
+        found_from_logged = found.world_from_camera @ other.camera.camera_from_world
+        return camera.at(found_from_logged @ camera.world_from_camera)
+
+    @cached_property
+    def _fitted_views(self) -> dict[int, RecordedView]:
+        """The views of the first camera that the fit saw, by frame."""
+        first = self.builder.scene.cameras.camera_names[0]
+        return {view.frame_index: view for view in self.recorded.views_of(first)}
+
+
+def followed_cameras(
+    recorded: DrivingScene, fitted_names: Sequence[str], wanted: str | None = None
+) -> tuple[str, ...]:
+    """The cameras to follow: `all`, names with commas between, or None for the first fitted one.
+
+    Raises:
+        SceneError: the scene has no such camera.
+    """
+    if wanted is None:
+        return (fitted_names[0],)
+    if wanted == ALL_CAMERAS:
+        return recorded.camera_names
+    names = tuple(dict.fromkeys(name.strip() for name in wanted.split(",")))
+    if unknown := [name for name in names if name not in recorded.camera_names]:
+        raise SceneError(
+            f"{recorded.path.name} has no camera {unknown[0]!r}, it has "
+            f"{', '.join(recorded.camera_names)}; {ALL_CAMERAS} takes every one"
+        )
+    return names
 
 
 def followed_views(
-    recorded: DrivingScene,
-    camera_names: Sequence[str],
-    camera: str | None = None,
-    frames: slice | None = None,
+    recorded: DrivingScene, camera: str, frames: slice | None = None
 ) -> tuple[RecordedView, ...]:
-    """The moments of one trained camera, the first of them if none is named.
+    """The moments of one camera.
 
     Raises:
-        SceneError: the fit did not see that camera, or no frame is left.
+        SceneError: there is no such camera, or no frame is left.
     """
-    name = camera or camera_names[0]
-    if name not in camera_names:
-        raise SceneError(
-            f"the fit of {recorded.path.name} saw no camera {name!r}, it saw "
-            f"{', '.join(camera_names)}"
-        )
-    views = recorded.views_of(name)[frames or slice(None)]
+    views = recorded.views_of(camera)[frames or slice(None)]
     if not views:
-        raise SceneError(f"{recorded.path.name}: no frame of {name} is left to render")
+        raise SceneError(f"{recorded.path.name}: no frame of {camera} is left to render")
     return views
 
 

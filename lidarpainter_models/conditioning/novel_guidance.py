@@ -8,6 +8,7 @@ result, for the report, but give no guidance. World: x forward, y left, z up; me
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Float, UInt8
@@ -22,6 +23,7 @@ from lidarpainter_models.conditioning.confidence import (
 )
 from lidarpainter_models.conditioning.sequences import SequencePainter
 from lidarpainter_models.conditioning.settings import NovelGuidanceConfig
+from lidarpainter_models.devices import within_memory
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.cameras import Camera
@@ -126,12 +128,14 @@ def _check_names(names: tuple[str, ...] | None, views: Sequence[TrainingView]) -
 
 def has_room(novel: NovelCamera, lidar_map: LidarMap, actors: MovingBoxes) -> bool:
     """Whether a camera stands in free space: not in or at a moving actor, a parked car, a wall."""
-    centre = novel.camera.centre_world.to(lidar_map.street.xyz_m)
+    street_m = lidar_map.street.xyz_m
+    centre = novel.camera.centre_world.to(street_m.dtype)
     for track, box in actors.placed(novel.timestamp_ns):
         if bool(is_inside_box(centre[None], box, track.size_m, margin_m=ROOM_M)):
             return False
-    near = ((lidar_map.street.xyz_m[:, 0] - centre[0]).abs() < ROOM_M).nonzero()[:, 0]
-    distance_m = (lidar_map.street.xyz_m[near] - centre).norm(dim=-1)
+    centre = centre.to(street_m.device)
+    near = ((street_m[:, 0] - centre[0]).abs() < ROOM_M).nonzero()[:, 0]
+    distance_m = (street_m[near] - centre).norm(dim=-1)
     return int((distance_m < ROOM_M).sum()) <= MAX_POINTS_IN_ROOM
 
 
@@ -161,7 +165,13 @@ def paint_novel_views(
                 (novel.shift, novel.key[1]),
                 SequencePainter(builder, painter, config=config.sequence),
             )
-            paintings.append(_paint(builder, path, novel))
+            paintings.append(
+                within_memory(
+                    partial(_paint, builder, path, novel),
+                    builder.scene.device,
+                    "painting: a narrower observation.width_px takes less",
+                )
+            )
         if progress is not None:
             progress(done, len(cameras))
     return paintings
@@ -172,7 +182,14 @@ def guidance_views(paintings: Sequence[NovelPainting]) -> list[GuidanceView]:
     return [painting.guidance for painting in paintings if not painting.gate.is_refused]
 
 
-def _paint(builder: ConditionBuilder, path: SequencePainter, novel: NovelCamera) -> NovelPainting:
+def _paint(
+    builder: ConditionBuilder,
+    path: SequencePainter,
+    novel: NovelCamera,
+    spares: bool,
+) -> NovelPainting:
+    if spares:
+        builder.forget_sources()
     conditions, painting = path.paint(novel.camera, novel.timestamp_ns)
     gate = guidance_gate(painting, conditions)
     depth_m = torch.where(
@@ -188,9 +205,9 @@ def _paint(builder: ConditionBuilder, path: SequencePainter, novel: NovelCamera)
         weight=weight,
         lidar_depth_m=conditions.lidar_depth_m,
     )
-    return NovelPainting(
-        novel=novel, guidance=guidance, gate=gate, images=_images(conditions, painting, weight)
-    )
+    home = torch.device("cpu")  # where paintings of a whole log have room
+    images = {name: rgb.to(home) for name, rgb in _images(conditions, painting, weight).items()}
+    return NovelPainting(novel=novel, guidance=guidance.to(home), gate=gate, images=images)
 
 
 def _images(

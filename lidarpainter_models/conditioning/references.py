@@ -68,8 +68,9 @@ def warped_references(
     """Patch `count` references together from sources given best first."""
     height_px, width_px = target.is_sky.shape
     num_pixels = height_px * width_px
-    rgb = torch.zeros(count, num_pixels, 3)
-    num_found = torch.zeros(num_pixels, dtype=torch.int64)
+    device = target.is_sky.device
+    rgb = torch.zeros(count, num_pixels, 3, device=device)
+    num_found = torch.zeros(num_pixels, dtype=torch.int64, device=device)
     for number, guess in enumerate(target.depth_guesses_m):
         is_sky = target.is_sky & (guess == 0) & (number == 0)
         depth_m = torch.where(is_sky, SKY_DEPTH_M, guess)
@@ -81,7 +82,7 @@ def warped_references(
             num_found=num_found,
         )
         _look_up(search, target.timestamp_ns, sources, boxes)
-    found = torch.arange(count)[:, None] < num_found
+    found = torch.arange(count, device=device)[:, None] < num_found
     return WarpedReferences(
         rgb=rgb.reshape(count, height_px, width_px, 3),
         valid=found.reshape(count, height_px, width_px),

@@ -26,15 +26,15 @@ def style_view(
 
     Returns:
         The view, its depth that of the render corrected by LiDAR; and camera z in metres where the
-        LiDAR hit, 0 elsewhere.
+        LiDAR hit, 0 elsewhere. All on the CPU, where styles are made.
     """
     render = builder.scene.render(camera, timestamp_ns)
     lidar = builder.lidar_image(camera, timestamp_ns)
-    sky = 1 - render.alpha.clamp(0, 1) if sky_mask is None else sky_mask.float()
+    sky = 1 - render.alpha.clamp(0, 1).cpu() if sky_mask is None else sky_mask.float()
     view = StyleView(
-        rgb=image,
-        depth_m=builder.surface_m(render, lidar, camera).detach(),
+        rgb=image.cpu(),
+        depth_m=builder.surface_m(render, lidar, camera).detach().cpu(),
         sky=sky.detach(),
         camera=camera,
     )
-    return view, lidar.depth_m
+    return view, lidar.depth_m.cpu()

@@ -8,7 +8,7 @@ Frames: world z up; camera x right, y down, z forward; depth is camera z in metr
 pixel centres at half-integers.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -36,6 +36,17 @@ class SourceImage:
     rgb: Float[Tensor, "height width 3"]
     depth_m: Float[Tensor, "height width"]
     alpha: Float[Tensor, "height width"]
+
+    def without(
+        self, hidden: Bool[Tensor, "height width"], rgb: Float[Tensor, "height width 3"]
+    ) -> "SourceImage":
+        """The same image where nothing is found in some pixels; seen whole, it shows others."""
+        return replace(
+            self,
+            rgb=torch.where(hidden[..., None], rgb, self.rgb),
+            depth_m=torch.where(hidden, 0.0, self.depth_m),
+            alpha=torch.where(hidden, 1.0, self.alpha),
+        )
 
     @cached_property
     def is_sky(self) -> Bool[Tensor, "height width"]:
@@ -69,7 +80,7 @@ def sample_source(
     """
     camera = source.camera
     pixels_uv, depth_m = camera.project(points_world)
-    size = pixels_uv.new_tensor([camera.width_px, camera.height_px])
+    size = torch.tensor([camera.width_px, camera.height_px]).to(pixels_uv, non_blocking=True)
     rim_px = 0.49  # half a pixel less rounding: outside it nothing can be interpolated
     inside = ((pixels_uv >= rim_px) & (pixels_uv <= size - rim_px)).all(dim=-1) & (depth_m > 0.1)
     grid = torch.where(inside[:, None], pixels_uv / size * 2 - 1, 0)

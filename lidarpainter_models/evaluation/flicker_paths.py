@@ -69,7 +69,8 @@ class FlickerJudgement:
             images[name] = painter.paint_conditions(conditions, camera, time_ns).rgb
         street = known_street(self.held_out.scene)
         if street is not None:
-            images[TRUTH] = street.render(camera, time_ns).rgb.clamp(0, 1)
+            truth = street.render(camera, time_ns).rgb.clamp(0, 1)
+            images[TRUTH] = truth.to(conditions.render_rgb.device)
         return FlickerFrame(
             camera=camera,
             timestamp_ns=time_ns,

@@ -78,11 +78,12 @@ def score_views(
     lpips: list[float] = []
     for view in views:
         image = render(view.camera, view.timestamp_ns).clamp(0, 1)
-        scores.append(score_image(image, view.truth_rgb, view.actor_mask))
+        truth = view.truth_rgb.to(image.device)
+        scores.append(score_image(image, truth, view.actor_mask.to(image.device)))
         if distances.features is not None:
-            features.append(float(distances.features(image, view.truth_rgb)))
+            features.append(float(distances.features(image, truth)))
         if distances.lpips is not None:
-            lpips.append(float(distances.lpips(image, view.truth_rgb)))
+            lpips.append(float(distances.lpips(image, truth)))
     return ViewScores(
         psnr=sum(score.psnr_db for score in scores) / len(scores),
         ssim=sum(score.ssim for score in scores) / len(scores),

@@ -39,7 +39,9 @@ class Judgement:
     def scores(self, shown: ShownScene, progress: Callable[[int, int], None]) -> Scores:
         """Recorded views, views beside the path, and depth at both."""
         shifts = self.config.scoring.shifts
-        distances = load_distances(self.config.feature_weights, self.config.lpips)
+        distances = load_distances(
+            self.config.feature_weights, self.config.lpips, shown.scene.device
+        )
         cameras = tuple(dict.fromkeys(view.camera_name for view in self.held_out.test_views))
         num_views, is_known = len(self.held_out.test_views), known_street(self.held_out.scene)
         # every view is rendered at both poses, where truth is known at every shift, and for depth

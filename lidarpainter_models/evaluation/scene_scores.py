@@ -83,7 +83,7 @@ def score_geometry(
         )  # costs more than all the renders of the view
         for shift in (Shift(), *shifts):
             camera = held_out.shifted_camera(fitted, view, shift)
-            depth_m = fitted.render(camera, view.timestamp_ns).depth_m
+            depth_m = fitted.render(camera, view.timestamp_ns).depth_m.cpu()
             scores[shift.name].append(score_depth(depth_m, camera, points))
         if progress is not None:
             progress(done, len(held_out.test_views))

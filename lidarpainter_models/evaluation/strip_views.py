@@ -4,12 +4,16 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from jaxtyping import Float
+from torch import Tensor
+
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.judged_views import Renderer
 from lidarpainter_models.evaluation.shown import ShownScene
 from lidarpainter_models.evaluation.strips import StripView, calibrate_strip, score_strips
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.lidar.sparse_depth import points_at_exposure
 from lidarpainter_models.observations.fit_size import fit_camera
@@ -36,7 +40,11 @@ class StripJudgement:
 
     def scores(self, shown: ShownScene, progress: Callable[[int, int], None]) -> dict[str, Any]:
         """Every camera's scores in the colours of the fitted one, or why there are none."""
-        scores, render = {}, shown.renderer(self.fitted_camera)
+        scores, shows = {}, shown.renderer(self.fitted_camera)
+
+        def render(camera: Camera, timestamp_ns: int) -> Float[Tensor, "height width 3"]:
+            return shows(camera, timestamp_ns).cpu()  # strips are cut and turned there
+
         for done, name in enumerate(self.cameras, start=1):
             scores[name] = self._score(shown.scene, render, name)
             progress(done, len(self.cameras))

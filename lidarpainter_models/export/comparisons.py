@@ -59,9 +59,9 @@ def _comparison(subject: Subject, view: RecordedView, shift: Shift) -> Compariso
     return Comparison(
         title=f"{shift.name}, {view.camera_name}, frame {view.frame_index}",
         before_label="before painting",
-        before_rgb=before.rgb.clamp(0, 1),
+        before_rgb=before.rgb.clamp(0, 1).cpu(),
         after_label="after painting",
-        after_rgb=conditions.render_rgb.clamp(0, 1),
+        after_rgb=conditions.render_rgb.clamp(0, 1).cpu(),
         truth_rgb=truth_rgb,
-        inputs=inputs,
+        inputs={name: rgb.cpu() for name, rgb in inputs.items()},
     )

@@ -1,4 +1,4 @@
-"""Images as files: PNG without loss, JPEG for pages."""
+"""Images as files: PNG without loss, JPEG for pages, depth and instances in 16 bits."""
 
 import base64
 from pathlib import Path
@@ -6,12 +6,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarpainter_models.errors import WriteError
 
 JPEG_QUALITY = 90
+DEPTH_UNITS_PER_M = 256
+"""Of a depth image, as KITTI has it: 4 mm apart, up to 256 m."""
+_MAX_U16 = 65535
 
 
 def to_bytes(rgb: Float[Tensor, "height width 3"]) -> np.ndarray:
@@ -32,8 +35,30 @@ def write_png(rgb: Float[Tensor, "height width 3"], path: Path) -> Path:
     Raises:
         WriteError: the file cannot be written.
     """
-    bgr = cv2.cvtColor(to_bytes(rgb), cv2.COLOR_RGB2BGR)
-    _, encoded = cv2.imencode(".png", bgr)
+    return _write(cv2.cvtColor(to_bytes(rgb), cv2.COLOR_RGB2BGR), path)
+
+
+def write_depth_png(depth_m: Float[Tensor, "height width"], path: Path) -> Path:
+    """Write camera z in 256ths of a metre, 16 bits; 0 where there is none, 65535 from 256 m on.
+
+    Raises:
+        WriteError: the file cannot be written.
+    """
+    units = (depth_m.detach() * DEPTH_UNITS_PER_M).round().clamp(0, _MAX_U16)
+    return _write(units.cpu().numpy().astype(np.uint16), path)
+
+
+def write_index_png(indices: Int[Tensor, "height width"], path: Path) -> Path:
+    """Write numbers from 0 to 65535 as they are, 16 bits.
+
+    Raises:
+        WriteError: the file cannot be written.
+    """
+    return _write(indices.cpu().numpy().astype(np.uint16), path)
+
+
+def _write(image: np.ndarray, path: Path) -> Path:
+    _, encoded = cv2.imencode(".png", image)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(encoded.tobytes())

@@ -13,10 +13,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.export.images import jpeg_data_url
+from lidarpainter_models.export.moving_picture import MovingPicture
+from lidarpainter_models.export.worst_views import WorstView
 
 PLOT_WIDTH, PLOT_HEIGHT = 460, 240
 PLOT_MARGIN = 46
 MOST_SHOWN_FACTS = 20
+DRIVE_PAGE = "drive.html"
+"""Where `demo` puts the page that plays the drive, beside the report."""
 SERIES_COLOURS = ("#0b6e99", "#d1495b", "#5c8001", "#8f5db7")
 
 Cell = str | float | int | None
@@ -64,6 +68,13 @@ class Report:
     title: str
     summary: Sequence[str]
     """Paragraphs below the title."""
+    verdict: Sequence[str] = ()
+    """What is good and what is bad, in sentences."""
+    moving: MovingPicture | None = None
+    """The first thing to be seen."""
+    worst: Sequence[WorstView] = ()
+    repeat: Sequence[str] = ()
+    """Commands that make the run again and show more of it."""
     comparisons: Sequence[Comparison] = ()
     tables: Sequence[Table] = ()
     plots: Sequence[Plot] = ()
@@ -141,6 +152,18 @@ def render_report(report: Report) -> str:
     return environment.from_string(source).render(
         title=report.title,
         summary=report.summary,
+        verdict=report.verdict,
+        moving=report.moving,
+        worst=[
+            {
+                "title": view.title,
+                "rendered": jpeg_data_url(view.rendered_rgb),
+                "truth": jpeg_data_url(view.truth_rgb),
+            }
+            for view in report.worst
+        ],
+        repeat=report.repeat,
+        drive_page=DRIVE_PAGE,
         comparisons=comparisons,
         tables=tables,
         plots=[plot_geometry(plot) for plot in report.plots],

@@ -1,14 +1,21 @@
 """The page about a run: its scores, what it took, the course of its fits."""
 
+import json
+import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from lidarpainter_models.evaluation.score_tables import SCORE_NOTE, score_columns, score_rows
-from lidarpainter_models.export.report import Cell, Comparison, Plot, Report, Table
+from lidarpainter_models.export.moving_picture import MovingPicture
+from lidarpainter_models.export.report import DRIVE_PAGE, Cell, Comparison, Plot, Report, Table
+from lidarpainter_models.export.verdict import verdict
+from lidarpainter_models.export.worst_views import WorstView
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 
 MEGABYTE = 1e6
+MOST_ACTORS = 20
+"""Rows of the table of actors."""
 GUIDANCE_COLUMNS = ("num_cameras", "num_without_room", "num_refused", "num_views", "mean_weight")
 
 GUIDANCE_NOTE = (
@@ -29,6 +36,17 @@ class StageCost:
     """Digest of what it made."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pictures:
+    """What is drawn of a run."""
+
+    comparisons: Sequence[Comparison] = ()
+    moving: MovingPicture | None = None
+    worst: Sequence[WorstView] = ()
+    actor_gaussians: Mapping[str, int] = field(default_factory=dict)
+    """How many Gaussians each fitted actor has, by its id."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RunPage:
     """What is known about a run before anything is drawn."""
@@ -43,7 +61,7 @@ class RunPage:
     def report(
         self,
         scene: DrivingScene,
-        comparisons: Sequence[Comparison],
+        pictures: Pictures,
         histories: Mapping[str, Sequence[Mapping[str, float]]],
         machine: Mapping[str, str],
     ) -> Report:
@@ -51,15 +69,19 @@ class RunPage:
 
         Args:
             scene: what the run is about.
-            comparisons: views of it.
+            pictures: what is shown of it.
             histories: of every fit, by stage.
             machine: names and values of what the page is made on.
         """
         return Report(
             title=f"LidarPainter: {self.result['scene']}",
             summary=[_scene_in_words(scene), _summary(self.result)],
-            comparisons=comparisons,
-            tables=_tables(self.result, self.costs),
+            verdict=verdict(self.result),
+            moving=pictures.moving,
+            worst=pictures.worst,
+            repeat=_repeat(self.result, json.loads(self.settings.get("train_cameras", "null"))),
+            comparisons=pictures.comparisons,
+            tables=[*_tables(self.result, self.costs), *_actors(scene, pictures.actor_gaussians)],
             plots=_plots(histories),
             facts={
                 "Provenance": self.provenance,
@@ -121,6 +143,13 @@ def _tables(result: Mapping[str, Any], costs: Sequence[StageCost]) -> list[Table
     if scores := score_rows(result):
         columns, note = score_columns(result["painter"]), SCORE_NOTE
         tables.insert(0, Table(title="Held-out views", columns=columns, rows=scores, note=note))
+    if by_camera := result.get("recorded_by_camera"):
+        rows: list[list[Cell]] = [
+            [name, *(values.get(key) for key in ("psnr", "ssim", "actors_psnr", "num_views"))]
+            for name, values in by_camera.items()
+        ]
+        columns = ["camera", "PSNR", "SSIM", "PSNR inside actor boxes", "views"]
+        tables.insert(-1, Table(title="Held-out views by camera", columns=columns, rows=rows))
     if guidance:
         tables.append(
             Table(
@@ -137,16 +166,58 @@ def _in_words(name: str) -> str:
     return name.removeprefix("num_").replace("_", " ")
 
 
-def _plots(histories: Mapping[str, Sequence[Mapping[str, float]]]) -> list[Plot]:
-    """The course of every fit of a run, by stage."""
+def _actors(scene: DrivingScene, num_gaussians: Mapping[str, int]) -> list[Table]:
+    """The actors that LiDAR saw best, and how much of the scene each has."""
+    seen = [int(track.num_points.sum()) for track in scene.tracks]
+    best = sorted(range(len(seen)), key=lambda index: -seen[index])[:MOST_ACTORS]
+    rows: list[list[Cell]] = [
+        [
+            f"{(track := scene.tracks[index]).category} {track.actor_id}",
+            "yes" if track.is_moving else "no",
+            " x ".join(f"{side_m:.1f}" for side_m in track.size_m.tolist()),
+            len(track.timestamps_ns),
+            seen[index],
+            num_gaussians.get(track.actor_id),
+        ]
+        for index in best
+    ]
+    if not rows:
+        return []
+    columns = ["actor", "moves", "size, m", "frames", "LiDAR points", "Gaussians"]
+    note = (
+        f"{len(rows)} of {len(seen)}, most points first. What stands still is part of the street."
+    )
+    return [Table(title="Actors", columns=columns, rows=rows, note=note)]
 
-    def lines(key: str) -> dict[str, list[tuple[float, float]]]:
-        return {
-            name: [(entry["step"], entry[key]) for entry in history]
-            for name, history in histories.items()
-        }
 
+def _repeat(result: Mapping[str, Any], cameras: Sequence[str] | None) -> list[str]:
+    """Commands, quoted for a shell."""
+    run = str(result["run_id"])
+    asked = {name: str(result[name]) for name in ("preset", "painter", "rounds", "split")}
+    words = ["lidarpainter", "reconstruct", str(result["scene"])]
+    words += [word for name, value in asked.items() for word in (f"--{name}", value)]
+    words += ["--train-cameras", ",".join(cameras)] if cameras else []
     return [
-        Plot(title="Training views", x_label="step", y_label="PSNR, dB", series=lines("psnr")),
-        Plot(title="Size", x_label="step", y_label="Gaussians", series=lines("num_gaussians")),
+        shlex.join(words),
+        shlex.join(["lidarpainter", "view", run]),
+        shlex.join(["lidarpainter", "export", run, "--format", "page", "--out", DRIVE_PAGE]),
+    ]
+
+
+def _plots(histories: Mapping[str, Sequence[Mapping[str, float]]]) -> list[Plot]:
+    """The course of all fits of a run, one after the other, over the time that they took."""
+    psnr: dict[str, list[tuple[float, float]]] = {}
+    size: dict[str, list[tuple[float, float]]] = {}
+    spent_s = 0.0
+    for name, history in histories.items():
+        minutes = [(spent_s + entry["cpu_s"]) / 60 for entry in history]
+        psnr[name] = [(at, entry["psnr"]) for at, entry in zip(minutes, history, strict=True)]
+        size[name] = [
+            (at, entry["num_gaussians"]) for at, entry in zip(minutes, history, strict=True)
+        ]
+        spent_s += history[-1]["cpu_s"] if history else 0.0
+    x_label = "CPU minutes of fitting"
+    return [
+        Plot(title="Training views", x_label=x_label, y_label="PSNR, dB", series=psnr),
+        Plot(title="Size", x_label=x_label, y_label="Gaussians", series=size),
     ]

@@ -51,3 +51,28 @@ def box_corners(size_m: Float[Tensor, "3"]) -> Float[Tensor, "8 3"]:
     """The eight corners in the box frame; x varies slowest, z fastest."""
     signs = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5], dtype=size_m.dtype)] * 3)
     return signs * size_m
+
+
+def first_box_hit(
+    origin_world: Float[Tensor, "3"],
+    direction_world: Float[Tensor, "3"],
+    world_from_boxes: Float[Tensor, "boxes 4 4"],
+    sizes_m: Float[Tensor, "boxes 3"],
+) -> int | None:
+    """The box that a ray enters first, by slabs (Kay and Kajiya, 1986); None if it meets none.
+
+    A box around the origin counts as entered at once.
+    """
+    if len(sizes_m) == 0:
+        return None
+    box_from_world = invert_rigid(world_from_boxes.double())
+    rotation, translation = box_from_world[:, :3, :3], box_from_world[:, :3, 3]
+    origin = rotation @ origin_world.double() + translation
+    direction = rotation @ direction_world.double()
+    half_m = sizes_m.double() / 2
+    safe = torch.where(direction.abs() < 1e-12, torch.full_like(direction, 1e-12), direction)
+    ends = torch.stack([(-half_m - origin) / safe, (half_m - origin) / safe])
+    enters, leaves = ends.amin(0).amax(1).clamp(min=0), ends.amax(0).amin(1)
+    distance = torch.where(enters <= leaves, enters, torch.inf)
+    nearest = int(distance.argmin())
+    return nearest if bool(distance[nearest].isfinite()) else None

@@ -74,7 +74,7 @@ class Camera:
 
         A point with depth <= 0 is behind the camera: its pixel position means nothing.
         """
-        camera_from_world = self.camera_from_world.to(points_world)
+        camera_from_world = self.camera_from_world.to(points_world, non_blocking=True)
         points = transform_points(camera_from_world, points_world)
         depth_m = points[:, 2]
         safe = torch.where(depth_m.abs() < 1e-9, torch.full_like(depth_m, 1e-9), depth_m)
@@ -94,18 +94,23 @@ class Camera:
         inside = (u >= 0) & (u < self.width_px) & (v >= 0) & (v < self.height_px)
         return inside & (depth_m > near_m)
 
-    def pixel_directions(self) -> Float[Tensor, "height width 3"]:
+    def pixel_directions(
+        self, device: torch.device | None = None
+    ) -> Float[Tensor, "height width 3"]:
         """Camera-frame directions through the pixel centres with z = 1, float32.
 
         Multiplied by a depth map they give camera-frame points.
         """
-        u = (torch.arange(self.width_px, dtype=torch.float32) + 0.5 - self.cx_px) / self.fx_px
-        v = (torch.arange(self.height_px, dtype=torch.float32) + 0.5 - self.cy_px) / self.fy_px
+        column = torch.arange(self.width_px, dtype=torch.float32, device=device)
+        row = torch.arange(self.height_px, dtype=torch.float32, device=device)
+        u = (column + 0.5 - self.cx_px) / self.fx_px
+        v = (row + 0.5 - self.cy_px) / self.fy_px
         grid_v, grid_u = torch.meshgrid(v, u, indexing="ij")
         return torch.stack([grid_u, grid_v, torch.ones_like(grid_u)], dim=-1)
 
     def unproject(self, depth_m: Float[Tensor, "height width"]) -> Float[Tensor, "height width 3"]:
         """World points (float32) seen at each pixel centre at the given camera z."""
-        points_camera = self.pixel_directions() * depth_m[..., None]
+        points_camera = self.pixel_directions(depth_m.device) * depth_m[..., None]
         world_from_camera = self.world_from_camera.to(torch.float32)
+        world_from_camera = world_from_camera.to(depth_m.device, non_blocking=True)
         return points_camera @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]

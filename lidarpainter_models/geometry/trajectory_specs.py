@@ -1,95 +1,155 @@
-"""Trajectories by name: what a user writes for where the camera should go.
+"""Trajectories by name: what a user writes for where a camera, a car or an actor should go.
 
-A trajectory is a shift from the recorded path for every moment of it, so it can be followed at
-any speed and for any length of log. Several parts are added with `+`: `lateral:2+up:1.5`.
+A trajectory is either steps off the recorded path, at every moment of it, or another path
+altogether and steps off that; so it can be followed at any speed and for any length of log.
+Parts are added with `+`: `lateral:2+up:1.5`, `follow:car-7+up:2`. The same words move a camera, the
+whole rig (body: ego) and an actor (body: box).
 """
 
-import math
-from collections.abc import Callable
+import re
 from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.geometry.shifts import Shift
+from lidarpainter_models.geometry.driven_paths import DrivenPath
+from lidarpainter_models.geometry.shifts import MAX_SHIFT_M
+from lidarpainter_models.geometry.trajectory_parts import (
+    Moments,
+    Offsets,
+    OtherPath,
+    PathOf,
+    offsets_of,
+    turns,
+)
+from lidarpainter_models.geometry.trajectory_words import PathWords, Step, read_trajectory_words
+from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_rotation
+from lidarpainter_models.geometry.waypoints import read_waypoints
 
-LANE_WIDTH_M = 3.5
-"""A lane change without a width goes this far to the left."""
-KINDS = ("recorded", "lateral:METRES", "up:METRES", "yaw:DEGREES", "lane-change[:METRES]")
+CAMERA_FROM_EGO = torch.tensor(
+    [[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=torch.float64
+)
+"""Of a camera that looks along x."""
 
-_Part = Callable[[float], Shift]
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Trajectory:
-    """A shift for every moment of a log."""
+    """Where a body goes in place of where it was."""
 
     spec: str
     """As the user wrote it."""
-    parts: tuple[_Part, ...]
+    steps: tuple[Step, ...]
+    other: OtherPath | None = None
+    """The path that the steps lead off; None is the recorded one."""
+    max_shift_m: float | None = MAX_SHIFT_M
+    """How far the steps may lead off the recorded path; None sets no limit."""
+    files: tuple[Path, ...] = ()
+    """What was read beside the text."""
 
     @property
     def name(self) -> str:
         """The spec as a file name."""
-        return self.spec.replace(":", "-").replace("+", "_")
+        return re.sub(r"[^A-Za-z0-9.-]+", "_", self.spec.replace(":", "-"))
 
-    def shift_at(self, progress: float) -> Shift:
-        """Where to be.
+    @property
+    def is_recorded(self) -> bool:
+        """Whether it leads nowhere else."""
+        return self.other is None and not self.steps
+
+    def placed(
+        self,
+        bodies: Float[Tensor, "moments 4 4"],
+        road: DrivenPath,
+        moments: Moments,
+        path_of: PathOf,
+        *,
+        is_camera: bool = False,
+    ) -> Float[Tensor, "moments 4 4"]:
+        """`world_from_body` at every moment.
 
         Args:
-            progress: 0 at the first moment of the log, 1 at the last.
+            bodies: where it was.
+            road: the path that gives the road: the ego's for cameras and for itself, an actor's
+                own for the actor.
+            moments: when, and at which poses of the road.
+            path_of: looks actors up.
+            is_camera: the body is one camera: it turns about itself, and looks where the path says.
+
+        Raises:
+            ConfigError: it leads too far out of the ends of the recorded path, or an actor is
+                not known.
         """
-        shifts = [part(progress) for part in self.parts]
-        return Shift(
-            lateral_m=sum(shift.lateral_m for shift in shifts),
-            up_m=sum(shift.up_m for shift in shifts),
-            yaw_rad=sum(shift.yaw_rad for shift in shifts),
-        )
+        if self.other is not None:
+            poses = self.other.poses(moments, road, path_of)
+            looks = is_camera and self.other.looks
+            egos_from_bodies = invert_rigid(road.world_from_body[moments.rows]) @ bodies
+            bodies = poses @ (invert_rigid(CAMERA_FROM_EGO) if looks else egos_from_bodies)
+            if not self.other.looks:  # else the recorded road says what is left and ahead
+                times_ns = road.timestamps_ns[moments.rows]
+                road = DrivenPath(timestamps_ns=times_ns, world_from_body=poses)
+                moments = moments._replace(rows=torch.arange(len(poses)))
+        found = Offsets.none(len(bodies))
+        for step in self.steps:
+            found = found.plus(offsets_of(step, moments, road))
+        directions = road.directions[moments.rows]
+        if bool((found.along_m != 0).any()):
+            self._check_ends(road, moments, found)
+            carried = road.moved_along(moments.rows, found.along_m)
+            bodies = carried @ bodies
+            directions = (carried[:, :3, :3] @ directions[..., None])[..., 0]
+        return _moved_aside(bodies, directions, found)
+
+    def _check_ends(self, road: DrivenPath, moments: Moments, offsets: Offsets) -> None:
+        if self.max_shift_m is None or self.other is not None:
+            return
+        if (beyond_m := road.beyond_m(moments.rows, offsets.along_m)) > self.max_shift_m:
+            raise ConfigError(
+                f"trajectory {self.spec!r} leads {beyond_m:.1f} m out of the ends of the recorded "
+                f"path, expected at most {self.max_shift_m:g} m"
+            )
 
 
-def parse_trajectory(spec: str) -> Trajectory:
-    """Read `recorded`, `lateral:2`, `up:1.5`, `yaw:-15`, `lane-change:3.5`, or a sum of them.
+def parse_trajectory(spec: str, *, max_shift_m: float | None = MAX_SHIFT_M) -> Trajectory:
+    """Read `recorded`, steps such as `lateral:2+up:1.5`, or another path and steps off it.
 
-    Lateral is to the left of the driving direction; a turn is counter-clockwise seen from above.
+    Lateral is to the left of the driving direction, along is ahead; a turn is counter-clockwise
+    seen from above. `lane-change:3.5@2s+3s` begins after two seconds of the log and takes three,
+    the heading following; without times it takes all that is followed, the heading kept.
+
+    Args:
+        spec: what a user wrote.
+        max_shift_m: how far steps may lead off the recorded path; other paths go anywhere.
 
     Raises:
         ConfigError: the text is no trajectory, or one that leads too far away.
     """
-    found = Trajectory(spec, tuple(_part(text.strip(), spec) for text in spec.split("+")))
-    try:
-        found.shift_at(1.0)  # every part goes farthest at its end
-    except ConfigError as error:
-        raise ConfigError(f"trajectory {spec!r}: {error}") from None
-    return found
+    words = read_trajectory_words(spec, max_shift_m=max_shift_m)
+    other = None if words.path is None else _other_path(words.path)
+    files = (Path(words.path.value),) if words.path and words.path.kind == "waypoints" else ()
+    return Trajectory(spec, words.steps, other, max_shift_m, files)
 
 
-def _part(text: str, spec: str) -> _Part:
-    kind, has_value, number = text.partition(":")
-    value = _number(number, spec) if has_value else None
-    if kind == "recorded" and value is None:
-        return lambda _progress: Shift()
-    if kind == "lane-change":
-        width_m = LANE_WIDTH_M if value is None else value
-        return lambda progress: Shift(lateral_m=width_m * _smooth_step(progress))
-    if value is not None:
-        if kind == "lateral":
-            return lambda _progress: Shift(lateral_m=value)
-        if kind == "up":
-            return lambda _progress: Shift(up_m=value)
-        if kind == "yaw":
-            return lambda _progress: Shift(yaw_rad=math.radians(value))
-    raise ConfigError(f"trajectory {spec!r}: expected one of {', '.join(KINDS)}, or a sum with +")
+def _other_path(words: PathWords) -> OtherPath:
+    if words.kind == "waypoints":
+        return OtherPath(kind=words.kind, waypoints=read_waypoints(Path(words.value)))
+    if words.kind == "birdseye":
+        return OtherPath(kind=words.kind, looks=True, height_m=words.height_m)
+    return OtherPath(kind=words.kind, actor=words.value, looks=words.kind == "orbit")
 
 
-def _number(text: str, spec: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ConfigError(f"trajectory {spec!r}: {text!r} is no number")
-    return value
-
-
-def _smooth_step(progress: float) -> float:
-    """From 0 to 1 with neither a jump in speed nor in steering (quintic)."""
-    clipped = min(max(progress, 0.0), 1.0)
-    return clipped**3 * (10 - 15 * clipped + 6 * clipped**2)
+def _moved_aside(
+    bodies: Float[Tensor, "moments 4 4"],
+    directions: Float[Tensor, "moments 3"],
+    offsets: Offsets,
+) -> Float[Tensor, "moments 4 4"]:
+    """Poses moved left and up relative to the road, and turned about up where they are."""
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=bodies.dtype)
+    left = torch.linalg.cross(up.expand_as(directions), directions.to(bodies))
+    if bool((left.norm(dim=1) < 1e-6).any()):
+        raise ConfigError("the road direction is vertical: no lateral direction is defined")
+    left = torch.nn.functional.normalize(left, dim=1)
+    away = offsets.lateral_m[:, None] * left + offsets.up_m[:, None] * up
+    return rigid_from_rotation(turns(offsets.yaw_rad) @ bodies[:, :3, :3], bodies[:, :3, 3] + away)

@@ -1,11 +1,14 @@
 """Choose which implementation of a kernel runs.
 
 Every kernel package holds `reference.py` (plain torch, the law), `cpu.py` (numba) and, where it
-pays, `cuda.py`. Implementations are imported when first asked for, so nothing is compiled at
-import.
+pays, `cuda.py` (gsplat) and `triton.py`. Implementations are imported when first asked for, so
+nothing is compiled at import. A run may ask for plain torch on the CPU too (`kernels_chosen`), the
+path of a GPU.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -14,9 +17,27 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
+from lidarpainter_models.devices import KernelChoice
 from lidarpainter_models.errors import BackendError
+from lidarpainter_models.kernels.gpu_packages import why_no_gsplat, why_no_triton
 
-Backend = Literal["auto", "reference", "cpu", "cuda"]
+Backend = Literal["auto", "reference", "cpu", "cuda", "triton"]
+FASTEST = {"cpu": ("cpu",), "cuda": ("cuda", "triton")}
+"""By device, what `auto` tries before the plain reference."""
+RASTERISER = "gaussian_raster"
+"""Its reference is for tests alone, far too slow to fit with."""
+
+_choice: ContextVar[KernelChoice] = ContextVar("kernel choice", default="auto")
+
+
+@contextmanager
+def kernels_chosen(choice: KernelChoice) -> Iterator[None]:
+    """Let kernels that are asked for nothing else be of a choice while this lasts."""
+    before = _choice.set(choice)
+    try:
+        yield
+    finally:
+        _choice.reset(before)
 
 
 @cache
@@ -31,9 +52,16 @@ def _written_backends(kernel: str) -> tuple[str, ...]:
 def available_backends(kernel: str) -> tuple[str, ...]:
     """The backends of a kernel that can run on this machine."""
     written = _written_backends(kernel)
-    if "cuda" in written and not torch.cuda.is_available():
-        return tuple(backend for backend in written if backend != "cuda")
-    return written
+    return tuple(backend for backend in written if why_missing(kernel, backend) is None)
+
+
+def why_missing(kernel: str, backend: str) -> str | None:
+    """Why a backend of a kernel cannot run here, in a line; None if it can."""
+    if backend not in _written_backends(kernel):
+        return "it is not written"
+    if backend == "cuda":
+        return why_no_gsplat()
+    return why_no_triton() if backend == "triton" else None
 
 
 def implementation(
@@ -41,7 +69,7 @@ def implementation(
 ) -> Callable[..., Any]:
     """The function of a kernel's backend.
 
-    `auto` takes numba on the CPU, on a GPU cuda where it is written, elsewhere the plain reference.
+    `auto` takes numba on the CPU; on a GPU gsplat, else Triton; otherwise the plain reference.
 
     Raises:
         BackendError: the backend does not exist for this kernel or cannot run here.
@@ -49,16 +77,22 @@ def implementation(
     found = available_backends(kernel)
     chosen: str = backend
     if backend == "auto":
-        fast = "cuda" if device.type == "cuda" else "cpu"
-        is_home = device.type in ("cpu", "cuda")
-        chosen = fast if is_home and fast in found else "reference"
+        is_plain = _choice.get() == "torch" and kernel != RASTERISER
+        fast = [] if is_plain else [name for name in FASTEST.get(device.type, ()) if name in found]
+        chosen = fast[0] if fast else "reference"
     if chosen not in found:
         raise BackendError(
-            f"kernel {kernel!r} has no {chosen!r} backend here (available: {', '.join(found)})"
+            f"kernel {kernel!r} has no {chosen!r} backend here: {why_missing(kernel, chosen)} "
+            f"(available: {', '.join(found)})"
         )
     if chosen == "cpu" and device.type != "cpu":
         raise BackendError(f"the numba {kernel} runs on the CPU, got a tensor on {device}")
     return getattr(import_module(f"lidarpainter_models.kernels.{kernel}.{chosen}"), function)
+
+
+def may_run_on_host(device: torch.device) -> bool:
+    """Whether numbers of a device may be given to code of the CPU that is no kernel (OpenCV)."""
+    return device.type == "cpu" and _choice.get() == "auto"
 
 
 def float32_backend(kernel: str, backend: Backend, like: Tensor) -> Backend:

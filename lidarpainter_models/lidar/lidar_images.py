@@ -129,7 +129,7 @@ def _image(
     """Recent points first, older ones where those leave the image open, then gaps closed."""
     surface = _surface(recent, camera, recent.radius_px.round())
     recent = recent.without(_hidden(recent, surface, reach_px))
-    everywhere = torch.ones(camera.height_px, camera.width_px, dtype=torch.bool)
+    everywhere = torch.ones_like(surface, dtype=torch.bool)
     image = _blend(recent, everywhere, camera)
     is_open = image[..., 4] == 0
     older = older.keep(_at(spread(is_open, reach_px), older))
@@ -184,14 +184,9 @@ class _Projected(NamedTuple):
             [[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]],
             dtype=torch.float64,
         )
-        found = project_inside(
-            body.xyz_m.contiguous().numpy(),
-            (lens @ camera_from_body[:3]).numpy(),
-            camera.width_px,
-            camera.height_px,
-            NEAR_M,
+        rows, positions_uv, depth_m = project_inside(
+            body.xyz_m, lens @ camera_from_body[:3], camera.width_px, camera.height_px, NEAR_M
         )
-        rows, positions_uv, depth_m = (torch.from_numpy(column) for column in found)
         age_ns = (body.timestamp_ns.index_select(0, rows) - timestamp_ns).abs()
         focal_px = (camera.fx_px + camera.fy_px) / 2
         return cls(body, rows, positions_uv, depth_m, age_ns, focal_px)

@@ -36,6 +36,12 @@ class MapPoints:
         """The points marked or listed."""
         return type(self)(**{field.name: getattr(self, field.name)[kept] for field in fields(self)})
 
+    def to(self, device: torch.device) -> "MapPoints":
+        """The same points on another device."""
+        return type(self)(
+            **{field.name: getattr(self, field.name).to(device) for field in fields(self)}
+        )
+
     def to_arrays(self) -> dict[str, Tensor]:
         """Columns by name, for storage."""
         return {field.name: getattr(self, field.name).contiguous() for field in fields(self)}
@@ -85,6 +91,13 @@ class LidarMap:
     actors: dict[str, MapPoints]
     """By actor id, in the box frame, from the whole log; only moving actors with points."""
     _newest_age_ns: dict[int, int] = field(default_factory=dict, init=False, repr=False)
+
+    def to(self, device: torch.device) -> "LidarMap":
+        """The same map on another device, itself if it is there."""
+        if self.street.xyz_m.device == device:
+            return self
+        actors = {name: points.to(device) for name, points in self.actors.items()}
+        return LidarMap(street=self.street.to(device), actors=actors)
 
     def newest_age_ns(self, timestamp_ns: int) -> int:
         """How far in time the nearest street point is; kept, as many views share a time."""

@@ -51,7 +51,7 @@ class MovingBoxes:
         """
         present = self._poses.present(timestamp_ns, presence_margin_ns).nonzero()[:, 0]
         if self._size_m is None or not len(present):
-            return torch.full(points_world.shape[:1], BACKGROUND)
+            return torch.full(points_world.shape[:1], BACKGROUND, device=points_world.device)
         boxes = box_owners(
             points_world,
             invert_rigid(self._poses.all_at(timestamp_ns)[present]),
@@ -59,6 +59,7 @@ class MovingBoxes:
             margin_m=MARGIN_M,
             floor_m=floor_m,
         )
+        present = present.to(boxes.device, non_blocking=True)
         return torch.where(boxes == NO_BOX, BACKGROUND, present[boxes])
 
     def moved(
@@ -80,5 +81,5 @@ class MovingBoxes:
         moved[carried] = turned + later_from_world[:, :3, 3]
         present = torch.ones_like(owners, dtype=torch.bool)
         is_there = self._poses.present(from_ns) & self._poses.present(to_ns)
-        present[carried] = is_there[owners[carried]]
+        present[carried] = is_there.to(owners.device, non_blocking=True)[owners[carried]]
         return moved, present

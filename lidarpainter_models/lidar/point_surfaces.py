@@ -29,7 +29,7 @@ def disc_surface(
         width_px=width_px,
         radius_px=radius_px,
     ).to(torch.int64)
-    beyond = depth_m.new_tensor([torch.inf])
+    beyond = depth_m.new_full((1,), torch.inf)
     return torch.cat([depth_m, beyond])[nearest]  # index -1 takes infinity
 
 

@@ -121,20 +121,19 @@ def points_in_view(
                 continue
             _, world_from_box = actors[body.track.actor_id]
             camera_from_points = camera_from_points @ world_from_box
-        rows, pixels_uv, depth_m = project_inside(
-            body.points.xyz_m.contiguous().numpy(),
-            (lens @ camera_from_points[:3]).numpy(),
+        inside, pixels_uv, depth_m = project_inside(
+            body.points.xyz_m,
+            lens @ camera_from_points[:3],
             camera.width_px,
             camera.height_px,
             near_m,
         )
-        inside = torch.from_numpy(rows)
         age_ns = (body.points.timestamp_ns[inside] - timestamp_ns).abs()
         parts.append(
             {
                 "rows": inside + start,
-                "pixels_uv": torch.from_numpy(pixels_uv),
-                "depth_m": torch.from_numpy(depth_m),
+                "pixels_uv": pixels_uv,
+                "depth_m": depth_m,
                 "range_m": body.points.range_m[inside],
                 "age_s": age_ns.float() * 1e-9,
                 "is_actor": torch.full(inside.shape, body.track is not None),

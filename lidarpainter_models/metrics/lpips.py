@@ -93,8 +93,8 @@ class Lpips(nn.Module):
         return (2 * views - 1 - self.get_buffer("shift")) / self.get_buffer("scale")
 
 
-def load_lpips(files: LpipsFiles) -> Lpips | None:
-    """Read LPIPS from its two files; None where one is not named.
+def load_lpips(files: LpipsFiles, device: torch.device | None = None) -> Lpips | None:
+    """Read LPIPS from its two files, to a device; None where one is not named.
 
     Raises:
         WeightsError: a file is missing or unreadable, the two belong to different networks, or
@@ -110,7 +110,7 @@ def load_lpips(files: LpipsFiles) -> Lpips | None:
             f"{files.backbone} is not the {backbone.name} that LPIPS was learnt on: expected "
             f"torchvision's file, whose SHA-256 begins with {digests}"
         )
-    return Lpips(stack, heads).eval().requires_grad_(requires_grad=False)
+    return Lpips(stack, heads).eval().requires_grad_(requires_grad=False).to(device)
 
 
 def read_heads(path: Path) -> tuple[Backbone, list[Float[Tensor, " _"]]]:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -28,13 +29,17 @@ class PerceptualDistances:
     """Why there is no LPIPS; None where there is."""
 
 
-def load_distances(feature_weights: Path | None, lpips: LpipsFiles) -> PerceptualDistances:
-    """Load every distance whose weights are named.
+def load_distances(
+    feature_weights: Path | None, lpips: LpipsFiles, device: torch.device | None = None
+) -> PerceptualDistances:
+    """Load every distance whose weights are named, to a device.
 
     Raises:
         WeightsError: a file that is named cannot be used.
     """
-    features = None if feature_weights is None else load_squeezenet_distance(feature_weights)
+    features = None
+    if feature_weights is not None:
+        features = load_squeezenet_distance(feature_weights).to(device)
     return PerceptualDistances(
-        features=features, lpips=load_lpips(lpips), lpips_missing=lpips.missing
+        features=features, lpips=load_lpips(lpips, device), lpips_missing=lpips.missing
     )

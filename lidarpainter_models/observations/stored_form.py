@@ -33,6 +33,8 @@ def observations_to_arrays(
     for index, view in enumerate(observations.views):
         for name in _IMAGES:
             arrays[f"view.{index}.{name}"] = getattr(view, name).contiguous()
+        if view.hidden is not None:
+            arrays[f"view.{index}.hidden"] = view.hidden.contiguous()
         arrays[f"view.{index}.world_from_camera"] = view.camera.world_from_camera.contiguous()
         lens = {name: getattr(view.camera, name) for name in _LENS}
         records.append({"key": list(view.key), "timestamp_ns": view.timestamp_ns, "lens": lens})
@@ -87,5 +89,6 @@ def _stored_view(arrays: dict[str, Tensor], index: int, record: dict[str, Any]) 
             world_from_camera=arrays[f"view.{index}.world_from_camera"], **record["lens"]
         ),
         timestamp_ns=record["timestamp_ns"],
+        hidden=arrays.get(f"view.{index}.hidden"),
         **images,
     )

@@ -3,8 +3,9 @@
 Frames: world (z up) and camera (x right, y down, z forward); metres.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
@@ -26,6 +27,9 @@ class TrainingView:
     sky_mask: Bool[Tensor, "height width"]
     lidar_depth_m: Float[Tensor, "height width"]
     """The own frame's sweeps, 0 where no point falls."""
+    hidden: Bool[Tensor, "height width"] | None = None
+    """Where the image shows what an edited scene does not: no reference takes its colours from
+    there. None hides nothing."""
 
     @property
     def rgb(self) -> Float[Tensor, "height width 3"]:
@@ -45,6 +49,17 @@ class GuidanceView:
     """Confidence per pixel, 0 to 1."""
     lidar_depth_m: Float[Tensor, "height width"]
     """Sparse LiDAR depth in this view, 0 where there is none."""
+
+    def to(self, device: torch.device) -> "GuidanceView":
+        """The same view on another device, as far as it is not there."""
+        if self.rgb.device == device:
+            return self
+        return replace(
+            self,
+            rgb=self.rgb.to(device, non_blocking=True),
+            weight=self.weight.to(device, non_blocking=True),
+            lidar_depth_m=self.lidar_depth_m.to(device, non_blocking=True),
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

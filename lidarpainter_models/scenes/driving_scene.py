@@ -122,6 +122,10 @@ class DrivingScene:
         offset, num_bytes = self._image_ranges[view.index]
         return self._stored.read_rows("image_bytes", offset, num_bytes).tobytes()
 
+    def is_stored_undistorted(self, view: RecordedView) -> bool:
+        """Whether the camera's own bytes show what `read_image` gives."""
+        return self._lenses[view.index][1].model == "none"
+
     def read_sweep(self, sweep: Sweep) -> SweepPoints:
         """The points of one sweep, in the world."""
         columns = {

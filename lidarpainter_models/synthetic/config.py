@@ -22,10 +22,22 @@ class RigCamera:
     """Position in the ego frame, whose origin is on the ground."""
     gain: float = 1.0
     """Exposure: recorded images are multiplied by it."""
+    gain_drift: float = 0.0
+    """How much more it is a second later, as a share of `gain`."""
+    readout_s: float = 0.0
+    """From the first row read to the last, downwards; an image's time is the middle of it."""
+    delay_s: float = 0.0
+    """How much later than stored its images are really taken."""
+    yaw_error_rad: float = 0.0
+    """How far to the left of the stored calibration it really looks."""
 
     def __post_init__(self) -> None:
         if self.focal_per_width <= 0 or self.gain <= 0:
             raise ConfigError(f"camera {self.name!r}: focal length and gain must be positive")
+        if not 0 <= self.readout_s < 1:
+            raise ConfigError(
+                f"camera {self.name!r}: a readout of {self.readout_s:g} s, expected 0 to 1"
+            )
 
 
 DEFAULT_CAMERAS = (
@@ -105,7 +117,13 @@ class SyntheticStreetConfig:
     box_noise_rad: float = 0.0
     """Deviation of the stored box headings."""
     camera_delay_s: float = 0.0
-    """How much later than stored the images are really taken."""
+    """How much later than stored the images of all cameras are really taken."""
+    is_readout_told: bool = True
+    """Whether the stored scene says how long cameras read."""
+    speed_mps: tuple[float, float] | None = None
+    """First and last speed of the recording car, 0 for one that stands; None draws it."""
+    are_people_walking: bool = False
+    """Whether people who move swing arms and legs, or glide in mid-stride."""
 
     def __post_init__(self) -> None:
         if self.seed < 0 or self.num_frames < 1 or self.frame_interval_s <= 0:
@@ -115,6 +133,8 @@ class SyntheticStreetConfig:
             )
         if min(self.width_px, self.height_px) < 8 or self.samples_per_axis < 1:
             raise ConfigError("a street needs images of 8 x 8 px or more and a ray per pixel")
+        if self.speed_mps is not None and min(self.speed_mps) < 0:
+            raise ConfigError(f"a car drives at 0 m/s or more, got {self.speed_mps}")
         if not self.cameras:
             raise ConfigError("a street needs at least one camera")
         if len({camera.name for camera in self.cameras}) != len(self.cameras):
@@ -124,6 +144,7 @@ class SyntheticStreetConfig:
         """As JSON-able values."""
         values = asdict(self)
         values["cameras"] = list(values["cameras"])
+        values["speed_mps"] = None if self.speed_mps is None else list(self.speed_mps)
         return values
 
     @classmethod
@@ -139,8 +160,11 @@ class SyntheticStreetConfig:
                 "cameras": tuple(RigCamera(**camera) for camera in values["cameras"]),
                 "lidar": RigLidar(**values["lidar"]),
             }
+            if given.get("speed_mps") is not None:
+                first, last = given["speed_mps"]
+                given["speed_mps"] = (first, last)
             return cls(**given)
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             known = ", ".join(field.name for field in fields(cls))
             raise ConfigError(
                 f"not a synthetic street's settings: {error} (expected {known})"

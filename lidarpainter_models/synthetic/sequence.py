@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
-from lidarpainter_models.scenes.records import BoxRecord, ImageRecord
+from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, RollingShutter
 from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
 from lidarpainter_models.synthetic.config import RigCamera, SyntheticStreetConfig
 from lidarpainter_models.synthetic.street import (
@@ -102,19 +102,22 @@ def _record_image(
 ) -> None:
     """An image with its exposure and noise, stored under a pose that may be a little wrong."""
     config = street.config
-    taken_ns = timestamp_ns + round(config.camera_delay_s * 1e9)
-    true_camera = street.camera(rig.name, taken_ns)
-    rgb = street.render(true_camera, taken_ns).rgb.numpy() * rig.gain
+    taken_ns = timestamp_ns + round((config.camera_delay_s + rig.delay_s) * 1e9)
+    since_s = (timestamp_ns - street.timestamps_ns[0]) / 1e9
+    gain = rig.gain * (1 + rig.gain_drift * since_s)
+    rgb = street.render_recorded(rig.name, taken_ns).rgb.numpy() * gain
     rgb = rgb + config.sensor_noise * rng.standard_normal(rgb.shape)
     bgr = np.round(np.clip(rgb[..., ::-1], 0, 1) * 255).astype(np.uint8)
     _, jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality])
     stated = street.camera(rig.name, timestamp_ns)
     error = _pose_error(rng, config.pose_noise_rad, config.pose_noise_m)
+    error = _turned_right(rig.yaw_error_rad) @ error
     writer.add_image(
         ImageRecord(
             camera_name=rig.name,
             timestamp_ns=timestamp_ns,
             camera=stated.at(stated.world_from_camera @ error),
+            rolling_shutter=_told_readout(config, rig),
         ),
         jpeg.tobytes(),
     )
@@ -144,6 +147,19 @@ def _record_boxes(
                 num_points=num_points,
             )
         )
+
+
+def _told_readout(config: SyntheticStreetConfig, rig: RigCamera) -> RollingShutter | None:
+    if rig.readout_s == 0 or not config.is_readout_told:
+        return None
+    return RollingShutter(duration_s=rig.readout_s, direction="down")
+
+
+def _turned_right(angle_rad: float) -> Float[Tensor, "4 4"]:
+    """What a camera turned to the left by an angle is stored as, in its own frame (y is down)."""
+    turn = torch.zeros(6, dtype=torch.float64)
+    turn[1] = angle_rad
+    return rigid_from_tangent(turn)
 
 
 def _pose_error(

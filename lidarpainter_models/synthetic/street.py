@@ -6,6 +6,7 @@ of its sweep.
 """
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
@@ -27,7 +28,8 @@ from lidarpainter_models.synthetic.lidar_sensor import (
 )
 from lidarpainter_models.synthetic.raytracing.scene_arrays import InstanceArrays, ViewArrays
 from lidarpainter_models.synthetic.textures.surfaces import StreetClass
-from lidarpainter_models.synthetic.world.city import City, build_city
+from lidarpainter_models.synthetic.world.city import ActorChange, City, build_city
+from lidarpainter_models.synthetic.world.traffic import StreetActor
 
 START_NS = 1_700_000_000_000_000_000
 GENERATOR = "lidarpainter synthetic street"
@@ -73,9 +75,9 @@ class SimulatedSweep:
 
 
 @lru_cache(maxsize=1)
-def _city(seed: int) -> City:
+def _city(seed: int, speed_mps: tuple[float, float] | None, are_people_walking: bool) -> City:
     """The last one is kept: whoever records a street judges it later."""
-    return build_city(seed)
+    return build_city(seed, speed_mps=speed_mps, are_people_walking=are_people_walking)
 
 
 class SyntheticStreet:
@@ -83,7 +85,19 @@ class SyntheticStreet:
 
     def __init__(self, config: SyntheticStreetConfig) -> None:
         self.config = config
-        self._city = _city(config.seed)
+        self._city = _city(config.seed, config.speed_mps, config.are_people_walking)
+
+    def changed(self, change: ActorChange) -> "SyntheticStreet":
+        """The same street with other actors in it: the exact truth of an edit."""
+        config = self.config
+        other = copy(self)
+        other._city = build_city(
+            config.seed,
+            speed_mps=config.speed_mps,
+            are_people_walking=config.are_people_walking,
+            change=change,
+        )
+        return other
 
     @classmethod
     def from_manifest(cls, manifest: Mapping[str, Any]) -> "SyntheticStreet":
@@ -134,10 +148,7 @@ class SyntheticStreet:
         Raises:
             ConfigError: the rig has no such camera.
         """
-        rig = next((rig for rig in self.config.cameras if rig.name == name), None)
-        if rig is None:
-            names = ", ".join(rig.name for rig in self.config.cameras)
-            raise ConfigError(f"the street has no camera {name!r} (it has {names})")
+        rig = self._rig(name)
         width_px, height_px = self.config.width_px, self.config.height_px
         focal_px = rig.focal_per_width * width_px
         return Camera(
@@ -164,19 +175,44 @@ class SyntheticStreet:
             for actor in self._city.actors
         ]
 
+    def _rig(self, name: str) -> RigCamera:
+        rig = next((rig for rig in self.config.cameras if rig.name == name), None)
+        if rig is None:
+            names = ", ".join(rig.name for rig in self.config.cameras)
+            raise ConfigError(f"the street has no camera {name!r} (it has {names})")
+        return rig
+
     def render(self, camera: Camera, timestamp_ns: int) -> TrueImage:
-        """The true image of any pinhole camera at any time."""
+        """The true image of any pinhole camera at any time, all rows of it at once."""
+        pose = camera.world_from_camera[None, :3].to(torch.float64).contiguous().numpy()
+        return self._traced(camera, pose, _seconds(timestamp_ns))
+
+    def render_recorded(self, name: str, timestamp_ns: int) -> TrueImage:
+        """What a camera of the rig sees around a time, read row by row if it does.
+
+        Raises:
+            ConfigError: the rig has no such camera.
+        """
+        camera, rig = self.camera(name, timestamp_ns), self._rig(name)
+        if rig.readout_s == 0:
+            return self.render(camera, timestamp_ns)
+        share = (np.arange(camera.height_px) + 0.5) / camera.height_px - 0.5
+        time_s = _seconds(timestamp_ns) + share * rig.readout_s
+        poses = self._city.ego.world_from_ego(time_s) @ ego_from_camera(rig).numpy()
+        return self._traced(camera, np.ascontiguousarray(poses[:, :3]), time_s)
+
+    def _traced(self, camera: Camera, poses: np.ndarray, time_s: np.ndarray) -> TrueImage:
+        """An image at one pose and time, or with one of each for every row."""
         from lidarpainter_models.synthetic.raytracing.render import render_image  # numba
 
         view = ViewArrays(
-            world_from_camera=camera.world_from_camera[:3].to(torch.float64).contiguous().numpy(),
+            world_from_camera=poses,
             intrinsics=np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px], float),
             offsets=sample_offsets(self.config.samples_per_axis),
             footprint_px=1.0 / self.config.samples_per_axis,
         )
-        instances = self._instances(_seconds(timestamp_ns))
         rgb, depth_m, semantics, actor_index = render_image(
-            self._city.arrays, instances, view, camera.height_px, camera.width_px
+            self._city.arrays, self._instances(time_s), view, camera.height_px, camera.width_px
         )
         return TrueImage(
             rgb=torch.from_numpy(rgb),
@@ -248,11 +284,16 @@ class SyntheticStreet:
             contact[:, index, 2:4] = pose[:, :2, 0]
             contact[:, index, 4:6] = actor.size_m[:2] / 2
         return InstanceArrays(
-            roots=city.roots,
+            roots=self._roots(moving, time_s),
             radius_m=city.radius_m,
             world_from_box=np.ascontiguousarray(poses[:, :, :3]),
             contact=contact,
         )
+
+    def _roots(self, moving: list[StreetActor], time_s: np.ndarray) -> np.ndarray:
+        """The mesh of everything that moves at given times."""
+        postures = np.stack([actor.posture(time_s) for actor in moving], axis=1)
+        return np.take_along_axis(self._city.roots, postures.T, axis=1).T.copy()
 
 
 def ego_from_camera(rig: RigCamera) -> Float[Tensor, "4 4"]:

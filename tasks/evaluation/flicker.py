@@ -5,8 +5,6 @@ from dataclasses import asdict
 from functools import partial
 from typing import Any
 
-from prefect import task
-
 from catalog.artefacts import Workplace
 from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.evaluation.flicker_paths import FlickerJudgement
@@ -19,10 +17,10 @@ from tasks.json_files import write_json
 from tasks.opened import opened
 from tasks.progress import Progress
 from tasks.specs import FittedRef, RunSpec
-from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
+from tasks.stages import StageResult, run_stage, stage_task
 
 
-@task(**STAGE_OPTIONS)
+@stage_task
 def evaluate_flicker(
     run: RunSpec,
     stage: str,
@@ -43,6 +41,7 @@ def evaluate_flicker(
     shifts = config.scoring.shifts
     return run_stage(
         this.store,
+        kernels=run.kernels,
         stage=stage,
         kind="evaluation",
         inputs=judged_inputs(this, fitted, view_time=True),

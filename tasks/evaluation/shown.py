@@ -1,7 +1,7 @@
 """Fitted scenes of the store, ready to be judged or shown: as they are or painted at view time."""
 
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 
 import torch
 
@@ -10,6 +10,8 @@ from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.evaluation.settings import JudgeConfig
 from lidarpainter_models.evaluation.shown import ShownScene, ViewTimePainting
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.observations.views import SceneObservations
 from lidarpainter_models.painter.selection import PainterChoice
 from tasks.opened import OpenedRun
 from tasks.specs import FittedRef
@@ -21,13 +23,13 @@ def shown_by(
 ) -> Callable[[], ShownScene]:
     """Opens a fitted scene as it is, or as the run's painter paints it at view time."""
     if not view_time:
-        return partial(unpainted_scene, this.store, fitted)
+        return partial(unpainted_scene, this.store, fitted, this.device)
     return partial(painted_scene, this.store, fitted, config.conditions, this.painter, this.device)
 
 
-def unpainted_scene(store: Store, fitted: FittedRef) -> ShownScene:
+def unpainted_scene(store: Store, fitted: FittedRef, device: torch.device) -> ShownScene:
     """A fitted scene as it is."""
-    return ShownScene(scene=load_scene(store, fitted.gaussians))
+    return ShownScene(scene=load_scene(store, fitted.gaussians).to(device))
 
 
 def painted_scene(
@@ -50,12 +52,20 @@ def view_time_painting(
     device: torch.device,
 ) -> ViewTimePainting:
     """What a painter needs to paint a fitted scene at view time."""
-    builder = condition_builder(store, fitted, conditions)
+    builder = condition_builder(store, fitted, conditions, device)
     return ViewTimePainting(conditions=builder, painter=painter, device=device)
 
 
-def condition_builder(store: Store, fitted: FittedRef, config: ConditionConfig) -> ConditionBuilder:
-    """What a painter is shown of a fitted scene."""
+def condition_builder(
+    store: Store, fitted: FittedRef, config: ConditionConfig, device: torch.device
+) -> ConditionBuilder:
+    """What a painter is shown of a fitted scene, gathered on a device; kept, with what it found."""
     seen = load_observations(store, fitted.observations)
-    scene = load_scene(store, fitted.gaussians)
-    return ConditionBuilder(scene, seen.lidar_map, seen.views, config=config)
+    return _builder(load_scene(store, fitted.gaussians), seen, config, device)
+
+
+@lru_cache(maxsize=1)
+def _builder(
+    scene: GaussianScene, seen: SceneObservations, config: ConditionConfig, device: torch.device
+) -> ConditionBuilder:
+    return ConditionBuilder(scene.to(device), seen.lidar_map, seen.views, config=config)

@@ -5,8 +5,6 @@ from dataclasses import asdict
 from functools import partial
 from typing import Any
 
-from prefect import task
-
 from catalog.artefacts import Workplace
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.settings import JudgeConfig
@@ -18,10 +16,10 @@ from tasks.json_files import write_json
 from tasks.opened import opened
 from tasks.progress import Progress
 from tasks.specs import FittedRef, RunSpec
-from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
+from tasks.stages import StageResult, run_stage, stage_task
 
 
-@task(**STAGE_OPTIONS)
+@stage_task
 def evaluate_strips(
     run: RunSpec, stage: str, fitted: FittedRef, config: JudgeConfig, *, view_time: bool = False
 ) -> StageResult:
@@ -38,6 +36,7 @@ def evaluate_strips(
         )
     return run_stage(
         this.store,
+        kernels=run.kernels,
         stage=stage,
         kind="strips",
         inputs=judged_inputs(this, fitted, view_time=view_time),

@@ -5,8 +5,6 @@ from dataclasses import asdict
 from functools import partial
 from typing import Any
 
-from prefect import task
-
 from catalog.artefacts import ArtefactRef, Workplace
 from catalog.store import Store
 from lidarpainter_models.evaluation.judging import Judgement
@@ -18,13 +16,13 @@ from tasks.json_files import read_json, write_json
 from tasks.opened import OpenedRun, opened
 from tasks.progress import Progress
 from tasks.specs import FittedRef, RunSpec
-from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
+from tasks.stages import StageResult, run_stage, stage_task
 from tasks.weights import file_digests
 
 SCORES_FILE = "scores.json"
 
 
-@task(**STAGE_OPTIONS)
+@stage_task
 def evaluate(
     run: RunSpec, stage: str, fitted: FittedRef, config: JudgeConfig, *, view_time: bool = False
 ) -> StageResult:
@@ -32,6 +30,7 @@ def evaluate(
     this = opened(run)
     return run_stage(
         this.store,
+        kernels=run.kernels,
         stage=stage,
         kind="evaluation",
         inputs=judged_inputs(this, fitted, view_time=view_time) | file_digests(config.weight_files),

@@ -6,8 +6,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from prefect import task
-
 import lidarpainter_models
 from catalog.records import SceneRecord
 from catalog.store import Store, open_store
@@ -16,13 +14,13 @@ from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street
 from tasks.measuring import measured
 from tasks.progress import listener
-from tasks.stages import STAGE_OPTIONS
+from tasks.stages import stage_task
 
 STAGE = "ingest"
 NS_PER_S = 1e9
 
 
-@task(**STAGE_OPTIONS)
+@stage_task
 def ingest_sequence(
     store_path: Path,
     dataset: str,
@@ -47,7 +45,7 @@ def ingest_sequence(
         return record_scene(store, path)
 
 
-@task(**STAGE_OPTIONS)
+@stage_task
 def ingest_street(store_path: Path, config: SyntheticStreetConfig) -> dict[str, Any]:
     """Render a synthetic street into the store; returns its row in `scenes`."""
     store = open_store(store_path)

@@ -10,8 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from prefect import task
-
 from catalog.artefacts import ArtefactRef, Workplace
 from catalog.store import Store, open_store
 from lidarpainter_models.errors import DataError, SceneError
@@ -29,12 +27,12 @@ from tasks.ingest.ingest import ingest_street
 from tasks.opened import open_scene, open_split
 from tasks.progress import Progress
 from tasks.specs import SplitSpec, street_id
-from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
+from tasks.stages import StageResult, run_stage, stage_task
 
 PAIRS_FOLDER = "pairs"
 
 
-@task(**STAGE_OPTIONS)
+@stage_task
 def keep_street(store_path: Path, config: SyntheticStreetConfig) -> str:
     """Write a synthetic street unless the store has exactly this one; returns its scene id."""
     store = open_store(store_path)
@@ -44,7 +42,7 @@ def keep_street(store_path: Path, config: SyntheticStreetConfig) -> str:
     return scene_id
 
 
-@task(**STAGE_OPTIONS)
+@stage_task
 def harvest_recorded(
     store_path: Path, stage: str, split: SplitSpec, config: HarvestConfig
 ) -> StageResult:
@@ -61,7 +59,7 @@ def harvest_recorded(
     )
 
 
-@task(**STAGE_OPTIONS)
+@stage_task
 def harvest_street(
     store_path: Path,
     stage: str,

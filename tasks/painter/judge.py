@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from prefect import task
 
 from catalog.artefacts import ArtefactRef, Workplace
 from catalog.digests import DIGEST_LENGTH, digest_file
@@ -30,13 +29,13 @@ from tasks.json_files import read_json, write_json
 from tasks.measuring import measured
 from tasks.painter.judged_fits import JudgedFit, unseen_sources
 from tasks.progress import Progress, listener, progress_of
-from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
+from tasks.stages import StageResult, run_stage, stage_task
 
 SCORES_FILE = "painting-scores.json"
 SAMPLES_FILE = "samples.png"
 
 
-@task(**STAGE_OPTIONS)
+@stage_task
 def judge_painters(
     painters: Mapping[str, str],
     sets: Sequence[PairSet],
@@ -84,7 +83,7 @@ def judge_painters(
     }
 
 
-@task(**STAGE_OPTIONS)
+@stage_task
 def judge_held_back(
     store_path: Path,
     stage: str,

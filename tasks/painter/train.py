@@ -9,8 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from prefect import task
-
 from catalog.artefacts import ArtefactRef, Workplace
 from catalog.digests import DIGEST_LENGTH, canonical_json, digest_file
 from catalog.store import Store, open_store
@@ -19,12 +17,12 @@ from lidarpainter_models.painter.selection import WEIGHTS_SUFFIX
 from lidarpainter_models.painter.training.loop import TrainingProgress
 from tasks.json_files import finite_or_none, read_json, write_json
 from tasks.progress import Progress
-from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
+from tasks.stages import StageResult, run_stage, stage_task
 
 RECORD_SUFFIX = ".json"
 
 
-@task(**STAGE_OPTIONS)
+@stage_task
 def train(store_path: Path, stage: str, request: TrainingRequest) -> StageResult:
     """Train on all pairs but those held back.
 
@@ -63,7 +61,7 @@ def _tell(progress: Progress, training: TrainingProgress) -> None:
     progress(training.share_done, 1.0, note)
 
 
-@task(**STAGE_OPTIONS)
+@stage_task
 def publish_painter(
     store_path: Path, trained: ArtefactRef, scores: dict[str, Any] | None
 ) -> dict[str, Any]:

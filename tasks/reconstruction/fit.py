@@ -1,11 +1,12 @@
 """Fit Gaussians to observations, from scratch or on from a fitted scene with painted views."""
 
+import logging
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from typing import Any
 
-from prefect import task
+import torch
 
 from catalog.artefacts import ArtefactRef, Workplace
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
@@ -21,15 +22,16 @@ from tasks.opened import opened
 from tasks.progress import Progress
 from tasks.reconstruction.painted_views import load_guidance
 from tasks.specs import RunSpec
-from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
+from tasks.stages import StageResult, run_stage, stage_task
 from tasks.stored import load_observations, load_scene, save_scene
 from tasks.weights import file_digests
 
+_LOG = logging.getLogger("lidarpainter")
 CHECKPOINT_EVERY_S = 10.0
 """A killed fit repeats at most this much."""
 
 
-@task(**STAGE_OPTIONS)
+@stage_task
 def fit(
     run: RunSpec,
     stage: str,
@@ -56,6 +58,7 @@ def fit(
     inputs = {"observations": observations, "start": start, "guidance": guidance}
     return run_stage(
         this.store,
+        kernels=run.kernels,
         stage=stage,
         kind="gaussians",
         inputs={name: ref.digest for name, ref in inputs.items() if ref is not None}
@@ -66,13 +69,14 @@ def fit(
             observations=partial(load_observations, this.store, observations),
             start=partial(load_scene, this.store, start) if start is not None else None,
             guidance=partial(load_guidance, this.store, guidance) if guidance is not None else None,
-            perceptual=partial(load_lpips, weighed) if weighed is not None else None,
+            perceptual=partial(load_lpips, weighed, this.device) if weighed is not None else None,
             config=config,
+            device=this.device,
         ),
     )
 
 
-def _build(
+def _build(  # noqa: PLR0913 - all that a fit is made from
     place: Workplace,
     progress: Progress,
     *,
@@ -81,12 +85,19 @@ def _build(
     guidance: Callable[[], tuple[GuidanceView, ...]] | None,
     perceptual: Callable[[], Perceptual | None] | None,
     config: FitConfig,
+    device: torch.device,
 ) -> dict[str, Any]:
+    plan = ""
+
     def told(step: int, steps: int, entry: dict[str, float]) -> None:
-        if "initialised" in entry:
+        nonlocal plan
+        if "planned_bytes" in entry:
+            note = plan = f"{entry['planned_bytes'] / 1e9:.2g} GB planned on {device}"
+            _LOG.info("a fit of %d steps: %s", steps, plan)
+        elif "initialised" in entry:
             note = f"placing Gaussians, {100 * entry['initialised']:.0f} %"
         else:
-            note = f"{entry['psnr']:.2f} dB, {entry['num_gaussians'] / 1000:.0f}k Gaussians"
+            note = f"{entry['psnr']:.2f} dB, {entry['num_gaussians'] / 1000:.0f}k Gaussians, {plan}"
         progress(step, steps, note)
 
     result = fit_gaussians(
@@ -99,6 +110,7 @@ def _build(
         ),
         progress=told,
         perceptual=perceptual() if perceptual else None,
+        device=device,
     )
     save_scene(place.output, result.scene, result.history)
     last = result.history[-1]

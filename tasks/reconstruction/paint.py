@@ -5,8 +5,6 @@ from dataclasses import asdict
 from functools import partial
 from typing import Any
 
-from prefect import task
-
 from catalog.artefacts import Workplace
 from lidarpainter_models.conditioning.novel_guidance import (
     NovelPainting,
@@ -21,10 +19,10 @@ from tasks.opened import opened
 from tasks.progress import Progress
 from tasks.reconstruction.painted_views import save_guidance
 from tasks.specs import FittedRef, RunSpec
-from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
+from tasks.stages import StageResult, run_stage, stage_task
 
 
-@task(**STAGE_OPTIONS)
+@stage_task
 def paint(
     run: RunSpec,
     stage: str,
@@ -47,6 +45,7 @@ def paint(
     this = opened(run)
     return run_stage(
         this.store,
+        kernels=run.kernels,
         stage=stage,
         kind="guidance",
         inputs={

@@ -4,8 +4,6 @@ from dataclasses import asdict
 from functools import partial
 from typing import Any
 
-from prefect import task
-
 from catalog.artefacts import Workplace
 from lidarpainter_models.observations.preparation import prepare_observations
 from lidarpainter_models.observations.settings import ObservationConfig
@@ -14,13 +12,13 @@ from lidarpainter_models.scenes.splits import ViewSplit
 from tasks.opened import opened
 from tasks.progress import Progress
 from tasks.specs import RunSpec
-from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
+from tasks.stages import StageResult, run_stage, stage_task
 from tasks.stored import save_observations
 
 STAGE = "prepare"
 
 
-@task(**STAGE_OPTIONS)
+@stage_task
 def prepare(run: RunSpec, config: ObservationConfig) -> StageResult:
     """Read images, sweeps and boxes of the training side into one artefact."""
     this = opened(run)

@@ -6,8 +6,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from prefect import task
-
 import lidarpainter_models
 from catalog.artefacts import ArtefactRef
 from catalog.digests import canonical_json, plain
@@ -17,16 +15,19 @@ from lidarpainter_models.evaluation.score_tables import metric_values
 from tasks.json_files import finite_or_none
 from tasks.opened import opened
 from tasks.specs import RunSpec
-from tasks.stages import STAGE_OPTIONS
+from tasks.stages import stage_task
 
 
-@task(**STAGE_OPTIONS)
+@stage_task
 def begin_run(
     run: RunSpec,
     run_id: str,
     source_digest: str,
     preset: str,
     parameters: Any,  # noqa: ANN401 - anything with a canonical form
+    *,
+    derived_from: str | None = None,
+    change: Any = None,  # noqa: ANN401 - likewise
 ) -> RunRecord:
     """Enter a run as running.
 
@@ -36,6 +37,8 @@ def begin_run(
         source_digest: of the code behind it.
         preset: name of the preset it started from.
         parameters: all of them.
+        derived_from: the run that it is changed from, if any.
+        change: what is changed then.
     """
     this = opened(run)
     record = RunRecord(
@@ -49,19 +52,21 @@ def begin_run(
         software_version=lidarpainter_models.__version__,
         started_at=datetime.now(UTC),
         device=str(this.device),
+        derived_from=derived_from,
+        change=None if change is None else canonical_json(plain(change)),
     )
     this.store.tables.merge("runs", [record.row()])
     return record
 
 
-@task(**STAGE_OPTIONS)
+@stage_task
 def end_run(store_path: Path, record: RunRecord, status: RunStatus, error: str | None) -> None:
     """Enter that a run failed, and why, or that it was interrupted."""
     ended = replace(record, status=status, error=error, finished_at=datetime.now(UTC))
     open_store(store_path).tables.merge("runs", [ended.row()])
 
 
-@task(**STAGE_OPTIONS)
+@stage_task
 def complete_run(
     store_path: Path,
     record: RunRecord,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from prefect import task
+import torch
 
 import lidarpainter_models
 from catalog.artefacts import ArtefactRef, Workplace
@@ -15,8 +15,10 @@ from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.settings import JudgeConfig
 from lidarpainter_models.evaluation.shown import ViewTimePainting
 from lidarpainter_models.export.comparisons import Subject, comparisons
+from lidarpainter_models.export.moving_picture import recorded_beside
 from lidarpainter_models.export.report import render_report
-from lidarpainter_models.export.run_page import RunPage, StageCost
+from lidarpainter_models.export.run_page import Pictures, RunPage, StageCost
+from lidarpainter_models.export.worst_views import worst_views
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.shifts import Shift
 from tasks.evaluation.shown import view_time_painting
@@ -24,7 +26,7 @@ from tasks.machine import machine
 from tasks.opened import OpenedRun, opened
 from tasks.progress import Progress
 from tasks.specs import FittedRef, RunSpec
-from tasks.stages import STAGE_OPTIONS, StageResult, run_stage
+from tasks.stages import StageResult, run_stage, stage_task
 from tasks.stored import History, load_history, load_scene
 
 REPORT_FILE = "report.html"
@@ -43,7 +45,7 @@ class ReportInputs:
     stages: Mapping[str, StageResult]
 
 
-@task(**STAGE_OPTIONS)
+@stage_task
 def write_report(run: RunSpec, inputs: ReportInputs, config: JudgeConfig) -> StageResult:
     """Write the report of a run as an artefact."""
     this = opened(run)
@@ -51,6 +53,7 @@ def write_report(run: RunSpec, inputs: ReportInputs, config: JudgeConfig) -> Sta
     fits = {name: made.ref for name, made in stages.items() if made.ref.kind == "gaussians"}
     return run_stage(
         this.store,
+        kernels=run.kernels,
         stage="report",
         kind="report",
         inputs={name: stage.ref.digest for name, stage in stages.items()}
@@ -94,12 +97,26 @@ def _build(  # noqa: PLR0913 - all that the page is made from
     subject = Subject(held_out=held_out, unpainted=unpainted(), painting=painting())
     report = page.report(
         held_out.scene,
-        comparisons(subject, shifts, progress=progress),
+        _pictures(subject, shifts, progress),
         histories(),
         machine(subject.painting.device),
     )
     (place.output / REPORT_FILE).write_text(render_report(report), "utf-8")
     return {}
+
+
+def _pictures(subject: Subject, shifts: Sequence[Shift], progress: Progress) -> Pictures:
+    fitted, held_out = subject.painting.conditions.scene, subject.held_out
+    beside = shifts[0] if shifts else Shift(lateral_m=2.0)
+    bodies = fitted.gaussians.body_index.long().cpu()
+    names = [track.actor_id for track in fitted.actors.recorded_tracks]
+    counts = torch.bincount(bodies, minlength=1 + len(names))[1:].tolist()
+    return Pictures(
+        comparisons=comparisons(subject, shifts, progress=progress),
+        moving=recorded_beside(held_out, fitted, beside),
+        worst=worst_views(held_out, fitted),
+        actor_gaussians=dict(zip(names, counts, strict=True)),
+    )
 
 
 def _cost(name: str, stage: StageResult) -> StageCost:

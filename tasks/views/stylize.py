@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from prefect import task
 
 from lidarpainter_models.conditioning.followed_paths import FollowedPath, image_record
 from lidarpainter_models.conditioning.style_views import style_view
@@ -15,12 +14,13 @@ from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.sky_masks import sky_mask
 from lidarpainter_models.metrics.edges import edge_agreement, mean_edge_scores
 from lidarpainter_models.observations.fit_size import shrink_image
-from lidarpainter_models.painter.styles import StyleView, apply_style, check_prompt
+from lidarpainter_models.painter.styles import StyleView, apply_mix
 from lidarpainter_models.scenes.records import RecordedView
+from lidarpainter_models.weather.mix import StyleMix
 from tasks.json_files import write_json
 from tasks.progress import listener
 from tasks.specs import FittedRef, RunSpec
-from tasks.stages import STAGE_OPTIONS
+from tasks.stages import stage_task
 from tasks.views.render import POSES_FILE, RenderRequest, followed_path
 
 STAGE = "stylize"
@@ -34,29 +34,27 @@ Images = Literal["rendered", "recorded"]
 class StylizeRequest:
     """Which images are wanted, and in which style."""
 
-    prompt: str
-    """One of `STYLE_PROMPTS`."""
+    mix: StyleMix
     view: RenderRequest
     images: Images = "rendered"
     """Style what the scene shows, or what the camera recorded where it stood."""
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse styles that are none, and recorded images from where nobody stood.
+        """Refuse recorded images from where nobody stood.
 
         Raises:
-            ConfigError: one of these.
+            ConfigError: they are asked for.
         """
-        check_prompt(self.prompt)
         if self.images not in ("rendered", RECORDED):
             raise ConfigError(f"no images {self.images!r}, expected rendered or recorded")
         if self.images == RECORDED and (
-            self.view.trajectory.spec != RECORDED or self.view.is_painted
+            not self.view.trajectory.is_recorded or self.view.is_painted
         ):
             raise ConfigError("recorded images exist on the recorded trajectory, unpainted")
 
 
-@task(**STAGE_OPTIONS)
+@stage_task
 def stylize(run: RunSpec, fitted: FittedRef, request: StylizeRequest, out: Path) -> dict[str, Any]:
     """Write a styled image for every recorded moment, the clear one beside it.
 
@@ -68,13 +66,16 @@ def stylize(run: RunSpec, fitted: FittedRef, request: StylizeRequest, out: Path)
     """
     path = followed_path(run, fitted, request.view)
     listener().started(STAGE)
+    times_ns = path.recorded.frame_timestamps_ns
+    first_ns, span_ns = int(times_ns[0]), max(int(times_ns[-1] - times_ns[0]), 1)
     rows, scores = [], []
     for number, moment in enumerate(path.views):
         camera = path.camera(number)
         view, lidar_depth_m = _view(path, camera, moment, request.images)
         # every frame has its own drops and noise, and the same ones each time
         generator = torch.Generator().manual_seed((request.seed << 32) + moment.frame_index)
-        styled = apply_style(view, request.prompt, generator)
+        passed = (moment.timestamp_ns - first_ns) / span_ns
+        styled = apply_mix(view, request.mix, generator, progress=passed)
         file = write_png(styled, out / f"{moment.frame_index:04d}.png")
         write_png(view.rgb, out / CLEAR_FOLDER / file.name)
         agreement = edge_agreement(styled, view.rgb, lidar_depth_m)
@@ -82,7 +83,7 @@ def stylize(run: RunSpec, fitted: FittedRef, request: StylizeRequest, out: Path)
         rows.append({**image_record(file.name, camera, moment), "edges": kept})
         scores += [] if agreement is None else [agreement]
         listener().advanced(STAGE, number + 1, len(path.views), "")
-    described = {"trajectory": request.view.trajectory.spec, "prompt": request.prompt}
+    described = {"trajectory": request.view.trajectory.spec, "prompt": request.mix.text}
     write_json(out / POSES_FILE, {**described, "seed": request.seed, "images": rows})
     return {
         "folder": str(out),

@@ -31,6 +31,7 @@ from bench_raster import (
     view_figures,
 )
 from bench_records import Figure, baseline_of, kept_to, table, write_figures
+from bench_twins import twin_figures
 from rich.console import Console
 
 BASELINE = Path(__file__).with_name("baseline.json")
@@ -72,7 +73,7 @@ def measure(*, quick):
     figures += (
         thread_figures(SCENE, 15) + view_figures(SCENE, 5) + reference_figures(REFERENCE_SCENE, 7)
     )
-    figures += iteration_figures(machine, 15)
+    figures += iteration_figures(machine, 15) + twin_figures(15)
     figures += point_figures(machine, 9)
     figures += growth_figures(3) + frame_growth_figures(48) + memory_figures()
     return machine.figures() + figures

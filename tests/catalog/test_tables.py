@@ -1,16 +1,17 @@
 """Tables merge on their id, whoever writes and how often."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pyarrow as pa
 import pytest
-from deltalake import write_deltalake
+from deltalake import DeltaTable, write_deltalake
 
 from catalog.errors import StorageError, UnknownRecordError
 from catalog.schemas import TABLES
-from catalog.tables import CatalogTables
+from catalog.tables import MOST_FILES, CatalogTables
 
 ROOT = Path(__file__).resolve().parents[2]
 WRITER = """
@@ -123,3 +124,32 @@ def test_a_table_that_cannot_be_written_is_a_storage_error(tmp_path):
     tables = CatalogTables(str(tmp_path / "file"))
     with pytest.raises(StorageError, match="cannot write table"):
         tables.merge("runs", [{"run_id": "a"}])
+
+
+def test_a_full_disk_is_told_before_a_commit_begins(tables, monkeypatch):
+    tables.merge("runs", [{"run_id": "a"}])
+    usage = shutil.disk_usage(tables.root)
+    with monkeypatch.context() as patched:
+        patched.setattr("catalog.tables.shutil.disk_usage", lambda _: usage._replace(free=1 << 20))
+        with pytest.raises(StorageError, match=r"cannot write table .*: no space left"):
+            tables.merge("runs", [{"run_id": "b"}])
+    tables.merge("runs", [{"run_id": "b"}])
+    assert [row["run_id"] for row in tables.rows("runs")] == ["a", "b"]
+
+
+def test_rows_are_added_once_and_replaced_by_newer_ones_alone(tables):
+    assert tables.add_absent("sequences", [{"sequence_id": "a", "fence": 3}]) == 1
+    assert tables.add_absent("sequences", [{"sequence_id": "a", "fence": 0}]) == 0
+    rows = [{"sequence_id": "a", "fence": 3, "state": "done"}, {"sequence_id": "b", "fence": 9}]
+    assert tables.replace_older("sequences", rows, "fence") == 0
+    rows[0]["fence"] = 4
+    assert tables.replace_older("sequences", rows, "fence") == 1
+    found = tables.rows("sequences")
+    assert [(row["sequence_id"], row["fence"], row["state"]) for row in found] == [("a", 4, "done")]
+
+
+def test_many_small_files_are_written_together_and_no_row_is_lost(tables):
+    for number in range(MOST_FILES + 3):
+        tables.merge("metrics", [{"metric_id": f"{number:03}"}])
+    assert len(DeltaTable(f"{tables.root}/metrics").file_uris()) < MOST_FILES
+    assert len(tables.rows("metrics")) == MOST_FILES + 3

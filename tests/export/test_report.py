@@ -22,7 +22,7 @@ from lidarpainter_models.export.report import (
     format_cell,
     render_report,
 )
-from lidarpainter_models.export.run_page import RunPage
+from lidarpainter_models.export.run_page import Pictures, RunPage
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.synthetic import record_street
 
@@ -89,10 +89,10 @@ def test_every_picture_is_named_and_no_two_alike():
 
 def test_confidence_is_as_large_as_the_images_beside_it():
     page = render_report(sample_report())
-    (grid,) = set(re.findall(r"\.inputs { grid-template-columns: (repeat\(4[^;]*);", page))
-    assert grid == "repeat(4, minmax(0, 1fr))"
-    for row in re.findall(r'<div class="inputs">(.*?)</div>', page, re.DOTALL):
-        assert row.count("<figure>") == len(INPUTS)
+    (grid,) = set(re.findall(r"\.inputs { grid-template-columns: ([^;]*);", page))
+    assert grid == "repeat(2, minmax(0, 1fr))"
+    rows = re.findall(r'<div class="inputs">(.*?)</div>', page, re.DOTALL)
+    assert [row.count("<figure>") for row in rows] == [len(INPUTS) + 1, len(INPUTS)]  # one truth
 
 
 def test_view_that_nobody_recorded_says_that_it_has_no_truth():
@@ -109,9 +109,10 @@ def test_many_settings_are_folded_up_and_few_facts_are_not():
 
 def test_page_begins_with_what_the_scene_is(tmp_path):
     scene = DrivingScene.open(record_street(drawn_street(tiny_street()), tmp_path))
-    scores = {"psnr": 1.0}
+    scores = {"psnr": 1.0, "num_views": 3}
     judged = {"recorded": scores, "novel": {}}
     result = {
+        "run_id": "0" * 16,
         "scene": "synthetic/street-0005",
         "preset": "preview",
         "painter": "nano",
@@ -123,7 +124,7 @@ def test_page_begins_with_what_the_scene_is(tmp_path):
         "unpainted": judged,
     }
     page = RunPage(result=result, costs=[], provenance={}, settings={"fit.steps": "40"})
-    report = page.report(scene, [], {}, {"processor": "abacus"})
+    report = page.report(scene, Pictures(), {}, {"processor": "abacus"})
     assert report.summary[0].startswith(
         "Sequence street-0005 of the dataset synthetic: 6 frames in 0.5 s; 12 images of 2 cameras "
         "(front_camera, side_camera); "

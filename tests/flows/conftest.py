@@ -1,6 +1,7 @@
 """One tiny street through the whole pipeline, once for all tests of the flows."""
 
-from dataclasses import dataclass
+import shutil
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -69,3 +70,11 @@ def tiny_run(
     store = open_store(out / "store")
     rows = {table: store.tables.rows(table) for table in TABLES}
     return TinyRun(store, out, answer.json, answer.err, rows)
+
+
+@pytest.fixture(scope="module")
+def own_run(tiny_run: TinyRun, tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
+    """The tiny run in a store that others do not see: what is made of it is nobody's latest run."""
+    root = tmp_path_factory.mktemp("own") / "store"
+    shutil.copytree(tiny_run.store.root, root)
+    return replace(tiny_run, store=open_store(root))

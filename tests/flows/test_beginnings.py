@@ -71,6 +71,8 @@ def test_help_is_fast_and_imports_nothing_heavy(command):
         ["render", "latest", "--trajectory", "latral:2", *OUT],
         ["render", "gone", "--trajectory", "lateral:2", *OUT],
         ["stylize", "latest", "--prompt", "night", "--frames", "5", *OUT],
+        ["stylize", "latest", "--prompt", "foggy:2", *OUT],
+        ["stylize", "latest", "--prompt", "foggy", "--visibility", "0", "--in-scene"],
         ["evaluate", "latest", "--protocol", "guess"],
         ["evaluate", "latest", "--previous", "mixed"],
     ],

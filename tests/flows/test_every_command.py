@@ -67,6 +67,9 @@ def test_demo_ends_with_a_page_and_progress_for_every_stage(tiny_run):
     text = page.read_text("utf-8")
     assert text.startswith("<!doctype html>")
     assert tiny_run.run_id in text
+    drive = Path(tiny_run.result["page"])
+    assert drive == tiny_run.out / "drive.html"
+    assert SCENE in drive.read_text("utf-8")
     for stage in STAGES:
         assert f"\n{stage}: " in f"\n{tiny_run.progress}"
 
@@ -305,7 +308,7 @@ def test_view_time_painting_is_judged_beside_the_run(tiny_run):
 def test_stylize_shows_every_style_beside_the_clear_image(tiny_run, tmp_path, prompt):
     words = ("--prompt", prompt, "--frames", "2:3", "--out", tmp_path)
     result = succeed("stylize", tiny_run.run_id, *words, "--json", store=tiny_run.store).json
-    assert (result["prompt"], result["num_images"]) == (prompt, 1)
+    assert (result["prompt"], result["num_images"]) == (f"{prompt}:1", 1)
     (row,) = json.loads((tmp_path / "trajectory.json").read_text())["images"]
     styled = seen_image(tmp_path / row["file"], WIDTH_PX, HEIGHT_PX)
     clear = seen_image(tmp_path / "clear" / row["file"], WIDTH_PX, HEIGHT_PX)

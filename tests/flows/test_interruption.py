@@ -6,6 +6,7 @@ import signal
 import psutil
 import pytest
 from commands import settings
+from process_ends import still_running
 from random_pairs import write_pairs
 from small_pandaset import PandasetFolder
 from terminals import TerminalCommand
@@ -99,7 +100,7 @@ def test_a_signal_ends_the_command_soon_and_it_goes_on(stage, number, begin, sto
     assert command.shown.count(MESSAGE) == 1
     assert command.shown.rstrip().endswith(MESSAGE)
     assert "Traceback" not in command.shown
-    assert psutil.wait_procs(started, timeout=1)[1] == []
+    assert still_running(started) == []
     if words[0] == "reconstruct":
         assert started  # the server at least
         assert statuses(store) == sorted([*known, "interrupted"])

@@ -62,6 +62,12 @@ def test_a_flow_runs_against_its_own_server_and_takes_it_along(tmp_path):
 
 
 @pytest.mark.slow
+def test_two_flows_may_begin_at_once_where_prefect_was_never_used(tmp_path):
+    flows = [start_flow(tmp_path, 0) for _ in range(2)]
+    assert [flow.communicate(timeout=240)[0].split()[1] for flow in flows] == ["7", "7"]
+
+
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="parent-death signals are Linux's")
 def test_a_killed_flow_leaves_no_server_behind(tmp_path):
     flow = start_flow(tmp_path, 60)

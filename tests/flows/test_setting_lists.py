@@ -29,7 +29,7 @@ def test_a_setting_says_what_its_class_says():
     assert (budget.type, budget.default) == ("int", 600_000)
     assert budget.reason.startswith("Never more than this")
     (device,) = known_settings(preset("preview", "a/b"), "device")
-    assert device.type == "auto|cpu|cuda"
+    assert device.type == "str"
 
 
 def test_the_command_lists_a_part_or_all():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.kernels.colour_sampling import (
@@ -26,7 +27,11 @@ def rng(seed=0):
 def test_the_same_points_fall_into_the_image(count):
     xyz_m = rng().uniform(-10, 10, (count, 3)).astype(np.float32)
     lens = np.array([[40.0, 0, 32, 0], [0, 40, 24, 0], [0, 0, 1, 0.5]])
-    fast, plain = (project_inside(xyz_m, lens, 64, 48, 0.5, backend=name) for name in BACKENDS)
+    points, matrix = torch.from_numpy(xyz_m), torch.from_numpy(lens)
+    fast, plain = (
+        [found.numpy() for found in project_inside(points, matrix, 64, 48, 0.5, backend=name)]
+        for name in BACKENDS
+    )
     assert np.array_equal(fast[0], plain[0])  # a selection, none on an edge
     # sums of terms up to focal length times 10 m over at least half a metre of depth
     assert np.abs(fast[1] - plain[1]).max(initial=0) <= 4 * EPS * (40 * 10 / 0.5)
@@ -101,7 +106,7 @@ def test_the_outlier_of_three_samples_is_left_out_by_hand(backend):
 def test_what_does_not_belong_together_is_refused():
     nothing = np.zeros((3, SLOTS), np.float32)
     with pytest.raises(ShapeError, match="points"):
-        project_inside(np.zeros((3, 2), np.float32), np.eye(3, 4), 4, 4, 0.1)
+        project_inside(torch.zeros(3, 2), torch.eye(3, 4), 4, 4, 0.1)
     with pytest.raises(ShapeError, match="slots differ"):
         combine_samples(
             BestSamples(nothing, np.zeros((3, 2, 3), np.uint8), nothing), np.ones((1, 3))

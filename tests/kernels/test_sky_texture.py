@@ -54,8 +54,9 @@ def test_fast_rays_and_samples_agree_with_plain_torch(yaw_rad):
     # a colour changes by at most 1 from texel to texel, along both axes
     rgb = sample_sky(texture, fast, layout, backend="cpu")
     assert float((rgb - reference.sample(texture, plain, layout)).abs().max()) <= 2 * most + 8 * EPS
-    # from the same places only the blend of four colours is rounded
-    assert float((rgb - reference.sample(texture, fast, layout)).abs().max()) <= 8 * EPS
+    # from the same places only the places, as shares of the texture, and the blend are rounded
+    most = (8 + 2 * layout.columns) * EPS
+    assert float((rgb - reference.sample(texture, fast, layout)).abs().max()) <= most
 
 
 def test_pixels_that_are_not_wanted_are_black():
@@ -65,7 +66,7 @@ def test_pixels_that_are_not_wanted_are_black():
     for backend in ("cpu", "reference"):
         rays = sky_rays(camera, layout, wanted, backend=backend)
         rgb = sample_sky(torch.ones(16, 64, 3), rays, layout, backend=backend)
-        assert torch.allclose(rgb, wanted[..., None].expand_as(rgb).float(), atol=4 * EPS, rtol=0)
+        assert torch.allclose(rgb, wanted[..., None].expand_as(rgb).float(), atol=8 * EPS, rtol=0)
 
 
 def test_fast_scatter_is_that_of_plain_torch_and_the_transpose_of_sampling():

@@ -45,7 +45,7 @@ def looking_ahead(position=(0.0, 0.0, 1.5), offsets=None):
     pose[:, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
     pose[:, 3] = position
     return ViewArrays(
-        world_from_camera=pose,
+        world_from_camera=pose[None],
         intrinsics=np.array([FOCAL_PX, FOCAL_PX, WIDTH_PX / 2, HEIGHT_PX / 2]),
         offsets=sample_offsets(2) if offsets is None else offsets,
         footprint_px=0.5,
@@ -54,7 +54,7 @@ def looking_ahead(position=(0.0, 0.0, 1.5), offsets=None):
 
 def nothing_moving(times=1):
     return InstanceArrays(
-        roots=np.zeros(0, np.int32),
+        roots=np.zeros((1, 0), np.int32),
         radius_m=np.zeros(0),
         world_from_box=np.zeros((times, 0, 3, 4)),
         contact=np.zeros((times, 0, 6)),
@@ -193,7 +193,7 @@ def test_a_moving_mesh_is_drawn_where_its_box_is():
         cosine, sine = np.cos(yaw_rad), np.sin(yaw_rad)
         pose[0, 0, :, :3] = [[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]]
         pose[0, 0, :, 3] = ahead_m, 0.0, 1.5
-        instances = InstanceArrays(roots, radius_m, pose, np.zeros((1, 0, 6)))
+        instances = InstanceArrays(roots[None], radius_m, pose, np.zeros((1, 0, 6)))
         _, depth_m, _, actor = render(arrays, instances, looking_ahead())
         middle = HEIGHT_PX // 2, WIDTH_PX // 2
         assert depth_m[middle] == pytest.approx(ahead_m - 1.0, rel=1e-5)
@@ -211,7 +211,8 @@ def test_each_lidar_column_sees_the_world_of_its_own_time():
     lidar = np.zeros((columns, 3, 4))
     lidar[:, :, :3] = np.eye(3)
     lidar[:, 0, 3] = 0.25 * np.arange(columns)  # and the LiDAR follows
-    instances = InstanceArrays(roots, radius_m, poses, np.zeros((columns, 0, 6)))
+    shown = np.tile(roots, (columns, 1))
+    instances = InstanceArrays(shown, radius_m, poses, np.zeros((columns, 0, 6)))
     inclinations = np.array([0.0, 0.02, 1.2])
     range_m, surface, label = cast_sweep(
         arrays, instances, lidar, np.zeros(columns), inclinations, 100.0

@@ -1,10 +1,14 @@
 """The stages of a reconstruction, one after the other, without a server."""
 
+import base64
 import json
 import re
 import shutil
 from dataclasses import replace
+from itertools import pairwise
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from toy_store import TOY_SCENE
@@ -17,6 +21,7 @@ from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.score_tables import flicker_by_image, metric_values
 from lidarpainter_models.evaluation.settings import ScoringConfig
+from lidarpainter_models.export.moving_picture import PANEL_WIDTH_PX
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.metrics import lpips
 from lidarpainter_models.metrics.backbones import SQUEEZENET
@@ -36,7 +41,9 @@ from tasks.stored import load_history, load_scene
 def test_every_stage_leaves_an_artefact_with_a_manifest(store, stages):
     for stage in stages.values():
         assert store.artefacts.verified(stage.ref).kind == stage.ref.kind
-    assert len(store.tables.rows("artefacts")) == len(stages)
+    made = [row["artefact_id"] for row in store.tables.rows("artefacts")]
+    assert len(made) == len(set(made))
+    assert {stage.ref.artefact_id for stage in stages.values()} <= set(made)
 
 
 def test_the_code_of_a_stage_holds_every_module_that_ran(store, stages, ran):
@@ -179,6 +186,24 @@ def test_a_report_says_what_was_run_when_and_on_what(store, run, parameters):
     assert known["memory"].endswith(" GB")
     assert known["device"] == "cpu"
     assert f"torch {torch.__version__.split('+')[0]}" in known["versions"]
+
+
+def test_a_report_moves_first_and_says_how_it_is_repeated(store, run):
+    page = (store.root / run.result["report"]).read_text("utf-8")
+    picture = base64.b64decode(re.search(r"data:image/webp;base64,([^\"]+)", page)[1])
+    _, frames = cv2.imdecodeanimation(np.frombuffer(picture, np.uint8))
+    assert len(frames.frames) == 4  # all that was recorded
+    _, width_px, _ = frames.frames[0].shape
+    assert width_px == 2 * PANEL_WIDTH_PX
+    left, right = frames.frames[0][:, : width_px // 2], frames.frames[0][:, width_px // 2 :]
+    assert left.std() > 10
+    assert abs(left.astype(int) - right.astype(int)).mean() > 2  # a step aside
+    for earlier, later in pairwise(
+        ["data:image/webp", 'class="verdict"', "Worst views", "<h2>Held-out", "How to repeat it"]
+    ):
+        assert page.index(earlier) < page.index(later)
+    assert f"lidarpainter view {run.run_id}" in page
+    assert "Car car" in page
 
 
 def test_a_report_stands_alone(store, run):

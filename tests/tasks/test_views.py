@@ -9,6 +9,7 @@ import pytest
 from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+from lidarpainter_models.weather.mix import StyleMix
 from tasks.views.render import RenderRequest, render
 from tasks.views.stylize import StylizeRequest, stylize
 
@@ -38,12 +39,12 @@ def test_a_run_is_shown_in_fog_beside_the_clear_images(store, run, parameters, t
         observation=parameters.observation,
         conditions=parameters.conditions,
     )
-    request = StylizeRequest(prompt="foggy", view=view, images=images)
+    request = StylizeRequest(mix=StyleMix.parse("foggy"), view=view, images=images)
     made = stylize.fn(parameters.run_spec(store.root), run.final, request, tmp_path / "a")
     assert made["num_images"] == 2
     assert 0.5 < made["edge_f1"] <= 1
     described = json.loads((tmp_path / "a" / "trajectory.json").read_text())
-    assert (described["prompt"], len(described["images"])) == ("foggy", 2)
+    assert (described["prompt"], len(described["images"])) == ("foggy:1", 2)
     foggy, clear = (
         cv2.imread(str(tmp_path / "a" / name)) for name in ("0001.png", "clear/0001.png")
     )
@@ -95,11 +96,9 @@ def test_recorded_images_exist_only_where_somebody_stood(parameters):
         conditions=parameters.conditions,
     )
     with pytest.raises(ConfigError, match="on the recorded trajectory"):
-        StylizeRequest(prompt="foggy", view=view, images="recorded")
+        StylizeRequest(mix=StyleMix.parse("foggy"), view=view, images="recorded")
     with pytest.raises(ConfigError, match="no images 'drawn'"):
-        StylizeRequest(prompt="foggy", view=view, images="drawn")
-    with pytest.raises(ConfigError, match="no style 'snow'"):
-        StylizeRequest(prompt="snow", view=view)
+        StylizeRequest(mix=StyleMix.parse("foggy"), view=view, images="drawn")
 
 
 def test_an_unknown_camera_is_named_before_anything_is_drawn(store, run, parameters, tmp_path):
@@ -109,6 +108,24 @@ def test_an_unknown_camera_is_named_before_anything_is_drawn(store, run, paramet
         observation=parameters.observation,
         conditions=parameters.conditions,
     )
-    with pytest.raises(SceneError, match="saw no camera 'back', it saw front"):
+    with pytest.raises(SceneError, match="has no camera 'back', it has front"):
         render.fn(parameters.run_spec(store.root), run.final, request, tmp_path)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_path_into_a_wall_is_refused_unless_that_is_wanted(store, run, parameters, tmp_path):
+    places = tmp_path / "places.csv"
+    places.write_text("x_m,y_m,yaw_deg\n0,0,0\n20,-4,0\n")  # the wall is at 20 m
+    request = RenderRequest(
+        trajectory=parse_trajectory(f"waypoints:{places}"),
+        observation=parameters.observation,
+        conditions=parameters.conditions,
+    )
+    spec, out = parameters.run_spec(store.root), tmp_path / "out"
+    with pytest.raises(ConfigError, match=r"leads the camera into a wall: \d+ LiDAR points from"):
+        render.fn(spec, run.final, request, out)
+    assert not out.exists()
+    made = render.fn(spec, run.final, replace(request, allows_collisions=True), out)
+    assert made["collisions"][0]["obstacle"] == "points"
+    described = json.loads((out / "trajectory.json").read_text())
+    assert described["collisions"] == made["collisions"]

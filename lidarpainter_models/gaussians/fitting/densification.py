@@ -30,9 +30,11 @@ class GradientTally:
     visits: Float[Tensor, " gaussians"]
 
     @classmethod
-    def zeros(cls, count: int) -> "GradientTally":
+    def zeros(cls, count: int, device: torch.device | None = None) -> "GradientTally":
         """Nothing collected."""
-        return cls(total=torch.zeros(count), visits=torch.zeros(count))
+        return cls(
+            total=torch.zeros(count, device=device), visits=torch.zeros(count, device=device)
+        )
 
     def add(
         self,
@@ -118,7 +120,7 @@ def split_along_longest_axis(parents: GaussianSet) -> GaussianSet:
     """
     columns = parents.columns()
     longest = columns["log_scale"].argmax(dim=1)
-    rows = torch.arange(len(parents))
+    rows = torch.arange(len(parents), device=longest.device)
     axes = rotation_from_quaternion(columns["rotation_wxyz"])
     direction = axes[rows, :, longest]
     offset_m = 0.75 * columns["log_scale"][rows, longest].exp()[:, None] * direction

@@ -9,14 +9,17 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 
+from lidarpainter_models.devices import within_memory
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.densification import densify, prune
 from lidarpainter_models.gaussians.fitting.images import FitImage, full_image, half_image
+from lidarpainter_models.gaussians.fitting.memory import planned_memory
 from lidarpainter_models.gaussians.fitting.shape_limits import (
     LIMITS_EVERY,
     limit_shapes,
@@ -32,7 +35,7 @@ from lidarpainter_models.observations.views import GuidanceView, SceneObservatio
 
 Progress = Callable[[int, int, dict[str, float]], None]
 """Told the steps done, the steps in all and the newest entry of the history; before the first step
-`initialised`, the part of the first scene that is made."""
+`initialised`, the part of the first scene that is made, and `planned_bytes` (see `memory`)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,7 +47,7 @@ class FitResult:
     """Every so many steps: step, loss, psnr (training views), num_gaussians, cpu_s."""
 
 
-def fit_gaussians(
+def fit_gaussians(  # noqa: PLR0913 - what was recorded, and one option each
     observations: SceneObservations,
     config: FitConfig,
     *,
@@ -53,6 +56,7 @@ def fit_gaussians(
     checkpoints: CheckpointFolder | None = None,
     progress: Progress | None = None,
     perceptual: Perceptual | None = None,
+    device: torch.device | None = None,
 ) -> FitResult:
     """Fit a scene.
 
@@ -65,19 +69,56 @@ def fit_gaussians(
         progress: told about every entry of the history.
         perceptual: distance of a rendered and a true image, such as LPIPS, weighted by
             `losses.perceptual` on recorded views and `guidance.perceptual` on painted ones.
+        device: where the fit runs and the scene then lies; None is where the start lies. Where its
+            memory runs out, images are left on the CPU: the same fit, a little slower.
 
     Raises:
         ConfigError: the start belongs to other training views, or a weight lacks its function.
+        DeviceMemoryError: it does not fit into the device's memory.
     """
     _check(observations, config, start, perceptual)
-    kept = checkpoints.load() if checkpoints is not None else None
-    cpu_before_s = time.process_time()
-    if kept is not None:
-        state = FitState.resume(*kept, config)
-    else:
-        state = FitState.begin(start or _first_scene(observations, config, progress), config)
-    cpu_before_s -= state.cpu_s
+    device = device or (start.device if start is not None else torch.device("cpu"))
+    steps = partial(_steps, observations, config, guidance, checkpoints, progress, perceptual)
+
+    def attempt(spares: bool) -> FitResult:
+        kept = checkpoints.load() if checkpoints is not None else None
+        if kept is not None:
+            return steps(FitState.resume(*kept, config, device), keeps_images=not spares)
+        first = start or _first_scene(observations, config, progress)
+        return steps(FitState.begin(first.to(device), config), keeps_images=not spares)
+
+    what = "the fit: a lower densification.budget or a narrower observation.width_px takes less"
+    return within_memory(attempt, device, what)
+
+
+def _steps(  # noqa: PLR0913 - as `fit_gaussians`
+    observations: SceneObservations,
+    config: FitConfig,
+    guidance: Sequence[GuidanceView],
+    checkpoints: CheckpointFolder | None,
+    progress: Progress | None,
+    perceptual: Perceptual | None,
+    state: FitState,
+    *,
+    keeps_images: bool,
+) -> FitResult:
+    """All steps that are left; images lie where the scene does, or are sent there one by one."""
+    cpu_before_s = time.process_time() - state.cpu_s
+    if progress is not None:
+        plan = planned_memory(
+            observations,
+            config,
+            state.scene.sky.layout,
+            start=state.scene.gaussians,
+            guidance=guidance,
+            keeps_images=keeps_images,
+        )
+        progress(state.step, config.steps, {"planned_bytes": float(plan.total)})
     full, half = _images(observations, state.scene, config)
+    if keeps_images:
+        device = state.scene.device
+        full, half = ([image.to(device) for image in images] for images in (full, half))
+        guidance = [view.to(device) for view in guidance]
     while state.step < config.steps:
         is_half = state.step < config.half_resolution * config.steps
         _advance(state, half if is_half else full, guidance, config, perceptual)
@@ -102,12 +143,12 @@ def _first_scene(
 def _images(
     observations: SceneObservations, scene: GaussianScene, config: FitConfig
 ) -> tuple[list[FitImage], list[FitImage]]:
-    """The training images, and those at half size if they are wanted."""
+    """The training images, and those at half size if they are wanted; on the CPU."""
     views = observations.views
     cameras, masks = [view.camera for view in views], [view.sky_mask for view in views]
     pairs = list(zip(views, seen_as_sky(scene.sky.layout, cameras, masks), strict=True))
-    full = [full_image(view, may_be_sky) for view, may_be_sky in pairs]
-    return full, [half_image(*pair) for pair in pairs] if config.half_resolution else []
+    halves = pairs if config.half_resolution else []
+    return [full_image(*pair) for pair in pairs], [half_image(*pair) for pair in halves]
 
 
 def _advance(
@@ -122,7 +163,9 @@ def _advance(
     painted = None
     if guidance and state.random() < config.guidance.probability:
         painted = guidance[int(torch.randint(len(guidance), (), generator=state.generator))]
-    told = fit_step(state, images[row], row, painted, config, perceptual)
+        painted = painted.to(state.scene.device)
+    image = images[row].to(state.scene.device)
+    told = fit_step(state, image, row, painted, config, perceptual)
     state.step += 1
     state.recent.append(told)
     _change_set(state, config)
@@ -152,7 +195,7 @@ def _change_set(state: FitState, config: FitConfig) -> None:
 
 def _log(state: FitState, config: FitConfig, progress: Progress | None) -> None:
     """Add an entry to the history."""
-    losses, errors = zip(*state.recent, strict=True) if state.recent else ((0.0,), (1.0,))
+    losses, errors = zip(*(state.recent_numbers() or [[0.0, 1.0]]), strict=True)
     entry = {
         "step": float(state.step),
         "loss": sum(losses) / len(losses),

@@ -44,6 +44,7 @@ class GaussianAdam:
                 LEAST_COLOUR_GRADIENT if name in COLOURS else LEAST_SHAPE_GRADIENT
                 for name in PARAMETERS
             ],
+            gaussians.means.device,
         )
 
     def seen(self, gaussians: GaussianSet, rows: Int[Tensor, " seen"]) -> SeenGaussians:
@@ -73,7 +74,7 @@ class GaussianAdam:
         fresh = state.first.new_zeros((num_added, state.first.shape[1]))
         state.first = torch.cat([state.first[kept], fresh])
         state.second = torch.cat([state.second[kept], fresh])
-        state.last = torch.full((len(kept) + num_added,), state.count, dtype=torch.int32)
+        state.last = state.last.new_full((len(kept) + num_added,), state.count)
 
     def tensors(self) -> dict[str, Tensor]:
         """State to be kept in a checkpoint, beside the parameters as they stand in the set.
@@ -91,9 +92,11 @@ class GaussianAdam:
 
     def load(self, tensors: dict[str, Tensor]) -> None:
         """Take over kept state."""
-        state = self.state
-        state.first, state.second = tensors["first"].clone(), tensors["second"].clone()
-        state.last, state.count = tensors["last"].clone(), int(tensors["count"])
+        state, device = self.state, self.state.first.device
+        state.first, state.second, state.last = (
+            tensors[name].to(device, copy=True) for name in ("first", "second", "last")
+        )
+        state.count = int(tensors["count"])
         state.missed = tensors["missed"].tolist()
 
 

@@ -1,6 +1,6 @@
 """Training images at full and half size, ready for a step of the fit."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import torch
@@ -22,6 +22,14 @@ class FitImage:
     timestamp_ns: int
     camera_name: str
     facts: PixelFacts
+
+    def to(self, device: torch.device) -> "FitImage":
+        """The same image on another device, as far as it is not there."""
+        facts = {name: getattr(self.facts, name) for name in ("rgb", "kind", "lidar_depth_m")}
+        if facts["rgb"].device == device:
+            return self
+        moved = {name: value.to(device, non_blocking=True) for name, value in facts.items()}
+        return replace(self, facts=PixelFacts(**moved))
 
     @property
     def is_open(self) -> Bool[Tensor, "height width"]:

@@ -21,14 +21,28 @@ class RowAdam:
         self.betas = betas
         self.first = torch.zeros_like(table)
         self.second = torch.zeros_like(table)
-        self.count = torch.zeros(table.shape[0], dtype=torch.int64)
+        self.count = torch.zeros(table.shape[0], dtype=torch.int64, device=table.device)
 
-    def step(self, table: Tensor, gradient: Tensor, rate: Float[Tensor, "columns"]) -> None:
-        """One step in place on the rows with a gradient; `rate` is per column."""
+    def step(
+        self,
+        table: Tensor,
+        gradient: Tensor,
+        rate: Float[Tensor, "columns"],
+        rows: slice | None = None,
+    ) -> None:
+        """One step in place on the rows with a gradient; `rate` is per column.
+
+        Whoever knows these rows names them: to look for them, the host waits for the device.
+        """
+        if rows is not None:
+            self._step(table, gradient, rate, rows)
+        elif (found := gradient.abs().sum(dim=1).nonzero()[:, 0]).numel():
+            self._step(table, gradient, rate, found)
+
+    def _step(
+        self, table: Tensor, gradient: Tensor, rate: Float[Tensor, "columns"], rows: slice | Tensor
+    ) -> None:
         beta1, beta2 = self.betas
-        rows = gradient.abs().sum(dim=1).nonzero()[:, 0]
-        if rows.numel() == 0:
-            return
         g = gradient[rows]
         self.count[rows] += 1
         count = self.count[rows, None].to(g.dtype)
@@ -45,5 +59,7 @@ class RowAdam:
 
     def load(self, tensors: dict[str, Tensor]) -> None:
         """Take over kept state."""
-        self.first, self.second = tensors["first"].clone(), tensors["second"].clone()
-        self.count = tensors["count"].clone()
+        device = self.first.device
+        self.first, self.second, self.count = (
+            tensors[name].to(device, copy=True) for name in ("first", "second", "count")
+        )

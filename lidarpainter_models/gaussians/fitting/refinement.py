@@ -86,8 +86,13 @@ class Refinement:
                 total = total + weights.actor_smoothness * pose_prior(jump, **noise)
         return total
 
-    def step(self, step: int) -> None:
-        """Move the corrections that are refined by the gradients they received; drop these."""
+    def step(self, step: int, camera_name: str) -> None:
+        """Move the corrections that are refined by the gradients they received; drop these.
+
+        Args:
+            step: of the fit.
+            camera_name: whose image gave the gradients.
+        """
         if self.refines_cameras(step):
             table = self.scene.cameras.view_tangent
             self.adams["camera_adam"].step(table, _gradient(table), self._rate("camera", step))
@@ -99,19 +104,23 @@ class Refinement:
                 rate = self._rate("actor", step)
                 self.adams["actor_adam"].step(tangent.view(-1, 6), gradient, rate)
         if self.refines_exposure:
-            self._step_exposure(step)
+            self._step_exposure(step, camera_name)
         for table in self._tables():
             table.grad = None
 
-    def _step_exposure(self, step: int) -> None:
-        matrix = self.scene.exposure.matrix
-        fraction = step / self.config.steps
+    def _step_exposure(self, step: int, camera_name: str) -> None:
+        names, matrix = self.scene.exposure.camera_names, self.scene.exposure.matrix
+        row = names.index(camera_name)
+        if row == 0 and len(names) > 1:
+            return  # the reference: all cameras together would be free to drift
+        rate = self.config.learning_rates.at("exposure", step / self.config.steps)
         with torch.no_grad():
-            rate = torch.full((12,), self.config.learning_rates.at("exposure", fraction))
-            gradient = _gradient(matrix).flatten(1)
-            if len(self.scene.exposure.camera_names) > 1:
-                gradient[0] = 0  # the reference: all cameras together would be free to drift
-            self.adams["exposure_adam"].step(matrix.view(-1, 12), gradient, rate)
+            self.adams["exposure_adam"].step(
+                matrix.view(-1, 12),
+                _gradient(matrix).flatten(1),
+                matrix.new_full((12,), rate),
+                slice(row, row + 1),
+            )
 
     def _rate(self, kind: str, step: int) -> Float[Tensor, "6"]:
         """Step sizes of a tangent's columns."""

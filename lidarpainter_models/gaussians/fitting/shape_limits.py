@@ -50,15 +50,15 @@ def viewing_rays(scene: GaussianScene, camera_rows: Sequence[int] | None = None)
     stride = math.ceil(num_views / _MOST_CAMERAS)
     rows = range(0, num_views, stride) if camera_rows is None else camera_rows
     total = torch.zeros_like(means)
-    count = torch.zeros(len(scene.gaussians))
-    distance_m = torch.full((len(scene.gaussians),), torch.inf)
+    count = means.new_zeros(len(means))
+    distance_m = means.new_full((len(means),), torch.inf)
     with torch.no_grad():
         for row in rows:
             timestamp_ns = int(scene.cameras.timestamps_ns[row])
             actors = scene.actors.corrected_poses(timestamp_ns)
             body_from_camera = invert_rigid(
                 camera_from_body(scene.cameras.world_from_camera(row), *actors)
-            )
+            ).to(means.device, non_blocking=True)
             offset = means - body_from_camera[body, :3, 3]
             forward = body_from_camera[body, :3, 2]
             length = offset.norm(dim=1).clamp(min=1e-3)

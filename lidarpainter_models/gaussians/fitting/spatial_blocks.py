@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -45,25 +44,24 @@ class SpatialBlocks:
     def of(cls, gaussians: GaussianSet, rates: LearningRates) -> "SpatialBlocks":
         """Blocks of a set whose Gaussians move at these rates at most."""
         block_of_row = _numbered(_cell_keys(gaussians, _reach_sigmas(rates)))
-        return cls.with_rows_in(torch.from_numpy(block_of_row), gaussians, rates)
+        return cls.with_rows_in(block_of_row, gaussians, rates)
 
     @classmethod
     def with_rows_in(
         cls, block_of_row: Int[Tensor, " gaussians"], gaussians: GaussianSet, rates: LearningRates
     ) -> "SpatialBlocks":
         """Blocks of these rows: numbers from 0 on, none of them left out."""
-        numbers = block_of_row.numpy()
-        order = np.argsort(numbers, kind="stable")
-        count = int(numbers.max(initial=-1)) + 1
-        first = np.searchsorted(numbers[order], np.arange(count + 1))
-        low, high = torch.empty(2, count, 3, dtype=torch.float64)
+        ordered, order = block_of_row.sort(stable=True)
+        count = int(ordered[-1]) + 1 if len(ordered) else 0
+        first = torch.searchsorted(ordered, torch.arange(count + 1, device=ordered.device))
+        low, high = torch.empty(2, count, 3, dtype=torch.float64, device=ordered.device)
         blocks = Blocks(
-            order=torch.from_numpy(order),
-            first=torch.from_numpy(first),
-            body=torch.from_numpy(gaussians.body_index.numpy()[order[first[:-1]]]),
+            order=order,
+            first=first,
+            body=gaussians.body_index[order[first[:-1]]],
             low=low,
             high=high,
-            reach=torch.empty(count, dtype=torch.float64),
+            reach=torch.empty(count, dtype=torch.float64, device=ordered.device),
         )
         made = cls(block_of_row=block_of_row, blocks=blocks, reach_sigmas=_reach_sigmas(rates))
         made.refresh(gaussians)
@@ -71,9 +69,10 @@ class SpatialBlocks:
 
     def refresh(self, gaussians: GaussianSet, rows: Int[Tensor, " changed"] | None = None) -> None:
         """Take up where the Gaussians are now: all, or those in the blocks of the given rows."""
-        is_stale = torch.full((len(self.blocks.body),), rows is None)
+        body = self.blocks.body
+        is_stale = torch.full((len(body),), rows is None, device=body.device)
         if rows is not None:
-            is_stale[self.block_of_row[rows]] = True
+            is_stale.index_fill_(0, self.block_of_row[rows], True)
         refresh_bounds(
             self.blocks,
             gaussians.means,
@@ -89,10 +88,10 @@ class SpatialBlocks:
 
         `actor_slack` is how far actors may still move (metres, radians) before they are drawn.
         """
-        is_seen = torch.zeros(len(self.block_of_row), dtype=torch.bool)
+        is_seen = torch.zeros_like(self.block_of_row, dtype=torch.bool)
         for camera, camera_from_body in views:
             mark_seen(self.blocks, camera, camera_from_body, is_seen, actor_slack=actor_slack)
-        return torch.from_numpy(np.flatnonzero(is_seen.numpy()))
+        return is_seen.nonzero()[:, 0]
 
 
 def _reach_sigmas(rates: LearningRates) -> float:
@@ -101,23 +100,25 @@ def _reach_sigmas(rates: LearningRates) -> float:
     return 1.001 * growth * (MOST_SIGMAS + MOST_UNITS * max(rates.means))
 
 
-def _cell_keys(gaussians: GaussianSet, reach_sigmas: float) -> Int[np.ndarray, "gaussians 5"]:
+def _cell_keys(gaussians: GaussianSet, reach_sigmas: float) -> Int[Tensor, "gaussians 5"]:
     """Body, size of the cell and its place in the grid; what is not finite goes anywhere."""
-    body = gaussians.body_index.numpy().astype(np.int64)
-    reach_m = reach_sigmas * gaussians.log_scale.detach().double().amax(dim=1).exp().numpy()
-    level = np.log2(np.clip(np.nan_to_num(reach_m, nan=1.0), CELL_M, 1e9) / CELL_M)
-    level = np.where(body == 0, np.ceil(level), 0.0)
-    cell_m = CELL_M * np.exp2(level)
-    place = np.floor(gaussians.means.detach().double().numpy() / cell_m[:, None])
-    place = np.where((body == 0)[:, None], np.nan_to_num(place, posinf=0.0, neginf=0.0), 0.0)
-    cells = np.column_stack([level, np.clip(place, -1e9, 1e9)]).astype(np.int64)
-    return np.column_stack([body, cells])
+    body = gaussians.body_index.long()
+    is_street = body == 0
+    reach_m = reach_sigmas * gaussians.log_scale.detach().double().amax(dim=1).exp()
+    level = (reach_m.nan_to_num(nan=1.0).clamp(CELL_M, 1e9) / CELL_M).log2().ceil()
+    level = torch.where(is_street, level, 0.0)
+    cell_m = CELL_M * level.exp2()
+    place = (gaussians.means.detach().double() / cell_m[:, None]).floor()
+    place = torch.where(is_street[:, None], place.nan_to_num(), 0.0).clamp(-1e9, 1e9)
+    return torch.column_stack([body, level.long(), place.long()])
 
 
-def _numbered(keys: Int[np.ndarray, "gaussians 5"]) -> Int[np.ndarray, " gaussians"]:
+def _numbered(keys: Int[Tensor, "gaussians 5"]) -> Int[Tensor, " gaussians"]:
     """A number for each different key, from 0 on."""
-    order = np.lexsort(keys.T)
-    differs = (keys[order[1:]] != keys[order[:-1]]).any(axis=1)
-    numbers = np.zeros(len(keys), np.int64)
-    numbers[order[1:]] = np.cumsum(differs)
+    order = torch.arange(len(keys), device=keys.device)
+    for column in keys.unbind(1):  # the last one counts most
+        order = order[column[order].argsort(stable=True)]
+    differs = (keys[order[1:]] != keys[order[:-1]]).any(dim=1)
+    numbers = torch.zeros_like(order)
+    numbers[order[1:]] = differs.cumsum(0)
     return numbers

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.gaussians.fitting.checkpoint import (
@@ -49,8 +50,9 @@ class FitState:
     cpu_s: float = 0.0
     """Process CPU seconds spent so far, earlier runs included."""
     history: list[dict[str, float]] = field(default_factory=list)
-    recent: list[tuple[float, float]] = field(default_factory=list)
-    """Loss and squared error of the steps since the last entry of the history."""
+    recent: list[Float[Tensor, "2"]] = field(default_factory=list)
+    """Loss and squared error of the steps since the last entry of the history; read together, for
+    the host waits for the device whenever it reads."""
 
     @classmethod
     def begin(cls, scene: GaussianScene, config: FitConfig) -> "FitState":
@@ -64,7 +66,7 @@ class FitState:
             gaussian_adam=GaussianAdam(scene.gaussians, config.learning_rates),
             blocks=SpatialBlocks.of(scene.gaussians, config.learning_rates),
             refinement=Refinement.begin(scene, config),
-            tally=GradientTally.zeros(scene.num_gaussians),
+            tally=GradientTally.zeros(scene.num_gaussians, scene.device),
             generator=generator,
         )
 
@@ -103,7 +105,7 @@ class FitState:
         self.scene = self.scene.with_gaussians(change.gaussians.as_leaves())
         self.gaussian_adam.rebuild(change.kept, change.num_added)
         self.blocks = SpatialBlocks.of(self.scene.gaussians, self.gaussian_adam.rates)
-        self.tally = GradientTally.zeros(len(change.gaussians))
+        self.tally = GradientTally.zeros(len(change.gaussians), self.scene.device)
 
     def keep(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Tensors and JSON-able numbers of the whole state."""
@@ -124,27 +126,38 @@ class FitState:
             "step": self.step,
             "cpu_s": self.cpu_s,
             "history": self.history,
-            "recent": self.recent,
+            "recent": self.recent_numbers(),
         }
         return tensors, numbers
 
+    def recent_numbers(self) -> list[list[float]]:
+        """Loss and squared error of the steps since the last entry of the history."""
+        return torch.stack(self.recent).tolist() if self.recent else []
+
     @classmethod
     def resume(
-        cls, tensors: dict[str, Tensor], numbers: dict[str, Any], config: FitConfig
+        cls,
+        tensors: dict[str, Tensor],
+        numbers: dict[str, Any],
+        config: FitConfig,
+        device: torch.device | None = None,
     ) -> "FitState":
-        """The state that `keep` described."""
+        """The state that `keep` described; where it was kept from does not matter."""
         scene = scene_from_arrays(ungroup_tensors(tensors, "scene"), numbers["scene"])
-        state = cls.begin(scene, config)
+        state = cls.begin(scene if device is None else scene.to(device), config)
         state.gaussian_adam.load(ungroup_tensors(tensors, "gaussian_adam"))
         for name, adam in state.refinement.adams.items():
             adam.load(ungroup_tensors(tensors, name))
         state.blocks = SpatialBlocks.with_rows_in(
-            tensors["blocks/block_of_row"], state.scene.gaussians, config.learning_rates
+            tensors["blocks/block_of_row"].to(device), state.scene.gaussians, config.learning_rates
         )
-        state.tally = GradientTally(**ungroup_tensors(tensors, "tally"))
+        tally = ungroup_tensors(tensors, "tally")
+        state.tally = GradientTally(**{name: value.to(device) for name, value in tally.items()})
         state.generator = generator_from(tensors["random/state"])
         state.waiting = list(numbers["waiting"])
         state.step, state.cpu_s = numbers["step"], numbers["cpu_s"]
         state.history = list(numbers["history"])
-        state.recent = [tuple(pair) for pair in numbers["recent"]]
+        state.recent = [
+            torch.tensor(pair, dtype=torch.float64, device=device) for pair in numbers["recent"]
+        ]
         return state

@@ -1,6 +1,7 @@
 """One step of a fit: gradients of a recorded view and perhaps a painted one, and the optimisers.
 
-Only the Gaussians that these views can show take part (`seen_gaussians`).
+Only the Gaussians that these views can show take part (`seen_gaussians`). Gaussians, sky, exposure
+and images lie on the device of the scene; poses (float64, a few 4x4 a step) on the CPU.
 """
 
 from collections.abc import Callable
@@ -33,6 +34,10 @@ from lidarpainter_models.kernels.sky_texture import SkyRays
 from lidarpainter_models.kernels.ssim import l1_ssim_loss
 from lidarpainter_models.observations.views import GuidanceView
 
+WAITS = 3
+"""Of the host for the device in a step, without the rasteriser's own: how many Gaussians are in
+view, how many of them lag and by how much, and the gradients of the bodies' poses."""
+
 Perceptual = Callable[
     [Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]], Float[Tensor, ""]
 ]
@@ -46,10 +51,10 @@ def fit_step(
     guidance: GuidanceView | None,
     config: FitConfig,
     perceptual: Perceptual | None,
-) -> tuple[float, float]:
+) -> Float[Tensor, "2"]:
     """Step everything by one recorded view, the `row`-th, and the painted one if it is given.
 
-    Returns the loss and the mean squared error of the recorded image.
+    Returns the loss and the mean squared error of the recorded image, where the scene lies.
     """
     pose = state.refinement.world_from_camera(row, state.step)
     recorded = image.camera.at(pose.detach())
@@ -73,11 +78,11 @@ def _recorded_step(
     view: View,
     config: FitConfig,
     perceptual: Perceptual | None,
-) -> tuple[float, float]:
+) -> Float[Tensor, "2"]:
     """Collect the Gaussians' gradients from a recorded view; step poses, exposure and sky."""
     (camera, bodies), weights, sky = view, config.losses, state.scene.sky
     with_actors = _wants_actor_term(state, config)
-    screen_gradient = torch.zeros(len(seen))
+    screen_gradient = torch.zeros(len(seen), device=seen.means.device)
     splat = draw_gaussians(
         seen,
         bodies,
@@ -95,13 +100,14 @@ def _recorded_step(
     loss = loss + weights.sky * terms.sky + weights.depth * terms.depth
     if with_actors:
         loss = loss + weights.actors * _actor_term(state, splat, image, camera)
-    loss = loss + state.refinement.prior(row, image.timestamp_ns, state.step)
-    loss.backward()
+    prior = state.refinement.prior(row, image.timestamp_ns, state.step)
+    # as a sum its gradient, which is the CPU's, would have to come from the device
+    torch.autograd.backward([loss, prior] if prior.requires_grad else [loss])
     state.tally.add(seen.rows, screen_gradient, splat.visible)
-    state.refinement.step(state.step)
+    state.refinement.step(state.step, image.camera_name)
     _step_sky(state, sky_rgb, rays, splat.alpha.detach(), config, image)
     squared_error = (shown.detach() - image.facts.rgb).square().mean()
-    return float(loss.detach()), float(squared_error)
+    return torch.stack([loss.detach() + prior.detach(), squared_error.double()])
 
 
 def _guidance_bodies(state: FitState, view: GuidanceView) -> Float[Tensor, "bodies 4 4"]:
@@ -164,6 +170,7 @@ def _actor_term(
         world_from_actors, present = actors.corrected_poses(image.timestamp_ns)
         sizes = [track.size_m for track in actors.recorded_tracks]
         in_boxes = project_boxes(camera, world_from_actors, sizes, present > 0)
+    in_boxes = in_boxes.to(splat.alpha.device, non_blocking=True)
     return actor_boundary_loss(splat.features[..., 0], in_boxes)
 
 

@@ -3,11 +3,13 @@
 A camera's correction is a small rigid motion in the camera's own frame: a constant per camera
 (extrinsic calibration) plus a part per training view. The views' parts of a camera sum to zero
 (the mean is moved into the constant), so the two are told apart. Tangents are (rotation vector in
-radians, translation in metres), float64.
+radians, translation in metres), float64, and stay on the CPU: a step reads one of them and sends a
+4x4 to wherever the Gaussians are. Colours are changed where the image is.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
@@ -47,6 +49,14 @@ class CameraCorrections:
             camera_names=names,
             camera_tangent=torch.zeros(len(names), 6, dtype=torch.float64),
         )
+
+    @cached_property
+    def _rows_of_cameras(self) -> tuple[Int[Tensor, " _"], ...]:
+        """The training views of each camera."""
+        found: dict[str, list[int]] = {name: [] for name in self.camera_names}
+        for row, (_, name) in enumerate(self.keys):
+            found[name].append(row)
+        return tuple(torch.tensor(rows, dtype=torch.int64) for rows in found.values())
 
     def row_of(self, key: ViewKey) -> int | None:
         """The training view's position, or None if it was not trained on."""
@@ -96,8 +106,7 @@ class CameraCorrections:
         With `keep_mean` it goes into the camera's constant, so that no pose changes.
         """
         with torch.no_grad():
-            for index, name in enumerate(self.camera_names):
-                rows = [row for row, key in enumerate(self.keys) if key[1] == name]
+            for index, rows in enumerate(self._rows_of_cameras):
                 mean = self.view_tangent[rows].mean(dim=0)
                 self.view_tangent[rows] -= mean
                 if keep_mean:
@@ -118,6 +127,10 @@ class ExposureCorrections:
             camera_names=tuple(camera_names),
             matrix=torch.eye(3, 4).repeat(len(camera_names), 1, 1),
         )
+
+    def to(self, device: torch.device) -> "ExposureCorrections":
+        """The same on another device."""
+        return replace(self, matrix=self.matrix.to(device))
 
     def apply(
         self, rgb: Float[Tensor, "height width 3"], camera_name: str | None

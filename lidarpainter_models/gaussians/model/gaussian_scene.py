@@ -1,9 +1,12 @@
 """A dynamic scene: street, rigid actors and sky, and what was corrected about the cameras."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
@@ -14,6 +17,8 @@ from lidarpainter_models.gaussians.model.scene_rendering import (
     draw_over_sky,
 )
 from lidarpainter_models.gaussians.model.sky import SkyTexture
+from lidarpainter_models.gaussians.model.styling.dressed import DressedScene
+from lidarpainter_models.gaussians.model.styling.scene_style import SceneStyle
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.backends import Backend
 from lidarpainter_models.scenes.driving_scene import ActorTrack
@@ -32,6 +37,8 @@ class GaussianScene:
     sky: SkyTexture
     cameras: CameraCorrections
     exposure: ExposureCorrections
+    style: SceneStyle | None = None
+    """Weather and night that the scene is rendered in."""
 
     @property
     def num_gaussians(self) -> int:
@@ -61,9 +68,14 @@ class GaussianScene:
             row = None if view_key is None else self.cameras.row_of(view_key)
             if row is not None:
                 camera = camera.at(self.cameras.world_from_camera(row))
-            poses = self.actors.likely_poses(timestamp_ns)
-            bodies = camera_from_body(camera.world_from_camera, *poses)
-            drawn = draw_over_sky(self.gaussians, bodies, self.sky, camera, backend=backend)
+            dressed = self._dressed
+            strengths = {} if dressed is None else dressed.style.strengths(timestamp_ns)
+            if dressed is not None and strengths:
+                drawn = dressed.render(camera, timestamp_ns, strengths, backend=backend)
+            else:
+                poses = self.actors.likely_poses(timestamp_ns)
+                bodies = camera_from_body(camera.world_from_camera, *poses)
+                drawn = draw_over_sky(self.gaussians, bodies, self.sky, camera, backend=backend)
             return replace(drawn, rgb=self.exposure.apply(drawn.rgb, camera_name))
 
     def corrected_camera(
@@ -83,6 +95,47 @@ class GaussianScene:
             camera, key=key, timestamp_ns=timestamp_ns, camera_name=camera_name
         )
 
+    @property
+    def device(self) -> torch.device:
+        """Where the scene is drawn: Gaussians, sky and exposure lie there, poses on the CPU."""
+        return self.gaussians.means.device
+
+    def to(self, device: torch.device) -> "GaussianScene":
+        """The same scene on another device, itself if it is there."""
+        if self.device == device:
+            return self
+        return replace(
+            self,
+            gaussians=self.gaussians.to(device),
+            sky=self.sky.to(device),
+            exposure=self.exposure.to(device),
+            style=None if self.style is None else self.style.to(device),
+        )
+
+    def baked(
+        self, timestamp_ns: int, eye_world: Float[Tensor, "3"] | None = None
+    ) -> "GaussianScene":
+        """The scene as its style shows it at a time, without the style: for formats without one.
+
+        Air and wet roads look as from `eye_world`; None takes where the car was that recorded.
+        Lamps light what they light, but do not shine into the camera themselves.
+        """
+        dressed = self._dressed
+        strengths = {} if dressed is None else dressed.style.strengths(timestamp_ns)
+        if dressed is None or not strengths:
+            return replace(self, style=None)
+        gaussians, sky = dressed.baked(timestamp_ns, strengths, eye_world)
+        return replace(self, style=None, gaussians=gaussians, sky=sky)
+
+    @cached_property
+    def _dressed(self) -> DressedScene | None:
+        """Of a scene in a style, which stays as it is."""
+        if self.style is None:
+            return None
+        return DressedScene(
+            gaussians=self.gaussians, actors=self.actors, sky=self.sky, style=self.style
+        )
+
     def with_gaussians(self, gaussians: GaussianSet) -> "GaussianScene":
         """The same scene with other Gaussians."""
         return replace(self, gaussians=gaussians)
@@ -95,5 +148,6 @@ def describe(scene: GaussianScene) -> dict[str, Any]:
         "num_gaussians": len(scene.gaussians),
         "num_actor_gaussians": int((body > 0).sum()),
         "num_actors": len(scene.actors.recorded_tracks),
+        "style": None if scene.style is None else scene.style.mix.text,
         "sky_texels": [scene.sky.layout.rows, scene.sky.layout.columns],
     }

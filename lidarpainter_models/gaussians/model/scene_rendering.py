@@ -13,6 +13,7 @@ from torch import Tensor
 
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
+from lidarpainter_models.gaussians.model.shown_gaussians import ShownGaussians
 from lidarpainter_models.gaussians.model.sky import SkyTexture
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid
@@ -22,6 +23,10 @@ from lidarpainter_models.kernels.gaussian_raster import SplatImage, Splats, rend
 OPAQUE = 1 - 1 / 512
 """From this opacity on the sky is not looked up: it would change no byte by more than half."""
 _FAR_BEHIND_M = -1e6
+
+
+DrawableGaussians = GaussianSet | SeenGaussians | ShownGaussians
+"""Gaussians in their bodies, as they are drawn."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,7 +48,7 @@ def camera_from_body(
     world_from_actors: Float[Tensor, "actors 4 4"],
     present: Float[Tensor, " actors"],
 ) -> Float[Tensor, "bodies 4 4"]:
-    """Where every body stands in the camera; differentiable in the poses, float32.
+    """Where every body stands in the camera; differentiable in the poses, float32, on the CPU.
 
     Absent actors are put far behind the camera, where nothing is drawn.
     """
@@ -58,7 +63,7 @@ def camera_from_body(
 
 
 def draw_gaussians(
-    gaussians: GaussianSet | SeenGaussians,
+    gaussians: DrawableGaussians,
     bodies: Float[Tensor, "bodies 4 4"],
     camera: Camera,
     *,
@@ -77,7 +82,7 @@ def draw_gaussians(
     )
     return render_gaussians(
         splats,
-        bodies.to(gaussians.means.device),
+        bodies.to(gaussians.means.device, non_blocking=True),
         camera,
         features=(gaussians.body_index > 0).float()[:, None] if with_actor_alpha else None,
         screen_gradient_out=screen_gradient_out,
@@ -86,7 +91,7 @@ def draw_gaussians(
 
 
 def draw_over_sky(
-    gaussians: GaussianSet,
+    gaussians: DrawableGaussians,
     bodies: Float[Tensor, "bodies 4 4"],
     sky: SkyTexture,
     camera: Camera,

@@ -1,6 +1,7 @@
 """The Gaussians that one step of a fit may see, as leaves that collect its gradients."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Float, Int
@@ -27,14 +28,15 @@ class SeenGaussians:
     @classmethod
     def room(cls, gaussians: GaussianSet, rows: Int[Tensor, " seen"]) -> "SeenGaussians":
         """Leaves for the given rows of a set; their values are still to be written."""
-        count = len(rows)
+        count, coefficients = len(rows), 1 + gaussians.sh_rest.shape[1]
+        leaf = partial(torch.empty, device=gaussians.means.device, requires_grad=True)
         return cls(
             rows=rows,
-            means=torch.empty(count, 3, requires_grad=True),
-            rotation_wxyz=torch.empty(count, 4, requires_grad=True),
-            log_scale=torch.empty(count, 3, requires_grad=True),
-            opacity_logit=torch.empty(count, requires_grad=True),
-            sh=torch.empty(count, 1 + gaussians.sh_rest.shape[1], 3, requires_grad=True),
+            means=leaf(count, 3),
+            rotation_wxyz=leaf(count, 4),
+            log_scale=leaf(count, 3),
+            opacity_logit=leaf(count),
+            sh=leaf(count, coefficients, 3),
             body_index=gaussians.body_index[rows],
         )
 

@@ -55,16 +55,33 @@ class SkyTexture:
         return cls(
             layout=layout,
             rgb=rgb.float().expand(*size, 3).clone(),
-            weight=torch.zeros(size),
+            weight=torch.zeros(size, device=rgb.device),
             moments=TexelMoments(
-                first=torch.zeros(*size, 3),
-                second=torch.zeros(*size, 3),
-                visits=torch.zeros(size, dtype=torch.int32),
+                first=torch.zeros(*size, 3, device=rgb.device),
+                second=torch.zeros(*size, 3, device=rgb.device),
+                visits=torch.zeros(size, dtype=torch.int32, device=rgb.device),
+            ),
+        )
+
+    def to(self, device: torch.device) -> "SkyTexture":
+        """The same sky on another device."""
+        moments = self.moments
+        return replace(
+            self,
+            rgb=self.rgb.to(device),
+            weight=self.weight.to(device),
+            moments=TexelMoments(
+                first=moments.first.to(device),
+                second=moments.second.to(device),
+                visits=moments.visits.to(device),
             ),
         )
 
     def rays(self, camera: Camera, wanted: Bool[Tensor, "height width"] | None = None) -> SkyRays:
         """Where the camera's rays (of the wanted pixels) meet the texture."""
+        if wanted is None:
+            size = (camera.height_px, camera.width_px)
+            wanted = torch.ones(size, dtype=torch.bool, device=self.rgb.device)
         return sky_rays(camera, self.layout, wanted)
 
     def sample(self, rays: SkyRays) -> Float[Tensor, "height width 3"]:

@@ -11,6 +11,7 @@ from lidarpainter_models.gaussians.model.corrections import CameraCorrections, E
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.sky import SkyTexture
+from lidarpainter_models.gaussians.model.styling.scene_style import style_from_arrays
 from lidarpainter_models.kernels.sky_texture import SkyLayout, TexelMoments
 from lidarpainter_models.scenes.stored_tracks import tracks_from_arrays, tracks_to_arrays
 
@@ -34,6 +35,7 @@ def scene_to_arrays(scene: GaussianScene) -> tuple[dict[str, Tensor], dict[str, 
         "cameras": cameras.tensors(),
         "actors": {"knots_ns": scene.actors.knots_ns, "tangent": scene.actors.tangent},
         "exposure": {"matrix": scene.exposure.matrix},
+        "style": {} if scene.style is None else scene.style.place.tensors(),
     }
     arrays = {
         f"{group}.{name}": value.detach().cpu().contiguous()
@@ -48,6 +50,8 @@ def scene_to_arrays(scene: GaussianScene) -> tuple[dict[str, Tensor], dict[str, 
         "exposure_camera_names": list(scene.exposure.camera_names),
         "sky_layout": asdict(sky.layout),
     }
+    if scene.style is not None:
+        metadata["style"] = scene.style.metadata()
     return arrays, metadata
 
 
@@ -82,6 +86,9 @@ def scene_from_arrays(arrays: dict[str, Tensor], metadata: dict[str, Any]) -> Ga
             exposure=ExposureCorrections(
                 camera_names=tuple(metadata["exposure_camera_names"]), **groups["exposure"]
             ),
+            style=style_from_arrays(groups["style"], metadata["style"])
+            if "style" in metadata
+            else None,
         )
     except (KeyError, TypeError) as error:
         raise SceneError(f"a stored Gaussian scene is incomplete: {error}") from error
@@ -90,7 +97,8 @@ def scene_from_arrays(arrays: dict[str, Tensor], metadata: dict[str, Any]) -> Ga
 def copy_scene(scene: GaussianScene) -> GaussianScene:
     """The same scene, sharing no memory and collecting no gradients."""
     arrays, metadata = scene_to_arrays(scene)
-    return scene_from_arrays({name: value.clone() for name, value in arrays.items()}, metadata)
+    copied = scene_from_arrays({name: value.clone() for name, value in arrays.items()}, metadata)
+    return copied.to(scene.device)
 
 
 def _sky(arrays: dict[str, Tensor], layout: SkyLayout) -> SkyTexture:

@@ -1,12 +1,14 @@
 """Colours of points from images: project, take samples, keep the best, combine them.
 
-Arrays in, arrays out: what is kept of millions of points is changed in place. Pixels are
+Arrays in, arrays out, on the CPU: what is kept of millions of points is changed in place.
+Projection alone is asked for on any device. Pixels are
 continuous, the top-left one has its centre at (0.5, 0.5); depth is camera z.
 """
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
 
 from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.kernels.backends import Backend, implementation
@@ -27,26 +29,29 @@ _CPU = torch.device("cpu")
 
 
 def project_inside(
-    xyz_m: Float[np.ndarray, "points 3"],
-    pixels_from_points: Float[np.ndarray, "3 4"],
+    xyz_m: Float[Tensor, "points 3"],
+    pixels_from_points: Float[Tensor, "3 4"],
     width_px: int,
     height_px: int,
     near_m: float,
     *,
     backend: Backend = "auto",
-) -> tuple[Int[np.ndarray, " rows"], Float[np.ndarray, "rows 2"], Float[np.ndarray, " rows"]]:
-    """Rows, continuous pixels and depth of the points that fall into an image.
+) -> tuple[Int[Tensor, " rows"], Float[Tensor, "rows 2"], Float[Tensor, " rows"]]:
+    """Rows, continuous pixels and depth of the points that fall into an image, where these lie.
 
     Raises:
         ShapeError: the points or the matrix have another shape.
     """
     if xyz_m.ndim != 2 or xyz_m.shape[1] != 3 or pixels_from_points.shape != (3, 4):
         raise ShapeError(
-            f"need points (points, 3) and a matrix (3, 4), got {xyz_m.shape} and "
-            f"{pixels_from_points.shape}"
+            f"need points (points, 3) and a matrix (3, 4), got {tuple(xyz_m.shape)} and "
+            f"{tuple(pixels_from_points.shape)}"
         )
-    project = implementation("colour_sampling", "project_inside", backend, _CPU)
-    return project(xyz_m, pixels_from_points, width_px, height_px, near_m)
+    project = implementation("colour_sampling", "project_inside", backend, xyz_m.device)
+    found: tuple[Tensor, Tensor, Tensor] = project(
+        xyz_m, pixels_from_points, width_px, height_px, near_m
+    )
+    return found
 
 
 def insert_samples(

@@ -5,12 +5,25 @@ Every point is handled by one thread alone, so the number of threads changes no 
 
 import numba
 import numpy as np
+import torch
+from torch import Tensor
 
 from lidarpainter_models.kernels.colour_sampling.sample_slots import AGREEMENT, SLOTS, BestSamples
 
 
-@numba.njit(cache=True)
 def project_inside(
+    xyz_m: Tensor, pixels_from_points: Tensor, width_px: int, height_px: int, near_m: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See `colour_sampling.project_inside`."""
+    found = _project_inside(
+        xyz_m.contiguous().numpy(), pixels_from_points.numpy(), width_px, height_px, near_m
+    )
+    rows, pixels_uv, depth_m = (torch.from_numpy(column) for column in found)
+    return rows, pixels_uv, depth_m
+
+
+@numba.njit(cache=True)
+def _project_inside(
     xyz_m: np.ndarray,
     pixels_from_points: np.ndarray,
     width_px: int,

@@ -8,15 +8,16 @@ from lidarpainter_models.kernels.colour_sampling.sample_slots import AGREEMENT, 
 
 
 def project_inside(
-    xyz_m: np.ndarray, pixels_from_points: np.ndarray, width_px: int, height_px: int, near_m: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    xyz_m: Tensor, pixels_from_points: Tensor, width_px: int, height_px: int, near_m: float
+) -> tuple[Tensor, Tensor, Tensor]:
     """See `colour_sampling.project_inside`."""
-    matrix = torch.from_numpy(pixels_from_points).double()
-    u, v, depth_m = (torch.from_numpy(xyz_m).double() @ matrix[:, :3].T + matrix[:, 3]).T
+    matrix = pixels_from_points.double().to(xyz_m.device, non_blocking=True)
+    u, v, depth_m = (xyz_m.double() @ matrix[:, :3].T + matrix[:, 3]).T
     u, v = u / depth_m, v / depth_m
     inside = (depth_m >= near_m) & (u >= 0) & (v >= 0) & (u < width_px) & (v < height_px)
-    pixels_uv = torch.stack([u, v], dim=1)[inside].float()
-    return inside.nonzero()[:, 0].numpy(), pixels_uv.numpy(), depth_m[inside].float().numpy()
+    rows = inside.nonzero()[:, 0]
+    pixels_uv = torch.stack([u, v], dim=1).index_select(0, rows).float()
+    return rows, pixels_uv, depth_m.index_select(0, rows).float()
 
 
 def insert_samples(

@@ -60,5 +60,5 @@ def mark_seen(
     if is_seen.shape != blocks.order.shape:
         raise ShapeError(f"{len(blocks.order)} Gaussians need as many flags, got {len(is_seen)}")
     mark = implementation("frustum_culling", "mark_seen", backend, is_seen.device)
-    bodies = camera_from_body.detach().double()
+    bodies = camera_from_body.detach().double().to(is_seen.device, non_blocking=True)
     mark(blocks, bodies, frustum_of(camera, actor_slack), is_seen)

@@ -2,8 +2,10 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -34,6 +36,12 @@ class Blocks:
     """Under `low` where no Gaussian of the block is finite."""
     reach: Float[Tensor, " blocks"]
     """The farthest that any may reach from its centre."""
+
+    @cached_property
+    def of_ordered(self) -> Int[Tensor, " gaussians"]:
+        """The block of each entry of `order`."""
+        sizes = self.first[1:] - self.first[:-1]
+        return torch.repeat_interleave(sizes, output_size=len(self.order))
 
 
 class Frustum(NamedTuple):

@@ -1,7 +1,7 @@
 """Bounds of blocks of Gaussians and the test of a view in plain torch: the law, on any device."""
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.kernels.frustum_culling.blocks import Blocks, Frustum
@@ -17,14 +17,17 @@ def refresh_bounds(
     """See `frustum_culling.refresh_bounds`."""
     largest = log_scale.amax(dim=1)
     is_finite = (means.sum(dim=1) + largest).isfinite()
-    for block in is_stale.nonzero()[:, 0].tolist():
-        rows = blocks.order[blocks.first[block] : blocks.first[block + 1]]
-        rows = rows[is_finite[rows]]
-        nothing = means.new_full((1, 3), torch.inf)
-        blocks.low[block] = torch.cat([means[rows], nothing]).amin(dim=0)
-        blocks.high[block] = torch.cat([means[rows], -nothing]).amax(dim=0)
-        sizes = torch.cat([largest[rows].double(), largest.new_full((1,), -torch.inf).double()])
-        blocks.reach[block] = reach_sigmas * sizes.amax().exp()
+    block, row = blocks.of_ordered, blocks.order
+    finite = is_finite[row][:, None]
+    count = len(blocks.body)
+    low = _of_each(block, torch.where(finite, means[row], torch.inf), count, "amin")
+    high = _of_each(block, torch.where(finite, means[row], -torch.inf), count, "amax")
+    size = torch.where(finite, largest[row][:, None], -torch.inf)
+    reach = reach_sigmas * _of_each(block, size, count, "amax")[:, 0].double().exp()
+    stale = is_stale[:, None]
+    blocks.low.copy_(torch.where(stale, low.double(), blocks.low))
+    blocks.high.copy_(torch.where(stale, high.double(), blocks.high))
+    blocks.reach.copy_(torch.where(is_stale, reach, blocks.reach))
 
 
 def mark_seen(
@@ -46,8 +49,21 @@ def mark_seen(
             # a plane through the camera: outside it is sign (x - tangent z) > 0
             plane = sign * (transform[:, axis] - tangent * transform[:, 2])
             is_in_view &= ~(-_farthest(-plane, blocks) > reach * frustum.stretch[axis])
-    sizes = blocks.first[1:] - blocks.first[:-1]
-    is_seen[blocks.order[torch.repeat_interleave(is_in_view, sizes)]] = True
+    is_seen |= torch.zeros_like(is_seen).index_copy(
+        0, blocks.order, is_in_view.index_select(0, blocks.of_ordered)
+    )
+
+
+def _of_each(
+    block: Int[Tensor, " gaussians"],
+    values: Float[Tensor, "gaussians columns"],
+    count: int,
+    which: str,
+) -> Float[Tensor, "blocks columns"]:
+    """The least or largest of each block; infinite where there is none."""
+    bound = torch.inf if which == "amin" else -torch.inf
+    out = values.new_full((count, values.shape[1]), bound)
+    return out.scatter_reduce(0, block[:, None].expand_as(values), values, which)
 
 
 def _farthest(plane: Float[Tensor, "blocks 4"], blocks: Blocks) -> Float[Tensor, " blocks"]:

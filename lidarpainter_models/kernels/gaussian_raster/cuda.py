@@ -9,7 +9,6 @@ views of one size go in one call in gsplat's packed form; depth is one of the bl
 """
 
 from collections.abc import Sequence
-from importlib import import_module
 from types import ModuleType
 
 import torch
@@ -25,6 +24,7 @@ from lidarpainter_models.kernels.gaussian_raster.reference import (
     screen_radii,
 )
 from lidarpainter_models.kernels.gaussian_raster.splats import DrawnImages, Splats
+from lidarpainter_models.kernels.gpu_packages import import_gsplat
 
 
 def draw_views(
@@ -114,32 +114,6 @@ def _rasterised(
         absgrad=is_watched,
     )
     return list(zip(images, alpha[..., 0], strict=True))
-
-
-def import_gsplat() -> ModuleType:
-    """Gsplat with kernels that can run; it compiles them here if no wheel brought them.
-
-    Raises:
-        BackendError: it is not installed, or there are no kernels and no compiler for them.
-    """
-    try:
-        gsplat = import_module("gsplat")
-    except ImportError as error:
-        raise BackendError(
-            f"the cuda backend needs gsplat ({error}); install the extra: "
-            "pip install 'lidarpainter[cuda]'"
-        ) from error
-    try:
-        kernels = import_module("gsplat.cuda._backend")._C
-    except (ImportError, OSError, RuntimeError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise BackendError(f"gsplat could not load or compile its kernels: {reason}") from error
-    if kernels is None:
-        raise BackendError(
-            f"gsplat has no compiled kernels and finds no nvcc; install its wheel for torch "
-            f"{torch.__version__} or a CUDA toolkit (CUDA_HOME)"
-        )
-    return gsplat
 
 
 def _tile_lists(

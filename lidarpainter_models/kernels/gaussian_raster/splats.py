@@ -69,7 +69,8 @@ class Splats:
         """
         if len(self) == 0:
             return
-        lowest, highest = (int(value) for value in torch.aminmax(self.body_index))
+        # together, so that a GPU is waited for once
+        lowest, highest = torch.stack(torch.aminmax(self.body_index)).tolist()
         if lowest < 0 or highest >= bodies:
             raise ShapeError(
                 f"body_index runs from {lowest} to {highest}, but camera_from_body holds "

@@ -24,13 +24,18 @@ import numba
 import numpy as np
 from torch import Tensor
 
-from lidarpainter_models.kernels.sparse_adam.state import BETA1, BETA2, AdamState, Parameters
+from lidarpainter_models.kernels.sparse_adam.state import (
+    BETA1,
+    BETA2,
+    MISSED_RUN_ENDS,
+    AdamState,
+    Parameters,
+)
 
 MEANS, LOG_SCALE = 0, 7
 """First of three columns each in a row of parameters; rotations lie between them."""
 OPACITY, HARMONICS = 10, 11
-RUN_ENDS = np.array([2, 4, 6, 8, 12, 20, 36, 68, 132, 260])
-"""Last missed step of each run."""
+RUN_ENDS = np.array(MISSED_RUN_ENDS)
 CHUNKS = 64
 """Rows are shared out in this many chunks, whatever the number of threads."""
 

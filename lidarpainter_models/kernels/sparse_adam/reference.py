@@ -1,14 +1,19 @@
-"""Adam on rows in plain torch: every missed step is taken, one after the other. The law.
+"""Adam on rows in plain torch, on any device: the law in float64, the twin of numba in float32.
 
-Any device and kind of numbers. At step t a row has m = BETA1 m + (1 - BETA1) g and
-v = BETA2 v + (1 - BETA2) g^2 and moves by rate m / (1 - BETA1^t) over
-sqrt(v / (1 - BETA2^t)) + eps; without a gradient, g is 0.
+At step t a row has m = BETA1 m + (1 - BETA1) g and v = BETA2 v + (1 - BETA2) g^2 and moves by
+rate m / (1 - BETA1^t) over sqrt(v / (1 - BETA2^t)) + eps; without a gradient, g is 0. What a row
+missed is in `missed_steps`: in float64 every step by itself, in float32 a few at once. Rows are
+sorted by how much they missed, so that the device is asked once how many there are of each.
 """
 
+import math
+from collections.abc import Sequence
+
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from lidarpainter_models.kernels.sparse_adam.missed_steps import gathered_steps, single_steps
 from lidarpainter_models.kernels.sparse_adam.state import BETA1, BETA2, AdamState, Parameters
 
 _MEANS, _LOG_SCALE = slice(0, 3), slice(7, 10)
@@ -18,8 +23,9 @@ def present_rows(
     state: AdamState, kept: Parameters, rows: Int[Tensor, " seen"], out: Parameters
 ) -> None:
     """See `sparse_adam.present_rows`."""
-    values, _, _ = _caught_up(state, kept, rows)
-    _store(values, out, torch.arange(len(rows), device=rows.device))
+    values = _table(state, Parameters(*(value.index_select(0, rows) for value in kept)))
+    _catch_up(state, values, rows)
+    _store(_split(values, out), out)
 
 
 def step_rows(
@@ -31,75 +37,121 @@ def step_rows(
     rates: list[float],
 ) -> None:
     """See `sparse_adam.step_rows`."""
+    # without a gradient too: it is what the row would have to catch up with, and a choice by mask
+    # would wait for the device
     gradient = _table(state, gradients)
-    is_moved = (gradient != 0).any(dim=1)
-    rows, gradient, values = rows[is_moved], gradient[is_moved], _table(state, seen)[is_moved]
-    faded = (state.count - 1 - state.last[rows])[:, None].to(values.dtype)
-    first = BETA1**faded * state.first[rows]
-    second = BETA2**faded * state.second[rows]
-    first = BETA1 * first + (1 - BETA1) * gradient
-    second = BETA2 * second + (1 - BETA2) * gradient.square()
-    _store(values - _move(state, values, first, second, rates, state.count), kept, rows)
-    state.first[rows], state.second[rows] = first, second
-    state.last[rows] = state.count
+    steps = (state.count - state.last.index_select(0, rows))[:, None].to(gradient.dtype)
+    first = state.first.index_select(0, rows).mul_(BETA1**steps)
+    second = state.second.index_select(0, rows).mul_(BETA2**steps)
+    first.add_(gradient, alpha=1 - BETA1)
+    second.addcmul_(gradient, gradient, value=1 - BETA2)
+    state.first.index_copy_(0, rows, first)
+    state.second.index_copy_(0, rows, second)
+    state.last.index_fill_(0, rows, state.count)
+    # the second moment's bias in the rate, and in what is added for its sake
+    bias = math.sqrt(1 - BETA2**state.count)
+    rate = torch.tensor(rates, dtype=torch.float64) * (bias / (1 - BETA1**state.count))
+    spread = second.sqrt_().add_(state.eps, alpha=bias)
+    move = first.mul_(_by_column(state, rate, gradient.dtype)).div_(spread)
+    move = _in_units(move, seen.log_scale)
+    _store(_split(_table(state, seen).sub_(move), kept), kept, rows)
 
 
 def catch_up(state: AdamState, kept: Parameters) -> None:
     """See `sparse_adam.catch_up`."""
-    rows = torch.arange(len(state.last), device=state.last.device)
-    values, state.first[:], state.second[:] = _caught_up(state, kept, rows)
-    _store(values, kept, rows)
-    state.last[:] = state.count
+    values = _table(state, kept)
+    _catch_up(state, values, None)
+    _store(_split(values, kept), kept)
+    faded = (state.count - state.last)[:, None].to(values.dtype)
+    state.first.mul_(BETA1**faded)
+    state.second.mul_(BETA2**faded)
+    state.last.fill_(state.count)
 
 
-def _caught_up(
-    state: AdamState, kept: Parameters, rows: Int[Tensor, " seen"]
-) -> tuple[
-    Float[Tensor, "seen columns"], Float[Tensor, "seen columns"], Float[Tensor, "seen columns"]
-]:
-    """Parameters and moments of rows after the steps they missed."""
-    values, last = _table(state, kept)[rows], state.last[rows]
-    first, second = state.first[rows], state.second[rows]
-    for place, rates in enumerate(state.missed):
-        step = state.count - len(state.missed) + 1 + place
-        missed: Bool[Tensor, "seen 1"] = (last < step)[:, None]
-        first = torch.where(missed, BETA1 * first, first)
-        second = torch.where(missed, BETA2 * second, second)
-        move = _move(state, values, first, second, rates, step)
-        values = torch.where(missed, values - move, values)
-    return values, first, second
+def _catch_up(
+    state: AdamState, values: Float[Tensor, "rows columns"], rows: Int[Tensor, " rows"] | None
+) -> None:
+    """Move a table of parameters by the steps that its rows (None: all) missed, in place."""
+    most = len(state.missed)
+    last = state.last if rows is None else state.last.index_select(0, rows)
+    missed = (state.count - last).long()
+    ones = torch.ones_like(missed)
+    of_each = ones.new_zeros(most + 1).index_add_(0, missed, ones)
+    at_least = of_each.flip(0).cumsum(0).flip(0).tolist()  # the host waits here, once
+    if most == 0 or at_least[1] == 0:
+        return
+    stale = missed.argsort(descending=True)[: at_least[1]]
+    missed = missed.index_select(0, stale)
+    places = stale if rows is None else rows.index_select(0, stale)
+    first, root = state.first.index_select(0, places), state.second.index_select(0, places).sqrt_()
+    moved_to = values.index_select(0, stale)
+    steps = (single_steps if values.dtype == torch.float64 else gathered_steps)(
+        state.missed, state.count
+    )
+    weight, depth = (
+        _by_column(state, torch.from_numpy(table), values.dtype)
+        for table in (steps.weight, steps.depth)
+    )
+    leads = torch.from_numpy(steps.lead).to(values.dtype).to(values.device, non_blocking=True)
+    for node, least in enumerate(steps.least):
+        count = at_least[least] if least <= most else 0
+        if count == 0:
+            break
+        begun = missed[:count]
+        move = weight[node].index_select(0, begun).mul_(first[:count])
+        move /= depth[node].index_select(0, begun).mul_(root[:count]).add_(state.eps)
+        lead = leads[node].index_select(0, begun)
+        moved_to[:count] -= _in_units(move, moved_to[:count, _LOG_SCALE], lead)
+    values[stale] = moved_to
 
 
-def _move(
-    state: AdamState,
-    values: Float[Tensor, "seen columns"],
-    first: Float[Tensor, "seen columns"],
-    second: Float[Tensor, "seen columns"],
-    rates: list[float],
-    step: int,
-) -> Float[Tensor, "seen columns"]:
-    """What a step takes off the values."""
-    rate = torch.tensor(rates, dtype=torch.float64)[state.kind_of_column].to(values)
-    spread = (second / (1 - BETA2**step)).sqrt() + state.eps.to(values)
-    move = rate * (first / (1 - BETA1**step)) / spread
-    size = values[:, _LOG_SCALE]
-    size_m = (0.5 * (size.sum(dim=1) - size.amin(dim=1))).exp()
+def _in_units(
+    move: Float[Tensor, "rows columns"],
+    log_scale: Float[Tensor, "rows 3"],
+    lead: Float[Tensor, " rows"] | None = None,
+) -> Float[Tensor, "rows columns"]:
+    """Moves with those of centres in units of the Gaussian's size, in place.
+
+    The size is the one that it has after the part `lead` (None: nothing) of the move.
+    """
+    if lead is not None:
+        log_scale = log_scale - lead[:, None] * move[:, _LOG_SCALE]
+    size_m = (0.5 * (log_scale.sum(dim=1) - log_scale.amin(dim=1))).exp()
     move[:, _MEANS] *= size_m[:, None]
     return move
+
+
+def _by_column(
+    state: AdamState, by_kind: Float[Tensor, "*batch kinds"], dtype: torch.dtype
+) -> Float[Tensor, "*batch columns"]:
+    """A number of each column from those of the kinds of parameters, on the moments' device."""
+    there = by_kind.to(dtype).to(state.first.device, non_blocking=True)
+    return there.index_select(-1, state.kind_of_column)
 
 
 def _table(state: AdamState, parameters: Parameters) -> Float[Tensor, "rows columns"]:
     """All parameters side by side, with zeros where a row of moments is longer."""
     count = len(parameters.means)
-    parts = [value.reshape(count, value[:1].numel() if count else 0) for value in parameters]
-    table = torch.cat(parts, dim=1)
-    return torch.nn.functional.pad(table, (0, state.first.shape[1] - table.shape[1]))
+    parts = [value.reshape(count, value.shape[1:].numel()) for value in parameters]
+    missing = state.first.shape[1] - sum(part.shape[1] for part in parts)
+    return torch.cat([*parts, parts[0].new_zeros(count, missing)], dim=1)
 
 
-def _store(values: Float[Tensor, "seen columns"], out: Parameters, rows: Tensor) -> None:
-    """Write a table's rows into rows of parameters."""
-    begin = 0
-    for value in out:
-        width = value.shape[1:].numel()
-        value[rows] = values[:, begin : begin + width].reshape(len(rows), *value.shape[1:])
-        begin += width
+def _split(table: Float[Tensor, "rows columns"], like: Parameters) -> list[Tensor]:
+    """The columns of a table as those parameters."""
+    widths = [value.shape[1:].numel() for value in like]
+    parts = table.split([*widths, table.shape[1] - sum(widths)], dim=1)
+    return [
+        part.reshape(len(table), *value.shape[1:]) for part, value in zip(parts, like, strict=False)
+    ]
+
+
+def _store(
+    parts: Sequence[Tensor], out: Parameters, rows: Int[Tensor, " seen"] | None = None
+) -> None:
+    """Write values into rows of parameters, or into all."""
+    for value, part in zip(out, parts, strict=True):
+        if rows is None:
+            value.copy_(part)
+        else:
+            value.index_copy_(0, rows, part)

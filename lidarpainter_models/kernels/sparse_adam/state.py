@@ -14,6 +14,8 @@ MOST_STEP = (1 - BETA1) / math.sqrt((1 - BETA2) * (1 - BETA1**2 / BETA2))
 MOST_UNITS = MOST_STEP / (math.sqrt(BETA2) / BETA1 - 1)
 """The farthest that a row still moves without a gradient, in learning rates: the steps shrink by
 BETA1 / sqrt(BETA2) each."""
+MISSED_RUN_ENDS = (2, 4, 6, 8, 12, 20, 36, 68, 132, 260)
+"""Last step of each run of missed steps that are taken at once; later ones are dropped."""
 VECTOR = 16
 """Rows of moments are this many float32, a cache line, or several times as long: no vector loop
 ends in single numbers."""
@@ -49,14 +51,16 @@ class AdamState:
     """Learning rates, one of each kind, of the steps since all rows were caught up."""
 
     @classmethod
-    def empty(cls, rows: int, widths: list[int], eps: list[float]) -> "AdamState":
+    def empty(
+        cls, rows: int, widths: list[int], eps: list[float], device: torch.device | None = None
+    ) -> "AdamState":
         """Nothing moved yet; one width (columns) and one epsilon for each kind of parameter."""
         padded = [*widths[:-1], widths[-1] + -sum(widths) % VECTOR]
         kind_of_column = torch.repeat_interleave(torch.arange(len(widths)), torch.tensor(padded))
         return cls(
-            kind_of_column=kind_of_column,
-            eps=torch.tensor(eps)[kind_of_column],
-            first=torch.zeros(rows, sum(padded)),
-            second=torch.zeros(rows, sum(padded)),
-            last=torch.zeros(rows, dtype=torch.int32),
+            kind_of_column=kind_of_column.to(device),
+            eps=torch.tensor(eps)[kind_of_column].to(device),
+            first=torch.zeros(rows, sum(padded), device=device),
+            second=torch.zeros(rows, sum(padded), device=device),
+            last=torch.zeros(rows, dtype=torch.int32, device=device),
         )

@@ -4,7 +4,6 @@ The window is 11 x 11, Gaussian, sigma 1.5 px, with zeros outside the image; the
 1 (images in [0, 1]). This is the SSIM of Wang et al. (2004) on each colour channel.
 """
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -70,14 +69,12 @@ def l1_ssim_loss(
         BackendError: the numba version was asked for and the images are not float32 on the CPU.
     """
     _check_images(rendered, target)
-    if pixel_weight is None:
-        pixel_weight = torch.ones_like(rendered[..., 0])
-    if pixel_weight.shape != rendered.shape[:2]:
+    if pixel_weight is not None and pixel_weight.shape != rendered.shape[:2]:
         raise ShapeError(
             f"need one weight per pixel, got {tuple(pixel_weight.shape)} for an image of "
             f"{tuple(rendered.shape)}"
         )
-    weight = pixel_weight.detach().to(rendered.dtype)
+    weight = None if pixel_weight is None else pixel_weight.detach().to(rendered.dtype)
     compute = implementation(
         "ssim", "l1_ssim_loss", float32_backend("ssim", backend, rendered), rendered.device
     )

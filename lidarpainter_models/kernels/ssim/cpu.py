@@ -43,9 +43,11 @@ def ssim_map(first_rgb: Tensor, second_rgb: Tensor) -> Tensor:
 
 
 def l1_ssim_loss(
-    rendered: Tensor, target: Tensor, pixel_weight: Tensor, ssim_weight: float
+    rendered: Tensor, target: Tensor, pixel_weight: Tensor | None, ssim_weight: float
 ) -> Tensor:
     """The fused loss; its gradient is computed along with it."""
+    if pixel_weight is None:
+        pixel_weight = torch.ones_like(rendered[..., 0])
     return _L1SsimLoss.apply(rendered, target, pixel_weight, ssim_weight)
 
 

@@ -2,14 +2,16 @@
 
 Wang, Bovik, Sheikh and Simoncelli, "Image quality assessment: from error visibility to structural
 similarity" (2004), with the 11 x 11 Gaussian window of that paper and zeros outside the image.
-Gradients come from autograd.
+The window is its own transpose, so gradients are means as well.
 """
 
 import math
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import conv2d
 
 WINDOW_RADIUS_PX = 5
 WINDOW_SIGMA_PX = 1.5
@@ -28,39 +30,62 @@ def ssim_map(
     first_rgb: Float[Tensor, "height width 3"], second_rgb: Float[Tensor, "height width 3"]
 ) -> Float[Tensor, "height width 3"]:
     """SSIM around every pixel, for each channel alone, in [-1, 1]."""
-    first, second = first_rgb.permute(2, 0, 1), second_rgb.permute(2, 0, 1)
-    mean_first, mean_second = _blurred(first), _blurred(second)
-    variance_first = _blurred(first * first) - mean_first**2
-    variance_second = _blurred(second * second) - mean_second**2
-    covariance = _blurred(first * second) - mean_first * mean_second
-    luminance = (2 * mean_first * mean_second + LUMINANCE_CONSTANT) / (
-        mean_first**2 + mean_second**2 + LUMINANCE_CONSTANT
-    )
-    contrast = (2 * covariance + CONTRAST_CONSTANT) / (
-        variance_first + variance_second + CONTRAST_CONSTANT
-    )
-    return (luminance * contrast).permute(1, 2, 0)
+    similarity: Tensor = _Ssim.apply(_planes(first_rgb), _planes(second_rgb))
+    return similarity.permute(1, 2, 0)
 
 
 def l1_ssim_loss(
     rendered: Float[Tensor, "height width 3"],
     target: Float[Tensor, "height width 3"],
-    pixel_weight: Float[Tensor, "height width"],
+    pixel_weight: Float[Tensor, "height width"] | None,
     ssim_weight: float,
 ) -> Float[Tensor, ""]:
     """The loss defined at `lidarpainter_models.kernels.ssim.l1_ssim_loss`."""
-    weight = pixel_weight[..., None]
-    seen = torch.where(weight > 0, rendered, target)
-    difference = (seen - target).abs()
-    dissimilarity = 1 - ssim_map(seen, target)
-    return (weight * (difference + ssim_weight * dissimilarity)).mean()
+    seen, target = _planes(rendered), _planes(target)
+    if pixel_weight is not None:
+        seen = torch.where(pixel_weight > 0, seen, target)
+    badness = (seen - target).abs() + ssim_weight * (1 - _Ssim.apply(seen, target))
+    return (badness if pixel_weight is None else pixel_weight * badness).mean()
 
 
-def _blurred(channels: Float[Tensor, "3 height width"]) -> Float[Tensor, "3 height width"]:
-    """The windowed mean around every pixel, with zeros outside the image."""
-    weights = torch.tensor(window_weights(), dtype=channels.dtype, device=channels.device)
-    rows = weights.view(1, 1, 1, -1)
-    blurred = torch.nn.functional.conv2d(channels[:, None], rows, padding=(0, WINDOW_RADIUS_PX))
-    columns = weights.view(1, 1, -1, 1)
-    blurred = torch.nn.functional.conv2d(blurred, columns, padding=(WINDOW_RADIUS_PX, 0))
-    return blurred[:, 0]
+class _Ssim(torch.autograd.Function):
+    """S = A B / (C D) of windowed means; a derivative by a mean is blurred back to the pixels."""
+
+    @staticmethod
+    def forward(ctx: Any, first: Tensor, second: Tensor) -> Tensor:  # noqa: ANN401
+        planes = torch.cat([first, second, first * first + second * second, first * second])
+        mean_1, mean_2, squares, product = _blurred(planes).split(3)
+        both, of_means = mean_1 * mean_2, mean_1**2 + mean_2**2
+        a, c = 2 * both + LUMINANCE_CONSTANT, of_means + LUMINANCE_CONSTANT
+        b, d = 2 * (product - both) + CONTRAST_CONSTANT, squares - of_means + CONTRAST_CONSTANT
+        ctx.save_for_backward(first, second, mean_1, mean_2, a, b, c, d)
+        return a * b / (c * d)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:  # noqa: ANN401
+        first, second, mean_1, mean_2, a, b, c, d = ctx.saved_tensors
+        share = gradient / (c * d)
+        by_squares = -share * a * b / d
+        by_mean = 2 * (share * mean_2 * (b - a) + by_squares * mean_1 * (d / c - 1))
+        planes = torch.cat([by_mean, by_squares, 2 * share * a])
+        mean, square, product = _blurred(planes).split(3)
+        return mean + 2 * first * square + second * product, None
+
+
+def _planes(rgb: Float[Tensor, "height width 3"]) -> Float[Tensor, "3 height width"]:
+    return rgb.permute(2, 0, 1).contiguous()
+
+
+def _blurred(planes: Float[Tensor, "planes height width"]) -> Float[Tensor, "planes height width"]:
+    """The windowed mean around every pixel, with zeros outside the image; all planes at once."""
+    count, height, width = planes.shape
+    offset = torch.arange(
+        -WINDOW_RADIUS_PX, WINDOW_RADIUS_PX + 1, dtype=planes.dtype, device=planes.device
+    )
+    weights = torch.exp(-(offset**2) / (2 * WINDOW_SIGMA_PX**2))
+    weights = (weights / weights.sum()).expand(count, 1, 1, -1).contiguous()
+    # pixel by pixel in memory, as such convolutions are fastest; turned as matrices, which is fast
+    image = planes.view(count, -1).t().contiguous().view(1, height, width, count).movedim(-1, 1)
+    image = conv2d(image, weights, padding=(0, WINDOW_RADIUS_PX), groups=count)
+    image = conv2d(image, weights.mT, padding=(WINDOW_RADIUS_PX, 0), groups=count)
+    return image.movedim(1, -1).reshape(-1, count).t().contiguous().view(count, height, width)

@@ -60,7 +60,7 @@ def painted_parts(
 ) -> list[PaintedPart]:
     """Rectangles that hold every doubtful tile, or the whole image where that is less work."""
     whole = Window(0, 0, height_px, width_px)
-    boxes = _boxes(tiles.numpy())
+    boxes = _boxes(tiles.cpu().numpy())
     parts = []
     for top, left, rows, columns in boxes:
         changed = _clipped(top, left, rows, columns, 0, whole)

@@ -1,34 +1,31 @@
 """Weather and time of day for an image whose depth is known, without another learned model."""
 
+from dataclasses import replace
+
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
-from lidarpainter_models.painter.styles.fog import add_fog
-from lidarpainter_models.painter.styles.night import turn_to_night
-from lidarpainter_models.painter.styles.rain import add_rain
+from lidarpainter_models.painter.styles.fog import FogConfig, add_fog
+from lidarpainter_models.painter.styles.night import NightConfig, turn_to_night
+from lidarpainter_models.painter.styles.rain import RainConfig, add_rain
 from lidarpainter_models.painter.styles.view import StyleView
+from lidarpainter_models.weather.mix import (
+    FOG_VISIBILITY_M,
+    STYLE_PROMPTS,
+    StyleMix,
+    check_prompt,
+)
 
-__all__ = ["STYLE_PROMPTS", "StyleView", "apply_style", "check_prompt"]
-
-STYLE_PROMPTS = (DEFAULT_PROMPT, "foggy", "night", "rain")
-"""Prompts that a style stands behind; the first changes nothing."""
-
-
-def check_prompt(prompt: str) -> str:
-    """The prompt, if a style stands behind it.
-
-    Raises:
-        ConfigError: none does.
-    """
-    if prompt not in STYLE_PROMPTS:
-        raise ConfigError(f"no style {prompt!r}, expected {', '.join(STYLE_PROMPTS)}")
-    return prompt
+__all__ = ["STYLE_PROMPTS", "StyleView", "apply_mix", "apply_style", "check_prompt"]
 
 
 def apply_style(
-    view: StyleView, prompt: str, generator: Generator
+    view: StyleView,
+    prompt: str,
+    generator: Generator,
+    *,
+    strength: float = 1.0,
+    visibility_m: float = FOG_VISIBILITY_M,
 ) -> Float[Tensor, "height width 3"]:
     """The view in a style, as displayed; the same for the same state of the generator.
 
@@ -36,10 +33,37 @@ def apply_style(
         ConfigError: there is no such style.
     """
     check_prompt(prompt)
+    if strength == 0:
+        return view.rgb
     if prompt == "foggy":
-        return add_fog(view)
+        return add_fog(view, FogConfig(visibility_m=visibility_m / strength))
     if prompt == "night":
-        return turn_to_night(view, generator)
+        return turn_to_night(view, generator, NightConfig(strength=strength))
     if prompt == "rain":
-        return add_rain(view, generator)
+        return add_rain(view, generator, RainConfig(strength=strength))
+    return view.rgb
+
+
+def apply_mix(
+    view: StyleView, mix: StyleMix, generator: Generator, *, progress: float
+) -> Float[Tensor, "height width 3"]:
+    """The view under all styles of a mix: first it gets wet, then dark, then fog comes up.
+
+    Args:
+        view: what is styled.
+        mix: the styles.
+        generator: lights windows, draws drops and noise.
+        progress: share of the log's time that has passed, which strengths may follow.
+    """
+    strengths = mix.strengths(progress)
+    for prompt in ("rain", "night", "foggy"):
+        if prompt in strengths:
+            rgb = apply_style(
+                view,
+                prompt,
+                generator,
+                strength=strengths[prompt],
+                visibility_m=mix.visibility_m,
+            )
+            view = replace(view, rgb=rgb)
     return view.rgb

@@ -7,32 +7,36 @@ large against the wavelength and scatter all colours alike, so it is nearly grey
 """
 
 from dataclasses import dataclass
-from math import inf, log
+from math import inf
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.painter.styles.light import luminance, to_display, to_linear
 from lidarpainter_models.painter.styles.view import StyleView, distances, elevations
-
-LEAST_CONTRAST = 0.02
-"""What the eye can just tell from the horizon, in the definition of visibility."""
+from lidarpainter_models.weather.air import (
+    FOG_BRIGHTNESS,
+    FOG_GREYNESS,
+    FOG_LAYER_M,
+    transmittance,
+)
+from lidarpainter_models.weather.light import luminance, to_display, to_linear
+from lidarpainter_models.weather.mix import FOG_VISIBILITY_M
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FogConfig:
     """A bank of fog on the ground."""
 
-    visibility_m: float = 120.0
+    visibility_m: float = FOG_VISIBILITY_M
     """Where contrast has fallen to 2 %; below 1000 m it is called fog. Infinity leaves the image
     as it is."""
-    layer_m: float = 120.0
+    layer_m: float = FOG_LAYER_M
     """Height of the fog above the camera: sky at elevation e is seen through layer / sin e of it,
     so that it may shine through at the zenith."""
-    greyness: float = 0.85
+    greyness: float = FOG_GREYNESS
     """How far the airlight's colour goes from that of the sky to grey."""
-    brightness: float = 0.8
+    brightness: float = FOG_BRIGHTNESS
     """Airlight against the light of the horizon in the clear image."""
 
 
@@ -43,19 +47,6 @@ def add_fog(view: StyleView, config: FogConfig | None = None) -> Float[Tensor, "
     through = fog_transmittance(view, config)[..., None]
     air = config.brightness * airlight(view, greyness=config.greyness)
     return to_display(clear * through + air * (1 - through))
-
-
-def extinction_per_m(visibility_m: float) -> float:
-    """Koschmieder's beta."""
-    return 0.0 if visibility_m == inf else -log(LEAST_CONTRAST) / visibility_m
-
-
-def transmittance(
-    distance_m: Float[Tensor, "height width"], visibility_m: float
-) -> Float[Tensor, "height width"]:
-    """exp(-beta d)."""
-    beta = extinction_per_m(visibility_m)
-    return torch.exp(-beta * distance_m) if beta else torch.ones_like(distance_m)
 
 
 def fog_transmittance(view: StyleView, config: FogConfig) -> Float[Tensor, "height width"]:

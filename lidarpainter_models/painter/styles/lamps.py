@@ -21,12 +21,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
-from lidarpainter_models.painter.styles.light import luminance
+from lidarpainter_models.weather.darkness import WARM_RGB
+from lidarpainter_models.weather.light import luminance
 
 LampKind = Literal["signal", "window", "street"]
 
-WARM_RGB = (1.0, 0.72, 0.38)
-"""A lamp of about 2900 kelvin, brightest channel 1."""
 SIGNAL_CHROMA = 0.45
 """Least excess of red over both other channels, as a share of it; of green over red two thirds."""
 SIGNAL_LEAST = (0.25, 0.45)

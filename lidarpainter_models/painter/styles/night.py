@@ -18,7 +18,6 @@ from torch import Generator, Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.painter.styles.lamps import Lamp, LampKind, Place, find_lamps
-from lidarpainter_models.painter.styles.light import luminance, to_display, to_linear
 from lidarpainter_models.painter.styles.view import (
     StyleView,
     distances,
@@ -28,38 +27,31 @@ from lidarpainter_models.painter.styles.view import (
     ray_directions,
     surface_points,
 )
+from lidarpainter_models.weather.darkness import (
+    BEAM,
+    BEAM_RGB,
+    FACING,
+    HEADLAMP_AHEAD_M,
+    HEADLAMP_HEIGHT_M,
+    LEAST_GRAZING,
+    NEAREST_M2,
+    WINDOW_POWER,
+    WINDOW_RADIANCE,
+    by_skylight,
+    dipped_beam,
+    night_reflectance,
+    night_sky,
+)
+from lidarpainter_models.weather.light import luminance, to_display, to_linear
 
-SKYLIGHT_RGB = (0.55, 0.75, 1.25)
-"""The blue of what is left when the sun is gone, of luminance about 0.75."""
-SKYGLOW_RGB = (1.0, 0.76, 0.58)
-"""Town light thrown back by the air near the horizon."""
-COLOUR_LEFT = 0.4
-"""Of a surface's own colour under skylight (the eye's cones no longer see it)."""
-BEAM_RGB = (1.0, 0.93, 0.78)
-HEADLAMP_HEIGHT_M = 0.65
-HEADLAMP_AHEAD_M = 1.2
 HEADLAMP_SIDE_M = 0.6
-BEAM_ACROSS_RAD = 0.26
-"""Deviation of the low beam to the sides."""
-BEAM_CUT_RAD = -0.008
-"""The cut-off: half a degree below the horizon."""
-BEAM_DOWN_RAD = 0.09
-LEAST_GRAZING = 0.12
-"""Share of a grazing beam that rough asphalt still sends back."""
-FACING = 0.15
-"""Share that surfaces above the ground send back; few face the lamp."""
 GLARE_SIGMAS_RAD = ((0.0015, 0.5), (0.006, 0.3), (0.025, 0.14), (0.09, 0.06))
 """Width and share of the Gaussians of the point spread; the rest passes straight."""
-RADIANCE: dict[LampKind, float] = {"signal": 1.6, "window": 0.55, "street": 6.0}
+RADIANCE: dict[LampKind, float] = {"signal": 1.6, "window": WINDOW_RADIANCE, "street": 6.0}
 """Of a lamp's own pixels, in units of display white."""
-POWER: dict[LampKind, float] = {"signal": 0.02, "window": 0.25, "street": 4.0}
+POWER: dict[LampKind, float] = {"signal": 0.02, "window": WINDOW_POWER, "street": 4.0}
 """Irradiance a metre away, in the same units."""
 MOST_SOURCES = 60
-NEAREST_M2 = 2.0
-"""Square of a distance that is added to all: a lamp lights what stands beside it little more."""
-AMBIENT = 0.055  # skylight against daylight; a camera at night is exposed far longer than the eye
-SKY_GLOW = 0.022  # radiance of the sky at the horizon, in units of display white
-SHADOW_SOFTENING = 0.75  # power of reflectance: below 1 the sun's shadows fade
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +60,7 @@ class NightConfig:
 
     strength: float = 1.0
     """0 is day and leaves the image as it is; between, day and night light are mixed."""
-    beam: float = 280.0
+    beam: float = BEAM
     """Irradiance of the low beam at a metre, in the same units; 0 turns it off."""
     lit_windows: float = 0.4
     """Share of the windows found that are lit."""
@@ -86,6 +78,31 @@ def turn_to_night(
     return to_display(day + config.strength * (night - day))
 
 
+def place_of(view: StyleView) -> tuple[Place, Float[Tensor, "height width 3"] | None]:
+    """What lamps are looked for in, and where its surfaces lie, metres from the camera."""
+    distance_m = _without_specks(distances(view))
+    points_m = None if view.camera is None else surface_points(view.camera, distance_m)
+    ground = None if points_m is None else fit_ground(points_m, view.surface)
+    if points_m is not None and ground is not None:
+        points_m = ground.flattened(points_m)
+    place = Place(
+        light=to_linear(view.rgb),
+        display=view.rgb,
+        distance_m=distance_m,
+        height_m=None if points_m is None or ground is None else ground.heights(points_m),
+        surface=view.surface,
+        focal_px=view.focal_px,
+    )
+    return place, points_m
+
+
+def sunlit_white(view: StyleView) -> float:
+    """Daylight of the brightest tenth of the surfaces."""
+    grey = luminance(to_linear(view.rgb))
+    seen = grey[view.surface] if bool(view.surface.any()) else grey.flatten()
+    return max(float(seen.kthvalue(max(1, round(0.9 * len(seen)))).values), 1e-3)
+
+
 def _relit(
     view: StyleView,
     day: Float[Tensor, "height width 3"],
@@ -93,22 +110,10 @@ def _relit(
     config: NightConfig,
 ) -> Float[Tensor, "height width 3"]:
     """Night light of the whole view, with glare and noise."""
-    distance_m = _without_specks(distances(view))
-    points_m = None if view.camera is None else surface_points(view.camera, distance_m)
-    ground = None if points_m is None else fit_ground(points_m, view.surface)
-    if points_m is not None and ground is not None:
-        points_m = ground.flattened(points_m)
-    place = Place(
-        light=day,
-        display=view.rgb,
-        distance_m=distance_m,
-        height_m=None if points_m is None or ground is None else ground.heights(points_m),
-        surface=view.surface,
-        focal_px=view.focal_px,
-    )
+    place, points_m = place_of(view)
     lamps = find_lamps(place, lit_share=config.lit_windows, generator=generator)
-    reflectance = _reflectance(day, view)
-    surface = _by_skylight(reflectance)
+    reflectance = night_reflectance(day, sunlit_white(view))
+    surface = by_skylight(reflectance)
     irradiance = torch.zeros_like(day)
     if view.camera is not None and points_m is not None and place.height_m is not None:
         irradiance += config.beam * low_beam(view.camera, points_m, place.height_m)
@@ -119,28 +124,11 @@ def _relit(
     return _with_noise(glowing, config.noise, generator)
 
 
-def _by_skylight(reflectance: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 3"]:
-    """Surfaces under the sky alone; so little light has hardly any colour of its own."""
-    grey = luminance(reflectance)[..., None]
-    return AMBIENT * torch.tensor(SKYLIGHT_RGB) * (grey + COLOUR_LEFT * (reflectance - grey))
-
-
 def _without_specks(
     distance_m: Float[Tensor, "height width"],
 ) -> Float[Tensor, "height width"]:
     """The median of five by five pixels: light falls off smoothly on a road."""
     return 1 / torch.from_numpy(cv2.medianBlur((1 / distance_m).numpy(), 5))
-
-
-def _reflectance(
-    day: Float[Tensor, "height width 3"], view: StyleView
-) -> Float[Tensor, "height width 3"]:
-    """Daylight over that of the brightest tenth of the surfaces, contrast softened."""
-    grey = luminance(day)
-    seen = grey[view.surface] if bool(view.surface.any()) else grey.flatten()
-    white = seen.kthvalue(max(1, round(0.9 * len(seen)))).values.clamp_min(1e-3)
-    relative = (grey / white).clamp(1e-4, 1.5)
-    return day / white * (relative ** (SHADOW_SOFTENING - 1))[..., None] * 0.8
 
 
 def _night_sky(view: StyleView) -> Float[Tensor, "height width 3"]:
@@ -149,9 +137,8 @@ def _night_sky(view: StyleView) -> Float[Tensor, "height width 3"]:
         rows = torch.linspace(0.6, 0.0, len(view.rgb))[:, None]
         elevation = rows.expand(view.rgb.shape[:2])
     else:
-        elevation = elevations(view.camera).clamp_min(0)
-    glow = torch.exp(-elevation / 0.15)[..., None] * torch.tensor(SKYGLOW_RGB)
-    return SKY_GLOW * glow + 0.2 * AMBIENT * torch.tensor(SKYLIGHT_RGB)
+        elevation = elevations(view.camera)
+    return night_sky(elevation)
 
 
 def low_beam(
@@ -176,13 +163,7 @@ def low_beam(
         distance = (forward**2 + across**2 + up**2).sqrt().clamp_min(1.0)
         level = forward.clamp_min(0.1)
         azimuth, elevation = torch.atan2(across, level), torch.atan2(up, level)
-        below = BEAM_CUT_RAD - elevation
-        beam = torch.where(
-            below > 0,
-            torch.exp(-below / BEAM_DOWN_RAD),
-            0.03 + 0.97 * torch.exp(-0.5 * (below / 0.012) ** 2),  # stray light over a soft edge
-        )
-        beam = beam * torch.exp(-0.5 * (azimuth / BEAM_ACROSS_RAD) ** 2) * (forward > 0)
+        beam = dipped_beam(azimuth, elevation) * (forward > 0)
         grazing = (HEADLAMP_HEIGHT_M / distance).clamp_min(LEAST_GRAZING)
         facing = grazing + ((height_m - 0.15) / 0.5).clamp(0, 1) * (FACING - grazing)
         found += beam * facing / distance**2

@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from lidarpainter_models.painter.styles.light import luminance, to_display, to_linear
 from lidarpainter_models.painter.styles.view import (
     StyleView,
     distances,
@@ -25,10 +24,21 @@ from lidarpainter_models.painter.styles.view import (
     ray_directions,
     surface_points,
 )
-from lidarpainter_models.painter.styles.wet_ground import (
+from lidarpainter_models.painter.styles.wet_ground import ground_pixels, mirrored
+from lidarpainter_models.weather.air import (
+    CLOUD_LIGHT,
+    COLOUR_WITHOUT_SUN,
+    OVERCAST,
+    OVERCAST_TINT,
+    rain_extinction_per_m,
+)
+from lidarpainter_models.weather.light import luminance, to_display, to_linear
+from lidarpainter_models.weather.water import (
+    FILM_SHINE,
+    PUDDLE_SHARE,
+    RAIN_MM_PER_H,
+    WETNESS,
     fresnel,
-    ground_pixels,
-    mirrored,
     puddles,
     wet_reflectance,
 )
@@ -37,9 +47,6 @@ STREAK_RANGE_M = (1.5, 12.0)
 """Nearer drops are blurs the lens does not resolve, farther ones belong to the veil."""
 DROP_RANGE_MM = (1.2, 3.5)
 EXPOSURE_S = 0.012
-OVERCAST_TINT = (0.96, 1.0, 1.05)
-CLOUD_LIGHT = 0.45
-"""Of the overcast sky, in units of display white, at strength 1."""
 
 STREAK_CONTRAST = 4.0
 """Drops show the bright sky above more than the rest: how much more their light counts."""
@@ -47,12 +54,7 @@ STREAK_BRIGHTNESS = 1.6
 """Of a drop against the mean of the view."""
 WIND = 0.06
 """Streaks lean by so much of their length."""
-COLOUR_LEFT = 0.75
-"""Of colours, without the sun."""
-FILM_SHINE = 0.55
-"""Of a thin film against a puddle, whose surface is whole."""
 _LINE_BITS = 3  # of a pixel's fraction in drawn lines
-OVERCAST = 0.62  # daylight under rain clouds against that of the image
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,11 +63,11 @@ class RainConfig:
 
     strength: float = 1.0
     """0 leaves the image as it is; between, dry and wet light are mixed."""
-    rain_mm_per_h: float = 25.0
+    rain_mm_per_h: float = RAIN_MM_PER_H
     """Heavy rain; veil and number of streaks follow it."""
-    wetness: float = 0.8
+    wetness: float = WETNESS
     """How far surfaces darken like wet ones; the road wholly, walls half as much."""
-    puddle_share: float = 0.35
+    puddle_share: float = PUDDLE_SHARE
     """Part of the road where water stands still and mirrors clearly."""
 
 
@@ -77,11 +79,6 @@ def add_rain(
     dry = to_linear(view.rgb)
     rain = _streaked(_wet(view, dry, generator, config), view, generator, config)
     return to_display(dry + config.strength * (rain - dry))
-
-
-def rain_extinction_per_m(rain_mm_per_h: float) -> float:
-    """Of the veil of far drops."""
-    return 0.312e-3 * rain_mm_per_h**0.67
 
 
 def fall_speed_mps(diameter_mm: Float[Tensor, " drops"]) -> Float[Tensor, " drops"]:
@@ -98,7 +95,7 @@ def _wet(
     """Everything but the streaks."""
     tint = torch.tensor(OVERCAST_TINT)
     grey = luminance(dry)[..., None]
-    dull = OVERCAST * (grey + COLOUR_LEFT * (dry - grey)) * tint
+    dull = OVERCAST * (grey + COLOUR_WITHOUT_SUN * (dry - grey)) * tint
     walls = wet_reflectance(dull, 0.5 * config.wetness)
     light = walls + open_sky(view)[..., None] * (CLOUD_LIGHT * tint - walls)
     distance_m = distances(view)

@@ -11,7 +11,7 @@ from torch import Tensor
 from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.painter.filters import fill_push_pull
-from lidarpainter_models.painter.styles.light import luminance, to_linear
+from lidarpainter_models.weather.light import luminance, to_linear
 
 NEAR_GROUND_M = 30.0
 """The ground plane is fitted to what is nearer than this."""

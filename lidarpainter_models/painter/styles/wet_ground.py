@@ -1,10 +1,7 @@
-"""A wet road: darker, and a mirror for what stands on it.
+"""A wet road is a mirror for what stands on it.
 
-Water between the grains of asphalt sends light back inside, so wet surfaces are darker and more
-strongly coloured (Lekner and Dorf, 1988). The film on top mirrors its surroundings as much as
-Fresnel's equations say of water (n = 1.33; Schlick's form, 1994). What it mirrors is found by
-following the mirrored ray through the image's own depth (screen-space reflection), and where it
-leaves the image or hits nothing, the overcast sky stands in.
+What it mirrors is found by following the mirrored ray through the image's own depth (screen-space
+reflection), and where it leaves the image or hits nothing, the overcast sky stands in.
 """
 
 import math
@@ -13,36 +10,17 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from torch import Generator, Tensor
+from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.painter.styles.view import SKY_M, Ground
 
-WATER_REFLECTANCE = 0.02
-"""Of water seen from straight above: ((1.33 - 1) / (1.33 + 1))^2."""
-WET_POWER = 1.5
-"""Reflectance r of a dry surface becomes about r to this when wet."""
 GROUND_HEIGHT_M = 0.2
 """Surfaces up to this height are ground."""
 FARTHEST_STEP_M = 200.0
 NUM_STEPS = 80
-PUDDLE_SIZE_M = 3.0
 FILM_ROUGHNESS_RAD = 0.012
 """Blur of a reflection along the column: waves smear it towards the viewer."""
-
-
-def wet_reflectance(
-    reflectance: Float[Tensor, "height width 3"], wetness: float
-) -> Float[Tensor, "height width 3"]:
-    """Dry reflectance r turned to r^1.5 as far as it is wet."""
-    return reflectance + wetness * (reflectance.clamp_min(0) ** WET_POWER - reflectance)
-
-
-def fresnel(
-    cosine: Float[Tensor, "height width"],
-) -> Float[Tensor, "height width"]:
-    """Share of light that water mirrors, by the cosine to its normal."""
-    return WATER_REFLECTANCE + (1 - WATER_REFLECTANCE) * (1 - cosine.clamp(0, 1)) ** 5
 
 
 def ground_pixels(
@@ -55,21 +33,6 @@ def ground_pixels(
     opened = cv2.morphologyEx(low.numpy().astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3)))
     closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, np.ones((5, 5)))
     return torch.from_numpy(cv2.GaussianBlur(closed.astype(np.float32), (0, 0), 1.0))
-
-
-def puddles(
-    points_m: Float[Tensor, "height width 3"], generator: Generator, *, share: float
-) -> Float[Tensor, "height width"]:
-    """How still the water stands on the ground, in [0, 1]: smooth noise fixed to the place."""
-    value = torch.zeros(points_m.shape[:2])
-    for _ in range(6):
-        drawn = torch.rand(3, generator=generator)
-        angle, phase = 2 * math.pi * drawn[0], 2 * math.pi * drawn[1]
-        wave = 2 * math.pi / (PUDDLE_SIZE_M * (0.5 + 1.5 * drawn[2]))
-        along = points_m[..., 0] * angle.cos() + points_m[..., 1] * angle.sin()
-        value += torch.sin(wave * along + phase)
-    level = math.sqrt(6 / 2) * math.sqrt(2) * torch.erfinv(torch.tensor(1 - 2 * share))
-    return torch.sigmoid(3 * (value - level))
 
 
 def mirrored(

@@ -1,6 +1,6 @@
 """How the recording car moves: along its lane, a little unsteady, never perfectly level."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,6 +45,13 @@ class EgoMotion:
     """Amplitude of roll and pitch."""
     wobble_hz: tuple[float, float]
     phase_rad: tuple[float, float]
+
+    def at_speed(self, first_mps: float, last_mps: float) -> "EgoMotion":
+        """The same drive at another pace; a car that stands neither sways nor wobbles."""
+        pace = Pace(first_mps, last_mps)
+        if first_mps == last_mps == 0:
+            return replace(self, pace=pace, sway_m=0.0, wobble_rad=(0.0, 0.0))
+        return replace(self, pace=pace)
 
     def travelled_m(self, time_s: np.ndarray | float) -> np.ndarray:
         """Distance along the street."""

@@ -38,9 +38,9 @@ def _displayed(scene: SceneArrays, light: float) -> float:
 
 
 @numba.njit(**INLINED)
-def _direction(view: ViewArrays, x: float, y: float) -> tuple[float, float, float]:
+def _direction(view: ViewArrays, time_index: int, x: float, y: float) -> tuple[float, float, float]:
     """World direction with camera z = 1 through a pixel position."""
-    pose = view.world_from_camera
+    pose = view.world_from_camera[time_index]
     u = (x - view.intrinsics[2]) / view.intrinsics[0]
     v = (y - view.intrinsics[3]) / view.intrinsics[1]
     return (
@@ -52,15 +52,20 @@ def _direction(view: ViewArrays, x: float, y: float) -> tuple[float, float, floa
 
 @numba.njit(**INLINED)
 def _sample(
-    scene: SceneArrays, instances: InstanceArrays, view: ViewArrays, place: tuple, stack: np.ndarray
+    scene: SceneArrays,
+    instances: InstanceArrays,
+    view: ViewArrays,
+    time_index: int,
+    place: tuple,
+    stack: np.ndarray,
 ) -> tuple[float, float, float, float, int, int]:
     """Image values, inverse depth (0: sky), class and primitive (-1: sky) of one sample."""
-    pose, footprint = view.world_from_camera, view.footprint_px
+    pose, footprint = view.world_from_camera[time_index], view.footprint_px
     origin = (pose[0, 3], pose[1, 3], pose[2, 3])
-    direction = _direction(view, place[0], place[1])
+    direction = _direction(view, time_index, place[0], place[1])
     width, down = footprint / view.intrinsics[0], footprint / view.intrinsics[1]
     limits = (FAR_M, width, 0.0)
-    hit = trace_scene(scene, instances, 0, origin, direction, limits, stack)
+    hit = trace_scene(scene, instances, time_index, origin, direction, limits, stack)
     if hit[1] < 0:
         scale = 1.0 / np.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
         sky = sky_radiance(scene, direction[0] * scale, direction[1] * scale, direction[2] * scale)
@@ -72,7 +77,7 @@ def _sample(
             (pose[0, 1] * down, pose[1, 1] * down, pose[2, 1] * down),
         )
         ray = (origin, direction, differentials)
-        red, green, blue, kind = shade(scene, instances, 0, ray, hit, stack)
+        red, green, blue, kind = shade(scene, instances, time_index, ray, hit, stack)
         inverse = 1.0 / hit[0]
     return (
         _displayed(scene, red),
@@ -86,14 +91,19 @@ def _sample(
 
 @numba.njit(**INLINED)
 def _centre(
-    scene: SceneArrays, instances: InstanceArrays, view: ViewArrays, place: tuple, stack: np.ndarray
+    scene: SceneArrays,
+    instances: InstanceArrays,
+    view: ViewArrays,
+    time_index: int,
+    place: tuple,
+    stack: np.ndarray,
 ) -> tuple[float, int, int]:
     """Depth, class and primitive on the ray through the pixel centre."""
-    pose = view.world_from_camera
+    pose = view.world_from_camera[time_index]
     origin = (pose[0, 3], pose[1, 3], pose[2, 3])
-    direction = _direction(view, place[0], place[1])
+    direction = _direction(view, time_index, place[0], place[1])
     limits = (FAR_M, view.footprint_px / view.intrinsics[0], 0.0)
-    hit = trace_scene(scene, instances, 0, origin, direction, limits, stack)
+    hit = trace_scene(scene, instances, time_index, origin, direction, limits, stack)
     if hit[1] < 0:
         return 0.0, SKY_CLASS, -1
     return hit[0], classify(scene, hit[1], paint_at(scene, hit)), hit[1]
@@ -101,7 +111,12 @@ def _centre(
 
 @numba.njit(**INLINED)
 def _render_pixel(
-    scene: SceneArrays, instances: InstanceArrays, view: ViewArrays, place: tuple, stack: np.ndarray
+    scene: SceneArrays,
+    instances: InstanceArrays,
+    view: ViewArrays,
+    time_index: int,
+    place: tuple,
+    stack: np.ndarray,
 ) -> tuple[tuple[float, float, float], float, int, int]:
     """Image values, depth, class and actor of the pixel whose top-left corner is `place`."""
     red, green, blue, inverse = 0.0, 0.0, 0.0, 0.0
@@ -109,7 +124,7 @@ def _render_pixel(
     first_prim, first_kind, num_same, num_kind = -2, 0, 0, 0
     for index in range(num_samples):
         at = (place[0] + view.offsets[index, 0], place[1] + view.offsets[index, 1])
-        sample = _sample(scene, instances, view, at, stack)
+        sample = _sample(scene, instances, view, time_index, at, stack)
         if index == 0:
             first_kind, first_prim = sample[4], sample[5]
         red += sample[0]
@@ -125,7 +140,7 @@ def _render_pixel(
         kind, prim = first_kind, first_prim
     else:
         centre = (place[0] + 0.5, place[1] + 0.5)
-        depth_m, kind, prim = _centre(scene, instances, view, centre, stack)
+        depth_m, kind, prim = _centre(scene, instances, view, time_index, centre, stack)
     actor = scene.prim_index[prim, ACTOR] if prim >= 0 else -1
     return (red * weight, green * weight, blue * weight), depth_m, kind, actor
 
@@ -138,7 +153,7 @@ def render_image(
     height_px: int,
     width_px: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Trace every pixel at the first time of `instances`.
+    """Trace every pixel, all at one time or each row at its own.
 
     Returns:
         rgb float32 (height, width, 3) in 0..1, depth float32 (camera z, metres; 0: sky), class
@@ -150,9 +165,10 @@ def render_image(
     actor_index = np.empty((height_px, width_px), np.int32)
     for line in numba.prange(height_px):
         stack = np.full((WORK_ROWS, 2), -1.0)
+        time_index = np.int64(line) if view.world_from_camera.shape[0] > 1 else 0
         for column in range(width_px):
             place = (float(column), float(line))
-            pixel = _render_pixel(scene, instances, view, place, stack)
+            pixel = _render_pixel(scene, instances, view, time_index, place, stack)
             for channel in range(3):
                 rgb[line, column, channel] = pixel[0][channel]
             depth_m[line, column] = pixel[1]

@@ -97,7 +97,7 @@ class InstanceArrays(NamedTuple):
     """The moving objects at one or more times."""
 
     roots: np.ndarray
-    """int32 (instances): root node of each one's own tree."""
+    """int32 (times, instances): root node of each one's own tree; that of a walker changes."""
     radius_m: np.ndarray
     """float64 (instances): of the ball around the box origin that holds the mesh."""
     world_from_box: np.ndarray
@@ -111,7 +111,7 @@ class ViewArrays(NamedTuple):
     """One pinhole view."""
 
     world_from_camera: np.ndarray
-    """float64 (3, 4)."""
+    """float64 (times, 3, 4): one, or one for each row of the image."""
     intrinsics: np.ndarray
     """float64 (4): fx, fy, cx, cy in pixels."""
     offsets: np.ndarray

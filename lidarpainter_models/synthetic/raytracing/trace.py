@@ -243,7 +243,7 @@ def trace_scene(
     if limits[2] > 0 and prim >= 0:
         return t, prim, u, v, instance
     squared = direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2
-    for index in range(instances.roots.size):
+    for index in range(instances.roots.shape[1]):
         pose = instances.world_from_box[time_index, index]
         x, y, z = origin[0] - pose[0, 3], origin[1] - pose[1, 3], origin[2] - pose[2, 3]
         along = x * direction[0] + y * direction[1] + z * direction[2]
@@ -252,9 +252,10 @@ def trace_scene(
             continue
         local_origin = to_box(pose, x, y, z)
         local_direction = to_box(pose, direction[0], direction[1], direction[2])
+        root = instances.roots[time_index, index]
         new_limits = (t, limits[1], limits[2])
         new_t, new_prim, new_u, new_v = trace(
-            scene, instances.roots[index], local_origin, local_direction, new_limits, -1, stack
+            scene, root, local_origin, local_direction, new_limits, -1, stack
         )
         if new_prim >= 0:
             t, prim, u, v, instance = new_t, new_prim, new_u, new_v, index

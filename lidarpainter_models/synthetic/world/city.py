@@ -1,5 +1,6 @@
 """Build everything of a street from its seed: geometry, surfaces, light, actors, the ego's way."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,9 @@ from lidarpainter_models.synthetic.world.vegetation import (
     bark_surface,
 )
 
+ActorChange = Callable[[tuple[StreetActor, ...]], tuple[StreetActor, ...]]
+"""Other actors for a street: some taken out, some elsewhere."""
+
 
 @dataclass(frozen=True, eq=False)
 class City:
@@ -41,13 +45,26 @@ class City:
     """Moving ones first."""
     arrays: SceneArrays
     roots: np.ndarray
-    """int32 (moving actors): root nodes of their trees."""
+    """int32 (moving actors, postures): root nodes of their trees, the last one repeated."""
     radius_m: np.ndarray
     """float64 (moving actors)."""
 
 
-def build_city(seed: int) -> City:
-    """Draw a street; each part has its own stream of random numbers."""
+def build_city(
+    seed: int,
+    *,
+    speed_mps: tuple[float, float] | None = None,
+    are_people_walking: bool = False,
+    change: ActorChange | None = None,
+) -> City:
+    """Draw a street; each part has its own stream of random numbers.
+
+    Args:
+        seed: decides everything.
+        speed_mps: first and last speed of the recording car, in place of a drawn one.
+        are_people_walking: whether people who move swing arms and legs.
+        change: who stands in it in place of those drawn, moving ones first; all else stays.
+    """
     streams = np.random.SeedSequence([seed, 20_261]).spawn(9)
     plan_rng, ground_rng, house_rng, green_rng, thing_rng, car_rng, sky_rng, ego_rng, lot_rng = (
         np.random.default_rng(stream) for stream in streams
@@ -61,14 +78,21 @@ def build_city(seed: int) -> City:
     _add_greenery(builder, surfaces, plan, lots, green_rng)
     StreetFurniture(builder, surfaces, plan, thing_rng).add_all()
     ego = draw_ego_motion(plan.line, ego_rng)
-    actors = tuple(Traffic(plan, ego, surfaces, car_rng).draw())
+    if speed_mps is not None:
+        ego = ego.at_speed(*speed_mps)
+    traffic = Traffic(plan, ego, surfaces, car_rng, are_people_walking=are_people_walking)
+    actors = tuple(traffic.draw())
+    actors = actors if change is None else change(actors)
     light = draw_light(surfaces, plan, sky_rng)
     street, owner = _standing(builder.build(), plan, actors)
-    moving = [
-        MovingMesh(actor.mesh, index) for index, actor in enumerate(actors) if actor.is_moving
-    ]
+    owners = [index for index, actor in enumerate(actors) if actor.is_moving]
+    moving = [MovingMesh(mesh, index) for index in owners for mesh in actors[index].meshes]
     arrays, roots, radius_m = pack_scene(street, owner, moving, surfaces, light)
-    return City(plan, ego, actors, arrays, roots, radius_m)
+    last = np.cumsum([len(actors[index].meshes) for index in owners])
+    most = max(len(actors[index].meshes) for index in owners)
+    first = np.concatenate([[0], last[:-1]])
+    places = np.minimum(first[:, None] + np.arange(most), last[:, None] - 1)
+    return City(plan, ego, actors, arrays, roots[places], radius_m[places].max(axis=1))
 
 
 def _standing(
@@ -79,8 +103,8 @@ def _standing(
     for index, actor in enumerate(actors):
         if not actor.is_moving:
             pose = actor.world_from_box(plan.line, np.zeros(1))[0]
-            meshes.append(actor.mesh.transformed(pose))
-            owners.append(np.full(len(actor.mesh.surface), index))
+            meshes.append(actor.meshes[0].transformed(pose))
+            owners.append(np.full(len(actor.meshes[0].surface), index))
     return Mesh.joined(meshes), np.concatenate(owners)
 
 

@@ -22,11 +22,12 @@ from lidarpainter_models.synthetic.textures.cars import CarAtlas, add_car_surfac
 from lidarpainter_models.synthetic.textures.surfaces import SurfaceSet
 from lidarpainter_models.synthetic.world.car_shapes import build_car
 from lidarpainter_models.synthetic.world.meshes import Mesh
-from lidarpainter_models.synthetic.world.pedestrians import build_pedestrian
+from lidarpainter_models.synthetic.world.pedestrians import draw_person
 
 KINDS = ("sedan", "sedan", "hatch", "suv", "suv", "pickup", "van")
 NUM_PAINTED = 14
 NEAR_M = 70.0
+NUM_POSTURES = 16
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,8 +38,8 @@ class StreetActor:
     category: str
     size_m: np.ndarray
     """Tight length, width, height."""
-    mesh: Mesh
-    """In the box frame."""
+    meshes: tuple[Mesh, ...]
+    """In the box frame: one, or the postures of a cycle of steps."""
     start_s_m: float
     d_m: float
     pace: Pace | None = None
@@ -46,11 +47,20 @@ class StreetActor:
     yaw_rad: float = 0.0
     """Relative to the street."""
     ground_m: float = 0.0
+    cycle_m: float = 1.0
+    """The way of one cycle of steps."""
 
     @property
     def is_moving(self) -> bool:
         """Whether it ever leaves its place."""
         return self.pace is not None
+
+    def posture(self, time_s: np.ndarray) -> np.ndarray:
+        """Which of the meshes is shown at times after the first frame; int64 (times)."""
+        if self.pace is None:
+            return np.zeros(time_s.shape, np.int64)
+        cycles = np.abs(self.pace.travelled_m(time_s)) / self.cycle_m
+        return np.floor(cycles * len(self.meshes)).astype(np.int64) % len(self.meshes)
 
     def world_from_box(self, line: StreetLine, time_s: np.ndarray | float) -> np.ndarray:
         """(n, 4, 4) at times after the first frame."""
@@ -69,6 +79,7 @@ class Traffic:
     ego: EgoMotion
     surfaces: SurfaceSet
     rng: np.random.Generator
+    are_people_walking: bool = False
     actors: list[StreetActor] = field(default_factory=list)
     _painted: list[tuple[str, CarAtlas]] = field(default_factory=list)
     _meshes: dict[tuple[int, bool], tuple[Mesh, np.ndarray]] = field(default_factory=dict)
@@ -97,7 +108,7 @@ class Traffic:
                 actor_id=name,
                 category=SHAPES[kind].category,
                 size_m=size,
-                mesh=mesh,
+                meshes=(mesh,),
                 pace=pace,
                 **way,
             )
@@ -149,19 +160,21 @@ class Traffic:
         for index in range(int(rng.integers(5, 9))):
             side = -1 if index % 2 else 1
             kerb = self.plan.left_kerb_m if side > 0 else self.plan.right_kerb_m
-            mesh, size = build_pedestrian(self.surfaces, rng)
+            person = draw_person(self.surfaces, rng)
+            meshes, size = person.postures(NUM_POSTURES if self.are_people_walking else 1)
             speed = float(rng.choice([-1.0, 1.0])) * rng.uniform(1.0, 1.6)
             self.actors.append(
                 StreetActor(
                     actor_id=f"person-{len(self.actors):03d}",
                     category="pedestrian",
                     size_m=size,
-                    mesh=mesh,
+                    meshes=meshes,
                     start_s_m=rng.uniform(7, 44),
                     d_m=kerb + side * rng.uniform(1.1, SIDEWALK_M - 0.7),
                     pace=Pace(speed, speed),
                     yaw_rad=0.0 if speed > 0 else np.pi,
                     ground_m=KERB_HEIGHT_M,
+                    cycle_m=person.cycle_m,
                 )
             )
 
@@ -182,7 +195,7 @@ class Traffic:
                 actor_id=f"parked-{len(self.actors):03d}",
                 category=category,
                 size_m=size,
-                mesh=mesh,
+                meshes=(mesh,),
                 start_s_m=s_m,
                 d_m=d_m,
                 yaw_rad=yaw_rad,

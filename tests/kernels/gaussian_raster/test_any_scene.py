@@ -1,4 +1,4 @@
-"""A thousand scenes nobody would draw: the numba backend agrees with float64 autograd or is zero.
+"""A thousand scenes nobody would draw: fast backends agree with float64 autograd or give zero.
 
 Small images and few Gaussians, each of an extreme kind, so that a thousand of them take seconds.
 A pixel that sits on a threshold (the alpha cut, the stop, the clamp, two Gaussians at one depth)
@@ -6,10 +6,11 @@ may fall on either side in float32: what such a flip can move is granted, and no
 """
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from splat_drawing import pinhole, render
+from splat_drawing import TRITON, pinhole, render
 
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import ALPHA_CUT, NEAR_M
 
@@ -90,9 +91,9 @@ def drawn(scene, backend, dtype):
     return image, {name: gradient.double() for name, gradient in gradients.items()}
 
 
-def disagreement(scene):
-    """Why the numba backend is wrong about a scene; None where it is right."""
-    image, gradients = drawn(scene, "cpu", torch.float32)
+def disagreement(scene, backend="cpu"):
+    """Why a backend is wrong about a scene; None where it is right."""
+    image, gradients = drawn(scene, backend, torch.float32)
     images = {name: getattr(image, name).detach() for name in ("rgb", "depth_m", "alpha")}
     for name, value in (images | gradients).items():
         assert bool(torch.isfinite(value).all()), f"{name} is not finite"
@@ -113,28 +114,38 @@ def disagreement(scene):
     return None
 
 
-DISAGREEMENTS: list[str] = []
+def disagreements(backend, count):
+    """Of so many scenes, those that a backend gets wrong."""
+    found: list[str] = []
 
+    @settings(
+        max_examples=count,
+        deadline=None,
+        derandomize=True,
+        database=None,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(
+        kinds=st.lists(st.sampled_from(KINDS), min_size=0, max_size=6),
+        seed=st.integers(0, 2**31),
+        size_px=st.sampled_from([(1, 1), (1, 9), (8, 6), (17, 3)]),
+    )
+    def check_scenes(kinds, seed, size_px):
+        reason = disagreement(scene_of(kinds, seed, size_px), backend)
+        if reason is not None:
+            found.append(f"{kinds} {seed} {size_px}: {reason}")
 
-@settings(
-    max_examples=1000,
-    deadline=None,
-    derandomize=True,
-    database=None,
-    suppress_health_check=list(HealthCheck),
-)
-@given(
-    kinds=st.lists(st.sampled_from(KINDS), min_size=0, max_size=6),
-    seed=st.integers(0, 2**31),
-    size_px=st.sampled_from([(1, 1), (1, 9), (8, 6), (17, 3)]),
-)
-def check_scenes(kinds, seed, size_px):
-    reason = disagreement(scene_of(kinds, seed, size_px))
-    if reason is not None:
-        DISAGREEMENTS.append(f"{kinds} {seed} {size_px}: {reason}")
+    check_scenes()
+    return found
 
 
 def test_a_thousand_scenes_are_finite_and_agree_with_float64():
-    DISAGREEMENTS.clear()
-    check_scenes()
-    assert len(DISAGREEMENTS) <= MOST_FLIPS, DISAGREEMENTS
+    found = disagreements("cpu", 1000)
+    assert len(found) <= MOST_FLIPS, found
+
+
+@pytest.mark.parametrize("backend", [TRITON])
+@pytest.mark.parametrize("count", [10, pytest.param(300, marks=pytest.mark.slow)])
+def test_some_scenes_agree_by_triton_too(backend, count):
+    found = disagreements(backend, count)
+    assert len(found) <= (MOST_FLIPS if count > 100 else 0), found

@@ -8,6 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from splat_drawing import pinhole, render
+from splat_errors import CASES, image_errors, relative_errors
 
 EPS = torch.finfo(torch.float32).eps
 # The polynomial exponential is good to 6 EPS, and a pixel's sums round each of some dozen Gaussians
@@ -25,44 +26,6 @@ multiply-add, 1.1e-5 without. Put into float64 one by one, the running sums of t
 finished image 7e-7. Compensated sums of what was passed gave 4.9e-6 for a tenth of the time of
 going back; of the image they would take four more sums a lane in drawing.
 """
-
-
-def image_errors(actual, expected):
-    scale = {"rgb": 1.0, "depth_m": 20.0, "alpha": 1.0, "features": 3.0}
-    return {
-        name: (getattr(actual, name) - getattr(expected, name)).detach().abs().mean().item() / size
-        for name, size in scale.items()
-        if getattr(expected, name).numel()
-    }
-
-
-def relative_errors(actual, expected):
-    return {
-        name: float((actual[name] - expected[name]).norm() / expected[name].norm())
-        for name in expected
-        if expected[name].norm() > 0
-    }
-
-
-CASES = {
-    "degree 3": {"count": 250, "coefficients": 16},
-    "degree 2 with features": {"count": 250, "coefficients": 9, "features": 2, "seed": 1},
-    "degree 1, one body": {
-        "count": 60,
-        "coefficients": 4,
-        "features": 1,
-        "num_bodies": 1,
-        "seed": 5,
-    },
-    "degree 0, small and many": {
-        "count": 700,
-        "coefficients": 1,
-        "features": 5,
-        "size_px": 1.5,
-        "seed": 3,
-    },
-    "large and opaque": {"count": 120, "coefficients": 1, "size_px": 40.0, "seed": 4},
-}
 
 
 @pytest.mark.parametrize("case", CASES)

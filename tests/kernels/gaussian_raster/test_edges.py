@@ -2,11 +2,12 @@
 
 import pytest
 import torch
-from splat_drawing import render
+from splat_drawing import TRITON, render
 
 from lidarpainter_models.errors import BackendError, ShapeError
 
-BACKENDS = ["reference", "cpu"]
+FAST = ["cpu", TRITON]
+BACKENDS = ["reference", *FAST]
 
 
 def assert_finite(drawn):
@@ -46,6 +47,7 @@ def test_any_image_size_is_drawn(splats, draw, backend, size_px):
     assert_finite(drawn)
 
 
+@pytest.mark.parametrize("backend", FAST)
 @pytest.mark.parametrize(
     "scale_m",
     [
@@ -57,19 +59,20 @@ def test_any_image_size_is_drawn(splats, draw, backend, size_px):
         (1e-30, 1.0, 1e30),
     ],
 )
-def test_huge_tiny_flat_and_needle_gaussians_stay_finite(splats, draw, scale_m):
-    inputs = splats(30, features=1)
-    inputs["scale_m"] = torch.tensor(scale_m).double().repeat(30, 1)
-    assert_finite(draw(inputs, backend="cpu", dtype=torch.float32))
+def test_huge_tiny_flat_and_needle_gaussians_stay_finite(splats, draw, backend, scale_m):
+    inputs = splats(12, width_px=40, height_px=24, features=1)
+    inputs["scale_m"] = torch.tensor(scale_m).double().repeat(12, 1)
+    assert_finite(draw(inputs, backend=backend, dtype=torch.float32))
 
 
+@pytest.mark.parametrize("backend", FAST)
 @pytest.mark.parametrize("scale_m", [(30.0, 0.01, 0.01), (20.0, 20.0, 0.01), (200.0, 0.01, 5.0)])
-def test_needles_and_walls_match_the_reference(splats, draw, scale_m):
-    inputs = splats(15, seed=7)
+def test_needles_and_walls_match_the_reference(splats, draw, backend, scale_m):
+    inputs = splats(15, seed=7, width_px=40, height_px=24)
     inputs["scale_m"] = torch.tensor(scale_m).double().repeat(15, 1)
     inputs["opacity"] = inputs["opacity"].clamp(max=0.5)
     expected = draw(inputs, backend="reference", dtype=torch.float64)
-    actual = draw(inputs, backend="cpu", dtype=torch.float32)
+    actual = draw(inputs, backend=backend, dtype=torch.float32)
     assert (actual.image.alpha - expected.image.alpha).detach().abs().mean() < 1e-5
     for name in ("opacity", "sh"):
         difference = actual.gradients[name] - expected.gradients[name]
@@ -77,11 +80,12 @@ def test_needles_and_walls_match_the_reference(splats, draw, scale_m):
         assert difference.norm() < 1e-4 * expected.gradients[name].norm()
 
 
+@pytest.mark.parametrize("backend", FAST)
 @pytest.mark.parametrize("opacity", [0.0, 1.0 / 256.0, 1.0])
-def test_extreme_opacities_stay_finite(splats, draw, opacity):
-    inputs = splats(40)
-    inputs["opacity"] = torch.full((40,), opacity).double()
-    drawn = draw(inputs, backend="cpu", dtype=torch.float32)
+def test_extreme_opacities_stay_finite(splats, draw, backend, opacity):
+    inputs = splats(20, width_px=40, height_px=24)
+    inputs["opacity"] = torch.full((20,), opacity).double()
+    drawn = draw(inputs, backend=backend, dtype=torch.float32)
     assert_finite(drawn)
     assert bool(drawn.image.visible.any()) == (opacity == 1.0)
 
@@ -90,7 +94,7 @@ def test_extreme_opacities_stay_finite(splats, draw, opacity):
 @pytest.mark.parametrize("name", ["means", "rotation_wxyz", "scale_m", "opacity", "sh"])
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_gaussian_that_is_not_finite_is_left_out(splats, backend, name, value):
-    inputs = splats(30, coefficients=1)
+    inputs = splats(30, coefficients=1, width_px=40, height_px=24)
     inputs = {
         k: v.float() if torch.is_tensor(v) and v.is_floating_point() else v
         for k, v in inputs.items()
@@ -113,12 +117,13 @@ def test_gaussian_that_is_not_finite_is_left_out(splats, backend, name, value):
     assert torch.equal(image.rgb, expected.rgb)
 
 
+@pytest.mark.parametrize("backend", FAST)
 @pytest.mark.parametrize("position_m", [1e-4, 0.1, 0.100001])
-def test_gaussian_at_the_near_plane_and_far_aside_stays_finite(splats, draw, position_m):
+def test_gaussian_at_the_near_plane_and_far_aside_stays_finite(splats, draw, backend, position_m):
     inputs = splats(8)
     inputs["camera_from_body"] = torch.eye(4).double().repeat(3, 1, 1)
     inputs["means"] = torch.tensor([[1e4, -1e3, position_m]]).double().repeat(8, 1)
-    assert_finite(draw(inputs, backend="cpu", dtype=torch.float32))
+    assert_finite(draw(inputs, backend=backend, dtype=torch.float32))
 
 
 def test_input_that_does_not_belong_together_is_refused(splats):

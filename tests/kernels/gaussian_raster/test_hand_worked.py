@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from splat_drawing import pinhole, render
+from splat_drawing import TRITON, pinhole, render
 
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import NEAR_M
 
@@ -14,7 +14,7 @@ WIDE = pinhole(fx_px=100.0, fy_px=100.0, cx_px=20.5, cy_px=4.5, width_px=41, hei
 ROUNDING = 2e-6  # float32 and the polynomial exponential of the fast backend
 
 
-@pytest.fixture(params=["reference", "cpu"])
+@pytest.fixture(params=["reference", "cpu", TRITON])
 def backend(request):
     return request.param
 

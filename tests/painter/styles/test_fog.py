@@ -10,12 +10,11 @@ from lidarpainter_models.painter.styles.fog import (
     FogConfig,
     add_fog,
     airlight,
-    extinction_per_m,
     fog_transmittance,
-    transmittance,
 )
-from lidarpainter_models.painter.styles.light import luminance, to_linear
 from lidarpainter_models.painter.styles.view import StyleView, distances
+from lidarpainter_models.weather.air import extinction_per_m, transmittance
+from lidarpainter_models.weather.light import luminance, to_linear
 
 
 def test_transmittance_is_the_exponential_of_distance():

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from lidarpainter_models.painter.styles.lamps import Place, find_lamps
-from lidarpainter_models.painter.styles.light import luminance, to_linear
 from lidarpainter_models.painter.styles.night import (
     NightConfig,
     add_glare,
@@ -15,6 +14,7 @@ from lidarpainter_models.painter.styles.night import (
     turn_to_night,
 )
 from lidarpainter_models.painter.styles.view import distances, fit_ground, surface_points
+from lidarpainter_models.weather.light import luminance, to_linear
 
 DARK = NightConfig(beam=0, lit_windows=0, noise=0)
 

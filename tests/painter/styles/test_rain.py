@@ -5,22 +5,20 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lidarpainter_models.painter.styles.light import luminance, to_linear
 from lidarpainter_models.painter.styles.rain import (
     RainConfig,
     add_rain,
     drops_per_m3,
     fall_speed_mps,
-    rain_extinction_per_m,
 )
 from lidarpainter_models.painter.styles.view import distances, fit_ground, surface_points
 from lidarpainter_models.painter.styles.wet_ground import (
-    fresnel,
     ground_pixels,
     mirrored,
-    puddles,
-    wet_reflectance,
 )
+from lidarpainter_models.weather.air import rain_extinction_per_m
+from lidarpainter_models.weather.light import luminance, to_linear
+from lidarpainter_models.weather.water import fresnel, puddles, wet_reflectance
 
 
 def generator_of(seed=0):

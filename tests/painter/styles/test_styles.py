@@ -8,7 +8,6 @@ import torch
 from lidarpainter_models.errors import ConfigError, ShapeError
 from lidarpainter_models.painter.styles import STYLE_PROMPTS, apply_style
 from lidarpainter_models.painter.styles.fog import FogConfig, add_fog
-from lidarpainter_models.painter.styles.light import to_display, to_linear
 from lidarpainter_models.painter.styles.night import NightConfig, turn_to_night
 from lidarpainter_models.painter.styles.rain import RainConfig, add_rain
 from lidarpainter_models.painter.styles.view import (
@@ -18,6 +17,7 @@ from lidarpainter_models.painter.styles.view import (
     open_sky,
     surface_points,
 )
+from lidarpainter_models.weather.light import to_display, to_linear
 
 NO_STRENGTH = {
     "foggy": lambda view: add_fog(view, FogConfig(visibility_m=inf)),

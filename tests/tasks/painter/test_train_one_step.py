@@ -8,6 +8,7 @@ import psutil
 import pytest
 import torch
 from killer import Killer
+from process_ends import still_running
 from quiet_augmentation import QUIET
 from random_pairs import write_pairs
 from tiny_diffusion import write_model
@@ -195,7 +196,7 @@ def test_a_lost_process_ends_the_training_with_one_line(pairs, store, model):
         train.fn(store.root, "train", request(pairs, config, 0.0, model, num_processes=2))
     assert "\n" not in str(caught.value)
     assert list((store.root / "work").glob("*/training.pt"))
-    assert not any(one.is_running() for one in killer.processes)
+    assert still_running(killer.processes) == []
 
 
 @pytest.mark.slow
@@ -211,7 +212,7 @@ def test_an_interrupted_training_leaves_no_process_behind(pairs, store, model):
     with listening(Interrupter()), pytest.raises(KeyboardInterrupt):
         train.fn(store.root, "train", request(pairs, config, 0.0, model, num_processes=2))
     assert started
-    assert not any(one.is_running() for one in started)
+    assert still_running(started) == []
 
 
 @pytest.mark.slow

@@ -1,0 +1,104 @@
+"""Why an attempt at a sequence ended, and what that means for the sequence.
+
+Bad input is set aside at once and never tried again. What can pass is tried again, later each time
+and a bounded number of times. A full disk and an interruption are nobody's fault and do not count.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any, Literal
+
+from catalog.leases import Lease
+from catalog.tables import Row
+
+Cause = Literal[
+    "done",
+    "bad-input",
+    "disk-full",
+    "killed",
+    "memory",
+    "timeout",
+    "system",
+    "error",
+    "interrupted",
+    "cancelled",
+    "superseded",
+]
+State = Literal["waiting", "running", "done", "set-aside", "failed"]
+
+FINAL: Mapping[Cause, State] = {
+    "done": "done",
+    "bad-input": "set-aside",
+    "error": "failed",
+    "cancelled": "failed",
+}
+CAN_PASS: tuple[Cause, ...] = ("killed", "memory", "timeout", "system")
+MAX_TRIES = 3
+"""Attempts that may fail of what can pass, before the sequence counts as failed."""
+FIRST_PAUSE_S = 20.0
+LONGEST_PAUSE_S = 1800.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ending:
+    """How an attempt ended and what it took."""
+
+    cause: Cause
+    reason: str | None = None
+    run_id: str | None = None
+    seconds: float = 0.0
+    cpu_seconds: float | None = None
+    peak_memory_bytes: int | None = None
+    num_bytes: int | None = None
+    effort: str | None = None
+    software_version: str | None = None
+
+
+def row_after(row: Row, ending: Ending, lease: Lease, *, first_pause_s: float) -> Row:
+    """The row of a sequence as an attempt leaves it."""
+    tries = row["tries"] + (ending.cause in CAN_PASS)
+    state: State = FINAL.get(ending.cause, "waiting")
+    reason, not_before = ending.reason, None
+    if ending.cause in CAN_PASS:
+        if tries >= MAX_TRIES:
+            state, reason = "failed", f"{reason} ({tries} attempts)"
+        else:
+            pause_s = min(LONGEST_PAUSE_S, first_pause_s * 2 ** (tries - 1))
+            not_before = datetime.now(UTC) + timedelta(seconds=pause_s)
+    return {
+        **row,
+        "state": state,
+        "cause": ending.cause,
+        "reason": reason,
+        "run_id": ending.run_id or row["run_id"],
+        "tries": tries,
+        "attempts": row["attempts"] + 1,
+        "seconds": (row["seconds"] or 0.0) + ending.seconds,
+        "not_before": not_before,
+        "changed_at": datetime.now(UTC),
+        "fence": lease.fence,
+    }
+
+
+def attempt_row(lease: Lease, ending: Ending) -> dict[str, Any]:
+    """The row of an attempt; what it was and what was predicted stands in its lease."""
+    started_at = datetime.fromtimestamp(lease.taken_at, UTC)
+    facts = ("fleet", "scene_id", "predicted_seconds", "predicted_memory_bytes")
+    return {
+        "attempt_id": f"{lease.name}-{lease.fence}",
+        "sequence_id": lease.name,
+        **{name: lease.facts.get(name) for name in (*facts, "predicted_num_bytes")},
+        "run_id": ending.run_id,
+        "worker": lease.holder.name,
+        "started_at": started_at,
+        "ended_at": started_at + timedelta(seconds=ending.seconds),
+        "seconds": ending.seconds,
+        "cpu_seconds": ending.cpu_seconds,
+        "peak_memory_bytes": ending.peak_memory_bytes,
+        "num_bytes": ending.num_bytes,
+        "cause": ending.cause,
+        "reason": ending.reason,
+        "effort": ending.effort,
+        "software_version": ending.software_version,
+    }

@@ -1,0 +1,67 @@
+"""Look at a finished run in a browser; a query without a Prefect server."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+
+from catalog.store import Store
+from flows.parameters import view_parameters
+from flows.views import PathRequest, render_request
+from lidarpainter_models.errors import ConfigError
+from tasks.runs import FinishedRun, open_run
+from tasks.specs import FittedRef
+from tasks.views.drive import DriveRequest, view_live
+from tasks.views.files import ViewKinds
+
+FINAL, UNPAINTED = "painted", "before painting"
+
+
+def view_run(
+    store: Store,
+    path: PathRequest,
+    *,
+    port: int | None,
+    opened_at: Callable[[str], None],
+    stopped: threading.Event,
+) -> None:
+    """Show a run in a browser on this machine until stopped.
+
+    Args:
+        store: where the run is.
+        path: which run, and whose camera is followed.
+        port: to listen on; None takes a free one.
+        opened_at: is told the address.
+        stopped: ends it.
+    """
+    finished = open_run(store, path.run)
+    run = view_parameters(finished).run_spec(store.root)
+    request = drive_request(store, finished, path)
+    request = replace(request, scenes=request.scenes | _other_scenes(store, finished))
+    view_live(run, request, port=port, opened_at=opened_at, stopped=stopped)
+
+
+def drive_request(store: Store, finished: FinishedRun, path: PathRequest) -> DriveRequest:
+    """A run as it is shown in a browser.
+
+    Raises:
+        ConfigError: images are to be painted or to stand beside others.
+    """
+    if path.is_painted or path.beside is not None:
+        raise ConfigError(
+            "a browser shows the scene itself: --postpaint and --beside are not for it"
+        )
+    view = render_request(store, finished, path, ViewKinds())
+    return DriveRequest(view=view, scenes={FINAL: finished.final})
+
+
+def _other_scenes(store: Store, finished: FinishedRun) -> dict[str, FittedRef]:
+    """The run before painting, and the runs that were derived from it."""
+    scenes = {}
+    if finished.unpainted != finished.final:
+        scenes[UNPAINTED] = finished.unpainted
+    for row in store.rows("runs"):
+        if row["derived_from"] == finished.run_id and row["status"] == "complete":
+            derived = open_run(store, row["run_id"])
+            kind = derived.change["kind"] if derived.change else "derived"
+            scenes[f"{kind} {derived.run_id[:8]}"] = derived.final
+    return scenes

@@ -1,0 +1,164 @@
+"""`lidarpainter edit`: take actors out of a run, put them in, let them go elsewhere."""
+
+import re
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from flows.cli.output import Cell, print_json, print_pairs, print_table, say_status
+from flows.cli.shared_options import AsJson, RunName, check_painter
+from lidarpainter_models.errors import ConfigError
+
+ACTORS = "actors"
+MANY = ("remove",)
+"""Operations on any number of actors."""
+NOBODY = ("freeze", "crop")
+"""Operations on nobody in particular."""
+MOST_SCRIPT_BYTES = 10_000_000
+_NUMBER = re.compile(r"factor|speed|.*_(m|s|deg|mps)")
+"""Fields whose name says that they are numbers."""
+
+
+def edit(
+    run: RunName,
+    words: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="actors (lists them), or an operation, whom, and field=value of docs/editing.md. "
+            "An actor is an id, the beginning of one, or nearest-ahead.",
+            show_default=False,
+        ),
+    ] = None,
+    script: Annotated[
+        list[Path] | None,
+        typer.Option(help="JSON list of operations; several are done one after the other."),
+    ] = None,
+    painter: Annotated[
+        str | None, typer.Option(help="Who paints what nobody saw; the run's own if absent.")
+    ] = None,
+    allow_collisions: Annotated[
+        bool, typer.Option("--allow-collisions", help="Let actors and the camera go through walls.")
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder for images along the script's `drive`, painted by clear day."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Edit a finished run: who is where. Makes a new run; the old one stays as it is.
+
+    Example: lidarpainter edit latest remove nearest-ahead
+
+    A lane change: lidarpainter edit latest move car-3 trajectory=lane-change:-3.5@1s+2s
+
+    Several at once: lidarpainter edit latest --script edits.json --out pictures
+    """
+    if words == [ACTORS] and not script:
+        _list(run, as_json=as_json)
+        return
+    operations: list[Any] = []
+    for path in script or ():
+        operations += _read_script(path)
+    operations += [_operation(words)] if words else []
+    from catalog.store import existing_store
+    from lidarpainter_models.editing.operations import parse_operations
+    from tasks.runs import open_run
+
+    known = parse_operations(operations, "edit")
+    open_run(existing_store(), run)
+    say_status(f"opening run {run}")
+    check_painter(painter)
+    from flows.cli.progress import shown_progress
+    from flows.edit import EditRequest, edit_run, shown_edit
+
+    request = EditRequest(
+        run=run, operations=known, painter=painter, allows_collisions=allow_collisions
+    )
+    with shown_progress():
+        result = edit_run(existing_store(), request)
+        if out is not None:
+            result["images"] = shown_edit(existing_store(), request, result, out.absolute())
+    print_json(result) if as_json else _show(result)
+
+
+def _show(result: dict[str, Any]) -> None:
+    summary = result["summary"]
+    pairs: dict[str, Cell] = {
+        "run": result["run_id"],
+        "derived from": result["derived_from"],
+        "Gaussians": result["num_gaussians"],
+        "filled in": summary["num_filled"],
+        "meetings": "; ".join(summary["encounters"]) or "none",
+        "trajectory": result["trajectory"],
+    }
+    print_pairs(f"edited {result['scene']}", pairs)
+
+
+def _list(run: str, *, as_json: bool) -> None:
+    """Who is in the run, the nearest first."""
+    from catalog.store import existing_store
+
+    store = existing_store()
+    say_status(f"opening run {run}")
+    from flows.edit import list_actors
+
+    rows = list_actors(store, run)
+    if as_json:
+        print_json({"run": run, "actors": rows})
+        return
+    columns = list(rows[0]) if rows else ["actor_id"]
+    cells = [list(row.values()) for row in rows]
+    print_table(f"actors of run {run}", columns, cells, num_text_columns=2)
+
+
+def _operation(words: list[str]) -> dict[str, Any]:
+    """`move car-3 trajectory=lateral:2` as an operation of a script.
+
+    Raises:
+        ConfigError: names and fields stand in no such order.
+    """
+    op, *rest = words
+    names = [word for word in rest if "=" not in word]
+    found: dict[str, Any] = {"op": op}
+    if op in MANY:
+        found["actors"] = names
+    elif op not in NOBODY:
+        if len(names) != 1:
+            raise ConfigError(f"edit: {op} takes one name, got {', '.join(names) or 'none'}")
+        found["name" if op == "insert" else "actor"] = names[0]
+    elif names:
+        raise ConfigError(f"edit: {op} takes no name, got {', '.join(names)}")
+    for word in rest:
+        field, is_field, text = word.partition("=")
+        if is_field:
+            outer, has_inner, inner = field.partition(".")
+            value = _value(field, text)
+            found |= {outer: found.get(outer, {}) | {inner: value}} if has_inner else {field: value}
+    return found
+
+
+def _value(field: str, text: str) -> str | float:
+    if not _NUMBER.fullmatch(field):
+        return text
+    try:
+        return float(text)
+    except ValueError:
+        raise ConfigError(f"edit: {field}={text}: expected a number") from None
+
+
+def _read_script(path: Path) -> list[Any]:
+    """The operations of a file, checked.
+
+    Raises:
+        ConfigError: it cannot be read, or is no list of operations.
+    """
+    from lidarpainter_models.editing.operations import parse_script
+
+    try:
+        if path.stat().st_size > MOST_SCRIPT_BYTES:
+            raise ConfigError(f"script {path}: expected at most {MOST_SCRIPT_BYTES / 1e6:g} MB")
+        text = path.read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"script {path} cannot be read: {error}") from None
+    return [one.model_dump(exclude_defaults=True) for one in parse_script(text, f"script {path}")]

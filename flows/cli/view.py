@@ -1,0 +1,52 @@
+"""`lidarpainter view`: a run in a browser on this machine."""
+
+import sys
+import threading
+import webbrowser
+from typing import Annotated
+
+import typer
+
+from flows.cli.output import clear_status, say_status
+from flows.cli.shared_options import FollowedCamera, FollowedFrames, RunName, parse_frames
+
+
+def view(
+    run: RunName,
+    camera: FollowedCamera = None,
+    frames: FollowedFrames = None,
+    port: Annotated[
+        int | None,
+        typer.Option(min=1, max=65535, help="Port on this machine; a free one if absent."),
+    ] = None,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Open a browser on it.")
+    ] = True,
+) -> None:
+    """Look at a finished run in a browser, live, until Ctrl-C.
+
+    Drive it, step a lane aside or anywhere, before and after painting, with boxes, tracks, cameras
+    and LiDAR; a click names an actor. Only this machine can reach it.
+
+    Example: lidarpainter view latest
+    """
+    from catalog.store import existing_store
+    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+    from lidarpainter_models.geometry.trajectory_words import RECORDED
+    from tasks.runs import open_run
+
+    chosen = parse_frames(frames)
+    open_run(existing_store(), run)
+    say_status(f"opening run {run}")
+    from flows.browsing import view_run
+    from flows.views import PathRequest
+
+    def opened_at(address: str) -> None:
+        clear_status()
+        sys.stdout.write(f"{address}\n")
+        sys.stdout.flush()
+        if browser:
+            webbrowser.open(address)
+
+    path = PathRequest(run=run, trajectory=parse_trajectory(RECORDED), camera=camera, frames=chosen)
+    view_run(existing_store(), path, port=port, opened_at=opened_at, stopped=threading.Event())

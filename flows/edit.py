@@ -1,0 +1,148 @@
+"""Edit a finished run into a new one; a query like `render`, so no server is needed."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from catalog.errors import UnknownRecordError
+from catalog.store import Store
+from flows.derive import Change, derive_run
+from flows.parameters import view_parameters
+from flows.views import PathRequest, render_run
+from lidarpainter_models.conditioning.settings import SequenceConfig
+from lidarpainter_models.devices import chosen_device
+from lidarpainter_models.editing.edits import refuse_walls
+from lidarpainter_models.editing.operations import Drive, Operation, parse_operations
+from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
+from lidarpainter_models.painter.selection import PainterChoice
+from lidarpainter_models.scenes.tracks import ActorTrack
+from tasks.editing.edit import (
+    Edits,
+    checked_encounters,
+    edit_build,
+    observations_build,
+    opened_world,
+)
+from tasks.runs import FinishedRun, open_run
+from tasks.views.files import ViewKinds
+
+EDIT = "edit"
+
+
+@dataclass(frozen=True, kw_only=True)
+class EditRequest:
+    """Which run is edited, and how."""
+
+    run: str
+    """A run id, a unique prefix of one, or `latest`."""
+    operations: tuple[Operation, ...]
+    painter: str | None = None
+    """Who paints what nobody saw; None takes the run's own."""
+    allows_collisions: bool = False
+    """Whether actors may go through walls."""
+
+
+def edit_run(store: Store, request: EditRequest) -> dict[str, Any]:
+    """Make an edited run of a finished one.
+
+    An edited run is edited anew from where it came from, with both lists one after the other:
+    what was uncovered is filled once, from what was recorded.
+
+    Returns:
+        As `derive_run`, with `trajectory`: where the script drives, `recorded` if it does not say.
+
+    Raises:
+        ConfigError: an operation cannot be done, or leads into a wall.
+    """
+    source, before = _origin(store, open_run(store, request.run))
+    operations = (*before, *request.operations)
+    parameters = view_parameters(source)
+    painter = PainterChoice.of(request.painter or parameters.painter)
+    edits = Edits(store=store, source=source, operations=operations)
+    told = {
+        "operations": [one.model_dump(exclude_defaults=True) for one in operations],
+        "painter": painter.name,
+        "conditions": asdict(parameters.conditions),
+        "allows_collisions": request.allows_collisions,
+    }
+
+    def check() -> None:
+        found = checked_encounters(edits)
+        if not request.allows_collisions:
+            refuse_walls(found)
+
+    result = derive_run(
+        store,
+        source,
+        Change(kind=EDIT, parameters=told, inputs=edits.inputs | {"painter": painter.digest}),
+        build=edit_build(
+            edits,
+            parameters.conditions,
+            painter,
+            chosen_device(parameters.device),
+        ),
+        build_observations=observations_build(edits),
+        check=check,
+    )
+    drives = [one.trajectory for one in operations if isinstance(one, Drive)]
+    return {**result, "trajectory": drives[-1] if drives else "recorded"}
+
+
+def shown_edit(
+    store: Store, request: EditRequest, result: dict[str, Any], out: Path
+) -> dict[str, Any]:
+    """Images of an edited run where its script drives; painted by clear day."""
+    path = PathRequest(
+        run=result["run_id"],
+        trajectory=parse_trajectory(result["trajectory"]),
+        is_painted=result["summary"]["style"] is None,  # painters know clear days
+        painter=request.painter,
+        allows_collisions=request.allows_collisions,
+    )
+    return render_run(
+        store, path, out, prompt=DEFAULT_PROMPT, sequence=SequenceConfig(), kinds=ViewKinds()
+    )
+
+
+def list_actors(store: Store, run: str) -> list[dict[str, Any]]:
+    """Everybody in a run: id, category, size, frames, Gaussians, distance when first seen."""
+    world = opened_world(store, open_run(store, run))
+    bodies = world.scene.gaussians.body_index.bincount(minlength=len(world.moving) + 1).tolist()
+    rows = []
+    for number, track in enumerate(world.tracks):
+        is_moving = number < len(world.moving)
+        length, width, height = (round(float(side), 1) for side in track.size_m)
+        rows.append(
+            {
+                "actor_id": track.actor_id,
+                "category": track.category,
+                "is_moving": is_moving,
+                "length_m": length,
+                "width_m": width,
+                "height_m": height,
+                "frames": len(track.timestamps_ns),
+                "num_gaussians": bodies[number + 1] if is_moving else world.count_parked(track),
+                "distance_m": _distance_m(world.log.ego.world_from_body, track),
+            }
+        )
+    return sorted(rows, key=lambda row: row["distance_m"])
+
+
+def _distance_m(world_from_ego: Any, track: ActorTrack) -> float:  # noqa: ANN401 - a tensor
+    """From the ego's first place to the actor's first."""
+    away = track.world_from_box[0, :3, 3] - world_from_ego[0, :3, 3]
+    return round(float(away.norm()), 1)
+
+
+def _origin(store: Store, run: FinishedRun) -> tuple[FinishedRun, Sequence[Operation]]:
+    """The run that edits begin from, and those that were made of it already."""
+    if run.change is None or run.change["kind"] != EDIT or run.derived_from is None:
+        return run, ()
+    try:
+        origin = open_run(store, run.derived_from)
+    except UnknownRecordError:
+        return run, ()  # it is gone: what was edited is all there is
+    found = run.change["parameters"]["operations"]
+    return origin, parse_operations(found, f"the edits of run {run.run_id}")

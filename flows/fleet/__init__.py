@@ -1,0 +1,1 @@
+"""Many sequences: what a manifest asks for, who works on it, and how it stands."""

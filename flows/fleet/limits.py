@@ -1,0 +1,70 @@
+"""What holds a fleet back: the room on the disk, the memory of the machine, its budget of hours."""
+
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from catalog.fleets import FleetLedger
+from catalog.leases import Lease, Leases
+from catalog.tables import Row
+from flows.fleet.manifest import Budget
+
+GIGABYTE = 1e9
+MEMORY_SHARE = 0.9
+"""Of the machine's memory that sequences may be planned into."""
+MEMORY_LIMIT = Path("/sys/fs/cgroup/memory.max")
+"""Bytes, where a container has a limit."""
+
+
+def lacks_disk(ledger: FleetLedger, budget: Budget, num_bytes: float = 0.0) -> str | None:
+    """Why a sequence that makes so much may not begin; None if there is room."""
+    free = shutil.disk_usage(ledger.store.root).free
+    needed = budget.free_disk_gb * GIGABYTE + num_bytes
+    if free >= needed:
+        return None
+    return (
+        f"{free / GIGABYTE:.2f} GB are free in {ledger.store.root}, "
+        f"expected {needed / GIGABYTE:.2f} GB before a sequence begins"
+    )
+
+
+def over_budget(rows: Sequence[Row]) -> str | None:
+    """Why nothing more may begin: the hours of the fleet are used up; None if it may."""
+    hours = Budget.model_validate_json(rows[0]["budget"]).hours
+    spent = sum(row["seconds"] or 0.0 for row in rows) / 3600
+    if hours is None or spent < hours:
+        return None
+    return f"the budget of {hours} h is used up: {spent:.2f} h"
+
+
+def admits(leases: Leases, lease: Lease, budget: Budget) -> bool:
+    """Whether a sequence in hand may begin beside what this machine already works on.
+
+    The one that was taken first always may: it would never begin otherwise.
+    """
+    others = [
+        one
+        for one in leases.held()
+        if one.name != lease.name and leases.is_near(one) and not leases.has_expired(one)
+    ]
+    if all((lease.taken_at, lease.name) < (one.taken_at, one.name) for one in others):
+        return True
+    limit = budget.memory_gb * 1e9 if budget.memory_gb else MEMORY_SHARE * machine_memory_bytes()
+    return sum(_planned_bytes(one) for one in [lease, *others]) <= limit
+
+
+def machine_memory_bytes(limit: Path = MEMORY_LIMIT) -> float:
+    """Memory of this machine, or of its container."""
+    memory = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    try:
+        allowed = limit.read_text("ascii").strip()
+    except OSError:
+        return memory
+    return memory if allowed == "max" else min(memory, float(allowed))
+
+
+def _planned_bytes(lease: Lease) -> float:
+    """What a sequence in hand is thought to take, or takes already."""
+    known = (lease.facts.get("predicted_memory_bytes"), lease.facts.get("memory_bytes"))
+    return max(float(one or 0.0) for one in known)

@@ -1,0 +1,69 @@
+"""How a fleet stands, as its commands say it."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from statistics import median
+from typing import Any, get_args
+
+from catalog.attempts import State
+from catalog.fleets import FleetLedger
+from catalog.tables import Row
+from flows.fleet.limits import lacks_disk, over_budget
+from flows.fleet.manifest import Budget
+
+STATES: tuple[State, ...] = get_args(State)
+ENDED: tuple[State, ...] = ("done", "set-aside")
+"""Nothing more is to be done, and nothing is amiss with the fleet."""
+
+
+def fleet_status(ledger: FleetLedger, fleet: str) -> dict[str, Any]:
+    """What `fleet status --json` prints.
+
+    Raises:
+        UnknownRecordError: there is no such fleet.
+    """
+    rows = ledger.rows(fleet)
+    counts = counts_of(rows)
+    attempts = [row for row in ledger.store.tables.rows("attempts") if row["fleet"] == fleet]
+    is_open = counts["waiting"] or counts["running"]
+    budget = Budget.model_validate_json(rows[0]["budget"])
+    return {
+        "fleet": fleet,
+        "store": str(ledger.store.root),
+        "counts": counts,
+        "held_back": (over_budget(rows) or lacks_disk(ledger, budget)) if is_open else None,
+        "sequences": [_sequence(row) for row in rows],
+        "cost": {
+            "seconds": sum(row["seconds"] or 0.0 for row in attempts),
+            "cpu_seconds": sum(row["cpu_seconds"] or 0.0 for row in attempts),
+            "attempts": len(attempts),
+        },
+        "planner_error": planner_error(attempts),
+    }
+
+
+def counts_of(rows: Sequence[Row]) -> dict[str, int]:
+    """How many sequences are in each state, in the order in which they go through them."""
+    return {state: sum(row["state"] == state for row in rows) for state in STATES}
+
+
+def is_over(status: Mapping[str, Any]) -> bool:
+    """Whether every sequence is done, or set aside with a reason."""
+    return sum(status["counts"][state] for state in ENDED) == len(status["sequences"])
+
+
+def planner_error(attempts: Iterable[Mapping[str, Any]]) -> float | None:
+    """How far off the predicted seconds were, as a share of the true ones: the median.
+
+    Attempts that were recalled or not predicted do not count; None where none is left.
+    """
+    shares = [
+        abs(row["predicted_seconds"] - row["seconds"]) / row["seconds"]
+        for row in attempts
+        if row["cause"] == "done" and row["effort"] and row["predicted_seconds"] and row["seconds"]
+    ]
+    return median(shares) if shares else None
+
+
+def _sequence(row: Row) -> dict[str, Any]:
+    names = ("cameras", "state", "reason", "run_id", "seconds", "attempts")
+    return {"scene": row["scene_id"], **{name: row[name] for name in names}}

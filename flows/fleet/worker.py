@@ -1,0 +1,170 @@
+"""A worker: takes one sequence after the other until a fleet has none left.
+
+It asks the catalog what waits, takes a lease, makes the sequence, and enters how that ended. Any
+number of workers may run, on any number of machines that share the store, and each may die at any
+moment: whoever looks next enters that and goes on.
+"""
+
+import os
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from functools import partial
+from typing import NoReturn
+
+import lidarpainter_models
+from catalog.attempts import Ending
+from catalog.errors import StorageError
+from catalog.fleets import FleetLedger
+from catalog.leases import Lease
+from catalog.tables import Row
+from flows.fleet.asked import Asked
+from flows.fleet.causes import cause_of, is_full_disk
+from flows.fleet.heartbeat import Heartbeat
+from flows.fleet.limits import admits, lacks_disk, over_budget
+from flows.fleet.manifest import Budget
+from flows.fleet.planner import Planner
+from flows.fleet.work import Work
+from flows.interruption import at_interruption
+
+POLL_S = 2.0
+REPLAN_S = 30.0
+"""How long the planner goes by what it read last."""
+ENDED_ITSELF = 3
+"""Exit code of a worker that had to leave its work; another one takes its place."""
+
+
+@dataclass(kw_only=True)
+class Worker:
+    """Works on one fleet."""
+
+    ledger: FleetLedger
+    fleet: str
+    work: Work
+    say: Callable[[str], None]
+    poll_s: float = POLL_S
+    _told: str = ""
+    _plans: tuple[float, Planner] | None = None
+    _entering: threading.Lock = field(default_factory=threading.Lock)
+
+    def run(self) -> None:
+        """Work until nothing waits and nobody else works, or the budget is used up."""
+        self.ledger.store.tables.keep_open()
+        while True:
+            try:
+                if self._step():
+                    return
+            except StorageError as error:
+                if not is_full_disk(error):
+                    raise
+                self._pause(str(error))
+
+    def _step(self) -> bool:
+        """Make one sequence, or wait a little; whether there is nothing left to do."""
+        for line in self.ledger.reconcile():
+            self.say(line)
+        rows = self.ledger.rows(self.fleet)
+        if not any(row["state"] in ("waiting", "running") for row in rows):
+            return True
+        if spent := over_budget(rows):
+            self.say(spent)
+            return True
+        taken = self._take(rows)
+        if taken is None:
+            time.sleep(self.poll_s)
+        else:
+            self._attempt(*taken)
+        return False
+
+    def _take(self, rows: Sequence[Row]) -> tuple[Row, Lease] | None:
+        """The next sequence that may begin, in hand; None if there is none now."""
+        now = datetime.now(UTC)
+        due = [r for r in rows if r["state"] == "waiting" and (r["not_before"] or now) <= now]
+        planner = self._planner()
+        for row in sorted(due, key=lambda row: (-row["priority"], row["position"])):
+            prediction = planner.predict(Asked.model_validate_json(row["asked"]))
+            budget = Budget.model_validate_json(row["budget"])
+            if lacking := lacks_disk(self.ledger, budget, prediction.num_bytes or 0.0):
+                self._pause(lacking, sleeps=False)
+                return None
+            lease = self.ledger.take(row, prediction.facts())
+            if lease is None:
+                continue
+            if admits(self.ledger.leases, lease, budget):
+                self._told = ""
+                return row, lease
+            self.ledger.leases.give_back(lease)
+        return None
+
+    def _attempt(self, row: Row, lease: Lease) -> None:
+        asked = Asked.model_validate_json(row["asked"])
+        hours = Budget.model_validate_json(row["budget"]).hours_per_sequence
+        beat = Heartbeat(
+            self.ledger.leases,
+            lease,
+            limit_s=hours and hours * 3600,
+            on_lost=lambda: self._leave(beat, Ending(cause="superseded", reason="lease lost")),
+            on_late=lambda: self._leave(
+                beat, Ending(cause="timeout", reason=f"took longer than {hours} h")
+            ),
+        )
+        self.say(f"{asked.scene_id}: begins, attempt {row['attempts'] + 1}")
+        version = lidarpainter_models.__version__
+        effort = self._planner().effort(asked)
+        with beat, at_interruption(partial(self._end, beat, Ending(cause="interrupted"))):
+            try:
+                made = self.work(asked, self.ledger.store.root)
+                ending = Ending(
+                    cause="done",
+                    run_id=made.run_id,
+                    num_bytes=made.num_bytes,
+                    peak_memory_bytes=made.peak_memory_bytes,
+                    effort=effort.to_json() if made.is_new and effort else None,
+                    software_version=version,
+                )
+            except Exception as error:  # noqa: BLE001 - whatever it is, it is entered
+                cause, reason = cause_of(error)
+                ending = Ending(cause=cause, reason=reason, software_version=version)
+        self._end(beat, ending)
+
+    def _end(self, beat: Heartbeat, ending: Ending) -> None:
+        """Enter how an attempt ended; on a full disk, as soon as there is room."""
+        with self._entering:
+            took = replace(ending, **beat.took())
+            peak = max(took.peak_memory_bytes or 0, ending.peak_memory_bytes or 0)
+            took = replace(took, peak_memory_bytes=peak)
+            while True:
+                try:
+                    follows = self.ledger.end(beat.lease, took)
+                    break
+                except StorageError as error:
+                    if not is_full_disk(error):
+                        raise
+                    self._pause(str(error))
+        scene = beat.lease.facts["scene_id"]
+        what = ending.cause if follows else "refused, it is in other hands"
+        self.say(f"{scene}: {what} after {took.seconds:.1f} s {ending.reason or ''}".rstrip())
+
+    def _leave(self, beat: Heartbeat, ending: Ending) -> NoReturn:
+        """End this process from the thread of the heartbeat, unless the end is being entered."""
+        if self._entering.acquire(blocking=False):
+            self._entering.release()
+            self._end(beat, ending)
+            os._exit(ENDED_ITSELF)
+        raise SystemExit
+
+    def _planner(self) -> Planner:
+        """By what is known now, or was a short while ago."""
+        now = time.monotonic()
+        if self._plans is None or now - self._plans[0] > REPLAN_S:
+            self._plans = (now, Planner.of(self.ledger.store))
+        return self._plans[1]
+
+    def _pause(self, why: str, *, sleeps: bool = True) -> None:
+        if why != self._told:
+            self.say(f"paused: {why}")
+            self._told = why
+        if sleeps:
+            time.sleep(self.poll_s)

@@ -1,0 +1,100 @@
+"""Recorded cameras moved along a trajectory, and what they run into there."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.driven_paths import DrivenPath
+from lidarpainter_models.geometry.trajectory_parts import Moments
+from lidarpainter_models.geometry.trajectory_specs import Trajectory
+from lidarpainter_models.geometry.transforms import invert_rigid
+from lidarpainter_models.lidar.collisions import Collision, MovingBody, find_collisions
+from lidarpainter_models.lidar.lidar_map import MapPoints
+from lidarpainter_models.scenes.actor_names import named_actor, path_of_track
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.records import RecordedView
+from lidarpainter_models.scenes.tracks import ActorTrack
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MovedCameras:
+    """One trajectory through one log."""
+
+    recorded: DrivingScene
+    tracks: Sequence[ActorTrack]
+    """The moving actors as they are shown; others are as they were recorded."""
+    trajectory: Trajectory
+    as_rig: bool = False
+    """Move the car and its cameras on it, not a camera alone: then a turn is the car's."""
+
+    @cached_property
+    def road(self) -> DrivenPath:
+        """The way the car drove."""
+        return DrivenPath(
+            timestamps_ns=self.recorded.frame_timestamps_ns,
+            world_from_body=self.recorded.world_from_ego,
+        )
+
+    def moved(self, views: Sequence[RecordedView], cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+        """The cameras of some moments of one camera, moved.
+
+        Raises:
+            ConfigError: the path leads too far out of the ends of the recorded one.
+            SceneError: it names an actor that is not there.
+        """
+        if self.trajectory.is_recorded:
+            return tuple(cameras)
+        road, moments, place = self.road, self._moments(views), self.trajectory.placed
+        poses = torch.stack([camera.world_from_camera.double() for camera in cameras])
+        if self.as_rig:
+            egos = road.world_from_body[moments.rows]
+            moved_from_ego = place(egos, road, moments, self._path_of) @ invert_rigid(egos)
+            poses = moved_from_ego @ poses
+        else:
+            poses = place(poses, road, moments, self._path_of, is_camera=True)
+        return tuple(camera.at(pose) for camera, pose in zip(cameras, poses, strict=True))
+
+    def collisions(
+        self, views: Sequence[RecordedView], cameras: Sequence[Camera], street: MapPoints
+    ) -> list[Collision]:
+        """What moved cameras run into: points of the street, boxes of moving actors."""
+        if self.trajectory.is_recorded:
+            return []
+        body = MovingBody.camera(
+            torch.stack([camera.world_from_camera.double() for camera in cameras]),
+            torch.tensor([view.timestamp_ns for view in views]),
+        )
+        start_ns = int(self.road.timestamps_ns[0])
+        return find_collisions(body, street, self.tracks, start_ns=start_ns)
+
+    def refuse_walls(self, found: Sequence[Collision]) -> None:
+        """Refuse cameras in a wall.
+
+        Raises:
+            ConfigError: they run into points of the street.
+        """
+        if walls := [one for one in found if one.is_wall]:
+            raise ConfigError(
+                f"trajectory {self.trajectory.spec!r} leads the camera into a wall: {walls[0]} "
+                "within half a metre; --allow-collisions goes through"
+            )
+
+    def _moments(self, views: Sequence[RecordedView]) -> Moments:
+        frames = [self.recorded.frame_position(view.frame_index) for view in views]
+        times_ns = torch.tensor([view.timestamp_ns for view in views])
+        start_ns, end_ns = (int(self.road.timestamps_ns[row]) for row in (0, -1))
+        return Moments(
+            rows=torch.tensor(frames),
+            seconds=(times_ns - start_ns).double() * 1e-9,
+            progress=torch.arange(len(frames)).double() / max(len(frames) - 1, 1),
+            log_s=(end_ns - start_ns) * 1e-9,
+        )
+
+    def _path_of(self, name: str) -> DrivenPath:
+        shown = {track.actor_id: track for track in self.tracks}
+        known = {track.actor_id: track for track in self.recorded.tracks} | shown
+        return path_of_track(named_actor([*known.values()], name, self.road))

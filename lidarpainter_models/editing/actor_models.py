@@ -1,0 +1,158 @@
+"""An actor apart from any scene: its Gaussians and points in its box frame, and its size.
+
+Box frame: x along the length, y left, z up, origin at the centre; metres.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.errors import SceneError
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
+from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
+
+SHADOW_HEIGHT_M = 0.03
+"""Above the bottom of the box: over the road, under the car."""
+SHADOW_CELL_M = 0.3
+SHADOW_OPACITY = 0.16
+"""Of one disc; three lie over one another, and take four tenths of the light."""
+SHADOW_REACH_M = 0.9
+SHADOW_FALL_PER_M = 3.2
+MAX_POINTS = 5000
+OPAQUE = 0.5
+MAX_GAIN = 2.5
+"""Two recordings of asphalt that differ by more in brightness show no difference of exposure."""
+LIGHTEST, DARKEST = 0.9, 0.02
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ActorModel:
+    """What somebody looks like."""
+
+    gaussians: GaussianSet
+    """Of body 0."""
+    points: MapPoints
+    """Its LiDAR points; none where nobody measured it."""
+    size_m: Float[Tensor, "3"]
+    category: str
+    road_rgb: Float[Tensor, "3"] | None = None
+    """Colour of the road where it was recorded, which tells its exposure."""
+
+    @classmethod
+    def of_gaussians(cls, gaussians: GaussianSet, category: str) -> "ActorModel":
+        """A model of which only Gaussians are known: its box is what the opaque ones fill.
+
+        Raises:
+            SceneError: there is nothing opaque.
+        """
+        seen = gaussians.means[gaussians.opacity > OPAQUE]
+        if not len(seen):
+            raise SceneError("an actor's Gaussians hold nothing opaque, expected a car")
+        low, high = (seen.quantile(share, dim=0) for share in (0.005, 0.995))
+        columns = gaussians.columns()
+        columns["means"] = columns["means"] - (low + high) / 2
+        columns["body_index"] = torch.zeros_like(columns["body_index"])
+        centred = GaussianSet(**columns)
+        return cls(
+            gaussians=centred,
+            points=sampled_points(centred),
+            size_m=(high - low).clamp(min=0.1),
+            category=category,
+        )
+
+    def scaled(self, factor: float) -> "ActorModel":
+        """The same, larger or smaller about the middle of its box."""
+        columns = self.gaussians.columns()
+        columns["means"] = columns["means"] * factor
+        columns["log_scale"] = columns["log_scale"] + math.log(factor)
+        return replace(
+            self,
+            gaussians=GaussianSet(**columns),
+            points=replace(self.points, xyz_m=self.points.xyz_m * factor),
+            size_m=self.size_m * factor,
+        )
+
+    def exposed_like(self, road_rgb: Float[Tensor, "3"] | None) -> "ActorModel":
+        """The same in the light of another scene, told by how bright its road is."""
+        if road_rgb is None or self.road_rgb is None:
+            return self
+        gain = (road_rgb.mean() / self.road_rgb.mean()).clamp(1 / MAX_GAIN, MAX_GAIN)
+        columns = self.gaussians.columns()
+        columns["sh_dc"] = sh_from_rgb(self.gaussians.base_rgb * gain)
+        columns["sh_rest"] = columns["sh_rest"] * gain
+        rgb_u8 = (self.points.rgb_u8 * gain).round().clamp(0, 255).to(torch.uint8)
+        return replace(
+            self, gaussians=GaussianSet(**columns), points=replace(self.points, rgb_u8=rgb_u8)
+        )
+
+    def of_degree(self, sh_degree: int) -> "ActorModel":
+        """The same with harmonics of another degree: what is more is left out, what lacks is 0."""
+        columns = self.gaussians.columns()
+        wanted = (sh_degree + 1) ** 2 - 1
+        rest = torch.zeros(len(self.gaussians), wanted, 3)
+        kept = min(wanted, columns["sh_rest"].shape[1])
+        rest[:, :kept] = columns["sh_rest"][:, :kept]
+        return replace(self, gaussians=GaussianSet(**(columns | {"sh_rest": rest})))
+
+    def with_shadow(self) -> "ActorModel":
+        """The same with a soft shadow where it touches the road; one that it had goes."""
+        black = (self.gaussians.sh_dc == sh_from_rgb(torch.zeros(1, 3))).all(dim=2)[:, 0]
+        kept = self.gaussians.select((~black).nonzero()[:, 0])
+        shadow = contact_shadow(self.size_m, sh_degree=kept.sh_degree)
+        return replace(self, gaussians=kept.append(shadow))
+
+
+def contact_shadow(size_m: Float[Tensor, "3"], *, sh_degree: int) -> GaussianSet:
+    """Black discs under a box, fainter the farther they are outside it."""
+    half_m = size_m[:2] / 2
+    axes = [
+        torch.arange(-reach_m, reach_m + 1e-6, SHADOW_CELL_M)
+        for reach_m in (half_m + SHADOW_REACH_M).tolist()
+    ]
+    xy_m = torch.cartesian_prod(*axes)
+    outside_m = (xy_m.abs() - half_m).clamp(min=0).norm(dim=1)
+    opacity = SHADOW_OPACITY * torch.exp(-SHADOW_FALL_PER_M * outside_m)
+    count = len(xy_m)
+    height_m = torch.full((count, 1), SHADOW_HEIGHT_M - float(size_m[2]) / 2)
+    flat_m = torch.tensor([0.7 * SHADOW_CELL_M, 0.7 * SHADOW_CELL_M, 0.005])
+    return GaussianSet(
+        means=torch.cat([xy_m, height_m], dim=1),
+        rotation_wxyz=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+        log_scale=flat_m.log().repeat(count, 1),
+        opacity_logit=opacity.logit(),
+        sh_dc=sh_from_rgb(torch.zeros(count, 3)),
+        sh_rest=torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3),
+        body_index=torch.zeros(count, dtype=torch.int32),
+    )
+
+
+def sampled_points(gaussians: GaussianSet) -> MapPoints:
+    """Points on the opaque Gaussians of somebody whom no LiDAR measured."""
+    rows = (gaussians.opacity > OPAQUE).nonzero()[:, 0]
+    rows = rows[:: max(1, len(rows) // MAX_POINTS)]
+    zeros = torch.zeros(len(rows), dtype=torch.int64)
+    rgb_u8 = (gaussians.base_rgb[rows].clamp(0, 1) * 255).round().to(torch.uint8)
+    bare = MapPoints.uncoloured(
+        xyz_m=gaussians.means[rows].contiguous(),
+        frame_index=zeros,
+        timestamp_ns=zeros,
+        range_m=torch.full((len(rows),), 10.0),
+    )
+    return replace(bare, rgb_u8=rgb_u8, has_colour=torch.ones(len(rows), dtype=torch.bool))
+
+
+def road_colour(lidar_map: LidarMap, xyz_m: Float[Tensor, "places 3"]) -> Float[Tensor, "3"] | None:
+    """Median colour of the road along a path on it; None where no image saw it."""
+    street = lidar_map.street
+    low, high = xyz_m[:, :2].amin(0) - 2, xyz_m[:, :2].amax(0) + 2
+    inside = ((street.xyz_m[:, :2] >= low) & (street.xyz_m[:, :2] <= high)).all(dim=1)
+    rows = (inside & street.has_colour).nonzero()[:, 0]
+    if not len(rows):
+        return None
+    height_m = street.xyz_m[rows, 2]
+    low_rows = rows[height_m <= height_m.quantile(0.5)] if len(rows) < 1_000_000 else rows
+    rgb = street.rgb_u8[low_rows].float().median(dim=0).values / 255
+    return rgb.clamp(DARKEST, LIGHTEST)

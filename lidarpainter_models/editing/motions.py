@@ -1,0 +1,154 @@
+"""Other ways for an actor: along a trajectory, later, slower, to a stop. World: z up; metres."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.geometry.driven_paths import DrivenPath
+from lidarpainter_models.geometry.trajectory_parts import Moments, PathOf, headed
+from lidarpainter_models.geometry.trajectory_specs import Trajectory
+from lidarpainter_models.lidar.ground_heights import GroundHeights
+from lidarpainter_models.scenes.actor_names import path_of_track
+from lidarpainter_models.scenes.tracks import ActorTrack
+
+MOST_STEP_M = 1.5
+"""Ground that is so much higher or lower elsewhere is a roof or a hole: it is not followed."""
+AFTER_NS = 1_000_000_000
+"""Who stands all the time stands so long before and after the log too."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LogTimes:
+    """The clock of a log, and its ego's way."""
+
+    ego: DrivenPath
+
+    @property
+    def start_ns(self) -> int:
+        """When it begins."""
+        return int(self.ego.timestamps_ns[0])
+
+    @property
+    def end_ns(self) -> int:
+        """When it ends."""
+        return int(self.ego.timestamps_ns[-1])
+
+    @property
+    def seconds(self) -> float:
+        """How long it is."""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+    def time_ns(self, seconds: float, what: str) -> int:
+        """A time of the log.
+
+        Raises:
+            ConfigError: it lies behind the end.
+        """
+        if not 0 <= seconds <= self.seconds:
+            raise ConfigError(
+                f"{what} {seconds:g} s: expected a time of the log, 0 to {self.seconds:.1f} s"
+            )
+        return self.start_ns + round(seconds * 1e9)
+
+
+def rerouted(
+    track: ActorTrack,
+    trajectory: Trajectory,
+    log: LogTimes,
+    ground: GroundHeights,
+    path_of: PathOf,
+) -> ActorTrack:
+    """An actor on another way, as high over the ground as it was."""
+    road = path_of_track(track)
+    count = len(road)
+    moments = Moments(
+        rows=torch.arange(count),
+        seconds=(track.timestamps_ns - log.start_ns).double() * 1e-9,
+        progress=torch.arange(count).double() / max(count - 1, 1),
+        log_s=log.seconds,
+    )
+    poses = trajectory.placed(road.world_from_body, road, moments, path_of)
+    return on_ground(replace(track, world_from_box=poses), road.world_from_body, ground)
+
+
+def on_ground(
+    track: ActorTrack, before: Float[Tensor, "times 4 4"], ground: GroundHeights
+) -> ActorTrack:
+    """A moved track, raised by how much higher the ground is than where it was before."""
+    poses = track.world_from_box.clone()
+    there, here = (ground.around(pose[:, :2, 3].float()) for pose in (poses, before))
+    step_m = (there - here).double()
+    poses[:, 2, 3] += torch.where(step_m.abs() <= MOST_STEP_M, step_m, 0.0)  # NaN fails too
+    return replace(track, world_from_box=poses)
+
+
+def beside_ego(
+    log: LogTimes,
+    ground: GroundHeights,
+    *,
+    ahead_m: float,
+    left_m: float,
+    yaw_rad: float,
+    speed_mps: float | None,
+    size_m: Float[Tensor, "3"],
+) -> tuple[Int[Tensor, " times"], Float[Tensor, "times 4 4"]]:
+    """Times and poses of a body that drives along the ego's path, tyres on the ground."""
+    ego = log.ego
+    rows = torch.arange(len(ego))
+    ahead = torch.full((len(ego),), ahead_m, dtype=torch.float64)
+    if speed_mps is not None:
+        seconds = (ego.timestamps_ns - log.start_ns).double() * 1e-9
+        ahead = ahead + speed_mps * seconds - ego.travelled_m
+    carried = ego.moved_along(rows, ahead)
+    directions = (carried[:, :3, :3] @ ego.directions[..., None])[..., 0]
+    left = torch.stack([-directions[:, 1], directions[:, 0], torch.zeros(len(ego))], dim=1)
+    centres = (carried @ ego.world_from_body)[:, :3, 3] + left_m * left
+    ground_m = ground.around(centres[:, :2].float()).double()
+    centres[:, 2] = torch.where(ground_m.isnan(), centres[:, 2], ground_m) + float(size_m[2]) / 2
+    heading = torch.atan2(directions[:, 1], directions[:, 0]) + yaw_rad
+    return ego.timestamps_ns, headed(centres, heading)
+
+
+def retimed(track: ActorTrack, log: LogTimes, *, delay_s: float, speed: float) -> ActorTrack:
+    """The same way, begun later and driven faster or slower."""
+    since_ns = (track.timestamps_ns - log.start_ns).double()
+    times_ns = log.start_ns + (since_ns / speed).round().long() + round(delay_s * 1e9)
+    return replace(track, timestamps_ns=times_ns)
+
+
+def stopped(track: ActorTrack, at_ns: int, *, over_s: float) -> ActorTrack:
+    """The same way up to a time, then evenly braked; it stays there until its track ends."""
+
+    def warped(since_s: Float[Tensor, " times"]) -> Float[Tensor, " times"]:
+        braking = since_s.clamp(0, over_s)
+        way = braking - braking**2 / (2 * over_s) if over_s > 0 else torch.zeros_like(since_s)
+        return torch.where(since_s <= 0, since_s, way)
+
+    return _at_other_times(track, at_ns, warped)
+
+
+def standing(track: ActorTrack, at_ns: int, log: LogTimes) -> ActorTrack:
+    """An actor that stands where it is at a time, as long as the log goes on."""
+    pose = track.pose_at(at_ns)
+    times_ns = torch.tensor([log.start_ns - AFTER_NS, log.end_ns + AFTER_NS])
+    return replace(
+        track,
+        frame_indices=torch.zeros(2, dtype=torch.int64),
+        timestamps_ns=times_ns,
+        world_from_box=pose.double().expand(2, 4, 4).clone(),
+        num_points=torch.zeros(2, dtype=torch.int64),
+    )
+
+
+def _at_other_times(
+    track: ActorTrack,
+    from_ns: int,
+    warped: Callable[[Float[Tensor, " times"]], Float[Tensor, " times"]],
+) -> ActorTrack:
+    since_s = (track.timestamps_ns - from_ns).double() * 1e-9
+    wanted_ns = from_ns + (warped(since_s) * 1e9).round().long()
+    return replace(track, world_from_box=path_of_track(track).at(wanted_ns).world_from_body)

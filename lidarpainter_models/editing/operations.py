@@ -1,0 +1,226 @@
+"""The words of an edit script: a JSON list of operations, each with its fields.
+
+What is not said here is refused, so that a script that is read can be replayed. Times are seconds
+since the log began, lengths metres.
+"""
+
+import json
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+from lidarpainter_models.weather.mix import StyleMix
+
+MOST_OPERATIONS = 10_000
+_Name = Annotated[str, Field(min_length=1, max_length=200)]
+_Seconds = Annotated[float, Field(ge=0, le=1e6)]
+_Metres = Annotated[float, Field(ge=-1e4, le=1e4)]
+
+
+class _Words(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
+
+
+class ActorSource(_Words):
+    """Whose Gaussians are put in: an actor of a run (of this one if none is named), or a file."""
+
+    actor: _Name | None = None
+    run: _Name | None = None
+    store: _Name | None = None
+    """Folder of the store of that run; this one if absent."""
+    ply: _Name | None = None
+    """Gaussians of one car: x ahead, y left, z up; its box is found around them."""
+
+    @model_validator(mode="after")
+    def _is_one_of_both(self) -> "ActorSource":
+        if (self.actor is None) == (self.ply is None):
+            raise ValueError("expected either actor or ply")
+        if self.ply is not None and (self.run or self.store):
+            raise ValueError("a ply has no run and no store")
+        return self
+
+
+class Remove(_Words):
+    """Take actors out."""
+
+    op: Literal["remove"]
+    actors: Annotated[tuple[_Name, ...], Field(min_length=1, strict=False)]
+
+
+class Move(_Words):
+    """Let an actor go elsewhere; `re-route` is another word for it."""
+
+    op: Literal["move", "re-route"]
+    actor: _Name
+    trajectory: _Name
+    """Off its own path: see `geometry/trajectory_specs.py`."""
+
+    @model_validator(mode="after")
+    def _leads_somewhere(self) -> "Move":
+        parse_trajectory(self.trajectory, max_shift_m=None)
+        return self
+
+
+class Insert(_Words):
+    """Put an actor in, before the ego or in another one's place."""
+
+    op: Literal["insert"]
+    source: ActorSource
+    name: _Name
+    """What it is called from then on."""
+    ahead_m: _Metres = 15.0
+    """Of the ego's place when the log begins, along its path."""
+    left_m: _Metres = 0.0
+    yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
+    """Against the road."""
+    speed_mps: Annotated[float, Field(ge=-100, le=100)] | None = None
+    """Along the ego's path; None drives as the ego does."""
+    trajectory: _Name = "recorded"
+    """Off the path that these give."""
+
+    @model_validator(mode="after")
+    def _leads_somewhere(self) -> "Insert":
+        parse_trajectory(self.trajectory, max_shift_m=None)
+        return self
+
+
+class Swap(_Words):
+    """Put another actor in the place of one, on its path."""
+
+    op: Literal["swap"]
+    actor: _Name
+    source: ActorSource
+
+
+class Scale(_Words):
+    """Make an actor larger or smaller where it stands."""
+
+    op: Literal["scale"]
+    actor: _Name
+    factor: Annotated[float, Field(gt=0.05, lt=20)]
+
+
+class Retime(_Words):
+    """Let an actor drive its path later, faster or slower."""
+
+    op: Literal["retime"]
+    actor: _Name
+    delay_s: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
+    speed: Annotated[float, Field(gt=0.01, lt=100)] = 1.0
+    """Times its own."""
+
+
+class Stop(_Words):
+    """Let an actor brake and stand from then on."""
+
+    op: Literal["stop"]
+    actor: _Name
+    at_s: _Seconds
+    """When it begins to brake."""
+    over_s: Annotated[float, Field(ge=0, le=1000)] = 1.0
+
+
+class Freeze(_Words):
+    """Let everybody stand as they do at a time."""
+
+    op: Literal["freeze"]
+    at_s: _Seconds
+
+
+class Crop(_Words):
+    """Keep a stretch of road only, counted along the ego's path."""
+
+    op: Literal["crop"]
+    from_m: _Metres
+    to_m: _Metres
+
+    @model_validator(mode="after")
+    def _holds_something(self) -> "Crop":
+        if self.from_m >= self.to_m:
+            raise ValueError("expected from_m < to_m")
+        return self
+
+
+class Drive(_Words):
+    """Where the camera goes when the edited run is shown with the script; changes no scene."""
+
+    op: Literal["drive"]
+    trajectory: _Name
+
+    @model_validator(mode="after")
+    def _leads_somewhere(self) -> "Drive":
+        parse_trajectory(self.trajectory)
+        return self
+
+
+class Style(_Words):
+    """Put the edited scene into fog, night or rain; the last one holds."""
+
+    op: Literal["style"]
+    prompt: _Name
+    """Such as `foggy:0.5+night`: see `weather/mix.py`."""
+    strength: Annotated[float, Field(ge=0, le=1)] = 1.0
+    visibility_m: Annotated[float, Field(gt=0, le=1e5)] | None = None
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+
+    @property
+    def mix(self) -> StyleMix:
+        """The styles."""
+        return StyleMix.parse(self.prompt, strength=self.strength, visibility_m=self.visibility_m)
+
+    @model_validator(mode="after")
+    def _is_known(self) -> "Style":
+        _ = self.mix
+        return self
+
+
+Operation = Annotated[
+    Remove | Move | Insert | Swap | Scale | Retime | Stop | Freeze | Crop | Drive | Style,
+    Field(discriminator="op"),
+]
+_SCRIPT: TypeAdapter[tuple[Operation, ...]] = TypeAdapter(
+    Annotated[tuple[Operation, ...], Field(strict=False, max_length=MOST_OPERATIONS)]
+)
+
+
+def parse_operations(found: Any, where: str) -> tuple[Operation, ...]:  # noqa: ANN401 - any JSON
+    """Read a list of operations.
+
+    Raises:
+        ConfigError: it is no such list; the message says which operation, which field, and why.
+    """
+    try:
+        operations = _SCRIPT.validate_python(found)
+    except ValidationError as error:
+        first = error.errors()[0]
+        number, *fields = [*first["loc"], ""][:-1] or [""]
+        place = ".".join(str(part) for part in fields[1:] or fields)
+        message = first["msg"].removeprefix("Value error, ")
+        step = f" operation {number + 1}" if isinstance(number, int) else ""
+        raise ConfigError(f"{where}{step}{f', {place}' if place else ''}: {message}") from None
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None
+    if not operations:
+        raise ConfigError(f"{where}: expected at least one operation")
+    return operations
+
+
+def parse_script(text: str, where: str) -> tuple[Operation, ...]:
+    """Read a script: a JSON list of operations.
+
+    Raises:
+        ConfigError: it is no JSON, or no such list.
+    """
+    try:
+        found = json.loads(text, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{where} is no JSON list of operations: {error}") from None
+    if not isinstance(found, list):
+        raise ConfigError(f"{where}: expected a JSON list of operations")
+    return parse_operations(found, where)
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is no number")

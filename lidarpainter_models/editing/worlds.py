@@ -1,0 +1,257 @@
+"""A fitted scene being edited: actors come out of it whole and are put in elsewhere.
+
+Every edit is one of both, or both; what has stood somewhere (`left`) and what stands there now
+(`came`) is kept, since there neither the street nor the recorded images can be believed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidarpainter_models.editing.actor_models import ActorModel, road_colour
+from lidarpainter_models.editing.motions import LogTimes, standing
+from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.gaussians.model.actors import Actors
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.model.placing import carried_gaussians
+from lidarpainter_models.geometry.boxes import is_inside_box
+from lidarpainter_models.geometry.driven_paths import DrivenPath
+from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
+from lidarpainter_models.kernels.box_owners import NO_BOX, box_owners
+from lidarpainter_models.lidar.actor_separation import height_above_ground
+from lidarpainter_models.lidar.ground_heights import GroundHeights
+from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
+from lidarpainter_models.observations.views import TrainingView
+from lidarpainter_models.scenes.actor_names import named_actor, path_of_track
+from lidarpainter_models.scenes.tracks import ActorTrack
+
+PARKED_MARGIN_M = 0.15
+"""Gaussians so far outside the box of a parked car are the car's."""
+PARKED_CLEARANCE_M = 0.08
+"""What is lower over the ground than this is road."""
+GHOST_SHRINK_M = 0.2
+"""So far inside the room that a car drove through, nothing stands."""
+GHOST_FLOOR_M = 0.3
+_GROUND_SAMPLE = 400_000
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EditedWorld:
+    """A scene, what LiDAR knows of it, and who stands in it."""
+
+    scene: GaussianScene
+    fitted: GaussianScene
+    """The scene before any edit."""
+    lidar_map: LidarMap
+    views: tuple[TrainingView, ...]
+    parked: tuple[ActorTrack, ...]
+    """Annotated actors that never move and are part of the street."""
+    log: LogTimes
+    left: tuple[ActorTrack, ...] = ()
+    """Where somebody was who is not there any more; `is_moving` as recorded."""
+    came: tuple[ActorTrack, ...] = ()
+    """Where somebody is who was not there."""
+
+    @cached_property
+    def moving(self) -> tuple[ActorTrack, ...]:
+        """Whoever has a body of Gaussians, in the order of the bodies."""
+        return self.scene.tracks
+
+    @property
+    def tracks(self) -> tuple[ActorTrack, ...]:
+        """All that can be named."""
+        return (*self.moving, *self.parked)
+
+    @cached_property
+    def ground(self) -> GroundHeights:
+        """The ground, from an even sample of the street."""
+        xyz_m = self.lidar_map.street.xyz_m
+        return GroundHeights(xyz_m[:: max(1, len(xyz_m) // _GROUND_SAMPLE)])
+
+    @cached_property
+    def road_rgb(self) -> Float[Tensor, "3"] | None:
+        """Colour of the road where the ego drove."""
+        return road_colour(self.lidar_map, self.log.ego.world_from_body[:, :3, 3].float())
+
+    def find(self, name: str) -> ActorTrack:
+        """An actor by its id, the beginning of it, or `nearest-ahead`.
+
+        Raises:
+            SceneError: none or several are called so.
+        """
+        return named_actor(self.tracks, name, self.log.ego)
+
+    def path_of(self, name: str) -> DrivenPath:
+        """The way of an actor."""
+        return path_of_track(self.find(name))
+
+    def model_of(self, track: ActorTrack) -> ActorModel:
+        """What an actor looks like, in its box frame.
+
+        Raises:
+            SceneError: nothing of it was fitted.
+        """
+        rows, points, pose = self._rows_of(track), self._points_of(track), None
+        if self._body_of(track) is None:
+            pose = invert_rigid(_parked_pose(track))
+            points = _carried_points(points, pose)
+        gaussians = self.scene.gaussians.select(rows)
+        if not len(gaussians):
+            raise SceneError(f"actor {track.actor_id!r} has no Gaussians here: nobody saw it")
+        gaussians = gaussians if pose is None else carried_gaussians(gaussians, pose)
+        columns = gaussians.columns()
+        columns["body_index"] = torch.zeros_like(columns["body_index"])
+        return ActorModel(
+            gaussians=GaussianSet(**columns),
+            points=points,
+            size_m=track.size_m,
+            category=track.category,
+            road_rgb=self.road_rgb,
+        )
+
+    def without(self, track: ActorTrack) -> "EditedWorld":
+        """The same world once an actor has gone."""
+        body = self._body_of(track)
+        gone = torch.zeros(len(self.scene.gaussians), dtype=torch.bool)
+        gone[self._rows_of(track)] = True
+        street, actors = self.lidar_map.street, dict(self.lidar_map.actors)
+        if body is None:
+            street = street.keep(~self._holds(track, street.xyz_m))
+        else:
+            gone |= self._ghosts(track)
+            actors.pop(track.actor_id, None)
+        scene = self.scene.with_gaussians(self.scene.gaussians.select((~gone).nonzero()[:, 0]))
+        was_there = track if body is not None else _always(track, self.log)
+        return replace(
+            self,
+            scene=scene if body is None else _without_body(scene, body),
+            lidar_map=LidarMap(street=street, actors=actors),
+            parked=tuple(one for one in self.parked if one.actor_id != track.actor_id),
+            left=(*self.left, was_there),
+        )
+
+    def with_actor(self, model: ActorModel, track: ActorTrack) -> "EditedWorld":
+        """The same world with somebody more, in its light and with a shadow under it.
+
+        Raises:
+            ConfigError: somebody is called so already.
+        """
+        if any(one.actor_id == track.actor_id for one in self.tracks):
+            raise ConfigError(f"an actor {track.actor_id!r} is there already, expected a new name")
+        own, actors = self.scene.gaussians, self.scene.actors
+        fitting = model.exposed_like(self.road_rgb).of_degree(own.sh_degree).with_shadow()
+        columns = fitting.gaussians.columns()
+        columns["body_index"] = torch.full_like(
+            columns["body_index"], len(actors.recorded_tracks) + 1
+        )
+        moving = replace(track, is_moving=True, size_m=fitting.size_m)
+        more = torch.zeros(1, *actors.tangent.shape[1:], dtype=actors.tangent.dtype)
+        scene = replace(
+            self.scene,
+            gaussians=own.append(GaussianSet(**columns)),
+            actors=Actors(
+                recorded_tracks=(*actors.recorded_tracks, moving),
+                knots_ns=actors.knots_ns,
+                tangent=torch.cat([actors.tangent, more]),
+            ),
+        )
+        points = {**self.lidar_map.actors, track.actor_id: fitting.points}
+        lidar_map = LidarMap(street=self.lidar_map.street, actors=points)
+        return replace(self, scene=scene, lidar_map=lidar_map, came=(*self.came, moving))
+
+    def count_parked(self, track: ActorTrack) -> int:
+        """Gaussians of the street that are a parked car's."""
+        return len(self._rows_of(track))
+
+    def _body_of(self, track: ActorTrack) -> int | None:
+        """Index of its body, or None where it is part of the street."""
+        ids = [one.actor_id for one in self.scene.actors.recorded_tracks]
+        return ids.index(track.actor_id) + 1 if track.actor_id in ids else None
+
+    def _rows_of(self, track: ActorTrack) -> Tensor:
+        gaussians, body = self.scene.gaussians, self._body_of(track)
+        if body is not None:
+            return (gaussians.body_index == body).nonzero()[:, 0]
+        held = self._holds(track, gaussians.means) & (gaussians.body_index == 0)
+        return held.nonzero()[:, 0]
+
+    def _points_of(self, track: ActorTrack) -> MapPoints:
+        if self._body_of(track) is not None:
+            return self.lidar_map.actors.get(track.actor_id, MapPoints.concatenate([]))
+        street = self.lidar_map.street
+        return street.keep(self._holds(track, street.xyz_m))
+
+    def _holds(
+        self, track: ActorTrack, points_world: Float[Tensor, "points 3"]
+    ) -> Bool[Tensor, " points"]:
+        """Which points belong to a parked car and not to the road under it."""
+        pose = _parked_pose(track)
+        held = is_inside_box(points_world, pose, track.size_m, margin_m=PARKED_MARGIN_M)
+        rows = held.nonzero()[:, 0]
+        bottom_m = torch.full((len(rows),), float(pose[2, 3] - track.size_m[2] / 2))
+        height_m = height_above_ground(points_world[rows], bottom_m, self.ground)
+        held[rows] = height_m >= PARKED_CLEARANCE_M
+        return held
+
+    def _ghosts(self, track: ActorTrack) -> Bool[Tensor, " gaussians"]:
+        """Gaussians of the street where a car drove through: smeared parts of it."""
+        gaussians = self.scene.gaussians
+        room_m = (track.size_m.double() - 2 * GHOST_SHRINK_M).clamp(min=0)
+        poses = track.world_from_box.double()
+        owners = box_owners(
+            gaussians.means.detach(),
+            invert_rigid(poses),
+            room_m.expand(len(poses), 3),
+            margin_m=0.0,
+            floor_m=0.0,
+        )
+        is_high = gaussians.means[:, 2] > poses[0, 2, 3] - track.size_m[2] / 2 + GHOST_FLOOR_M
+        return (owners != NO_BOX) & (gaussians.body_index == 0) & is_high
+
+
+def _without_body(scene: GaussianScene, body: int) -> GaussianScene:
+    """The scene without an actor that has no Gaussians any more."""
+    actors = scene.actors
+    kept = [row for row in range(len(actors.recorded_tracks)) if row != body - 1]
+    columns = scene.gaussians.columns()
+    columns["body_index"] = columns["body_index"] - (columns["body_index"] > body).int()
+    return replace(
+        scene,
+        gaussians=GaussianSet(**columns),
+        actors=Actors(
+            recorded_tracks=tuple(actors.recorded_tracks[row] for row in kept),
+            knots_ns=actors.knots_ns,
+            tangent=actors.tangent[kept],
+        ),
+    )
+
+
+def _parked_pose(track: ActorTrack) -> Float[Tensor, "4 4"]:
+    """Where a parked car stands: its boxes differ by how well they were drawn."""
+    return track.world_from_box[len(track.world_from_box) // 2].double()
+
+
+def _always(track: ActorTrack, log: LogTimes) -> ActorTrack:
+    """A parked car, there before it was first and after it was last seen."""
+    middle_ns = int(track.timestamps_ns[len(track.timestamps_ns) // 2])
+    return standing(track, middle_ns, log)
+
+
+def as_moving(track: ActorTrack, log: LogTimes) -> ActorTrack:
+    """The track of an actor that will be put in again: a parked car is there all the time."""
+    return track if track.is_moving else replace(_always(track, log), is_moving=True)
+
+
+def _carried_points(points: MapPoints, target_from_source: Float[Tensor, "4 4"]) -> MapPoints:
+    xyz_m = transform_points(target_from_source.to(points.xyz_m), points.xyz_m)
+    return replace(points, xyz_m=xyz_m)
+
+
+def boxes_at(tracks: Sequence[ActorTrack], timestamp_ns: int) -> list[ActorTrack]:
+    """Those that are there at a time."""
+    return [track for track in tracks if track.is_present(timestamp_ns)]

@@ -1,0 +1,66 @@
+"""LiDAR sweeps as other programs read them: PCD, and the five columns of nuScenes.
+
+Points stand in the frame of their sensor at the time of the sweep, motion already taken out.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
+from lidarpainter_models.scenes.records import Sweep, SweepPoints
+from lidarpainter_models.storage.whole_files import write_whole
+
+_PCD_ROW = np.dtype(
+    [
+        *(("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")),
+        *(("ring", "<i4"), ("time_offset_ns", "<i4")),
+    ]
+)
+
+
+def write_pcd(path: Path, sweep: Sweep, points: SweepPoints) -> None:
+    """Write a sweep as binary PCD 0.7, folders included.
+
+    Raises:
+        WriteError: the disk refuses.
+    """
+    table = np.zeros(points.num_points, dtype=_PCD_ROW)
+    for axis, column in zip("xyz", points_lidar(sweep, points).unbind(1), strict=True):
+        table[axis] = column.numpy()
+    table["intensity"] = points.intensity.numpy()
+    table["ring"] = points.ring.numpy()
+    table["time_offset_ns"] = points.time_offset_ns.numpy()
+    kinds = [_PCD_ROW[name].kind.upper() for name in _PCD_ROW.names or ()]
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format",
+        "VERSION 0.7",
+        f"FIELDS {' '.join(_PCD_ROW.names or ())}",
+        f"SIZE {' '.join('4' for _ in kinds)}",
+        f"TYPE {' '.join(kinds)}",
+        f"COUNT {' '.join('1' for _ in kinds)}",
+        f"WIDTH {len(table)}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {len(table)}",
+        "DATA binary",
+    )
+    write_whole(path, ("\n".join(header) + "\n").encode("ascii") + table.tobytes())
+
+
+def write_pcd_bin(path: Path, sweep: Sweep, points: SweepPoints) -> None:
+    """Write a sweep as nuScenes does: float32 x, y, z, intensity, ring, and nothing else.
+
+    Raises:
+        WriteError: the disk refuses.
+    """
+    columns = [points.intensity[:, None], points.ring.float()[:, None]]
+    table = torch.cat([points_lidar(sweep, points), *columns], dim=1)
+    write_whole(path, table.numpy().astype("<f4").tobytes())
+
+
+def points_lidar(sweep: Sweep, points: SweepPoints) -> torch.Tensor:
+    """The points in the frame of their sensor, float32."""
+    lidar_from_world = invert_rigid(sweep.world_from_lidar.double())
+    return transform_points(lidar_from_world, points.xyz_m.double()).float()

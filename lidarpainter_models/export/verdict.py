@@ -1,0 +1,75 @@
+"""What is good and what is bad about a scene, in sentences that follow from its figures."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from lidarpainter_models.evaluation.score_tables import DEPTH, fitted_on
+
+CLOSE_DB, FAIR_DB = 30.0, 26.0
+"""From here on a view is close to its photograph, or good but soft; measured streets lie between
+25 and 33 dB."""
+WORSE_DB = 1.0
+"""Actors that lie so far below the whole image are named."""
+SOUND_DEPTH, WEAK_DEPTH = 0.95, 0.85
+"""Part of LiDAR pixels that a sound surface meets, and one that is torn."""
+TELLING = 0.005
+"""Smaller changes of that part are noise between runs."""
+
+
+def verdict(result: Mapping[str, Any]) -> list[str]:
+    """Sentences about recorded views, views aside, and actors; `result` is that of a run."""
+    if result.get("recorded") is None:
+        return ["Nobody judged this scene: `lidarpainter evaluate` does."]
+    return [
+        sentence
+        for sentence in (_recorded(result["recorded"]), _aside(result), _actors(result["recorded"]))
+        if sentence
+    ]
+
+
+def _recorded(scores: Mapping[str, Any]) -> str:
+    psnr = scores.get("psnr")
+    if psnr is None:
+        return "No frame was held back, so nothing says how it shows what it has not seen."
+    if psnr >= CLOSE_DB:
+        words = "Good: along the recorded path it is close to photographs it never saw"
+    elif psnr >= FAIR_DB:
+        words = "Fair: along the recorded path it shows what is there, fine detail is soft"
+    else:
+        words = "Poor: even along the recorded path it is blurred or torn"
+    return f"{words} ({psnr:.1f} dB over {scores['num_views']} held-out views)."
+
+
+def _aside(result: Mapping[str, Any]) -> str:
+    depths = {name: values.get(DEPTH) for name, values in (result.get("novel") or {}).items()}
+    known = {name: value for name, value in depths.items() if value is not None}
+    if not known:
+        return "Beside the path nothing measured it."
+    worst = min(known, key=lambda name: known[name])
+    part = known[worst]
+    if part >= SOUND_DEPTH:
+        words = "Good: surfaces hold wherever it was tried"
+    elif part >= WEAK_DEPTH:
+        words = "Fair: surfaces beside the path hold, with holes"
+    else:
+        words = "Poor: surfaces beside the path tear"
+    sentence = f"{words}; worst is {worst}, where {part:.0%} of LiDAR pixels are met"
+    before = ((result.get("unpainted") or {}).get("novel") or {}).get(worst, {}).get(DEPTH)
+    if before is None or fitted_on(result["painter"]) == "refined":
+        return f"{sentence}."
+    gain = part - before
+    if abs(gain) < TELLING:
+        return f"{sentence}; painting changed nothing there."
+    did = "helped" if gain > 0 else "made it worse"
+    return f"{sentence}; painting {did} there ({before:.0%} before)."
+
+
+def _actors(scores: Mapping[str, Any]) -> str:
+    inside, whole = scores.get("actors_psnr"), scores.get("psnr")
+    if inside is None or whole is None:
+        return "No moving actor was judged."
+    if whole - inside > WORSE_DB:
+        return (
+            f"Weak: moving actors are worse than the street ({inside:.1f} against {whole:.1f} dB)."
+        )
+    return f"Good: moving actors are as sharp as the street ({inside:.1f} against {whole:.1f} dB)."

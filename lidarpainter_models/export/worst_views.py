@@ -1,0 +1,44 @@
+"""The held-out views that a scene shows worst, so that nobody has to look for them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.evaluation.held_out import HeldOut
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.metrics.images import score_image
+from lidarpainter_models.scenes.records import RecordedView
+
+MOST_LOOKED_AT = 24
+"""Views that are rendered for it, spread over all."""
+NUM_SHOWN = 3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WorstView:
+    """One of them beside what was recorded."""
+
+    title: str
+    rendered_rgb: Float[Tensor, "height width 3"]
+    truth_rgb: Float[Tensor, "height width 3"]
+
+
+def worst_views(held_out: HeldOut, fitted: GaussianScene) -> list[WorstView]:
+    """Those of the least PSNR at interpolated poses, worst first."""
+    looked_at = _spread(held_out.test_views, MOST_LOOKED_AT)
+    found: list[tuple[float, WorstView]] = []
+    for view in looked_at:
+        camera = held_out.camera_of(fitted, view, "interpolated")
+        rendered = fitted.render(camera, view.timestamp_ns, camera_name=view.camera_name)
+        rgb, truth = rendered.rgb.clamp(0, 1).cpu(), held_out.image_of(view)
+        psnr = score_image(rgb, truth).psnr_db
+        title = f"frame {view.frame_index}, {view.camera_name}: {psnr:.1f} dB"
+        found.append((psnr, WorstView(title=title, rendered_rgb=rgb, truth_rgb=truth)))
+        found = sorted(found, key=lambda pair: pair[0])[:NUM_SHOWN]
+    return [view for _, view in found]
+
+
+def _spread(views: Sequence[RecordedView], most: int) -> Sequence[RecordedView]:
+    return views[:: max(-(-len(views) // most), 1)]

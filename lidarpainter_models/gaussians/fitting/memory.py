@@ -1,0 +1,97 @@
+"""What memory a fit takes on its device, told before it begins.
+
+Bytes of what is kept are counted; those of a step are what its parts were seen to take, rounded up.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from lidarpainter_models.gaussians.fitting.config import FitConfig
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.kernels.sky_texture import SkyLayout
+from lidarpainter_models.kernels.sparse_adam.state import VECTOR
+from lidarpainter_models.observations.views import GuidanceView, SceneObservations
+
+FLOAT = 4
+"""Bytes of a number."""
+IMAGE_BYTES, GUIDANCE_BYTES = 17, 20
+"""Of a pixel: colour, depth and kind of a recorded image; colour, weight and depth of a painted."""
+HALF_IMAGES = 0.25
+"""Of a full image's pixels."""
+TEXEL_BYTES = 44
+"""Of the sky: colour, weight, moments and visits."""
+STEP_FLOATS_PER_PIXEL = 60
+"""Of images, terms and their gradients that live at once, most of them SSIM's."""
+STEP_FLOATS_PER_TEXEL = 16
+"""Gradients of the sky, and what its Adam works with."""
+RASTER_BYTES_PER_GAUSSIAN = 512
+"""Projected Gaussians, their gradients, and entries of about eight tiles each, sorted."""
+ROW_BYTES = 48
+"""Of a Gaussian: its body, block, place among blocks, tallies and last step."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitMemory:
+    """Bytes on the device of a fit at its largest."""
+
+    gaussians: int
+    """Parameters and the optimiser's moments."""
+    sky: int
+    images: int
+    """Recorded and painted, where they are kept there."""
+    step: int
+    """One step: leaves, gradients, images under way."""
+    rasteriser: int
+
+    @property
+    def total(self) -> int:
+        """All of it."""
+        return self.gaussians + self.sky + self.images + self.step + self.rasteriser
+
+    def told(self) -> str:
+        """In words, such as `2.1 GB (Gaussians 0.9, images 0.5, ...)`."""
+        parts = ("gaussians", "sky", "images", "step", "rasteriser")
+        shares = ", ".join(f"{name} {getattr(self, name) / 1e9:.2f}" for name in parts)
+        return f"{self.total / 1e9:.2f} GB ({shares})"
+
+
+def planned_memory(
+    observations: SceneObservations,
+    config: FitConfig,
+    sky: SkyLayout,
+    *,
+    start: GaussianSet | None = None,
+    guidance: Sequence[GuidanceView] = (),
+    keeps_images: bool = True,
+) -> FitMemory:
+    """What a fit takes when it has as many Gaussians as it may have and all are in view.
+
+    Args:
+        observations: what it is fitted to.
+        config: see there.
+        sky: texels of its sky.
+        start: Gaussians it goes on from; they may be more than the budget.
+        guidance: painted views.
+        keeps_images: whether images lie on the device, or are sent there one by one.
+    """
+    at_first = config.initialisation.num_gaussians if start is None else len(start)
+    degree = config.initialisation.sh_degree if start is None else start.sh_degree
+    count = max(at_first, config.densification.budget)
+    columns = 11 + 3 * (degree + 1) ** 2
+    padded = columns + -columns % VECTOR
+    pixels = [view.camera.width_px * view.camera.height_px for view in observations.views]
+    painted = [view.camera.width_px * view.camera.height_px for view in guidance]
+    kept = sum(pixels) * (1 + HALF_IMAGES * bool(config.half_resolution)) * IMAGE_BYTES
+    texels = sky.rows * sky.columns
+    return FitMemory(
+        gaussians=count * (FLOAT * (columns + 2 * padded) + ROW_BYTES),
+        sky=texels * TEXEL_BYTES,
+        images=round(kept + sum(painted) * GUIDANCE_BYTES) if keeps_images else 0,
+        step=FLOAT
+        * (
+            count * (3 * columns + 4 * padded)
+            + max([*pixels, *painted]) * STEP_FLOATS_PER_PIXEL
+            + texels * STEP_FLOATS_PER_TEXEL
+        ),
+        rasteriser=count * RASTER_BYTES_PER_GAUSSIAN,
+    )

@@ -1,0 +1,96 @@
+"""What a scene stores of its style: which, and what the place knows of lamps, windows and light.
+
+Everything else follows from the Gaussians as they are, so an edited scene keeps its style. World:
+z up, metres; light is linear, in units of display white.
+"""
+
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lidarpainter_models.weather.mix import StyleMix, StyleShare
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StyledPlace:
+    """Found once in views from all along the path; the same for every style."""
+
+    white: Float[Tensor, ""]
+    """Daylight of sunlit surfaces."""
+    horizon_light: Float[Tensor, "3"]
+    """Of the clear sky, just above the horizon."""
+    lamp_position: Float[Tensor, "lamps 3"]
+    """Street lamps and signals."""
+    lamp_rgb: Float[Tensor, "lamps 3"]
+    lamp_power: Float[Tensor, " lamps"]
+    """Irradiance a metre away."""
+    lamp_radiance: Float[Tensor, " lamps"]
+    window_centre: Float[Tensor, "windows 3"]
+    """Of lit windows."""
+    window_along: Float[Tensor, "windows 3"]
+    """Level unit vectors along their sills."""
+    window_half_m: Float[Tensor, "windows 2"]
+    """Half of width and height."""
+    ego_times_ns: Int[Tensor, " frames"]
+    """Ascending: the frames of the log."""
+    ego_lamp: Float[Tensor, "frames 3"]
+    """Between the headlamps of the car that recorded."""
+    ego_heading: Float[Tensor, "frames 3"]
+    """Level unit vectors."""
+
+    def progress(self, timestamp_ns: int) -> float:
+        """Share of the log's time that has passed."""
+        first_ns, last_ns = int(self.ego_times_ns[0]), int(self.ego_times_ns[-1])
+        return (timestamp_ns - first_ns) / max(last_ns - first_ns, 1)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything to be stored."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def to(self, device: torch.device | str) -> "StyledPlace":
+        """The same on another device."""
+        return type(self)(**{name: value.to(device) for name, value in self.tensors().items()})
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneStyle:
+    """A style as part of a scene."""
+
+    mix: StyleMix
+    seed: int
+    """Decides where puddles stand."""
+    place: StyledPlace
+
+    def strengths(self, timestamp_ns: int) -> dict[str, float]:
+        """The strength of every style that changes anything at a time."""
+        return self.mix.strengths(self.place.progress(timestamp_ns))
+
+    def to(self, device: torch.device | str) -> "SceneStyle":
+        """The same on another device."""
+        return replace(self, place=self.place.to(device))
+
+    def metadata(self) -> dict[str, Any]:
+        """All but the tensors, as JSON types."""
+        shares = [[share.prompt, share.first, share.last] for share in self.mix.shares]
+        return {"shares": shares, "visibility_m": self.mix.visibility_m, "seed": self.seed}
+
+
+def style_from_arrays(arrays: dict[str, Tensor], metadata: dict[str, Any]) -> SceneStyle:
+    """Rebuild a stored style.
+
+    Raises:
+        KeyError, TypeError: something is missing or too much.
+        ConfigError: it holds a style that there is not.
+    """
+    shares = tuple(
+        StyleShare(prompt=str(prompt), first=float(first), last=float(last))
+        for prompt, first, last in metadata["shares"]
+    )
+    return SceneStyle(
+        mix=StyleMix(shares=shares, visibility_m=float(metadata["visibility_m"])),
+        seed=int(metadata["seed"]),
+        place=StyledPlace(**arrays),
+    )

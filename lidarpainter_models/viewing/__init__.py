@@ -1,0 +1,1 @@
+"""A fitted drive in a browser, drawn by viser: its nodes, and the live viewer around them."""

@@ -1,0 +1,109 @@
+"""A drive as nodes of a viser scene, seen from the seat: the viewer's frame rides along.
+
+Not the browser's camera moves along the path but the world below it, so that a person who looks
+aside, or steps aside, keeps doing so while the drive goes on. Seat frame: x forward, y left, z up,
+origin at the camera; it is the browser's world.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+import viser
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.conditioning.followed_paths import FollowedPath
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.transforms import rigid_from_rotation
+from lidarpainter_models.viewing.annotations import TrackNodes, vertical_fov_rad
+from lidarpainter_models.viewing.scene_nodes import SceneNodes, place_node
+from lidarpainter_models.viewing.sky_panels import SKY_M
+
+ROOT = "/drive"
+SEAT_FROM_CAMERA = rigid_from_rotation(
+    torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), torch.zeros(3)
+).double()
+LOOK_AHEAD_M = 10.0
+"""What one turns around on a drag of the mouse lies so far ahead."""
+FAR_M = 4 * SKY_M
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ShownDrive:
+    """What can be shown of a run."""
+
+    path: FollowedPath
+    """The recorded path of one camera."""
+    scenes: Mapping[str, Callable[[], GaussianScene]]
+    """Opened when first shown, by the names that people choose from; the first is the path's own
+    and shown first."""
+
+    @property
+    def camera_name(self) -> str:
+        """Whose path is followed."""
+        return self.path.views[0].camera_name
+
+    def recorded_cameras(self) -> list[tuple[Camera, int]]:
+        """Where the followed camera stood at every moment, and when."""
+        return [
+            (self.path.camera(number), view.timestamp_ns)
+            for number, view in enumerate(self.path.views)
+        ]
+
+
+class DriveNodes:
+    """The nodes of a drive, one moment at a time."""
+
+    def __init__(self, server: viser.ViserServer, drive: ShownDrive) -> None:
+        """Send everything but scenes; those are sent when they are first shown."""
+        self._api, self._drive = server.scene, drive
+        self._cameras = drive.recorded_cameras()
+        self._scenes: dict[str, SceneNodes] = {}
+        self._api.configure_default_lights(False)
+        self._api.configure_environment_map(None)
+        self._world = self._api.add_frame(ROOT, show_axes=False)
+        self.tracks = TrackNodes(self._api, ROOT, drive.path.builder.scene.tracks)
+        self.with_actors = True
+        self.show_scene(next(iter(drive.scenes)))
+        look_forward(server.initial_camera, self._cameras[0][0])
+
+    def show_scene(self, name: str) -> None:
+        """Show another of the drive's scenes; it is sent when it is first asked for."""
+        if name not in self._scenes:
+            self._scenes[name] = SceneNodes(
+                self._api,
+                f"{ROOT}/{name}",
+                self._drive.scenes[name](),
+                self._cameras,
+                self._drive.camera_name,
+            )
+        self._shown = self._scenes[name]
+        for nodes in self._scenes.values():
+            nodes.visible = nodes is self._shown
+
+    def place(self, timestamp_ns: int, seat: Camera) -> None:
+        """Show a moment from a seat.
+
+        Args:
+            timestamp_ns: when the actors stand where they are shown.
+            seat: the camera in whose place the browser's viewer sits.
+        """
+        self._shown.with_actors = self.with_actors
+        self._shown.place(timestamp_ns, seat.centre_world)
+        self.tracks.place(self._drive.path.builder.scene.actors.likely_poses(timestamp_ns))
+        place_node(self._world, seat_from_world(seat))
+
+
+def seat_from_world(seat: Camera) -> Float[Tensor, "4 4"]:
+    """The world as it lies before somebody in the place of a camera."""
+    return SEAT_FROM_CAMERA @ seat.camera_from_world
+
+
+def look_forward(view: viser.InitialCameraConfig | viser.CameraHandle, lens: Camera) -> None:
+    """Look from the seat straight ahead, as wide as the lens."""
+    view.position = (0.0, 0.0, 0.0)
+    view.look_at = (LOOK_AHEAD_M, 0.0, 0.0)
+    view.fov = vertical_fov_rad(lens)
+    view.far = FAR_M

@@ -1,0 +1,249 @@
+"""The live viewer: a drive in a browser on this machine, with a panel that moves it.
+
+Time goes in recorded moments. Callbacks come from viser's threads, so what is shown is changed
+under one lock.
+"""
+
+import math
+import re
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+
+import torch
+import viser
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.evaluation.shown import ShownScene, ViewTimePainting
+from lidarpainter_models.export.images import to_bytes
+from lidarpainter_models.geometry.boxes import first_box_hit
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+from lidarpainter_models.geometry.transforms import (
+    invert_rigid,
+    rigid_from_rotation,
+    rotation_from_quaternion,
+)
+from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
+from lidarpainter_models.scenes.tracks import ActorTrack
+from lidarpainter_models.viewing.annotations import LidarNodes, RigNodes
+from lidarpainter_models.viewing.controls import ASIDE, CLICK_HINT, FREE, add_controls
+from lidarpainter_models.viewing.drive_nodes import (
+    ROOT,
+    DriveNodes,
+    ShownDrive,
+    look_forward,
+    seat_from_world,
+)
+from lidarpainter_models.viewing.servers import local_server
+
+FRUSTUM_PX = 240
+"""Width of a recorded image in its frustum."""
+MOST_POINTS = 60_000
+"""LiDAR points of a sweep that are shown."""
+PAUSED_S = 0.1
+"""How often a standing viewer looks whether it is to play."""
+
+
+class LiveViewer:
+    """A drive, its nodes and its panel."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        drive: ShownDrive,
+        painting: ViewTimePainting | None = None,
+    ) -> None:
+        """Send the drive's first moment, and answer the panel from now on.
+
+        Args:
+            server: where it is shown.
+            drive: what is shown.
+            painting: who paints the own renderer's images if asked; None never paints.
+        """
+        self._server, self._drive, self._painting = server, drive, painting
+        self._lock = threading.RLock()
+        self._nodes = DriveNodes(server, drive)
+        self._rig = RigNodes(server.scene, f"{ROOT}/cameras")
+        self._lidar = LidarNodes(server.scene, f"{ROOT}/lidar")
+        self._seat = drive.path.camera(0)
+        server.gui.configure_theme(show_share_button=False, show_logo=False)
+        self.controls = add_controls(
+            server.gui, num_moments=len(drive.path.views), scenes=list(drive.scenes)
+        )
+        self.controls.painted.disabled = painting is None
+        self.controls.on_change(self.show)
+        self.controls.straighten.on_click(lambda event: self._straighten(event.client))
+        self.controls.render.on_click(lambda event: self._render(event.client))
+        server.scene.on_click()(self._pick)
+        self.show()
+
+    def show(self) -> None:
+        """Show what the panel says."""
+        with self._lock, self._server.atomic():
+            wanted = self.controls
+            view = self._drive.path.views[self._moment]
+            if wanted.seat.value != FREE:
+                self._seat = self._camera_aside()
+            self._nodes.show_scene(wanted.scene.value)
+            self._nodes.with_actors = wanted.actors.value
+            self._nodes.tracks.boxes.visible = wanted.boxes.value
+            self._nodes.tracks.tracks.visible = wanted.tracks.value
+            self._nodes.place(view.timestamp_ns, self._seat)
+            self._rig.root.visible = wanted.cameras.value
+            if wanted.cameras.value:
+                self._place_rig(view.frame_index)
+            self._lidar.cloud.visible = wanted.lidar.value
+            if wanted.lidar.value and self._drive.path.recorded.sweeps_of(view.frame_index):
+                points = self._drive.path.recorded.read_points(view.frame_index).xyz_m
+                every = max(-(-len(points) // MOST_POINTS), 1)
+                self._lidar.place(points[::every], self._seat.centre_world)
+
+    def play(self, stopped: threading.Event) -> None:
+        """Let time go on while `play` is ticked, and begin again after the last moment."""
+        while not stopped.is_set():
+            if not self.controls.play.value:
+                stopped.wait(PAUSED_S)
+                continue
+            speed = float(self.controls.speed.value.rstrip("x"))
+            views = self._drive.path.views
+            after = (self._moment + 1) % len(views)
+            pause_ns = max(views[after].timestamp_ns - views[self._moment].timestamp_ns, 0)
+            stopped.wait(pause_ns * 1e-9 / speed)
+            self.controls.moment.value = after  # type: ignore[misc]  # it has a setter
+
+    def own_image(
+        self, view: viser.CameraHandle, *, painted: bool
+    ) -> Float[Tensor, "height width 3"]:
+        """What our own renderer shows from where a browser looks."""
+        with self._lock:
+            camera = self._camera_of(view)
+            moment = self._drive.path.views[self._moment]
+            scene = self._drive.scenes[self.controls.scene.value]()
+            shown = ShownScene(scene=scene, painting=self._painting if painted else None)
+            render = shown.renderer(self._drive.camera_name)
+            return render(camera, moment.timestamp_ns).clamp(0, 1)
+
+    @property
+    def _moment(self) -> int:
+        return min(self.controls.moment.value, len(self._drive.path.views) - 1)
+
+    def _camera_aside(self) -> Camera:
+        """The followed camera at the moment, moved as the panel says."""
+        wanted, path = self.controls, self._drive.path
+        if wanted.seat.value == ASIDE:
+            spec = f"lateral:{wanted.left_m.value:g}+up:{wanted.up_m.value:g}"
+            path = replace(path, trajectory=parse_trajectory(spec))
+        return path.camera(self._moment)
+
+    def _place_rig(self, frame_index: int) -> None:
+        path, scene = self._drive.path, self._drive.path.builder.scene
+        size = replace(path.observation, width_px=FRUSTUM_PX)
+        for view in path.recorded.views:
+            if view.frame_index != frame_index:
+                continue
+            camera = scene.corrected_camera(
+                fit_camera(view, size),
+                timestamp_ns=view.timestamp_ns,
+                camera_name=view.camera_name,
+                key=view.key,
+            )
+            rgb_u8 = shrink_image(
+                path.recorded.read_image(view),
+                width_px=camera.width_px,
+                height_px=camera.height_px,
+            )
+            self._rig.place(view.camera_name, camera, rgb_u8)
+        in_the_way = self._drive.camera_name if self.controls.seat.value == "recorded" else None
+        names = path.recorded.camera_names
+        self._rig.show_only([name for name in names if name != in_the_way])
+
+    def _camera_of(self, view: viser.CameraHandle) -> Camera:
+        """Where a browser looks from, in the world, as wide as the images of the fit."""
+        rotation = rotation_from_quaternion(torch.from_numpy(view.wxyz).double())
+        seat_from_view = rigid_from_rotation(rotation, torch.from_numpy(view.position).double())
+        width_px = self._seat.width_px
+        height_px = max(round(width_px / view.aspect), 1)
+        focal_px = height_px / 2 / math.tan(view.fov / 2)
+        return Camera(
+            world_from_camera=self._world_from_seat @ seat_from_view,
+            fx_px=focal_px,
+            fy_px=focal_px,
+            cx_px=width_px / 2,
+            cy_px=height_px / 2,
+            width_px=width_px,
+            height_px=height_px,
+        )
+
+    @property
+    def _world_from_seat(self) -> Float[Tensor, "4 4"]:
+        return invert_rigid(seat_from_world(self._seat))
+
+    def _straighten(self, client: viser.ClientHandle | None) -> None:
+        """Sit down again, after having looked around."""
+        for one in [client] if client else self._server.get_clients().values():
+            look_forward(one.camera, self._drive.path.camera(0))
+
+    def _render(self, client: viser.ClientHandle | None) -> None:
+        if client is not None:
+            rgb = self.own_image(client.camera, painted=self.controls.painted.value)
+            self.controls.own_image.image = to_bytes(rgb)
+            self.controls.own_image.visible = True
+
+    def _pick(self, event: viser.SceneClickEvent) -> None:
+        """Say what was clicked on."""
+        with self._lock:
+            track = self._track_hit(event.ray_origin, event.ray_direction)
+            self.controls.picked.content = CLICK_HINT if track is None else _in_words(track)
+
+    def _track_hit(
+        self, origin_seat: Sequence[float], direction_seat: Sequence[float]
+    ) -> ActorTrack | None:
+        """The actor whose box a ray of the seat's frame meets first."""
+        actors = self._drive.path.builder.scene.actors
+        moment = self._drive.path.views[self._moment]
+        world_from_actors, present = actors.likely_poses(moment.timestamp_ns)
+        there = [actors.recorded_tracks[row] for row in present.nonzero()[:, 0].tolist()]
+        if not there:
+            return None
+        rotation, centre = self._world_from_seat[:3, :3], self._world_from_seat[:3, 3]
+        hit = first_box_hit(
+            rotation @ torch.tensor(origin_seat).double() + centre,
+            rotation @ torch.tensor(direction_seat).double(),
+            world_from_actors[present > 0],
+            torch.stack([track.size_m for track in there]),
+        )
+        return None if hit is None else there[hit]
+
+
+def _in_words(track: ActorTrack) -> str:
+    length_m, width_m, height_m = track.size_m.tolist()
+    return (
+        f"**{_plain(track.category)}**, id `{_plain(track.actor_id)}`, {length_m:.1f} m long, "
+        f"{width_m:.1f} m wide, {height_m:.1f} m high"
+    )
+
+
+def _plain(name: str) -> str:
+    """A dataset's name without what Markdown and HTML would make something of."""
+    return re.sub(r"[^\w .:-]+", " ", name)
+
+
+@contextmanager
+def live_viewer(
+    drive: ShownDrive,
+    painting: ViewTimePainting | None,
+    *,
+    label: str,
+    port: int | None,
+) -> Iterator[tuple[LiveViewer, str]]:
+    """A viewer and its address, for as long as the block runs.
+
+    Raises:
+        ConfigError: the port is in use or not allowed.
+    """
+    with local_server(label=label, port=port) as server:
+        viewer = LiveViewer(server, drive, painting)
+        yield viewer, f"http://{server.get_host()}:{server.get_port()}"

@@ -1,0 +1,1 @@
+"""What weather and night physically are, for pictures and for Gaussians alike: laws and names."""

@@ -1,0 +1,1 @@
+"""Stages that change a finished run."""

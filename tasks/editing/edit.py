@@ -1,0 +1,193 @@
+"""Edit a finished run: who is where, mended where somebody was, masked for painters."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from catalog.artefacts import Workplace
+from catalog.digests import digest_file
+from catalog.store import Store, open_store
+from lidarpainter_models.conditioning.scene_styles import styled_scene
+from lidarpainter_models.conditioning.settings import ConditionConfig
+from lidarpainter_models.editing.actor_models import ActorModel
+from lidarpainter_models.editing.edits import Encounter, edited, encounters
+from lidarpainter_models.editing.filled_scenes import filled, masked_observations
+from lidarpainter_models.editing.motions import LogTimes
+from lidarpainter_models.editing.operations import (
+    ActorSource,
+    Insert,
+    Move,
+    Operation,
+    Style,
+    Swap,
+)
+from lidarpainter_models.editing.worlds import EditedWorld
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene, describe
+from lidarpainter_models.gaussians.model.ply_files import read_ply
+from lidarpainter_models.geometry.driven_paths import DrivenPath
+from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+from lidarpainter_models.painter.selection import NO_PAINTER, PainterChoice
+from lidarpainter_models.storage.tensor_files import write_tensors
+from tasks.opened import open_scene
+from tasks.progress import Progress
+from tasks.runs import FinishedRun, open_run
+from tasks.stored import load_observations, load_scene, save_observations, save_scene
+
+FILLED_FILE = "filled.safetensors"
+"""Confidence of the last Gaussians of the scene, which were filled in."""
+CATEGORY = "car"
+"""Of what comes from a file, which does not say."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Edits:
+    """What is done to a run; everything is read when it is first asked for."""
+
+    store: Store
+    source: FinishedRun
+    operations: tuple[Operation, ...]
+
+    @property
+    def inputs(self) -> dict[str, str]:
+        """Digests of what is read beside the run's artefacts, by the part it plays."""
+        found = {"scene": open_scene(self.store, self.source.scene_id).content_digest}
+        for number, operation in enumerate(self.operations, start=1):
+            if isinstance(operation, Insert | Swap):
+                found |= _digests(f"actor-{number}", self._donor(operation.source))
+            if isinstance(operation, Insert | Move):
+                way = parse_trajectory(operation.trajectory, max_shift_m=None)
+                found |= {f"waypoints-{number}": digest_file(path) for path in way.files}
+        return found
+
+    def world(self) -> EditedWorld:
+        """The run as it is before them."""
+        return opened_world(self.store, self.source)
+
+    def models(self) -> Mapping[ActorSource, ActorModel]:
+        """What actors of other runs and of files look like."""
+        sources = [one.source for one in self.operations if isinstance(one, Insert | Swap)]
+        return {source: self._model(source) for source in sources if source.run or source.ply}
+
+    def _donor(self, source: ActorSource) -> "FinishedRun | str | None":
+        """The run or the file that an actor comes from; None is the edited run itself."""
+        if source.ply is not None:
+            return source.ply
+        if source.run is None:
+            if source.store is not None:
+                raise ConfigError("a store without a run, expected both or neither")
+            return None
+        return open_run(self._store_of(source), source.run)
+
+    def _model(self, source: ActorSource) -> ActorModel:
+        donor = self._donor(source)
+        if isinstance(donor, FinishedRun):
+            world = opened_world(self._store_of(source), donor)
+            return world.model_of(world.find(str(source.actor)))
+        return ActorModel.of_gaussians(read_ply(_file(str(donor))), CATEGORY)
+
+    def _store_of(self, source: ActorSource) -> Store:
+        return self.store if source.store is None else open_store(source.store)
+
+
+def opened_world(store: Store, run: FinishedRun) -> EditedWorld:
+    """A finished run, ready to be edited."""
+    scene = open_scene(store, run.scene_id)
+    seen = load_observations(store, run.final.observations)
+    # what is mended is mended by day
+    fitted = replace(load_scene(store, run.final.gaussians), style=None)
+    bodies = {track.actor_id for track in fitted.actors.recorded_tracks}
+    ego = DrivenPath(timestamps_ns=scene.frame_timestamps_ns, world_from_body=scene.world_from_ego)
+    return EditedWorld(
+        scene=fitted,
+        fitted=fitted,
+        lidar_map=seen.lidar_map,
+        views=seen.views,
+        parked=tuple(
+            track for track in scene.tracks if not track.is_moving and track.actor_id not in bodies
+        ),
+        log=LogTimes(ego=ego),
+    )
+
+
+def checked_encounters(edits: Edits) -> list[Encounter]:
+    """Do the edits once, keep nothing, and say what those who were moved run into.
+
+    Raises:
+        ConfigError: an operation cannot be done.
+    """
+    return encounters(edited(edits.world(), edits.operations, edits.models()))
+
+
+def edit_build(
+    edits: Edits, conditions: ConditionConfig, painter: PainterChoice, device: torch.device
+) -> partial[dict[str, Any]]:
+    """Writes the edited scene."""
+    return partial(_build, edits=edits, conditions=conditions, painter=painter, device=device)
+
+
+def observations_build(edits: Edits) -> partial[dict[str, Any]]:
+    """Writes what may be seen of it."""
+    return partial(_build_observations, edits=edits)
+
+
+def _build(
+    place: Workplace,
+    _progress: Progress,
+    *,
+    edits: Edits,
+    conditions: ConditionConfig,
+    painter: PainterChoice,
+    device: torch.device,
+) -> dict[str, Any]:
+    world = edited(edits.world(), edits.operations, edits.models())
+    paints = painter.name != NO_PAINTER
+    found = filled(world, conditions, painter.load(device) if paints else None)
+    scene = _styled(found.scene, edits)
+    save_scene(place.output, scene, [])
+    write_tensors(place.output / FILLED_FILE, {"confidence": found.confidence}, {})
+    mean = float(found.confidence.mean()) if len(found.confidence) else None
+    return describe(scene) | {
+        "num_filled": len(found.confidence),
+        "num_filled_ground": found.num_ground,
+        "mean_filled_confidence": mean,
+        "encounters": [str(one) for one in encounters(world)],
+    }
+
+
+def _styled(scene: GaussianScene, edits: Edits) -> GaussianScene:
+    """The edited scene in the style that it is put in, or else in that of its source."""
+    store, final = edits.store, edits.source.final
+    style = next((one for one in reversed(edits.operations) if isinstance(one, Style)), None)
+    if style is None:
+        return replace(scene, style=load_scene(store, final.gaussians).style)
+    seen, recorded = load_observations(store, final.observations), edits.source.scene_id
+    return styled_scene(scene, seen, open_scene(store, recorded), style.mix, seed=style.seed)
+
+
+def _build_observations(place: Workplace, _progress: Progress, *, edits: Edits) -> dict[str, Any]:
+    world = edited(edits.world(), edits.operations, edits.models())
+    seen = masked_observations(world)
+    save_observations(place.output, seen)
+    hidden = [float(view.hidden.float().mean()) for view in seen.views if view.hidden is not None]
+    return {"num_views": len(seen.views), "hidden_share": sum(hidden) / max(len(hidden), 1)}
+
+
+def _digests(part: str, donor: FinishedRun | str | None) -> dict[str, str]:
+    if donor is None:
+        return {}
+    if isinstance(donor, str):
+        return {part: digest_file(_file(donor))}
+    seen, fitted = donor.final.observations, donor.final.gaussians
+    return {part: fitted.digest, f"{part}-observations": seen.digest}
+
+
+def _file(name: str) -> Path:
+    path = Path(name)
+    if not path.is_file():
+        raise ConfigError(f"no file {name}, expected Gaussians as PLY")
+    return path

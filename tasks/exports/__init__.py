@@ -1,0 +1,1 @@
+"""Stages that write a finished run as files of other programs."""

@@ -1,0 +1,135 @@
+"""A finished run in a browser: as a page that plays it from the disk, or live."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import lidarpainter_models
+from catalog.store import open_store
+from lidarpainter_models.conditioning.followed_paths import FollowedPath
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.geometry.trajectory_specs import Trajectory, parse_trajectory
+from lidarpainter_models.geometry.trajectory_words import RECORDED
+from lidarpainter_models.storage.whole_files import write_whole
+from tasks.evaluation.shown import view_time_painting
+from tasks.opened import opened
+from tasks.progress import listener
+from tasks.specs import FittedRef, RunSpec
+from tasks.stages import stage_task
+from tasks.stored import load_scene
+from tasks.views.render import RenderRequest, followed_path
+
+if TYPE_CHECKING:
+    from lidarpainter_models.viewing.drive_nodes import ShownDrive
+
+STAGE = "page"
+BESIDE = ("lateral:2", "lateral:-2", RECORDED)
+"""Where the page drives after the recorded path, if nothing else is asked for: the first of these
+that leads into no wall."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveRequest:
+    """What of a run is shown in a browser."""
+
+    view: RenderRequest
+    """Whose path is followed, and where to; unpainted."""
+    scenes: dict[str, FittedRef]
+    """Fitted scenes by the names that people choose from; the first is shown first."""
+
+
+@stage_task
+def write_page(run: RunSpec, request: DriveRequest, out: Path) -> dict[str, Any]:
+    """Write a page that drives the recorded path, then the one asked for or one beside it.
+
+    Raises:
+        SceneError: the run did not train on that camera, or no frame is left.
+        ConfigError: the path leads into a wall.
+        WriteError: the file cannot be written.
+    """
+    from lidarpainter_models.export.page import PageNotes
+    from lidarpainter_models.viewing.recording import Leg, recorded_page
+
+    drive = shown_drive(run, request)
+    trajectory = request.view.trajectory
+    aside = _beside(drive.path) if trajectory.is_recorded else trajectory
+    recorded = drive.path.recorded
+    name = f"{recorded.dataset}/{recorded.sequence}"
+    notes = PageNotes(
+        title=f"LidarPainter: {name}",
+        licence=recorded.manifest["licence"],
+        software=f"lidarpainter {lidarpainter_models.__version__}",
+    )
+    legs = [Leg(title=f"{name}, recorded", trajectory=parse_trajectory(RECORDED))]
+    if not aside.is_recorded:
+        legs.append(Leg(title=f"{name}, {aside.spec}", trajectory=aside))
+    listener().started(STAGE)
+    page = recorded_page(
+        drive,
+        legs,
+        notes,
+        progress=lambda done, total: listener().advanced(STAGE, done, total, ""),
+    )
+    write_whole(out, page.encode("utf-8"))
+    return {"path": str(out), "bytes": len(page), "num_moments": len(drive.path.views)}
+
+
+def view_live(
+    run: RunSpec,
+    request: DriveRequest,
+    *,
+    port: int | None,
+    opened_at: Callable[[str], None],
+    stopped: threading.Event,
+) -> None:
+    """Show a drive in a browser until stopped; tells its address when it is there.
+
+    Raises:
+        SceneError: the run did not train on that camera, or no frame is left.
+        ConfigError: the port is in use or not allowed.
+    """
+    from lidarpainter_models.viewing.viewer import live_viewer
+
+    this = opened(run)
+    fitted = next(iter(request.scenes.values()))
+    painting = view_time_painting(
+        this.store, fitted, request.view.conditions, this.painter, this.device
+    )
+    label = f"{this.scene.dataset}/{this.scene.sequence}"
+    with live_viewer(shown_drive(run, request), painting, label=label, port=port) as (
+        viewer,
+        address,
+    ):
+        opened_at(address)
+        viewer.play(stopped)
+
+
+def _beside(path: FollowedPath) -> Trajectory:
+    ways = (parse_trajectory(spec) for spec in BESIDE)
+    return next(way for way in ways if not _meets_walls(replace(path, trajectory=way)))
+
+
+def _meets_walls(path: FollowedPath) -> bool:
+    try:
+        path.refuse_walls()
+    except ConfigError:
+        return True
+    return False
+
+
+def shown_drive(run: RunSpec, request: DriveRequest) -> "ShownDrive":
+    """Load what is shown; scenes other than the first when they are asked for."""
+    from lidarpainter_models.viewing.drive_nodes import ShownDrive
+
+    path = followed_path(run, next(iter(request.scenes.values())), request.view)
+    store = open_store(run.store_path)
+    return ShownDrive(
+        path=replace(path, trajectory=parse_trajectory(RECORDED)),
+        scenes={
+            name: partial(load_scene, store, fitted.gaussians)
+            for name, fitted in request.scenes.items()
+        },
+    )

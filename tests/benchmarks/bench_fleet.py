@@ -1,0 +1,85 @@
+"""What a fleet costs beside its stages: CPU seconds a sequence, with stages that do nothing.
+
+`python tests/benchmarks/bench_fleet.py 10 100` asks for so many streets, lets one worker go through
+them, and asks for them again. Starting up (imports) is not in the figures, commits to the tables
+are. `--prefect` makes each sequence a flow run against a server of its own, whose CPU time counts.
+"""
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support")]
+
+from flows.environment import prepare_environment  # noqa: E402
+
+prepare_environment()
+
+import psutil  # noqa: E402
+from stub_fleet import stub_ledger, stub_work, stub_worker, write_stub_manifest  # noqa: E402
+
+from flows.fleet.asked import wishes  # noqa: E402
+from flows.fleet.manifest import read_manifest  # noqa: E402
+from flows.fleet.status import fleet_status, is_over  # noqa: E402
+
+
+def cpu_seconds() -> float:
+    """Of this process and those it has started."""
+    children = psutil.Process().children(recursive=True)
+    of_children = sum(sum(child.cpu_times()[:2]) for child in children)
+    return time.process_time() + of_children
+
+
+def measured(number: int, *, as_flows: bool) -> tuple[float, float]:
+    """CPU seconds a sequence of the first time and of the second."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        path = write_stub_manifest(folder, sequences=number)
+        began = cpu_seconds()
+        ledger = stub_ledger(folder / "store")
+        ledger.store.make()
+        ledger.ask(wishes(read_manifest(path), folder))
+        worker = stub_worker(ledger.store.root, "stub")
+        worker.work = _flow_of(stub_work) if as_flows else stub_work
+        worker.run()
+        first = cpu_seconds() - began
+        rows = ledger.rows("stub")
+        complete = {"status": "complete", "artefacts": []}
+        ledger.store.tables.merge("runs", [{"run_id": row["run_id"], **complete} for row in rows])
+        began = cpu_seconds()
+        ledger.ask(wishes(read_manifest(path), folder))
+        assert is_over(fleet_status(ledger, "stub"))
+        return first / number, (cpu_seconds() - began) / number
+
+
+def _flow_of(work: Callable) -> Callable:
+    from prefect import flow
+
+    made = flow(work, name="fleet-sequence", persist_result=False, validate_parameters=False)
+    return lambda asked, store: made.with_options(flow_run_name=asked.scene_id)(asked, store)
+
+
+def main() -> None:
+    """Measure and print a line for each number of sequences."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("numbers", type=int, nargs="+")
+    parser.add_argument("--prefect", action="store_true")
+    arguments = parser.parse_args()
+    from flows.server import prefect_server
+
+    measured(2, as_flows=False)  # code that is read, tables' first use
+    with tempfile.TemporaryDirectory() as name:
+        server = prefect_server(Path(name) / "server.log") if arguments.prefect else nullcontext()
+        with server:
+            for number in arguments.numbers:
+                first, second = measured(number, as_flows=arguments.prefect)
+                print(f"{number} sequences: {first:.3f} s each, again {second:.4f} s each")  # noqa: T201
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,162 @@
+"""What rendering, fitting and painting take on a device: milliseconds and memory.
+
+Without a GPU everything is small and the networks tiny: a rehearsal of the code, not a figure.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+
+import kernel_trials
+import torch
+from gpu_findings import Cost, Findings
+from random_conditions import random_conditions
+
+import lidarpainter_models as lp
+from lidarpainter_models.errors import WeightsError
+from lidarpainter_models.kernels.backends import available_backends
+from lidarpainter_models.painter.selection import PainterChoice
+from tasks.measuring import measured
+
+RASTER_SIZES = ((100_000, 960, 640), (400_000, 1024, 576))
+REHEARSED_RASTER_SIZES = ((2000, 96, 64),)
+PRESETS = ("paper", "fast")
+PAINTED_PX = (576, 1024)
+REHEARSED_PAINTED_PX = (64, 128)
+
+
+def cost_of(what: str, run: Callable[[], object], device: torch.device, repeats: int = 10) -> Cost:
+    """Run it once, and then so many times."""
+    is_gpu = device.type == "cuda"
+    if is_gpu:
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats(device)
+    with measured() as whole:
+        times_s = [_seconds(run, device) for _ in range(1 + repeats)]
+    peak_bytes = torch.cuda.max_memory_allocated(device) if is_gpu else whole.peak_memory_bytes
+    return Cost(
+        what=what,
+        first_ms=1e3 * times_s[0],
+        ms=1e3 * median(times_s[1:]),
+        peak_bytes=peak_bytes,
+    )
+
+
+def _seconds(run: Callable[[], object], device: torch.device) -> float:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    started = time.perf_counter()
+    run()
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter() - started
+
+
+def measure_rasterisers(findings: Findings, device: torch.device) -> None:
+    """Images with all gradients, by every fast backend of the device."""
+    is_gpu = device.type == "cuda"
+    names = [name for name in ("cuda", "triton") if name in available_backends("gaussian_raster")]
+    for backend in names if is_gpu else ["cpu"]:
+        for size in RASTER_SIZES if is_gpu else REHEARSED_RASTER_SIZES:
+            count, width_px, height_px = size
+            what = f"draw and go back, {count} Gaussians, {width_px}x{height_px}, {backend}"
+            with findings.part(what):
+                run = partial(kernel_trials.raster, size, backend, device)
+                findings.costs.append(cost_of(what, run, device))
+
+
+def measure_stages(findings: Findings, device: torch.device) -> None:
+    """A small street through fit, render, conditions and the small painter."""
+    is_gpu = device.type == "cuda"
+    size = {"width_px": 480, "height_px": 270} if is_gpu else {"width_px": 96, "height_px": 54}
+    count, steps = (60_000, 200) if is_gpu else (1500, 10)
+    with findings.part("stages of a street"), TemporaryDirectory() as folder:
+        street = lp.SyntheticStreetConfig(seed=5, num_frames=4, samples_per_axis=1, **size)
+        scene = lp.open_scene(lp.write_street(street, Path(folder)))
+        split = lp.split_views(scene, "alternate", ("front_camera",))
+        observation = lp.ObservationConfig(width_px=size["width_px"])
+        seen = lp.prepare_observations(scene, split, observation)
+        config = lp.FitConfig(steps=steps, log_every=steps)
+        config = _with_gaussians(config, count)
+        fitted = lp.fit_gaussians(seen, config, device=device).scene
+        name = f"{size['width_px']}x{size['height_px']}"
+
+        def add(what: str, run: Callable[[], object], repeats: int, share: float = 1.0) -> None:
+            cost = cost_of(f"{what}, {name}", run, device, repeats)
+            scaled = Cost(
+                what=cost.what,
+                first_ms=share * cost.first_ms,
+                ms=share * cost.ms,
+                peak_bytes=cost.peak_bytes,
+            )
+            findings.costs.append(scaled)
+
+        again = partial(lp.fit_gaussians, seen, config, start=fitted, device=device)
+        add(f"a step of a fit, {len(fitted.gaussians)} Gaussians", again, 1, 1 / steps)
+        view = seen.views[1]
+        add("render", partial(fitted.render, view.camera, view.timestamp_ns), 5)
+        aside = lp.camera_beside(fitted, scene, view, lp.Shift(lateral_m=2.0))
+        known = lp.ConditionBuilder(fitted, seen.lidar_map, seen.views)
+        add("what is known of a view", partial(known.conditions, aside, view.timestamp_ns), 3)
+
+
+def _with_gaussians(config: lp.FitConfig, count: int) -> lp.FitConfig:
+    return replace(
+        config,
+        initialisation=replace(config.initialisation, num_gaussians=count),
+        densification=replace(config.densification, budget=count),
+    )
+
+
+def measure_painters(findings: Findings, device: torch.device, model: str | None) -> None:
+    """One view by the small painter and by presets of the one-step painter."""
+    height_px, width_px = PAINTED_PX if device.type == "cuda" else REHEARSED_PAINTED_PX
+    known = random_conditions(height_px, width_px)
+    size = f"{width_px}x{height_px}"
+    with findings.part("painter nano"), torch.inference_mode():
+        painter = PainterChoice.of("nano").load(device)
+        run = partial(painter.paint, known)
+        findings.painters.append(cost_of(f"nano, {size}", run, device, 5))
+    for preset in PRESETS:
+        if find_spec("diffusers") is None:
+            findings.unchecked.append(f"painter {preset}: diffusers is not installed")
+            continue
+        with findings.part(f"painter {preset}"):
+            painter, weights = one_step_painter(preset, device, model)
+            run = partial(painter.paint, known)
+            what = f"{preset} ({weights}), {size}"
+            findings.painters.append(cost_of(what, run, device, 5))
+            del painter, run
+
+
+def one_step_painter(preset, device, model):
+    """The painter, and whether its weights are a model's or random, which take as long."""
+    if model is not None:
+        try:
+            return PainterChoice.of(f"{model}:{preset}").load(device), "trained weights"
+        except WeightsError as error:
+            raise WeightsError(f"{model}: {error}") from None
+    from random_diffusion import random_network
+    from tiny_diffusion import TINY
+
+    from lidarpainter_models.painter.one_step.architectures import SD_TURBO, TEXT_TOKENS
+    from lidarpainter_models.painter.one_step.assembly import made_lean
+    from lidarpainter_models.painter.one_step.painter import OneStepPainter
+    from lidarpainter_models.painter.one_step.presets import preset_named
+    from lidarpainter_models.painter.one_step.prompts import PromptBook
+    from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
+
+    is_gpu = device.type == "cuda"
+    architecture = SD_TURBO if is_gpu else TINY
+    dtype = torch.bfloat16 if is_gpu else torch.float32
+    network = random_network(
+        preset_named(preset), architecture=architecture, dtype=dtype, has_adapters=True
+    )
+    text = torch.zeros(TEXT_TOKENS, architecture.text_width, dtype=dtype)
+    painter = OneStepPainter(made_lean(network), PromptBook({DEFAULT_PROMPT: text}), {})
+    return painter.to(device), "random weights" if is_gpu else "tiny network"

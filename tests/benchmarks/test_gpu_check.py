@@ -1,0 +1,104 @@
+"""The check of a GPU: its page, and that its parts run on a device that is not the CPU."""
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import gpu_costs
+import kernel_trials
+import pytest
+import torch
+from gpu_agreement import compare_kernels
+from gpu_findings import Agreement, Cost, Findings
+from strict_device import strict_runs
+
+CPU = torch.device("cpu")
+
+
+def findings_of(*agreements, is_gpu=True):
+    facts = {"device": "cuda, a card", "date": "today"}
+    return Findings(machine=facts, is_gpu=is_gpu, agreements=list(agreements))
+
+
+def agreement(error):
+    return Agreement(what="ssim", compared="GPU, numba", error=error, allowed=1e-4)
+
+
+@pytest.mark.parametrize(("error", "is_fit"), [(1e-5, True), (1e-3, False), (math.nan, False)])
+def test_a_part_agrees_up_to_its_tolerance(error, is_fit):
+    findings = findings_of(agreement(error))
+    assert findings.is_fit == is_fit
+    assert ("**differs**" in findings.page()) == (not is_fit)
+
+
+def test_what_fails_is_named_and_the_rest_goes_on():
+    findings = findings_of(agreement(0.0))
+    with findings.part("a fit"):
+        raise RuntimeError("out of memory\nwith a long tail")
+    assert findings.failed == ["a fit: RuntimeError: out of memory"]
+    assert findings.first_line == (
+        "GPU check on cuda, a card: 1 of 1 parts agree, 1 failed, 0 not checked"
+    )
+    assert "- a fit: RuntimeError: out of memory" in findings.page()
+
+
+def test_the_page_sets_a_painter_beside_the_papers():
+    findings = findings_of()
+    findings.painters.append(Cost(what="paper", first_ms=9000.4, ms=123.4, peak_bytes=2 * 10**9))
+    page = findings.page()
+    assert "| paper | 9000 | 123.4 | 2.00 |" in page
+    assert "| the paper, at 1024x576 |  | 870 | 10.5 |" in page
+
+
+def test_without_a_gpu_the_first_line_says_so():
+    assert findings_of(is_gpu=False).page().startswith("No GPU was found. On the CPU instead")
+
+
+@pytest.mark.parametrize("kernel", kernel_trials.TRIALS)
+def test_a_trial_runs_on_another_device_and_gives_what_the_cpu_gives(kernel, monkeypatch):
+    trial = kernel_trials.TRIALS[kernel]
+    with strict_runs(monkeypatch) as device:
+        found = [each.detach().cpu() for each in trial.run("reference", device)]
+    assert kernel_trials.disagreement(found, trial.run("cpu", CPU)) <= trial.tolerance
+
+
+def test_another_answer_is_a_disagreement():
+    trial = kernel_trials.TRIALS["ssim"]
+    found = trial.run("cpu", CPU)
+    assert kernel_trials.disagreement([found[0], found[1].flip(0)], found) > 0.1
+    chosen = torch.tensor([1, 2, 3, 4])
+    assert kernel_trials.disagreement([chosen], [torch.tensor([1, 2, 3, 5])]) == 0.25
+
+
+def test_the_cpu_agrees_with_itself_part_by_part(monkeypatch):
+    kept = {name: kernel_trials.TRIALS[name] for name in ("ssim", "point_splat")}
+    monkeypatch.setattr(kernel_trials, "TRIALS", kept)
+    findings = findings_of()
+    compare_kernels(findings, CPU)
+    assert findings.is_fit
+    assert {found.what for found in findings.agreements} >= set(kept)
+    assert any(line.startswith("gaussian_raster by cuda") for line in findings.unchecked)
+
+
+@pytest.mark.slow
+def test_stages_and_painters_are_rehearsed_on_another_device(monkeypatch):
+    findings = findings_of()
+    with strict_runs(monkeypatch) as device:
+        gpu_costs.measure_stages(findings, device)
+    gpu_costs.measure_painters(findings, CPU, None)
+    assert findings.failed == []
+    assert len(findings.costs) == 3
+    assert [cost.what.split()[0] for cost in findings.painters] == ["nano,", "paper", "fast"]
+
+
+@pytest.mark.slow
+def test_the_check_runs_to_its_end_and_writes_its_page(tmp_path):
+    script = Path(gpu_costs.__file__).with_name("gpu_check.py")
+    page = tmp_path / "gpu-check.md"
+    result = subprocess.run(
+        [sys.executable, script, "--out", page], capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert page.read_text("utf-8") == result.stdout
+    assert "Failed:\n\n- nothing" in result.stdout

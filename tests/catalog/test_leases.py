@@ -1,0 +1,109 @@
+"""One holder at a time, whoever dies, sleeps or comes back."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from catalog.errors import CatalogError
+from catalog.leases import FolderObjects, LeaseLostError, Leases
+
+ROOT = Path(__file__).resolve().parents[2]
+COUNTER = """
+import sys, time
+from pathlib import Path
+from catalog.leases import FolderObjects, Leases
+folder = Path(sys.argv[1])
+leases = Leases(FolderObjects(folder / "leases"))
+for name in ("a", "b", "c"):
+    for _ in range(10):
+        while (lease := leases.take(name, above=0, facts={})) is None:
+            time.sleep(0.001)
+        count = folder / name
+        before = int(count.read_text()) if count.exists() else 0
+        lease = leases.renew(lease, {})
+        count.write_text(str(before + 1))
+        assert leases.give_back(lease)
+"""
+TAKER = """
+import sys
+from pathlib import Path
+from catalog.leases import FolderObjects, Leases
+assert Leases(FolderObjects(Path(sys.argv[1]))).take("a", above=6, facts={"scene_id": "x/y"})
+"""
+
+
+class Clock:
+    now = 1000.0
+
+    def __call__(self):
+        return self.now
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+@pytest.fixture
+def leases(tmp_path, clock):
+    return Leases(FolderObjects(tmp_path), time_to_live_s=60.0, now=clock)
+
+
+def test_what_is_in_hand_cannot_be_taken(leases):
+    lease = leases.take("a", above=3, facts={"scene_id": "x/y"})
+    assert lease.fence == 4
+    assert leases.take("a", above=9, facts={}) is None
+    assert [(one.name, one.facts) for one in leases.held()] == [("a", {"scene_id": "x/y"})]
+    assert leases.give_back(lease)
+    assert leases.take("a", above=4, facts={}).fence == 5
+
+
+def test_a_lease_lives_by_its_heartbeat(leases, clock):
+    lease = leases.take("a", above=0, facts={})
+    clock.now += 50
+    lease = leases.renew(lease, {"memory_bytes": 7})
+    clock.now += 50
+    assert not leases.has_expired(lease)
+    assert leases.held()[0].facts == {"memory_bytes": 7}
+    clock.now += 11
+    assert leases.has_expired(lease)
+
+
+def test_a_holder_that_slept_too_long_is_refused(leases, clock):
+    late = leases.take("a", above=0, facts={})
+    clock.now += 61
+    assert leases.give_back(late)  # whoever reconciles
+    new = leases.take("a", above=late.fence, facts={})
+    with pytest.raises(LeaseLostError, match="number 1 was taken away"):
+        leases.renew(late, {})
+    assert not leases.give_back(late)
+    assert leases.held() == [new]
+
+
+def test_the_lease_of_a_dead_process_expires_at_once(tmp_path):
+    subprocess.run([sys.executable, "-c", TAKER, tmp_path], cwd=ROOT, check=True)
+    leases = Leases(FolderObjects(tmp_path))
+    assert leases.has_expired(leases.held()[0])
+
+
+@pytest.mark.parametrize("name", ["../a", "a/b", "", ".lock", "a\n", "x" * 200])
+def test_a_name_that_leaves_the_folder_is_refused(leases, name):
+    with pytest.raises(CatalogError, match="cannot name a lease"):
+        leases.take(name, above=0, facts={})
+
+
+@pytest.mark.parametrize("content", [b"", b"[]", b"{}", b'{"fence": 1, "holder": 3}', b"\xff"])
+def test_a_damaged_lease_is_told_in_one_line(leases, tmp_path, content):
+    (tmp_path / "a").write_bytes(content)
+    with pytest.raises(CatalogError, match="the lease a is damaged"):
+        leases.held()
+
+
+def test_eight_processes_count_and_none_is_lost(tmp_path):
+    counters = [
+        subprocess.Popen([sys.executable, "-c", COUNTER, str(tmp_path)], cwd=ROOT) for _ in range(8)
+    ]
+    assert [counter.wait(timeout=120) for counter in counters] == [0] * 8
+    assert [(tmp_path / name).read_text() for name in "abc"] == ["80"] * 3

@@ -1,0 +1,226 @@
+"""Actors come out whole, go elsewhere, and what they leave is mended."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from gaussian_world import FRAME_NS, build_world, camera_at, map_points, round_gaussians
+
+from lidarpainter_models.conditioning.conditions import ConditionBuilder
+from lidarpainter_models.conditioning.settings import ConditionConfig
+from lidarpainter_models.editing.actor_models import ActorModel, contact_shadow
+from lidarpainter_models.editing.edits import edited, encounters, refuse_walls
+from lidarpainter_models.editing.filled_scenes import filled, masked_observations
+from lidarpainter_models.editing.motions import LogTimes
+from lidarpainter_models.editing.operations import ActorSource, parse_operations
+from lidarpainter_models.editing.worlds import EditedWorld
+from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.geometry.driven_paths import DrivenPath
+from lidarpainter_models.geometry.transforms import rigid_from_tangent
+from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
+
+TIMES_NS = torch.arange(4) * FRAME_NS
+GROUND_M = -0.1
+
+
+def ground(step_m=0.1):
+    """Grey road around the car."""
+    xy = torch.cartesian_prod(torch.arange(2, 12, step_m), torch.arange(-6, 6, step_m))
+    return torch.cat([xy, torch.full((len(xy), 1), GROUND_M)], dim=1)
+
+
+@pytest.fixture(scope="module")
+def world():
+    """A car that drives to the left on a grey road before a wall; the ego stands nearly still."""
+    made = build_world()
+    road_m = ground()
+    grey = torch.full((len(road_m), 3), 0.4)
+    road = round_gaussians(road_m, grey, sigma_m=0.08)
+    street = MapPoints.concatenate([made.observations.lidar_map.street, map_points(road_m, grey)])
+    scene = made.scene.with_gaussians(made.scene.gaussians.append(road))
+    tangents = torch.zeros(4, 6, dtype=torch.float64)
+    tangents[:, 3] = 0.3 * torch.arange(4)
+    ego = DrivenPath(timestamps_ns=TIMES_NS, world_from_body=rigid_from_tangent(tangents))
+    return EditedWorld(
+        scene=scene,
+        fitted=scene,
+        lidar_map=LidarMap(street=street, actors=made.observations.lidar_map.actors),
+        views=made.observations.views,
+        parked=(),
+        log=LogTimes(ego=ego),
+    )
+
+
+def done(world, *operations, models=None):
+    return edited(world, parse_operations([*operations], "test"), models or {})
+
+
+def places(world, name="car"):
+    (track,) = [track for track in world.moving if track.actor_id == name]
+    return torch.stack([track.pose_at(int(time))[:3, 3] for time in TIMES_NS])
+
+
+def test_a_removed_actor_leaves_no_gaussian_no_point_and_no_track(world):
+    after = done(world, {"op": "remove", "actors": ["car"]})
+    assert int(after.scene.gaussians.body_index.max()) == 0
+    assert after.scene.tracks == () == after.moving
+    assert after.lidar_map.actors == {}
+    assert len(world.scene.tracks) == 1  # the source stays as it is
+
+
+@pytest.mark.parametrize(
+    ("operation", "expected_y_m"),
+    [
+        ({"op": "move", "trajectory": "along:2"}, [0, 1, 2, 3]),
+        ({"op": "stop", "at_s": 0.1, "over_s": 0}, [-2, -1, -1, -1]),
+        ({"op": "stop", "at_s": 0.1, "over_s": 0.2}, [-2, -1, -0.25, 0]),
+        ({"op": "retime", "delay_s": 0.1}, [-2, -2, -1, 0]),
+        ({"op": "retime", "speed": 2}, [-2, 0, 1, 1]),
+        ({"op": "scale", "factor": 2}, [-2, -1, 0, 1]),
+    ],
+)
+def test_an_actor_goes_another_way(world, operation, expected_y_m):
+    after = done(world, operation | {"actor": "car"})
+    assert places(after)[:, 1].tolist() == pytest.approx(expected_y_m, abs=1e-6)
+    assert len(after.lidar_map.actors["car"]) == 120
+
+
+def test_a_larger_actor_keeps_its_wheels_on_the_road(world):
+    before, after = world.moving[0], done(world, {"op": "scale", "actor": "car", "factor": 2})
+    larger = after.moving[0]
+    assert larger.size_m.tolist() == pytest.approx((2 * before.size_m).tolist())
+    bottoms = [
+        float(track.world_from_box[0, 2, 3] - track.size_m[2] / 2) for track in (before, larger)
+    ]
+    assert bottoms[0] == pytest.approx(bottoms[1])
+
+
+def test_time_can_be_frozen(world):
+    after = done(world, {"op": "freeze", "at_s": 0.2})
+    assert places(after)[:, 1].tolist() == pytest.approx([0, 0, 0, 0])
+
+
+def test_a_guest_takes_the_light_of_the_scene_and_throws_a_shadow(world):
+    model = world.model_of(world.moving[0])
+    dim = replace(model, road_rgb=world.road_rgb / 2)
+    source = ActorSource(run="other", actor="guest")
+    operation = {
+        "op": "insert",
+        "name": "guest",
+        "source": source.model_dump(exclude_defaults=True),
+        "ahead_m": 5,
+        "left_m": 3,
+        "speed_mps": 0,
+    }
+    after = done(world, operation, models={source: dim})
+    assert places(after, "guest")[:, :2].tolist() == [[5, 3]] * 4
+    bottom_m = float(places(after, "guest")[0, 2] - model.size_m[2] / 2)
+    assert bottom_m == pytest.approx(GROUND_M, abs=0.02)
+    guest = after.model_of(after.find("guest")).gaussians
+    shadow = contact_shadow(model.size_m, sh_degree=1)
+    assert len(guest) == len(model.gaussians) + len(shadow)
+    mine = guest.base_rgb[: len(model.gaussians)]
+    assert torch.allclose(mine, 2 * model.gaussians.base_rgb, atol=1e-4)
+    again = done(after, {"op": "move", "actor": "guest", "trajectory": "lateral:1"})
+    assert len(again.model_of(again.find("guest")).gaussians) == len(guest)  # one shadow
+
+
+def test_the_road_under_a_removed_parked_car_is_mended(world):
+    """A dark car stands on a road that nobody saw under it."""
+    size_m = torch.tensor([3.0, 1.6, 1.2])
+    pose = rigid_from_tangent(torch.tensor([0, 0, 0, 5.0, 3.0, 0.5]).double())
+    parked = replace(
+        world.moving[0],
+        actor_id="parked",
+        is_moving=False,
+        size_m=size_m,
+        world_from_box=pose.expand(4, 4, 4),
+    )
+    inside = (torch.rand(400, 3, generator=torch.Generator().manual_seed(0)) - 0.5) * size_m * 0.9
+    car_m = inside + pose[:3, 3].float()
+    car_m = car_m[car_m[:, 2] > GROUND_M + 0.15]
+    dark = torch.full((len(car_m), 3), 0.05)
+    scene, street = world.scene, world.lidar_map.street
+    hidden = ((ground() - pose[:3, 3].float()).abs()[:, :2] < size_m[:2] / 2).all(dim=1)
+    road = scene.gaussians.means.shape[0] - len(ground())
+    seen = torch.cat([torch.arange(road), road + (~hidden).nonzero()[:, 0]])
+    gaussians = scene.gaussians.select(seen).append(round_gaussians(car_m, dark, sigma_m=0.1))
+    wall = len(street) - len(ground())
+    points = street.keep(torch.cat([torch.arange(wall), wall + (~hidden).nonzero()[:, 0]]))
+    standing = replace(
+        world,
+        scene=scene.with_gaussians(gaussians),
+        fitted=scene.with_gaussians(gaussians),
+        lidar_map=LidarMap(street=points, actors=world.lidar_map.actors),
+        parked=(parked,),
+    )
+    after = done(standing, {"op": "remove", "actors": ["parked"]})
+    mended = filled(after, ConditionConfig(num_references=1, num_sources=1), None)
+    camera = camera_at(0.0)
+    above = camera.at(pose @ torch.diag(torch.tensor([1.0, -1, -1, 1])).double())
+    above.world_from_camera[2, 3] = 4.0
+    bare, whole = (one.render(above, 0) for one in (after.scene, mended.scene))
+    middle = (slice(20, 28), slice(28, 36))
+    assert float(bare.alpha[middle].max()) < 0.5
+    assert float(whole.alpha[middle].min()) > 0.8
+    assert torch.allclose(whole.rgb[middle], torch.tensor(0.4), atol=0.08)
+    assert 0 < float(mended.confidence.min()) <= float(mended.confidence.max()) < 1
+
+
+def test_painters_do_not_see_what_was_recorded_where_somebody_was(world):
+    after = done(world, {"op": "remove", "actors": ["car"]})
+    seen = masked_observations(after)
+    assert seen.tracks == ()
+    hidden = torch.stack([view.hidden for view in seen.views])
+    assert 0.01 < float(hidden.float().mean()) < 0.5
+    builder = ConditionBuilder(after.scene, seen.lidar_map, seen.views)
+    source = builder.source(seen.views[1].key)
+    covered = seen.views[1].hidden
+    shown = after.scene.render(source.camera, source.timestamp_ns).rgb
+    assert torch.equal(source.rgb[covered], shown[covered])
+    assert float(source.depth_m[covered].max()) == 0
+
+
+def test_who_is_moved_into_a_wall_is_found(world):
+    after = done(world, {"op": "move", "actor": "car", "trajectory": "lateral:-2.3"})
+    thick = after.lidar_map.street
+    walled = replace(
+        after, lidar_map=LidarMap(street=MapPoints.concatenate([thick] * 9), actors={})
+    )
+    with pytest.raises(ConfigError, match=r"into a wall: car meets \d+ LiDAR points"):
+        refuse_walls(encounters(walled))
+
+
+@pytest.mark.parametrize(
+    ("operation", "complaint"),
+    [
+        ({"op": "remove", "actors": ["bus"]}, "operation 1, remove: no actor 'bus'"),
+        ({"op": "stop", "actor": "car", "at_s": 9}, "at_s 9 s: expected a time of the log, 0 to"),
+        (
+            {"op": "insert", "name": "car", "source": {"actor": "car"}},
+            "'car' is there already, expected a new name",
+        ),
+        ({"op": "crop", "from_m": 500, "to_m": 600}, "nothing stands from 500 to 600 m"),
+        (
+            {"op": "move", "actor": "car", "trajectory": "follow:bus"},
+            "operation 1, move: no actor 'bus'",
+        ),
+    ],
+)
+def test_what_cannot_be_done_is_said(world, operation, complaint):
+    with pytest.raises(ConfigError, match=complaint):
+        done(world, operation)
+
+
+def test_a_file_without_a_car_is_refused():
+    empty = round_gaussians(torch.zeros(3, 3), torch.zeros(3, 3), sigma_m=0.1, opacity=0.1)
+    with pytest.raises(SceneError, match="nothing opaque"):
+        ActorModel.of_gaussians(empty, "car")
+
+
+def test_a_style_is_read_and_left_to_the_end():
+    (style,) = parse_operations([{"op": "style", "prompt": "foggy:0.5+night", "strength": 0.5}], "")
+    assert style.mix.text == "foggy:0.25+night:0.5"
+    for wrong in ({"prompt": "snow"}, {"prompt": "rain", "visibility_m": 50.0}):
+        with pytest.raises(ConfigError):
+            parse_operations([{"op": "style", **wrong}], "test")

@@ -1,0 +1,55 @@
+"""The sentences say what the figures say, and no more."""
+
+import pytest
+
+from lidarpainter_models.export.verdict import verdict
+
+
+def run(psnr=30.5, actors=30.0, depth=0.97, before=0.90, **changes):
+    """What a run printed."""
+    recorded = {"psnr": psnr, "actors_psnr": actors, "num_views": 14}
+
+    def aside(part):
+        return {"left-2m": {"depth_within_5_percent": part}, "up-1.5m": {"psnr": None}}
+
+    result = {"painter": "nano", "recorded": recorded, "novel": aside(depth)}
+    return {**result, "unpainted": {"novel": aside(before)}, **changes}
+
+
+@pytest.mark.parametrize(
+    ("figures", "position", "expected"),
+    [
+        ({}, 0, "Good: along the recorded path"),
+        ({"psnr": 27.0}, 0, "Fair: "),
+        ({"psnr": 20.0}, 0, "Poor: even along the recorded path"),
+        ({}, 1, "Good: surfaces hold"),
+        ({"depth": 0.9, "before": 0.8}, 1, "painting helped there (80% before)"),
+        ({"depth": 0.7, "before": 0.8}, 1, "painting made it worse there"),
+        ({"depth": 0.9, "before": 0.899}, 1, "painting changed nothing"),
+        ({}, 2, "Good: moving actors are as sharp"),
+        ({"actors": 25.0}, 2, "Weak: moving actors are worse than the street (25.0 against 30.5"),
+        ({"actors": None}, 2, "No moving actor was judged"),
+    ],
+)
+def test_sentence_follows_from_its_figure(figures, position, expected):
+    sentences = verdict(run(**figures))
+    assert len(sentences) == 3
+    assert expected in sentences[position]
+
+
+def test_worst_of_several_ways_is_named():
+    novel = {
+        "left-2m": {"depth_within_5_percent": 0.96},
+        "right-3m": {"depth_within_5_percent": 0.8},
+    }
+    sentence = verdict(run(novel=novel))[1]
+    assert sentence.startswith("Poor: surfaces beside the path tear; worst is right-3m")
+
+
+def test_nothing_is_said_of_painting_where_nobody_painted():
+    assert "painting" not in verdict(run(painter="none"))[1]
+
+
+def test_unjudged_scene_is_not_praised():
+    (sentence,) = verdict(run(recorded=None))
+    assert "Nobody judged" in sentence

@@ -1,0 +1,92 @@
+"""The planner learns from attempts what a sequence takes, and says how far off it was."""
+
+from datetime import UTC, datetime, timedelta
+
+import pytest
+
+from flows.fleet.asked import Asked
+from flows.fleet.planner import Planner
+from flows.fleet.status import planner_error
+
+START = datetime(2026, 11, 22, tzinfo=UTC)
+
+
+def street(seed=1, *, frames=12, steps=400, width_px=320):
+    return Asked(
+        dataset="synthetic",
+        sequence=f"street-{seed:04d}",
+        seed=seed,
+        frames=(0, frames),
+        width_px=width_px,
+        preset="preview",
+        settings=(f"fit.steps={steps}", f"observation.width_px={width_px}"),
+    )
+
+
+def attempt(asked, number):
+    """What it would take if costs were exactly sums of efforts."""
+    effort = Planner([], []).effort(asked)
+    _, steps, views, painted, _, drawn = effort.amounts
+    return {
+        "cause": "done",
+        "effort": effort.to_json(),
+        "ended_at": START + timedelta(minutes=number),
+        "seconds": 5 + 2e-7 * steps + 1e-6 * views + 3e-6 * painted + 2e-6 * drawn,
+        "peak_memory_bytes": 4e8 + 30 * views,
+        "num_bytes": 1e6 + 2 * drawn,
+        "predicted_seconds": None,
+    }
+
+
+@pytest.fixture
+def past():
+    asked = [
+        street(frames=frames, steps=steps, width_px=width_px)
+        for frames in (6, 12, 28)
+        for steps in (200, 800)
+        for width_px in (160, 480)
+    ]
+    return [attempt(one, number) for number, one in enumerate(asked)]
+
+
+def test_where_nothing_is_known_nothing_is_said():
+    assert Planner([], []).predict(street()).seconds is None
+    assert set(Planner([], []).predict(street()).facts().values()) == {None}
+
+
+def test_a_sequence_like_none_before_is_predicted(past):
+    asked = street(frames=20, steps=500, width_px=320)
+    true = attempt(asked, 0)
+    prediction = Planner(past, []).predict(asked)
+    assert prediction.seconds == pytest.approx(true["seconds"], rel=0.05)
+    assert prediction.memory_bytes == pytest.approx(true["peak_memory_bytes"], rel=0.05)
+    assert prediction.num_bytes == pytest.approx(true["num_bytes"], rel=0.05)
+
+
+def test_one_attempt_predicts_its_like(past):
+    prediction = Planner(past[:1], []).predict(street(frames=6, steps=200, width_px=160))
+    assert prediction.seconds == pytest.approx(past[0]["seconds"], rel=0.01)
+
+
+def test_a_scene_that_is_stored_is_not_drawn_again():
+    rows = [{"scene_id": "synthetic/street-0001", "num_views": 12, "cameras": ["front_camera"]}]
+    assert Planner([], rows).effort(street()).drawn_pixels == 0
+    assert Planner([], []).effort(street()).drawn_pixels > 0
+
+
+def test_views_that_cannot_be_counted_are_not_guessed():
+    log = Asked(dataset="pandaset", sequence="002", root="/logs", preset="preview")
+    assert Planner([], []).effort(log) is None
+    row = {"scene_id": "pandaset/002", "num_views": 480, "cameras": ["a", "b", "c", "d", "e", "f"]}
+    assert Planner([], [row]).effort(log).views == 480
+    front = log.model_copy(update={"cameras": ("a",)})
+    assert Planner([], [row]).effort(front).views == 80
+
+
+def test_the_error_counts_what_was_predicted_and_computed(past):
+    assert planner_error(past) is None
+    wrong = [{**row, "predicted_seconds": row["seconds"] * 1.2} for row in past]
+    assert planner_error(wrong) == pytest.approx(0.2)
+    assert planner_error([*wrong, {**wrong[0], "effort": None, "seconds": 1.0}]) == pytest.approx(
+        0.2
+    )

@@ -1,0 +1,265 @@
+"""Workers take, die, refuse and go on; the catalog holds each thing once."""
+
+import shutil
+import signal
+import time
+
+import pytest
+from commands import call
+from small_pandaset import PandasetFolder
+from stub_fleet import (
+    behave,
+    stub_ledger,
+    stub_starter,
+    stub_work,
+    stub_worker,
+    write_stub_manifest,
+)
+
+from catalog.attempts import Ending
+from catalog.errors import DamagedArtefactError, StorageError
+from catalog.leases import FolderObjects, Leases
+from catalog.store import open_store
+from flows.fleet.asked import wishes
+from flows.fleet.causes import cause_of
+from flows.fleet.limits import admits
+from flows.fleet.manifest import Budget, read_manifest
+from lidarpainter_models.errors import BackendError, SceneError, WriteError
+
+STREETS = [f"synthetic/street-{seed:04d}" for seed in range(1, 5)]
+
+
+@pytest.fixture
+def store(tmp_path):
+    found = open_store(tmp_path / "store")
+    found.make()
+    return found
+
+
+@pytest.fixture
+def asked(store, tmp_path):
+    """A ledger in which a manifest of four streets was asked for."""
+    path = write_stub_manifest(tmp_path)
+    ledger = stub_ledger(store.root)
+    ledger.ask(wishes(read_manifest(path), path.parent))
+    return ledger
+
+
+def states(ledger):
+    return [row["state"] for row in ledger.rows("stub")]
+
+
+def causes(ledger, scene):
+    rows = ledger.store.tables.rows("attempts")
+    found = [row for row in rows if row["scene_id"] == scene]
+    return [row["cause"] for row in sorted(found, key=lambda row: row["started_at"])]
+
+
+def until(happens, timeout_s=60.0):
+    deadline = time.monotonic() + timeout_s
+    while not (found := happens()):
+        assert time.monotonic() < deadline, "it did not happen"
+        time.sleep(0.05)
+    return found
+
+
+def test_a_worker_decides_by_the_cause(asked, store):
+    for scene, what in zip(STREETS, ("bad", "no memory", "full", "good"), strict=True):
+        behave(store.root, scene, what)
+    stub_worker(store.root, "stub").run()
+    assert states(asked) == ["set-aside", "failed", "done", "done"]
+    assert [causes(asked, scene) for scene in STREETS] == [
+        ["bad-input"],
+        ["memory"] * 3,
+        ["disk-full", "done"],
+        ["done"],
+    ]
+    first, second, *_ = asked.rows("stub")
+    assert first["reason"] == f"{STREETS[0]}: the third image is damaged"
+    assert second["reason"] == "MemoryError (3 attempts)"
+    assert asked.leases.held() == []
+
+
+def test_after_a_kill_another_worker_finishes(asked, store):
+    behave(store.root, STREETS[0], "slow")
+    victim = stub_starter(store.root, "stub", 1)(0)
+    until(lambda: not list((store.root / "stub").iterdir()))  # it is in its work
+    assert "running" in states(asked)
+    victim.send_signal(signal.SIGKILL)
+    victim.wait()
+    stub_worker(store.root, "stub").run()
+    assert states(asked) == ["done"] * 4
+    assert causes(asked, STREETS[0]) == ["killed", "done"]
+    assert asked.leases.held() == []
+
+
+def test_a_cancelled_worker_leaves_its_work(asked, store):
+    behave(store.root, STREETS[0], "slow")
+    worker = stub_starter(store.root, "stub", 1)(0)
+    until(lambda: not list((store.root / "stub").iterdir()))
+    asked.cancel("stub")
+    assert worker.wait(timeout=60) != 0
+    assert states(asked) == ["failed"] * 4
+    assert causes(asked, STREETS[0]) == ["cancelled"]
+
+
+def test_a_corrupted_log_is_set_aside_with_its_reason(store, tmp_path, monkeypatch):
+    log = PandasetFolder(tmp_path / "logs")
+    log.write_log()
+    (log.path / "camera" / "front_camera" / "00.jpg").write_bytes(b"no image")
+    path = tmp_path / "night.toml"
+    text = '[[source]]\ndataset = "pandaset"\nroot = "logs"\n[budget]\nfree_disk_gb = 0\n'
+    path.write_text(f'name = "stub"\n{text}')
+    ledger = stub_ledger(store.root)
+    ledger.ask(wishes(read_manifest(path), tmp_path))
+    from flows.fleet.work import make_sequence
+
+    monkeypatch.delenv("PREFECT_API_URL", raising=False)
+    worker = stub_worker(store.root, "stub")
+    worker.work = make_sequence
+    worker.run()
+    row = ledger.rows("stub")[0]
+    assert (row["state"], row["attempts"]) == ("set-aside", 1)
+    assert "00.jpg" in row["reason"]
+
+
+def test_no_work_begins_on_a_disk_without_room(asked, store, monkeypatch):
+    usage = shutil.disk_usage(store.root)
+    heard = []
+
+    def fuller(_path):
+        if len(heard) < 2:
+            return usage._replace(free=-1)
+        return usage
+
+    monkeypatch.setattr("flows.fleet.limits.shutil.disk_usage", fuller)
+    worker = stub_worker(store.root, "stub")
+    monkeypatch.setattr("flows.fleet.worker.time.sleep", lambda _s: heard.append("slept"))
+    lines = []
+    worker.say = lines.append
+    worker.run()
+    assert states(asked) == ["done"] * 4
+    paused = [line for line in lines if line.startswith("paused")]
+    assert len(paused) == 1
+    assert "expected 0.00 GB before a sequence begins" in paused[0]
+
+
+def test_an_end_that_finds_no_room_is_entered_once_there_is_some(asked, store, monkeypatch):
+    usage = shutil.disk_usage(store.root)
+    worker = stub_worker(store.root, "stub")
+    full, lines = [False], []
+
+    def work(asked, store_path):
+        full[0] = asked.scene_id == STREETS[1]
+        return stub_work(asked, store_path)
+
+    worker.work, worker.say = work, lines.append
+    monkeypatch.setattr(
+        "catalog.tables.shutil.disk_usage",
+        lambda _: usage._replace(free=0) if full[0] else usage,
+    )
+    monkeypatch.setattr("flows.fleet.worker.time.sleep", lambda _s: full.__setitem__(0, False))
+    worker.run()
+    assert states(asked) == ["done"] * 4
+    assert [row["attempts"] for row in asked.rows("stub")] == [1] * 4
+    assert any("paused" in line and "no space left" in line for line in lines)
+
+
+def test_the_hours_of_a_budget_end_a_fleet(store, tmp_path):
+    path = write_stub_manifest(tmp_path, more="hours = 0.5\n")
+    ledger = stub_ledger(store.root)
+    ledger.ask(wishes(read_manifest(path), path.parent))
+    lease = ledger.take(ledger.rows("stub")[0], {})
+    ledger.end(lease, Ending(cause="done", run_id="run", seconds=1900.0))
+    stub_worker(store.root, "stub").run()
+    assert states(ledger) == ["done", *["waiting"] * 3]
+
+
+def test_what_does_not_fit_into_memory_together_waits(tmp_path):
+    leases = Leases(FolderObjects(tmp_path))
+    budget = Budget(memory_gb=8)
+    first, second, third = (
+        leases.take(name, above=0, facts={"predicted_memory_bytes": gigabytes * 1e9})
+        for name, gigabytes in (("a", 9), ("b", 3), ("c", 1))
+    )
+    assert admits(leases, first, budget)  # alone it would never begin otherwise
+    assert not admits(leases, second, budget)
+    leases.give_back(first)
+    assert admits(leases, second, budget)
+    assert admits(leases, third, budget)
+
+
+@pytest.mark.parametrize(
+    ("error", "cause"),
+    [
+        (SceneError("scene x lacks a camera"), "bad-input"),
+        (BackendError("no cuda"), "error"),
+        (DamagedArtefactError("no manifest"), "error"),
+        (WriteError("cannot be written"), "system"),
+        (StorageError(28, "No space left on device"), "disk-full"),
+        (RuntimeError("Generic error: No space left on device (os error 28)"), "disk-full"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: 8 bytes"), "memory"),
+        (TimeoutError("late"), "timeout"),
+        (ConnectionError("reset"), "system"),
+        (ZeroDivisionError("division by zero"), "error"),
+    ],
+)
+def test_an_error_has_one_cause(error, cause):
+    assert cause_of(error)[0] == cause
+
+
+@pytest.fixture
+def stubbed(store, monkeypatch):
+    """The command, with workers whose sequences cost nothing."""
+    monkeypatch.setattr("flows.fleet.local_workers.starter", stub_starter)
+
+    def run(*words):
+        return call("--quiet", "fleet", *words, store=store)
+
+    return run
+
+
+def test_the_command_runs_two_workers_and_says_how_it_stands(stubbed, store, tmp_path):
+    behave(store.root, STREETS[1], "bad")
+    path = write_stub_manifest(tmp_path)
+    answer = stubbed("run", path, "--workers", "2", "--json")
+    assert answer.code == 0, answer.err
+    assert answer.json["counts"] == {
+        "waiting": 0,
+        "running": 0,
+        "done": 3,
+        "set-aside": 1,
+        "failed": 0,
+    }
+    assert [one["scene"] for one in answer.json["sequences"]] == STREETS
+    done, aside, *_ = answer.json["sequences"]
+    assert (done["state"], done["reason"], done["attempts"]) == ("done", None, 1)
+    assert done["run_id"] == "run-street-0001"
+    assert done["seconds"] >= 0
+    assert (aside["state"], aside["run_id"]) == ("set-aside", None)
+    assert stubbed("status", "--json").json["counts"] == answer.json["counts"]
+    amiss = stubbed("status", "stub", "--failed", "--json").json["sequences"]
+    assert [one["scene"] for one in amiss] == [STREETS[1]]
+    rows = [
+        {"run_id": f"run-street-{n:04d}", "status": "complete", "artefacts": []} for n in (1, 3, 4)
+    ]
+    store.tables.merge("runs", rows)
+    before = store.tables.rows("attempts")
+    assert stubbed("run", path, "--json").json["sequences"] == answer.json["sequences"]
+    assert store.tables.rows("attempts") == before
+
+
+def test_a_fleet_that_failed_exits_otherwise_and_can_be_retried(stubbed, store, tmp_path):
+    behave(store.root, STREETS[0], "no memory")
+    path = write_stub_manifest(tmp_path, sequences=1)
+    assert stubbed("run", path, "--json").code == 2
+    assert stubbed("retry", "--json").json == {"fleet": "stub", "scenes": [STREETS[0]]}
+    behave(store.root, STREETS[0], "good")
+    assert stubbed("run", path, "--json").code == 0
+
+
+def test_a_fault_of_the_manifest_leaves_no_store(tmp_path, monkeypatch):
+    monkeypatch.setenv("LIDARPAINTER_STORE", str(tmp_path / "store"))
+    answer = call("fleet", "run", tmp_path / "absent.toml")
+    assert (answer.code, answer.err.count("\n")) == (2, 1)
+    assert not (tmp_path / "store").exists()

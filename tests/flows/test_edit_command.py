@@ -1,0 +1,85 @@
+"""`lidarpainter edit` from a list of actors to a run of its own, and what it refuses."""
+
+import json
+
+import pytest
+from commands import call, seen_image, succeed
+from tiny_street import HEIGHT_PX, WIDTH_PX
+
+from tasks.runs import open_run
+from tasks.stored import load_observations, load_scene
+
+AHEAD = "nearest-ahead"
+
+
+@pytest.fixture(scope="module")
+def ahead(own_run):
+    """Who is listed as the nearest moving car that was seen."""
+    listed = succeed("edit", own_run.run_id, "actors", "--json", store=own_run.store).json
+    found = [row for row in listed["actors"] if row["is_moving"] and row["num_gaussians"] > 20]
+    return found[0]["actor_id"]
+
+
+def test_one_script_takes_out_moves_puts_in_and_shows(own_run, ahead, tmp_path):
+    script = tmp_path / "edits.json"
+    places = tmp_path / "places.csv"
+    places.write_text("x_m,y_m\n20,1\n40,2\n")
+    operations = [
+        {"op": "insert", "name": "guest", "source": {"actor": ahead}, "ahead_m": 9},
+        {"op": "re-route", "actor": "guest", "trajectory": f"waypoints:{places}"},
+        {"op": "remove", "actors": [ahead]},
+        {"op": "drive", "trajectory": "lateral:1"},
+        {"op": "style", "prompt": "foggy"},
+    ]
+    script.write_text(json.dumps(operations))
+    words = ("edit", own_run.run_id, "--script", script, "--allow-collisions", "--json")
+    first = succeed(*words, "--out", tmp_path / "shown", store=own_run.store).json
+    assert first["trajectory"] == "lateral:1"
+    seen_image(tmp_path / "shown" / "0000.png", WIDTH_PX, HEIGHT_PX)
+    run = open_run(own_run.store, first["run_id"])
+    scene = load_scene(own_run.store, run.final.gaussians)
+    assert scene.style.mix.text == "foggy:1"
+    names = [track.actor_id for track in scene.tracks]
+    assert "guest" in names
+    assert ahead not in names
+    views = load_observations(own_run.store, run.final.observations).views
+    assert any(bool(view.hidden.any()) for view in views)
+    again = succeed(*words, store=own_run.store).json
+    assert again["run_id"] == first["run_id"]
+    assert not any(again["computed_now"].values())
+    places.write_text("x_m,y_m\n20,1\n40,-2\n")  # what a script reads is part of it
+    assert succeed(*words, store=own_run.store).json["run_id"] != first["run_id"]
+
+
+def test_edits_of_an_edited_run_are_added_to_its_list(own_run, ahead):
+    store = own_run.store
+    first = succeed("edit", own_run.run_id, "scale", ahead, "factor=1.1", "--json", store=store)
+    second = succeed("edit", first.json["run_id"], "freeze", "at_s=0.2", "--json", store=store).json
+    assert second["derived_from"] == own_run.run_id
+    told = second["change"]["parameters"]["operations"]
+    assert [one["op"] for one in told] == ["scale", "freeze"]
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("remove", "bus"), "no actor 'bus', expected an id"),
+        (("move", AHEAD, "trajectory=latral:2"), "trajectory 'latral:2': expected one of"),
+        (("move", AHEAD), "trajectory: Field required"),
+        (("move", "trajectory=lateral:2"), "move takes one name, got none"),
+        (("stop", AHEAD, "at_s=soon"), "at_s=soon: expected a number"),
+        (("stop", AHEAD, "at_s=nan"), "finite number"),
+        (("fly", AHEAD), "does not match any of the expected"),
+        (("insert", "new", "source.ply=nowhere.ply"), "no file nowhere.ply"),
+        (("insert", "new", "source.run=nobody", "source.actor=a"), "no run_id 'nobody'"),
+        ((), "expected at least one operation"),
+        (("--script", "nowhere.json"), "script nowhere.json cannot be read"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line_and_leaves_nothing(own_run, words, complaint):
+    before = own_run.store.tables.rows("runs")
+    answer = call("edit", own_run.run_id, *words, store=own_run.store)
+    assert answer.code == 2
+    assert complaint in answer.err
+    assert answer.err.count("\n") == 1
+    assert own_run.store.tables.rows("runs") == before

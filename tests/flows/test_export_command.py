@@ -1,0 +1,118 @@
+"""`lidarpainter export` and the views of `render`, on the tiny street with two cameras."""
+
+import json
+from pathlib import Path
+from typing import get_args
+
+import cv2
+import pytest
+import torch
+from commands import call, seen_image, succeed
+from plyfile import PlyData
+from tiny_street import FRONT, HEIGHT_PX, NUM_FRAMES, SCENE, SIDE, WIDTH_PX
+
+from flows.cli.export import FormatName
+from flows.exports import FORMATS
+from lidarpainter_models.geometry.transforms import invert_rigid
+from tasks.opened import open_scene
+
+
+def test_the_command_knows_the_formats_of_the_flow():
+    assert get_args(FormatName) == FORMATS
+
+
+def test_a_scene_is_exported_with_what_it_loses(tiny_run, tmp_path):
+    words = (
+        "export",
+        tiny_run.run_id,
+        "--format",
+        "ply",
+        "--out",
+        tmp_path / "a.ply",
+        "--time",
+        "0.1",
+    )
+    made = succeed(*words, "--json", store=tiny_run.store).json
+    assert (made["run_id"], made["scene"]) == (tiny_run.run_id, SCENE)
+    assert made["path"] == str(tmp_path / "a.ply")
+    assert made["num_gaussians"] == len(PlyData.read(made["path"])["vertex"])
+    assert made["psnr"] > 60
+    told = succeed(*words, "--sky", store=tiny_run.store)
+    assert "far Gaussians" in told.out
+
+
+@pytest.mark.parametrize("wanted", ["colmap", "semantics", "video"])
+def test_every_camera_is_exported_also_one_that_no_fit_used(tiny_run, tmp_path, wanted):
+    words = ("--format", wanted, "--out", tmp_path / "a", "--camera", "all", "--frames", "0:2")
+    made = succeed("export", tiny_run.run_id, *words, "--json", store=tiny_run.store).json
+    assert made["num_images"] == 4
+    found = {path.name.split(".")[0] for path in Path(made["path"]).rglob("*")}
+    assert {FRONT, SIDE} <= found
+
+
+def test_render_shows_all_cameras_wider_and_beside_the_recording(tiny_run, tmp_path):
+    words = ("--trajectory", "lateral:0.5", "--camera", "all", "--frames", "0:2", "--fps", "5")
+    words += ("--width", WIDTH_PX // 2, "--video", "--beside", "recorded", "--out", tmp_path)
+    made = succeed("render", tiny_run.run_id, *words, "--json", store=tiny_run.store).json
+    assert made["cameras"] == f"{FRONT}, {SIDE}"
+    for camera in (FRONT, SIDE):
+        seen_image(tmp_path / camera / "0001.png", WIDTH_PX // 2, HEIGHT_PX // 2)
+        seen_image(tmp_path / camera / "beside" / "0001.png", WIDTH_PX, HEIGHT_PX // 2)
+        film = cv2.VideoCapture(str(tmp_path / camera / "video.mp4"))
+        assert film.get(cv2.CAP_PROP_FPS) == pytest.approx(5)
+
+
+def test_a_camera_that_no_fit_used_rides_on_the_rig_as_the_fit_found_it(tiny_run, tmp_path):
+    words = ("--trajectory", "recorded", "--camera", "all", "--frames", "1:2", "--out", tmp_path)
+    succeed("render", tiny_run.run_id, *words, store=tiny_run.store)
+    found = {}
+    for camera in (FRONT, SIDE):
+        (row,) = json.loads((tmp_path / camera / "trajectory.json").read_text())["images"]
+        found[camera] = torch.tensor(row["world_from_camera"], dtype=torch.float64).reshape(4, 4)
+    logged = {
+        view.camera_name: view.camera.world_from_camera
+        for view in open_scene(tiny_run.store, SCENE).views
+        if view.frame_index == 1
+    }
+    front_from_side = invert_rigid(found[FRONT]) @ found[SIDE]
+    expected = invert_rigid(logged[FRONT]) @ logged[SIDE]
+    torch.testing.assert_close(front_from_side, expected, atol=1e-9, rtol=0)
+    assert not torch.allclose(found[SIDE], logged[SIDE], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("--format", "obj", "--out", "a"), "'obj' is not one of 'ply', 'spz'"),
+        (
+            ("--format", "ply", "--out", "a.ply", "--time", "soon"),
+            "--time 'soon': expected seconds",
+        ),
+        (("--format", "ply", "--out", "a.ply", "--actors", "x"), "has no actor 'x', it has"),
+        (("--format", "video", "--out", "a.mp4", "--sky"), "--sky has no use for --format video"),
+        (("--format", "ply", "--out", "a.ply", "--camera", "all"), "--camera has no use for"),
+        (("--format", "gltf", "--out", "a.glb", "--per-actor"), "--per-actor has no use for"),
+        (("--format", "depth", "--out", "a", "--postpaint"), "--postpaint has no use for"),
+        (("--format", "spz", "--out", "a.spz", "--spz-version", "2"), "expected 3 or 4"),
+        (("--format", "depth", "--out", "a", "--camera", "roof"), "has no camera 'roof'"),
+        (("--format", "depth", "--out", "a", "--width", "9999"), "expected at most"),
+        (("--format", "video", "--out", "a.mp4", "--fps", "0"), "--fps 0: expected above 0"),
+        (("--format", "video", "--out", "a.mp4", "--beside", "ffff"), "'ffff'"),
+        (("--format", "colmap", "--out", "a", "--postpaint"), "taken as they are"),
+        (("--format", "ply", "--out", "/proc/no/a.ply"), "cannot be written"),
+    ],
+)
+def test_wrong_words_are_answered_in_one_line(tiny_run, tmp_path, monkeypatch, words, complaint):
+    monkeypatch.chdir(tmp_path)
+    answer = call("export", tiny_run.run_id, *words, store=tiny_run.store)
+    assert answer.code == 2, answer.err
+    (line,) = [one for one in answer.err.splitlines() if one.startswith("lidarpainter: ")]
+    assert complaint in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_frames_are_numbered_as_recorded(tiny_run, tmp_path):
+    words = ("--format", "lidar-bin", "--out", tmp_path / "a", "--frames", f"{NUM_FRAMES - 1}:")
+    made = succeed("export", tiny_run.run_id, *words, "--json", store=tiny_run.store).json
+    (file,) = Path(made["path"]).rglob("*.pcd.bin")
+    assert file.name == f"{NUM_FRAMES - 1:04d}.pcd.bin"

@@ -1,0 +1,203 @@
+"""A finished run in a browser: the panel moves what it says, and the page holds the drive."""
+
+import threading
+from contextlib import contextmanager
+from dataclasses import replace
+from unittest.mock import Mock
+
+import pytest
+import torch
+import viser
+from viser import transforms
+
+from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+from lidarpainter_models.geometry.transforms import invert_rigid, quaternion_from_rotation
+from lidarpainter_models.viewing.annotations import vertical_fov_rad
+from lidarpainter_models.viewing.controls import CLICK_HINT
+from lidarpainter_models.viewing.drive_nodes import SEAT_FROM_CAMERA
+from lidarpainter_models.viewing.servers import local_server
+from lidarpainter_models.viewing.viewer import LiveViewer
+from tasks.views.drive import DriveRequest, shown_drive, write_page
+from tasks.views.render import RenderRequest
+
+
+@pytest.fixture(scope="module")
+def wanted(run, parameters):
+    view = RenderRequest(
+        trajectory=parse_trajectory("recorded"),
+        observation=parameters.observation,
+        conditions=parameters.conditions,
+    )
+    return DriveRequest(view=view, scenes={"painted": run.final, "before painting": run.unpainted})
+
+
+@pytest.fixture(scope="module")
+def drive(store, parameters, wanted):
+    return shown_drive(parameters.run_spec(store.root), wanted)
+
+
+@pytest.fixture(scope="module")
+def server():
+    with local_server(port=0) as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def viewer(server, drive):
+    return LiveViewer(server, drive)
+
+
+@contextmanager
+def chosen(viewer, **values):
+    """The panel with other values, for as long as the block runs."""
+    controls = {name: getattr(viewer.controls, name) for name in values}
+    before = {name: control.value for name, control in controls.items()}
+    for name, value in values.items():
+        controls[name].value = value
+    yield
+    for name, value in before.items():
+        controls[name].value = value
+
+
+def pose(handle):
+    """Parent from node."""
+    rotation = transforms.SO3(handle.wxyz)
+    found = transforms.SE3.from_rotation_and_translation(rotation, handle.position)
+    return torch.from_numpy(found.as_matrix())
+
+
+def seat_camera(server):
+    """`world_from_camera` of the seat that the browser is shown."""
+    world = server.scene.get_handle_by_name("/drive")
+    return invert_rigid(pose(world)) @ SEAT_FROM_CAMERA
+
+
+def shown(server, name):
+    return server.scene.get_handle_by_name(f"/drive/{name}").visible
+
+
+def test_seat_is_where_the_camera_stood(server, viewer, drive):
+    for moment in range(len(drive.path.views)):
+        with chosen(viewer, moment=moment):
+            recorded = drive.path.camera(moment).world_from_camera
+            assert torch.allclose(seat_camera(server), recorded, atol=1e-6)
+
+
+def test_seat_aside_is_as_far_to_the_left_as_was_chosen(server, viewer, drive):
+    with chosen(viewer, seat="aside", left_m=1.5, up_m=0.5):
+        step = seat_camera(server) - drive.path.camera(0).world_from_camera
+    assert torch.allclose(step[:3, 3], torch.tensor([0.0, 1.5, 0.5]).double(), atol=1e-6)
+    assert float(step[:3, :3].abs().max()) < 1e-6
+
+
+def test_free_seat_stays_while_actors_go_on(server, viewer, drive):
+    car = server.scene.get_handle_by_name("/drive/boxes/000 Car")
+    with chosen(viewer, seat="aside"), chosen(viewer, seat="free"):
+        before, stood = seat_camera(server), pose(car)
+        with chosen(viewer, moment=3):
+            assert torch.equal(seat_camera(server), before)
+            expected = drive.path.builder.scene.actors.likely_poses(
+                drive.path.views[3].timestamp_ns
+            )
+            assert torch.allclose(pose(car), expected[0][0], atol=1e-6)
+            assert not torch.allclose(pose(car), stood, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("control", "name"),
+    [
+        ("actors", "painted/actors"),
+        ("boxes", "boxes"),
+        ("tracks", "tracks"),
+        ("cameras", "cameras"),
+        ("lidar", "lidar"),
+    ],
+)
+def test_every_tick_shows_and_hides_its_kind(server, viewer, control, name):
+    for is_ticked in (True, False):
+        with chosen(viewer, **{control: is_ticked}):
+            assert shown(server, name) == is_ticked
+
+
+def test_camera_shows_its_image_and_lidar_its_points(server, viewer, drive):
+    with chosen(viewer, cameras=True, lidar=True, moment=2):
+        frustum = server.scene.get_handle_by_name("/drive/cameras/front")
+        assert frustum.image.std() > 10
+        assert not frustum.visible  # one sits in it
+        view = drive.path.views[2]
+        cloud = server.scene.get_handle_by_name("/drive/lidar")
+        assert len(cloud.points) == len(drive.path.recorded.read_points(view.frame_index).xyz_m)
+        with chosen(viewer, seat="aside"):
+            assert frustum.visible
+
+
+def test_scene_before_painting_takes_the_place_of_the_painted_one(server, viewer):
+    with chosen(viewer, scene="before painting"):
+        assert shown(server, "before painting")
+        assert not shown(server, "painted")
+    assert shown(server, "painted")
+    assert not shown(server, "before painting")
+
+
+def test_click_names_the_actor_under_it_and_nothing_else(viewer):
+    car, sky = Mock(viser.SceneClickEvent), Mock(viser.SceneClickEvent)
+    car.ray_origin = sky.ray_origin = (0.0, 0.0, 0.0)
+    car.ray_direction, sky.ray_direction = (10.0, -4.0, -0.9), (0.0, 0.0, 1.0)
+    viewer._pick(car)
+    assert "**Car**, id `car`, 4.0 m long, 1.8 m wide, 1.5 m high" in viewer.controls.picked.content
+    viewer._pick(sky)
+    assert viewer.controls.picked.content == CLICK_HINT
+
+
+def test_time_goes_on_while_playing_and_begins_again(viewer, drive):
+    seen, stopped = [], threading.Event()
+
+    def watch(event):
+        seen.append(event.target.value)
+        if len(seen) == len(drive.path.views):
+            stopped.set()
+
+    viewer.controls.moment.on_update(watch)
+    with chosen(viewer, play=True, speed="4x"):
+        viewer.play(stopped)
+    viewer.controls.moment.remove_update_callback(watch)
+    assert seen == [1, 2, 3, 0]
+
+
+def test_own_image_is_what_the_scene_shows_from_the_browsers_camera(viewer, drive):
+    camera, view = drive.path.camera(0), Mock(viser.CameraHandle)
+    view.wxyz = quaternion_from_rotation(SEAT_FROM_CAMERA[:3, :3]).numpy()
+    view.position = torch.zeros(3).numpy()
+    view.fov, view.aspect = vertical_fov_rad(camera), camera.width_px / camera.height_px
+    found = viewer.own_image(view, painted=False)
+    scene, moment = drive.path.builder.scene, drive.path.views[0]
+    expected = scene.render(camera, moment.timestamp_ns, camera_name="front").rgb.clamp(0, 1)
+    lower = round(camera.height_px / 2 - camera.cy_px)  # a browser looks through the middle
+    assert lower > 0
+    error = (found[lower:] - expected[:-lower]).square().mean()
+    assert float(error) < 1e-3
+
+
+def test_port_that_is_taken_is_refused(server):
+    with pytest.raises(ConfigError, match="cannot be had"), local_server(port=server.get_port()):
+        pass
+
+
+def test_page_drives_the_recorded_path_and_one_beside_it(
+    store, parameters, wanted, tmp_path, capfd
+):
+    out = tmp_path / "drive.html"
+    run = parameters.run_spec(store.root)
+    made = write_page.fn(run, wanted, out)
+    page = out.read_text("utf-8")
+    assert made["bytes"] == len(page) < 2_000_000
+    assert "<title>LidarPainter: toy/street</title>" in page
+    assert "made from numbers" in page
+    assert capfd.readouterr().out == ""
+
+
+def test_page_along_no_camera_is_refused(store, parameters, wanted):
+    run = parameters.run_spec(store.root)
+    with pytest.raises(SceneError, match="no camera"):
+        shown_drive(run, replace(wanted, view=replace(wanted.view, camera="rear")))

@@ -1,0 +1,164 @@
+"""A finished run, taken along: what the stages write of it, and what they refuse."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from lidarpainter_models.errors import ConfigError, SceneError, WriteError
+from lidarpainter_models.gaussians.model.instance_images import SKY
+from lidarpainter_models.gaussians.model.ply_files import read_ply
+from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+from tasks.exports.dataset import DatasetRequest, export_dataset
+from tasks.exports.scene import SceneRequest, export_scene
+from tasks.exports.sweeps import export_sweeps
+from tasks.exports.views import export_images, export_video
+from tasks.stored import load_scene
+from tasks.views.files import ViewKinds
+from tasks.views.render import RenderRequest, render
+
+
+@pytest.fixture
+def asked(store, run, parameters):
+    """The run as tasks are given it, and its fit."""
+    return parameters.run_spec(store.root), run.final
+
+
+@pytest.fixture
+def view(parameters):
+    """Two views a metre to the left."""
+    return RenderRequest(
+        trajectory=parse_trajectory("lateral:1"),
+        frames=slice(1, 3),
+        observation=parameters.observation,
+        conditions=parameters.conditions,
+    )
+
+
+@pytest.mark.parametrize(
+    ("wanted", "ending", "least_db"),
+    [("ply", "ply", 80), ("spz", "spz", 40), ("gltf", "glb", 80), ("usd", "usdz", 80)],
+)
+def test_a_scene_is_written_and_says_what_is_lost(asked, tmp_path, wanted, ending, least_db):
+    out = tmp_path / "made" / f"street.{ending}"
+    made = export_scene.fn(*asked, SceneRequest(format=wanted, frame=2), out)
+    assert made["path"] == str(out)
+    assert made["num_bytes"] == out.stat().st_size
+    assert made["num_actors"] == 1
+    assert made["worst_psnr"] > least_db
+    assert [path.name for path in out.parent.iterdir()] == [out.name]
+
+
+def test_actors_stand_in_files_of_their_own(store, asked, tmp_path):
+    request = SceneRequest(format="ply", is_per_actor=True)
+    export_scene.fn(*asked, request, tmp_path / "parts")
+    names = sorted(path.name for path in (tmp_path / "parts").iterdir())
+    assert names == ["actor-000.ply", "street.ply"]
+    scene = load_scene(store, asked[1].gaussians)
+    counts = [len(read_ply(tmp_path / "parts" / name)) for name in names]
+    assert counts == np.bincount(scene.gaussians.body_index.numpy())[::-1].tolist()
+    comment = (tmp_path / "parts" / "actor-000.ply").read_bytes()[:300]
+    assert b"box frame: x along the length, y left, z up" in comment
+
+
+def test_chosen_actors_are_not_called_a_loss(asked, tmp_path):
+    made = export_scene.fn(*asked, SceneRequest(format="ply", actors=()), tmp_path / "a.ply")
+    assert (made["num_actors"], made["psnr"]) == (0, None)
+
+
+@pytest.mark.parametrize(
+    ("changes", "name", "error", "complaint"),
+    [
+        ({"actors": ("nobody",)}, "a.ply", SceneError, "has no actor 'nobody'"),
+        ({"time_s": 99.0}, "a.ply", ConfigError, "--time 99: expected 0 to"),
+        ({"frame": 99}, "a.ply", ConfigError, "--time frame:99: expected 0 to 3"),
+        ({}, "a.obj", ConfigError, r"a\.obj: expected a name in \.ply"),
+        ({"actors": (), "is_per_actor": True}, "a", SceneError, "leave --per-actor out"),
+        ({"format": "gltf", "is_per_actor": True}, "a", ConfigError, "not as gltf"),
+        ({}, "file/a.ply", WriteError, "cannot be written"),
+        ({"is_per_actor": True}, "full", ConfigError, "is there already"),
+    ],
+)
+def test_what_cannot_be_written_is_refused(asked, tmp_path, changes, name, error, complaint):
+    (tmp_path / "file").touch()
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "kept").touch()
+    request = SceneRequest(**{"format": "ply", **changes})
+    with pytest.raises(error, match=complaint):
+        export_scene.fn(*asked, request, tmp_path / name)
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "full", "kept"]
+
+
+@pytest.mark.parametrize("wanted", ["colmap", "nerfstudio"])
+def test_a_data_set_has_recorded_images_and_views_beside(asked, view, tmp_path, wanted):
+    recorded = replace(view, trajectory=parse_trajectory("recorded"))
+    request = DatasetRequest(format=wanted, recorded=recorded, beside=view)
+    made = export_dataset.fn(*asked, request, tmp_path / "set")
+    assert (made["num_recorded"], made["num_images"]) == (2, 4)
+    if wanted == "colmap":
+        found = pycolmap.Reconstruction(tmp_path / "set" / "sparse" / "0")
+        names = [image.name for image in found.images.values()]
+        assert len(found.points3D) == made["num_points"] > 0
+    else:
+        frames = json.loads((tmp_path / "set" / "transforms.json").read_text())["frames"]
+        names = [frame["file_path"].removeprefix("images/") for frame in frames]
+    folders = sorted({name.split("/")[0] for name in names})
+    assert folders == ["front", "front_lateral-1"]
+    for name in names:
+        assert cv2.imread(str(tmp_path / "set" / "images" / name)) is not None
+    with pytest.raises(ConfigError, match="recorded images are taken as they are"):
+        replace(request, beside=recorded)
+
+
+def test_depth_and_semantics_say_the_same_of_the_sky(asked, view, tmp_path):
+    kinds = ViewKinds(images=False, depth=True, semantics=True)
+    made = export_images.fn(*asked, replace(view, kinds=kinds), tmp_path / "maps")
+    assert made["num_images"] == 2
+    depth = cv2.imread(str(tmp_path / "maps" / "depth" / "0001.png"), cv2.IMREAD_UNCHANGED)
+    who = cv2.imread(str(tmp_path / "maps" / "semantics" / "0001.png"), cv2.IMREAD_UNCHANGED)
+    assert (depth.dtype, who.dtype) == (np.uint16, np.uint16)
+    np.testing.assert_array_equal(depth == 0, who == SKY)
+    legend = json.loads((tmp_path / "maps" / "semantics.json").read_text())
+    assert {str(number) for number in np.unique(who)} <= set(legend["instances"])
+    assert not (tmp_path / "maps" / "0001.png").exists()
+
+
+def test_a_film_shows_the_recording_to_the_left(asked, view, tmp_path):
+    kinds = ViewKinds(images=False, video=True, fps=4.0)
+    request = replace(view, kinds=kinds, beside="recorded")
+    made = export_video.fn(*asked, request, tmp_path / "a.mp4")
+    film = cv2.VideoCapture(str(tmp_path / "a.mp4"))
+    assert (made["fps"], film.get(cv2.CAP_PROP_FRAME_COUNT)) == (4.0, 2)
+    assert film.get(cv2.CAP_PROP_FRAME_WIDTH) == 240  # twice the width of the fit
+    with pytest.raises(ConfigError, match=r"a\.avi: expected a name in \.mp4"):
+        export_video.fn(*asked, request, tmp_path / "a.avi")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
+
+
+@pytest.mark.parametrize(("wanted", "ending"), [("lidar", ".pcd"), ("lidar-bin", ".pcd.bin")])
+def test_recorded_sweeps_come_with_their_poses(asked, tmp_path, wanted, ending):
+    made = export_sweeps.fn(asked[0], wanted, slice(0, 2), tmp_path / "sweeps")
+    listed = json.loads((tmp_path / "sweeps" / "sweeps.json").read_text())["sweeps"]
+    assert (made["num_sweeps"], len(listed)) == (2, 2)
+    assert all((tmp_path / "sweeps" / row["file"]).name.endswith(ending) for row in listed)
+    with pytest.raises(SceneError, match="no LiDAR sweep is left"):
+        export_sweeps.fn(asked[0], wanted, slice(90, 99), tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+
+
+def test_renders_come_with_film_depth_semantics_and_a_companion(asked, view, tmp_path):
+    kinds = ViewKinds(depth=True, semantics=True, video=True)
+    request = replace(view, kinds=kinds, beside=asked[1])
+    made = render.fn(*asked, request, tmp_path)
+    assert made["fps"] == pytest.approx(10, abs=0.1)
+    row = json.loads((tmp_path / "trajectory.json").read_text())["images"][0]
+    for kind in ("file", "depth", "semantics", "beside"):
+        assert (tmp_path / row[kind]).is_file()
+    pair = cv2.imread(str(tmp_path / row["beside"]))
+    np.testing.assert_array_equal(pair[:, :120], pair[:, 120:])  # the other run is this one
+    assert (tmp_path / "video.mp4").is_file()
+    with pytest.raises(ConfigError, match="--beside unpainted needs a painter"):
+        replace(view, beside="unpainted")
