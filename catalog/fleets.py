@@ -31,6 +31,8 @@ class Wish:
     fleet: str
     scene_id: str
     cameras: tuple[str, ...] | None
+    configuration: str | None = None
+    fit_seed: int = 0
     position: int
     priority: int
     variants: tuple[str, ...]
@@ -41,9 +43,10 @@ class Wish:
 
     @property
     def sequence_id(self) -> str:
-        """One scene may be asked for with several choices of cameras."""
+        """One scene may be asked for with several choices of cameras, and in several ways."""
         cameras = self.cameras and sorted(self.cameras)
-        return digest_text(canonical_json([self.fleet, self.scene_id, cameras]))[:ID_LENGTH]
+        way = [self.configuration, self.fit_seed]
+        return digest_text(canonical_json([self.fleet, self.scene_id, cameras, *way]))[:ID_LENGTH]
 
     def row(self) -> dict[str, Any]:
         """The row before the first attempt."""

@@ -165,12 +165,14 @@ PAINTERS = TableSchema(
 
 SEQUENCES = TableSchema(
     "sequences",
-    "What each fleet was asked for, and where it stands: one row for one scene and its cameras.",
+    "What each fleet was asked for, and where it stands: one row for one way to make one scene.",
     (
-        Column("sequence_id", "text", "digest of the fleet, the scene and the cameras"),
+        Column("sequence_id", "text", "digest of the fleet, the scene, the cameras and the way"),
         Column("fleet", "text", "name of the manifest"),
         Column("scene_id", "text", "dataset/sequence"),
         Column("cameras", "texts", "cameras to train on; null: all"),
+        Column("configuration", "text", "name of the way it is made; null where there is one"),
+        Column("fit_seed", "integer", "decides in which order a fit sees its views"),
         Column("position", "integer", "place in the manifest, from 0"),
         Column("priority", "integer", "higher ones go first"),
         Column("variants", "texts", "styles that are wanted of it"),

@@ -5,8 +5,10 @@ different cameras: it is read once with all of them, and each run trains on its 
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from functools import cached_property
+from itertools import cycle, product
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ from catalog.digests import canonical_json, digest_text, plain
 from catalog.errors import UnknownRecordError
 from catalog.fleets import Wish
 from catalog.store import split_scene_id
-from flows.fleet.manifest import SYNTHETIC, Manifest, Source, range_of
+from flows.fleet.manifest import STORED, SYNTHETIC, Manifest, Source, range_of
 from flows.overrides import with_changes, with_overrides
 from flows.parameters import ReconstructParameters
 from flows.presets import preset as preset_named
@@ -32,6 +34,7 @@ from tasks.specs import street_id
 from tasks.weights import file_digests
 
 MAX_SEQUENCES = 100_000
+FITS = ("fit", "refine")
 _WILD = "*?["
 
 
@@ -53,6 +56,9 @@ class Asked(BaseModel):
     preset: str
     painter: str | None = None
     settings: tuple[str, ...] = ()
+    configuration: str | None = None
+    """Name of the way that it is made in, where there are several."""
+    fit_seed: int = 0
     scores: bool = True
     report: bool = True
 
@@ -72,7 +78,13 @@ class Asked(BaseModel):
         changes |= {"train_cameras": self.cameras} if self.cameras else {}
         changes |= {"painter": self.painter} if self.painter else {}
         chosen = with_changes(preset_named(self.preset, self.scene_id), changes)
-        return with_overrides(chosen, self.settings)
+        seeded = {name: replace(getattr(chosen, name), seed=self.fit_seed) for name in FITS}
+        return with_overrides(with_changes(chosen, seeded), self.settings)
+
+    @property
+    def is_stored(self) -> bool:
+        """Whether it is made of a scene that the store has to have already."""
+        return self.seed is None and self.root is None
 
     @property
     def street(self) -> SyntheticStreetConfig:
@@ -111,10 +123,18 @@ def wishes(manifest: Manifest, folder: Path) -> list[Wish]:
         for number, source in enumerate(manifest.source, start=1)
         for asked in _of_source(manifest, source, folder, f"[[source]] {number}")
     ]
-    if len(found) > MAX_SEQUENCES:
-        raise ConfigError(f"{len(found)} sequences are asked for, expected at most {MAX_SEQUENCES}")
-    asked = _with_shared_reading([one for _, one in found])
-    weights = _weights(asked[0].parameters)
+    number = len(found) * max(len(manifest.configuration), 1) * len(manifest.fit_seeds)
+    if number > MAX_SEQUENCES:
+        raise ConfigError(f"{number} sequences are asked for, expected at most {MAX_SEQUENCES}")
+    read = _with_shared_reading([one for _, one in found])
+    sources = [source for source, _ in found]
+    # neighbours are of different scenes: workers wait for no fit that two of them need
+    asked = [
+        one.model_copy(update={**changes, "settings": (*one.settings, *more)})
+        for changes, more in _ways(manifest)
+        for one in read
+    ]
+    weights: dict[tuple[str, str], list[Any]] = {}
     code = [code_behind(START).digest, lidarpainter_models.__version__]
     budget = canonical_json(manifest.budget)
     return [
@@ -122,22 +142,40 @@ def wishes(manifest: Manifest, folder: Path) -> list[Wish]:
             fleet=manifest.name,
             scene_id=one.scene_id,
             cameras=one.cameras,
+            configuration=one.configuration,
+            fit_seed=one.fit_seed,
             position=position,
             priority=source.priority,
             variants=manifest.variants,
             asked=one.model_dump_json(),
-            asked_digest=digest_text(canonical_json([plain(one), plain(one.parameters), weights])),
+            asked_digest=digest_text(
+                canonical_json([plain(one), plain(one.parameters), _weights(one, weights)])
+            ),
             code_digest=digest_text(canonical_json(code)),
             budget=budget,
         )
-        for position, ((source, _), one) in enumerate(zip(found, asked, strict=True))
+        for position, (one, source) in enumerate(zip(asked, cycle(sources), strict=False))
     ]
 
 
-def _weights(parameters: ReconstructParameters) -> list[Any]:
-    """Digests of what is learned; the same for all sequences of a manifest."""
-    painter = PainterChoice.of(parameters.painter).digest
-    return [painter, file_digests(parameters.judge_config.weight_files)]
+def _ways(manifest: Manifest) -> Iterator[tuple[dict[str, Any], tuple[str, ...]]]:
+    """What every configuration with every seed changes of a sequence, and its further settings."""
+    for way, fit_seed in product(manifest.configuration or (None,), manifest.fit_seeds):
+        if way is None:
+            yield {"fit_seed": fit_seed}, ()
+            continue
+        stated = {name: getattr(way, name) for name in ("preset", "painter")}
+        stated = {name: value for name, value in stated.items() if value is not None}
+        yield {**stated, "configuration": way.name, "fit_seed": fit_seed}, way.settings
+
+
+def _weights(asked: Asked, known: dict[tuple[str, str], list[Any]]) -> list[Any]:
+    """Digests of what is learned, read once for each choice of files."""
+    painter, files = asked.parameters.painter, asked.parameters.judge_config.weight_files
+    key = painter, str(sorted(files.items()))
+    if key not in known:
+        known[key] = [PainterChoice.of(painter).digest, file_digests(files)]
+    return known[key]
 
 
 def _of_source(manifest: Manifest, source: Source, folder: Path, table: str) -> Iterator[Asked]:
@@ -155,6 +193,11 @@ def _of_source(manifest: Manifest, source: Source, folder: Path, table: str) -> 
         same["frames"] = (chosen.start, chosen.stop)
     if source.dataset == SYNTHETIC:
         yield from _streets(source, same, table)
+        return
+    if source.dataset == STORED:
+        for scene in source.scenes or ():
+            dataset, _, name = scene.partition("/")
+            yield Asked(sequence=name, **{**same, "dataset": dataset})
         return
     root = (folder / Path(source.root or "").expanduser()).resolve()
     for name in _matching(source, root, table):

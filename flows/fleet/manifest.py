@@ -23,7 +23,8 @@ from pydantic import (
 
 from lidarpainter_models.errors import ConfigError
 
-SYNTHETIC = "synthetic"
+SYNTHETIC, STORED = "synthetic", "stored"
+"""In place of a dataset: streets to be drawn, and scenes that are in the store."""
 MAX_BYTES = 1 << 20
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _GLOB = re.compile(r"[A-Za-z0-9*?\[\]!._-]{1,64}")
@@ -34,8 +35,15 @@ WORDS = {
     " after validation": "",
     "valid dictionary or instance of Budget": "table",
     "valid dictionary or instance of Source": "table",
+    "valid dictionary or instance of Configuration": "table",
 }
 """What TOML calls things that Python calls otherwise."""
+_SPECIAL_KEYS = {"root", "seeds", "scenes", "sequences", "frames", "width_px"}
+_KEYS: dict[str, tuple[str, set[str]]] = {
+    SYNTHETIC: ("seeds", {"frames", "width_px"}),
+    STORED: ("scenes", set()),
+}
+"""What a source that is no dataset needs, and what else it may have of these."""
 _MODEL = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
@@ -48,6 +56,12 @@ def _name(text: str) -> str:
 def _glob(text: str) -> str:
     if not _GLOB.fullmatch(text) or text.startswith("."):
         raise ValueError(f"{text!r}: expected the name of a sequence, or a glob such as 1*")
+    return text
+
+
+def _scene(text: str) -> str:
+    if [_GLOB.fullmatch(part) is None for part in text.split("/")] != [False, False]:
+        raise ValueError(f"{text!r}: expected dataset/sequence")
     return text
 
 
@@ -66,6 +80,7 @@ def _local(text: str) -> str:
 
 Name = Annotated[StrictStr, AfterValidator(_name)]
 Glob = Annotated[StrictStr, AfterValidator(_glob)]
+SceneName = Annotated[StrictStr, AfterValidator(_scene)]
 Range = Annotated[StrictStr, AfterValidator(_range)]
 Folder = Annotated[StrictStr, AfterValidator(_local)]
 Number = StrictFloat | StrictInt
@@ -77,11 +92,13 @@ class Source(BaseModel):
     model_config = _MODEL
 
     dataset: Name
-    """A dataset, or `synthetic`."""
+    """A dataset, `synthetic`, or `stored`."""
     root: Folder | None = None
     """Its folder as downloaded; a relative one counts from the manifest."""
     sequences: Annotated[tuple[Glob, ...], Field(min_length=1)] | None = None
     """Names or globs; left out: all."""
+    scenes: Annotated[tuple[SceneName, ...], Field(min_length=1)] | None = None
+    """`dataset/sequence` of scenes that are in the store."""
     cameras: Annotated[tuple[Name, ...], Field(min_length=1)] | None = None
     """Cameras to train on; left out: all."""
     frames: Range | None = None
@@ -95,17 +112,28 @@ class Source(BaseModel):
 
     @model_validator(mode="after")
     def _fits_dataset(self) -> "Source":
-        is_street = self.dataset == SYNTHETIC
-        needed, unfit = ("seeds", "root") if is_street else ("root", "seeds")
-        others = ("sequences",) if is_street else ("width_px",)
+        needed, allowed = _KEYS.get(self.dataset, ("root", {"sequences", "frames"}))
         if getattr(self, needed) is None:
             raise ValueError(f"{needed} is missing, which dataset {self.dataset!r} needs")
-        for name in (unfit, *others):
+        for name in sorted(_SPECIAL_KEYS - {needed} - allowed):
             if getattr(self, name) is not None:
                 raise ValueError(f"{name} is not for dataset {self.dataset!r}")
-        if is_street and self.frames is not None and range_of(self.frames).start:
+        if self.seeds is not None and self.frames is not None and range_of(self.frames).start:
             raise ValueError(f"frames {self.frames!r}: a street begins at frame 0")
         return self
+
+
+class Configuration(BaseModel):
+    """One way to make the sequences, where several are to be compared."""
+
+    model_config = _MODEL
+
+    name: Name
+    preset: StrictStr | None = None
+    """The manifest's if absent, as the painter."""
+    painter: StrictStr | None = None
+    settings: tuple[StrictStr, ...] = Field(default=(), alias="set")
+    """`key=value`, after those of the manifest."""
 
 
 class Budget(BaseModel):
@@ -136,11 +164,26 @@ class Manifest(BaseModel):
     settings: tuple[StrictStr, ...] = Field(default=(), alias="set")
     """`key=value`, as `--set` of `reconstruct`."""
     source: Annotated[tuple[Source, ...], Field(min_length=1)]
+    configuration: tuple[Configuration, ...] = ()
+    """Every sequence is made in each of these ways; left out: in one."""
+    fit_seeds: Annotated[tuple[Annotated[StrictInt, Field(ge=0)], ...], Field(min_length=1)] = (0,)
+    """Each way is tried with each of these, which decide in which order a fit sees its views."""
     variants: tuple[Name, ...] = ()
     """Names of styles that are wanted of every scene; entered into the catalog."""
     publish: tuple[Literal["scores", "report"], ...] = ("scores", "report")
     """What is made of every fitted scene."""
     budget: Budget = Budget()
+
+    @model_validator(mode="after")
+    def _tells_ways_apart(self) -> "Manifest":
+        names = [way.name for way in self.configuration]
+        if len(set(names)) < len(names) or len(set(self.fit_seeds)) < len(self.fit_seeds):
+            raise ValueError("two configurations have one name, or two fit_seeds are equal")
+        return self
+
+
+LISTS: dict[str, type[BaseModel]] = {"source": Source, "configuration": Configuration}
+"""Tables that a manifest may hold several of."""
 
 
 def range_of(text: str) -> range:
@@ -178,8 +221,9 @@ def _fault(error: ValidationError, values: dict[str, Any]) -> str:
     names = [one for one in names if one not in ("float", "int")]  # arms of a number
     table = ""
     owner: type[BaseModel] = Manifest
-    if names and names[0] == "source" and len(names) > 1:
-        table, owner = f"[[source]] {int(names[1]) + 1}: ", Source  # people count from one
+    if names and names[0] in LISTS and len(names) > 1:
+        # people count from one
+        table, owner = f"[[{names[0]}]] {int(names[1]) + 1}: ", LISTS[str(names[0])]
         names = names[2:]
     elif names and names[0] == "budget" and isinstance(values.get("budget"), dict):
         table, owner, names = "[budget]: ", Budget, names[1:]

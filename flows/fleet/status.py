@@ -11,6 +11,11 @@ from flows.fleet.limits import lacks_disk, over_budget
 from flows.fleet.manifest import Budget
 
 STATES: tuple[State, ...] = get_args(State)
+SHOWN = (
+    *("configuration", "fit_seed", "cameras"),
+    *("state", "reason", "run_id", "seconds", "attempts"),
+)
+"""Columns of a sequence."""
 ENDED: tuple[State, ...] = ("done", "set-aside")
 """Nothing more is to be done, and nothing is amiss with the fleet."""
 
@@ -65,5 +70,4 @@ def planner_error(attempts: Iterable[Mapping[str, Any]]) -> float | None:
 
 
 def _sequence(row: Row) -> dict[str, Any]:
-    names = ("cameras", "state", "reason", "run_id", "seconds", "attempts")
-    return {"scene": row["scene_id"], **{name: row[name] for name in names}}
+    return {"scene": row["scene_id"], **{name: row[name] for name in SHOWN}}

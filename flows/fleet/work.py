@@ -81,8 +81,12 @@ def _bring_in(asked: Asked, store: Store) -> None:
     """Read or draw the scene unless the store has it as it is asked for.
 
     Raises:
+        SceneError: the store was to have it.
         ConfigError: the store has it, read or drawn otherwise; other runs may stand on it.
     """
+    if asked.is_stored:
+        open_scene(store, asked.scene_id)
+        return
     if asked.seed is None:
         frames = None if asked.frames is None else slice(*asked.frames)
         root = asked.root or Path()

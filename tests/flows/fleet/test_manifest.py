@@ -12,6 +12,7 @@ from lidarpainter_models.errors import ConfigError, DataError, WeightsError
 STREETS = '[[source]]\ndataset = "synthetic"\nseeds = "1:3"\n'
 GOOD = f'name = "night"\n{STREETS}'
 LOGS = '[[source]]\ndataset = "pandaset"\nroot = "logs"\n'
+WAY = '[[configuration]]\nname = "short"\nset = ["fit.steps=20"]\n'
 FAULTS = {
     "name is missing": STREETS,
     "source is missing": 'name = "night"',
@@ -31,6 +32,13 @@ FAULTS = {
     "[budget]: hours: input should be greater than 0, got -1": f"{GOOD}[budget]\nhours = -1\n",
     "budget: input should be a table, got 3": f"budget = 3\n{GOOD}",
     "publish.0: input should be 'scores' or 'report', got 'all'": f'publish = ["all"]\n{GOOD}',
+    "[[source]] 1: scenes.0: '002': expected dataset/sequence": (
+        'name = "night"\n[[source]]\ndataset = "stored"\nscenes = ["002"]\n'
+    ),
+    "[[source]] 1: scenes is not for dataset 'synthetic'": f'{GOOD}scenes = ["a/b"]\n',
+    "[[configuration]] 1: name is missing": f"{GOOD}[[configuration]]\n",
+    "two configurations have one name": f"{GOOD}{2 * WAY}",
+    "or two fit_seeds are equal": f"fit_seeds = [1, 1]\n{GOOD}",
     "expected TOML": "name = [[[",
     "expected TOML: maximum recursion": "name = " + "[" * 5000,
 }
@@ -130,3 +138,27 @@ def test_one_scene_with_several_choices_of_cameras_is_read_once_with_all(asked_o
         asked_of(f'{GOOD}cameras = ["rear"]\n')
     with pytest.raises(ConfigError, match="seeds: expected at most"):
         asked_of(GOOD.replace("1:3", "0:999999999"))
+
+
+def test_every_configuration_is_tried_with_every_seed_on_every_scene(asked_of):
+    words = 'painter = "warp"\nset = ["fit.steps=40"]\nfit_seeds = [0, 7]\n'
+    found = asked_of(f'{words}{GOOD}{WAY}[[configuration]]\nname = "bare"\npainter = "none"\n')
+    assert len(found) == 8
+    assert [one.sequence for one in found[:2]] == ["street-0001", "street-0002"]
+    by_way = {(one.configuration, one.fit_seed): one.parameters for one in found}
+    assert set(by_way) == {("short", 0), ("short", 7), ("bare", 0), ("bare", 7)}
+    short, bare = by_way["short", 7], by_way["bare", 0]
+    assert (short.fit.steps, short.painter, short.fit.seed, short.refine.seed) == (20, "warp", 7, 7)
+    assert (bare.fit.steps, bare.painter, bare.fit.seed) == (40, "none", 0)
+
+
+def test_each_way_is_a_sequence_of_its_own(written):
+    path = written(f"fit_seeds = [0, 7]\n{GOOD}{WAY}")
+    found = wishes(read_manifest(path), path.parent)
+    assert len({wish.sequence_id for wish in found}) == len({wish.asked for wish in found}) == 4
+
+
+def test_scenes_of_the_store_are_taken_as_they_are(asked_of):
+    text = 'name = "night"\n[[source]]\ndataset = "stored"\nscenes = ["pandaset/002"]\n'
+    (one,) = asked_of(text)
+    assert (one.scene_id, one.is_stored) == ("pandaset/002", True)
