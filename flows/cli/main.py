@@ -25,6 +25,7 @@ from flows.cli import (
     export,
     fleet,
     ingest,
+    measure,
     painter,
     reconstruct,
     render,
@@ -70,6 +71,8 @@ app.command("stylize")(stylize.stylize)
 app.command("edit")(edit.edit)
 app.command("view")(view.view)
 app.command("evaluate")(evaluate.evaluate)
+app.command("chart")(measure.chart)
+app.command("size")(measure.size)
 app.add_typer(painter.app, name="painter")
 app.add_typer(fleet.app, name="fleet")
 app.add_typer(catalog.app, name="catalog")

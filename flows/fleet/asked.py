@@ -164,9 +164,11 @@ def _ways(manifest: Manifest) -> Iterator[tuple[dict[str, Any], tuple[str, ...]]
         if way is None:
             yield {"fit_seed": fit_seed}, ()
             continue
-        stated = {name: getattr(way, name) for name in ("preset", "painter")}
-        stated = {name: value for name, value in stated.items() if value is not None}
-        yield {**stated, "configuration": way.name, "fit_seed": fit_seed}, way.settings
+        changes = {} if way.preset is None else {"preset": way.preset}
+        # after the manifest's settings, which may name a painter too
+        painter = () if way.painter is None else (f"painter={way.painter}",)
+        named = {"configuration": way.name, "fit_seed": fit_seed}
+        yield {**changes, **named}, (*painter, *way.settings)
 
 
 def _weights(asked: Asked, known: dict[tuple[str, str], list[Any]]) -> list[Any]:

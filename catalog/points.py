@@ -1,0 +1,102 @@
+"""What the sequences of a fleet came to: their cost and every number of their runs."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from catalog.artefacts import ArtefactRef
+from catalog.fleets import FleetLedger
+from catalog.records import json_of
+from catalog.store import Store
+from catalog.tables import Row
+
+JUDGING = ("evaluate", "report")
+"""Stages that look at a scene and make nothing of it."""
+FINAL = ("painted", "refined")
+"""Variants of numbers that are of the scene at the end of its run."""
+
+MetricName = tuple[str, str, str]
+"""Protocol, trajectory and name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Point:
+    """One scene, made in one way with one seed."""
+
+    scene: str
+    configuration: str
+    seed: int
+    run_id: str
+    cost: dict[str, float]
+    """Of the stages that make the scene, each as computed, also where it was recalled: seconds,
+    cpu_seconds, peak_memory_bytes; num_gaussians and scene_bytes of what they made."""
+    metrics: dict[MetricName, float]
+    """Of the scene at the end."""
+
+
+def points_of(store: Store, fleet: str) -> tuple[list[Point], list[Row]]:
+    """The points of a fleet that are done, and the sequences that are not.
+
+    Raises:
+        UnknownRecordError: there is no such fleet.
+        CatalogError: a run's row is damaged.
+    """
+    sequences = FleetLedger(store).rows(fleet)
+    done = {row["run_id"]: row for row in sequences if row["state"] == "done"}
+    runs = {row["run_id"]: row for row in _chosen(store, "runs", run_id=done)}
+    scenes = {run_id: _last_scene(run) for run_id, run in runs.items()}
+    made = _chosen(store, "artefacts", artefact_id=scenes.values())
+    sizes = {row["artefact_id"]: row["num_bytes"] for row in made}
+    metrics: dict[str, dict[MetricName, float]] = {run_id: {} for run_id in runs}
+    for row in _chosen(store, "metrics", run_id=runs, variant=FINAL):
+        if row["value"] is not None:
+            name = row["protocol"], row["trajectory"], row["name"]
+            metrics[row["run_id"]][name] = row["value"]
+    ended = [row for row in sequences if row["run_id"] in runs and row["state"] == "done"]
+    points = [
+        Point(
+            scene=row["scene_id"],
+            configuration=row["configuration"] or fleet,
+            seed=row["fit_seed"] or 0,
+            run_id=row["run_id"],
+            cost=_cost(runs[row["run_id"]], sizes[scenes[row["run_id"]]]),
+            metrics=metrics[row["run_id"]],
+        )
+        for row in ended
+    ]
+    return points, [row for row in sequences if row not in ended]
+
+
+def _chosen(store: Store, table: str, **wanted: Iterable[str]) -> list[Row]:
+    """The rows of a table whose columns hold one of some values each."""
+    found = store.tables.arrow(table)
+    for column, values in wanted.items():
+        found = found.filter(pc.is_in(found[column], pa.array(list(values), pa.string())))
+    return found.to_pylist()
+
+
+def _last_scene(run: Row) -> str:
+    fitted = [one for one in run["artefacts"] if ArtefactRef.of_id(one).kind == "gaussians"]
+    return str(fitted[-1])
+
+
+def _cost(run: Row, scene_bytes: int) -> dict[str, float]:
+    result: dict[str, Any] = json_of(run, "result")
+    return {
+        "seconds": _made(result["seconds"]),
+        "cpu_seconds": _made(result["cpu_seconds"]),
+        "peak_memory_bytes": result["peak_memory_bytes"],
+        "num_gaussians": result["num_gaussians"],
+        "scene_bytes": scene_bytes,
+    }
+
+
+def _made(by_stage: Mapping[str, float]) -> float:
+    return sum(cost for stage, cost in by_stage.items() if not _judges(stage))
+
+
+def _judges(stage: str) -> bool:
+    return stage == "total" or stage.startswith(JUDGING)

@@ -1,0 +1,151 @@
+"""`lidarpainter chart` and `size`: what the user asked to see, measured and drawn."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from flows.cli.output import complain, loudness, print_json, print_table
+from flows.cli.shared_options import AsJson, Settings, parse_names
+from lidarpainter_models.errors import ConfigError
+
+if TYPE_CHECKING:
+    from catalog.points import Point
+    from flows.fleet.manifest import Configuration
+    from flows.measure.sweep import Sweep
+
+COLUMNS = ("scene", "configuration", "seed", "cpu_seconds", "num_gaussians")
+SHOWN = ("recorded_psnr", "aside_psnr", "aside_depth")
+"""Qualities in the table."""
+
+Scenes = Annotated[list[str], typer.Argument(help="dataset/sequence, as ingested.")]
+Out = Annotated[Path, typer.Option(help="Folder for the pictures.")]
+Preset = Annotated[str, typer.Option(help="What is changed, one thing at a time.")]
+Cameras = Annotated[
+    str | None, typer.Option(help="Cameras to train on, with commas between; all if absent.")
+]
+Seeds = Annotated[
+    int, typer.Option(min=1, max=100, help="How often each point is tried, for the bars.")
+]
+Only = Annotated[
+    str | None, typer.Option(help="Names of what is compared, with commas between; all if absent.")
+]
+Workers = Annotated[int, typer.Option(min=1, help="Points at once, each in a process of its own.")]
+Stale = Annotated[
+    bool, typer.Option("--accept-stale", help="Draw what older code has done as it is.")
+]
+
+
+def chart(  # noqa: PLR0913 - the options of a command
+    scenes: Scenes,
+    out: Out,
+    preset: Preset = "preview",
+    train_cameras: Cameras = None,
+    seeds: Seeds = 3,
+    only: Only = None,
+    workers: Workers = 1,
+    accept_stale: Stale = False,
+    settings: Settings = None,
+    as_json: AsJson = False,
+) -> None:
+    """Chart speed against accuracy: painters, rounds, steps and sizes, with bars over seeds.
+
+    Whatever ends it, the same command goes on. Points that are done are only drawn.
+
+    Example: lidarpainter chart synthetic/street-0001 --seeds 2 --out chart
+    """
+    from flows.measure.chart import chart_of
+    from flows.measure.configurations import CHART
+
+    names = _known(only, [one.name for one in CHART])
+    chosen = [one for one in CHART if one.name in names]
+    sweep = _sweep("chart", scenes, chosen, preset, train_cameras, seeds, settings)
+    points = _made(sweep, workers=workers, accept_stale=accept_stale)
+    _show(chart_of(points, out), as_json=as_json)
+
+
+def size(  # noqa: PLR0913 - the options of a command
+    scenes: Scenes,
+    out: Out,
+    preset: Preset = "preview",
+    train_cameras: Cameras = None,
+    seeds: Seeds = 3,
+    only: Only = None,
+    workers: Workers = 1,
+    accept_stale: Stale = False,
+    settings: Settings = None,
+    as_json: AsJson = False,
+) -> None:
+    """Chart quality against size: Gaussians, harmonics, steps, rounds, painted views.
+
+    Whatever ends it, the same command goes on. Points that are done are only drawn.
+
+    Example: lidarpainter size synthetic/street-0001 --only gaussians --out size
+    """
+    from flows.measure.chart import sizes_of
+    from flows.measure.configurations import SIZE
+
+    names = _known(only, [factor.name for factor in SIZE])
+    factors = [factor for factor in SIZE if factor.name in names]
+    levels = [level for factor in factors for level in factor.levels]
+    sweep = _sweep("size", scenes, levels, preset, train_cameras, seeds, settings)
+    points = _made(sweep, workers=workers, accept_stale=accept_stale)
+    _show(sizes_of(points, factors, out), as_json=as_json)
+
+
+def _known(only: str | None, names: Sequence[str]) -> tuple[str, ...]:
+    """The names that were chosen, or all.
+
+    Raises:
+        ConfigError: one is not known.
+    """
+    chosen = parse_names(only) or tuple(names)
+    if unknown := [name for name in chosen if name not in names]:
+        raise ConfigError(
+            f"--only: nothing is called {', '.join(unknown)}, expected some of {', '.join(names)}"
+        )
+    return chosen
+
+
+def _sweep(
+    name: str,
+    scenes: Sequence[str],
+    configurations: Sequence["Configuration"],
+    preset: str,
+    train_cameras: str | None,
+    seeds: int,
+    settings: Sequence[str] | None,
+) -> "Sweep":
+    from flows.measure.sweep import Sweep
+
+    return Sweep(
+        name=name,
+        scenes=tuple(scenes),
+        cameras=parse_names(train_cameras),
+        preset=preset,
+        settings=tuple(settings or ()),
+        configurations=tuple(configurations),
+        seeds=tuple(range(seeds)),
+    )
+
+
+def _made(sweep: "Sweep", *, workers: int, accept_stale: bool) -> list["Point"]:
+    from catalog.store import existing_store
+    from flows.measure.sweep import run_sweep
+
+    say = complain if loudness() != "quiet" else _silent
+    return run_sweep(sweep, existing_store(), workers=workers, accept_stale=accept_stale, say=say)
+
+
+def _silent(_line: str) -> None:
+    """In place of progress."""
+
+
+def _show(result: dict[str, Any], *, as_json: bool) -> None:
+    if as_json:
+        print_json(result)
+        return
+    cells = [[point.get(name) for name in (*COLUMNS, *SHOWN)] for point in result["points"]]
+    note = "\n".join([*result["says"], *result["pictures"]])
+    print_table("points", [*COLUMNS, *SHOWN], cells, note, num_text_columns=2)

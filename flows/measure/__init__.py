@@ -1,0 +1,1 @@
+"""What the user asked to see: configurations compared on scenes, stored in the catalog, drawn."""

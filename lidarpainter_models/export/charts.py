@@ -1,0 +1,183 @@
+"""Quality against cost as pictures and as a page: configurations as points with their bars."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lidarpainter_models.errors import WriteError
+from lidarpainter_models.evaluation.fronts import Spread, pareto_front
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+INK, SOFT, NAMED, FRONT = "#1f2430", "#7b8494", "#c2410c", "#94a3b8"
+PANEL_INCHES = (4.6, 3.4)
+SALT = "lidarpainter"
+"""Makes the ids in an SVG the same every time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mark:
+    """One configuration in one panel."""
+
+    name: str
+    is_named: bool
+    """Whether it is a preset or another default, which is set off."""
+    figures: Mapping[str, Spread]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chart:
+    """Panels side by side, a scene each, one below the other for each quality."""
+
+    title: str
+    panels: Mapping[str, Sequence[Mark]]
+    """By the name of the scene."""
+    labels: Mapping[str, str]
+    """What the axes say, by the name of a figure."""
+
+
+def draw_chart(chart: Chart, cost: str, qualities: Sequence[str], stem: Path) -> list[Path]:
+    """Draw qualities over one cost, as SVG and PNG; returns both files.
+
+    Args:
+        chart: what is drawn.
+        cost: figure on the x axis, logarithmic.
+        qualities: a row of panels each; a panel where nobody knows it stays empty.
+        stem: of the files, without suffix.
+
+    Raises:
+        WriteError: a file cannot be written.
+    """
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    size = PANEL_INCHES[0] * len(chart.panels), PANEL_INCHES[1] * len(qualities)
+    with mpl.rc_context({"svg.hashsalt": SALT, "font.size": 9, "axes.edgecolor": FRONT}):
+        figure = Figure(figsize=size, layout="constrained")
+        axes = figure.subplots(len(qualities), len(chart.panels), squeeze=False)
+        for row, quality in enumerate(qualities):
+            for column, (scene, marks) in enumerate(chart.panels.items()):
+                _draw_panel(axes[row, column], marks, cost, quality)
+                axes[row, column].set_title(scene if row == 0 else "", loc="left", color=INK)
+            axes[row, 0].set_ylabel(chart.labels[quality], color=SOFT)
+        for panel in axes[-1]:
+            panel.set_xlabel(chart.labels[cost], color=SOFT)
+        figure.suptitle(chart.title, x=0.01, ha="left", color=INK, fontsize=11)
+        paths = [stem.with_suffix(".svg"), stem.with_suffix(".png")]
+        try:
+            stem.parent.mkdir(parents=True, exist_ok=True)
+            figure.savefig(paths[0], metadata={"Date": None})
+            figure.savefig(paths[1], dpi=110)
+        except OSError as error:
+            raise WriteError(f"{error.filename or stem} cannot be written: {error}") from None
+    return paths
+
+
+def _draw_panel(axes: "Axes", marks: Sequence[Mark], cost: str, quality: str) -> None:
+    from matplotlib.ticker import EngFormatter, LogLocator, NullLocator
+
+    known = [mark for mark in marks if cost in mark.figures and quality in mark.figures]
+    if not known:
+        axes.axis("off")
+        axes.text(0.5, 0.5, "not known here", transform=axes.transAxes, ha="center", color=SOFT)
+        return
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(colors=SOFT)
+    axes.grid(alpha=0.25)
+    xs, ys = ([mark.figures[name] for mark in known] for name in (cost, quality))
+    front = pareto_front([x.mean for x in xs], [y.mean for y in ys])
+    axes.plot([xs[i].mean for i in front], [ys[i].mean for i in front], color=FRONT, zorder=1)
+    for mark, x, y in zip(known, xs, ys, strict=True):
+        colour = NAMED if mark.is_named else INK
+        axes.errorbar(x.mean, y.mean, _bar(y), _bar(x), fmt="o", ms=5, color=colour, elinewidth=1)
+        axes.annotate(
+            mark.name,
+            (x.mean, y.mean),
+            xytext=(0, 6),
+            textcoords="offset points",
+            ha="center",
+            fontsize=7.5,
+            color=colour,
+        )
+
+
+def _bar(spread: Spread) -> float:
+    return spread.half_width if math.isfinite(spread.half_width) else 0.0
+
+
+def write_chart_page(
+    chart: Chart, costs: Sequence[str], qualities: Sequence[str], path: Path
+) -> Path:
+    """One HTML file with all of it, to be looked at without a network: axes are chosen in it.
+
+    Raises:
+        WriteError: the file cannot be written.
+    """
+    from plotly.subplots import make_subplots
+
+    figure = make_subplots(rows=1, cols=len(chart.panels), subplot_titles=list(chart.panels))
+    all_marks = [mark for marks in chart.panels.values() for mark in marks]
+    for column, marks in enumerate(chart.panels.values(), start=1):
+        for mark in marks:
+            figure.add_scatter(
+                name=mark.name,
+                mode="markers+text",
+                text=[mark.name],
+                textposition="top right",
+                marker={"color": NAMED if mark.is_named else INK, "size": 9},
+                **_axis("x", mark, costs[0]),
+                **_axis("y", mark, qualities[0]),
+                row=1,
+                col=column,
+            )
+    menus = [
+        _menu("x", costs, all_marks, chart, position=0.0),
+        _menu("y", qualities, all_marks, chart, position=0.4),
+    ]
+    figure.update_xaxes(type="log", title=chart.labels[costs[0]])
+    figure.update_yaxes(title=chart.labels[qualities[0]])
+    figure.update_layout(
+        title=chart.title,
+        template="plotly_white",
+        showlegend=False,
+        updatemenus=menus,
+        margin={"t": 140},
+    )
+    page = figure.to_html(include_plotlyjs=True, full_html=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(page, "utf-8")
+    except OSError as error:
+        raise WriteError(f"{path} cannot be written: {error.strerror}") from None
+    return path
+
+
+def _axis(axis: str, mark: Mark, name: str) -> dict[str, Any]:
+    """Place and bar of a mark along an axis; none where its figure is not known."""
+    spread = mark.figures.get(name)
+    place = [] if spread is None else [spread.mean]
+    bar = [] if spread is None else [_bar(spread)]
+    return {axis: place, f"error_{axis}": {"type": "data", "array": bar}}
+
+
+def _menu(
+    axis: str, names: Sequence[str], marks: Sequence[Mark], chart: Chart, *, position: float
+) -> dict[str, Any]:
+    """A menu that puts another figure on an axis of all panels."""
+    ends = ["", *map(str, range(2, len(chart.panels) + 1))]
+    buttons = []
+    for name in names:
+        parts = [_axis(axis, mark, name) for mark in marks]
+        places = {axis: [part[axis] for part in parts]}
+        bars = {f"error_{axis}.array": [part[f"error_{axis}"]["array"] for part in parts]}
+        titles = {f"{axis}axis{end}.title.text": chart.labels[name] for end in ends}
+        args = [{**places, **bars}, titles]
+        buttons.append({"label": chart.labels[name], "method": "update", "args": args})
+    return {"buttons": buttons, "x": position, "xanchor": "left", "y": 1.3, "yanchor": "top"}

@@ -1,0 +1,121 @@
+"""What a chart draws and says of points that are known."""
+
+import re
+from pathlib import Path
+
+import cv2
+import pytest
+
+from catalog.points import Point
+from flows.measure.chart import chart_of, sizes_of
+from flows.measure.configurations import CHART, SIZE
+from flows.measure.figures import LANES, QUALITIES, qualities
+
+SCENES = ("synthetic/street-0001", "pandaset/002")
+GAINS = {"preset": 0.0, "first-fit": -1.0, "steps-x2": 0.3, "steps-x0.5": -0.4, "warp": -0.6}
+COSTS = {"preset": 200, "first-fit": 90, "steps-x2": 390, "steps-x0.5": 120, "warp": 230}
+
+
+def point(scene, configuration, seed, psnr, cpu_seconds, num_gaussians=80_000):
+    metrics = {("recorded", "recorded", "psnr"): psnr + 0.02 * seed}
+    for number, lane in enumerate(LANES):
+        metrics["depth", lane, "depth_within_5_percent"] = 0.9 + 0.01 * number
+        if scene.startswith("synthetic"):
+            metrics["truth", lane, "psnr"] = psnr - 3 + number
+    cost = {
+        "seconds": cpu_seconds / 2,
+        "cpu_seconds": cpu_seconds + seed,
+        "peak_memory_bytes": 1.4e9,
+        "num_gaussians": num_gaussians,
+        "scene_bytes": 100.0 * num_gaussians,
+    }
+    return Point(
+        scene=scene,
+        configuration=configuration,
+        seed=seed,
+        run_id=f"{scene}-{configuration}-{seed}",
+        cost=cost,
+        metrics=metrics,
+    )
+
+
+@pytest.fixture
+def points():
+    return [
+        point(scene, name, seed, 28.0 + gain, COSTS[name])
+        for scene in SCENES
+        for name, gain in GAINS.items()
+        for seed in range(3)
+    ]
+
+
+def test_a_quality_is_the_mean_of_its_numbers_or_unknown():
+    found = qualities(point(SCENES[0], "preset", 0, 28.0, 100).metrics)
+    assert found["recorded_psnr"] == 28.0
+    assert found["aside_psnr"] == pytest.approx(25 + 1.5)
+    assert found["aside_depth"] == pytest.approx(0.915)
+    assert "recorded_lpips" not in found
+    assert "aside_psnr" not in qualities(point(SCENES[1], "preset", 0, 28.0, 100).metrics)
+
+
+def test_fronts_and_what_beats_the_preset_are_said_in_words(points, tmp_path):
+    says = chart_of(points, tmp_path)["says"]
+    recorded = next(one for one in says if one.startswith("pandaset/002, PSNR of held-out"))
+    assert "front first-fit, steps-x0.5, preset, steps-x2" in recorded
+    assert "warp" not in recorded
+    beaten = [one for one in says if "faster and better" in one]
+    assert all(one.endswith(": nothing") for one in beaten)
+    better = [*points, *(point(SCENES[1], "overlay", seed, 29.0, 50) for seed in range(3))]
+    says = chart_of(better, tmp_path)["says"]
+    assert any("pandaset/002, PSNR" in one and one.endswith(": overlay") for one in says)
+
+
+def test_pictures_hold_every_point(points, tmp_path):
+    result = chart_of(points, tmp_path / "new" / "folder")
+    svg, png, page = result["pictures"]
+    assert Path(svg).read_text().count("<use") > len(points) / 3  # a mark for each mean at least
+    drawn = cv2.imread(png)
+    assert drawn.shape[1] > drawn.shape[0] / 2
+    assert drawn.std() > 10
+    html = Path(page).read_text().replace("\\u002f", "/")
+    for name in (*GAINS, *SCENES, "Gaussians"):
+        assert name in html
+    assert not re.search(r'<(script|link|img)[^>]+(src|href)="?(https?:)?//', html)
+
+
+def test_the_same_points_draw_the_same_file(points, tmp_path):
+    first, second = (chart_of(points, tmp_path / name)["pictures"][0] for name in "ab")
+    assert Path(first).read_bytes() == Path(second).read_bytes()
+
+
+def test_each_level_is_held_against_the_one_before(tmp_path):
+    factor = SIZE[0]
+    points = [
+        point(SCENES[0], level.name, seed, psnr, 100 + 10 * number, 20_000 * 2**number)
+        for number, (level, psnr) in enumerate(
+            zip(factor.levels, (24.0, 26.0, 27.0, 27.0, 26.9), strict=True)
+        )
+        for seed in range(3)
+    ]
+    result = sizes_of(points, [factor], tmp_path)
+    recorded = next(one for one in result["says"] if "held-out" in one)
+    assert "gaussians-40k +2, gaussians-80k +1, gaussians-160k +0 (within the noise)" in recorded
+    assert [path.rsplit("/", 1)[1] for path in result["pictures"]] == [
+        "size-gaussians.svg",
+        "size-gaussians.png",
+    ]
+
+
+def test_configurations_are_changes_that_a_preset_can_take():
+    from flows.overrides import with_overrides
+    from flows.presets import preview
+
+    names = [way.name for way in CHART]
+    assert len(set(names)) == len(names) >= 12
+    for way in (*CHART, *(level for factor in SIZE for level in factor.levels)):
+        with_overrides(preview("a/b"), way.settings)
+    for factor in SIZE:
+        assert factor.default in {level.name for level in factor.levels}
+        default = next(level for level in factor.levels if level.name == factor.default)
+        assert with_overrides(preview("a/b"), default.settings) == preview("a/b")
+    assert set(QUALITIES) >= {"recorded_psnr", "aside_psnr"}
