@@ -1,4 +1,4 @@
-"""`lidarpainter chart` and `size`: what the user asked to see, measured and drawn."""
+"""`lidarpainter chart`, `size` and `stress`: what the user asked to see, measured and drawn."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -94,6 +94,38 @@ def size(  # noqa: PLR0913 - the options of a command
     _show(sizes_of(points, factors, out), as_json=as_json)
 
 
+def stress(  # noqa: PLR0913 - the options of a command
+    scenes: Scenes,
+    out: Out,
+    preset: Preset = "preview",
+    train_cameras: Cameras = None,
+    seeds: Seeds = 1,
+    only: Only = None,
+    levels: Annotated[int, typer.Option(min=1, help="Of each cause, from mild on.")] = 4,
+    workers: Workers = 1,
+    accept_stale: Stale = False,
+    settings: Settings = None,
+    as_json: AsJson = False,
+) -> None:
+    """Spoil recordings by one cause at a time, and hold painted scenes against unpainted ones.
+
+    Faults are in the frames that train; those that judge stay as recorded. Whatever ends it, the
+    same command goes on.
+
+    Example: lidarpainter stress synthetic/street-0001 --only beams,clock --out stress
+    """
+    from catalog.store import existing_store
+    from flows.measure.stress import WAYS, stress_of, trials_of
+    from lidarpainter_models.stress.causes import CAUSES
+
+    store, causes = existing_store(), _known(only, list(CAUSES))
+    trials = trials_of(store, scenes, causes, levels)
+    names = [*scenes, *(trial.spoilt for trial in trials)]
+    sweep = _sweep("stress", names, WAYS, preset, train_cameras, seeds, settings)
+    points = _made(sweep, workers=workers, accept_stale=accept_stale)
+    _show(stress_of(points, trials, out), as_json=as_json)
+
+
 def _known(only: str | None, names: Sequence[str]) -> tuple[str, ...]:
     """The names that were chosen, or all.
 
@@ -135,6 +167,8 @@ def _made(sweep: "Sweep", *, workers: int, accept_stale: bool) -> list["Point"]:
     from flows.measure.sweep import run_sweep
 
     say = complain if loudness() != "quiet" else _silent
+    ways = len(sweep.configurations) * len(sweep.seeds)
+    say(f"{len(sweep.scenes) * ways} points: {len(sweep.scenes)} scenes in {ways} ways")
     return run_sweep(sweep, existing_store(), workers=workers, accept_stale=accept_stale, say=say)
 
 

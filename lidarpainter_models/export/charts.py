@@ -11,6 +11,7 @@ from lidarpainter_models.evaluation.fronts import Spread, pareto_front
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 INK, SOFT, NAMED, FRONT = "#1f2430", "#7b8494", "#c2410c", "#94a3b8"
 PANEL_INCHES = (4.6, 3.4)
@@ -66,13 +67,17 @@ def draw_chart(chart: Chart, cost: str, qualities: Sequence[str], stem: Path) ->
         for panel in axes[-1]:
             panel.set_xlabel(chart.labels[cost], color=SOFT)
         figure.suptitle(chart.title, x=0.01, ha="left", color=INK, fontsize=11)
-        paths = [stem.with_suffix(".svg"), stem.with_suffix(".png")]
-        try:
-            stem.parent.mkdir(parents=True, exist_ok=True)
-            figure.savefig(paths[0], metadata={"Date": None})
-            figure.savefig(paths[1], dpi=110)
-        except OSError as error:
-            raise WriteError(f"{error.filename or stem} cannot be written: {error}") from None
+        return _saved(figure, stem)
+
+
+def _saved(figure: "Figure", stem: Path) -> list[Path]:
+    paths = [stem.with_suffix(".svg"), stem.with_suffix(".png")]
+    try:
+        stem.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(paths[0], metadata={"Date": None})
+        figure.savefig(paths[1], dpi=110)
+    except OSError as error:
+        raise WriteError(f"{error.filename or stem} cannot be written: {error}") from None
     return paths
 
 
@@ -110,6 +115,56 @@ def _draw_panel(axes: "Axes", marks: Sequence[Mark], cost: str, quality: str) ->
 
 def _bar(spread: Spread) -> float:
     return spread.half_width if math.isfinite(spread.half_width) else 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Line:
+    """How a figure changes from level to level."""
+
+    name: str
+    levels: Sequence[str]
+    values: Sequence[Spread]
+
+
+def draw_lines(
+    panels: Mapping[str, Sequence[Line]], label: str, stem: Path, *, columns: int = 4
+) -> list[Path]:
+    """Draw small multiples, a panel for each title, as SVG and PNG; returns both files.
+
+    Args:
+        panels: the first line of each is set off.
+        label: of the y axis, which all share.
+        stem: of the files, without suffix.
+        columns: panels in a row.
+
+    Raises:
+        WriteError: a file cannot be written.
+    """
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    rows = math.ceil(len(panels) / columns)
+    size = 0.7 * PANEL_INCHES[0] * columns, 0.7 * PANEL_INCHES[1] * rows
+    with mpl.rc_context({"svg.hashsalt": SALT, "font.size": 7.5, "axes.edgecolor": FRONT}):
+        figure = Figure(figsize=size, layout="constrained")
+        axes = list(figure.subplots(rows, columns, squeeze=False, sharey=True).flat)
+        for panel, (title, lines) in zip(axes, panels.items(), strict=False):
+            panel.set_title(title, loc="left", color=INK, fontsize=8)
+            panel.spines[["top", "right"]].set_visible(False)
+            panel.tick_params(colors=SOFT)
+            panel.grid(alpha=0.25)
+            for number, line in enumerate(lines):
+                colour = INK if number else NAMED
+                means = [value.mean for value in line.values]
+                bars = [_bar(value) for value in line.values]
+                panel.errorbar(
+                    line.levels, means, bars, fmt="o-", ms=3, color=colour, label=line.name
+                )
+        for panel in axes[len(panels) :]:
+            panel.axis("off")
+        figure.suptitle(label, x=0.01, ha="left", color=INK)
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="upper right", ncols=len(lines))
+        return _saved(figure, stem)
 
 
 def write_chart_page(

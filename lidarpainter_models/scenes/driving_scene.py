@@ -16,7 +16,14 @@ from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.scenes.records import Distortion, RecordedView, Sweep, SweepPoints
+from lidarpainter_models.scenes.records import (
+    Distortion,
+    ImageRecord,
+    RecordedView,
+    RollingShutter,
+    Sweep,
+    SweepPoints,
+)
 from lidarpainter_models.scenes.stored import StoredScene
 from lidarpainter_models.scenes.tracks import ActorTrack, tracks_from_boxes
 from lidarpainter_models.scenes.undistortion import pinhole_of, undistort
@@ -122,6 +129,17 @@ class DrivingScene:
         offset, num_bytes = self._image_ranges[view.index]
         return self._stored.read_rows("image_bytes", offset, num_bytes).tobytes()
 
+    def image_record(self, view: RecordedView) -> ImageRecord:
+        """What is stored of the image itself: through which lens it was taken, undone or not."""
+        camera, distortion = self._lenses[view.index]
+        return ImageRecord(
+            camera_name=view.camera_name,
+            timestamp_ns=view.timestamp_ns,
+            camera=camera,
+            distortion=distortion,
+            rolling_shutter=self._shutters[view.index],
+        )
+
     def is_stored_undistorted(self, view: RecordedView) -> bool:
         """Whether the camera's own bytes show what `read_image` gives."""
         return self._lenses[view.index][1].model == "none"
@@ -172,6 +190,7 @@ class DrivingScene:
             (_lens(row, pose), Distortion(row["distortion_model"], tuple(row["distortion_terms"])))
             for row, pose in zip(rows, poses, strict=True)
         ]
+        self._shutters = [_shutter(row) for row in rows]
         self.views: tuple[RecordedView, ...] = tuple(
             RecordedView(
                 frame_index=row["frame_index"],
@@ -217,3 +236,10 @@ def _lens(row: dict[str, Any], world_from_camera: Float[Tensor, "4 4"]) -> Camer
         width_px=row["width_px"],
         height_px=row["height_px"],
     )
+
+
+def _shutter(row: dict[str, Any]) -> RollingShutter | None:
+    if row["rolling_shutter_s"] is None:
+        return None
+    direction = row["rolling_shutter_direction"]
+    return RollingShutter(duration_s=row["rolling_shutter_s"], direction=direction)

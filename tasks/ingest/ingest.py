@@ -32,7 +32,7 @@ def ingest_sequence(
     """Read one sequence of a dataset into the store; returns its row in `scenes`."""
     store = open_store(store_path)
     store.make()
-    with _writing(store, f"{dataset}/{sequence}"):
+    with writing(store, f"{dataset}/{sequence}"):
         path = ingest_scene(
             dataset,
             root,
@@ -50,7 +50,7 @@ def ingest_street(store_path: Path, config: SyntheticStreetConfig) -> dict[str, 
     """Render a synthetic street into the store; returns its row in `scenes`."""
     store = open_store(store_path)
     store.make()
-    with _writing(store, f"synthetic/street-{config.seed:04d}"):
+    with writing(store, f"synthetic/street-{config.seed:04d}"):
         path = write_street(
             config,
             store.root,
@@ -60,7 +60,7 @@ def ingest_street(store_path: Path, config: SyntheticStreetConfig) -> dict[str, 
 
 
 @contextmanager
-def _writing(store: Store, scene_id: str) -> Iterator[None]:
+def writing(store: Store, scene_id: str) -> Iterator[None]:
     """Tell the listener, and keep other writers of the scene out."""
     listener().started(STAGE)
     with measured() as cost:

@@ -119,3 +119,27 @@ def test_configurations_are_changes_that_a_preset_can_take():
         default = next(level for level in factor.levels if level.name == factor.default)
         assert with_overrides(preview("a/b"), default.settings) == preview("a/b")
     assert set(QUALITIES) >= {"recorded_psnr", "aside_psnr"}
+
+
+def test_stress_says_where_painting_hurts(tmp_path):
+    from flows.measure.stress import Trial, stress_of
+
+    scene, quality = SCENES[0], {"none": 2.0, "32": 1.5, "16": 0.8, "8": -0.4}
+    trials = [
+        Trial(scene=scene, cause="beams", level=float(level), spoilt=f"synthetic/spoilt-{level}")
+        for level in ("32", "16", "8")
+    ]
+    names = [scene, *(trial.spoilt for trial in trials)]
+    points = [
+        point(name, way, seed, 25.0 + (gain if way == "painted" else 0.0), 100)
+        for name, gain in zip(names, quality.values(), strict=True)
+        for way in ("painted", "unpainted")
+        for seed in range(2)
+    ]
+    result = stress_of(points, trials, tmp_path)
+    told = next(one for one in result["says"] if one.startswith("beams"))
+    assert "gains +2.00 as recorded, -0.40 at 8 beams; halved at 16, hurts at 8" in told
+    assert result["says"][-1].endswith(
+        "painting costs most -0.40 (beams, " + scene + " at 8 beams)"
+    )
+    assert all(Path(path).stat().st_size > 5_000 for path in result["pictures"])

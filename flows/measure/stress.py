@@ -1,0 +1,135 @@
+"""Stability where methods fail: one cause at a time, with and without painting."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from catalog.points import Point
+from catalog.store import Store
+from flows.fleet.manifest import Configuration
+from flows.measure.chart import rows_of
+from flows.measure.figures import LABELS, groups_of
+from lidarpainter_models.evaluation.fronts import Spread
+from lidarpainter_models.export.charts import Line, draw_lines
+from lidarpainter_models.stress.causes import CAUSES, cause_of
+from tasks.ingest.spoil import ingest_spoilt
+
+PAINTED, UNPAINTED = "painted", "unpainted"
+WAYS = (
+    Configuration(name=PAINTED),
+    Configuration(name=UNPAINTED, painter="none"),
+)
+"""The unpainted scene is fitted as long."""
+QUALITIES = ("aside_psnr", "recorded_psnr")
+HARM_DB = 0.1
+"""Painting that costs more hurts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """A recording with a fault."""
+
+    scene: str
+    """As recorded."""
+    cause: str
+    level: float
+    spoilt: str
+    """Its scene id."""
+
+
+def trials_of(
+    store: Store, scenes: Sequence[str], causes: Sequence[str], num_levels: int
+) -> list[Trial]:
+    """Spoil scenes by causes, unless they are there.
+
+    Args:
+        store: where they are, and the spoilt ones will be.
+        scenes: to be spoilt.
+        causes: names of `stress.causes.CAUSES`.
+        num_levels: of each cause, from mild on.
+
+    Raises:
+        ConfigError: there is no such cause.
+    """
+    return [
+        Trial(
+            scene=scene,
+            cause=name,
+            level=level,
+            spoilt=ingest_spoilt.fn(store.root, scene, name, level),
+        )
+        for name in causes
+        for level in cause_of(name).levels[:num_levels]
+        for scene in scenes
+    ]
+
+
+def stress_of(points: Sequence[Point], trials: Sequence[Trial], out: Path) -> dict[str, Any]:
+    """Draw every cause with and without painting.
+
+    Args:
+        points: of all trials, and of the scenes as recorded.
+        trials: what was spoilt.
+        out: folder of the pictures.
+
+    Returns:
+        What `stress --json` prints: `points`, `pictures`, and what they say.
+    """
+    figures = {(group.scene, group.configuration): group.figures for group in groups_of(points)}
+    pictures, says = [], []
+    for quality in QUALITIES:
+        panels: dict[str, list[Line]] = {}
+        for scene in dict.fromkeys(trial.scene for trial in trials):
+            found = _curves([t for t in trials if t.scene == scene], scene, figures, quality)
+            panels |= {f"{cause}, {scene}": lines for cause, lines in found.items()}
+        if panels:
+            stem = out / f"stress-{quality}"
+            pictures += draw_lines(panels, LABELS[quality], stem)
+            says += _told(panels, quality)
+    return {"points": rows_of(points), "pictures": list(map(str, pictures)), "says": says}
+
+
+def _curves(
+    trials: Sequence[Trial],
+    scene: str,
+    figures: Mapping[tuple[str, str], Mapping[str, Spread]],
+    quality: str,
+) -> dict[str, list[Line]]:
+    """By cause: a line for each way, from the scene as recorded on."""
+    curves = {}
+    for cause in dict.fromkeys(trial.cause for trial in trials):
+        steps = [("none", scene)]
+        steps += [(f"{t.level:g}", t.spoilt) for t in trials if t.cause == cause]
+        lines = []
+        for way in (PAINTED, UNPAINTED):
+            known = [
+                (level, figures[name, way][quality])
+                for level, name in steps
+                if quality in figures.get((name, way), {})
+            ]
+            levels, values = [level for level, _ in known], [value for _, value in known]
+            lines.append(Line(name=way, levels=levels, values=values))
+        if lines[0].values:
+            curves[cause] = lines
+    return curves
+
+
+def _told(panels: Mapping[str, Sequence[Line]], quality: str) -> list[str]:
+    """By cause: where the lead of painting is halved, where it hurts; the worst case last."""
+    says, worst = [], (0.0, "")
+    for title, (painted, unpainted) in panels.items():
+        gains = [a.mean - b.mean for a, b in zip(painted.values, unpainted.values, strict=True)]
+        levels = painted.levels
+        unit = CAUSES[title.split(",")[0]].unit
+        halved = next((lv for lv, g in zip(levels, gains, strict=True) if g < gains[0] / 2), None)
+        hurts = next((lv for lv, g in zip(levels, gains, strict=True) if g < -HARM_DB), None)
+        says.append(
+            f"{title}, {LABELS[quality]}: gains {gains[0]:+.2f} as recorded, {gains[-1]:+.2f} at "
+            f"{levels[-1]} {unit}; halved at {halved or 'none'}, hurts at {hurts or 'none'}"
+        )
+        worst = min(worst, (min(gains), f"{title} at {levels[gains.index(min(gains))]} {unit}"))
+    return [
+        *says,
+        f"{LABELS[quality]}: painting costs most {worst[0]:+.2f} ({worst[1] or 'never'})",
+    ]

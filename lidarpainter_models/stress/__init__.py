@@ -1,0 +1,1 @@
+"""Recordings spoilt by one cause at a time, to see where methods fail."""

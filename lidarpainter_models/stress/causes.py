@@ -1,0 +1,70 @@
+"""What can go wrong with a recording, one cause at a time, at levels from mild to grave."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.stress import images, labels, sweeps
+from lidarpainter_models.stress.frames import Frame
+
+SHARES = (0.25, 0.5, 0.75, 1)
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """One thing that goes wrong in the frames that a fit sees."""
+
+    name: str
+    unit: str
+    levels: tuple[float, ...]
+    """From mild to grave."""
+    spoil: Callable[[Frame, float, np.random.Generator], Frame]
+    """A frame at a level."""
+    is_of_actors: bool = False
+    """Then it spoils all frames: what an actor is, its boxes say together."""
+
+
+def _lost_pictures(frame: Frame, level: float, _dice: np.random.Generator) -> Frame:
+    """Pictures of one in so many training frames are left."""
+    return frame if frame.position // 2 % round(level) == 0 else replace(frame, shots=())
+
+
+CAUSES = {
+    cause.name: cause
+    for cause in (
+        Cause("beams", "beams", (32, 16, 8, 4, 1), sweeps.beams),
+        Cause("reach", "m", (60, 40, 20, 10), sweeps.reach),
+        Cause("dropout", "share", (0.25, 0.5, 0.75, 0.9), sweeps.dropout),
+        Cause("clutter", "share", (0.02, 0.05, 0.1, 0.2), sweeps.clutter),
+        Cause("clock", "ms", (10, 25, 50, 100), labels.clock_offset),
+        Cause("pose-noise", "m", (0.02, 0.05, 0.1, 0.3), labels.pose_noise),
+        Cause("camera-yaw", "degrees", (0.2, 0.5, 1, 2), labels.camera_yaw),
+        Cause("focal-length", "share", (0.005, 0.01, 0.02, 0.05), labels.focal_length),
+        Cause("box-noise", "m", (0.1, 0.25, 0.5, 1), labels.box_noise, is_of_actors=True),
+        Cause("missing-boxes", "share", SHARES, labels.missing_boxes, is_of_actors=True),
+        Cause("false-boxes", "boxes", (1, 2, 4, 8), labels.false_boxes, is_of_actors=True),
+        Cause("wrong-classes", "share", SHARES, labels.wrong_classes, is_of_actors=True),
+        Cause("exposure", "share", (0.1, 0.2, 0.3, 0.5), images.exposure),
+        Cause("white-balance", "share", (0.05, 0.1, 0.2, 0.3), images.white_balance),
+        Cause("motion-blur", "1/1000", (2, 5, 10, 20), images.motion_blur),
+        Cause("darkness", "share", (0.5, 0.8, 0.9, 0.97), images.darkness),
+        Cause("dirt", "share", (0.01, 0.03, 0.06, 0.12), images.dirt),
+        Cause("swapped", "pairs", (1, 2, 3, 4), images.swapped_cameras),
+        Cause("missing-cameras", "cameras", (1, 2, 3, 4), images.missing_cameras),
+        Cause("frame-rate", "one of", (2, 3, 4, 6), _lost_pictures),
+    )
+}
+
+
+def cause_of(name: str) -> Cause:
+    """A cause by name.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    try:
+        return CAUSES[name]
+    except KeyError:
+        raise ConfigError(f"no cause {name!r}, expected one of {', '.join(CAUSES)}") from None

@@ -1,0 +1,83 @@
+"""A stored scene with a fault in every frame that trains; what judges stays as recorded."""
+
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.splits import split_frames
+from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
+from lidarpainter_models.stress.causes import cause_of
+from lidarpainter_models.stress.frames import Frame, read_frame
+
+DATASET = "stress"
+GENERATOR = "generator"
+"""Entry of a street's manifest by which its exact truth is drawn."""
+SPLIT = "alternate"
+
+
+def spoilt_name(scene: DrivingScene, cause: str, level: float) -> str:
+    """Name of the sequence that a fault makes of a scene."""
+    return f"{scene.dataset}-{scene.sequence}-{cause}-{level:g}"
+
+
+def write_spoilt(
+    scene: DrivingScene,
+    cause: str,
+    level: float,
+    store: Path,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Write a scene anew with a fault; returns the folder of the new scene.
+
+    Args:
+        scene: as it was recorded.
+        cause: of `causes.CAUSES`.
+        level: one of its own, or another.
+        store: where it is written, as `stress/DATASET-SEQUENCE-CAUSE-LEVEL`.
+        progress: told how many frames of all are done.
+
+    Raises:
+        ConfigError: there is no such cause.
+    """
+    fault = cause_of(cause)
+    more = {GENERATOR: scene.manifest[GENERATOR]} if GENERATOR in scene.manifest else {}
+    header = SceneHeader(
+        licence=scene.manifest["licence"],
+        global_from_world=scene.global_from_world,
+        semantic_classes=scene.semantic_classes,
+        more={**more, "stress": {"scene": scene.content_digest, "cause": cause, "level": level}},
+    )
+    train, _ = split_frames(scene.frame_indices, SPLIT)
+    name = spoilt_name(scene, cause, level)
+    with SceneWriter(store, DATASET, name, header) as writer:
+        for done, frame_index in enumerate(scene.frame_indices, start=1):
+            frame = read_frame(scene, frame_index)
+            if frame_index in train or fault.is_of_actors:
+                seed = zlib.crc32(f"{cause} {frame_index}".encode())
+                frame = fault.spoil(frame, level, np.random.default_rng(seed))
+            _write(writer, frame)
+            if progress is not None:
+                progress(done, len(scene.frame_indices))
+        writer.set_provenance({"spoilt": f"{scene.dataset}/{scene.sequence}"})
+    return writer.path
+
+
+def _write(writer: SceneWriter, frame: Frame) -> None:
+    writer.add_frame(
+        frame.frame_index, timestamp_ns=frame.timestamp_ns, world_from_ego=frame.world_from_ego
+    )
+    for shot in frame.shots:
+        writer.add_image(shot.record, shot.jpeg)
+    for turn in frame.turns:
+        writer.add_sweep(
+            turn.sweep.lidar_name,
+            turn.points,
+            timestamp_ns=turn.sweep.timestamp_ns,
+            world_from_lidar=turn.sweep.world_from_lidar,
+            semantics=turn.semantics,
+        )
+    writer.add_boxes(frame.boxes)

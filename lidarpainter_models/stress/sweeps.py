@@ -1,0 +1,76 @@
+"""Faults of LiDAR: fewer beams, less range, lost and made-up returns."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
+from lidarpainter_models.stress.frames import Frame, Turn
+
+CLUTTER_M = 12.0
+"""Rain and spray return from up to this distance."""
+
+
+def beams(frame: Frame, level: float, _dice: np.random.Generator) -> Frame:
+    """So many of the lasers are left, evenly spread.
+
+    Where rings are not known they are told by elevation, as a sensor of 64 has them.
+    """
+    return _each(frame, lambda turn: turn.kept(_beam_mask(turn, int(level))))
+
+
+def reach(frame: Frame, level: float, _dice: np.random.Generator) -> Frame:
+    """Nothing returns from beyond so many metres."""
+    return _each(frame, lambda turn: turn.kept(_own_points(turn).norm(dim=1) <= level))
+
+
+def dropout(frame: Frame, level: float, dice: np.random.Generator) -> Frame:
+    """A share of the returns is lost."""
+    return _each(frame, lambda turn: turn.kept(_drawn(turn, dice) >= level))
+
+
+def clutter(frame: Frame, level: float, dice: np.random.Generator) -> Frame:
+    """A share of the returns come from drops in the air before what the beam would meet."""
+
+    def rained(turn: Turn) -> Turn:
+        own = _own_points(turn)
+        away_m = own.norm(dim=1).clamp_min(1e-3)
+        nearest_m = torch.minimum(away_m, torch.full_like(away_m, CLUTTER_M))
+        stop_m = nearest_m * _drawn(turn, dice)
+        is_drop = _drawn(turn, dice) < level
+        share = torch.where(is_drop, stop_m / away_m, torch.ones_like(away_m))
+        world = transform_points(turn.sweep.world_from_lidar, own * share[:, None])
+        return replace(turn, points=replace(turn.points, xyz_m=world.float()))
+
+    return _each(frame, rained)
+
+
+def _each(frame: Frame, change: Callable[[Turn], Turn]) -> Frame:
+    return replace(frame, turns=tuple(change(turn) for turn in frame.turns))
+
+
+def _own_points(turn: Turn) -> torch.Tensor:
+    """Points in the frame of the sensor, float64."""
+    lidar_from_world = invert_rigid(turn.sweep.world_from_lidar)
+    return transform_points(lidar_from_world, turn.points.xyz_m.double())
+
+
+def _drawn(turn: Turn, dice: np.random.Generator) -> torch.Tensor:
+    """A number from 0 to 1 for each point."""
+    return torch.from_numpy(dice.uniform(0, 1, turn.points.num_points))
+
+
+def _beam_mask(turn: Turn, count: int) -> torch.Tensor:
+    rings = turn.points.ring.long()
+    if int(rings.min()) < 0 or len(rings.unique()) == 1:
+        own = _own_points(turn)
+        elevation = torch.atan2(own[:, 2], own[:, :2].norm(dim=1))
+        rings = torch.bucketize(elevation, torch.quantile(elevation[::97], _LEVELS))
+    known = rings.unique()
+    chosen = known[torch.linspace(0, len(known) - 1, min(count, len(known))).round().long()]
+    return torch.isin(rings, chosen)
+
+
+_LEVELS = torch.linspace(0, 1, 65, dtype=torch.float64)[1:-1]

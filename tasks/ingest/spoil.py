@@ -1,0 +1,39 @@
+"""Bring a recording with a fault into the store and the catalog."""
+
+from pathlib import Path
+
+from catalog.store import open_store
+from lidarpainter_models.errors import SceneError
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.stress.spoiling import DATASET, spoilt_name, write_spoilt
+from tasks.ingest.ingest import STAGE, record_scene, writing
+from tasks.opened import open_scene
+from tasks.progress import listener
+from tasks.stages import stage_task
+
+
+@stage_task
+def ingest_spoilt(store_path: Path, scene_id: str, cause: str, level: float) -> str:
+    """Write a stored scene anew with a fault, unless that is there; returns its scene id."""
+    store = open_store(store_path)
+    scene = open_scene(store, scene_id)
+    spoilt_id = f"{DATASET}/{spoilt_name(scene, cause, level)}"
+    if not _is_of(store.scene_folder(spoilt_id), scene):
+        with writing(store, spoilt_id):
+            path = write_spoilt(
+                scene,
+                cause,
+                level,
+                store.root,
+                progress=lambda done, total: listener().advanced(STAGE, done, total, spoilt_id),
+            )
+            record_scene(store, path)
+    return spoilt_id
+
+
+def _is_of(folder: Path, scene: DrivingScene) -> bool:
+    """Whether a folder holds a spoilt scene of this one as it is now."""
+    try:
+        return bool(DrivingScene.open(folder).manifest["stress"]["scene"] == scene.content_digest)
+    except (SceneError, KeyError):
+        return False

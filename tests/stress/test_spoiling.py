@@ -1,0 +1,147 @@
+"""Every fault changes what it says in frames that train, and nothing in those that judge."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from toy_store import write_toy_scene
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.stress.causes import CAUSES
+from lidarpainter_models.stress.frames import read_frame
+from lidarpainter_models.stress.spoiling import write_spoilt
+
+TRAINS, JUDGES = 2, 1
+"""Positions of frames; the first one holds the origin of the world."""
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory):
+    return DrivingScene.open(write_toy_scene(tmp_path_factory.mktemp("clean")))
+
+
+@pytest.fixture
+def spoilt(clean, tmp_path):
+    def write(cause, level):
+        return DrivingScene.open(write_spoilt(clean, cause, level, tmp_path))
+
+    return write
+
+
+def frame_of(scene, position):
+    return read_frame(scene, scene.frame_indices[position])
+
+
+def same(one, other):
+    """Whether two frames hold the same, whatever it is stored as."""
+    shots = [(s.jpeg, s.record.timestamp_ns, s.record.camera) for s in one.shots]
+    others = [(s.jpeg, s.record.timestamp_ns, s.record.camera) for s in other.shots]
+    cameras = len(shots) == len(others) and all(
+        a[:2] == b[:2]
+        and torch.equal(a[2].world_from_camera, b[2].world_from_camera)
+        and a[2].fx_px == b[2].fx_px
+        for a, b in zip(shots, others, strict=True)
+    )
+    points = all(
+        torch.equal(a.points.xyz_m, b.points.xyz_m)
+        for a, b in zip(one.turns, other.turns, strict=True)
+    )
+    boxes = [(b.actor_id, b.category, b.world_from_box.tolist()) for b in one.boxes]
+    return (
+        cameras
+        and points
+        and boxes == [(b.actor_id, b.category, b.world_from_box.tolist()) for b in other.boxes]
+    )
+
+
+@pytest.mark.parametrize("cause", sorted(CAUSES))
+def test_a_fault_touches_frames_that_train_alone(clean, spoilt, cause):
+    level = CAUSES[cause].levels[-1]
+    scene = spoilt(cause, level)
+    judging, recorded = frame_of(scene, JUDGES), frame_of(clean, JUDGES)
+    if CAUSES[cause].is_of_actors:
+        judging, recorded = (replace(frame, boxes=()) for frame in (judging, recorded))
+    assert same(judging, recorded)
+    if cause not in ("swapped", "missing-cameras"):  # of one camera nothing can be
+        assert not same(frame_of(scene, TRAINS), frame_of(clean, TRAINS))
+    assert scene.manifest["stress"] == {
+        "scene": clean.content_digest,
+        "cause": cause,
+        "level": level,
+    }
+
+
+def test_the_same_fault_is_the_same_scene(clean, tmp_path):
+    digests = {
+        DrivingScene.open(write_spoilt(clean, "dropout", 0.5, tmp_path / name)).content_digest
+        for name in "ab"
+    }
+    assert len(digests) == 1
+
+
+def test_a_cause_that_is_none_is_refused(clean, tmp_path):
+    with pytest.raises(ConfigError, match="no cause 'rust', expected one of beams"):
+        write_spoilt(clean, "rust", 1, tmp_path)
+    assert not list(tmp_path.rglob("manifest.json"))
+
+
+@pytest.mark.parametrize("share", [0.25, 0.75])
+def test_so_many_returns_are_lost(clean, spoilt, share):
+    before, after = (frame_of(one, TRAINS).turns[0] for one in (clean, spoilt("dropout", share)))
+    left = after.points.num_points / before.points.num_points
+    assert left == pytest.approx(1 - share, abs=0.05)
+
+
+def test_nothing_returns_from_beyond_the_reach(spoilt):
+    turn = frame_of(spoilt("reach", 10.0), TRAINS).turns[0]
+    away_m = (turn.points.xyz_m - turn.sweep.world_from_lidar[:3, 3]).norm(dim=1)
+    assert 0 < float(away_m.max()) <= 10.001
+
+
+def test_beams_are_counted(clean, spoilt):
+    before = frame_of(clean, TRAINS).turns[0].points.num_points
+    counts = [frame_of(spoilt("beams", n), TRAINS).turns[0].points.num_points for n in (16, 4, 1)]
+    assert before > counts[0] > counts[1] > counts[2] > 0
+
+
+def test_drops_lie_between_the_sensor_and_what_it_saw(clean, spoilt):
+    before, after = (frame_of(one, TRAINS).turns[0] for one in (clean, spoilt("clutter", 0.2)))
+    origin = before.sweep.world_from_lidar[:3, 3].float()
+    seen, found = ((t.points.xyz_m - origin).norm(dim=1) for t in (before, after))
+    is_drop = (seen - found) > 1e-3
+    assert float(is_drop.float().mean()) == pytest.approx(0.2, abs=0.04)
+    assert float(found[is_drop].max()) <= 12.0
+
+
+def test_a_pose_moves_all_that_the_car_saw(clean, spoilt):
+    before, after = (frame_of(one, TRAINS) for one in (clean, spoilt("pose-noise", 0.3)))
+    motion = after.world_from_ego @ torch.linalg.inv(before.world_from_ego)
+    moved = motion @ before.shots[0].record.camera.world_from_camera
+    assert torch.allclose(after.shots[0].record.camera.world_from_camera, moved)
+    points = before.turns[0].points.xyz_m.double() @ motion[:3, :3].T + motion[:3, 3]
+    assert torch.allclose(after.turns[0].points.xyz_m.double(), points, atol=1e-5)
+
+
+def test_yaw_and_focal_length_are_as_stated(clean, spoilt):
+    before = frame_of(clean, TRAINS).shots[0].record.camera
+    turned = frame_of(spoilt("camera-yaw", 2.0), TRAINS).shots[0].record.camera
+    ahead = [camera.world_from_camera[:3, 2] for camera in (before, turned)]
+    assert float(torch.rad2deg(torch.arccos(ahead[0] @ ahead[1]))) == pytest.approx(2.0, rel=1e-6)
+    right = before.world_from_camera[:3, 0]
+    assert float(ahead[1] @ right) > 0
+    longer = frame_of(spoilt("focal-length", 0.05), TRAINS).shots[0].record.camera
+    assert longer.fx_px == pytest.approx(1.05 * before.fx_px)
+
+
+def test_pictures_grow_dark_and_blurred(clean, spoilt):
+    def pixels(scene):
+        view = next(v for v in scene.views if v.frame_index == scene.frame_indices[TRAINS])
+        return scene.read_image(view).numpy().astype(np.float64)
+
+    before = pixels(clean)
+    assert pixels(spoilt("darkness", 0.9)).mean() < 0.6 * before.mean()
+    blurred = pixels(spoilt("motion-blur", 20))
+    across = [np.abs(np.diff(image, axis=1)).max() for image in (before, blurred)]
+    assert across[1] < 0.7 * across[0]
