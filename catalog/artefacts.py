@@ -58,6 +58,11 @@ class ArtefactRef:
         """`kind/digest`, its id in the catalog."""
         return f"{self.kind}/{self.digest}"
 
+    @property
+    def entry(self) -> str:
+        """Its folder, from that of the store."""
+        return f"artefacts/{self.artefact_id}"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
@@ -141,14 +146,23 @@ Build = Callable[[Workplace], Mapping[str, Any] | None]
 
 
 class ArtefactStore:
-    """The artefacts below one folder."""
+    """The artefacts below one folder; for a bucket see `mirrored_artefacts`."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
 
     def folder(self, ref: ArtefactRef) -> Path:
-        """Where the files of an artefact lie, whether it exists or not."""
-        return self.root / "artefacts" / ref.kind / ref.digest
+        """Where the files of an artefact lie on this machine, whether they are there or not."""
+        return self.root / ref.entry
+
+    def files(self, ref: ArtefactRef) -> Path:
+        """Its folder, for whoever reads it: in a bucket's mirror its files are fetched first."""
+        return self.folder(ref)
+
+    def ids(self) -> set[str]:
+        """The id of every artefact that has a name."""
+        folders = self.root.glob("artefacts/*/[!.]*")
+        return {f"{path.parent.name}/{path.name}" for path in folders}
 
     def find(self, recipe: Recipe) -> ArtefactRef | None:
         """What was made from this recipe before, or None; damaged folders count as absent."""
@@ -186,8 +200,8 @@ class ArtefactStore:
         with held_lock(self.root / "locks" / f"{recipe.digest}.lock", on_wait=on_wait):
             if found := self.find(recipe):
                 return found, False
-            ref = self._build(recipe, build)
-        return ref, True
+            counts = self._build(recipe, build)
+        return ArtefactRef(recipe.kind, recipe.digest), counts
 
     def manifest(self, ref: ArtefactRef) -> Manifest:
         """The manifest of a stored artefact.
@@ -214,7 +228,7 @@ class ArtefactStore:
             UnknownRecordError: there is no such artefact.
             DamagedArtefactError: a file is missing or is not what was written.
         """
-        manifest, folder = self.manifest(ref), self.folder(ref)
+        manifest, folder = self.manifest(ref), self.files(ref)
         for name, known in manifest.files.items():
             path = folder / name
             if not path.is_file():
@@ -225,8 +239,8 @@ class ArtefactStore:
                 )
         return manifest
 
-    def _build(self, recipe: Recipe, build: Build) -> ArtefactRef:
-        """Write aside, then rename; the caller holds the lock."""
+    def _build(self, recipe: Recipe, build: Build) -> bool:
+        """Write aside, then rename; the caller holds the lock. Whether it is what counts."""
         ref = ArtefactRef(recipe.kind, recipe.digest)
         aside = self.root / "aside"
         scratch = self.root / "work" / recipe.digest
@@ -244,7 +258,7 @@ class ArtefactStore:
             finally:
                 shutil.rmtree(output, ignore_errors=True)
         shutil.rmtree(scratch, ignore_errors=True)
-        return ref
+        return True
 
 
 def _write_manifest(

@@ -1,7 +1,8 @@
 """Why an attempt at a sequence ended, and what that means for the sequence.
 
 Bad input is set aside at once and never tried again. What can pass is tried again, later each time
-and a bounded number of times. A full disk and an interruption are nobody's fault and do not count.
+and a bounded number of times. A full disk, a bucket that does not answer and an interruption are
+nobody's fault and do not count.
 """
 
 from collections.abc import Mapping
@@ -16,6 +17,7 @@ Cause = Literal[
     "done",
     "bad-input",
     "disk-full",
+    "store-lost",
     "killed",
     "memory",
     "timeout",

@@ -98,6 +98,9 @@ def delete(store: Store, doomed: Sequence[Doomed]) -> None:
     for one in doomed:
         if one.folder is None:
             continue
+        if store.mirror is not None:
+            store.mirror.remove(one.folder.relative_to(store.root).as_posix())
+            continue
         with storage_errors(f"cannot delete {one.folder}"), suppress(FileNotFoundError):
             aside = store.root / "aside" / f"deleted-{uuid.uuid4().hex}"
             aside.parent.mkdir(exist_ok=True)
@@ -151,8 +154,7 @@ def _doomed(store: Store, table: str, names: Iterable[str]) -> list[Doomed]:
     found = []
     for name in sorted(names):
         folder = _folder(store, table, name) if table in ("artefacts", "scenes") else None
-        files = [] if folder is None else [path for path in folder.rglob("*") if path.is_file()]
-        num_bytes = sum(path.stat().st_size for path in files)
+        num_bytes = 0 if folder is None else store.entry_bytes(folder)
         found.append(Doomed(table=table, row_id=name, folder=folder, num_bytes=num_bytes))
     return found
 

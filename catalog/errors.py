@@ -18,6 +18,10 @@ class StorageError(CatalogError, OSError):
     """The store cannot be written or read: disk full, permissions, a broken disk."""
 
 
+class UnreachableError(StorageError):
+    """A bucket did not answer, or not in time, however often it was asked; it may be back later."""
+
+
 class DamagedArtefactError(CatalogError, ValueError):
     """A stored artefact is not what its manifest says."""
 

@@ -140,6 +140,9 @@ class Explainer:
         if scene_id := self._scenes.get(digest):
             file = self._store.scene_folder(scene_id) / MANIFEST_NAME
             provenance = {}
+            with suppress(UnknownRecordError):
+                if files := self._store.scene_files(scene_id):
+                    files([MANIFEST_NAME])
             with suppress(OSError, ValueError, KeyError, TypeError):  # gone or damaged: not known
                 provenance = json.loads(file.read_text("utf-8"))["provenance"]
             return Explanation(name=scene_id, facts={"content": digest, "read_from": provenance})

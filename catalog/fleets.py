@@ -16,7 +16,7 @@ from typing import Any
 from catalog.attempts import FIRST_PAUSE_S, Ending, attempt_row, row_after
 from catalog.digests import canonical_json, digest_text
 from catalog.errors import UnknownRecordError
-from catalog.leases import FolderObjects, Lease, Leases
+from catalog.leases import Lease, Leases
 from catalog.store import Store
 from catalog.tables import Row
 
@@ -62,7 +62,7 @@ class FleetLedger:
         self, store: Store, *, leases: Leases | None = None, first_pause_s: float = FIRST_PAUSE_S
     ) -> None:
         self.store = store
-        self.leases = leases or Leases(FolderObjects(store.root / "leases"))
+        self.leases = leases or Leases(store.objects("leases"))
         self._first_pause_s = first_pause_s
 
     def latest(self) -> str:
@@ -73,7 +73,7 @@ class FleetLedger:
         """
         rows = self.store.tables.rows(TABLE)
         if not rows:
-            raise UnknownRecordError(f"no fleet in {self.store.root}: `fleet run` makes one")
+            raise UnknownRecordError(f"no fleet in {self.store.name}: `fleet run` makes one")
         return max(rows, key=lambda row: row["asked_at"])["fleet"]
 
     def rows(self, fleet: str) -> list[Row]:
@@ -86,7 +86,7 @@ class FleetLedger:
         found = [row for row in rows if row["fleet"] == fleet]
         if not found:
             known = ", ".join(sorted({row["fleet"] for row in rows})) or "none"
-            raise UnknownRecordError(f"no fleet {fleet!r} in {self.store.root}, there is {known}")
+            raise UnknownRecordError(f"no fleet {fleet!r} in {self.store.name}, there is {known}")
         live = {lease.name for lease in self.leases.held() if not self.leases.has_expired(lease)}
         for row in found:
             if row["state"] == "waiting" and row["sequence_id"] in live:
@@ -238,8 +238,7 @@ class _StandingRuns:
 
     @cached_property
     def _ids(self) -> set[str]:
-        folder = self._store.root / "artefacts"
-        there = {f"{path.parent.name}/{path.name}" for path in folder.glob("*/[!.]*")}
+        there = self._store.artefacts.ids()
         return {
             row["run_id"]
             for row in self._store.tables.rows("runs")

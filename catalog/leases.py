@@ -18,22 +18,23 @@ import os
 import platform
 import re
 import secrets
+import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
 from catalog.digests import digest_text
-from catalog.errors import CatalogError, ConflictError, storage_errors
+from catalog.errors import CatalogError, ConflictError, StorageError, storage_errors
 
 TIME_TO_LIVE_S = 120.0
 """Without a heartbeat; clocks of machines that share a store must agree far better than this."""
 BEATS = 12
 """Heartbeats in a time to live."""
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,159}")
 _PROC = Path("/proc")
 _STARTED, _STATE = 19, 0
 """Fields of /proc/PID/stat after the name of the command (proc(5))."""
@@ -223,6 +224,29 @@ class Leases:
     def give_back(self, lease: Lease) -> bool:
         """Take a lease away, one's own or an expired one; whether it still was as it is given."""
         return self._objects.remove(lease.name, version=lease.version)
+
+    @contextmanager
+    def kept(self, name: str) -> Iterator[None]:
+        """Hold a lease of a name of one's own while the block runs; a thread renews it."""
+        lease, over = self.take(name, above=0, facts={}), threading.Event()
+        if lease is None:
+            raise LeaseLostError(f"the lease {name} is in other hands")
+        last = [lease]
+
+        def beat() -> None:
+            while not over.wait(self.time_to_live_s / BEATS):
+                with suppress(StorageError, LeaseLostError):  # the next beat may get through
+                    last[0] = self.renew(last[0], {})
+
+        thread = threading.Thread(target=beat, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
+            with suppress(StorageError):  # it will have expired
+                self.give_back(last[0])
 
     def held(self) -> list[Lease]:
         """All leases that are there, expired ones too."""

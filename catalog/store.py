@@ -1,20 +1,29 @@
-"""Where everything is: one folder with scenes, artefacts, tables and locks."""
+"""Where everything is: scenes, artefacts, tables, leases, in a folder or below an `s3://` address.
+
+On a folder, locks of the kernel keep writers of one thing apart. On a bucket, `root` is a mirror of
+it on this machine (see `mirrors`): those locks then hold between the processes of one machine, and
+between machines nothing needs to be locked, since artefacts and scenes are published on a
+condition. That a run is going on is told by a lock in a folder, by a lease in a bucket.
+"""
 
 import os
 import re
+import secrets
 import tempfile
-from collections.abc import Callable
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from catalog.artefacts import ArtefactStore
 from catalog.errors import CatalogError, StorageError, UnknownRecordError
+from catalog.leases import ConditionalObjects, FolderObjects, Leases
 from catalog.locks import held_lock, is_held, shared_lock
 
 if TYPE_CHECKING:
+    from catalog.mirrors import EntryFiles, Mirror
     from catalog.tables import CatalogTables, Row
 
 STORE_ENVIRONMENT = "LIDARPAINTER_STORE"
@@ -29,35 +38,108 @@ class Store:
     """A LidarPainter store."""
 
     root: Path
+    """Of this machine: the store, or what mirrors its bucket."""
+    mirror: "Mirror | None" = field(default=None, compare=False)
+
+    @property
+    def address(self) -> Path:
+        """What `open_store` opens it by, on any machine that sees it."""
+        return Path(self.name)
+
+    @property
+    def name(self) -> str:
+        """Its address, for people: a folder or `s3://BUCKET/PREFIX`."""
+        return str(self.root) if self.mirror is None else self.mirror.bucket.address
 
     @cached_property
     def artefacts(self) -> ArtefactStore:
         """The content-addressed artefacts."""
-        return ArtefactStore(self.root)
+        if self.mirror is None:
+            return ArtefactStore(self.root)
+        from catalog.mirrored_artefacts import MirroredArtefacts
+
+        return MirroredArtefacts(self.mirror)
 
     @cached_property
     def tables(self) -> "CatalogTables":
         """The catalog's tables."""
         from catalog.tables import CatalogTables  # Arrow and Delta: help does without
 
-        return CatalogTables(str(self.root / "tables"))
+        if self.mirror is None:
+            return CatalogTables(str(self.root / "tables"))
+        from catalog.buckets import table_options
+
+        return CatalogTables(f"{self.name}/tables", storage_options=table_options())
+
+    def objects(self, folder: str) -> ConditionalObjects:
+        """The small objects of a folder of the store."""
+        if self.mirror is None:
+            return FolderObjects(self.root / folder)
+        from catalog.buckets import BucketObjects
+
+        return BucketObjects(self.mirror.bucket, folder)
 
     def make(self) -> None:
         """Make the folder of the store where it is not there, and see that it takes a file.
 
         Raises:
-            StorageError: it cannot be made or written.
+            StorageError: it cannot be made or written, or there is no such bucket.
         """
-        make_writable(self.root, "the store")
+        make_writable(self.root, "the store" if self.mirror is None else "the cache")
+        if self.mirror is not None:
+            self.mirror.bucket.holds("tables")
+
+    def require_folder(self, what: str) -> None:
+        """Refuse what works on folders alone.
+
+        Raises:
+            CatalogError: the store is a bucket.
+        """
+        if self.mirror is not None:
+            raise CatalogError(f"{what} works on a store in a folder, {self.name} is a bucket")
 
     def scene_folder(self, scene_id: str) -> Path:
-        """Folder of the scene `<dataset>/<sequence>`, whether it exists or not.
+        """Folder of the scene `<dataset>/<sequence>` on this machine, whether it exists or not.
 
         Raises:
             UnknownRecordError: the id is no dataset and sequence, or tries to leave the store.
         """
+        return self.root / scene_entry(scene_id)
+
+    def scene_files(self, scene_id: str) -> "EntryFiles | None":
+        """What fetches the files of a scene into its folder; None where they lie there.
+
+        Raises:
+            UnknownRecordError: there is no such scene in the bucket.
+        """
+        return None if self.mirror is None else self.mirror.opened(scene_entry(scene_id))
+
+    def scene_ids(self) -> list[str]:
+        """The scenes whose folders are there."""
+        if self.mirror is not None:
+            return sorted(one.removeprefix("scenes/") for one in self.mirror.entries("scenes"))
+        folders = self.root.glob("scenes/*/[!.]*")
+        return sorted(f"{path.parent.name}/{path.name}" for path in folders)
+
+    @contextmanager
+    def scene_lock(
+        self, scene_id: str, *, on_wait: Callable[[str], None] | None = None
+    ) -> Iterator[bool]:
+        """What whoever writes this scene must hold; a bucket has the scene when the block ends.
+
+        Of two machines that write one scene at once the second takes over what the first wrote.
+        """
         dataset, sequence = split_scene_id(scene_id)
-        return self.root / "scenes" / dataset / sequence
+        path = self.root / "locks" / f"scene-{dataset}-{sequence}.lock"
+        with held_lock(path, on_wait=on_wait) as waited:
+            if self.mirror is None:
+                yield waited
+                return
+            entry = scene_entry(scene_id)
+            before = self.mirror.version(entry)
+            self.mirror.forget(entry)
+            yield waited
+            self.mirror.publish(entry, replacing=before)
 
     def name_of(self, path: Path) -> str:
         """A path as rows hold it: from the folder of the store; outside it, absolute."""
@@ -65,23 +147,38 @@ class Store:
         return str(path.relative_to(self.root) if path.is_relative_to(self.root) else path)
 
     def path_of(self, name: str) -> Path:
-        """The path that a row holds, see `name_of`."""
+        """The path that a row holds, see `name_of`; its artefact is fetched where it must be."""
+        parts = Path(name).parts
+        if self.mirror is not None and parts[0] == "artefacts":
+            self.mirror.fetch("/".join(parts[:3]))
         return self.root / name
 
-    def scene_lock(
-        self, scene_id: str, *, on_wait: Callable[[str], None] | None = None
-    ) -> AbstractContextManager[bool]:
-        """The lock that whoever writes this scene must hold."""
-        dataset, sequence = split_scene_id(scene_id)
-        return held_lock(self.root / "locks" / f"scene-{dataset}-{sequence}.lock", on_wait=on_wait)
+    def place_of(self, name: str) -> str:
+        """Where something of the store lies, for people; nothing is fetched."""
+        return str(self.root / name) if self.mirror is None else f"{self.name}/{name}"
+
+    def entry_bytes(self, folder: Path) -> int:
+        """Size of all files of an artefact or a scene, by its folder."""
+        if self.mirror is not None:
+            listing = self.mirror.listing(folder.relative_to(self.root).as_posix())
+            return 0 if listing is None else sum(listing.sizes.values())
+        return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+    def release(self) -> None:
+        """What this process has fetched is no longer in use, and may be let go."""
+        if self.mirror is not None:
+            self.mirror.release()
 
     def run_lock(self, run_id: str) -> AbstractContextManager[None]:
-        """The lock that every process which works on this run holds."""
-        return shared_lock(self._run_lock(run_id))
+        """What every process which works on this run holds."""
+        if self.mirror is None:
+            return shared_lock(self._run_lock(run_id))
+        return self._run_leases.kept(f"{run_id}.{secrets.token_hex(4)}")
 
     def rows(self, table: str) -> "list[Row]":
         """All rows of a table, by id; a run that was killed does not count as running."""
-        return [self._as_it_is(table, row) for row in self.tables.rows(table)]
+        rows = self.tables.rows(table)
+        return self._as_they_are(rows) if table == "runs" else rows
 
     def row(self, table: str, id_or_prefix: str) -> "Row":
         """The one row with this id, or whose id starts with it; see `rows`.
@@ -89,13 +186,25 @@ class Store:
         Raises:
             UnknownRecordError: none matches, or more than one.
         """
-        return self._as_it_is(table, self.tables.row(table, id_or_prefix))
+        row = self.tables.row(table, id_or_prefix)
+        return self._as_they_are([row])[0] if table == "runs" else row
 
-    def _as_it_is(self, table: str, row: "Row") -> "Row":
-        is_over = table == "runs" and row["status"] == "running"
-        if is_over and not is_held(self._run_lock(row["run_id"])):
-            return {**row, "status": "interrupted"}
-        return row
+    def _as_they_are(self, runs: "list[Row]") -> "list[Row]":
+        begun = {row["run_id"] for row in runs if row["status"] == "running"}
+        over = begun - self._going_on(begun)
+        return [{**row, "status": "interrupted"} if row["run_id"] in over else row for row in runs]
+
+    def _going_on(self, run_ids: set[str]) -> set[str]:
+        """Those of some runs on which a process works."""
+        if self.mirror is None:
+            return {run_id for run_id in run_ids if is_held(self._run_lock(run_id))}
+        leases = self._run_leases
+        held = leases.held() if run_ids else []
+        return {one.name.partition(".")[0] for one in held if not leases.has_expired(one)}
+
+    @cached_property
+    def _run_leases(self) -> Leases:
+        return Leases(self.objects("running"))
 
     def _run_lock(self, run_id: str) -> Path:
         return self.root / "locks" / f"run-{run_id}.lock"
@@ -110,23 +219,35 @@ class Store:
             return self.row("runs", run_id)
         complete = [row for row in self.tables.rows("runs") if row["status"] == "complete"]
         if not complete:
-            raise UnknownRecordError(f"no complete run in {self.root}")
+            raise UnknownRecordError(f"no complete run in {self.name}")
         return max(complete, key=lambda row: row["finished_at"])
 
 
 def open_store(path: Path | str | None = None) -> Store:
-    """The store at a path, else at `LIDARPAINTER_STORE`, else at `./lidarpainter-store`.
+    """The store at a folder or an address, else at `LIDARPAINTER_STORE`, else here.
 
-    Nothing is made before something is written.
+    `s3://BUCKET/PREFIX` is a bucket, also as a `Path`, which makes one slash of the two. Nothing is
+    made before something is written.
 
     Raises:
-        CatalogError: something that is not a folder is in the way.
+        CatalogError: something that is not a folder is in the way, or the address is none.
     """
-    chosen = Path(path or os.environ.get(STORE_ENVIRONMENT) or DEFAULT_STORE).expanduser()
-    root = chosen.absolute()
+    text = str(path or os.environ.get(STORE_ENVIRONMENT) or DEFAULT_STORE)
+    if text.startswith("s3:/"):
+        mirror = _mirror(text, os.environ.get("LIDARPAINTER_CACHE"))
+        return Store(mirror.root, mirror)
+    root = Path(text).expanduser().absolute()
     if root.exists() and not root.is_dir():
         raise CatalogError(f"the store {root} is a file, expected a folder")
     return Store(root)
+
+
+@lru_cache(maxsize=8)  # its connections are kept
+def _mirror(address: str, _cache: str | None) -> "Mirror":
+    from catalog.buckets import Bucket  # HTTP: who has a folder does without
+    from catalog.mirrors import Mirror
+
+    return Mirror(Bucket(address))
 
 
 def existing_store() -> Store:
@@ -134,10 +255,16 @@ def existing_store() -> Store:
 
     Raises:
         CatalogError: there is none, or something that is not a folder is in the way.
+        StorageError: there is no such bucket.
     """
     store = open_store()
-    if not any((store.root / name).is_dir() for name in ("tables", "scenes")):
-        raise CatalogError(f"no store at {store.root}: `ingest` or `demo` makes one, see --store")
+    parts = ("tables", "scenes")
+    if store.mirror is None:
+        is_there = any((store.root / name).is_dir() for name in parts)
+    else:
+        is_there = any(store.mirror.bucket.holds(name) for name in parts)
+    if not is_there:
+        raise CatalogError(f"no store at {store.name}: `ingest` or `demo` makes one, see --store")
     return store
 
 
@@ -169,3 +296,8 @@ def split_scene_id(scene_id: str) -> tuple[str, str]:
             f"{scene_id!r} is no scene id, expected dataset/sequence such as pandaset/002"
         )
     return parts[0], parts[1]
+
+
+def scene_entry(scene_id: str) -> str:
+    """The folder of a scene, from that of the store; raises what `split_scene_id` does."""
+    return "/".join(["scenes", *split_scene_id(scene_id)])

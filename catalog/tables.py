@@ -24,6 +24,7 @@ from catalog.errors import (
     ConflictError,
     StorageError,
     UnknownRecordError,
+    UnreachableError,
     storage_errors,
 )
 from catalog.schemas import TABLES, TableSchema
@@ -34,6 +35,8 @@ LONGEST_PAUSE_S = 2.0
 MOST_FILES = 24
 """Of a table, before they are written together: each merge and each query opens all of them."""
 
+_NO_ANSWER = "Generic S3 error"
+"""How Delta Lake says that a bucket failed, whatever it failed of."""
 LEAST_ROOM_BYTES = 4 << 20
 """Below this a disk counts as full: more than any commit takes."""
 
@@ -252,7 +255,7 @@ class CatalogTables:
 
 @contextmanager
 def _damage(doing: str) -> Iterator[None]:
-    """Turn a table that is not as it was written into one line, as a failing disk."""
+    """Turn a damaged table or a bucket that does not answer into one line, as a failing disk."""
     try:
         with storage_errors(doing):
             yield
@@ -260,6 +263,8 @@ def _damage(doing: str) -> Iterator[None]:
         raise
     except (DeltaError, pa.ArrowException, OSError) as error:
         found = str(error).splitlines()[0][:200]
+        if _NO_ANSWER in str(error):
+            raise UnreachableError(f"{doing}: {found}") from None
         raise StorageError(f"{doing}: it is damaged ({found})") from None
 
 

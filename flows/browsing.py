@@ -34,7 +34,7 @@ def view_run(
         stopped: ends it.
     """
     finished = open_run(store, path.run)
-    run = view_parameters(finished).run_spec(store.root)
+    run = view_parameters(finished).run_spec(store.address)
     request = drive_request(store, finished, path)
     request = replace(request, scenes=request.scenes | _other_scenes(store, finished))
     view_live(run, request, port=port, opened_at=opened_at, stopped=stopped)

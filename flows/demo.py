@@ -58,4 +58,4 @@ def _first_view(config: SyntheticStreetConfig) -> Float[Tensor, "height width 3"
 @flow(name="demo-scene")
 def demo_scene(store: str | None = None) -> dict[str, Any]:
     """Run the demo as a worker is asked to, in the worker's store."""
-    return demo.fn(demo_street(), preview(street_id(DEMO_SEED)), open_store(store).root)
+    return demo.fn(demo_street(), preview(street_id(DEMO_SEED)), open_store(store).address)

@@ -100,7 +100,7 @@ def derive_run(
         return known
     if check is not None:
         check()
-    run = view_parameters(source).run_spec(store.root)
+    run = view_parameters(source).run_spec(store.address)
     with store.run_lock(run_id):
         record = begin_run.fn(
             run,
@@ -111,7 +111,7 @@ def derive_run(
             derived_from=source.run_id,
             change=told,
         )
-        with early_end_recorded(store.root, record):
+        with early_end_recorded(store.address, record):
             return _derive(store, source, record, builds, _StageInputs(inputs, told))
 
 
@@ -165,4 +165,4 @@ def _derive(
         "artefacts": {name: stage.ref.artefact_id for name, stage in stages.items()},
         "report": None,
     }
-    return located(complete_run.fn(store.root, record, result, {}, tuple(refs)), store)
+    return located(complete_run.fn(store.address, record, result, {}, tuple(refs)), store)

@@ -78,7 +78,7 @@ def _variants(
     if request.is_painted or request.painter:
         judged["view-time"] = finished.final
     judge = evaluate_strips if request.protocol == CROSS_CAMERA else evaluate
-    run = parameters.run_spec(store.root, painter=request.painter)
+    run = parameters.run_spec(store.address, painter=request.painter)
     scores = {}
     for name, fitted in judged.items():
         made = judge.fn(
@@ -95,7 +95,7 @@ def _variants(
 def _flicker(
     store: Store, finished: FinishedRun, parameters: ViewParameters, request: EvaluationRequest
 ) -> dict[str, Any]:
-    run = parameters.run_spec(store.root, painter=request.painter)
+    run = parameters.run_spec(store.address, painter=request.painter)
     made = evaluate_flicker.fn(
         run, FLICKER, finished.final, parameters.judge_config, request.previous
     )

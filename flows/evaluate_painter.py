@@ -58,7 +58,7 @@ def _first_fit(run: str) -> JudgedFit:
     finished = open_run(store, run)
     parameters = view_parameters(finished)
     return JudgedFit(
-        store_path=store.root,
+        store_path=store.address,
         run_id=finished.run_id,
         split=parameters.split_spec,
         fitted=finished.unpainted,

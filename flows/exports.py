@@ -112,7 +112,7 @@ def export_run(store: Store, request: ExportRequest, out: Path) -> dict[str, Any
         out: the file, or a new folder.
     """
     finished = open_run(store, request.path.run)
-    run = view_parameters(finished).run_spec(store.root, painter=request.path.painter)
+    run = view_parameters(finished).run_spec(store.address, painter=request.path.painter)
     made = _export(store, request, finished, run, out)
     return {
         "run_id": finished.run_id,

@@ -61,6 +61,6 @@ def located(result: dict[str, Any], store: Store) -> dict[str, Any]:
     refs = {name: ArtefactRef.of_id(one) for name, one in result["artefacts"].items()}
     return {
         **result,
-        "artefacts": {name: str(store.artefacts.folder(ref)) for name, ref in refs.items()},
-        "report": result["report"] and str(store.path_of(result["report"])),
+        "artefacts": {name: store.place_of(ref.entry) for name, ref in refs.items()},
+        "report": result["report"] and store.place_of(result["report"]),
     }

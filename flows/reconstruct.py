@@ -100,7 +100,7 @@ def reconstruct_scene(
         store: folder of the store; by default what `LIDARPAINTER_STORE` says on the worker.
     """
     parameters = with_overrides(preset_named(preset, scene), settings)
-    return reconstruct.fn(parameters, open_store(store).root)
+    return reconstruct.fn(parameters, open_store(store).address)
 
 
 def _run(course: Course) -> dict[str, Any]:

@@ -60,7 +60,7 @@ def render_run(
         kinds: which files are written.
     """
     finished = open_run(store, path.run)
-    run = view_parameters(finished).run_spec(store.root, painter=path.painter)
+    run = view_parameters(finished).run_spec(store.address, painter=path.painter)
     request = render_request(store, finished, path, kinds)
     request = replace(request, prompt=prompt, sequence=sequence)
     made = render.fn(run, finished.final, request, out)
@@ -160,7 +160,7 @@ def stylize_run(
         allows_collisions=path.allows_collisions,
     )
     request = StylizeRequest(mix=mix, view=view, images=images, seed=seed)
-    run = parameters.run_spec(store.root, painter=path.painter)
+    run = parameters.run_spec(store.address, painter=path.painter)
     made = stylize.fn(run, finished.final, request, out)
     return {
         "run_id": finished.run_id,

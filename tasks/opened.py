@@ -11,6 +11,7 @@ from pathlib import Path
 
 import torch
 
+from catalog.errors import UnknownRecordError
 from catalog.store import Store, open_store
 from lidarpainter_models.devices import chosen_device
 from lidarpainter_models.errors import SceneError
@@ -20,6 +21,7 @@ from lidarpainter_models.painter.selection import PainterChoice
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.schema import MANIFEST_NAME
 from lidarpainter_models.scenes.splits import ViewSplit, split_views
+from lidarpainter_models.scenes.stored import Fetch
 from tasks.specs import RunSpec, SplitSpec
 
 
@@ -63,16 +65,17 @@ def open_scene(store: Store, scene_id: str) -> DrivingScene:
     """
     folder = store.scene_folder(scene_id)
     try:
+        files = store.scene_files(scene_id)
+        if files is not None:
+            files([MANIFEST_NAME])
         manifest = (folder / MANIFEST_NAME).stat()
-    except OSError:
-        known = sorted(
-            f"{path.parent.name}/{path.name}" for path in store.root.glob("scenes/*/[!.]*")
-        )
+    except (FileNotFoundError, NotADirectoryError, UnknownRecordError):
+        known = store.scene_ids()
         raise SceneError(
-            f"no scene {scene_id} in {store.root}: ingest it first "
+            f"no scene {scene_id} in {store.name}: ingest it first "
             f"(there {'is' if len(known) == 1 else 'are'} {', '.join(known) or 'none'})"
         ) from None
-    return _scene(folder, manifest.st_ino, manifest.st_mtime_ns)
+    return _scene(folder, files, manifest.st_ino, manifest.st_mtime_ns)
 
 
 def open_split(store: Store, split: SplitSpec) -> tuple[DrivingScene, ViewSplit]:
@@ -82,8 +85,8 @@ def open_split(store: Store, split: SplitSpec) -> tuple[DrivingScene, ViewSplit]
 
 
 @lru_cache(maxsize=4)
-def _scene(folder: Path, _inode: int, _changed_ns: int) -> DrivingScene:
-    return DrivingScene.open(folder)
+def _scene(folder: Path, files: Fetch | None, _inode: int, _changed_ns: int) -> DrivingScene:
+    return DrivingScene.open(folder, files)
 
 
 @lru_cache(maxsize=1)

@@ -8,7 +8,6 @@ see the thin task only, and what is done is written in the store.
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from prefect import Task
@@ -104,7 +103,7 @@ def run_stage(
     if is_new:
         store.tables.merge("artefacts", [artefact_row(ref, manifest)])
     listener().finished(stage, manifest.seconds, is_new=is_new)
-    _log(stage, recipe, store.artefacts.folder(ref), is_new=is_new)
+    _log(stage, recipe, store.place_of(ref.entry), is_new=is_new)
     return StageResult(
         ref=ref,
         seconds=manifest.seconds,
@@ -115,7 +114,7 @@ def run_stage(
     )
 
 
-def _log(stage: str, recipe: Recipe, folder: Path, *, is_new: bool) -> None:
+def _log(stage: str, recipe: Recipe, place: str, *, is_new: bool) -> None:
     """Say what a stage is keyed on, whether it was there, and where it lies."""
     _LOG.info(
         "%s: %s; from %s; settings %s; code %s; lies in %s",
@@ -124,7 +123,7 @@ def _log(stage: str, recipe: Recipe, folder: Path, *, is_new: bool) -> None:
         ", ".join(f"{name} {digest[:SHOWN_DIGITS]}" for name, digest in recipe.inputs.items()),
         digest_text(canonical_json(plain(recipe.config)))[:SHOWN_DIGITS],
         recipe.code.digest[:SHOWN_DIGITS],
-        folder,
+        place,
     )
 
 

@@ -33,7 +33,7 @@ def save_observations(folder: Path, observations: SceneObservations) -> None:
 
 def load_observations(store: Store, ref: ArtefactRef) -> SceneObservations:
     """The observations of an artefact, read and checked once in a process."""
-    path = store.artefacts.folder(ref) / OBSERVATIONS_FILE
+    path = store.artefacts.files(ref) / OBSERVATIONS_FILE
     return _observations(store, ref, path, *_as_it_is(path))
 
 
@@ -54,7 +54,7 @@ def load_scene(store: Store, ref: ArtefactRef) -> GaussianScene:
 
     It is shared: whoever changes it takes a copy.
     """
-    path = store.artefacts.folder(ref) / SCENE_FILE
+    path = store.artefacts.files(ref) / SCENE_FILE
     return _scene(store, ref, path, *_as_it_is(path))
 
 
@@ -75,4 +75,4 @@ def _as_it_is(path: Path) -> tuple[int, int]:
 
 def load_history(store: Store, ref: ArtefactRef) -> History:
     """Read the course of the fit that made an artefact."""
-    return read_json(store.artefacts.folder(ref) / HISTORY_FILE)
+    return read_json(store.artefacts.files(ref) / HISTORY_FILE)

@@ -43,7 +43,8 @@ def checked_modules() -> frozenset[str]:
 _finder = install_import_hook([], "shape_checking.check").hook
 _finder.should_instrument = checked_modules().__contains__
 
-pytest_plugins = ["board_world", "small_pandaset"]  # fixtures that several rooms share
+# fixtures that several rooms share
+pytest_plugins = ["board_world", "bucket_stand_in", "small_pandaset"]
 
 
 @pytest.fixture(scope="session")

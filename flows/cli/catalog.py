@@ -64,7 +64,7 @@ def list_table(
     absent = _absent(rows) if table == "metrics" else {}
     rows = [row for row in rows if table != "metrics" or row["value"] is not None]
     if as_json:
-        found = {"table": table, "store": str(store.root), "rows": [_open(row) for row in rows]}
+        found = {"table": table, "store": store.name, "rows": [_open(row) for row in rows]}
         missing = [{"names": names, "reason": reason} for reason, names in absent.items()]
         print_json(found | ({"absent": missing} if table == "metrics" else {}))
         return
@@ -75,7 +75,7 @@ def list_table(
         f"{reason}"
         for reason, names in absent.items()
     )
-    print_table(f"{table} in {store.root}", columns, cells, note)
+    print_table(f"{table} in {store.name}", columns, cells, note)
 
 
 @app.command("show")
@@ -166,7 +166,7 @@ def delete_record(
     num_bytes = sum(one.num_bytes for one in doomed)
     if not as_json:
         rows = [[one.table[:-1], one.row_id, format_bytes(one.num_bytes)] for one in doomed]
-        title = f"{format_bytes(num_bytes)} of {store.root}"
+        title = f"{format_bytes(num_bytes)} of {store.name}"
         print_table(title, ["what", "name", "size"], rows, num_text_columns=2)
     if not dry_run:
         if not yes and not typer.confirm("Delete this?"):

@@ -57,7 +57,7 @@ def run(
     ledger.ask(wanted, accept_stale=accept_stale)
     counts = counts_of(ledger.rows(asked.name))
     if still := counts["waiting"] + counts["running"]:
-        start = starter(store.root, asked.name, threads)
+        start = starter(store.address, asked.name, threads)
         run_workers(ledger, asked.name, start, min(workers, still), _tell)
     status = fleet_status(ledger, asked.name)
     _show(status, as_json=as_json)

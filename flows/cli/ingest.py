@@ -62,14 +62,14 @@ def ingest(  # noqa: PLR0913 - one per option
     names = find_sequences(dataset, root, sequences or ())
     from tasks.ingest.jobs import IngestRequest, ingest_sequences
 
-    request = IngestRequest(store.root, dataset, root, chosen_frames, chosen_cameras)
+    request = IngestRequest(store.address, dataset, root, chosen_frames, chosen_cameras)
     with shown_progress():
         done = ingest_sequences(request, names, jobs=jobs, again=again, on_failure=complain)
     rows, failures = done.rows, done.failures
     if as_json:
-        print_json({"store": str(store.root), "scenes": rows, "failures": failures})
+        print_json({"store": store.name, "scenes": rows, "failures": failures})
     else:
         cells = [[*(row[name] for name in COLUMNS), format_bytes(row["num_bytes"])] for row in rows]
-        print_table(f"scenes in {store.root}", [*COLUMNS.values(), "size"], cells)
+        print_table(f"scenes in {store.name}", [*COLUMNS.values(), "size"], cells)
     if failures:
         raise typer.Exit(SOME_FAILED)

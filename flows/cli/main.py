@@ -89,7 +89,11 @@ def _print_version(asked: bool) -> None:
 def options(
     store: Annotated[
         Path | None,
-        typer.Option(help="Folder of the store.", envvar=STORE_ENVIRONMENT, show_default=False),
+        typer.Option(
+            help="The store: a folder or s3://BUCKET/PREFIX.",
+            envvar=STORE_ENVIRONMENT,
+            show_default=False,
+        ),
     ] = None,
     debug: Annotated[  # noqa: ARG001 - `main` reads it; here it is only documented
         bool, typer.Option("--debug", help="Show tracebacks and Prefect's log.")

@@ -20,13 +20,13 @@ def run_reconstruction(parameters: "ReconstructParameters", store: Store) -> dic
     """Reconstruct one scene of the store; what is known already is not asked of a server."""
     from flows.recall import recalled
 
-    if (known := recalled(parameters, store.root)) is not None:
+    if (known := recalled(parameters, store.address)) is not None:
         return known
     from flows.reconstruct import check_inputs, reconstruct
 
-    check_inputs(parameters, store.root)  # before a server is started for nothing
+    check_inputs(parameters, store.address)  # before a server is started for nothing
     with _running(store, parameters):
-        return reconstruct(parameters, store.root)
+        return reconstruct(parameters, store.address)
 
 
 def run_demo(
@@ -36,7 +36,7 @@ def run_demo(
     from flows.demo import demo, demo_street
 
     with _running(store, parameters):
-        return demo(demo_street(seed), parameters, store.root, first_image)
+        return demo(demo_street(seed), parameters, store.address, first_image)
 
 
 @contextmanager

@@ -24,7 +24,7 @@ Parameters = TypeVar("Parameters")
 
 def run_harvest(parameters: HarvestParameters) -> dict[str, Any]:
     """Harvest into the store."""
-    check_harvest(parameters, open_store().root)
+    check_harvest(parameters, open_store().address)
     return _run(harvest_pairs, parameters)
 
 
@@ -33,7 +33,7 @@ def run_training(parameters: TrainPainterParameters, out: Path | None) -> dict[s
 
     What cannot be trained on, or written to, is refused before any work begins.
     """
-    check_sources(parameters, open_store().root)
+    check_sources(parameters, open_store().address)
     if out is not None:
         make_writable(out.parent if out.suffix == WEIGHTS_SUFFIX else out, "--out")
     result = _run(train_painter, parameters)
@@ -53,4 +53,4 @@ def _run(flow: Callable[..., dict[str, Any]], parameters: Parameters) -> dict[st
     store.make()
     say_status("starting Prefect's server")
     with prefect_server(store.root / "logs" / "prefect.log"), shown_progress():
-        return flow(parameters, store.root)
+        return flow(parameters, store.address)

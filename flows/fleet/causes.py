@@ -3,7 +3,7 @@
 import errno
 
 from catalog.attempts import Cause
-from catalog.errors import CatalogError, ConflictError, disk_error
+from catalog.errors import CatalogError, ConflictError, UnreachableError, disk_error
 from lidarpainter_models.errors import (
     BackendError,
     LidarPainterError,
@@ -30,13 +30,15 @@ def cause_of(error: Exception) -> tuple[Cause, str]:
     return cause, text if is_ours and text else f"{name}: {text}".removesuffix(": ")
 
 
-def is_full_disk(error: Exception) -> bool:
-    """Whether it came about because there is no room left."""
-    return disk_error(error) in NO_ROOM
+def is_storage_away(error: Exception) -> bool:
+    """Whether the store cannot be used for now: there is no room, or a bucket does not answer."""
+    return disk_error(error) in NO_ROOM or isinstance(error, UnreachableError)
 
 
 def _cause(error: Exception) -> Cause:
-    if is_full_disk(error):
+    if isinstance(error, UnreachableError):
+        return "store-lost"
+    if is_storage_away(error):
         return "disk-full"
     if isinstance(error, MemoryError) or any(words in str(error) for words in NO_MEMORY):
         return "memory"

@@ -16,6 +16,7 @@ from pathlib import Path
 from catalog.attempts import Ending
 from catalog.errors import CatalogError
 from catalog.fleets import FleetLedger
+from catalog.store import open_store
 from flows.children import start_child
 from flows.fleet.status import counts_of
 
@@ -47,8 +48,8 @@ def starter(store: Path, fleet: str, threads: int) -> Start:
 
 
 def log_path(store: Path, fleet: str, number: int) -> Path:
-    """Where a worker writes what it does."""
-    return store / "logs" / f"fleet-{fleet}-{number}.log"
+    """Where a worker of this machine writes what it does."""
+    return open_store(store).root / "logs" / f"fleet-{fleet}-{number}.log"
 
 
 def run_workers(
@@ -117,7 +118,7 @@ class _Crew:
         self._early_deaths = self._early_deaths + 1 if entered == self._entered else 0
         self._entered = entered
         if self._early_deaths >= MAX_EARLY_DEATHS:
-            path = log_path(self.ledger.store.root, self.fleet, number)
+            path = log_path(self.ledger.store.address, self.fleet, number)
             raise CatalogError(f"workers of fleet {self.fleet} end at once; see {path}")
 
 

@@ -33,7 +33,7 @@ def fleet_status(ledger: FleetLedger, fleet: str) -> dict[str, Any]:
     budget = Budget.model_validate_json(rows[0]["budget"])
     return {
         "fleet": fleet,
-        "store": str(ledger.store.root),
+        "store": ledger.store.name,
         "counts": counts,
         "held_back": (over_budget(rows) or lacks_disk(ledger, budget)) if is_open else None,
         "sequences": [_sequence(row) for row in rows],

@@ -62,7 +62,7 @@ def fleet_sequence(asked: str, store_path: Path) -> Made:
 def _made(asked: Asked, store_path: Path) -> Made:
     store = open_store(store_path)
     _bring_in(asked, store)
-    result = reconstruct.fn(asked.parameters, store.root)
+    result = reconstruct.fn(asked.parameters, store.address)
     new = {name for name, is_new in result["computed_now"].items() if is_new}
     refs = [_ref(path) for name, path in result["artefacts"].items() if name in new]
     return Made(
@@ -90,7 +90,7 @@ def _bring_in(asked: Asked, store: Store) -> None:
     if asked.seed is None:
         frames = None if asked.frames is None else slice(*asked.frames)
         root = asked.root or Path()
-        request = IngestRequest(store.root, asked.dataset, root, frames, asked.read_cameras)
+        request = IngestRequest(store.address, asked.dataset, root, frames, asked.read_cameras)
         ingest_or_recall(request, asked.sequence, again=False)
         return
     try:
@@ -98,7 +98,7 @@ def _bring_in(asked: Asked, store: Store) -> None:
     except SceneError:
         drawn = {}
     if drawn.get("world_version") != WORLD_VERSION:
-        ingest_street(store.root, asked.street)
+        ingest_street(store.address, asked.street)
     elif drawn.get("config") != json.loads(json.dumps(asked.street.to_dict())):
         raise ConfigError(
             f"scene {asked.scene_id} is in the store with other frames, width or cameras; it was "

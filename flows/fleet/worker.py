@@ -21,7 +21,7 @@ from catalog.fleets import FleetLedger
 from catalog.leases import Lease
 from catalog.tables import Row
 from flows.fleet.asked import Asked
-from flows.fleet.causes import cause_of, is_full_disk
+from flows.fleet.causes import cause_of, is_storage_away
 from flows.fleet.heartbeat import Heartbeat
 from flows.fleet.limits import admits, lacks_disk, over_budget
 from flows.fleet.manifest import Budget
@@ -57,7 +57,7 @@ class Worker:
                 if self._step():
                     return
             except StorageError as error:
-                if not is_full_disk(error):
+                if not is_storage_away(error):
                     raise
                 self._pause(str(error))
 
@@ -76,6 +76,7 @@ class Worker:
             time.sleep(self.poll_s)
         else:
             self._attempt(*taken)
+            self.ledger.store.release()
         return False
 
     def _take(self, rows: Sequence[Row]) -> tuple[Row, Lease] | None:
@@ -115,7 +116,7 @@ class Worker:
         effort = self._planner().effort(asked)
         with beat, at_interruption(partial(self._end, beat, Ending(cause="interrupted"))):
             try:
-                made = self.work(asked, self.ledger.store.root)
+                made = self.work(asked, self.ledger.store.address)
                 ending = Ending(
                     cause="done",
                     run_id=made.run_id,
@@ -130,7 +131,7 @@ class Worker:
         self._end(beat, ending)
 
     def _end(self, beat: Heartbeat, ending: Ending) -> None:
-        """Enter how an attempt ended; on a full disk, as soon as there is room."""
+        """Enter how an attempt ended; where the store is away, as soon as it is back."""
         with self._entering:
             took = replace(ending, **beat.took())
             peak = max(took.peak_memory_bytes or 0, ending.peak_memory_bytes or 0)
@@ -140,7 +141,7 @@ class Worker:
                     follows = self.ledger.end(beat.lease, took)
                     break
                 except StorageError as error:
-                    if not is_full_disk(error):
+                    if not is_storage_away(error):
                         raise
                     self._pause(str(error))
         scene = beat.lease.facts["scene_id"]

@@ -24,7 +24,7 @@ from lidarpainter_models.scenes.records import (
     Sweep,
     SweepPoints,
 )
-from lidarpainter_models.scenes.stored import StoredScene
+from lidarpainter_models.scenes.stored import Fetch, StoredScene
 from lidarpainter_models.scenes.tracks import ActorTrack, tracks_from_boxes
 from lidarpainter_models.scenes.undistortion import pinhole_of, undistort
 
@@ -72,13 +72,17 @@ class DrivingScene:
         self._read_tables()
 
     @classmethod
-    def open(cls, path: Path) -> "DrivingScene":
+    def open(cls, path: Path, fetch: Fetch | None = None) -> "DrivingScene":
         """Open the scene at a path.
+
+        Args:
+            path: its folder.
+            fetch: brings files there before they are read; None if all are there.
 
         Raises:
             SceneError: there is no scene, or it is incomplete or damaged.
         """
-        return cls(StoredScene(Path(path)))
+        return cls(StoredScene(Path(path), fetch))
 
     @property
     def global_from_world(self) -> Float[Tensor, "4 4"]:

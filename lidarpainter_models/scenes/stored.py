@@ -2,11 +2,13 @@
 
 Zarr reads a missing chunk as zeros, so completeness is checked against the manifest's list of
 files and sizes when a scene is opened; every read chunk is checked by its CRC-32C. The full digest
-of the content is recomputed on demand (`verify_content`).
+of the content is recomputed on demand (`verify_content`). Where a scene is fetched as it is read,
+each file is asked for before it is opened, and of an array only the chunks that hold the rows.
 """
 
 import hashlib
 import json
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,9 @@ import zarr
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.scenes import schema
 from lidarpainter_models.scenes.validation import shown
+
+Fetch = Callable[[Collection[str]], None]
+"""Sees that files of a scene are in its folder, whole and as they were published."""
 
 _VERIFY_ROWS = 1 << 20
 _ENTRIES = {"files": dict, "arrays": dict, "tables": dict, "camera_names": list}
@@ -37,8 +42,12 @@ def stored_digest(path: Path) -> str | None:
         return None
 
 
-def read_manifest(path: Path) -> dict[str, Any]:
+def read_manifest(path: Path, *, is_all_here: bool = True) -> dict[str, Any]:
     """The manifest of a scene, after checking that every file it lists is there.
+
+    Args:
+        path: folder of the scene.
+        is_all_here: otherwise files are fetched later, and not looked for.
 
     Raises:
         SceneError: there is no scene, it is incomplete, or another version wrote it.
@@ -60,7 +69,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
     for name, kind in _ENTRIES.items():
         if not isinstance(manifest.get(name), kind):
             raise SceneError(f"{file}: {name} is no {kind.__name__}; the scene is damaged")
-    for name, num_bytes in manifest["files"].items():
+    for name, num_bytes in manifest["files"].items() if is_all_here else ():
         _require_file(path / name, num_bytes)
     return manifest
 
@@ -79,14 +88,17 @@ def _require_file(file: Path, num_bytes: int) -> None:
 class StoredScene:
     """The files of one scene, read lazily."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, fetch: Fetch | None = None) -> None:
         self.path = Path(path)
-        self.manifest = read_manifest(self.path)
+        self._fetch = fetch or (lambda _names: None)
+        self._fetch([schema.MANIFEST_NAME])
+        self.manifest = read_manifest(self.path, is_all_here=fetch is None)
         self._arrays: dict[str, zarr.Array] = {}
 
     def table(self, name: str) -> pa.Table:
         """One of the tables of the schema, whole; its columns are checked."""
         file = self.path / f"{name}.parquet"
+        self._fetch([file.name])
         try:
             table = pq.read_table(file)
         except (OSError, pa.ArrowException) as error:
@@ -115,7 +127,9 @@ class StoredScene:
                 f"{self.path}: rows {offset} to {offset + num_rows} of {name}, which has {total}"
             )
         try:
-            rows = self._array(name)[offset : offset + num_rows]
+            array = self._array(name)
+            self._fetch(self._chunks(name, offset, num_rows, array.chunks[0]))
+            rows = array[offset : offset + num_rows]
         except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
             raise SceneError(
                 f"{self.path}: array {name} cannot be read ({shown(str(error))}); "
@@ -126,12 +140,20 @@ class StoredScene:
     def _array(self, name: str) -> zarr.Array:
         """An array, opened once: that takes as long as reading a sweep."""
         if name not in self._arrays:
+            self._fetch([f"{schema.ARRAYS_NAME}/{name}/zarr.json"])
             self._arrays[name] = zarr.open_array(
                 self.path / schema.ARRAYS_NAME / name,
                 mode="r",
                 zarr_format=3,  # version 2 has codecs that unpickle
             )
         return self._arrays[name]
+
+    def _chunks(self, name: str, offset: int, num_rows: int, chunk_rows: int) -> list[str]:
+        """Files of an array that hold some of its rows."""
+        begin = f"{schema.ARRAYS_NAME}/{name}/c/"
+        wanted = range(offset // chunk_rows, -(-(offset + num_rows) // chunk_rows))
+        files = (file for file in self.manifest["files"] if file.startswith(begin))
+        return [file for file in files if int(file.removeprefix(begin).split("/")[0]) in wanted]
 
     def verify_content(self) -> None:
         """Read everything and compare it with the digests in the manifest.

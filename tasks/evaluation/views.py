@@ -60,7 +60,7 @@ def judged_inputs(this: OpenedRun, fitted: FittedRef, *, view_time: bool) -> dic
 
 def load_scores(store: Store, ref: ArtefactRef) -> Scores:
     """Read the scores of an evaluation."""
-    return read_json(store.artefacts.folder(ref) / SCORES_FILE)
+    return read_json(store.artefacts.files(ref) / SCORES_FILE)
 
 
 def _build(

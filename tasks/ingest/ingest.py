@@ -10,10 +10,11 @@ import lidarpainter_models
 from catalog.records import SceneRecord
 from catalog.store import Store, open_store
 from lidarpainter_models.readers import ingest_scene
-from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street
 from tasks.measuring import measured
+from tasks.opened import open_scene
 from tasks.progress import listener
+from tasks.specs import street_id
 from tasks.stages import stage_task
 
 STAGE = "ingest"
@@ -42,7 +43,7 @@ def ingest_sequence(
             cameras=cameras,
             progress=lambda done, total: listener().advanced(STAGE, done, total, ""),
         )
-        return record_scene(store, path)
+    return record_scene(store, path)
 
 
 @stage_task
@@ -50,13 +51,13 @@ def ingest_street(store_path: Path, config: SyntheticStreetConfig) -> dict[str, 
     """Render a synthetic street into the store; returns its row in `scenes`."""
     store = open_store(store_path)
     store.make()
-    with writing(store, f"synthetic/street-{config.seed:04d}"):
+    with writing(store, street_id(config.seed)):
         path = write_street(
             config,
             store.root,
             progress=lambda done, total: listener().advanced(STAGE, done, total, ""),
         )
-        return record_scene(store, path)
+    return record_scene(store, path)
 
 
 @contextmanager
@@ -71,8 +72,8 @@ def writing(store: Store, scene_id: str) -> Iterator[None]:
 
 
 def record_scene(store: Store, path: Path) -> dict[str, Any]:
-    """Enter a stored scene into the catalog; returns its row."""
-    scene = DrivingScene.open(path)
+    """Enter the scene whose folder is at a path of the store into the catalog; returns its row."""
+    scene = open_scene(store, f"{path.parent.name}/{path.name}")
     times_ns = scene.frame_timestamps_ns
     row = SceneRecord(
         scene_id=f"{scene.dataset}/{scene.sequence}",

@@ -22,10 +22,9 @@ import lidarpainter_models
 from catalog.errors import CatalogError
 from catalog.store import open_store
 from lidarpainter_models.errors import ConfigError, LidarPainterError
-from lidarpainter_models.scenes.stored import read_manifest
-from lidarpainter_models.storage.whole_files import write_whole
 from tasks.ingest.ingest import STAGE as ONE_SEQUENCE
 from tasks.ingest.ingest import ingest_sequence
+from tasks.opened import open_scene
 from tasks.progress import listener
 
 STAGE = "sequences"
@@ -105,19 +104,21 @@ def ingest_or_recall(request: IngestRequest, name: str, again: bool) -> dict[str
     Raises:
         ConfigError: the scene is in the store, read with another choice than this.
     """
-    note = request.store_path / "ingested" / request.dataset / f"{name}.json"
-    if not again and (row := _known(note, request, name)) is not None:
+    notes = open_store(request.store_path).objects(f"ingested/{request.dataset}")
+    noted = notes.read(f"{name}.json")
+    if not again and (row := _known(noted and noted[0], request, name)) is not None:
         listener().started(ONE_SEQUENCE)
         listener().finished(ONE_SEQUENCE, 0.0, is_new=False)
         return row
     row = ingest_sequence.fn(
         request.store_path, request.dataset, request.root, name, request.frames, request.cameras
     )
-    write_whole(note, json.dumps({"request": request.key(), "row": row}).encode())
+    note = json.dumps({"request": request.key(), "row": row}).encode()
+    notes.write(f"{name}.json", note, replacing=noted and noted[1])
     return row
 
 
-def _known(note: Path, request: IngestRequest, name: str) -> dict[str, Any] | None:
+def _known(note: bytes | None, request: IngestRequest, name: str) -> dict[str, Any] | None:
     """The row of the scene if it is there as asked for; None where it has to be read.
 
     Raises:
@@ -125,13 +126,13 @@ def _known(note: Path, request: IngestRequest, name: str) -> dict[str, Any] | No
     """
     asked, row, earlier = request.key(), {}, {}
     try:
-        noted = json.loads(note.read_text("utf-8"))
+        noted = json.loads(note or b"")
         row, earlier = dict(noted["row"]), dict(noted["request"])
         scene_id, digest = row["scene_id"], row["content_digest"]
-    except (OSError, ValueError, KeyError, TypeError):  # no note, or one that cannot be read
+    except (ValueError, KeyError, TypeError):  # no note, or one that cannot be read
         scene_id, digest = f"{request.dataset}/{name}", None
     try:
-        stored = read_manifest(open_store(request.store_path).scene_folder(scene_id))
+        stored = open_scene(open_store(request.store_path), scene_id).manifest
     except (LidarPainterError, CatalogError):
         return None
     if stored["content_digest"] != digest:

@@ -82,7 +82,7 @@ def harvest_street(
 
 def pair_set(store: Store, name: str, ref: ArtefactRef) -> PairSet:
     """The pairs of an artefact."""
-    return PairSet(name=name, folder=store.artefacts.folder(ref) / PAIRS_FOLDER)
+    return PairSet(name=name, folder=store.artefacts.files(ref) / PAIRS_FOLDER)
 
 
 def _has_street(store: Store, scene_id: str, config: SyntheticStreetConfig) -> bool:

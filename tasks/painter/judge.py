@@ -148,12 +148,12 @@ def _build_scores(
 
 def load_painting_scores(store: Store, ref: ArtefactRef) -> dict[str, Any]:
     """Read the scores of `judge_held_back`."""
-    return read_json(store.artefacts.folder(ref) / SCORES_FILE)
+    return read_json(store.artefacts.files(ref) / SCORES_FILE)
 
 
 def samples_path(store: Store, ref: ArtefactRef) -> Path:
     """The images that `judge_held_back` has painted: render, LiDAR, painted, true."""
-    return store.artefacts.folder(ref) / SAMPLES_FILE
+    return store.artefacts.files(ref) / SAMPLES_FILE
 
 
 def feature_distance_of(weights: Path | None) -> SqueezeNetDistance | None:

@@ -90,7 +90,7 @@ def publish_painter(
 
 def weights_path(store: Store, trained: ArtefactRef) -> Path:
     """The weights of a trained painter, called after its kind."""
-    (path,) = store.artefacts.folder(trained).glob(f"*{WEIGHTS_SUFFIX}")
+    (path,) = store.artefacts.files(trained).glob(f"*{WEIGHTS_SUFFIX}")
     return path
 
 

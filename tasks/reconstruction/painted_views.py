@@ -45,7 +45,7 @@ def save_guidance(folder: Path, paintings: Sequence[NovelPainting]) -> None:
 def load_guidance(store: Store, ref: ArtefactRef) -> tuple[GuidanceView, ...]:
     """Read the views that guide."""
     store.artefacts.verified(ref)
-    arrays, metadata = read_tensors(store.artefacts.folder(ref) / GUIDANCE_FILE)
+    arrays, metadata = read_tensors(store.artefacts.files(ref) / GUIDANCE_FILE)
     return tuple(
         GuidanceView(
             camera=Camera(world_from_camera=arrays[f"{index}.world_from_camera"], **row["lens"]),

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from catalog.fleets import FleetLedger
-from catalog.leases import FolderObjects, Leases
+from catalog.leases import Leases
 from catalog.store import open_store
 from flows.fleet.local_workers import log_path
 from lidarpainter_models.errors import DataError
@@ -36,7 +36,7 @@ def write_stub_manifest(folder, name="stub", sequences=4, more=""):
 
 def stub_ledger(root, **options):
     store = open_store(root)
-    leases = Leases(FolderObjects(store.root / "leases"), time_to_live_s=TIME_TO_LIVE_S)
+    leases = Leases(store.objects("leases"), time_to_live_s=TIME_TO_LIVE_S)
     return FleetLedger(store, leases=leases, first_pause_s=0.0, **options)
 
 
