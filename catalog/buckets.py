@@ -33,7 +33,7 @@ from obstore.exceptions import (
 )
 from obstore.store import S3Store
 
-from catalog.errors import CatalogError, StorageError, UnreachableError
+from catalog.errors import CatalogError, StorageError, UnreachableError, reason_of
 
 if TYPE_CHECKING:
     from obstore import PutMode
@@ -48,8 +48,6 @@ RETRY_S = 60
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 5.0
 PART_BYTES = 16 << 20
 """Larger files go up in parts of this size, and come down in pieces of it."""
-LONGEST_REASON = 160
-_METADATA_SERVICE = "169.254.169.254"
 _AMAZON_FILES = {
     "AWS_CONFIG_FILE": "~/.aws/config",
     "AWS_SHARED_CREDENTIALS_FILE": "~/.aws/credentials",
@@ -171,6 +169,8 @@ class Bucket:
         except (PermissionDeniedError, UnauthenticatedError) as error:
             raise StorageError(f"{doing}: the bucket refuses these credentials") from error
         except BaseError as error:
+            if "NoSuchBucket" in str(error):
+                raise StorageError(f"{doing}: there is no such bucket") from None
             raise UnreachableError(f"{doing}: {reason_of(error)}") from error
 
 
@@ -236,14 +236,6 @@ def table_options() -> dict[str, str]:
         "max_retries": str(RETRIES),
         "retry_timeout": f"{RETRY_S}s",
     }
-
-
-def reason_of(error: Exception) -> str:
-    """Why a bucket did not do what was asked, in one line."""
-    line = str(error).splitlines()[0]
-    if _METADATA_SERVICE in line:
-        return "no credentials: AWS_ACCESS_KEY_ID, ~/.aws/credentials or a role of this machine"
-    return line.rpartition(" - ")[2].partition(": <")[0][:LONGEST_REASON]
 
 
 def _is_plain_http() -> bool:

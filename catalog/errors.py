@@ -50,6 +50,10 @@ REASONS = {
     errno.EEXIST: "a file is in the way",
 }
 
+LONGEST_REASON = 160
+_METADATA_SERVICE = "169.254.169.254"
+"""Asked for credentials where nothing else has them; there is one on Amazon's machines alone."""
+_DECORATION = re.compile("\x1b\\[[0-9;]*m|↳")
 _FOREIGN_CODE = re.compile(r"\(os error (\d+)\)|\bOs \{ code: (\d+),")
 
 
@@ -85,3 +89,12 @@ def disk_error(error: BaseException) -> int | None:
             return code if code in REASONS else None
         seen = seen.__cause__
     return None
+
+
+def reason_of(error: BaseException) -> str:
+    """Why a bucket did not do what was asked, in one line: clients in Rust fill a page."""
+    text = " ".join(_DECORATION.sub(" ", str(error)).split())
+    if _METADATA_SERVICE in text:
+        return "no credentials: AWS_ACCESS_KEY_ID, ~/.aws/credentials or a role of this machine"
+    end = text.partition(" Debug source:")[0].rpartition(" - ")[2]
+    return re.split(r":? <", end)[0][:LONGEST_REASON]

@@ -25,6 +25,7 @@ from catalog.errors import (
     StorageError,
     UnknownRecordError,
     UnreachableError,
+    reason_of,
     storage_errors,
 )
 from catalog.schemas import TABLES, TableSchema
@@ -262,9 +263,9 @@ def _damage(doing: str) -> Iterator[None]:
     except StorageError:
         raise
     except (DeltaError, pa.ArrowException, OSError) as error:
-        found = str(error).splitlines()[0][:200]
         if _NO_ANSWER in str(error):
-            raise UnreachableError(f"{doing}: {found}") from None
+            raise UnreachableError(f"{doing}: {reason_of(error)}") from None
+        found = str(error).splitlines()[0][:200]
         raise StorageError(f"{doing}: it is damaged ({found})") from None
 
 

@@ -28,6 +28,7 @@ from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.selection import PainterChoice
 from lidarpainter_models.painter.styles import check_prompt
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
+from tasks.ingest.bucket_roots import is_in_bucket
 from tasks.ingest.sequences import find_sequences
 from tasks.source import code_behind
 from tasks.specs import street_id
@@ -201,7 +202,9 @@ def _of_source(manifest: Manifest, source: Source, folder: Path, table: str) -> 
             dataset, _, name = scene.partition("/")
             yield Asked(sequence=name, **{**same, "dataset": dataset})
         return
-    root = (folder / Path(source.root or "").expanduser()).resolve()
+    root = Path(source.root or "").expanduser()
+    if not is_in_bucket(root):
+        root = (folder / root).resolve()
     for name in _matching(source, root, table):
         asked = Asked(sequence=name, root=root, **same)
         try:

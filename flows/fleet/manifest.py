@@ -72,9 +72,9 @@ def _range(text: str) -> str:
     return text
 
 
-def _local(text: str) -> str:
-    if re.match(r"[A-Za-z][A-Za-z0-9+.-]*://", text):
-        raise ValueError(f"{text!r}: expected a folder; buckets cannot be read yet")
+def _root(text: str) -> str:
+    if re.match(r"(?!s3:)[A-Za-z][A-Za-z0-9+.-]*://", text):
+        raise ValueError(f"{text!r}: expected a folder or s3://BUCKET/PREFIX")
     return text
 
 
@@ -82,7 +82,7 @@ Name = Annotated[StrictStr, AfterValidator(_name)]
 Glob = Annotated[StrictStr, AfterValidator(_glob)]
 SceneName = Annotated[StrictStr, AfterValidator(_scene)]
 Range = Annotated[StrictStr, AfterValidator(_range)]
-Folder = Annotated[StrictStr, AfterValidator(_local)]
+Root = Annotated[StrictStr, AfterValidator(_root)]
 Number = StrictFloat | StrictInt
 
 
@@ -93,8 +93,8 @@ class Source(BaseModel):
 
     dataset: Name
     """A dataset, `synthetic`, or `stored`."""
-    root: Folder | None = None
-    """Its folder as downloaded; a relative one counts from the manifest."""
+    root: Root | None = None
+    """Its folder or address, as downloaded; a relative one counts from the manifest."""
     sequences: Annotated[tuple[Glob, ...], Field(min_length=1)] | None = None
     """Names or globs; left out: all."""
     scenes: Annotated[tuple[SceneName, ...], Field(min_length=1)] | None = None

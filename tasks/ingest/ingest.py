@@ -11,6 +11,7 @@ from catalog.records import SceneRecord
 from catalog.store import Store, open_store
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street
+from tasks.ingest.bucket_roots import root_at_hand
 from tasks.measuring import measured
 from tasks.opened import open_scene
 from tasks.progress import listener
@@ -33,10 +34,10 @@ def ingest_sequence(
     """Read one sequence of a dataset into the store; returns its row in `scenes`."""
     store = open_store(store_path)
     store.make()
-    with writing(store, f"{dataset}/{sequence}"):
+    with root_at_hand(root, sequence) as folder, writing(store, f"{dataset}/{sequence}"):
         path = ingest_scene(
             dataset,
-            root,
+            folder,
             sequence,
             store.root,
             frames=frames,

@@ -22,6 +22,7 @@ import lidarpainter_models
 from catalog.errors import CatalogError
 from catalog.store import open_store
 from lidarpainter_models.errors import ConfigError, LidarPainterError
+from tasks.ingest.bucket_roots import normal_root
 from tasks.ingest.ingest import STAGE as ONE_SEQUENCE
 from tasks.ingest.ingest import ingest_sequence
 from tasks.opened import open_scene
@@ -44,7 +45,7 @@ class IngestRequest:
         """What must be equal for an earlier answer to hold, JSON-able."""
         frames = self.frames
         return {
-            "root": str(Path(self.root).resolve()),
+            "root": normal_root(self.root),
             "frames": None if frames is None else [frames.start, frames.stop],
             "cameras": None if self.cameras is None else list(self.cameras),
             "software_version": lidarpainter_models.__version__,

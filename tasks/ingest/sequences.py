@@ -6,15 +6,18 @@ from pathlib import Path
 
 from lidarpainter_models.errors import DataError, LidarPainterError
 from lidarpainter_models.readers import known_datasets, list_sequences
+from tasks.ingest.bucket_roots import is_in_bucket, sequences_in_bucket
 
 
 def find_sequences(dataset: str, root: Path, named: Sequence[str] = ()) -> list[str]:
-    """The sequences that were named, each once, or all that are found below a root.
+    """The sequences that were named, each once, or all that are found below a root or address.
 
     Raises:
         DataError: the dataset is not known, none is found, or the root is part of a dataset: then
             the folder above is named.
     """
+    if is_in_bucket(root):
+        return list(dict.fromkeys(named or sequences_in_bucket(root)))
     found: tuple[str, ...] = ()
     with suppress(DataError):
         found = list_sequences(dataset, root)

@@ -3,9 +3,11 @@
 `python tests/benchmarks/bench_fleet.py 10 100` asks for so many streets, lets one worker go through
 them, and asks for them again. Starting up (imports) is not in the figures, commits to the tables
 are. `--prefect` makes each sequence a flow run against a server of its own, whose CPU time counts.
+`--bucket` has the store in a stand-in for a bucket, whose CPU time does not.
 """
 
 import argparse
+import os
 import sys
 import tempfile
 import time
@@ -21,6 +23,7 @@ from flows.environment import prepare_environment  # noqa: E402
 prepare_environment()
 
 import psutil  # noqa: E402
+from bucket_stand_in import BUCKET, running_stand_in  # noqa: E402
 from stub_fleet import stub_ledger, stub_work, stub_worker, write_stub_manifest  # noqa: E402
 
 from flows.fleet.asked import wishes  # noqa: E402
@@ -35,26 +38,27 @@ def cpu_seconds() -> float:
     return time.process_time() + of_children
 
 
-def measured(number: int, *, as_flows: bool) -> tuple[float, float]:
+def measured(number: int, *, as_flows: bool, bucket: str | None = None) -> tuple[float, float]:
     """CPU seconds a sequence of the first time and of the second."""
+    cpu = time.process_time if bucket else cpu_seconds
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         path = write_stub_manifest(folder, sequences=number)
-        began = cpu_seconds()
-        ledger = stub_ledger(folder / "store")
+        began = cpu()
+        ledger = stub_ledger(f"{bucket}/{number}" if bucket else folder / "store")
         ledger.store.make()
         ledger.ask(wishes(read_manifest(path), folder))
-        worker = stub_worker(ledger.store.root, "stub")
+        worker = stub_worker(ledger.store.address, "stub")
         worker.work = _flow_of(stub_work) if as_flows else stub_work
         worker.run()
-        first = cpu_seconds() - began
+        first = cpu() - began
         rows = ledger.rows("stub")
         complete = {"status": "complete", "artefacts": []}
         ledger.store.tables.merge("runs", [{"run_id": row["run_id"], **complete} for row in rows])
-        began = cpu_seconds()
+        began = cpu()
         ledger.ask(wishes(read_manifest(path), folder))
         assert is_over(fleet_status(ledger, "stub"))
-        return first / number, (cpu_seconds() - began) / number
+        return first / number, (cpu() - began) / number
 
 
 def _flow_of(work: Callable) -> Callable:
@@ -69,15 +73,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("numbers", type=int, nargs="+")
     parser.add_argument("--prefect", action="store_true")
+    parser.add_argument("--bucket", action="store_true")
     arguments = parser.parse_args()
     from flows.server import prefect_server
 
     measured(2, as_flows=False)  # code that is read, tables' first use
     with tempfile.TemporaryDirectory() as name:
         server = prefect_server(Path(name) / "server.log") if arguments.prefect else nullcontext()
-        with server:
+        with server, running_stand_in() if arguments.bucket else nullcontext() as stand_in:
+            if stand_in:
+                os.environ |= {**stand_in.environment, "LIDARPAINTER_CACHE": name}
             for number in arguments.numbers:
-                first, second = measured(number, as_flows=arguments.prefect)
+                bucket = f"s3://{BUCKET}/bench" if stand_in else None
+                first, second = measured(number, as_flows=arguments.prefect, bucket=bucket)
                 print(f"{number} sequences: {first:.3f} s each, again {second:.4f} s each")  # noqa: T201
 
 

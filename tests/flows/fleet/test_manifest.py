@@ -25,7 +25,7 @@ FAULTS = {
     "[[source]] 1: frames '2:4': a street begins at frame 0": f'{GOOD}frames = "2:4"\n',
     "[[source]] 1: width_px: input should be greater than or equal": f"{GOOD}width_px=4",
     "[[source]] 2: root is missing": f'{GOOD}[[source]]\ndataset = "waymo"\n',
-    "[[source]] 2: root: 's3://logs': expected a folder": GOOD + LOGS.replace("logs", "s3://logs"),
+    "[[source]] 2: root: 'gs://logs': expected a folder": GOOD + LOGS.replace("logs", "gs://logs"),
     "sequences.0: '../../etc': expected the name": f'{GOOD}{LOGS}sequences = ["../../etc"]\n',
     "[[source]] 1: cameras: input should be an array, got 'front'": f'{GOOD}cameras = "front"\n',
     "[budget]: unknown key 'hous', expected one of hours": f"{GOOD}[budget]\nhous = 3\n",

@@ -1,0 +1,65 @@
+"""A fleet whose store is a bucket: it goes on when the bucket is back."""
+
+import pytest
+from small_pandaset import PandasetFolder
+from stub_fleet import stub_ledger, stub_worker, write_stub_manifest
+
+from catalog import buckets
+from catalog.buckets import Bucket
+from catalog.store import open_store
+from flows.fleet.asked import Asked, wishes
+from flows.fleet.manifest import read_manifest
+from tasks.ingest.jobs import IngestRequest, ingest_or_recall
+
+
+@pytest.fixture
+def asked(address, tmp_path):
+    path = write_stub_manifest(tmp_path, sequences=2)
+    ledger = stub_ledger(address)
+    ledger.store.make()
+    ledger.ask(wishes(read_manifest(path), path.parent))
+    return ledger
+
+
+def test_a_log_in_a_bucket_is_fetched_read_and_let_go(address, tmp_path, monkeypatch):
+    log = PandasetFolder(tmp_path / "logs")
+    log.write_log()
+    logs = Bucket(f"{address}/logs")
+    for path in log.path.rglob("*"):
+        if path.is_file():
+            logs.upload(path.relative_to(tmp_path / "logs").as_posix(), path)
+    manifest = tmp_path / "night.toml"
+    source = f'[[source]]\ndataset = "pandaset"\nroot = "{logs.address}"\n'
+    manifest.write_text(f'name = "stub"\n{source}[budget]\nfree_disk_gb = 0\n')
+    (wish,) = wishes(read_manifest(manifest), tmp_path)
+    asked = Asked.model_validate_json(wish.asked)
+    store = open_store(tmp_path / "store")
+    request = IngestRequest(store.address, asked.dataset, asked.root, None, None)
+    row = ingest_or_recall(request, asked.sequence, again=False)
+    assert row["scene_id"] == wish.scene_id
+    assert list((tmp_path / "cache").glob("dataset-*")) == []
+    monkeypatch.setattr("tasks.ingest.jobs.ingest_sequence", None)  # it is not read again
+    assert ingest_or_recall(request, asked.sequence, again=False) == row
+
+
+def test_a_bucket_that_is_away_holds_a_fleet_up(asked, address, tmp_path, stand_in, monkeypatch):
+    monkeypatch.setattr(buckets, "RETRIES", 0)
+    worker = stub_worker(address, "stub")
+    heard = []
+
+    def hears(line):
+        heard.append(line)
+        if "begins" in line and len(heard) == 1:
+            stand_in.fail(before=10**6)
+        elif line.startswith("paused"):
+            stand_in.fail()
+
+    worker.say = hears
+    worker.run()
+    rows = asked.rows("stub")
+    assert [(row["state"], row["attempts"]) for row in rows] == [("done", 1)] * 2
+    assert asked.leases.held() == []
+    assert str(tmp_path) not in str(rows)
+    (paused,) = [line for line in heard if line.startswith("paused")]
+    assert address in paused
+    assert "503" in paused
