@@ -57,7 +57,7 @@ def trials_of(
             scene=scene,
             cause=name,
             level=level,
-            spoilt=ingest_spoilt.fn(store.root, scene, name, level),
+            spoilt=ingest_spoilt.fn(store.address, scene, name, level),
         )
         for name in causes
         for level in cause_of(name).levels[:num_levels]

@@ -67,7 +67,7 @@ def run_sweep(
     ledger.ask(wishes(sweep.manifest, Path()), accept_stale=accept_stale)
     counts = counts_of(ledger.rows(sweep.name))
     if still := counts["waiting"] + counts["running"]:
-        start = starter(store.root, sweep.name, threads=1)
+        start = starter(store.address, sweep.name, threads=1)
         run_workers(ledger, sweep.name, start, min(workers, still), say)
     points, missing = points_of(store, sweep.name)
     if missing:

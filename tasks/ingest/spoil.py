@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from catalog.store import open_store
+from catalog.store import Store, open_store
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.stress.spoiling import DATASET, spoilt_name, write_spoilt
@@ -18,7 +18,7 @@ def ingest_spoilt(store_path: Path, scene_id: str, cause: str, level: float) -> 
     store = open_store(store_path)
     scene = open_scene(store, scene_id)
     spoilt_id = f"{DATASET}/{spoilt_name(scene, cause, level)}"
-    if not _is_of(store.scene_folder(spoilt_id), scene):
+    if not _is_of(store, spoilt_id, scene):
         with writing(store, spoilt_id):
             path = write_spoilt(
                 scene,
@@ -27,13 +27,15 @@ def ingest_spoilt(store_path: Path, scene_id: str, cause: str, level: float) -> 
                 store.root,
                 progress=lambda done, total: listener().advanced(STAGE, done, total, spoilt_id),
             )
-            record_scene(store, path)
+        record_scene(store, path)
     return spoilt_id
 
 
-def _is_of(folder: Path, scene: DrivingScene) -> bool:
-    """Whether a folder holds a spoilt scene of this one as it is now."""
+def _is_of(store: Store, spoilt_id: str, scene: DrivingScene) -> bool:
+    """Whether the store holds a spoilt scene of this one as it is now."""
     try:
-        return bool(DrivingScene.open(folder).manifest["stress"]["scene"] == scene.content_digest)
+        return bool(
+            open_scene(store, spoilt_id).manifest["stress"]["scene"] == scene.content_digest
+        )
     except (SceneError, KeyError):
         return False
