@@ -24,12 +24,15 @@ SHOWN_COLUMNS = {
     "painters": ("painter_id", "name", "num_bytes", "created_at"),
     "sequences": ("fleet", "scene_id", "state", "cause", "attempts", "seconds", "run_id"),
     "attempts": ("fleet", "scene_id", "worker", "started_at", "seconds", "cause", "reason"),
+    "assets": ("asset_id", "kind", "category", "style", "dataset", "num_sightings", "score"),
+    "sightings": ("asset_id", "scene_id", "run_id", "actor_id", "num_views", "sides", "score"),
 }
 NEWEST_FIRST = {
     "runs": "started_at",
     "artefacts": "created_at",
     "painters": "created_at",
     "attempts": "started_at",
+    "assets": "created_at",
 }
 JSON_COLUMNS = (
     *("parameters", "stage_seconds", "result", "change"),
@@ -45,7 +48,10 @@ LONGEST_JSON = 120
 def list_table(
     table: Annotated[
         str,
-        typer.Argument(help="scenes, runs, artefacts, metrics, painters, sequences, attempts."),
+        typer.Argument(
+            help="scenes, runs, artefacts, metrics, painters, sequences, attempts, assets or "
+            "sightings."
+        ),
     ] = "runs",
     as_json: AsJson = False,
 ) -> None:
