@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from catalog.artefacts import ArtefactRef
+from catalog.assets import forget_sightings
 from catalog.errors import CatalogError, UnknownRecordError, storage_errors
 from catalog.records import json_of
 from catalog.store import Store
@@ -95,6 +96,8 @@ def delete(store: Store, doomed: Sequence[Doomed]) -> None:
     store.tables.delete("metrics", "run_id", names["runs"])
     for table, key in KEYS.items():
         store.tables.delete(table, key, names[table])
+    for table in ("runs", "artefacts"):  # assets are what is left of their sightings
+        forget_sightings(store, KEYS[table], names[table])
     for one in doomed:
         if one.folder is None:
             continue

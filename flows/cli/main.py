@@ -17,6 +17,7 @@ import typer
 from catalog.errors import CatalogError
 from catalog.store import STORE_ENVIRONMENT
 from flows.cli import (
+    assets,
     catalog,
     demo,
     doctor,
@@ -76,6 +77,7 @@ app.command("size")(measure.size)
 app.command("stress")(measure.stress)
 app.add_typer(painter.app, name="painter")
 app.add_typer(fleet.app, name="fleet")
+app.add_typer(assets.app, name="assets")
 app.add_typer(catalog.app, name="catalog")
 
 

@@ -62,6 +62,9 @@ class Asked(BaseModel):
     fit_seed: int = 0
     scores: bool = True
     report: bool = True
+    assets: bool = False
+    variants: tuple[str, ...] = ()
+    """Styles to make runs in."""
 
     @property
     def scene_id(self) -> str:
@@ -190,6 +193,8 @@ def _of_source(manifest: Manifest, source: Source, folder: Path, table: str) -> 
         "settings": manifest.settings,
         "scores": "scores" in manifest.publish,
         "report": "report" in manifest.publish,
+        "assets": "assets" in manifest.publish,
+        "variants": manifest.variants,
     }
     if source.frames is not None:
         chosen = range_of(source.frames)

@@ -169,9 +169,9 @@ class Manifest(BaseModel):
     fit_seeds: Annotated[tuple[Annotated[StrictInt, Field(ge=0)], ...], Field(min_length=1)] = (0,)
     """Each way is tried with each of these, which decide in which order a fit sees its views."""
     variants: tuple[Name, ...] = ()
-    """Names of styles that are wanted of every scene; entered into the catalog."""
-    publish: tuple[Literal["scores", "report"], ...] = ("scores", "report")
-    """What is made of every fitted scene."""
+    """Names of styles; of every scene a run in each of them is made too."""
+    publish: tuple[Literal["scores", "report", "assets"], ...] = ("scores", "report")
+    """What is made of every fitted scene; assets of its variants too."""
     budget: Budget = Budget()
 
     @model_validator(mode="after")

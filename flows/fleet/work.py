@@ -1,4 +1,4 @@
-"""What a worker does with one sequence: bring its scene into the store, then reconstruct it.
+"""What a worker does with one sequence: bring it into the store, reconstruct, dress, publish it.
 
 Where a Prefect API is configured, each sequence is one flow run there, and its stages are task
 runs. Else they are plain functions, and no server is started: who works on what and what is done
@@ -15,10 +15,13 @@ from prefect.settings import PREFECT_API_URL
 
 from catalog.artefacts import ArtefactRef
 from catalog.store import Store, open_store
+from flows.assets import publish_run
+from flows.dress import dress_run
 from flows.fleet.asked import Asked
 from flows.reconstruct import reconstruct
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.synthetic.street import WORLD_VERSION
+from lidarpainter_models.weather.mix import StyleMix
 from tasks.ingest.ingest import ingest_street
 from tasks.ingest.jobs import IngestRequest, ingest_or_recall
 from tasks.opened import open_scene
@@ -62,14 +65,27 @@ def fleet_sequence(asked: str, store_path: Path) -> Made:
 def _made(asked: Asked, store_path: Path) -> Made:
     store = open_store(store_path)
     _bring_in(asked, store)
-    result = reconstruct.fn(asked.parameters, store.address)
-    new = {name for name, is_new in result["computed_now"].items() if is_new}
-    refs = [_ref(path) for name, path in result["artefacts"].items() if name in new]
+    run = reconstruct.fn(asked.parameters, store.address)
+    results = [run]
+    for variant in asked.variants:
+        mix = StyleMix.parse(variant)
+        results.append(dress_run(store, run["run_id"], mix, seed=0))
+    new = [result for result in results if any(result["computed_now"].values())]
+    refs = [
+        _ref(path)
+        for result in new
+        for name, path in result["artefacts"].items()
+        if result["computed_now"].get(name)
+    ]
+    if asked.assets:
+        published = [publish_run(store, result["run_id"]) for result in results]
+        refs += [_ref(one["artefact"]) for one in published if one["is_new"]]
+    peaks = [result["peak_memory_bytes"] for result in new]
     return Made(
-        run_id=result["run_id"],
-        is_new=bool(new),
+        run_id=run["run_id"],
+        is_new=bool(refs),
         num_bytes=sum(store.artefacts.manifest(ref).num_bytes for ref in refs),
-        peak_memory_bytes=result["peak_memory_bytes"] if new else None,
+        peak_memory_bytes=max(peaks, default=None),
     )
 
 

@@ -25,6 +25,10 @@ MAX_POINTS = 5000
 OPAQUE = 0.5
 MAX_GAIN = 2.5
 """Two recordings of asphalt that differ by more in brightness show no difference of exposure."""
+MAX_CAST = 1.25
+"""Likewise in the share of a channel: then the roads are of different colour, not the light."""
+NEUTRAL_ROAD_RGB = (0.4, 0.4, 0.4)
+"""What asphalt looks like to a neutral camera: assets are kept so."""
 LIGHTEST, DARKEST = 0.9, 0.02
 
 
@@ -76,16 +80,16 @@ class ActorModel:
         )
 
     def exposed_like(self, road_rgb: Float[Tensor, "3"] | None) -> "ActorModel":
-        """The same in the light of another scene, told by how bright its road is."""
+        """The same in the light of another scene, told by the colour of its road."""
         if road_rgb is None or self.road_rgb is None:
             return self
-        gain = (road_rgb.mean() / self.road_rgb.mean()).clamp(1 / MAX_GAIN, MAX_GAIN)
-        columns = self.gaussians.columns()
-        columns["sh_dc"] = sh_from_rgb(self.gaussians.base_rgb * gain)
-        columns["sh_rest"] = columns["sh_rest"] * gain
+        gain = exposure_gain(self.road_rgb, road_rgb)
         rgb_u8 = (self.points.rgb_u8 * gain).round().clamp(0, 255).to(torch.uint8)
         return replace(
-            self, gaussians=GaussianSet(**columns), points=replace(self.points, rgb_u8=rgb_u8)
+            self,
+            gaussians=exposed(self.gaussians, gain),
+            points=replace(self.points, rgb_u8=rgb_u8),
+            road_rgb=self.road_rgb * gain,
         )
 
     def of_degree(self, sh_degree: int) -> "ActorModel":
@@ -103,6 +107,27 @@ class ActorModel:
         kept = self.gaussians.select((~black).nonzero()[:, 0])
         shadow = contact_shadow(self.size_m, sh_degree=kept.sh_degree)
         return replace(self, gaussians=kept.append(shadow))
+
+
+def exposure_gain(
+    own_road_rgb: Float[Tensor, "3"], road_rgb: Float[Tensor, "3"]
+) -> Float[Tensor, "3"]:
+    """What colours are multiplied by, channel by channel, to go from one scene into another.
+
+    A factor, since a camera's curve is nearly a power: exposure and white balance multiply before
+    it, hence after it too.
+    """
+    brightness = (road_rgb.mean() / own_road_rgb.mean()).clamp(1 / MAX_GAIN, MAX_GAIN)
+    cast = (road_rgb / road_rgb.mean()) / (own_road_rgb / own_road_rgb.mean())
+    return brightness * cast.clamp(1 / MAX_CAST, MAX_CAST)
+
+
+def exposed(gaussians: GaussianSet, gain: Float[Tensor, "3"]) -> GaussianSet:
+    """Gaussians of other brightness, channel by channel."""
+    columns = gaussians.columns()
+    columns["sh_dc"] = sh_from_rgb(gaussians.base_rgb * gain)
+    columns["sh_rest"] = columns["sh_rest"] * gain
+    return GaussianSet(**columns)
 
 
 def contact_shadow(size_m: Float[Tensor, "3"], *, sh_degree: int) -> GaussianSet:

@@ -14,6 +14,7 @@ from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.weather.mix import StyleMix
 
 MOST_OPERATIONS = 10_000
+ASSET = "asset:"
 _Name = Annotated[str, Field(min_length=1, max_length=200)]
 _Seconds = Annotated[float, Field(ge=0, le=1e6)]
 _Metres = Annotated[float, Field(ge=-1e4, le=1e4)]
@@ -24,21 +25,35 @@ class _Words(BaseModel):
 
 
 class ActorSource(_Words):
-    """Whose Gaussians are put in: an actor of a run (of this one if none is named), or a file."""
+    """Whose Gaussians are put in: those of a run, of the library of assets, or of a file.
+
+    The text `asset:ID` is short for one of the library.
+    """
 
     actor: _Name | None = None
     run: _Name | None = None
+    """Of that actor; the run that is edited if absent."""
+    asset: _Name | None = None
+    """Id of an asset, or a unique prefix of one."""
     store: _Name | None = None
-    """Folder of the store of that run; this one if absent."""
+    """Folder of the store of that run or asset; this one if absent."""
     ply: _Name | None = None
     """Gaussians of one car: x ahead, y left, z up; its box is found around them."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, value: Any) -> Any:  # noqa: ANN401 - whatever stood there
+        is_short = isinstance(value, str) and value.startswith(ASSET)
+        return {"asset": value.removeprefix(ASSET)} if is_short else value
+
     @model_validator(mode="after")
-    def _is_one_of_both(self) -> "ActorSource":
-        if (self.actor is None) == (self.ply is None):
-            raise ValueError("expected either actor or ply")
+    def _is_one_of_them(self) -> "ActorSource":
+        if sum(one is not None for one in (self.actor, self.ply, self.asset)) != 1:
+            raise ValueError("expected one of actor, asset and ply")
         if self.ply is not None and (self.run or self.store):
             raise ValueError("a ply has no run and no store")
+        if self.asset is not None and self.run:
+            raise ValueError("an asset has no run")
         return self
 
 

@@ -1,6 +1,7 @@
-"""Images as files: PNG without loss, JPEG for pages, depth and instances in 16 bits."""
+"""Images as files: PNG without loss, JPEG and WebP for pages, depth and instances in 16 bits."""
 
 import base64
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ from torch import Tensor
 from lidarpainter_models.errors import WriteError
 
 JPEG_QUALITY = 90
+WEBP_QUALITY = 80
 DEPTH_UNITS_PER_M = 256
 """Of a depth image, as KITTI has it: 4 mm apart, up to 256 m."""
 _MAX_U16 = 65535
@@ -38,6 +40,16 @@ def write_png(rgb: Float[Tensor, "height width 3"], path: Path) -> Path:
     return _write(cv2.cvtColor(to_bytes(rgb), cv2.COLOR_RGB2BGR), path)
 
 
+def write_webp(rgb: Float[Tensor, "height width 3"], path: Path) -> Path:
+    """Write a small WebP, folders included.
+
+    Raises:
+        WriteError: the file cannot be written.
+    """
+    bgr = cv2.cvtColor(to_bytes(rgb), cv2.COLOR_RGB2BGR)
+    return _write(bgr, path, ".webp", [cv2.IMWRITE_WEBP_QUALITY, WEBP_QUALITY])
+
+
 def write_depth_png(depth_m: Float[Tensor, "height width"], path: Path) -> Path:
     """Write camera z in 256ths of a metre, 16 bits; 0 where there is none, 65535 from 256 m on.
 
@@ -57,8 +69,10 @@ def write_index_png(indices: Int[Tensor, "height width"], path: Path) -> Path:
     return _write(indices.cpu().numpy().astype(np.uint16), path)
 
 
-def _write(image: np.ndarray, path: Path) -> Path:
-    _, encoded = cv2.imencode(".png", image)
+def _write(
+    image: np.ndarray, path: Path, ending: str = ".png", options: Sequence[int] = ()
+) -> Path:
+    _, encoded = cv2.imencode(ending, image, options)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(encoded.tobytes())

@@ -8,9 +8,11 @@ from typing import Any
 
 import torch
 
-from catalog.artefacts import Workplace
-from catalog.digests import digest_file
+from catalog.artefacts import ArtefactRef, Workplace
+from catalog.assets import find_asset
+from catalog.digests import canonical_json, digest_file, digest_text
 from catalog.store import Store, open_store
+from lidarpainter_models.assets.asset_files import read_asset
 from lidarpainter_models.conditioning.scene_styles import styled_scene
 from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.editing.actor_models import ActorModel
@@ -71,12 +73,14 @@ class Edits:
     def models(self) -> Mapping[ActorSource, ActorModel]:
         """What actors of other runs and of files look like."""
         sources = [one.source for one in self.operations if isinstance(one, Insert | Swap)]
-        return {source: self._model(source) for source in sources if source.run or source.ply}
+        return {one: self._model(one) for one in sources if one.run or one.ply or one.asset}
 
-    def _donor(self, source: ActorSource) -> "FinishedRun | str | None":
-        """The run or the file that an actor comes from; None is the edited run itself."""
+    def _donor(self, source: ActorSource) -> "FinishedRun | LibraryActor | str | None":
+        """The run, asset or file that an actor comes from; None is the edited run itself."""
         if source.ply is not None:
             return source.ply
+        if source.asset is not None:
+            return LibraryActor.named(self._store_of(source), source.asset)
         if source.run is None:
             if source.store is not None:
                 raise ConfigError("a store without a run, expected both or neither")
@@ -88,10 +92,41 @@ class Edits:
         if isinstance(donor, FinishedRun):
             world = opened_world(self._store_of(source), donor)
             return world.model_of(world.find(str(source.actor)))
+        if isinstance(donor, LibraryActor):
+            return read_asset(donor.path)
         return ActorModel.of_gaussians(read_ply(_file(str(donor))), CATEGORY)
 
     def _store_of(self, source: ActorSource) -> Store:
         return self.store if source.store is None else open_store(source.store)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LibraryActor:
+    """The files of an actor of the library of assets."""
+
+    path: Path
+    digest: str
+    """Of the files, which may become others when the actor is seen better."""
+
+    @classmethod
+    def named(cls, store: Store, name: str) -> "LibraryActor":
+        """An actor by the id of its asset, or a unique prefix of one.
+
+        Raises:
+            UnknownRecordError: there is none, or several begin so.
+            DamagedArtefactError: its files are not what was written.
+            ConfigError: it is no actor, or has no files.
+        """
+        row = find_asset(store, name)
+        if row["kind"] != "actor":
+            raise ConfigError(f"asset {row['asset_id']} is a {row['kind']}, expected an actor")
+        ref = ArtefactRef.of_id(row["artefact_id"])
+        files = store.artefacts.verified(ref).files
+        own = {file: one for file, one in files.items() if file.startswith(f"{row['folder']}/")}
+        if not own:
+            raise ConfigError(f"asset {row['asset_id']} has no files in {row['artefact_id']}")
+        path = store.artefacts.folder(ref) / row["folder"]
+        return cls(path=path, digest=digest_text(canonical_json(own)))
 
 
 def opened_world(store: Store, run: FinishedRun) -> EditedWorld:
@@ -177,9 +212,11 @@ def _build_observations(place: Workplace, _progress: Progress, *, edits: Edits) 
     return {"num_views": len(seen.views), "hidden_share": sum(hidden) / max(len(hidden), 1)}
 
 
-def _digests(part: str, donor: FinishedRun | str | None) -> dict[str, str]:
+def _digests(part: str, donor: FinishedRun | LibraryActor | str | None) -> dict[str, str]:
     if donor is None:
         return {}
+    if isinstance(donor, LibraryActor):
+        return {part: donor.digest}
     if isinstance(donor, str):
         return {part: digest_file(_file(donor))}
     seen, fitted = donor.final.observations, donor.final.gaussians

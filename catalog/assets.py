@@ -1,0 +1,205 @@
+"""Assets out of sightings: which are of one thing, and which of them serves.
+
+An asset is all sightings of one thing. Its id is the least `occurrence_id` among them, so it
+follows from what was seen and not from who came first, and stays where a run is made anew. Its row
+takes the columns of the sighting with the best score. Both tables are written under one lock.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from catalog.digests import canonical_json, digest_text
+from catalog.errors import UnknownRecordError
+from catalog.locks import held_lock
+from catalog.schemas import ASSETS, SIGHTINGS
+from catalog.store import Store
+from catalog.tables import Row
+
+ID_LENGTH = 16
+NEAR_M = 10.0
+"""Sightings farther apart in the ground plane, or in either of its axes, are never compared by
+place."""
+
+IsSame = Callable[[Row, Row], bool]
+"""Whether two sightings are of one thing; asked in either order."""
+
+
+def digest_of(*names: str | None) -> str:
+    """An id that follows from some names."""
+    return digest_text(canonical_json(list(names)))[:ID_LENGTH]
+
+
+def enter_sightings(store: Store, rows: Sequence[Row], is_same: IsSame) -> list[str]:
+    """Enter the sightings of a run, all but their `asset_id`; returns the ids of their assets.
+
+    Sightings that are known are replaced; the same ones again change nothing.
+
+    Raises:
+        ConflictError: other writers won every attempt.
+        StorageError: a table cannot be written.
+    """
+    with _alone(store):
+        known = store.tables.arrow(SIGHTINGS.name)
+        new = [{column.name: row.get(column.name) for column in SIGHTINGS.columns} for row in rows]
+        old = _where(known, "sighting_id", [row["sighting_id"] for row in new])
+        others = _leaving(_candidates(known, new), new)
+        groups = _Groups()
+        for row in old:
+            groups.join(row["sighting_id"], row["asset_id"])
+        for number, row in enumerate(new):
+            for other in (*others, *new[:number]):
+                if is_same(row, other):
+                    groups.join(row["sighting_id"], other["asset_id"] or other["sighting_id"])
+        touched = groups.names & set(known["asset_id"].to_pylist())
+        members = _leaving(_where(known, "asset_id", touched), new)
+        for row in members:
+            groups.join(row["sighting_id"], row["asset_id"])
+        entered = _named([*new, *members], groups)
+        _write(store, known, entered, touched)
+        ids = {row["sighting_id"]: row["asset_id"] for row in entered}
+        return [ids[row["sighting_id"]] for row in new]
+
+
+def forget_sightings(store: Store, column: str, values: Iterable[str]) -> None:
+    """Take sightings out whose run or artefact (`column`) is gone; assets without any go too."""
+    with _alone(store):
+        known = store.tables.arrow(SIGHTINGS.name)
+        gone = _where(known, column, values)
+        if not gone:
+            return
+        touched = {row["asset_id"] for row in gone}
+        names = {row["sighting_id"] for row in gone}
+        store.tables.delete(SIGHTINGS.name, "sighting_id", sorted(names))
+        known = store.tables.arrow(SIGHTINGS.name)
+        members, groups = _where(known, "asset_id", touched), _Groups()
+        for row in members:
+            groups.join(row["sighting_id"], row["asset_id"])
+        _write(store, known, _named(members, groups), touched)
+
+
+def find_asset(store: Store, name: str) -> Row:
+    """The asset of an id, of a unique prefix of one, or of the `occurrence_id` of a sighting.
+
+    Raises:
+        UnknownRecordError: there is none, or several begin so.
+    """
+    sightings = store.tables.arrow(SIGHTINGS.name)
+    for column in ("asset_id", "occurrence_id"):  # an id that was merged into another one
+        begins = pc.starts_with(sightings[column], pattern=name)
+        found = set(sightings.filter(begins)["asset_id"].to_pylist())
+        if len(found) == 1:
+            return store.tables.row(ASSETS.name, found.pop())
+        if found:
+            some = ", ".join(sorted(found)[:5])
+            raise UnknownRecordError(f"asset {name!r} is not unique: {some}")
+    raise UnknownRecordError(
+        f"no asset {name!r} in {store.root}: `assets list` names them, `assets publish` makes them"
+    )
+
+
+def _alone(store: Store):  # noqa: ANN202 - a context manager
+    (store.root / "locks").mkdir(parents=True, exist_ok=True)
+    return held_lock(store.root / "locks" / "assets.lock")
+
+
+class _Groups:
+    """Names that belong together (disjoint sets)."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, str] = {}
+
+    @property
+    def names(self) -> set[str]:
+        """All that were ever joined."""
+        return set(self._parents)
+
+    def join(self, one: str, other: str) -> None:
+        """Let two groups be one."""
+        self._parents[self.root(one)] = self.root(other)
+
+    def root(self, name: str) -> str:
+        """The name that stands for a group."""
+        while (parent := self._parents.setdefault(name, name)) != name:
+            self._parents[name] = name = self._parents[parent]
+        return name
+
+
+def _candidates(known: pa.Table, new: Sequence[Row]) -> list[Row]:
+    """The known sightings that one of some new ones may be of the same thing as."""
+    mask = np.zeros(known.num_rows, dtype=bool)
+    for column in ("occurrence_id", "actor_id"):
+        names = pa.array([row[column] for row in new if row[column] is not None], pa.string())
+        is_in = pc.is_in(known[column], value_set=names)
+        mask |= is_in.to_numpy(zero_copy_only=False).astype(bool)
+    x_m, y_m = (known[name].to_numpy() for name in ("x_m", "y_m"))
+    standing = [row for row in new if row["is_moving"] is False]
+    frames = pc.is_in(known["frame"], value_set=pa.array({row["frame"] for row in standing}))
+    here = np.flatnonzero(frames.to_numpy(zero_copy_only=False))
+    for row in standing:
+        near = (abs(x_m[here] - row["x_m"]) < NEAR_M) & (abs(y_m[here] - row["y_m"]) < NEAR_M)
+        mask[here[near]] = True
+    return known.filter(pa.array(mask)).to_pylist()
+
+
+def _named(rows: Sequence[Row], groups: _Groups) -> list[Row]:
+    """The rows with the ids of their assets."""
+    least: dict[str, str] = {}
+    for row in rows:
+        root = groups.root(row["sighting_id"])
+        least[root] = min(least.get(root, row["occurrence_id"]), row["occurrence_id"])
+    return [row | {"asset_id": least[groups.root(row["sighting_id"])]} for row in rows]
+
+
+def _write(store: Store, known: pa.Table, entered: Sequence[Row], touched: set[str]) -> None:
+    """Bring both tables to what the sightings of some assets are now."""
+    before = {row["sighting_id"]: row for row in _of(known, entered)}
+    changed = [row for row in entered if before.get(row["sighting_id"]) != row]
+    store.tables.merge(SIGHTINGS.name, changed)
+    sightings = store.tables.arrow(SIGHTINGS.name) if changed else known
+    # what wears a style names the asset that it is a style of, which may be another one by now
+    styled = _where(sightings, "base_id", {row["occurrence_id"] for row in entered})
+    ids = {row["asset_id"] for row in (*entered, *styled)}
+    members: dict[str, list[Row]] = {name: [] for name in ids}
+    for row in _where(sightings, "asset_id", ids):
+        members[row["asset_id"]].append(row)
+    bases = {row["base_id"] for rows in members.values() for row in rows if row["base_id"]}
+    base_of = {
+        row["occurrence_id"]: row["asset_id"] for row in _where(sightings, "occurrence_id", bases)
+    }
+    assets = store.tables.arrow(ASSETS.name)
+    stood = {row["asset_id"]: row for row in _where(assets, "asset_id", ids)}
+    rows = [_asset_row(found, base_of) for found in members.values()]
+    store.tables.merge(ASSETS.name, [row for row in rows if stood.get(row["asset_id"]) != row])
+    store.tables.delete(ASSETS.name, "asset_id", sorted(touched - ids))
+
+
+def _asset_row(members: Sequence[Row], base_of: dict[str, str]) -> Row:
+    """The row of an asset; the sighting of the best score serves."""
+    best = max(members, key=lambda row: (row["score"] or 0.0, row["sighting_id"]))
+    bases = sorted({base_of[row["base_id"]] for row in members if row["base_id"] in base_of})
+    taken = {column.name: best.get(column.name) for column in ASSETS.columns}
+    return taken | {
+        "scene_ids": sorted({row["scene_id"] for row in members}),
+        "num_sightings": len(members),
+        "derived_from": bases[0] if bases else None,
+    }
+
+
+def _where(table: pa.Table, column: str, values: Iterable[str]) -> list[Row]:
+    """The rows with one of these values in a column."""
+    wanted = pa.array(sorted(values), pa.string())
+    return table.filter(pc.is_in(table[column], value_set=wanted)).to_pylist()
+
+
+def _of(table: pa.Table, rows: Sequence[Row]) -> list[Row]:
+    """The rows of a table of sightings with the ids of these."""
+    return _where(table, "sighting_id", [row["sighting_id"] for row in rows])
+
+
+def _leaving(rows: Sequence[Row], out: Sequence[Row]) -> list[Row]:
+    """The sightings that are none of some others."""
+    ids = {row["sighting_id"] for row in out}
+    return [row for row in rows if row["sighting_id"] not in ids]

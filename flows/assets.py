@@ -1,0 +1,52 @@
+"""Publish what a finished run yields into the library of assets; needs no server."""
+
+from collections import Counter
+from typing import Any
+
+from catalog.store import Store
+from flows.dress import STYLE
+from flows.parameters import view_parameters
+from lidarpainter_models.errors import ConfigError
+from tasks.assets.enter import enter_published
+from tasks.assets.publish import publish_assets
+from tasks.runs import open_run
+
+
+def publish_run(store: Store, run: str) -> dict[str, Any]:
+    """Publish the street, the actors, the sky and the trajectories of a run.
+
+    The same run again changes nothing.
+
+    Args:
+        store: where the run is.
+        run: a run id, a unique prefix of one, or `latest`.
+
+    Returns:
+        What `--json` prints.
+
+    Raises:
+        ConfigError: the run was edited: what it shows is not what was recorded.
+    """
+    finished = open_run(store, run)
+    if finished.change is not None and finished.change["kind"] != STYLE:
+        raise ConfigError(
+            f"run {finished.run_id} was changed ({finished.change['kind']}), "
+            f"expected a recorded or styled one: publish {finished.derived_from}"
+        )
+    style = None if finished.change is None else finished.change["parameters"]["prompt"]
+    parameters = view_parameters(finished)
+    published = publish_assets(parameters.run_spec(store.root), finished, parameters.observation)
+    ids = enter_published(store, finished, published, style)
+    counts = {name: count for name, count in published.summary.items() if name.startswith("num_")}
+    return {
+        "run_id": finished.run_id,
+        "scene": finished.scene_id,
+        "style": style,
+        **counts,
+        "num_assets": len(Counter(ids)),
+        "assets": ids,
+        "artefact": str(store.artefacts.folder(published.ref)),
+        "seconds": published.seconds,
+        "cpu_seconds": published.cpu_seconds,
+        "is_new": published.is_new,
+    }

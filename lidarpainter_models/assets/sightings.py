@@ -1,0 +1,184 @@
+"""How well an actor was seen: from where, which sides of it, how sharp, how right, how hidden.
+
+`Sighting` collects views one by one; its numbers stand in the catalog. Directions are those from
+the middle of the box to the camera, in the box frame.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidarpainter_models.assets.box_views import SIDES, BoxView
+from lidarpainter_models.metrics.images import psnr_from_error
+
+LEAST_PIXELS = 64
+"""A view that shows less of a box says nothing about it."""
+MOST_HIDDEN = 0.5
+"""A view in which more of the box is hidden was not seen from there."""
+CELLS = 4
+"""A side is this many cells long and high."""
+LEAST_SLOPE = 0.2
+"""Sine of the least angle between a side and the way it is looked at: 12 degrees."""
+SEEN_CELLS = 0.5
+"""Share of a side's cells from which on it counts as seen."""
+REACH_RAD = math.radians(20)
+"""So far around the direction of a view an actor looks as it did there."""
+NUM_DIRECTIONS = 1000
+SIDE_WEIGHTS = {"front": 0.2, "rear": 0.2, "left": 0.25, "right": 0.25, "top": 0.1}
+"""What a side counts for: long ones show most, and cameras of cars hardly see the top."""
+WORST_DB, BEST_DB = 15.0, 30.0
+"""From the PSNR of a smear in the right colour to that of a good fit of a recorded car."""
+FINE_PIXELS_PER_M = 50.0
+"""As a camera of 1920 px and 60 degrees shows what is 33 m away."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Look:
+    """One view of an actor."""
+
+    azimuth_deg: float
+    """0 ahead of it, 90 to its left."""
+    elevation_deg: float
+    distance_m: float
+    num_pixels: int
+    hidden_share: float
+
+
+@dataclass(kw_only=True, eq=False)
+class Sighting:
+    """What the views of one run show of one actor."""
+
+    looks: list[Look] = field(default_factory=list)
+    cells: Bool[Tensor, "6 cells cells"] = field(
+        default_factory=lambda: torch.zeros(len(SIDES), CELLS, CELLS, dtype=torch.bool)
+    )
+    """Which parts of its sides were seen, at a slope that shows something."""
+    pixels_per_m: float = 0.0
+    squared_error: float = 0.0
+    num_judged: int = 0
+    """Pixels that the error is a sum over."""
+    gradient: float = 0.0
+    """Of the rendered images inside the box, summed."""
+    true_gradient: float = 0.0
+    """Of the recorded ones."""
+
+    def add_look(self, seen: BoxView, focal_px: float) -> bool:
+        """Take a view; whether it shows enough to say something."""
+        if len(seen.row) < LEAST_PIXELS:
+            return False
+        x, y, z = seen.camera_box.tolist()
+        distance_m = math.hypot(x, y, z)
+        self.looks.append(
+            Look(
+                azimuth_deg=round(math.degrees(math.atan2(y, x)), 1),
+                elevation_deg=round(math.degrees(math.asin(z / distance_m)), 1),
+                distance_m=round(distance_m, 2),
+                num_pixels=len(seen.row),
+                hidden_share=round(seen.hidden_share, 4),
+            )
+        )
+        shown = ~seen.is_hidden
+        if seen.hidden_share <= MOST_HIDDEN:
+            self.pixels_per_m = max(self.pixels_per_m, focal_px / distance_m)
+        for side in seen.side[shown].unique().tolist():
+            axis = side // 2
+            if abs(float(seen.camera_box[axis])) / distance_m < LEAST_SLOPE:
+                continue
+            across, along = (other for other in range(3) if other != axis)
+            here = shown & (seen.side == side)
+            cell = ((seen.entry_box[here] + 1) / 2 * CELLS).long().clamp(0, CELLS - 1)
+            self.cells[side, cell[:, across], cell[:, along]] = True
+        return True
+
+    def add_error(
+        self,
+        seen: BoxView,
+        squared_error: Float[Tensor, "height width"],
+        gradient: Float[Tensor, "height width"],
+        true_gradient: Float[Tensor, "height width"],
+    ) -> None:
+        """Hold a view against the image that was recorded, where nothing stands before the box."""
+        row, column = seen.row[~seen.is_hidden], seen.column[~seen.is_hidden]
+        self.squared_error += float(squared_error[row, column].double().sum())
+        self.gradient += float(gradient[row, column].double().sum())
+        self.true_gradient += float(true_gradient[row, column].double().sum())
+        self.num_judged += len(row)
+
+    @property
+    def near_looks(self) -> list[Look]:
+        """Those that show most of it."""
+        return [look for look in self.looks if look.hidden_share <= MOST_HIDDEN]
+
+    @property
+    def sides(self) -> list[str]:
+        """The sides that were seen, of those that can be."""
+        shares = self.cells.float().mean(dim=(1, 2)).tolist()
+        seen = {name for name, share in zip(SIDES, shares, strict=True) if share >= SEEN_CELLS}
+        return [name for name in SIDE_WEIGHTS if name in seen]
+
+    @property
+    def coverage(self) -> float:
+        """Share of the directions above the horizon that lie near one it was seen from."""
+        directions = half_sphere(NUM_DIRECTIONS)
+        looks = [
+            (math.radians(look.azimuth_deg), math.radians(look.elevation_deg))
+            for look in self.near_looks
+        ]
+        if not looks:
+            return 0.0
+        azimuth, elevation = torch.tensor(looks).unbind(1)
+        flat = elevation.cos()
+        from_where = torch.stack(
+            [flat * azimuth.cos(), flat * azimuth.sin(), elevation.sin()], dim=1
+        )
+        nearest = (directions @ from_where.T).amax(1)
+        return float((nearest >= math.cos(REACH_RAD)).float().mean())
+
+    @property
+    def occlusion(self) -> float:
+        """Share of it that others hid, the mean of its views by their pixels."""
+        total = sum(look.num_pixels for look in self.looks)
+        hidden = sum(look.num_pixels * look.hidden_share for look in self.looks)
+        return hidden / total if total else 1.0
+
+    @property
+    def psnr_db(self) -> float | None:
+        """Inside the box, over all judged views; None where none was."""
+        if not self.num_judged:
+            return None
+        return psnr_from_error(max(self.squared_error / self.num_judged, 1e-10))
+
+    @property
+    def sharpness(self) -> float | None:
+        """Its gradients against those of the images, at most 1; None where none was judged."""
+        if not self.true_gradient:
+            return None
+        return min(1.0, self.gradient / self.true_gradient)
+
+    @property
+    def score(self) -> float:
+        """How usable it is: the geometric mean of sides, truth, detail and openness.
+
+        A geometric mean, since what fails in one of them is not made good by the others. What was
+        not judged (a style has no truth) is left out of the mean.
+        """
+        factors = [
+            sum(SIDE_WEIGHTS[side] for side in self.sides),
+            min(1.0, self.pixels_per_m / FINE_PIXELS_PER_M) * (self.sharpness or 1.0),
+            1.0 - self.occlusion,
+        ]
+        if self.psnr_db is not None:
+            factors.append(min(1.0, max(0.0, (self.psnr_db - WORST_DB) / (BEST_DB - WORST_DB))))
+        return math.prod(factors) ** (1 / len(factors))
+
+
+def half_sphere(count: int) -> Float[Tensor, "directions 3"]:
+    """Directions spread evenly over the upper half of the sphere, along a golden spiral."""
+    number = torch.arange(count).double()
+    height = (number + 0.5) / count
+    azimuth = number * math.pi * (3 - math.sqrt(5))
+    flat = (1 - height**2).sqrt()
+    return torch.stack([flat * azimuth.cos(), flat * azimuth.sin(), height], dim=1).float()

@@ -1,0 +1,1 @@
+"""Publish what a finished run yields for use elsewhere."""

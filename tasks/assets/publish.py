@@ -1,0 +1,121 @@
+"""Write what a run yields for use elsewhere: actors, street, sky and trajectories, and how well.
+
+One artefact a run, a folder for each asset in it; `sightings.json` lists them as the catalog will.
+"""
+
+from collections import Counter
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from torch import Tensor
+
+from catalog.artefacts import Workplace
+from lidarpainter_models.assets.extraction import AssetSource, write_assets
+from lidarpainter_models.assets.sighted_actors import RecordedLook, sighted_actors
+from lidarpainter_models.editing.worlds import EditedWorld
+from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
+from lidarpainter_models.observations.settings import ObservationConfig
+from lidarpainter_models.scenes.records import RecordedView
+from tasks.editing.edit import opened_world
+from tasks.json_files import write_json
+from tasks.opened import OpenedRun, opened
+from tasks.progress import Progress
+from tasks.runs import FinishedRun
+from tasks.specs import RunSpec
+from tasks.stages import StageResult, run_stage, stage_task
+from tasks.stored import load_scene
+
+KIND = "assets"
+SIGHTINGS_FILE = "sightings.json"
+
+
+@stage_task
+def publish_assets(
+    run: RunSpec, finished: FinishedRun, observation: ObservationConfig
+) -> StageResult:
+    """Write the assets of a finished run as an artefact."""
+    this = opened(run)
+    return run_stage(
+        this.store,
+        kernels=run.kernels,
+        stage="publish-assets",
+        kind=KIND,
+        inputs={
+            "scene": this.scene.content_digest,
+            "observations": finished.final.observations.digest,
+            "gaussians": finished.final.gaussians.digest,
+        },
+        config={"split": run.split, "observation": observation},
+        build=partial(_build, this=this, finished=finished, observation=observation),
+    )
+
+
+def _build(
+    place: Workplace,
+    progress: Progress,
+    *,
+    this: OpenedRun,
+    finished: FinishedRun,
+    observation: ObservationConfig,
+) -> dict[str, Any]:
+    world = opened_world(this.store, finished)
+    final = load_scene(this.store, finished.final.gaussians)
+    looks = _looks(this, world, observation, is_judged=final.style is None)
+    sighted = sighted_actors(world, looks, lambda done, total: progress(done, total, "seen"))
+    middle_ns = (world.log.start_ns + world.log.end_ns) // 2
+    source = AssetSource(
+        world=replace(world, scene=final.baked(middle_ns)),
+        sighted=sighted,
+        judged_on="held-out" if this.views.test else "training",
+        global_from_world=this.scene.global_from_world,
+    )
+    records = write_assets(source, place.output)
+    write_json(place.output / SIGHTINGS_FILE, records)
+    return {f"num_{kind}": count for kind, count in Counter(one["kind"] for one in records).items()}
+
+
+def _looks(
+    this: OpenedRun, world: EditedWorld, observation: ObservationConfig, *, is_judged: bool
+) -> list[RecordedLook]:
+    """The images that the fit saw, and those held out; errors are of the latter if there are any.
+
+    A style has no truth: its scene is not judged.
+    """
+    scene = world.fitted
+    looks = [
+        RecordedLook(
+            camera=scene.corrected_camera(
+                view.camera,
+                timestamp_ns=view.timestamp_ns,
+                camera_name=view.key[1],
+                key=view.key,
+            ),
+            camera_name=view.key[1],
+            timestamp_ns=view.timestamp_ns,
+            is_seen=True,
+            truth_rgb=(lambda view=view: view.rgb) if is_judged and not this.views.test else None,
+        )
+        for view in world.views
+    ]
+    for held in this.views.test if is_judged else ():
+        camera = scene.corrected_camera(
+            fit_camera(held, observation),
+            timestamp_ns=held.timestamp_ns,
+            camera_name=held.camera_name,
+        )
+        looks.append(
+            RecordedLook(
+                camera=camera,
+                camera_name=held.camera_name,
+                timestamp_ns=held.timestamp_ns,
+                is_seen=False,
+                truth_rgb=partial(_image, this, held, camera.width_px, camera.height_px),
+            )
+        )
+    return looks
+
+
+def _image(this: OpenedRun, view: RecordedView, width_px: int, height_px: int) -> Tensor:
+    image = shrink_image(this.scene.read_image(view), width_px=width_px, height_px=height_px)
+    return image.float() / 255
