@@ -123,7 +123,7 @@ def list_actors(store: Store, run: str) -> list[dict[str, Any]]:
                 "width_m": width,
                 "height_m": height,
                 "frames": len(track.timestamps_ns),
-                "num_gaussians": bodies[number + 1] if is_moving else world.count_parked(track),
+                "num_gaussians": bodies[number + 1] if is_moving else len(world.rows_of(track)),
                 "distance_m": _distance_m(world.log.ego.world_from_body, track),
             }
         )

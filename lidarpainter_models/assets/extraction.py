@@ -137,11 +137,12 @@ def _measured(seen: Sighting, judged_on: str) -> Record:
 
 def _street(source: AssetSource, output: Path) -> Iterator[Record]:
     """The street without moving and parked actors, in blocks."""
-    shown = source.world
-    for track in shown.parked:
-        shown = shown.without(track)
-    rows = (shown.scene.gaussians.body_index == 0).nonzero()[:, 0]
-    for block in street_blocks(shown.scene.gaussians.select(rows), shown.log.ego):
+    world, gaussians = source.world, source.world.scene.gaussians
+    is_street = gaussians.body_index == 0
+    for track in world.parked:
+        is_street[world.rows_of(track)] = False
+    street = gaussians.select(is_street.nonzero()[:, 0])
+    for block in street_blocks(street, world.log.ego):
         model = ActorModel(
             gaussians=exposed(block.gaussians, source.gain),
             points=MapPoints.concatenate([]),

@@ -1,7 +1,7 @@
 """A street in blocks: lengths of the driven path with all that stands beside them.
 
-World and block frames: x forward, y left, z up; a block's origin is where the ego was at its
-beginning, x along the path there; metres.
+World and block frames: x forward, y left, z up; a block's origin is where the ego was in its
+middle, x along the path there; metres.
 """
 
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ def street_blocks(street: GaussianSet, path: DrivenPath) -> list[StreetBlock]:
         rows = (numbers == number).nonzero()[:, 0]
         if len(rows) < LEAST_GAUSSIANS or number == torch.iinfo(torch.int64).min:
             continue
-        pose = _begins(path, number)
+        pose = _middle(path, number)
         gaussians = carried_gaussians(street.select(rows), invert_rigid(pose))
         low, high = (gaussians.means.quantile(share, dim=0) for share in (0.02, 0.98))
         blocks.append(
@@ -73,10 +73,11 @@ def _along(
     return torch.cat(ahead_m), torch.cat(beside_m)
 
 
-def _begins(path: DrivenPath, number: int) -> Float[Tensor, "4 4"]:
-    """Where a block begins: on the path, upright."""
+def _middle(path: DrivenPath, number: int) -> Float[Tensor, "4 4"]:
+    """The middle of a block: on the path, upright."""
     first = torch.zeros(1, dtype=torch.int64)
-    carried = path.moved_along(first, torch.tensor([number * BLOCK_M], dtype=torch.float64))
+    ahead_m = torch.tensor([(number + 0.5) * BLOCK_M], dtype=torch.float64)
+    carried = path.moved_along(first, ahead_m)
     direction = carried[0, :3, :3] @ path.directions[0]
     centre = (carried @ path.world_from_body[first])[:, :3, 3]
     return headed(centre, torch.atan2(direction[1], direction[0])[None])[0]

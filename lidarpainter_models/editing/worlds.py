@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.editing.actor_models import ActorModel, road_colour
@@ -96,7 +96,7 @@ class EditedWorld:
         Raises:
             SceneError: nothing of it was fitted.
         """
-        rows, points, pose = self._rows_of(track), self._points_of(track), None
+        rows, points, pose = self.rows_of(track), self._points_of(track), None
         if self._body_of(track) is None:
             pose = invert_rigid(_parked_pose(track))
             points = _carried_points(points, pose)
@@ -118,7 +118,7 @@ class EditedWorld:
         """The same world once an actor has gone."""
         body = self._body_of(track)
         gone = torch.zeros(len(self.scene.gaussians), dtype=torch.bool)
-        gone[self._rows_of(track)] = True
+        gone[self.rows_of(track)] = True
         street, actors = self.lidar_map.street, dict(self.lidar_map.actors)
         if body is None:
             street = street.keep(~self._holds(track, street.xyz_m))
@@ -164,21 +164,18 @@ class EditedWorld:
         lidar_map = LidarMap(street=self.lidar_map.street, actors=points)
         return replace(self, scene=scene, lidar_map=lidar_map, came=(*self.came, moving))
 
-    def count_parked(self, track: ActorTrack) -> int:
-        """Gaussians of the street that are a parked car's."""
-        return len(self._rows_of(track))
-
-    def _body_of(self, track: ActorTrack) -> int | None:
-        """Index of its body, or None where it is part of the street."""
-        ids = [one.actor_id for one in self.scene.actors.recorded_tracks]
-        return ids.index(track.actor_id) + 1 if track.actor_id in ids else None
-
-    def _rows_of(self, track: ActorTrack) -> Tensor:
+    def rows_of(self, track: ActorTrack) -> Int[Tensor, " rows"]:
+        """The Gaussians that are an actor's; of a parked car those of the street."""
         gaussians, body = self.scene.gaussians, self._body_of(track)
         if body is not None:
             return (gaussians.body_index == body).nonzero()[:, 0]
         held = self._holds(track, gaussians.means) & (gaussians.body_index == 0)
         return held.nonzero()[:, 0]
+
+    def _body_of(self, track: ActorTrack) -> int | None:
+        """Index of its body, or None where it is part of the street."""
+        ids = [one.actor_id for one in self.scene.actors.recorded_tracks]
+        return ids.index(track.actor_id) + 1 if track.actor_id in ids else None
 
     def _points_of(self, track: ActorTrack) -> MapPoints:
         if self._body_of(track) is not None:

@@ -1,7 +1,7 @@
 """A run's assets: published once, found, put into another scene, and gone with the run."""
 
 import pytest
-from commands import call, succeed
+from commands import succeed
 
 from lidarpainter_models.assets.asset_files import read_asset
 
