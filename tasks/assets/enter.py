@@ -54,7 +54,7 @@ def enter_published(
         "software_version": manifest.software_version,
     }
     records = read_json(store.artefacts.folder(published.ref) / SIGHTINGS_FILE)
-    rows = [same | record | _ids(same, record) for record in records]
+    rows = [same | record | ids_of(same, record) for record in records]
     return enter_sightings(store, rows, is_same)
 
 
@@ -93,7 +93,8 @@ def _overlap(one: Row, other: Row) -> float:
     return common / (areas - common)
 
 
-def _ids(same: Mapping[str, Any], record: Mapping[str, Any]) -> Row:
+def ids_of(same: Mapping[str, Any], record: Mapping[str, Any]) -> Row:
+    """The ids of a sighting, whose names in a run and in a scene follow from it."""
     named = (record["kind"], record.get("actor_id") or record["name"])
     base = digest_of(same["scene_id"], *named, None)
     return {
