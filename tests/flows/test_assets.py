@@ -1,9 +1,14 @@
 """A run's assets: published once, found, put into another scene, and gone with the run."""
 
 import pytest
-from commands import succeed
+from commands import call, succeed
+from tiny_street import SCENE, SETTINGS
 
+from flows.fleet.asked import Asked
+from flows.fleet.work import make_sequence
 from lidarpainter_models.assets.asset_files import read_asset
+from tasks.runs import open_run
+from tasks.stored import load_scene
 
 
 @pytest.fixture(scope="module")
@@ -39,3 +44,77 @@ def test_publishing_again_changes_nothing(own_run, published):
     assert not again["is_new"]
     assert again["assets"] == published["published"][0]["assets"]
     assert [store.tables.rows(table) for table in ("assets", "sightings")] == before
+
+
+def best_actor(store):
+    return max(rows(store, kind="actor", style=None), key=lambda row: row["score"])["asset_id"]
+
+
+def test_an_actor_of_the_library_drives_in_a_scene(own_run, published):  # noqa: ARG001
+    store, asset = own_run.store, best_actor(own_run.store)
+    words = ("edit", own_run.run_id, "insert", "guest", f"source=asset:{asset[:8]}", "ahead_m=9")
+    first = succeed(*words, "--allow-collisions", "--json", store=store).json
+    run = open_run(store, first["run_id"])
+    tracks = load_scene(store, run.final.gaussians).tracks
+    (guest,) = (track for track in tracks if track.actor_id == "guest")
+    known = store.tables.find("assets", asset)
+    size_m = [known["length_m"], known["width_m"], known["height_m"]]
+    assert guest.size_m.tolist() == pytest.approx(size_m, abs=1e-5)
+    again = succeed(*words, "--allow-collisions", "--json", store=store).json
+    assert again["run_id"] == first["run_id"]
+    assert not any(again["computed_now"].values())
+    refused = call("assets", "publish", first["run_id"], store=store)
+    assert refused.code == 2
+    assert "expected a recorded or styled one" in refused.err
+
+
+@pytest.mark.parametrize(
+    ("source", "complaint"),
+    [
+        ("asset:zebra", "no asset 'zebra'"),
+        ("asset:", "source.asset: String should have at least 1 character"),
+        ("zebra", "source: Input should be"),
+    ],
+)
+def test_an_asset_that_cannot_be_put_in_is_one_line(own_run, published, source, complaint):  # noqa: ARG001
+    words = ("edit", own_run.run_id, "insert", "guest", f"source={source}")
+    refused = call(*words, store=own_run.store)
+    assert refused.code == 2
+    assert complaint in refused.err
+    assert refused.err.count("\n") == 1
+
+
+def test_streets_are_not_put_in_like_actors(own_run, published):  # noqa: ARG001
+    street = rows(own_run.store, kind="street")[0]["asset_id"]
+    words = ("edit", own_run.run_id, "insert", "guest", f"source.asset={street}")
+    assert "is a street, expected an actor" in call(*words, store=own_run.store).err
+
+
+def test_a_fleet_publishes_a_scene_and_its_variants(own_run, published):  # noqa: ARG001
+    """Fits and observations are those of the run that is there."""
+    store = own_run.store
+    dataset, _, sequence = SCENE.partition("/")
+    asked = Asked(
+        dataset=dataset,
+        sequence=sequence,
+        preset="preview",
+        settings=SETTINGS,
+        scores=False,
+        report=False,
+        assets=True,
+        variants=("night",),
+    )
+    before = len(rows(store, kind="actor"))
+    made = make_sequence(asked, store.root)
+    assert made.is_new
+    styled = rows(store, kind="actor", style="night:1")
+    assert len(styled) == before
+    bases = {row["asset_id"] for row in rows(store, kind="actor", style=None)}
+    assert {row["derived_from"] for row in styled} == bases
+    assert {row["num_sightings"] for row in rows(store, kind="actor", style=None)} == {2}
+    assert all(row["psnr_db"] is None and row["score"] > 0 for row in styled)
+    tables = [store.tables.rows(table) for table in ("assets", "sightings")]
+    assert not make_sequence(asked, store.root).is_new
+    assert [store.tables.rows(table) for table in ("assets", "sightings")] == tables
+    succeed("catalog", "delete", made.run_id, "--yes", store=store)
+    assert {row["num_sightings"] for row in rows(store, kind="actor", style=None)} == {1}
