@@ -6,6 +6,7 @@ takes the columns of the sighting with the best score. Both tables are written u
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
 
 import numpy as np
 import pyarrow as pa
@@ -20,8 +21,7 @@ from catalog.tables import Row
 
 ID_LENGTH = 16
 NEAR_M = 10.0
-"""Sightings farther apart in the ground plane, or in either of its axes, are never compared by
-place."""
+"""Sightings farther apart along x or y are not compared: no car is so long."""
 
 IsSame = Callable[[Row, Row], bool]
 """Whether two sightings are of one thing; asked in either order."""
@@ -43,7 +43,8 @@ def enter_sightings(store: Store, rows: Sequence[Row], is_same: IsSame) -> list[
     """
     with _alone(store):
         known = store.tables.arrow(SIGHTINGS.name)
-        new = [{column.name: row.get(column.name) for column in SIGHTINGS.columns} for row in rows]
+        names = SIGHTINGS.arrow.names
+        new: list[Row] = [{name: row.get(name) for name in names} for row in rows]
         old = _where(known, "sighting_id", [row["sighting_id"] for row in new])
         others = _leaving(_candidates(known, new), new)
         groups = _Groups()
@@ -100,8 +101,8 @@ def find_asset(store: Store, name: str) -> Row:
     )
 
 
-def _alone(store: Store):  # noqa: ANN202 - a context manager
-    (store.root / "locks").mkdir(parents=True, exist_ok=True)
+def _alone(store: Store) -> AbstractContextManager[bool]:
+    """Held by whoever writes: what is one asset is decided from all that is there."""
     return held_lock(store.root / "locks" / "assets.lock")
 
 
@@ -155,7 +156,8 @@ def _named(rows: Sequence[Row], groups: _Groups) -> list[Row]:
 
 def _write(store: Store, known: pa.Table, entered: Sequence[Row], touched: set[str]) -> None:
     """Bring both tables to what the sightings of some assets are now."""
-    before = {row["sighting_id"]: row for row in _of(known, entered)}
+    names = [row["sighting_id"] for row in entered]
+    before = {row["sighting_id"]: row for row in _where(known, "sighting_id", names)}
     changed = [row for row in entered if before.get(row["sighting_id"]) != row]
     store.tables.merge(SIGHTINGS.name, changed)
     sightings = store.tables.arrow(SIGHTINGS.name) if changed else known
@@ -192,11 +194,6 @@ def _where(table: pa.Table, column: str, values: Iterable[str]) -> list[Row]:
     """The rows with one of these values in a column."""
     wanted = pa.array(sorted(values), pa.string())
     return table.filter(pc.is_in(table[column], value_set=wanted)).to_pylist()
-
-
-def _of(table: pa.Table, rows: Sequence[Row]) -> list[Row]:
-    """The rows of a table of sightings with the ids of these."""
-    return _where(table, "sighting_id", [row["sighting_id"] for row in rows])
 
 
 def _leaving(rows: Sequence[Row], out: Sequence[Row]) -> list[Row]:

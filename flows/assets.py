@@ -1,6 +1,5 @@
 """Publish what a finished run yields into the library of assets; needs no server."""
 
-from collections import Counter
 from typing import Any
 
 from catalog.store import Store
@@ -43,7 +42,7 @@ def publish_run(store: Store, run: str) -> dict[str, Any]:
         "scene": finished.scene_id,
         "style": style,
         **counts,
-        "num_assets": len(Counter(ids)),
+        "num_assets": len(set(ids)),
         "assets": ids,
         "artefact": str(store.artefacts.folder(published.ref)),
         "seconds": published.seconds,

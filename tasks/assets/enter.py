@@ -77,15 +77,16 @@ def _overlap(one: Row, other: Row) -> float:
     """Intersection over union of two boxes from above; 0 where one is over the other."""
     if abs(one["z_m"] - other["z_m"]) > (one["height_m"] + other["height_m"]) / 2:
         return 0.0
-    boxes = [
-        (  # from the first box on: a global frame has more digits than OpenCV's floats
+    # from the first box on: a global frame has more digits than OpenCV's floats
+    first, second = (
+        (
             (row["x_m"] - one["x_m"], row["y_m"] - one["y_m"]),
             (row["length_m"], row["width_m"]),
             math.degrees(row["heading_rad"]),
         )
         for row in (one, other)
-    ]
-    kind, corners = cv2.rotatedRectangleIntersection(*boxes)
+    )
+    kind, corners = cv2.rotatedRectangleIntersection(first, second)
     if kind == cv2.INTERSECT_NONE or corners is None:
         return 0.0
     common = cv2.contourArea(cv2.convexHull(corners))

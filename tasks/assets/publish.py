@@ -16,6 +16,7 @@ from lidarpainter_models.assets.sighted_actors import RecordedLook, sighted_acto
 from lidarpainter_models.editing.worlds import EditedWorld
 from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
 from lidarpainter_models.observations.settings import ObservationConfig
+from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.scenes.records import RecordedView
 from tasks.editing.edit import opened_world
 from tasks.json_files import write_json
@@ -94,7 +95,7 @@ def _looks(
             camera_name=view.key[1],
             timestamp_ns=view.timestamp_ns,
             is_seen=True,
-            truth_rgb=(lambda view=view: view.rgb) if is_judged and not this.views.test else None,
+            truth_rgb=partial(_seen, view) if is_judged and not this.views.test else None,
         )
         for view in world.views
     ]
@@ -114,6 +115,10 @@ def _looks(
             )
         )
     return looks
+
+
+def _seen(view: TrainingView) -> Tensor:
+    return view.rgb
 
 
 def _image(this: OpenedRun, view: RecordedView, width_px: int, height_px: int) -> Tensor:

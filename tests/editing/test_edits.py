@@ -8,7 +8,12 @@ from gaussian_world import FRAME_NS, build_world, camera_at, map_points, round_g
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.settings import ConditionConfig
-from lidarpainter_models.editing.actor_models import ActorModel, contact_shadow
+from lidarpainter_models.editing.actor_models import (
+    MAX_CAST,
+    ActorModel,
+    contact_shadow,
+    exposure_gain,
+)
 from lidarpainter_models.editing.edits import edited, encounters, refuse_walls
 from lidarpainter_models.editing.filled_scenes import filled, masked_observations
 from lidarpainter_models.editing.motions import LogTimes
@@ -123,6 +128,20 @@ def test_a_guest_takes_the_light_of_the_scene_and_throws_a_shadow(world):
     assert torch.allclose(mine, 2 * model.gaussians.base_rgb, atol=1e-4)
     again = done(after, {"op": "move", "actor": "guest", "trajectory": "lateral:1"})
     assert len(again.model_of(again.find("guest")).gaussians) == len(guest)  # one shadow
+
+
+def test_the_light_of_another_scene_is_taken_and_given_back(world):
+    """Brightness and tint come from the road; a road of another colour gives a limited tint."""
+    model = world.model_of(world.moving[0])
+    warm = world.road_rgb * torch.tensor([1.32, 1.2, 1.08])
+    lit = model.exposed_like(warm)
+    assert torch.allclose(lit.gaussians.base_rgb, model.gaussians.base_rgb * warm / world.road_rgb)
+    back = lit.exposed_like(world.road_rgb)
+    assert torch.allclose(back.gaussians.base_rgb, model.gaussians.base_rgb, atol=1e-6)
+    brick = torch.tensor([0.6, 0.2, 0.2])
+    gain = exposure_gain(world.road_rgb, brick)
+    brightness = float(brick.mean() / world.road_rgb.mean())
+    assert float(gain[0]) == pytest.approx(MAX_CAST * brightness, rel=0.02)
 
 
 def test_the_road_under_a_removed_parked_car_is_mended(world):
