@@ -65,10 +65,10 @@ class Sighting:
     true_gradient: float = 0.0
     """Of the recorded ones."""
 
-    def add_look(self, seen: BoxView, focal_px: float) -> bool:
-        """Take a view; whether it shows enough to say something."""
+    def add_look(self, seen: BoxView, focal_px: float) -> None:
+        """Take a view, if it shows enough to say something."""
         if len(seen.row) < LEAST_PIXELS:
-            return False
+            return
         x, y, z = seen.camera_box.tolist()
         distance_m = math.hypot(x, y, z)
         self.looks.append(
@@ -91,7 +91,6 @@ class Sighting:
             here = shown & (seen.side == side)
             cell = ((seen.entry_box[here] + 1) / 2 * CELLS).long().clamp(0, CELLS - 1)
             self.cells[side, cell[:, across], cell[:, along]] = True
-        return True
 
     def add_error(
         self,

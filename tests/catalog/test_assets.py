@@ -1,7 +1,6 @@
 """Which sightings are one asset, whoever comes first; what serves; what a style is derived from."""
 
 from datetime import UTC, datetime
-from itertools import permutations
 
 import pytest
 
@@ -79,9 +78,10 @@ def test_whoever_comes_first_the_assets_are_the_same(tmp_path):
         [sighting("b", place=0.8, run="two", scene="toy/2")],
         [sighting("c", place=1.6, run="three", scene="toy/3")],
     ]
+    orders = ((0, 1, 2), (2, 0, 1), (2, 1, 0))  # the one between comes second, last, second
     found = [
-        entered(open_store(tmp_path / f"store-{number}"), *order)
-        for number, order in enumerate(permutations(batches))
+        entered(open_store(tmp_path / str(order)), *(batches[place] for place in order))
+        for order in orders
     ]
     assert all(one == found[0] for one in found)
     (asset,) = found[0]["assets"]
