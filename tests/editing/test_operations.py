@@ -47,7 +47,8 @@ def test_a_script_says_again_what_was_read():
         ('[{"op": "freeze", "at_s": 1, "over": 2}]', "over: Extra inputs are not permitted"),
         ('[{"op": "remove", "actors": []}]', "operation 1, actors"),
         ('[{"op": "crop", "from_m": 3, "to_m": 3}]', "expected from_m < to_m"),
-        ('[{"op": "swap", "actor": "a", "source": {}}]', "expected either actor or ply"),
+        ('[{"op": "swap", "actor": "a", "source": {}}]', "expected one of actor, asset and ply"),
+        ('[{"op": "swap", "actor": "a", "source": {"asset": "b", "run": "c"}}]', "has no run"),
         (
             '[{"op": "move", "actor": "a", "trajectory": "latral:2"}]',
             "operation 1.*'latral:2': expected one of",
