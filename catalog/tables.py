@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import pyarrow as pa
 from deltalake import DeltaTable, Field
@@ -34,7 +35,11 @@ COMMIT_ATTEMPTS = 25
 FIRST_PAUSE_S = 0.05
 LONGEST_PAUSE_S = 2.0
 MOST_FILES = 24
-"""Of a table, before they are written together: each merge and each query opens all of them."""
+"""Small ones of a table, before they are written together: each merge and query opens all files."""
+
+FILE_BYTES = 16 << 20
+"""A file of a table, about: 140 000 assets. Replacing a row writes its whole file again, so a table
+of many files takes a change in one place without being written anew."""
 
 _NO_ANSWER = "Generic S3 error"
 """How Delta Lake says that a bucket failed, whatever it failed of."""
@@ -155,6 +160,15 @@ class CatalogTables:
         ]
         return pa.table(columns, schema=schema.arrow)
 
+    def files(self, table: str) -> list[str]:
+        """The Parquet files that a table in a folder consists of; none if nothing was written."""
+        schema = _schema(table)
+        with _damage(f"cannot read table {self._uri(schema)}"):
+            try:
+                return [unquote(uri) for uri in self._current(schema).file_uris()]
+            except TableNotFoundError:
+                return []
+
     def find(self, table: str, row_id: str) -> Row | None:
         """The row with exactly this id, or None."""
         arrow = self.arrow(table)
@@ -208,9 +222,10 @@ class CatalogTables:
             if "version already exists" in str(error).lower():  # lost the race to create it
                 return None
             raise
-        if len(target.file_uris()) > MOST_FILES:
+        sizes = pa.table(target.get_add_actions()).column("size_bytes").to_pylist()
+        if sum(size < FILE_BYTES // 2 for size in sizes) > MOST_FILES:
             with suppress(CommitFailedError):  # whoever won may do it
-                target.optimize.compact()
+                target.optimize.compact(target_size=FILE_BYTES)
         return int(counts["num_target_rows_inserted"]) + int(counts["num_target_rows_updated"])
 
     def _opened(self, schema: TableSchema) -> DeltaTable:
@@ -224,6 +239,7 @@ class CatalogTables:
                 mode="ignore",
                 name=schema.name,
                 description=schema.description,
+                configuration={"delta.targetFileSize": str(FILE_BYTES)},
                 storage_options=self.storage_options,
             )
             table = self._current(schema)

@@ -1,0 +1,147 @@
+"""Questions about the asset library: which assets there are, and everything about one.
+
+They are SQL with values beside it, see `catalog.sql`; what an asset was made from is told by
+`catalog.explain`.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+from catalog.errors import UnknownRecordError
+from catalog.sql import Answer, CatalogSql
+from catalog.tables import Row
+
+Sort = Literal["score", "coverage", "psnr_db", "length_m", "num_views", "num_points", "created_at"]
+SORTS: tuple[Sort, ...] = get_args(Sort)
+SIDES = ("front", "rear", "left", "right", "top")
+AS_RECORDED = "recorded"
+"""The style of what wears none."""
+SEDAN = "sedan"
+_SEDAN = "length_m BETWEEN 4.1 AND 5.3 AND height_m <= 1.6"
+"""No data set says sedan, all say car: these are the lengths and heights of sedans."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AssetFilter:
+    """Which assets are wanted; every field that is given must hold."""
+
+    kind: str | None = None
+    category: str | None = None
+    """A word of a data set, or its last part (`car` finds `vehicle.car` and `Car`), or `sedan`."""
+    dataset: str | None = None
+    licence: str | None = None
+    """A part of it: `BY` finds `CC BY 4.0`."""
+    style: str | None = None
+    """A word of the style, as `night`, or `recorded`."""
+    scene: str | None = None
+    """dataset/sequence of a sighting."""
+    sides: tuple[str, ...] = ()
+    """All of these were seen."""
+    min_sides: int | None = None
+    min_length_m: float | None = None
+    min_score: float | None = None
+    min_coverage: float | None = None
+    max_lpips: float | None = None
+    """Where it was measured; without the weights for it nothing would pass."""
+
+    def __post_init__(self) -> None:
+        """Refuse sides that nothing has.
+
+        Raises:
+            UnknownRecordError: there is no such side.
+        """
+        if unknown := set(self.sides) - set(SIDES):
+            raise UnknownRecordError(
+                f"no side {min(unknown)!r}, expected some of {', '.join(SIDES)}"
+            )
+
+
+_CONDITIONS = {
+    "kind": "kind = $kind",
+    "dataset": "dataset = $dataset",
+    "licence": "contains(lower(licence), lower($licence))",
+    "style": "contains(style, $style)",
+    "scene": "list_contains(scene_ids, $scene)",
+    "sides": "list_has_all(sides, $sides)",
+    "min_sides": "len(sides) >= $min_sides",
+    "min_length_m": "length_m >= $min_length_m",
+    "min_score": "score >= $min_score",
+    "min_coverage": "coverage >= $min_coverage",
+    "max_lpips": "(lpips IS NULL OR lpips < $max_lpips)",
+}
+
+
+def find_assets(sql: CatalogSql, wanted: AssetFilter, *, sort: Sort, most: int) -> Answer:
+    """The assets that are wanted, the highest of a column first.
+
+    Raises:
+        UnknownRecordError: no asset is of that category.
+    """
+    conditions, values = ["true"], {}
+    for name, condition in _CONDITIONS.items():
+        value = getattr(wanted, name)
+        if value is not None and value != ():
+            conditions.append(condition)
+            values[name] = list(value) if isinstance(value, tuple) else value
+    if wanted.style == AS_RECORDED:
+        del values["style"]
+        conditions[conditions.index(_CONDITIONS["style"])] = "style IS NULL"
+    if wanted.category is not None:
+        conditions += _of_category(sql, wanted.category, values)
+    return sql.ask(
+        f"SELECT * FROM assets WHERE {' AND '.join(conditions)} "  # noqa: S608 - values stand beside
+        f"ORDER BY {sort} DESC NULLS LAST, asset_id",
+        values,
+        most_rows=most,
+    )
+
+
+def find_asset(sql: CatalogSql, id_or_prefix: str) -> Row:
+    """The one asset with this id, or whose id starts with it.
+
+    Raises:
+        UnknownRecordError: none matches, or more than one.
+    """
+    found = sql.ask(
+        "SELECT * FROM assets WHERE starts_with(asset_id, $name) ORDER BY asset_id = $name DESC",
+        {"name": id_or_prefix},
+        most_rows=5,
+    ).rows
+    if not id_or_prefix or not found:
+        raise UnknownRecordError(f"no asset {id_or_prefix!r}, see `lidarpainter assets list`")
+    if len(found) > 1 and found[0]["asset_id"] != id_or_prefix:
+        ids = ", ".join(row["asset_id"] for row in found)
+        raise UnknownRecordError(f"asset {id_or_prefix!r} is not unique: {ids}")
+    return found[0]
+
+
+def sightings_of(sql: CatalogSql, asset_id: str) -> list[Row]:
+    """Every time that the asset was seen, the best first."""
+    return sql.ask(
+        "SELECT * FROM sightings WHERE asset_id = $name ORDER BY score DESC NULLS LAST, run_id",
+        {"name": asset_id},
+    ).rows
+
+
+def _of_category(sql: CatalogSql, asked: str, values: dict[str, Any]) -> Iterator[str]:
+    """The conditions of a category: its words as the data sets have them, which files can skip by.
+
+    Raises:
+        UnknownRecordError: no data set has the word.
+    """
+    known = [row["category"] for row in sql.ask("SELECT DISTINCT category FROM assets").rows]
+    word = asked.lower()
+    if word == SEDAN:
+        word = "car"
+        yield _SEDAN
+    values["categories"] = [name for name in known if word in (name.lower(), _last_part(name))]
+    if not values["categories"]:
+        raise UnknownRecordError(
+            f"no asset of category {asked!r}; there are {', '.join(sorted(known)) or 'none'}"
+        )
+    yield "list_contains($categories, category)"
+
+
+def _last_part(category: str) -> str:
+    return category.lower().rpartition(".")[2]
