@@ -71,6 +71,11 @@ _CONDITIONS = {
     "max_lpips": "(lpips IS NULL OR lpips < $max_lpips)",
 }
 
+_NAMED = (
+    "starts_with(asset_id, $name)",
+    "asset_id IN (SELECT asset_id FROM sightings WHERE starts_with(occurrence_id, $name))",
+)
+
 
 def find_assets(sql: CatalogSql, wanted: AssetFilter, *, sort: Sort, most: int) -> Answer:
     """The assets that are wanted, the highest of a column first.
@@ -98,17 +103,16 @@ def find_assets(sql: CatalogSql, wanted: AssetFilter, *, sort: Sort, most: int) 
 
 
 def find_asset(sql: CatalogSql, id_or_prefix: str) -> Row:
-    """The one asset with this id, or whose id starts with it.
+    """The one asset with this id, or whose id starts with it, or once did: see `catalog.assets`.
 
     Raises:
         UnknownRecordError: none matches, or more than one.
     """
-    found = sql.ask(
-        "SELECT * FROM assets WHERE starts_with(asset_id, $name) ORDER BY asset_id = $name DESC",
-        {"name": id_or_prefix},
-        most_rows=5,
-    ).rows
-    if not id_or_prefix or not found:
+    found: list[Row] = []
+    for condition in _NAMED if id_or_prefix else ():
+        text = f"FROM assets WHERE {condition} ORDER BY asset_id = $name DESC"
+        found = found or sql.ask(text, {"name": id_or_prefix}, most_rows=5).rows
+    if not found:
         raise UnknownRecordError(f"no asset {id_or_prefix!r}, see `lidarpainter assets list`")
     if len(found) > 1 and found[0]["asset_id"] != id_or_prefix:
         ids = ", ".join(row["asset_id"] for row in found)

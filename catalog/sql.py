@@ -32,7 +32,7 @@ _TYPES: dict[ColumnType, str] = {
     "time": "TIMESTAMPTZ",
     "texts": "VARCHAR[]",
 }
-_BOUNDS = {
+_BOUNDS: dict[str, str | bool | int | float | list[str]] = {
     "threads": 1,
     "memory_limit": MOST_MEMORY,
     "temp_directory": "",
