@@ -1,11 +1,34 @@
 """`lidarpainter assets`: what runs yield for use elsewhere."""
 
-from typing import Annotated
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from flows.cli.output import print_json, print_table, say_status
-from flows.cli.shared_options import AsJson
+from flows.cli.catalog import opened_row, row_cell, told_explanation
+from flows.cli.output import print_json, print_pairs, print_table, say_status
+from flows.cli.shared_options import AsJson, parse_names
+
+if TYPE_CHECKING:
+    from catalog.sql import CatalogSql
+    from catalog.store import Store
+    from catalog.tables import Row
+
+ID_LENGTH = 12
+"""Of an id in a table, enough to name the asset by."""
+MOST_SHOWN = 1000
+"""Rows of a query's answer."""
+AssetName = Annotated[
+    str, typer.Argument(help="An asset id, or the beginning of one.", show_default=False)
+]
+Category = Annotated[
+    str | None, typer.Option(help="A word of a data set: car also finds vehicle.car; or sedan.")
+]
+MinScore = Annotated[float | None, typer.Option(help="Least score, 0 to 1.")]
+SortName = Literal[  # `catalog.asset_queries.Sort`, known before anything is imported
+    "score", "coverage", "psnr_db", "length_m", "num_views", "num_points", "created_at"
+]
 
 app = typer.Typer(help="Actors, streets and skies for use elsewhere.", no_args_is_help=True)
 
@@ -39,3 +62,190 @@ def publish(
         return
     columns = ("run_id", "scene", "style", "num_actor", "num_street", "num_assets", "seconds")
     print_table("published", columns, [[one[name] for name in columns] for one in results])
+
+
+@app.command("list")
+def list_assets(  # noqa: PLR0913 - the options of a command
+    kind: Annotated[str | None, typer.Option(help="actor, street, sky or trajectory.")] = None,
+    category: Category = None,
+    dataset: Annotated[str | None, typer.Option(help="Where the log comes from.")] = None,
+    licence: Annotated[str | None, typer.Option(help="A part of its name, as CC BY.")] = None,
+    style: Annotated[
+        str | None, typer.Option(help="A word of it, as night; or recorded for none.")
+    ] = None,
+    scene: Annotated[str | None, typer.Option(help="dataset/sequence it was seen in.")] = None,
+    sides: Annotated[
+        str | None,
+        typer.Option(help="All seen, with commas between: front, rear, left, right, top."),
+    ] = None,
+    min_sides: Annotated[int | None, typer.Option(help="Least number of sides seen.")] = None,
+    min_length: Annotated[float | None, typer.Option(help="Least length in metres.")] = None,
+    min_score: MinScore = None,
+    min_coverage: Annotated[
+        float | None, typer.Option(help="Least share of directions seen, 0 to 1.")
+    ] = None,
+    max_lpips: Annotated[
+        float | None, typer.Option(help="Highest LPIPS, where it was measured.")
+    ] = None,
+    sort: Annotated[SortName, typer.Option(help="Column whose highest come first.")] = "score",
+    limit: Annotated[int, typer.Option(min=1, help="Rows at most.")] = 50,
+    as_json: AsJson = False,
+) -> None:
+    """List assets: all filters that are given must hold.
+
+    Example: lidarpainter assets list --category sedan --style night --min-sides 3 --max-lpips 0.1
+    """
+    from catalog.asset_queries import AssetFilter, find_assets
+
+    wanted = AssetFilter(
+        kind=kind,
+        category=category,
+        dataset=dataset,
+        licence=licence,
+        style=style,
+        scene=scene,
+        sides=parse_names(sides) or (),
+        min_sides=min_sides,
+        min_length_m=min_length,
+        min_score=min_score,
+        min_coverage=min_coverage,
+        max_lpips=max_lpips,
+    )
+    store, sql = _library()
+    found = find_assets(sql, wanted, sort=sort, most=limit)
+    if as_json:
+        rows = [opened_row(row) for row in found.rows]
+        print_json({"store": str(store.root), "assets": rows, "is_cut": found.is_cut})
+        return
+    note = f"only the first {limit} by {sort}: --limit shows more" if found.is_cut else ""
+    _show_assets(f"assets in {store.root}", found.rows, note)
+
+
+@app.command()
+def show(name: AssetName, as_json: AsJson = False) -> None:
+    """Show everything about an asset: each sighting, and what it was made from.
+
+    Example: lidarpainter assets show 3f2a
+    """
+    from catalog.artefacts import ArtefactRef
+    from catalog.asset_queries import find_asset, sightings_of
+    from catalog.explain import Explainer
+    from tasks.stages import project_source
+
+    store, sql = _library()
+    asset = find_asset(sql, name)
+    sightings = sightings_of(sql, asset["asset_id"])
+    explainer = Explainer(store, project_source().code_from)
+    made = explainer.artefact(ArtefactRef.of_id(asset["artefact_id"]))
+    if as_json:
+        rows = [opened_row(row) for row in sightings]
+        print_json({**opened_row(asset), "sightings": rows, "made_from": made.to_dict()})
+        return
+    print_pairs(f"asset {asset['asset_id']}", {key: row_cell(key, asset[key]) for key in asset})
+    columns = ("scene_id", "run_id", "actor_id", "num_views", "median_m", "sides", "score")
+    cells = [[row_cell(column, row[column]) for column in columns] for row in sightings]
+    print_table("sightings", columns, cells, num_text_columns=3)
+    sys.stdout.write("\n".join(["made from", *told_explanation("", made, set())]) + "\n")
+
+
+@app.command()
+def query(
+    sql: Annotated[str, typer.Argument(help="One SELECT in DuckDB's words.", show_default=False)],
+    as_json: AsJson = False,
+) -> None:
+    """Ask all tables of the catalog by SQL, which can read them and nothing else.
+
+    Example: lidarpainter assets query "SELECT category, count(*) FROM assets GROUP BY category"
+    """
+    _, library = _library()
+    found = library.ask(sql, most_rows=MOST_SHOWN)
+    rows = [{name: _told(value) for name, value in row.items()} for row in found.rows]
+    if as_json:
+        print_json({"columns": list(found.columns), "rows": rows, "is_cut": found.is_cut})
+        return
+    cells = [[row_cell("", row[name]) for name in found.columns] for row in rows]
+    note = f"only the first {MOST_SHOWN} rows" if found.is_cut else ""
+    print_table("query", found.columns, cells, note, num_text_columns=len(found.columns))
+
+
+@app.command("export")
+def export(
+    name: AssetName,
+    format_: Annotated[
+        Literal["ply", "spz", "gltf"], typer.Option("--format", help="ply, spz or gltf (.glb).")
+    ],
+    out: Annotated[Path, typer.Option(help="The file.")],
+    as_json: AsJson = False,
+) -> None:
+    """Write an actor or a block of street for other programs, in its own frame.
+
+    Example: lidarpainter assets export 3f2a --format gltf --out car.glb
+    """
+    from catalog.asset_queries import find_asset
+
+    store, sql = _library()
+    asset = find_asset(sql, name)
+    say_status(f"exporting asset {asset['asset_id']}")
+    from tasks.exports.asset import export_asset
+
+    result = export_asset(store, asset, format_, out.absolute())
+    print_json(result) if as_json else print_pairs(f"asset {asset['name']}", result)
+
+
+@app.command()
+def gallery(
+    out: Annotated[Path, typer.Option(help="A new folder, or an older gallery.")],
+    category: Category = None,
+    min_score: MinScore = None,
+    limit: Annotated[int, typer.Option(min=1, help="Assets at most, the best ones.")] = 10_000,
+    as_json: AsJson = False,
+) -> None:
+    """Write a page to leaf through the assets, which opens from the disk.
+
+    Example: lidarpainter assets gallery --out gallery
+    """
+    from catalog.asset_queries import AssetFilter, find_assets
+
+    store, sql = _library()
+    wanted = AssetFilter(category=category, min_score=min_score)
+    found = find_assets(sql, wanted, sort="score", most=limit)
+    say_status(f"writing {len(found.rows)} assets")
+    from tasks.exports.asset import export_gallery
+
+    result = {**export_gallery(store, found.rows, out.absolute()), "is_cut": found.is_cut}
+    print_json(result) if as_json else print_pairs("gallery", result)
+
+
+def _library() -> "tuple[Store, CatalogSql]":
+    from catalog.sql import CatalogSql
+    from catalog.store import existing_store
+
+    store = existing_store()
+    return store, CatalogSql(store.tables)
+
+
+def _show_assets(title: str, rows: "list[Row]", note: str) -> None:
+    columns = ("name", "style", "scene_ids", "sides", "coverage", "psnr_db", "score")
+    cells = [
+        [
+            row["asset_id"][:ID_LENGTH],
+            *(row_cell(name, row[name]) for name in columns),
+            _extent(row),
+        ]
+        for row in rows
+    ]
+    print_table(title, ["asset", *columns, "size in m"], cells, note, num_text_columns=5)
+
+
+def _extent(row: dict[str, Any]) -> str | None:
+    """Length, width and height, those that there are."""
+    sides = [row[name] for name in ("length_m", "width_m", "height_m") if row[name] is not None]
+    return " x ".join(f"{side:.1f}" for side in sides) or None
+
+
+def _told(value: Any) -> Any:  # noqa: ANN401 - any value that SQL can make
+    """A value as JSON has it; what JSON lacks, as text."""
+    if isinstance(value, list):
+        return [_told(one) for one in value]
+    is_plain = value is None or isinstance(value, bool | int | float | str)
+    return value if is_plain else str(value)

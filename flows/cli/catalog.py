@@ -70,7 +70,7 @@ def list_table(
     absent = _absent(rows) if table == "metrics" else {}
     rows = [row for row in rows if table != "metrics" or row["value"] is not None]
     if as_json:
-        found = {"table": table, "store": store.name, "rows": [_open(row) for row in rows]}
+        found = {"table": table, "store": store.name, "rows": [opened_row(row) for row in rows]}
         missing = [{"names": names, "reason": reason} for reason, names in absent.items()]
         print_json(found | ({"absent": missing} if table == "metrics" else {}))
         return
@@ -99,9 +99,9 @@ def show_record(
 
     table, row = _find(existing_store(), name)
     if as_json:
-        print_json({"table": table, **_open(row)})
+        print_json({"table": table, **opened_row(row)})
         return
-    print_pairs(f"{table}: {name}", {column: _cell(column, row[column]) for column in row})
+    print_pairs(f"{table}: {name}", {column: row_cell(column, row[column]) for column in row})
 
 
 @app.command("explain")
@@ -131,7 +131,7 @@ def explain(
     if as_json:
         print_json(found.to_dict())
     else:
-        sys.stdout.write("\n".join(_tree("", found, set())) + "\n")
+        sys.stdout.write("\n".join(told_explanation("", found, set())) + "\n")
 
 
 @app.command("delete")
@@ -183,7 +183,7 @@ def delete_record(
         print_json({"is_deleted": not dry_run, "num_bytes": num_bytes, "rows": going})
 
 
-def _tree(part: str, found: Any, shown: set[str], depth: int = 0) -> Iterator[str]:  # noqa: ANN401
+def told_explanation(part: str, found: Any, shown: set[str], depth: int = 0) -> Iterator[str]:  # noqa: ANN401
     """An explanation as indented lines; what was explained above is only named."""
     indent = "  " * depth
     state = f"STALE: {'; '.join(found.stale)}" if found.stale else ""
@@ -199,7 +199,7 @@ def _tree(part: str, found: Any, shown: set[str], depth: int = 0) -> Iterator[st
     for what, value in (found.newest or {}).items():
         yield f"{indent}  newest {what}: {_short(value)}"
     for name, made in found.inputs.items():
-        yield from _tree("" if name == made.name else name, made, shown, depth + 1)
+        yield from told_explanation("" if name == made.name else name, made, shown, depth + 1)
 
 
 def _short(value: Any) -> str:  # noqa: ANN401 - any JSON value
@@ -241,7 +241,7 @@ def _absent(rows: list[dict[str, Any]]) -> dict[str, Counter[str]]:
     return found
 
 
-def _open(row: dict[str, Any]) -> dict[str, Any]:
+def opened_row(row: dict[str, Any]) -> dict[str, Any]:
     """A row with times as text and JSON columns as what they hold."""
     from catalog.records import json_of
 
@@ -256,16 +256,17 @@ def _open(row: dict[str, Any]) -> dict[str, Any]:
 def _listed(name: str, value: Any) -> Cell:  # noqa: ANN401 - any value of a table
     """A cell of a list, where a change is its kind and what was asked for, if that is short."""
     if name != "change" or value is None:
-        return _cell(name, value)
+        return row_cell(name, value)
     change = json.loads(value)
     return " ".join(filter(None, (change["kind"], change["parameters"].get("prompt"))))
 
 
-def _cell(name: str, value: Any) -> Cell:  # noqa: ANN401 - any value of a table
+def row_cell(name: str, value: Any) -> Cell:  # noqa: ANN401 - any value of a table
+    """A cell of a table: sizes, times and lists as people read them, long JSON cut off."""
     if value is None or isinstance(value, (bool, float, int)):
         return format_bytes(value) if value is not None and name.endswith("bytes") else value
     if isinstance(value, list):
-        return ", ".join(value)
+        return ", ".join(map(str, value))
     if hasattr(value, "isoformat"):
         return value.strftime("%Y-%m-%d %H:%M:%S")  # UTC, as all times of the catalog
     is_long = name in JSON_COLUMNS and len(value) > LONGEST_JSON
