@@ -1,0 +1,123 @@
+"""What the asset library costs as it grows: one scene merged into it, and questions asked of it.
+
+    PYTHONPATH=.:tests/support python tests/benchmarks/bench_catalog.py [ROWS ...]
+
+CPU seconds of one thread, each in a process of its own, with the largest resident memory of that
+process. `new` merges 50 assets of a scene that is new, `again` those of a scene that is there;
+`rewritten` is the share of the table's bytes that `again` wrote. `open` begins a session of SQL,
+`night sedans` asks for sedans seen from three sides at night with LPIPS under 0.1, `one` for an
+asset by the beginning of its id, `by category` counts all of them.
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from resource import RUSAGE_SELF, getrusage
+
+import pyarrow as pa
+from asset_rows import ACTORS_A_SCENE, asset_id, asset_rows
+from deltalake import DeltaTable, write_deltalake
+from rich.console import Console
+from rich.table import Table
+
+from catalog.asset_queries import AssetFilter, find_asset, find_assets
+from catalog.sql import CatalogSql
+from catalog.tables import FILE_BYTES, CatalogTables
+from flows.interruption import leave
+
+MEASURED = ("new", "again", "ask")
+AT_ONCE = 100_000
+NIGHT_SEDANS = AssetFilter(category="sedan", style="night", min_sides=3, max_lpips=0.1)
+
+
+def fill(root, count):
+    """A library as merges have left it: written scene after scene, its files as large as theirs."""
+    tables = CatalogTables(root)
+    tables.merge("assets", asset_rows(1).to_pylist())
+    for first in range(1, count, AT_ONCE):
+        rows = asset_rows(min(AT_ONCE, count - first), first=first)
+        write_deltalake(f"{root}/assets", rows, mode="append", target_file_size=FILE_BYTES)
+    DeltaTable(f"{root}/assets").optimize.compact(target_size=FILE_BYTES)
+
+
+def measure(what, root, count):
+    """CPU seconds by name, in this process."""
+    if what == "ask":
+        return ask(root, count)
+    first = count if what == "new" else count // 2
+    rows = asset_rows(ACTORS_A_SCENE, first=first).to_pylist()
+    tables = CatalogTables(root)
+    before = sizes(root)
+    seconds = timed(lambda: tables.merge("assets", rows))
+    after = sizes(root)
+    written = sum(size for path, size in after.items() if path not in before)
+    return {what: seconds, f"{what} wrote": written / sum(after.values())}
+
+
+def ask(root, count):
+    """The questions, one after the other."""
+    opened = []
+    found = {"open": timed(lambda: opened.append(CatalogSql(CatalogTables(root))))}
+    (sql,) = opened
+    questions = {
+        "night sedans": lambda: find_assets(sql, NIGHT_SEDANS, sort="score", most=50),
+        "one": lambda: find_asset(sql, asset_id(count // 2)[:12]),
+        "by category": lambda: sql.ask("SELECT category, count(*) FROM assets GROUP BY category"),
+    }
+    return found | {name: timed(question) for name, question in questions.items()}
+
+
+def timed(action):
+    start = time.process_time()
+    action()
+    return time.process_time() - start
+
+
+def sizes(root):
+    """Bytes of the table's files, by path."""
+    actions = pa.table(DeltaTable(f"{root}/assets").get_add_actions())
+    return dict(zip(*(actions[name].to_pylist() for name in ("path", "size_bytes")), strict=True))
+
+
+def measured_apart(what, root, count):
+    """The same in a process of its own, with its largest memory."""
+    command = [sys.executable, __file__, "--measure", what, root, str(count)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    return json.loads(done.stdout)
+
+
+def main(counts):
+    """Print a row for each size of the library."""
+    heads = ("assets", "MB", "files", "new", "again", "rewritten", "merge MB", "open")
+    shown = Table(*heads, "night sedans", "one", "by category", "ask MB", title="CPU seconds")
+    for count in counts:
+        with tempfile.TemporaryDirectory() as root:
+            fill(root, count)
+            found = {what: measured_apart(what, root, count) for what in MEASURED}
+            stored = sizes(root)
+        new, again, ask_ = (found[what] for what in MEASURED)
+        shown.add_row(
+            f"{count:,}",
+            f"{sum(stored.values()) / 1e6:.1f}",
+            str(len(stored)),
+            f"{new['new']:.2f}",
+            f"{again['again']:.2f}",
+            f"{again['again wrote']:.0%}",
+            f"{max(new['MB'], again['MB']):.0f}",
+            *(f"{ask_[name]:.2f}" for name in ("open", "night sedans", "one", "by category")),
+            f"{ask_['MB']:.0f}",
+        )
+    Console(width=140).print(shown)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--measure"]:
+        what, root, count = sys.argv[2], sys.argv[3], int(sys.argv[4])
+        found = measure(what, root, count)
+        peak_mb = getrusage(RUSAGE_SELF).ru_maxrss / 1000
+        sys.stdout.write(json.dumps(found | {"MB": peak_mb}))
+        leave(0)  # threads of the libraries may abort an interpreter on its way out
+    else:
+        main([int(count) for count in sys.argv[1:]] or [1_000, 10_000, 100_000, 1_000_000])
