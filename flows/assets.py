@@ -34,7 +34,7 @@ def publish_run(store: Store, run: str) -> dict[str, Any]:
         )
     style = None if finished.change is None else finished.change["parameters"]["prompt"]
     parameters = view_parameters(finished)
-    published = publish_assets(parameters.run_spec(store.root), finished, parameters.observation)
+    published = publish_assets(parameters.run_spec(store.address), finished, parameters.observation)
     ids = enter_published(store, finished, published, style)
     counts = {name: count for name, count in published.summary.items() if name.startswith("num_")}
     return {
