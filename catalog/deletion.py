@@ -9,15 +9,14 @@ leaves nothing half-deleted under a name.
 import re
 import shutil
 import uuid
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from catalog.artefacts import ArtefactRef
 from catalog.assets import forget_sightings
 from catalog.errors import CatalogError, UnknownRecordError, storage_errors
-from catalog.records import json_of
+from catalog.needs import Needs
 from catalog.store import Store
 from catalog.tables import Row
 
@@ -60,15 +59,15 @@ def plan_deletion(store: Store, table: str, row: Row) -> Deletion:
         raise UnknownRecordError(
             f"rows of {table} are not deleted, expected a run, an artefact or a scene"
         )
-    needs, name = _Needs(store), row[KEYS[table]]
-    named = _doomed(store, table, [name])
+    needs, name = Needs(store), row[KEYS[table]]
+    named = doomed_rows(store, table, [name])
     if table == "runs":
         if row["status"] == "running":
             raise CatalogError(f"run {name} is running, expected one that has ended")
-        listed = needs.listed(but=name)
+        listed = needs.listed(run["run_id"] for run in needs.runs if run["run_id"] != name)
         own = set(row["artefacts"] or ()) - listed
         own |= needs.made_from(own) - listed
-        return Deletion(own=(*named, *_doomed(store, "artefacts", own)), dependents=())
+        return Deletion(own=(*named, *doomed_rows(store, "artefacts", own)), dependents=())
     if table == "artefacts":
         made = needs.made_from({name})
         runs = needs.runs_with({name, *made})
@@ -78,9 +77,9 @@ def plan_deletion(store: Store, table: str, row: Row) -> Deletion:
         runs |= needs.runs_with(made)
     gone = {*made, *([name] if table == "artefacts" else [])}
     dependents = (
-        *_doomed(store, "runs", runs),
-        *_doomed(store, "painters", needs.painters_in(gone)),
-        *_doomed(store, "artefacts", made),
+        *doomed_rows(store, "runs", runs),
+        *doomed_rows(store, "painters", needs.painters_in(gone)),
+        *doomed_rows(store, "artefacts", made),
     )
     return Deletion(own=tuple(named), dependents=dependents)
 
@@ -111,55 +110,23 @@ def delete(store: Store, doomed: Sequence[Doomed]) -> None:
             shutil.rmtree(aside)
 
 
-class _Needs:
-    """Who needs whom, as the tables are now."""
+def doomed_rows(store: Store, table: str, names: Iterable[str]) -> list[Doomed]:
+    """Rows of a table by id, with their folders and sizes.
 
-    def __init__(self, store: Store) -> None:
-        self.runs = store.rows("runs")
-        self._painters = store.rows("painters")
-        self._inputs: Mapping[str, set[str]] = {
-            row["artefact_id"]: set(json_of(row, "inputs").values())
-            for row in store.rows("artefacts")
-        }
-
-    def listed(self, *, but: str) -> set[str]:
-        """The artefacts of all runs but one."""
-        others = (row["artefacts"] or () for row in self.runs if row["run_id"] != but)
-        return {name for artefacts in others for name in artefacts}
-
-    def runs_with(self, artefacts: set[str]) -> set[str]:
-        """The runs that list one of them."""
-        return {row["run_id"] for row in self.runs if artefacts & set(row["artefacts"] or ())}
-
-    def painters_in(self, artefacts: set[str]) -> set[str]:
-        """The painters whose weights lie in one of them."""
-        folders = tuple(f"artefacts/{name}/" for name in artefacts)
-        return {row["painter_id"] for row in self._painters if row["path"].startswith(folders)}
-
-    def made_of(self, digest: str) -> set[str]:
-        """The artefacts with this digest among their inputs, however far back."""
-        first = {name for name, inputs in self._inputs.items() if digest in inputs}
-        return first | self.made_from(first)
-
-    def made_from(self, artefacts: set[str]) -> set[str]:
-        """The artefacts that were made from these, and from those in turn; without these."""
-        found: set[str] = set()
-        new = artefacts
-        while new:
-            digests = {ArtefactRef.of_id(name).digest for name in new}
-            new = {name for name, inputs in self._inputs.items() if inputs & digests}
-            new -= found | artefacts
-            found |= new
-        return found
-
-
-def _doomed(store: Store, table: str, names: Iterable[str]) -> list[Doomed]:
+    Raises:
+        CatalogError: a name leads out of the store.
+    """
     found = []
     for name in sorted(names):
         folder = _folder(store, table, name) if table in ("artefacts", "scenes") else None
         num_bytes = 0 if folder is None else store.entry_bytes(folder)
         found.append(Doomed(table=table, row_id=name, folder=folder, num_bytes=num_bytes))
     return found
+
+
+def size_of(folder: Path) -> int:
+    """Bytes of all files below a folder."""
+    return sum(path.lstat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def _folder(store: Store, table: str, name: str) -> Path:

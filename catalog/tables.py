@@ -10,8 +10,9 @@ import os
 import random
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -113,7 +114,7 @@ class CatalogTables:
 
     def _committed(self, schema: TableSchema, attempted: Callable[[], int | None]) -> int:
         """Attempt a commit until it wins, a bounded number of times; None is a lost attempt."""
-        with _damage(f"cannot write table {self._uri(schema)}"):
+        with damage_told(f"cannot write table {self._uri(schema)}"):
             self._require_room()
             for attempt in range(COMMIT_ATTEMPTS):
                 if attempt:
@@ -137,33 +138,65 @@ class CatalogTables:
         if shutil.disk_usage(folder).free < LEAST_ROOM_BYTES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    def rows(self, table: str) -> list[Row]:
-        """All rows of a table, by id; none if nothing was ever written."""
-        arrow = self.arrow(table)
+    def rows(self, table: str, *, as_of: int | datetime | None = None) -> list[Row]:
+        """All rows of a table, by id, as it is or was; see `arrow`."""
+        arrow = self.arrow(table, as_of=as_of)
         return arrow.sort_by(_schema(table).key).to_pylist()
 
-    def arrow(self, table: str) -> pa.Table:
-        """A table as Arrow, with exactly the columns of its schema."""
+    def arrow(
+        self, table: str, *, columns: Collection[str] = (), as_of: int | datetime | None = None
+    ) -> pa.Table:
+        """A table as Arrow, with exactly the columns of its schema.
+
+        Args:
+            table: its name.
+            columns: only these; none means all.
+            as_of: its version, or the time at which it stood so; None means now.
+
+        Raises:
+            UnknownRecordError: there is no such version, or its files were vacuumed.
+            StorageError: the table cannot be read.
+        """
         schema = _schema(table)
-        with _damage(f"cannot read table {self._uri(schema)}"):
-            try:
-                found = self._current(schema)
-            except TableNotFoundError:
+        with damage_told(f"cannot read table {self._uri(schema)}"):
+            found = self.delta(table, as_of=as_of)
+            if found is None:
                 return schema.arrow.empty_table()
             # pyarrow's threads may outlive the read and abort the interpreter as it ends
-            stored = found.to_pyarrow_dataset().to_table(use_threads=False)
-        columns = [
+            there = found.to_pyarrow_dataset()
+            wanted = [field for field in schema.arrow if not columns or field.name in columns]
+            names = [field.name for field in wanted if field.name in there.schema.names]
+            try:
+                stored = there.to_table(columns=names, use_threads=False)
+            except FileNotFoundError:
+                if as_of is None:
+                    raise
+                raise UnknownRecordError(
+                    f"{table} as of {as_of} was vacuumed, expected a later version"
+                ) from None
+        found_columns = [
             stored[field.name].cast(field.type)
-            if field.name in stored.column_names
+            if field.name in names
             else pa.nulls(stored.num_rows, field.type)
-            for field in schema.arrow
+            for field in wanted
         ]
-        return pa.table(columns, schema=schema.arrow)
+        return pa.table(found_columns, schema=pa.schema(wanted))
+
+    def delta(self, table: str, *, as_of: int | datetime | None = None) -> DeltaTable | None:
+        """The Delta table itself, as it is or was; None if nothing was ever written.
+
+        Raises:
+            UnknownRecordError: there is no such version.
+        """
+        schema = _schema(table)
+        with suppress(TableNotFoundError):
+            return self._current(schema) if as_of is None else self._past(schema, as_of)
+        return None
 
     def files(self, table: str) -> list[str]:
         """The Parquet files that a table in a folder consists of; none if nothing was written."""
         schema = _schema(table)
-        with _damage(f"cannot read table {self._uri(schema)}"):
+        with damage_told(f"cannot read table {self._uri(schema)}"):
             try:
                 return [unquote(uri) for uri in self._current(schema).file_uris()]
             except TableNotFoundError:
@@ -194,6 +227,23 @@ class CatalogTables:
 
     def _uri(self, schema: TableSchema) -> str:
         return f"{self.root}/{schema.name}"
+
+    def _past(self, schema: TableSchema, as_of: int | datetime) -> DeltaTable:
+        """The table as it was.
+
+        Raises:
+            TableNotFoundError: nothing was ever written.
+            UnknownRecordError: there is no such version.
+        """
+        found = DeltaTable(self._uri(schema), storage_options=self.storage_options)
+        try:
+            found.load_as_version(as_of)
+        except (DeltaError, ValueError, OverflowError) as error:
+            why = str(error).splitlines()[0][:200]
+            raise UnknownRecordError(
+                f"no {schema.name} as of {as_of}, the last version is {found.version()} ({why})"
+            ) from None
+        return found
 
     def _try_delete(self, schema: TableSchema, predicate: str) -> int | None:
         """One commit; how many rows went, or None if it lost."""
@@ -271,7 +321,7 @@ class CatalogTables:
 
 
 @contextmanager
-def _damage(doing: str) -> Iterator[None]:
+def damage_told(doing: str) -> Iterator[None]:
     """Turn a damaged table or a bucket that does not answer into one line, as a failing disk."""
     try:
         with storage_errors(doing):

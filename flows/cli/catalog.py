@@ -4,14 +4,19 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from flows.cli import upkeep
 from flows.cli.output import Cell, format_bytes, print_json, print_pairs, print_table
 from flows.cli.shared_options import AsJson
 
+if TYPE_CHECKING:
+    from datetime import datetime
+
 app = typer.Typer(help="What the store holds.", no_args_is_help=True)
+app.add_typer(upkeep.app)
 
 SHOWN_COLUMNS = {
     "scenes": ("scene_id", "num_frames", "num_views", "num_actors", "duration_s", "num_bytes"),
@@ -53,10 +58,14 @@ def list_table(
             "sightings."
         ),
     ] = "runs",
+    as_of: Annotated[
+        str | None, typer.Option(help="A version of the table, or a time: 2026-11-22T08:00.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """List a table of the catalog: runs, artefacts and painters from the newest on.
 
+    As it is, or with --as-of as it was; `catalog vacuum` says how far that reaches back.
     Metrics that have no value are not listed but counted, by the reason why there is none.
 
     Example: lidarpainter catalog list scenes
@@ -64,7 +73,8 @@ def list_table(
     from catalog.store import existing_store
 
     store = existing_store()
-    rows = store.rows(table)
+    past = None if as_of is None else _version_or_time(as_of)
+    rows = store.rows(table) if past is None else store.tables.rows(table, as_of=past)
     if table in NEWEST_FIRST:
         rows.sort(key=lambda row: str(row[NEWEST_FIRST[table]] or ""), reverse=True)
     absent = _absent(rows) if table == "metrics" else {}
@@ -84,6 +94,27 @@ def list_table(
     print_table(f"{table} in {store.name}", columns, cells, note)
 
 
+def _version_or_time(text: str) -> "int | datetime":
+    """What `--as-of` means; a time without a zone is UTC, as all times of the catalog.
+
+    Raises:
+        ConfigError: it is neither a number nor a time.
+    """
+    from datetime import UTC, datetime
+
+    from lidarpainter_models.errors import ConfigError
+
+    if text.isdecimal():
+        return int(text)
+    try:
+        found = datetime.fromisoformat(text)
+    except ValueError:
+        raise ConfigError(
+            f"--as-of {text!r}: expected a version such as 3, or a time such as 2026-11-22T08:00"
+        ) from None
+    return found if found.tzinfo else found.replace(tzinfo=UTC)
+
+
 @app.command("show")
 def show_record(
     name: Annotated[
@@ -97,7 +128,7 @@ def show_record(
     """
     from catalog.store import existing_store
 
-    table, row = _find(existing_store(), name)
+    table, row = find_row(existing_store(), name)
     if as_json:
         print_json({"table": table, **opened_row(row)})
         return
@@ -120,7 +151,7 @@ def explain(
     from tasks.stages import project_source
 
     store = existing_store()
-    table, row = _find(store, name)
+    table, row = find_row(store, name)
     explainer = Explainer(store, project_source().code_from)
     if table == "runs":
         found = explainer.run(row)
@@ -159,7 +190,7 @@ def delete_record(
     from catalog.store import existing_store
 
     store = existing_store()
-    plan = plan_deletion(store, *_find(store, name))
+    plan = plan_deletion(store, *find_row(store, name))
     doomed = (*plan.own, *plan.dependents)
     if plan.dependents and not with_dependents and not dry_run:
         named = ", ".join(f"{one.table[:-1]} {one.row_id}" for one in plan.dependents[:5])
@@ -207,7 +238,7 @@ def _short(value: Any) -> str:  # noqa: ANN401 - any JSON value
     return f"{text[:LONGEST_JSON]}... (--json shows all)" if len(text) > LONGEST_JSON else text
 
 
-def _find(store: Any, name: str) -> tuple[str, dict[str, Any]]:  # noqa: ANN401 - imported late
+def find_row(store: Any, name: str) -> tuple[str, dict[str, Any]]:  # noqa: ANN401 - imported late
     """The row with a name, wherever it stands.
 
     Raises:

@@ -1,67 +1,24 @@
 """What is deleted is gone with what it alone needed; what others need stays."""
 
 import pytest
+from shop import Shop
 
-from catalog.artefacts import Recipe
-from catalog.code_closure import Code
-from catalog.deletion import delete, plan_deletion
+from catalog.deletion import delete
 from catalog.errors import CatalogError, UnknownRecordError
-from catalog.records import artefact_row
-from catalog.store import open_store
 
 
 def ids(doomed):
     return {(one.table, one.row_id.split("/")[0]) for one in doomed}
 
 
-class Shop:
-    """A store with a scene, two runs that share a fit, and what was made later from one of them."""
-
-    def __init__(self, folder):
-        self.store = open_store(folder / "store")
-        scene = self.store.root / "scenes/toy/street"
-        scene.mkdir(parents=True)
-        (scene / "manifest.json").write_text("12345")
-        row = {"scene_id": "toy/street", "content_digest": "scene-digest"}
-        self.store.tables.merge("scenes", [row])
-        self.fit = self.made("fit", scene="scene-digest")
-        self.first = self.made("first", fit=self.fit.digest)
-        self.second = self.made("second", fit=self.fit.digest)
-        self.flicker = self.made("flicker", fitted=self.first.digest)
-        self.run("r1", self.fit, self.first)
-        self.run("r2", self.fit, self.second)
-        weights = f"artefacts/{self.second.artefact_id}/w.safetensors"
-        self.store.tables.merge("painters", [{"painter_id": "p1", "path": weights}])
-
-    def made(self, kind, **inputs):
-        recipe = Recipe(kind=kind, inputs=inputs, config={}, code=Code(modules={}, starts=[]))
-
-        def build(place):
-            (place.output / "data").write_bytes(b"-" * 1000)
-
-        ref, _is_new = self.store.artefacts.produce(recipe, build)
-        manifest = self.store.artefacts.manifest(ref)
-        self.store.tables.merge("artefacts", [artefact_row(ref, manifest)])
-        return ref
-
-    def run(self, run_id, *refs, status="complete"):
-        row = {"run_id": run_id, "scene_id": "toy/street", "status": status}
-        artefacts = [ref.artefact_id for ref in refs]
-        self.store.tables.merge("runs", [{**row, "artefacts": artefacts}])
-        metric = {"metric_id": f"m-{run_id}", "run_id": run_id, "name": "psnr", "value": 30.0}
-        self.store.tables.merge("metrics", [metric])
-
-    def plan(self, table, name):
-        return plan_deletion(self.store, table, self.store.row(table, name))
-
-    def names(self, table):
-        key = next(iter(self.store.tables.arrow(table).column_names))
-        return {row[key].split("/")[0] for row in self.store.rows(table)}
+@pytest.fixture(scope="module")
+def first_shop(tmp_path_factory):
+    return Shop(tmp_path_factory.mktemp("shop"))
 
 
 @pytest.fixture
-def shop(tmp_path):
-    return Shop(tmp_path)
+def shop(first_shop, tmp_path):
+    return first_shop.copied(tmp_path)
 
 
 def test_a_run_goes_with_what_it_alone_needs(shop):

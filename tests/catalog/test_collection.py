@@ -1,0 +1,138 @@
+"""What somebody needs stays, what nobody needs is found, whoever was killed in the middle."""
+
+import fcntl
+import os
+import time
+from datetime import UTC, datetime, timedelta
+
+import pytest
+from shop import Shop
+
+from catalog.collection import plan_collection
+from catalog.deletion import delete
+from catalog.locks import held_lock
+
+NOW = datetime.now(UTC)
+LONG_AGO = NOW - timedelta(days=90)
+SINCE = NOW - timedelta(days=30)
+
+
+@pytest.fixture(scope="module")
+def old_shop(tmp_path_factory):
+    """All of it is old, and no painter is in it."""
+    made = Shop(tmp_path_factory.mktemp("shop"))
+    made.store.tables.delete("painters", "painter_id", ["p1"])
+    artefacts, runs = (made.store.tables.rows(table) for table in ("artefacts", "runs"))
+    made.store.tables.merge("artefacts", [{**row, "created_at": LONG_AGO} for row in artefacts])
+    then = {"started_at": LONG_AGO, "finished_at": LONG_AGO}
+    made.store.tables.merge("runs", [{**row, **then} for row in runs])
+    return made
+
+
+@pytest.fixture
+def shop(old_shop, tmp_path):
+    made = old_shop.copied(tmp_path)
+    age(made.store.root / "scenes/toy/street", days=90)
+    return made
+
+
+def age(path, *, days):
+    then = time.time() - days * 86400
+    os.utime(path, (then, then))
+
+
+def going(shop):
+    return {
+        (one.table, one.row_id.split("/")[0] if one.table == "artefacts" else one.row_id)
+        for one in plan_collection(shop.store, SINCE)
+    }
+
+
+def ids(table, *names):
+    return {(table, name) for name in names}
+
+
+EVERYTHING = {
+    *ids("runs", "r1", "r2"),
+    *ids("artefacts", "fit", "first", "second", "flicker"),
+    *ids("scenes", "toy/street"),
+}
+OF_R1 = {*ids("runs", "r1"), *ids("artefacts", "first", "flicker")}
+
+
+def test_nothing_recent_needs_old_things(shop):
+    assert going(shop) == EVERYTHING
+    delete(shop.store, plan_collection(shop.store, SINCE))
+    assert not list(shop.store.root.glob("artefacts/*/*"))
+    assert not (shop.store.root / "scenes/toy/street").exists()
+    assert going(shop) == set()
+
+
+def test_a_recent_run_keeps_what_it_was_made_from(shop):
+    shop.change("runs", "r2", finished_at=NOW)
+    assert going(shop) == OF_R1
+
+
+def test_a_wanted_sequence_keeps_its_run(shop):
+    wanted = {"sequence_id": "s1", "scene_id": "toy/street", "run_id": "r2", "state": "done"}
+    shop.store.tables.merge("sequences", [wanted])
+    assert going(shop) == OF_R1
+
+
+def test_a_sequence_that_waits_keeps_what_it_may_take_up(shop):
+    waiting = {"sequence_id": "s1", "scene_id": "toy/street", "state": "waiting"}
+    shop.store.tables.merge("sequences", [waiting])
+    assert going(shop) == ids("runs", "r1", "r2")
+
+
+def test_a_running_run_keeps_what_it_may_take_up(shop):
+    shop.run("r3", status="running")
+    with shop.store.run_lock("r3"):
+        assert going(shop) == ids("runs", "r1", "r2")
+
+
+def test_a_trained_painter_stays_with_what_it_was_made_from(shop):
+    shop.store.tables.merge(
+        "painters", [{"painter_id": "p", "path": f"artefacts/{shop.second.artefact_id}/w"}]
+    )
+    gone = {*ids("runs", "r1", "r2"), *ids("artefacts", "first", "flicker")}
+    assert going(shop) == gone
+
+
+def test_what_was_made_from_a_needed_artefact_stays_though_no_run_lists_it(shop):
+    shop.change("runs", "r1", finished_at=NOW)
+    assert going(shop) == {*ids("runs", "r2"), *ids("artefacts", "second")}
+
+
+def test_a_changed_run_keeps_the_run_that_it_was_changed_from(shop):
+    shop.change("runs", "r2", finished_at=NOW, derived_from="r1")
+    assert going(shop) == set()
+
+
+def test_what_killed_processes_left_is_found_and_what_is_locked_is_not(shop):
+    root, digest = shop.store.root, "0" * 32
+    wanted = {"sequence_id": "s1", "scene_id": "toy/street", "run_id": "r1", "state": "done"}
+    shop.store.tables.merge("sequences", [wanted, {**wanted, "sequence_id": "s2", "run_id": "r2"}])
+    abandoned = (
+        f"artefacts/fit/{digest}",
+        f"work/{digest}",
+        f"aside/{digest}-12345678",
+        "scenes/toy/.street.writing-1234",
+    )
+    for name in (*abandoned, f"work/{shop.fit.digest}", "aside/fresh-1"):
+        (root / name).mkdir(parents=True)
+    for name in abandoned:
+        age(root / name, days=90)
+    (root / "leases").mkdir()
+    (root / "leases" / "s1").write_text("{}")
+    found = {*ids("leftovers", *abandoned, f"work/{shop.fit.digest}")}
+    assert going(shop) == found
+    writing = root / "scenes/toy/.street.writing-1234/.writing"
+    writing.touch()
+    age(writing.parent, days=90)
+    with held_lock(root / "locks" / f"{digest}.lock"), writing.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        assert going(shop) == ids("leftovers", f"work/{shop.fit.digest}")
+    delete(shop.store, plan_collection(shop.store, SINCE))
+    assert going(shop) == set()
+    assert (root / "leases" / "s1").exists()
