@@ -157,7 +157,7 @@ class Explainer:
         except IdentityError as error:
             yield f"its code is gone: {error}"
             return
-        if changed := _changed_modules(manifest.code, today.modules):
+        if changed := changed_modules(manifest.code, today.modules):
             yield f"code changed: {', '.join(changed)}"
 
     def _newest(self, ref: ArtefactRef, manifest: Manifest) -> dict[str, Any] | None:
@@ -172,7 +172,7 @@ class Explainer:
             "name": newest["artefact_id"],
             "inputs": _changes(manifest.inputs, other.inputs),
             "settings": _changes(manifest.config, other.config),
-            "code": _changed_modules(manifest.code, other.code),
+            "code": changed_modules(manifest.code, other.code),
         }
 
 
@@ -188,7 +188,8 @@ def _share_an_input(ours: Mapping[str, str], theirs: Mapping[str, str]) -> bool:
     return ours.keys() == theirs.keys() and bool(ours.items() & theirs.items())
 
 
-def _changed_modules(before: Mapping[str, str], after: Mapping[str, str]) -> list[str]:
+def changed_modules(before: Mapping[str, str], after: Mapping[str, str]) -> list[str]:
+    """The modules of which other code is reached than before, by their digests."""
     return sorted(name for name in {*before, *after} if before.get(name) != after.get(name))
 
 

@@ -109,6 +109,7 @@ def artefact_row(ref: ArtefactRef, manifest: Manifest) -> dict[str, Any]:
         "inputs": canonical_json(manifest.inputs),
         "config": canonical_json(manifest.config),
         "source_digest": manifest.source_digest,
+        "starts": list(manifest.starts),
         "num_bytes": manifest.num_bytes,
         "seconds": manifest.seconds,
         "created_at": datetime.fromisoformat(manifest.created_at),

@@ -125,6 +125,7 @@ ARTEFACTS = TableSchema(
         Column("inputs", "text", "digest of every input by its part, JSON"),
         Column("config", "text", "configuration of the stage, canonical JSON"),
         Column("source_digest", "text", "digest of the code that made it"),
+        Column("starts", "texts", "where that code starts, module:name"),
         Column("num_bytes", "integer", "size of its files", "byte"),
         Column("seconds", "number", "wall time of the process that finished it", "s"),
         Column("created_at", "time", "when it was finished"),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flows.cli import upkeep
+from flows.cli import questions, upkeep
 from flows.cli.output import Cell, format_bytes, print_json, print_pairs, print_table
 from flows.cli.shared_options import AsJson
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from datetime import datetime
 
 app = typer.Typer(help="What the store holds.", no_args_is_help=True)
+app.add_typer(questions.app)
 app.add_typer(upkeep.app)
 
 SHOWN_COLUMNS = {
@@ -92,6 +93,23 @@ def list_table(
         for reason, names in absent.items()
     )
     print_table(f"{table} in {store.name}", columns, cells, note)
+
+
+@app.command("tables")
+def describe_tables(as_json: AsJson = False) -> None:
+    """Describe every table and column: type, unit and meaning, as Markdown.
+
+    Example: lidarpainter catalog tables
+    """
+    from dataclasses import asdict
+
+    from catalog.schemas import TABLES
+    from catalog.table_docs import tables_page
+
+    if as_json:
+        print_json({"tables": [asdict(table) for table in TABLES.values()]})
+    else:
+        sys.stdout.write(tables_page())
 
 
 def _version_or_time(text: str) -> "int | datetime":

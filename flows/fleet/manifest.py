@@ -143,6 +143,8 @@ class Budget(BaseModel):
 
     hours: Annotated[Number, Field(gt=0)] | None = None
     """Of all workers together; nothing begins after that."""
+    money_per_hour: Annotated[Number, Field(ge=0)] | None = None
+    """Of one worker, in whatever currency; for what `fleet report` and `catalog cost` say."""
     hours_per_sequence: Annotated[Number, Field(gt=0)] | None = None
     """An attempt that takes longer is ended, and tried again."""
     memory_gb: Annotated[Number, Field(gt=0)] | None = None

@@ -12,7 +12,6 @@ import pytest
 from commands import call, seen_image, settings, succeed
 from tiny_street import FRONT, HEIGHT_PX, NUM_FRAMES, SCENE, SETTINGS, SIDE, WIDTH_PX
 
-from flows.cli.catalog import app as catalog_app
 from flows.cli.evaluate import PROTOCOLS
 from lidarpainter_models.painter.styles import STYLE_PROMPTS
 
@@ -342,7 +341,7 @@ def test_catalog_shows_a_scene_a_run_and_an_artefact_by_prefix(tiny_run):
         assert name in succeed("catalog", "show", name, store=tiny_run.store).out
 
 
-@pytest.mark.parametrize("command", [command.name for command in catalog_app.registered_commands])
+@pytest.mark.parametrize("command", ["list", "show", "explain", "delete"])
 def test_every_command_of_the_catalog_answers_about_the_run(tiny_run, command):
     names = {"list": ("runs",), "delete": (tiny_run.run_id, "--dry-run")}
     words = ("catalog", command, *names.get(command, (tiny_run.run_id,)))
