@@ -6,12 +6,13 @@ from catalog.schemas import TABLES, TableSchema
 
 HEAD = """# Tables of the catalog
 
-Delta Lake tables below `STORE/tables/`, each merged on its first column. Times are UTC, texts are UTF-8, JSON is
-canonical (sorted keys, no spaces). This page is what `lidarpainter catalog tables` prints, made from
-`catalog/schemas.py`; what becomes of tables that older or newer software wrote is said there.
+Delta Lake tables below `STORE/tables/`, each merged on its first column. Times are UTC, JSON is
+canonical (sorted keys, no spaces). This page is what `lidarpainter catalog tables` prints, from the
+dictionary in `catalog/schemas.py`, which says too what becomes of tables that older or newer
+software wrote.
 
-`lidarpainter catalog list TABLE --as-of VERSION|TIME` shows a table as it was. From Python:
-`deltalake.DeltaTable("STORE/tables/runs").to_pyarrow_table()`; DuckDB, polars and Spark read the same files.
+`lidarpainter catalog list TABLE --as-of VERSION|TIME` shows a table as it was. DuckDB, polars and
+Spark read the same files; from Python, `deltalake.DeltaTable("STORE/tables/runs").to_pandas()`.
 """
 
 

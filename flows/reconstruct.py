@@ -22,6 +22,7 @@ from lidarpainter_models.observations.fit_size import require_recorded_width
 from lidarpainter_models.painter.selection import NO_PAINTER
 from tasks.evaluation.views import evaluate, load_scores
 from tasks.opened import opened
+from tasks.progress import working_on
 from tasks.reconstruction.fit import fit
 from tasks.reconstruction.paint import paint
 from tasks.reconstruction.prepare import prepare
@@ -61,7 +62,7 @@ def reconstruct(parameters: ReconstructParameters, store_path: Path) -> dict[str
     run = parameters.run_spec(store_path)
     store = open_store(store_path)
     run_id, source_digest = run_identity(parameters, store), code_behind(START).digest
-    with store.run_lock(run_id):
+    with store.run_lock(run_id), working_on(scene=parameters.scene, run=run_id):
         record = begin_run(run, run_id, source_digest, parameters.preset, parameters)
         with early_end_recorded(store_path, record):
             return _run(Course(parameters=parameters, run=run, record=record))

@@ -5,7 +5,7 @@ reports into silence. The listener belongs to the running context, so two flows 
 not hear each other.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Protocol
@@ -54,6 +54,24 @@ _listener: ContextVar[ProgressListener | None] = ContextVar("progress_listener",
 def listener() -> ProgressListener:
     """Who listens in this context."""
     return _listener.get() or _SILENCE
+
+
+_subject: ContextVar[Mapping[str, str] | None] = ContextVar("progress_subject", default=None)
+
+
+def subject() -> Mapping[str, str]:
+    """What is worked on in this context: `scene` and `run`, as far as they are known."""
+    return _subject.get() or {}
+
+
+@contextmanager
+def working_on(**facts: str) -> Iterator[None]:
+    """Say of everything inside the block what it is about."""
+    token = _subject.set({**subject(), **facts})
+    try:
+        yield
+    finally:
+        _subject.reset(token)
 
 
 Progress = Callable[..., None]

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from flows.cli import fleet_report
 from flows.cli.output import complain, loudness, print_json, print_table, say_status
 from flows.cli.shared_options import AsJson
 
@@ -18,6 +19,7 @@ Fleet = Annotated[
 ]
 
 app = typer.Typer(help="Many sequences from one manifest.", no_args_is_help=True)
+app.add_typer(fleet_report.app)
 
 
 @app.command("run")
@@ -71,6 +73,10 @@ def status(
     failed: Annotated[
         bool, typer.Option("--failed", help="Only what failed or was set aside, and why.")
     ] = False,
+    metrics: Annotated[
+        Path | None,
+        typer.Option(help="Also write this file, X.prom, in the text format of Prometheus."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Show where every sequence of a fleet stands.
@@ -80,7 +86,12 @@ def status(
     from flows.fleet.status import fleet_status
 
     ledger = _ledger()
-    found = fleet_status(ledger, fleet or ledger.latest())
+    name = fleet or ledger.latest()
+    if metrics is not None:
+        from flows.fleet.metrics_file import write_metrics
+
+        write_metrics(ledger, name, metrics)
+    found = fleet_status(ledger, name)
     if failed:
         amiss = [one for one in found["sequences"] if one["state"] in ("failed", "set-aside")]
         found = {**found, "sequences": amiss}
@@ -126,10 +137,14 @@ def work(fleet: Annotated[str, typer.Argument(help="Name of the fleet.")]) -> No
     """
     ledger = _ledger()
     ledger.rows(fleet)
+    from flows.fleet.event_log import EventLog
     from flows.fleet.work import make_sequence
     from flows.fleet.worker import Worker
+    from tasks.progress import listening
 
-    Worker(ledger=ledger, fleet=fleet, work=make_sequence, say=_log).run()
+    log = EventLog(fleet, sys.stderr.write)
+    with listening(log):
+        Worker(ledger=ledger, fleet=fleet, work=make_sequence, say=log).run()
 
 
 def _ledger() -> "FleetLedger":
@@ -165,12 +180,3 @@ def _show_scenes(fleet: str, state: str, scenes: list[str], *, as_json: bool) ->
 def _tell(line: str) -> None:
     if loudness() != "quiet":
         complain(line)
-
-
-def _log(line: str) -> None:
-    """What a worker does, with the time: one line for one event."""
-    from datetime import UTC, datetime
-
-    now = datetime.now(UTC).isoformat(timespec="seconds")
-    sys.stderr.write(f"{now} {' '.join(line.split())}\n")
-    sys.stderr.flush()

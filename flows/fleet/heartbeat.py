@@ -8,6 +8,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
+from contextvars import copy_context
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -50,7 +51,8 @@ class Heartbeat:
         self._on_late = on_late
         self._began, self._cpu_began = time.monotonic(), time.process_time()
         self._over = threading.Event()
-        self._thread = threading.Thread(target=self._beat, daemon=True)
+        run = copy_context().run  # what it says is about the same
+        self._thread = threading.Thread(target=run, args=(self._beat,), daemon=True)
 
     def __enter__(self) -> Self:
         """Start to beat."""

@@ -28,6 +28,7 @@ from flows.fleet.manifest import Budget
 from flows.fleet.planner import Planner
 from flows.fleet.work import Work
 from flows.interruption import at_interruption
+from tasks.progress import working_on
 
 POLL_S = 2.0
 REPLAN_S = 30.0
@@ -75,7 +76,8 @@ class Worker:
         if taken is None:
             time.sleep(self.poll_s)
         else:
-            self._attempt(*taken)
+            with working_on(scene=taken[0]["scene_id"]):
+                self._attempt(*taken)
             self.ledger.store.release()
         return False
 

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidarpainter_models.errors import WriteError
+from lidarpainter_models.errors import DataError, WriteError
 
 JPEG_QUALITY = 90
 WEBP_QUALITY = 80
@@ -26,9 +26,39 @@ def to_bytes(rgb: Float[Tensor, "height width 3"]) -> np.ndarray:
 
 def jpeg_data_url(rgb: Float[Tensor, "height width 3"]) -> str:
     """The image as a JPEG that stands inside a page."""
-    bgr = cv2.cvtColor(to_bytes(rgb), cv2.COLOR_RGB2BGR)
-    _, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode("ascii")
+    return "data:image/jpeg;base64," + base64.b64encode(_jpeg(rgb)).decode("ascii")
+
+
+def write_jpeg(rgb: Float[Tensor, "height width 3"], path: Path) -> Path:
+    """Write a JPEG, folders included.
+
+    Raises:
+        WriteError: the file cannot be written.
+    """
+    return _write_bytes(_jpeg(rgb), path)
+
+
+def read_image(path: Path) -> Float[Tensor, "height width 3"]:
+    """Read a JPEG or PNG as rgb in [0, 1].
+
+    Raises:
+        DataError: it is not there, or no image.
+    """
+    bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if bgr is None:
+        raise DataError(f"{path}: expected an image")
+    return torch.from_numpy(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)).float() / 255
+
+
+def small_image(
+    rgb: Float[Tensor, "height width 3"], most_px: int
+) -> Float[Tensor, "small_height small_width 3"]:
+    """The image, at most so wide: pixels are averaged."""
+    height, width, _ = rgb.shape
+    if width <= most_px:
+        return rgb
+    size = (most_px, max(round(height * most_px / width), 1))
+    return torch.from_numpy(cv2.resize(rgb.detach().numpy(), size, interpolation=cv2.INTER_AREA))
 
 
 def write_png(rgb: Float[Tensor, "height width 3"], path: Path) -> Path:
@@ -69,13 +99,23 @@ def write_index_png(indices: Int[Tensor, "height width"], path: Path) -> Path:
     return _write(indices.cpu().numpy().astype(np.uint16), path)
 
 
+def _jpeg(rgb: Float[Tensor, "height width 3"]) -> bytes:
+    bgr = cv2.cvtColor(to_bytes(rgb), cv2.COLOR_RGB2BGR)
+    _, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return encoded.tobytes()
+
+
 def _write(
     image: np.ndarray, path: Path, ending: str = ".png", options: Sequence[int] = ()
 ) -> Path:
     _, encoded = cv2.imencode(ending, image, options)
+    return _write_bytes(encoded.tobytes(), path)
+
+
+def _write_bytes(content: bytes, path: Path) -> Path:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(encoded.tobytes())
+        path.write_bytes(content)
     except OSError as error:
         raise WriteError(f"cannot write {path}: {error.strerror}") from None
     return path

@@ -73,6 +73,7 @@ class Report:
     moving: MovingPicture | None = None
     """The first thing to be seen."""
     worst: Sequence[WorstView] = ()
+    worst_title: str = "Worst views"
     repeat: Sequence[str] = ()
     """Commands that make the run again and show more of it."""
     comparisons: Sequence[Comparison] = ()
@@ -162,6 +163,7 @@ def render_report(report: Report) -> str:
             }
             for view in report.worst
         ],
+        worst_title=report.worst_title,
         repeat=report.repeat,
         drive_page=DRIVE_PAGE,
         comparisons=comparisons,

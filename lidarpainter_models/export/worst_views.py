@@ -2,11 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.evaluation.held_out import HeldOut
+from lidarpainter_models.export.images import read_image, small_image, write_jpeg
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.metrics.images import score_image
 from lidarpainter_models.scenes.records import RecordedView
@@ -14,6 +17,8 @@ from lidarpainter_models.scenes.records import RecordedView
 MOST_LOOKED_AT = 24
 """Views that are rendered for it, spread over all."""
 NUM_SHOWN = 3
+THUMBNAIL_WIDTH_PX = 400
+"""Of each half, where many runs are shown on one page."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -38,6 +43,26 @@ def worst_views(held_out: HeldOut, fitted: GaussianScene) -> list[WorstView]:
         found.append((psnr, WorstView(title=title, rendered_rgb=rgb, truth_rgb=truth)))
         found = sorted(found, key=lambda pair: pair[0])[:NUM_SHOWN]
     return [view for _, view in found]
+
+
+def write_beside(view: WorstView, path: Path) -> Path:
+    """Write one as a small JPEG, rendered on the left and recorded on the right.
+
+    Raises:
+        WriteError: the file cannot be written.
+    """
+    both = [small_image(rgb, THUMBNAIL_WIDTH_PX) for rgb in (view.rendered_rgb, view.truth_rgb)]
+    return write_jpeg(torch.cat(both, dim=1), path)
+
+
+def read_beside(path: Path, title: str) -> WorstView:
+    """Read what `write_beside` wrote.
+
+    Raises:
+        DataError: that is no such image.
+    """
+    rendered, truth = read_image(path).chunk(2, dim=1)
+    return WorstView(title=title, rendered_rgb=rendered, truth_rgb=truth)
 
 
 def _spread(views: Sequence[RecordedView], most: int) -> Sequence[RecordedView]:

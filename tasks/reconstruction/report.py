@@ -18,7 +18,7 @@ from lidarpainter_models.export.comparisons import Subject, comparisons
 from lidarpainter_models.export.moving_picture import recorded_beside
 from lidarpainter_models.export.report import render_report
 from lidarpainter_models.export.run_page import Pictures, RunPage, StageCost
-from lidarpainter_models.export.worst_views import worst_views
+from lidarpainter_models.export.worst_views import worst_views, write_beside
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.shifts import Shift
 from tasks.evaluation.shown import view_time_painting
@@ -30,6 +30,8 @@ from tasks.stages import StageResult, run_stage, stage_task
 from tasks.stored import History, load_history, load_scene
 
 REPORT_FILE = "report.html"
+WORST_FILE = "worst.jpg"
+"""The worst view beside what was recorded, for pages about many runs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,13 +97,16 @@ def _build(  # noqa: PLR0913 - all that the page is made from
     painting: Callable[[], ViewTimePainting],
 ) -> dict[str, Any]:
     subject = Subject(held_out=held_out, unpainted=unpainted(), painting=painting())
+    pictures = _pictures(subject, shifts, progress)
     report = page.report(
         held_out.scene,
-        _pictures(subject, shifts, progress),
+        pictures,
         histories(),
         machine(subject.painting.device),
     )
     (place.output / REPORT_FILE).write_text(render_report(report), "utf-8")
+    if pictures.worst:
+        write_beside(pictures.worst[0], place.output / WORST_FILE)
     return {}
 
 
