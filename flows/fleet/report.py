@@ -23,10 +23,11 @@ from lidarpainter_models.export.worst_views import WorstView, read_beside
 from tasks.reconstruction.report import WORST_FILE
 
 HOUR_S, GIGABYTE, GIBIBYTE = 3600.0, 1e9, 2.0**30
-NUM_PICTURED = 5
+NUM_PICTURED = 3
 """Scenes shown of the worst, and of the slowest."""
 MOST_ROWS = 50
 """Of a table: reasons and scenes beyond are counted."""
+MOST_SCENES = 10
 QUALITY = ("psnr", "ssim", "lpips")
 FINAL_VARIANTS = ("painted", "refined")
 RUNNING_MEDIAN = 9
@@ -273,7 +274,7 @@ def _scenes(title: str, record: FleetRecord, rows: Sequence[Row]) -> Table:
         for row in rows
     ]
     columns = ["scene", "s", "attempts", "PSNR, dB", "SSIM", "LPIPS", "run"]
-    return _table(title, columns, cells, most=2 * NUM_PICTURED)
+    return _table(title, columns, cells, most=MOST_SCENES)
 
 
 def _table(

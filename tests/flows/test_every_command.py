@@ -13,7 +13,9 @@ from commands import call, seen_image, settings, succeed
 from tiny_street import FRONT, HEIGHT_PX, NUM_FRAMES, SCENE, SETTINGS, SIDE, WIDTH_PX
 
 from flows.cli.evaluate import PROTOCOLS
+from lidarpainter_models.export.images import read_image
 from lidarpainter_models.painter.styles import STYLE_PROMPTS
+from tasks.reconstruction.report import WORST_FILE
 
 ROOT = Path(__file__).resolve().parents[2]
 STAGES = ("prepare", "fit", "paint-1", "refine-1", "evaluate-unpainted", "evaluate", "report")
@@ -71,6 +73,8 @@ def test_demo_ends_with_a_page_and_progress_for_every_stage(tiny_run):
     assert SCENE in drive.read_text("utf-8")
     for stage in STAGES:
         assert f"\n{stage}: " in f"\n{tiny_run.progress}"
+    worst = read_image(Path(tiny_run.result["artefacts"]["report"]) / WORST_FILE)
+    assert worst.shape == (HEIGHT_PX, 2 * WIDTH_PX, 3)
 
 
 def test_catalog_holds_what_the_demo_made_and_nothing_else(tiny_run):

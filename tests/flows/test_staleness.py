@@ -10,6 +10,7 @@ import subprocess
 import sys
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from toy_store import SMALL, TOY_SCENE, write_toy_scene
@@ -35,7 +36,13 @@ class Project:
     def computed(self) -> set[str]:
         """The stages that the same command computes now."""
         assignments = [word for setting in SETTINGS for word in ("--set", setting)]
-        command = ["--store", str(self.store), "reconstruct", TOY_SCENE, "--json", *assignments]
+        found = self.answer("reconstruct", TOY_SCENE, *assignments)["computed_now"]
+        assert set(found) == STAGES
+        return {stage for stage, is_new in found.items() if is_new}
+
+    def answer(self, *words: object) -> dict[str, Any]:
+        """What a command prints as JSON."""
+        command = ["--store", str(self.store), *map(str, words), "--json"]
         environment = {
             **os.environ,
             "PYTHONPATH": str(self.folder),
@@ -52,9 +59,7 @@ class Project:
             check=False,
         )
         assert answer.returncode == 0, answer.stderr
-        found = json.loads(answer.stdout)["computed_now"]
-        assert set(found) == STAGES
-        return {stage for stage, is_new in found.items() if is_new}
+        return json.loads(answer.stdout)
 
     def sources(self) -> list[Path]:
         return [path for package in PACKAGES for path in (self.folder / package).rglob("*.py")]
@@ -117,3 +122,76 @@ def test_a_reader_computes_nothing_of_a_stored_scene(project):
             f"lidarpainter_models.readers.{reader}", "return ", "return None or "
         )
         assert computed == set(), reader
+
+
+NIGHT = """
+name = "night"
+painter = "none"
+publish = []
+set = [
+    "observation.width_px=64", "rounds=1", "fit.steps=6", "refine.steps=4",
+    "fit.initialisation.num_gaussians=300", "fit.densification.budget=400",
+    "refine.densification.budget=400",
+]
+[[source]]
+dataset = "synthetic"
+seeds = "1:3"
+frames = "0:4"
+width_px = 64
+cameras = ["front_camera"]
+[budget]
+free_disk_gb = 0
+"""
+LOSS = "lidarpainter_models/gaussians/fitting/losses.py"
+
+
+class Fleet:
+    """A fleet of two streets, made by a copy of the project."""
+
+    def __init__(self, folder: Path) -> None:
+        self.project = Project(folder)
+        self.manifest = folder / "night.toml"
+        self.manifest.write_text(NIGHT)
+
+    def run(self, *words: str) -> list[tuple[str, str, int]]:
+        """Scene, run and number of attempts of every sequence after `fleet run`."""
+        found = self.project.answer("fleet", "run", self.manifest, *words)["sequences"]
+        assert [one["state"] for one in found] == ["done", "done"]
+        return [(one["scene"], one["run_id"], one["attempts"]) for one in found]
+
+    def made(self) -> dict[str, int]:
+        """How many artefacts there are of each kind, and when scenes were written."""
+        root = self.project.store
+        counts = {one.name: len(list(one.iterdir())) for one in (root / "artefacts").iterdir()}
+        scenes = (root / "scenes/synthetic").glob("*/manifest.json")
+        return counts | {one.parent.name: one.stat().st_mtime_ns for one in scenes}
+
+
+def test_one_changed_line_in_a_loss_redoes_fits_and_what_follows_but_not_ingest(tmp_path):
+    fleet = Fleet(tmp_path)
+    first = fleet.run()
+    before = fleet.made()
+    assert before["observations"] == 2
+    answer = fleet.project.answer
+    assert answer("catalog", "stale")["runs"] == []
+    change = ("(tangents / unit)", "(tangents / (1 * unit))")
+    with fleet.project.changed([tmp_path / LOSS], lambda text: text.replace(*change, 1)):
+        stale = answer("catalog", "stale")
+        assert stale["scenes"] == 2
+        assert stale["total"]["cpu_seconds"] > 0
+        for one in stale["runs"]:
+            assert {name.partition("/")[0] for name in one["artefacts"]} == {"gaussians"}
+            assert one["changed"] == ["lidarpainter_models.gaussians.fitting.losses"]
+        told = answer("catalog", "explain", first[0][1])
+        stages = {name.partition("/")[0]: one for name, one in told["inputs"].items()}
+        assert stages["gaussians"]["is_stale"]
+        assert "fitting.losses" in stages["gaussians"]["stale"][0]
+        assert not stages["observations"]["is_stale"]
+        assert fleet.run("--accept-stale") == first
+        assert fleet.made() == before
+        again = fleet.run()
+        assert [scene for scene, _, _ in again] == [scene for scene, _, _ in first]
+        assert {run for _, run, _ in again}.isdisjoint(run for _, run, _ in first)
+        assert [attempts for _, _, attempts in again] == [2, 2]
+        assert fleet.made() == before | {"gaussians": 2 * before["gaussians"]}
+        assert answer("catalog", "stale")["runs"] == []

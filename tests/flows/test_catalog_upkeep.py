@@ -1,0 +1,101 @@
+"""Keeping a store by commands: what they find in the store of a whole run, and how they end."""
+
+import json
+
+import pytest
+from commands import call, succeed
+from tiny_street import SCENE
+
+from catalog.store import open_store
+
+
+def test_a_whole_store_is_verified_and_a_flipped_bit_ends_with_1(tiny_run, own_run):
+    found = succeed("catalog", "verify", "--json", store=tiny_run.store).json
+    assert found["damaged"] == []
+    assert found["num_checked"] > len(tiny_run.rows["artefacts"])
+    assert "are as they were written" in succeed("catalog", "verify", store=tiny_run.store).out
+    broken = [
+        next(own_run.store.root.glob("artefacts/gaussians/*/scene.safetensors")),
+        next(own_run.store.root.glob("scenes/*/*/scene.zarr/image_bytes/c/0")),
+    ]
+    for path in broken:
+        content = bytearray(path.read_bytes())
+        content[len(content) // 2] ^= 1
+        path.write_bytes(content)
+    answer = call("catalog", "verify", "--json", store=own_run.store)
+    assert answer.code == 1
+    names = {one["name"] for one in answer.json["damaged"]}
+    assert names == {f"gaussians/{broken[0].parent.name}", f"scene {SCENE}"}
+    assert "is not what was written" in call("catalog", "verify", store=own_run.store).out
+
+
+def test_an_exported_run_is_imported_elsewhere_and_known_there(tiny_run, tmp_path):
+    out = tmp_path / "run.tar"
+    words = ("catalog", "export", tiny_run.run_id, "--out", out, "--json")
+    assert succeed(*words, store=tiny_run.store).json["rows"]["runs"] == 1
+    other = open_store(tmp_path / "other")
+    counts = succeed("catalog", "import", out, "--json", store=other).json["new_rows"]
+    assert counts["artefacts"] == len(tiny_run.rows["artefacts"])
+    for table in ("scenes", "runs", "artefacts"):
+        assert other.tables.rows(table) == tiny_run.rows[table]
+    metrics = other.tables.rows("metrics")
+    assert all(row in metrics for row in tiny_run.rows["metrics"])
+    assert succeed("catalog", "verify", "--json", store=other).json["damaged"] == []
+    assert succeed("catalog", "import", out, store=other).code == 0
+    answer = call("catalog", "export", "ffff", "--out", out, store=other)
+    assert answer.code == 2
+    assert "nothing is called 'ffff'" in answer.err
+
+
+def test_gc_leaves_a_young_store_alone_and_says_what_would_go(tiny_run):
+    found = succeed("catalog", "gc", "--json", store=tiny_run.store).json
+    assert (found["is_deleted"], found["rows"]) == (False, [])
+    all_of_it = succeed("catalog", "gc", "--days", "0", "--json", store=tiny_run.store).json
+    assert {one["id"] for one in all_of_it["rows"]} >= {tiny_run.run_id, SCENE}
+    told = succeed("catalog", "gc", "--days", "0", store=tiny_run.store).out
+    assert "nothing was deleted: --delete does" in told
+    assert tiny_run.store.tables.find("runs", tiny_run.run_id) == tiny_run.rows["runs"][0]
+
+
+def test_tables_are_compacted_vacuumed_and_read_as_they_were(own_run):
+    tables = succeed("catalog", "compact", "--json", store=own_run.store).json["tables"]
+    assert {one["table"] for one in tables} >= {"runs", "artefacts"}
+    assert all(one["files_after"] == 1 for one in tables)
+    kept = succeed("catalog", "vacuum", "--json", store=own_run.store).json
+    assert (kept["is_deleted"], sum(kept["num_files"].values())) == (False, 0)
+    now = succeed("catalog", "list", "runs", "--json", store=own_run.store).json["rows"]
+    first = succeed("catalog", "list", "runs", "--as-of", "1", "--json", store=own_run.store)
+    assert first.json["rows"][0]["status"] == "running"
+    assert {row["status"] for row in now if row["preset"]} == {"complete"}
+    later = ("catalog", "list", "runs", "--as-of", "2100-01-01", "--json")
+    assert succeed(*later, store=own_run.store).json["rows"] == now
+
+
+@pytest.mark.parametrize(
+    ("as_of", "expected"),
+    [
+        ("yesterday", "expected a version such as 3, or a time"),
+        ("99", "no runs as of 99, the last version is"),
+        ("1999-01-01", "no runs as of 1999-01-01"),
+    ],
+)
+def test_a_past_that_there_was_not_is_one_line(tiny_run, as_of, expected):
+    answer = call("catalog", "list", "runs", "--as-of", as_of, store=tiny_run.store)
+    assert answer.code == 2
+    assert expected in answer.err
+
+
+def test_nothing_is_stale_and_the_scene_has_a_cost(tiny_run):
+    stale = succeed("catalog", "stale", "--json", store=tiny_run.store).json
+    assert (stale["scenes"], stale["runs"]) == (0, [])
+    cost = succeed("catalog", "cost", SCENE, "--json", store=tiny_run.store).json
+    spent = {kind: one["cpu_seconds"] for kind, one in cost["stages"].items()}
+    assert set(spent) >= {"observations", "gaussians", "guidance", "evaluation", "report"}
+    made = [row for row in tiny_run.rows["artefacts"] if row["kind"] == "observations"]
+    summaries = [json.loads(row["summary"]) for row in made]
+    assert spent["observations"] >= sum(one["cpu_seconds"] for one in summaries) > 0
+    assert cost["attempts"]["money"] is None
+    assert "stage: gaussians" in succeed("catalog", "cost", SCENE, store=tiny_run.store).out
+    answer = call("catalog", "cost", "toy/none", store=tiny_run.store)
+    assert answer.code == 2
+    assert "no run and no attempt" in answer.err
