@@ -73,7 +73,7 @@ def select(store: Store, named: Iterable[tuple[str, Row]]) -> Selection:
     rows["metrics"] = [r for r in store.rows("metrics") if r["run_id"] in wanted["runs"]]
     refs = [ArtefactRef.of_id(row["artefact_id"]) for row in rows["artefacts"]]
     scenes = [store.scene_folder(row["scene_id"]) for row in rows["scenes"]]
-    return Selection(rows=rows, folders=[*map(store.artefacts.folder, refs), *scenes])
+    return Selection(rows=rows, folders=[*map(store.artefacts.files, refs), *scenes])
 
 
 def write_archive(store: Store, selection: Selection, out: Path) -> int:

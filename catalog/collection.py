@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from catalog.deletion import Doomed, doomed_rows, size_of
+from catalog.artefacts import ArtefactRef
+from catalog.deletion import Doomed, doomed_rows
 from catalog.locks import is_held
 from catalog.needs import Needs
 from catalog.store import Store
@@ -45,9 +46,9 @@ def plan_collection(store: Store, since: datetime) -> list[Doomed]:
 def _leftovers(store: Store, known: set[str], since: datetime) -> Iterator[Doomed]:
     """Artefacts without a row, scratch of nobody, folders that were being written or removed."""
     settled = datetime.now(UTC) - SETTLED_AFTER
-    for folder in store.root.glob("artefacts/*/*"):
-        name = f"{folder.parent.name}/{folder.name}"
-        if name not in known and _changed_at(folder) < since and not _is_locked(store, name):
+    for name in sorted(store.artefacts.ids() - known):
+        folder = store.artefacts.folder(ArtefactRef.of_id(name))
+        if _changed_at(folder) < since and not _is_locked(store, name):
             yield _leftover(store, folder)
     for folder in store.root.glob("work/*"):
         is_made = any(store.root.glob(f"artefacts/*/{folder.name}"))
@@ -65,7 +66,7 @@ def _leftovers(store: Store, known: set[str], since: datetime) -> Iterator[Doome
 
 def _leftover(store: Store, folder: Path) -> Doomed:
     name = str(folder.relative_to(store.root))
-    return Doomed(table=LEFTOVERS, row_id=name, folder=folder, num_bytes=size_of(folder))
+    return Doomed(table=LEFTOVERS, row_id=name, folder=folder, num_bytes=store.entry_bytes(folder))
 
 
 def _is_locked(store: Store, name: str) -> bool:

@@ -124,11 +124,6 @@ def doomed_rows(store: Store, table: str, names: Iterable[str]) -> list[Doomed]:
     return found
 
 
-def size_of(folder: Path) -> int:
-    """Bytes of all files below a folder."""
-    return sum(path.lstat().st_size for path in folder.rglob("*") if path.is_file())
-
-
 def _folder(store: Store, table: str, name: str) -> Path:
     """Where the files lie; the name comes from a table that anybody may have written.
 

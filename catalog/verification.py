@@ -32,11 +32,9 @@ def verify(store: Store, check_scene: SceneCheck) -> Iterator[Checked]:
     """Check everything that the catalog names or that lies where artefacts and scenes lie."""
     for table in TABLES:
         yield Checked(name=f"table {table}", damage=_table_damage(store, table))
-    artefacts = {f"{path.parent.name}/{path.name}" for path in store.root.glob("artefacts/*/[!.]*")}
-    for name in sorted(artefacts | _ids(store, "artefacts", "artefact_id")):
+    for name in sorted(store.artefacts.ids() | _ids(store, "artefacts", "artefact_id")):
         yield Checked(name=name, damage=_artefact_damage(store, name))
-    scenes = {f"{path.parent.name}/{path.name}" for path in store.root.glob("scenes/*/[!.]*")}
-    for name in sorted(scenes | _ids(store, "scenes", "scene_id")):
+    for name in sorted({*store.scene_ids()} | _ids(store, "scenes", "scene_id")):
         yield Checked(name=f"scene {name}", damage=check_scene(store.scene_folder(name)))
 
 

@@ -90,7 +90,7 @@ class FleetRecord:
             refs = map(ArtefactRef.of_id, store.run(row["run_id"])["artefacts"])
             report = next((ref for ref in refs if ref.kind == "report"), None)
             if report is not None:
-                return read_beside(store.artefacts.folder(report) / WORST_FILE, title)
+                return read_beside(store.artefacts.files(report) / WORST_FILE, title)
         return None
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from small_pandaset import PandasetFolder
 from toy_store import SMALL, TOY_SCENE, write_toy_scene
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -134,10 +135,8 @@ set = [
     "refine.densification.budget=400",
 ]
 [[source]]
-dataset = "synthetic"
-seeds = "1:3"
-frames = "0:4"
-width_px = 64
+dataset = "pandaset"
+root = "logs"
 cameras = ["front_camera"]
 [budget]
 free_disk_gb = 0
@@ -146,12 +145,14 @@ LOSS = "lidarpainter_models/gaussians/fitting/losses.py"
 
 
 class Fleet:
-    """A fleet of two streets, made by a copy of the project."""
+    """A fleet of two short logs, made by a copy of the project."""
 
     def __init__(self, folder: Path) -> None:
         self.project = Project(folder)
         self.manifest = folder / "night.toml"
         self.manifest.write_text(NIGHT)
+        for sequence in ("001", "002"):
+            PandasetFolder(folder / "logs", sequence).write_log()
 
     def run(self, *words: str) -> list[tuple[str, str, int]]:
         """Scene, run and number of attempts of every sequence after `fleet run`."""
@@ -163,7 +164,7 @@ class Fleet:
         """How many artefacts there are of each kind, and when scenes were written."""
         root = self.project.store
         counts = {one.name: len(list(one.iterdir())) for one in (root / "artefacts").iterdir()}
-        scenes = (root / "scenes/synthetic").glob("*/manifest.json")
+        scenes = (root / "scenes/pandaset").glob("*/manifest.json")
         return counts | {one.parent.name: one.stat().st_mtime_ns for one in scenes}
 
 
