@@ -76,7 +76,6 @@ def test_tables_are_compacted_vacuumed_and_read_as_they_were(own_run):
     [
         ("yesterday", "expected a version such as 3, or a time"),
         ("99", "no runs as of 99, the last version is"),
-        ("1999-01-01", "no runs as of 1999-01-01"),
     ],
 )
 def test_a_past_that_there_was_not_is_one_line(tiny_run, as_of, expected):
