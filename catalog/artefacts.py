@@ -164,15 +164,6 @@ class ArtefactStore:
         folders = self.root.glob("artefacts/*/[!.]*")
         return {f"{path.parent.name}/{path.name}" for path in folders}
 
-    def files(self, ref: ArtefactRef) -> Path:
-        """Its folder, for whoever reads it: in a bucket's mirror its files are fetched first."""
-        return self.folder(ref)
-
-    def ids(self) -> set[str]:
-        """The id of every artefact that has a name."""
-        folders = self.root.glob("artefacts/*/[!.]*")
-        return {f"{path.parent.name}/{path.name}" for path in folders}
-
     def find(self, recipe: Recipe) -> ArtefactRef | None:
         """What was made from this recipe before, or None; damaged folders count as absent."""
         ref = ArtefactRef(recipe.kind, recipe.digest)

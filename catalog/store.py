@@ -141,15 +141,6 @@ class Store:
             yield waited
             self.mirror.publish(entry, replacing=before)
 
-    def scene_ids(self) -> list[str]:
-        """The scenes whose folders are there."""
-        folders = self.root.glob("scenes/*/[!.]*")
-        return sorted(f"{path.parent.name}/{path.name}" for path in folders)
-
-    def entry_bytes(self, folder: Path) -> int:
-        """Size of all files of an artefact or a scene, by its folder."""
-        return sum(path.lstat().st_size for path in folder.rglob("*") if path.is_file())
-
     def name_of(self, path: Path) -> str:
         """A path as rows hold it: from the folder of the store; outside it, absolute."""
         path = path.absolute()

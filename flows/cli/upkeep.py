@@ -37,6 +37,7 @@ def collect(days: Days = 30.0, for_real: ForReal = False, as_json: AsJson = Fals
     from catalog.store import existing_store
 
     store = existing_store()
+    store.require_folder("gc")
     doomed = plan_collection(store, datetime.now(UTC) - timedelta(days=days))
     if for_real:
         delete(store, doomed)
@@ -54,7 +55,7 @@ def collect(days: Days = 30.0, for_real: ForReal = False, as_json: AsJson = Fals
     if doomed and not for_real:
         notes.append("nothing was deleted: --delete does")
     what = "deleted from" if for_real else "not needed in"
-    title = f"{format_bytes(num_bytes)} {what} {store.root}"
+    title = f"{format_bytes(num_bytes)} {what} {store.name}"
     print_table(title, ["what", "name", "size"], rows, "\n".join(notes), num_text_columns=2)
 
 
@@ -74,13 +75,13 @@ def compact_tables(as_json: AsJson = False) -> None:
     store = existing_store()
     done = compact(store.tables)
     if as_json:
-        print_json({"store": str(store.root), "tables": [asdict(one) for one in done]})
+        print_json({"store": store.name, "tables": [asdict(one) for one in done]})
     else:
         rows: list[list[Cell]] = [
             [one.table, one.version, one.files_before, one.files_after] for one in done
         ]
         columns = ["table", "version", "files before", "files after"]
-        print_table(f"tables of {store.root}", columns, rows)
+        print_table(f"tables of {store.name}", columns, rows)
 
 
 @app.command("vacuum")
@@ -104,7 +105,7 @@ def vacuum_tables(days: Days = 30.0, for_real: ForReal = False, as_json: AsJson 
     else:
         note = "" if for_real else "nothing was deleted: --delete does"
         what = "deleted from" if for_real else "not needed in"
-        print_pairs(f"files {what} tables of {store.root}", counts, note)
+        print_pairs(f"files {what} tables of {store.name}", counts, note)
 
 
 @app.command("verify")
@@ -126,18 +127,19 @@ def verify_store(as_json: AsJson = False) -> None:
         return None
 
     store = existing_store()
-    say_status(f"reading {store.root}")
+    store.require_folder("verify")
+    say_status(f"reading {store.name}")
     checked = list(verify(store, scene_damage))
     damaged = [one for one in checked if one.damage]
     if as_json:
         found = [{"name": one.name, "damage": one.damage} for one in damaged]
-        print_json({"store": str(store.root), "num_checked": len(checked), "damaged": found})
+        print_json({"store": store.name, "num_checked": len(checked), "damaged": found})
     elif damaged:
         rows = [[one.name, one.damage] for one in damaged]
-        title = f"damaged in {store.root}, of {len(checked)}"
+        title = f"damaged in {store.name}, of {len(checked)}"
         print_table(title, ["what", "damage"], rows, num_text_columns=2)
     else:
-        sys.stdout.write(f"all {len(checked)} in {store.root} are as they were written\n")
+        sys.stdout.write(f"all {len(checked)} in {store.name} are as they were written\n")
     if damaged:
         raise typer.Exit(DAMAGED)
 
@@ -159,6 +161,7 @@ def export_selection(
     from flows.cli.catalog import find_row
 
     store = existing_store()
+    store.require_folder("export")
     chosen = select(store, [find_row(store, name) for name in selection])
     num_bytes = write_archive(store, chosen, out)
     counts = {table: len(rows) for table, rows in chosen.rows.items() if rows}
@@ -181,8 +184,9 @@ def import_selection(
     from catalog.store import open_store
 
     store = open_store()
+    store.require_folder("import")
     counts = import_archive(store, archive)
     if as_json:
-        print_json({"store": str(store.root), "new_rows": counts})
+        print_json({"store": store.name, "new_rows": counts})
     else:
-        print_pairs(f"new in {store.root}", counts)
+        print_pairs(f"new in {store.name}", counts)
