@@ -1,8 +1,8 @@
 """Why an attempt at a sequence ended, and what that means for the sequence.
 
 Bad input is set aside at once and never tried again. What can pass is tried again, later each time
-and a bounded number of times. A full disk, a bucket that does not answer and an interruption are
-nobody's fault and do not count.
+and a bounded number of times. A full disk, a bucket or a dispatcher that does not answer and an
+interruption are nobody's fault and do not count.
 """
 
 from collections.abc import Mapping
@@ -18,6 +18,7 @@ Cause = Literal[
     "bad-input",
     "disk-full",
     "store-lost",
+    "api-lost",
     "killed",
     "memory",
     "timeout",
@@ -51,6 +52,7 @@ class Ending:
     run_id: str | None = None
     seconds: float = 0.0
     cpu_seconds: float | None = None
+    compile_seconds: float | None = None
     peak_memory_bytes: int | None = None
     num_bytes: int | None = None
     effort: str | None = None
@@ -83,20 +85,27 @@ def row_after(row: Row, ending: Ending, lease: Lease, *, first_pause_s: float) -
     }
 
 
+def attempt_id(lease: Lease) -> str:
+    """Of the attempt under a lease: what tells it from all others, in tables and flow runs."""
+    return f"{lease.name}-{lease.fence}"
+
+
 def attempt_row(lease: Lease, ending: Ending) -> dict[str, Any]:
     """The row of an attempt; what it was and what was predicted stands in its lease."""
     started_at = datetime.fromtimestamp(lease.taken_at, UTC)
-    facts = ("fleet", "scene_id", "predicted_seconds", "predicted_memory_bytes")
+    predicted = ("seconds", "cpu_seconds", "memory_bytes", "num_bytes")
+    facts = ("fleet", "scene_id", *(f"predicted_{name}" for name in predicted))
     return {
-        "attempt_id": f"{lease.name}-{lease.fence}",
+        "attempt_id": attempt_id(lease),
         "sequence_id": lease.name,
-        **{name: lease.facts.get(name) for name in (*facts, "predicted_num_bytes")},
+        **{name: lease.facts.get(name) for name in facts},
         "run_id": ending.run_id,
         "worker": lease.holder.name,
         "started_at": started_at,
         "ended_at": started_at + timedelta(seconds=ending.seconds),
         "seconds": ending.seconds,
         "cpu_seconds": ending.cpu_seconds,
+        "compile_seconds": ending.compile_seconds,
         "peak_memory_bytes": ending.peak_memory_bytes,
         "num_bytes": ending.num_bytes,
         "cause": ending.cause,

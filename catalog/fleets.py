@@ -63,6 +63,10 @@ class FleetLedger:
     ) -> None:
         self.store = store
         self.leases = leases or Leases(store.objects("leases"))
+        self.flow_runs = Leases(
+            store.objects("flow-runs"), time_to_live_s=self.leases.time_to_live_s
+        )
+        """Of those who dispatch: who is alive, beside who works on what."""
         self._first_pause_s = first_pause_s
 
     def latest(self) -> str:

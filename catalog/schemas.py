@@ -213,17 +213,19 @@ ATTEMPTS = TableSchema(
         Column("ended_at", "time", "when the end was entered, or the last sign of life"),
         Column("seconds", "number", "wall time", "s"),
         Column("cpu_seconds", "number", "CPU time of all threads", "s"),
+        Column("compile_seconds", "number", "CPU time of compiling kernels, part of that", "s"),
         Column("peak_memory_bytes", "integer", "largest resident memory", "byte"),
         Column("num_bytes", "integer", "size of what it made", "byte"),
         Column(
             "cause",
             "text",
-            "why it ended: done, bad-input, disk-full, killed, memory, timeout, system, error, "
-            "interrupted, cancelled or superseded",
+            "why it ended: done, bad-input, disk-full, api-lost, killed, memory, timeout, system, "
+            "error, interrupted, cancelled or superseded",
         ),
         Column("reason", "text", "one line about the cause"),
-        Column("effort", "text", "what its cost grows with, JSON; null where it was recalled"),
+        Column("effort", "text", "what its cost grows with, JSON; null unless it made all stages"),
         Column("predicted_seconds", "number", "what the planner said before", "s"),
+        Column("predicted_cpu_seconds", "number", "likewise, without compiling", "s"),
         Column("predicted_memory_bytes", "integer", "likewise", "byte"),
         Column("predicted_num_bytes", "integer", "likewise", "byte"),
         Column("software_version", "text", "version of lidarpainter"),

@@ -28,6 +28,7 @@ from catalog.digests import canonical_json, digest_text
 from catalog.errors import IdentityError
 
 RUNNING = ""
+PARSE_ATTEMPTS = 5
 _NO_PART = {"ctx", "kind", "type_comment"}
 _IMPORTS = (ast.Import, ast.ImportFrom)
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
@@ -95,7 +96,7 @@ def _outline(module: str, path: Path, source: bytes) -> Outline:
     parts: dict[str, list[ast.stmt]] = defaultdict(list)
     imports: dict[str, set[str]] = defaultdict(set)
     uses: dict[str, set[str]] = defaultdict(set)
-    for statement in ast.parse(source, path).body:
+    for statement in _parsed(source, path).body:
         names = _defined(statement)
         for name in _registers_at(statement):
             uses[name].update(names)
@@ -110,6 +111,14 @@ def _outline(module: str, path: Path, source: bytes) -> Outline:
                 uses[name] |= _free(statement, package)
     origins = {name: sorted(found) for name, found in imports.items()}
     return Outline(_symbols(parts, uses, origins), origins)
+
+
+def _parsed(source: bytes, path: Path) -> ast.Module:
+    """Python 3.11 counts the depth of all threads as one: where two parse at once, one fails."""
+    for _ in range(PARSE_ATTEMPTS - 1):
+        with suppress(SystemError):  # CPython issue 106905
+            return ast.parse(source, path)
+    return ast.parse(source, path)
 
 
 def _symbols(

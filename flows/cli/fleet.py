@@ -7,13 +7,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flows.cli import fleet_report
-from flows.cli.output import complain, loudness, print_json, print_table, say_status
+from flows.cli.output import complain, loudness, print_json, print_pairs, print_table, say_status
 from flows.cli.shared_options import AsJson
 
 if TYPE_CHECKING:
     from catalog.fleets import FleetLedger
+    from flows.fleet.manifest import Manifest
 
 NOT_OVER = 2
+MOST_WORKERS = 150
+"""Beyond 200 flow runs that wait, Prefect's queues starve (its issue 19403)."""
 Fleet = Annotated[
     str | None, typer.Argument(help="Name of the fleet; the one that was asked for last if absent.")
 ]
@@ -23,15 +26,26 @@ app.add_typer(fleet_report.app)
 
 
 @app.command("run")
-def run(
+def run(  # noqa: PLR0913 - the options of a command
     manifest: Annotated[Path, typer.Argument(help="TOML file, see docs/fleet.md.")],
     workers: Annotated[
-        int, typer.Option(min=1, help="Sequences at once, each in a process of its own.")
+        int,
+        typer.Option(min=1, max=MOST_WORKERS, help="Sequences at once, each in its own process."),
     ] = 1,
     threads: Annotated[int, typer.Option(min=1, help="Of each worker.")] = 1,
     accept_stale: Annotated[
         bool, typer.Option("--accept-stale", help="Leave what older code has done as it is.")
     ] = False,
+    deploys: Annotated[
+        bool, typer.Option("--deploy", help="Let workers of a Prefect work pool make them.")
+    ] = False,
+    cron: Annotated[
+        str | None,
+        typer.Option(help="With --deploy: look at the manifest at these times (UTC); else now."),
+    ] = None,
+    pool: Annotated[
+        str | None, typer.Option(help="With --deploy: work pool, made if it is not there.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Make every sequence that a manifest asks for; what is done stays done.
@@ -43,28 +57,18 @@ def run(
     from flows.fleet.manifest import read_manifest
 
     asked = read_manifest(manifest)
-    say_status(f"looking for the sequences of {asked.name}")
-    from catalog.fleets import FleetLedger
-    from catalog.store import open_store
-    from flows.fleet.asked import wishes
-    from flows.fleet.local_workers import run_workers, starter
-    from flows.fleet.status import counts_of, fleet_status, is_over
-
-    wanted = wishes(asked, manifest.absolute().parent)
-    store = open_store()
-    store.make()
-    ledger = FleetLedger(store)
-    for line in ledger.reconcile():
-        _tell(line)
-    ledger.ask(wanted, accept_stale=accept_stale)
-    counts = counts_of(ledger.rows(asked.name))
-    if still := counts["waiting"] + counts["running"]:
-        start = starter(store.address, asked.name, threads)
-        run_workers(ledger, asked.name, start, min(workers, still), _tell)
-    status = fleet_status(ledger, asked.name)
-    _show(status, as_json=as_json)
-    if not is_over(status):
-        raise typer.Exit(NOT_OVER)
+    if deploys:
+        parameters = {
+            "manifest": str(manifest.absolute()),
+            "workers": workers,
+            "accept_stale": accept_stale,
+        }
+        _deploy(asked.name, parameters, cron=cron, pool=pool, as_json=as_json)
+        return
+    if cron is not None or pool is not None:
+        raise typer.BadParameter("--cron and --pool go with --deploy")
+    folder = manifest.absolute().parent
+    _run_here(asked, folder, workers, threads, accept_stale=accept_stale, as_json=as_json)
 
 
 @app.command("status")
@@ -145,6 +149,69 @@ def work(fleet: Annotated[str, typer.Argument(help="Name of the fleet.")]) -> No
     log = EventLog(fleet, sys.stderr.write)
     with listening(log):
         Worker(ledger=ledger, fleet=fleet, work=make_sequence, say=log).run()
+
+
+def _run_here(
+    asked: "Manifest",
+    folder: Path,
+    workers: int,
+    threads: int,
+    *,
+    accept_stale: bool,
+    as_json: bool,
+) -> None:
+    """Make a fleet with workers of this machine."""
+    say_status(f"looking for the sequences of {asked.name}")
+    from catalog.fleets import FleetLedger
+    from catalog.store import open_store
+    from flows.fleet.asked import wishes
+    from flows.fleet.local_workers import run_workers, starter
+    from flows.fleet.status import counts_of, fleet_status, is_over
+
+    wanted = wishes(asked, folder)
+    store = open_store()
+    store.make()
+    ledger = FleetLedger(store)
+    for line in [*ledger.reconcile(), *_closed(ledger)]:
+        _tell(line)
+    ledger.ask(wanted, accept_stale=accept_stale)
+    counts = counts_of(ledger.rows(asked.name))
+    if still := counts["waiting"] + counts["running"]:
+        start = starter(store.address, asked.name, threads)
+        run_workers(ledger, asked.name, start, min(workers, still), _tell)
+    status = fleet_status(ledger, asked.name)
+    _show(status, as_json=as_json)
+    if not is_over(status):
+        raise typer.Exit(NOT_OVER)
+
+
+def _deploy(
+    name: str, parameters: dict[str, Any], *, cron: str | None, pool: str | None, as_json: bool
+) -> None:
+    say_status(f"deploying {name}")
+    from catalog.store import open_store
+    from flows.fleet.deployment import POOL, deploy
+
+    store = open_store().name
+    made = deploy(name, {**parameters, "store": store}, pool=pool or POOL, cron=cron)
+    if as_json:
+        print_json(made)
+    else:
+        print_pairs(f"fleet {name}, deployed", made)
+
+
+def _closed(ledger: "FleetLedger") -> list[str]:
+    """Lines about flow runs that nobody works on, where Prefect is configured."""
+    from prefect.settings import PREFECT_API_URL
+
+    from flows.fleet.flow_runs import ApiLostError, close_lost_runs
+
+    if not PREFECT_API_URL.value():
+        return []
+    try:
+        return close_lost_runs(ledger)
+    except ApiLostError as error:  # workers wait until it answers
+        return [str(error)]
 
 
 def _ledger() -> "FleetLedger":

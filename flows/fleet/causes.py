@@ -1,9 +1,11 @@
 """From an error to the cause that the catalog decides by."""
 
 import errno
+from collections.abc import Callable
 
 from catalog.attempts import Cause
 from catalog.errors import CatalogError, ConflictError, UnreachableError, disk_error
+from flows.fleet.flow_runs import is_of_lost_api
 from lidarpainter_models.errors import (
     BackendError,
     LidarPainterError,
@@ -15,7 +17,7 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 OF_THIS_MACHINE = (BackendError, MissingPackageError, TrainingError)
 """Of the library, but not the fault of the input."""
 ORCHESTRATION = ("prefect", "httpx", "httpcore")
-"""Packages whose errors say that Prefect's server was not there, not that the work is wrong."""
+"""Packages whose errors say that Prefect is amiss, not that the work is wrong."""
 NO_MEMORY = ("can't allocate memory", "out of memory", "not enough memory")
 """How torch says that there is no memory: by a RuntimeError."""
 LONGEST_REASON = 500
@@ -35,19 +37,30 @@ def is_storage_away(error: Exception) -> bool:
     return disk_error(error) in NO_ROOM or isinstance(error, UnreachableError)
 
 
+def _is_memory(error: Exception) -> bool:
+    return isinstance(error, MemoryError) or any(words in str(error) for words in NO_MEMORY)
+
+
+def _is_of_system(error: Exception) -> bool:
+    is_orchestration = type(error).__module__.partition(".")[0] in ORCHESTRATION
+    return is_orchestration or isinstance(error, (OSError, ConflictError))
+
+
+def _is_bad_input(error: Exception) -> bool:
+    return isinstance(error, LidarPainterError) and not isinstance(error, OF_THIS_MACHINE)
+
+
 def _cause(error: Exception) -> Cause:
-    if isinstance(error, UnreachableError):
-        return "store-lost"
-    if is_storage_away(error):
-        return "disk-full"
-    if isinstance(error, MemoryError) or any(words in str(error) for words in NO_MEMORY):
-        return "memory"
-    if isinstance(error, TimeoutError):
-        return "timeout"
-    if isinstance(error, (OSError, ConflictError)):
-        return "system"
-    if type(error).__module__.partition(".")[0] in ORCHESTRATION:
-        return "system"
-    if isinstance(error, LidarPainterError) and not isinstance(error, OF_THIS_MACHINE):
-        return "bad-input"
-    return "error"
+    return next((cause for cause, fits in RULES if fits(error)), "error")
+
+
+RULES: tuple[tuple[Cause, Callable[[Exception], bool]], ...] = (
+    ("store-lost", lambda error: isinstance(error, UnreachableError)),
+    ("disk-full", is_storage_away),
+    ("api-lost", is_of_lost_api),
+    ("memory", _is_memory),
+    ("timeout", lambda error: isinstance(error, TimeoutError)),
+    ("system", _is_of_system),
+    ("bad-input", _is_bad_input),
+)
+"""The first that fits says why."""

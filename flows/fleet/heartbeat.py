@@ -15,6 +15,7 @@ from typing import Any, Self
 
 from catalog.errors import StorageError
 from catalog.leases import BEATS, Lease, LeaseLostError, Leases
+from lidarpainter_models.kernels.compile_clock import CompileClock
 
 STATM = Path("/proc/self/statm")
 RESIDENT = 1
@@ -50,12 +51,14 @@ class Heartbeat:
         self._on_lost = on_lost
         self._on_late = on_late
         self._began, self._cpu_began = time.monotonic(), time.process_time()
+        self._compiling = CompileClock()
         self._over = threading.Event()
         run = copy_context().run  # what it says is about the same
         self._thread = threading.Thread(target=run, args=(self._beat,), daemon=True)
 
     def __enter__(self) -> Self:
         """Start to beat."""
+        self._compiling.start()
         self._thread.start()
         return self
 
@@ -68,12 +71,14 @@ class Heartbeat:
         """Stop; the lease is as the last beat left it."""
         self._over.set()
         self._thread.join()
+        self._compiling.stop()
 
     def took(self) -> dict[str, Any]:
         """What the block has taken so far: the fields of an `Ending`."""
         return {
             "seconds": time.monotonic() - self._began,
             "cpu_seconds": time.process_time() - self._cpu_began,
+            "compile_seconds": self._compiling.cpu_seconds,
             "peak_memory_bytes": max(self.peak_memory_bytes, resident_bytes()),
         }
 

@@ -1,15 +1,20 @@
 """What a sequence will take, by what sequences have taken before.
 
-Seconds, memory and bytes are sums of what grows with the effort: views read, pixels drawn, steps
-and views at their width. The weights are found from the attempts in the catalog by non-negative
-least squares on relative errors, so a short sequence counts as much as a long one. Where nothing is
-known, nothing is said, and nothing is held back.
+CPU seconds, memory and bytes are sums of what grows with the effort: views read, pixels drawn,
+steps and views at their width. The weights are found from the attempts in the catalog by
+non-negative least squares on relative errors, so a short sequence counts as much as a long one, and
+a recent one more than an old one. Where few attempts cannot tell the amounts apart, each keeps a
+share of the cost. Compiling kernels is paid once a machine and is taken out. Wall time is CPU time
+by the ratio that the machine had lately: what else runs there is not the sequence's own. Where
+nothing is known, nothing is said, and nothing is held back.
 """
 
 import json
-from collections.abc import Iterable, Sequence
+import platform
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from statistics import median
 from typing import Any, Self
 
 import numpy as np
@@ -22,7 +27,13 @@ from lidarpainter_models.painter.selection import NO_PAINTER
 
 MOST_ATTEMPTS = 500
 """The newest ones, by which is planned."""
-TARGETS = ("seconds", "peak_memory_bytes", "num_bytes")
+HALF_LIFE = 10
+"""Attempts after which one counts half as much."""
+RECENT = 10
+"""Attempts by which the ratio of wall to CPU time is known, and the error of the planner."""
+SIZES = ("peak_memory_bytes", "num_bytes")
+EQUAL_SHARES = 0.05
+"""How much it counts, in attempts, that all amounts have a share of the cost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,16 +74,17 @@ class Prediction:
     """What a sequence is thought to take; None where nothing tells."""
 
     seconds: float | None = None
+    cpu_seconds: float | None = None
+    """Without compiling kernels."""
     memory_bytes: float | None = None
     num_bytes: float | None = None
 
     def facts(self) -> dict[str, Any]:
         """As a lease carries it to the catalog."""
-        rounded = {name: None if value is None else round(value) for name, value in self._items()}
-        return {**rounded, "predicted_seconds": self.seconds}
-
-    def _items(self) -> Iterable[tuple[str, float | None]]:
-        return [(f"predicted_{name}", getattr(self, name)) for name in self.__slots__]
+        sizes = {"memory_bytes": self.memory_bytes, "num_bytes": self.num_bytes}
+        rounded = {name: None if size is None else round(size) for name, size in sizes.items()}
+        facts = {"seconds": self.seconds, "cpu_seconds": self.cpu_seconds, **rounded}
+        return {f"predicted_{name}": value for name, value in facts.items()}
 
 
 class Planner:
@@ -100,8 +112,13 @@ class Planner:
         if effort is None or not self._past:
             return Prediction()
         amounts = np.asarray(effort.amounts)
-        seconds, memory, num_bytes = (float(amounts @ weights) for weights in self._weights)
-        return Prediction(seconds=seconds, memory_bytes=memory, num_bytes=num_bytes)
+        cpu_seconds, memory, num_bytes = (float(amounts @ weights) for weights in self._weights)
+        return Prediction(
+            seconds=cpu_seconds * self._wall_ratio,
+            cpu_seconds=cpu_seconds,
+            memory_bytes=memory,
+            num_bytes=num_bytes,
+        )
 
     def effort(self, asked: Asked) -> Effort | None:
         """What the cost of a sequence grows with; None where its views cannot be counted."""
@@ -139,25 +156,63 @@ class Planner:
 
     @cached_property
     def _weights(self) -> list[Float[np.ndarray, " amounts"]]:
-        efforts = [Effort(**json.loads(row["effort"])).amounts for row in self._past]
-        return [
-            _fitted(
-                np.asarray(efforts), np.asarray([row[name] or 0.0 for row in self._past], float)
-            )
-            for name in TARGETS
+        """Of CPU seconds, memory and bytes."""
+        efforts = np.asarray([Effort(**json.loads(row["effort"])).amounts for row in self._past])
+        costs = [
+            [own_cpu_seconds(row) for row in self._past],
+            *([row[name] or 0.0 for row in self._past] for name in SIZES),
         ]
+        return [_fitted(efforts, np.asarray(cost, float)) for cost in costs]
+
+    @cached_property
+    def _wall_ratio(self) -> float:
+        """Of wall to CPU time in the newest attempts, those of this machine if there are any."""
+        here = [row for row in self._past if row["worker"].rpartition(":")[0] == platform.node()]
+        newest = (here or self._past)[-RECENT:]
+        return median(row["seconds"] / max(row["cpu_seconds"] or 0.0, 1e-3) for row in newest)
+
+
+def own_cpu_seconds(attempt: Mapping[str, Any]) -> float:
+    """What a sequence took by itself: without compiling kernels for it and all after it."""
+    return (attempt["cpu_seconds"] or 0.0) - (attempt["compile_seconds"] or 0.0)
+
+
+def planner_error(attempts: Iterable[Mapping[str, Any]]) -> float | None:
+    """How far off the predicted CPU seconds were, as a share of the true ones.
+
+    It is the median of the newest attempts that were predicted; those that were recalled or went on
+    with what others had begun do not count. None where there is none.
+    """
+    shares = [
+        abs(row["predicted_cpu_seconds"] - own_cpu_seconds(row)) / own_cpu_seconds(row)
+        for row in sorted(attempts, key=lambda row: row["ended_at"])
+        if row["cause"] == "done" and row["effort"] and row["predicted_cpu_seconds"]
+    ]
+    return median(shares[-RECENT:]) if shares else None
 
 
 def _fitted(
     amounts: Float[np.ndarray, "attempts amounts"], costs: Float[np.ndarray, " attempts"]
 ) -> Float[np.ndarray, " amounts"]:
-    """Non-negative weights whose sums come nearest to the costs, in relative terms."""
+    """Non-negative weights whose sums come nearest to the costs, in relative terms.
+
+    Args:
+        amounts: of attempts, oldest first.
+        costs: likewise; what is not known is no larger than 0.
+    """
     from scipy.optimize import nnls
 
     is_known = costs > 0
     if not is_known.any():
         return np.zeros(amounts.shape[1])
     relative = amounts[is_known] / costs[is_known, None]
-    scale = np.maximum(relative.max(axis=0), np.finfo(float).tiny)
-    weights, _residual = nnls(relative / scale, np.ones(len(relative)))
+    scale = np.maximum(relative.mean(axis=0), np.finfo(float).tiny)
+    ages = np.arange(len(relative))[::-1]
+    counts = np.sqrt(0.5 ** (ages / HALF_LIFE))
+    seen = (relative > 0).any(axis=0)
+    shares = np.sqrt(EQUAL_SHARES) * np.diag(seen.astype(float))
+    weights, _residual = nnls(
+        np.vstack([relative / scale * counts[:, None], shares]),
+        np.concatenate([counts, shares.sum(axis=0) / seen.sum()]),
+    )
     return weights / scale

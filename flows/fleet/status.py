@@ -1,7 +1,6 @@
 """How a fleet stands, as its commands say it."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from statistics import median
+from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
 from catalog.attempts import State
@@ -9,6 +8,7 @@ from catalog.fleets import FleetLedger
 from catalog.tables import Row
 from flows.fleet.limits import lacks_disk, over_budget
 from flows.fleet.manifest import Budget
+from flows.fleet.planner import planner_error
 
 STATES: tuple[State, ...] = get_args(State)
 SHOWN = (
@@ -54,19 +54,6 @@ def counts_of(rows: Sequence[Row]) -> dict[str, int]:
 def is_over(status: Mapping[str, Any]) -> bool:
     """Whether every sequence is done, or set aside with a reason."""
     return sum(status["counts"][state] for state in ENDED) == len(status["sequences"])
-
-
-def planner_error(attempts: Iterable[Mapping[str, Any]]) -> float | None:
-    """How far off the predicted seconds were, as a share of the true ones: the median.
-
-    Attempts that were recalled or not predicted do not count; None where none is left.
-    """
-    shares = [
-        abs(row["predicted_seconds"] - row["seconds"]) / row["seconds"]
-        for row in attempts
-        if row["cause"] == "done" and row["effort"] and row["predicted_seconds"] and row["seconds"]
-    ]
-    return median(shares) if shares else None
 
 
 def _sequence(row: Row) -> dict[str, Any]:

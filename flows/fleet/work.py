@@ -2,7 +2,7 @@
 
 Where a Prefect API is configured, each sequence is one flow run there, and its stages are task
 runs. Else they are plain functions, and no server is started: who works on what and what is done
-stands in the store either way.
+stands in the store either way. What Prefect cannot be told of changes nothing about it.
 """
 
 import json
@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from prefect import flow
+from prefect import flow, tags
 from prefect.settings import PREFECT_API_URL
 
 from catalog.artefacts import ArtefactRef
@@ -18,6 +18,7 @@ from catalog.store import Store, open_store
 from flows.assets import publish_run
 from flows.dress import dress_run
 from flows.fleet.asked import Asked
+from flows.fleet.flow_runs import SEQUENCE, store_tag
 from flows.reconstruct import reconstruct
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.synthetic.street import WORLD_VERSION
@@ -32,34 +33,43 @@ class Made:
     """What came of one sequence."""
 
     run_id: str
-    is_new: bool
-    """Whether any stage was computed."""
+    is_whole: bool
+    """Whether all stages were computed, so that it took what such a sequence takes."""
     num_bytes: int
     """Size of what was computed."""
     peak_memory_bytes: int | None = None
 
 
-Work = Callable[[Asked, Path], Made]
-"""Makes one sequence in a store."""
+Work = Callable[[Asked, Path, str], Made]
+"""Makes one sequence in a store, in the attempt of an id."""
 
 
-def make_sequence(asked: Asked, store_path: Path) -> Made:
-    """Make a sequence, as a flow run where Prefect is configured."""
-    if PREFECT_API_URL.value():
-        named = fleet_sequence.with_options(flow_run_name=asked.scene_id)
-        return named(asked.model_dump_json(), store_path)
-    return _made(asked, store_path)
+def make_sequence(asked: Asked, store_path: Path, attempt: str) -> Made:
+    """Make a sequence, as a flow run where Prefect is configured.
 
-
-@flow(name="fleet-sequence", persist_result=False)
-def fleet_sequence(asked: str, store_path: Path) -> Made:
-    """Make one sequence of a fleet.
-
-    Args:
-        asked: as the catalog keeps it, JSON.
-        store_path: folder of the store.
+    What came of the work counts; an error of Prefect does where the work did not begin.
     """
-    return _made(Asked.model_validate_json(asked), store_path)
+    if not PREFECT_API_URL.value():
+        return _made(asked, store_path)
+    ended: list[Made | Exception] = []
+
+    def fleet_sequence(asked: str, store_path: str, attempt: str) -> None:  # noqa: ARG001
+        try:
+            ended.append(_made(Asked.model_validate_json(asked), Path(store_path)))
+        except Exception as error:
+            ended.append(error)
+            raise
+
+    run = flow(name=SEQUENCE, flow_run_name=asked.scene_id, persist_result=False)(fleet_sequence)
+    with tags(store_tag(store_path)):
+        try:
+            run(asked.model_dump_json(), str(store_path), attempt)
+        except Exception:
+            if not ended:
+                raise
+    if isinstance(ended[0], Exception):
+        raise ended[0]
+    return ended[0]
 
 
 def _made(asked: Asked, store_path: Path) -> Made:
@@ -83,7 +93,7 @@ def _made(asked: Asked, store_path: Path) -> Made:
     peaks = [result["peak_memory_bytes"] for result in new]
     return Made(
         run_id=run["run_id"],
-        is_new=bool(refs),
+        is_whole=bool(refs) and all(all(one["computed_now"].values()) for one in results),
         num_bytes=sum(store.artefacts.manifest(ref).num_bytes for ref in refs),
         peak_memory_bytes=max(peaks, default=None),
     )

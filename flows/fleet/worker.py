@@ -15,13 +15,14 @@ from functools import partial
 from typing import NoReturn
 
 import lidarpainter_models
-from catalog.attempts import Ending
+from catalog.attempts import Ending, attempt_id
 from catalog.errors import StorageError
 from catalog.fleets import FleetLedger
 from catalog.leases import Lease
 from catalog.tables import Row
 from flows.fleet.asked import Asked
 from flows.fleet.causes import cause_of, is_storage_away
+from flows.fleet.flow_runs import api_lost
 from flows.fleet.heartbeat import Heartbeat
 from flows.fleet.limits import admits, lacks_disk, over_budget
 from flows.fleet.manifest import Budget
@@ -72,6 +73,9 @@ class Worker:
         if spent := over_budget(rows):
             self.say(spent)
             return True
+        if lost := api_lost():
+            self._pause(lost)
+            return False
         taken = self._take(rows)
         if taken is None:
             time.sleep(self.poll_s)
@@ -116,15 +120,16 @@ class Worker:
         self.say(f"{asked.scene_id}: begins, attempt {row['attempts'] + 1}")
         version = lidarpainter_models.__version__
         effort = self._planner().effort(asked)
+        is_first = row["cause"] is None  # else it may go on where another has stopped
         with beat, at_interruption(partial(self._end, beat, Ending(cause="interrupted"))):
             try:
-                made = self.work(asked, self.ledger.store.address)
+                made = self.work(asked, self.ledger.store.address, attempt_id(lease))
                 ending = Ending(
                     cause="done",
                     run_id=made.run_id,
                     num_bytes=made.num_bytes,
                     peak_memory_bytes=made.peak_memory_bytes,
-                    effort=effort.to_json() if made.is_new and effort else None,
+                    effort=effort.to_json() if effort and is_first and made.is_whole else None,
                     software_version=version,
                 )
             except Exception as error:  # noqa: BLE001 - whatever it is, it is entered

@@ -47,7 +47,7 @@ def behave(root, scene, what):
     (folder / scene.replace("/", "-")).write_text(what)
 
 
-def stub_work(asked, store_path):
+def stub_work(asked, store_path, _attempt):
     """Make nothing, and say that it is done."""
     from flows.fleet.work import Made
 
@@ -63,7 +63,7 @@ def stub_work(asked, store_path):
     if what == "slow":
         path.unlink()
         time.sleep(120)
-    return Made(run_id=f"run-{asked.sequence}", is_new=False, num_bytes=0)
+    return Made(run_id=f"run-{asked.sequence}", is_whole=False, num_bytes=0)
 
 
 def stub_worker(root, fleet, say=lambda _line: None):

@@ -149,9 +149,9 @@ def test_an_end_that_finds_no_room_is_entered_once_there_is_some(asked, store, m
     worker = stub_worker(store.root, "stub")
     full, lines = [False], []
 
-    def work(asked, store_path):
+    def work(asked, store_path, attempt):
         full[0] = asked.scene_id == STREETS[1]
-        return stub_work(asked, store_path)
+        return stub_work(asked, store_path, attempt)
 
     worker.work, worker.say = work, lines.append
     monkeypatch.setattr(

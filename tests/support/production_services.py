@@ -1,0 +1,138 @@
+"""PostgreSQL and a Prefect server as a fleet runs on them: real ones, on loopback, in a folder."""
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from contextlib import suppress
+from pathlib import Path
+
+SCRIPTS = Path(__file__).resolve().parent
+ROOT = SCRIPTS.parents[1]
+BINARIES = sorted(Path("/usr/lib/postgresql").glob("*/bin"))
+NO_POSTGRES = None if BINARIES else "Debian's postgresql is not installed"
+START_S = 180.0
+OWNER = "postgres"
+"""Who PostgreSQL runs as where the tests are root, which it refuses to be."""
+
+
+class Postgres:
+    """A cluster of its own, on a Unix socket: nobody else can reach it, no password is needed."""
+
+    PREFIX = "lidarpainter-postgres-"
+
+    def __init__(self):
+        self.folder = Path(tempfile.mkdtemp(prefix=self.PREFIX))
+        self._user = OWNER if os.geteuid() == 0 else None
+        if self._user:
+            shutil.chown(self.folder, self._user)
+        self._call("initdb", "-D", self._data, "-A", "trust", "-U", OWNER, "--no-sync")
+        self.start()
+        self._call("createdb", "-h", self.folder, "-U", OWNER, "prefect")
+
+    @property
+    def url(self):
+        return f"postgresql+asyncpg://{OWNER}@/prefect?host={self.folder}"
+
+    def start(self):
+        options = f"-k {self.folder} -c listen_addresses='' -c fsync=off -c max_connections=60"
+        log = self.folder / "log"
+        self._call("pg_ctl", "-D", self._data, "-l", log, "-w", "-o", options, "start")
+
+    def stop(self, mode="immediate"):
+        self._call("pg_ctl", "-D", self._data, "-m", mode, "-w", "stop")
+
+    def remove(self):
+        self.stop()
+        shutil.rmtree(self.folder)
+
+    @property
+    def _data(self):
+        return self.folder / "data"
+
+    def _call(self, program, *words):
+        subprocess.run(
+            [BINARIES[-1] / program, *words],
+            check=True,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            cwd=self.folder,
+            user=self._user,
+        )
+
+
+class PrefectService:
+    """`prefect server start` over a PostgreSQL, with a home of its own."""
+
+    def __init__(self, folder, database_url, **settings):
+        self.folder = Path(folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self._port = probe.getsockname()[1]
+        self.url = f"http://127.0.0.1:{self._port}/api"
+        self._database_url, self._settings = database_url, settings
+        self.start()
+
+    @property
+    def environment(self):
+        """Of processes that use it."""
+        kept = {name: value for name, value in os.environ.items() if "PREFECT" not in name}
+        return {
+            **kept,
+            "PREFECT_HOME": str(self.folder),
+            "PREFECT_API_URL": self.url,
+            "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+            "DO_NOT_TRACK": "1",
+            "PYTHONPATH": ":".join([str(ROOT), str(SCRIPTS), kept.get("PYTHONPATH", "")]),
+        }
+
+    def start(self):
+        environment = {
+            **self.environment,
+            **self._settings,
+            "PREFECT_API_DATABASE_CONNECTION_URL": self._database_url,
+            "PREFECT_UI_ENABLED": "0",
+        }
+        words = ["server", "start", "--host", "127.0.0.1", "--port", str(self._port), "--no-ui"]
+        self.process = self.spawn(words, "server", environment)
+        deadline = time.monotonic() + START_S
+        while not self.answers():
+            assert self.process.poll() is None, f"see {self.folder / 'server.log'}"
+            assert time.monotonic() < deadline, f"see {self.folder / 'server.log'}"
+            time.sleep(0.5)
+
+    def answers(self):
+        try:
+            with urllib.request.urlopen(f"{self.url}/health", timeout=5) as answer:  # noqa: S310
+                return answer.status == 200
+        except OSError:
+            return False
+
+    def spawn(self, words, name, environment=None):
+        """`prefect ...` with a log of its own and a session that `kill_session` ends."""
+        with (self.folder / f"{name}.log").open("ab") as log:
+            return subprocess.Popen(
+                [sys.executable, "-m", "prefect", *words],
+                stdout=log,
+                stderr=log,
+                env=environment or self.environment,
+                cwd=self.folder,
+                start_new_session=True,
+            )
+
+    def kill(self):
+        self.process.kill()
+        self.process.wait()
+
+
+def kill_session(process):
+    """End a process and those that it has started."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
