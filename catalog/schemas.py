@@ -12,8 +12,9 @@ What becomes of what older and newer software stored, in tables and in manifests
   are taken as they are.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import pyarrow as pa
 
@@ -62,6 +63,20 @@ class TableSchema:
     def arrow(self) -> pa.Schema:
         """The Arrow schema."""
         return pa.schema([column.arrow for column in self.columns])
+
+    def rows_as_arrow(self, rows: Sequence[Mapping[str, Any]]) -> pa.Table:
+        """Rows as they are written.
+
+        Raises:
+            ValueError: a row has a column that is not here, or two share an id.
+        """
+        names = set(self.arrow.names)
+        for row in rows:
+            if unknown := sorted(set(row) - names):
+                raise ValueError(f"table {self.name} has no column {', '.join(unknown)}")
+        if len({row[self.key] for row in rows}) != len(rows):
+            raise ValueError(f"two rows for table {self.name} share a {self.key}")
+        return pa.Table.from_pylist(list(rows), schema=self.arrow)
 
 
 SCENES = TableSchema(

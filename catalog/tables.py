@@ -109,7 +109,7 @@ class CatalogTables:
         if not rows:
             return 0
         schema = _schema(table)
-        source = _as_arrow(schema, rows)
+        source = schema.rows_as_arrow(rows)
         return self._committed(schema, lambda: self._try_merge(schema, source, rule))
 
     def _committed(self, schema: TableSchema, attempted: Callable[[], int | None]) -> int:
@@ -340,14 +340,3 @@ def _schema(table: str) -> TableSchema:
         return TABLES[table]
     except KeyError:
         raise UnknownRecordError(f"no table {table!r}; there are {', '.join(TABLES)}") from None
-
-
-def _as_arrow(schema: TableSchema, rows: Sequence[Row]) -> pa.Table:
-    names = set(schema.arrow.names)
-    for row in rows:
-        if unknown := sorted(set(row) - names):
-            raise ValueError(f"table {schema.name} has no column {', '.join(unknown)}")
-    ids = [row[schema.key] for row in rows]
-    if len(set(ids)) != len(ids):
-        raise ValueError(f"two rows for table {schema.name} share a {schema.key}")
-    return pa.Table.from_pylist(list(rows), schema=schema.arrow)
