@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lidarpainter_models.geometry.box_masks import FARTHEST_PX, project_box
+from lidarpainter_models.geometry.box_masks import box_outlines
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.metrics.images import ImageScores, pooled_psnr, score_image
@@ -55,11 +55,11 @@ def actor_mask(
 ) -> Bool[Tensor, "height width"]:
     """Pixels inside the projected boxes of the actors present at that time."""
     mask = np.zeros((camera.height_px, camera.width_px), np.uint8)
-    for track, world_from_box in actors.placed(timestamp_ns):
-        pixels_uv = project_box(camera, world_from_box, track.size_m)
-        if len(pixels_uv):
-            clamped = pixels_uv.clamp(-FARTHEST_PX, FARTHEST_PX).numpy().astype(np.float32)
-            hull = cv2.convexHull(clamped)
+    if placed := actors.placed(timestamp_ns):
+        tracks, poses = zip(*placed, strict=True)
+        sizes_m = torch.stack([track.size_m for track in tracks])
+        for outline in box_outlines(camera, torch.stack(poses), sizes_m):
+            hull = cv2.convexHull(outline.pixels_uv.astype(np.float32))
             cv2.fillConvexPoly(mask, np.round(hull - 0.5).astype(np.int32), 1)
     return torch.from_numpy(mask.astype(bool))
 

@@ -8,7 +8,7 @@ from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.judged_views import Renderer, ViewScores, score_views
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.shifts import Shift
-from lidarpainter_models.lidar.sparse_depth import points_at_exposure
+from lidarpainter_models.lidar.sparse_depth import FramePoints
 from lidarpainter_models.metrics.depth import (
     DepthScores,
     pooled_inlier_fraction,
@@ -77,10 +77,9 @@ def score_geometry(
 ) -> dict[str, float | None]:
     """Part of held-out LiDAR pixels that the rendered depth meets within 5 %, per trajectory."""
     scores: dict[str, list[DepthScores]] = {shift.name: [] for shift in (Shift(), *shifts)}
+    lidar = FramePoints(held_out.scene)
     for done, view in enumerate(held_out.test_views, start=1):
-        points = points_at_exposure(
-            held_out.scene, view
-        )  # costs more than all the renders of the view
+        points = lidar.at_exposure(view)
         for shift in (Shift(), *shifts):
             camera = held_out.shifted_camera(fitted, view, shift)
             depth_m = fitted.render(camera, view.timestamp_ns).depth_m.cpu()

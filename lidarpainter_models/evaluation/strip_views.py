@@ -15,7 +15,7 @@ from lidarpainter_models.evaluation.strips import StripView, calibrate_strip, sc
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid
-from lidarpainter_models.lidar.sparse_depth import points_at_exposure
+from lidarpainter_models.lidar.sparse_depth import FramePoints
 from lidarpainter_models.observations.fit_size import fit_camera
 from lidarpainter_models.scenes.splits import ViewSplit
 
@@ -82,7 +82,7 @@ def strip_views(
     where the log says, moved as the fit moved the other camera, for the jitter of logged poses is
     the rig's. Frames that one of the two lacks, or that have no sweep, are left out.
     """
-    scene = held_out.scene
+    scene, lidar = held_out.scene, FramePoints(held_out.scene)
     judging = {view.frame_index: view for view in scene.views_of(judging_camera)}
     fitting = {view.frame_index: view for view in scene.views_of(fitted_camera)}
     views = []
@@ -103,7 +103,7 @@ def strip_views(
                 timestamp_ns=own.timestamp_ns,
                 truth_rgb=held_out.image_of(own),
                 fitted_camera=found,
-                points_world=points_at_exposure(scene, own),
+                points_world=lidar.at_exposure(own),
             )
         )
     return views

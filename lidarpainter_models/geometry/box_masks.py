@@ -1,6 +1,7 @@
 """Which pixels of a camera boxes cover; boxes as in `boxes`, depth is camera z in metres."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -10,29 +11,53 @@ from torch import Tensor
 
 from lidarpainter_models.geometry.boxes import BOX_EDGES, box_corners
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.geometry.transforms import transform_points
 
 NEAR_M = 0.5
 """What of a box is nearer to the image plane than this, or behind it, is cut off."""
 FARTHEST_PX = 1e4
 """Outlines are clamped so far out, where they fit into OpenCV's integers."""
 
+_CORNERS = box_corners(torch.ones(3, dtype=torch.float64)).numpy()
+_EDGES = np.array(BOX_EDGES).T
 
-def project_box(
-    camera: Camera, world_from_box: Float[Tensor, "4 4"], size_m: Float[Tensor, "3"]
-) -> Float[Tensor, "corners 2"]:
-    """Pixels whose convex hull is a box seen by a camera; none of a box behind the near plane."""
-    corners = transform_points(world_from_box.double(), box_corners(size_m.double()))
-    pixels_uv, depth_m = camera.project(corners)
-    is_front = depth_m >= NEAR_M
-    if bool(is_front.all()):
-        return pixels_uv
-    first, second = torch.tensor(BOX_EDGES).unbind(1)
-    cut = is_front[first] != is_front[second]
-    first, second = first[cut], second[cut]
-    share = (NEAR_M - depth_m[first]) / (depth_m[second] - depth_m[first])
-    on_plane = torch.lerp(corners[first], corners[second], share[:, None])
-    return torch.cat([pixels_uv[is_front], camera.project(on_plane)[0]])
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BoxOutline:
+    """A box as a camera sees it."""
+
+    box: int
+    """Position among the boxes."""
+    pixels_uv: Float[np.ndarray, "corners 2"]
+    """Their convex hull is the box; clamped to `FARTHEST_PX`."""
+    far_m: float
+    """Depth of the furthest corner."""
+
+
+def box_outlines(
+    camera: Camera,
+    world_from_boxes: Float[Tensor, "boxes 4 4"],
+    sizes_m: Float[Tensor, "boxes 3"],
+) -> list[BoxOutline]:
+    """Outlines of the boxes that reach into the image, in their order."""
+    camera_from_box = (camera.camera_from_world.double() @ world_from_boxes.double()).numpy()
+    corners = _CORNERS * sizes_m.double().numpy()[:, None]
+    corners = corners @ camera_from_box[:, :3, :3].swapaxes(1, 2) + camera_from_box[:, None, :3, 3]
+    is_front = corners[..., 2] >= NEAR_M
+    outlines = []
+    for box in np.flatnonzero(is_front.any(axis=1)):
+        seen = corners[box]
+        if not is_front[box].all():
+            seen = np.concatenate([seen[is_front[box]], _on_near_plane(seen, is_front[box])])
+        u = seen[:, 0] / seen[:, 2] * camera.fx_px + camera.cx_px
+        v = seen[:, 1] / seen[:, 2] * camera.fy_px + camera.cy_px
+        # outlines are rounded to whole pixels: one beside the image may still touch it
+        is_beside = u.max() < -1 or u.min() > camera.width_px + 1
+        if is_beside or v.max() < -1 or v.min() > camera.height_px + 1:
+            continue
+        pixels_uv = np.stack([u, v], axis=1).clip(-FARTHEST_PX, FARTHEST_PX)
+        far_m = float(corners[box, :, 2].max())
+        outlines.append(BoxOutline(box=int(box), pixels_uv=pixels_uv, far_m=far_m))
+    return outlines
 
 
 def project_boxes(
@@ -45,11 +70,21 @@ def project_boxes(
 ) -> Bool[Tensor, "height width"]:
     """Pixels covered by any of the boxes, slightly grown."""
     mask = np.zeros((camera.height_px, camera.width_px), np.uint8)
-    for pose, size_m, is_present in zip(world_from_boxes, sizes_m, present.tolist(), strict=True):
-        if not is_present:
-            continue
-        pixels_uv = project_box(camera, pose, size_m.double() * margin)
-        if len(pixels_uv):
-            clamped = pixels_uv.numpy().clip(-FARTHEST_PX, FARTHEST_PX)
-            cv2.fillConvexPoly(mask, cv2.convexHull(clamped.round().astype(np.int32)), 1)
+    if bool(present.any()):
+        sizes = torch.stack(list(sizes_m))[present].double() * margin
+        for outline in box_outlines(camera, world_from_boxes[present], sizes):
+            rounded = outline.pixels_uv.round().astype(np.int32)
+            cv2.fillConvexPoly(mask, cv2.convexHull(rounded), 1)
     return torch.from_numpy(mask.astype(bool))
+
+
+def _on_near_plane(
+    corners: Float[np.ndarray, "8 3"], is_front: Bool[np.ndarray, "8"]
+) -> Float[np.ndarray, "cut 3"]:
+    """Where the edges of a box in the camera frame meet the near plane."""
+    first, second = _EDGES[:, is_front[_EDGES[0]] != is_front[_EDGES[1]]]
+    depth_m = corners[:, 2]
+    share = (NEAR_M - depth_m[first]) / (depth_m[second] - depth_m[first])
+    on_plane = corners[first] + share[:, None] * (corners[second] - corners[first])
+    on_plane[:, 2] = NEAR_M
+    return on_plane

@@ -20,6 +20,10 @@ _TICK_NS = 1_000_000
 """Points of one millisecond share a pose: at 40 m/s it is 2 cm wrong."""
 _LONGEST_EXTRAPOLATION_S = 0.1
 """One sweep: a point may be measured before the first or after the last box of its actor."""
+_HALF_SWEEP_NS = 50_000_000
+"""The speed of an actor is told from where it is so much earlier and later."""
+_ROUNDING_M = 0.01
+"""More than float32 loses at the ends of a log."""
 ACTOR_MARGIN_M = 0.1
 """Points up to this far outside the box still belong to the actor: mirrors, tight boxes."""
 STREET_MARGIN_M = 0.3  # points up to this far outside the box are kept out of the street
@@ -53,10 +57,11 @@ def near_actors(
     tracks: Sequence[ActorTrack],
 ) -> NearActors:
     """Find the points that moving actors keep out of the street."""
+    across = xyz_m[:, 0].sort()
     parts = [
         part
         for index, track in enumerate(tracks)
-        if (part := _near_one(xyz_m, timestamp_ns, index, track)) is not None
+        if (part := _near_one(xyz_m, timestamp_ns, across, index, track)) is not None
     ]
     if not parts:
         none, zero = torch.zeros(0, dtype=torch.int64), torch.zeros(0)
@@ -96,39 +101,64 @@ def poses_at(
 
     Up to a sweep beyond the ends of the track its first or last motion goes on.
     """
-    times_ns = track.timestamps_ns
-    if len(times_ns) == 1:
+    if len(track.timestamps_ns) == 1:
         return track.world_from_box.expand(len(timestamp_ns), 4, 4)
-    reach_ns = round(_LONGEST_EXTRAPOLATION_S * 1e9)
-    wanted_ns = timestamp_ns.clamp(int(times_ns[0]) - reach_ns, int(times_ns[-1]) + reach_ns)
-    before = (torch.searchsorted(times_ns, wanted_ns, right=True) - 1).clamp(0, len(times_ns) - 2)
-    span_ns = (times_ns[before + 1] - times_ns[before]).double()
-    fraction = (wanted_ns - times_ns[before]).double() / span_ns
+    before, fraction = _between(track, timestamp_ns)
     return interpolate_rigid(
         track.world_from_box[before], track.world_from_box[before + 1], fraction
     )
 
 
+def _centres_at(track: ActorTrack, timestamp_ns: Int[Tensor, " times"]) -> Float[Tensor, "times 3"]:
+    """The centres of `poses_at`, without the cost of turning."""
+    centres = track.world_from_box[:, :3, 3]
+    if len(centres) == 1:
+        return centres.expand(len(timestamp_ns), 3)
+    before, fraction = _between(track, timestamp_ns)
+    mix = fraction[:, None]
+    return (1 - mix) * centres[before] + mix * centres[before + 1]
+
+
+def _between(
+    track: ActorTrack, timestamp_ns: Int[Tensor, " times"]
+) -> tuple[Int[Tensor, " times"], Float[Tensor, " times"]]:
+    """After which box each time comes, and which part of the way to the next one."""
+    times_ns = track.timestamps_ns
+    reach_ns = round(_LONGEST_EXTRAPOLATION_S * 1e9)
+    wanted_ns = timestamp_ns.clamp(int(times_ns[0]) - reach_ns, int(times_ns[-1]) + reach_ns)
+    before = (torch.searchsorted(times_ns, wanted_ns, right=True) - 1).clamp(0, len(times_ns) - 2)
+    span_ns = (times_ns[before + 1] - times_ns[before]).double()
+    return before, (wanted_ns - times_ns[before]).double() / span_ns
+
+
 def _near_one(
     xyz_m: Float[Tensor, "points 3"],
     timestamp_ns: Int[Tensor, " points"],
+    across: tuple[Float[Tensor, " points"], Int[Tensor, " points"]],
     index: int,
     track: ActorTrack,
 ) -> NearActors | None:
-    """The points in or beside one actor, None where there are none."""
+    """The points in or beside one actor, None where there are none.
+
+    `across` is the points' x in ascending order and their rows: of a sweep, an actor has few.
+    """
     if xyz_m.shape[0] == 0:
         return None
     middle_ns = (int(timestamp_ns.min()) + int(timestamp_ns.max())) // 2
     if not track.is_present(middle_ns, margin_ns=round(_LONGEST_EXTRAPOLATION_S * 1e9)):
         return None
-    speed_mps = _speed(track, middle_ns)
+    around_ns = torch.tensor([-_HALF_SWEEP_NS, 0, _HALF_SWEEP_NS])
+    earlier, centre, later = _centres_at(track, middle_ns + around_ns)
+    speed_mps = float((later - earlier).norm()) * 1e9 / (2 * _HALF_SWEEP_NS)
     margin_m = torch.full((3,), STREET_MARGIN_M)
     margin_m[0] += LAG_S * speed_mps
     half_m = track.size_m / 2
     reach_m = float((half_m + margin_m).norm()) + _LONGEST_EXTRAPOLATION_S * speed_mps
-    centre = track.pose_at(middle_ns)[:3, 3].to(xyz_m)
-    is_close = ((xyz_m - centre).abs() <= reach_m).all(dim=-1)
-    rows = is_close.nonzero()[:, 0]
+    centre = centre.to(xyz_m)
+    ends_m = centre[0] + (reach_m + _ROUNDING_M) * torch.tensor([-1.0, 1.0])
+    first, last = torch.searchsorted(across[0], ends_m).tolist()
+    rows = across[1][first:last]
+    rows = rows[((xyz_m[rows] - centre).abs() <= reach_m).all(dim=-1)].sort().values
     if len(rows) == 0:
         return None
     times_ns, own_time = torch.unique(timestamp_ns[rows] // _TICK_NS, return_inverse=True)
@@ -146,10 +176,3 @@ def _near_one(
         outside_m=beyond_m[is_near].amax(dim=-1),
         bottom_m=(world_from_box[is_near, 2, 3] - half_m[2]).float(),
     )
-
-
-def _speed(track: ActorTrack, timestamp_ns: int) -> float:
-    """Metres per second around a time, from its poses a sweep apart."""
-    around = torch.tensor([-50_000_000, 50_000_000]) + timestamp_ns
-    positions = poses_at(track, around)[:, :3, 3]
-    return float((positions[1] - positions[0]).norm()) / 0.1

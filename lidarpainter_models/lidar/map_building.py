@@ -104,15 +104,16 @@ class _PlacedSweep:
 
 def _place_sweep(scene: DrivingScene, sweep: Sweep, tracks: Sequence[ActorTrack]) -> _PlacedSweep:
     """Read a sweep, drop what is out of range, and find what lies near actors."""
-    read = scene.read_sweep(sweep)
-    away = read.xyz_m - sweep.world_from_lidar[:3, 3].to(read.xyz_m)
+    xyz_m = scene.read_column(sweep, "xyz_m")
+    away = xyz_m - sweep.world_from_lidar[:3, 3].to(xyz_m)
     range_m = away.norm(dim=-1)
     left = scene.world_from_ego[scene.frame_position(sweep.frame_index), :3, 1].to(away)
     is_ego = (range_m < EGO_RANGE_M) & ((away @ left).abs() < EGO_HALF_WIDTH_M)
     used = (range_m >= MIN_RANGE_M) & (range_m <= MAX_RANGE_M) & ~is_ego
-    timestamp_ns = sweep.timestamp_ns + read.time_offset_ns[used].to(torch.int64)
+    time_offset_ns = scene.read_column(sweep, "time_offset_ns")
+    timestamp_ns = sweep.timestamp_ns + time_offset_ns[used].to(torch.int64)
     points = MapPoints.uncoloured(
-        xyz_m=read.xyz_m[used],
+        xyz_m=xyz_m[used],
         frame_index=torch.full_like(timestamp_ns, sweep.frame_index),
         timestamp_ns=timestamp_ns,
         range_m=range_m[used],

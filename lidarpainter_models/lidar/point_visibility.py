@@ -16,10 +16,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lidarpainter_models.geometry.box_masks import FARTHEST_PX, project_box
-from lidarpainter_models.geometry.boxes import box_corners
+from lidarpainter_models.geometry.box_masks import box_outlines
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.geometry.transforms import transform_points
 from lidarpainter_models.kernels.point_splat import splat_points
 
 _FAR_M = 1e6
@@ -114,16 +112,13 @@ def box_far_ends(
         camera: its pixels are the cells.
     """
     far_ends = np.full((camera.height_px, camera.width_px), _FAR_M, np.float32)
-    for world_from_box, size_m in boxes:
-        pixels_uv = project_box(camera, world_from_box, size_m)
-        if len(pixels_uv) == 0:
-            continue
-        outline = pixels_uv.clamp(-FARTHEST_PX, FARTHEST_PX).floor().int().numpy()
-        mask = np.zeros(far_ends.shape, np.uint8)
-        cv2.fillConvexPoly(mask, cv2.convexHull(outline), 1)
-        corners = transform_points(world_from_box.double(), box_corners(size_m.double()))
-        far_end_m = transform_points(camera.camera_from_world, corners)[:, 2].max()
-        np.minimum(far_ends, np.float32(far_end_m), out=far_ends, where=mask > 0)
+    if boxes:
+        poses, sizes_m = map(torch.stack, zip(*boxes, strict=True))
+        outlines = box_outlines(camera, poses, sizes_m)
+        # the nearest is drawn last, over all that end behind it
+        for outline in sorted(outlines, key=lambda outline: outline.far_m, reverse=True):
+            hull = cv2.convexHull(np.floor(outline.pixels_uv).astype(np.int32))
+            cv2.fillConvexPoly(far_ends, hull, outline.far_m)
     return torch.from_numpy(far_ends)
 
 

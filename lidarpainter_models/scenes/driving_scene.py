@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
@@ -150,11 +150,12 @@ class DrivingScene:
 
     def read_sweep(self, sweep: Sweep) -> SweepPoints:
         """The points of one sweep, in the world."""
-        columns = {
-            name: torch.from_numpy(self._stored.read_rows(array, sweep.offset, sweep.num_points))
-            for name, array in _POINT_COLUMNS.items()
-        }
-        return SweepPoints(**columns)
+        return SweepPoints(**{name: self.read_column(sweep, name) for name in _POINT_COLUMNS})
+
+    def read_column(self, sweep: Sweep, name: str) -> Shaped[Tensor, "points *_"]:
+        """One field of `read_sweep`, for whoever needs no other."""
+        array = _POINT_COLUMNS[name]
+        return torch.from_numpy(self._stored.read_rows(array, sweep.offset, sweep.num_points))
 
     def sweeps_of(self, frame_index: int) -> tuple[Sweep, ...]:
         """The sweeps of all LiDARs in one frame."""

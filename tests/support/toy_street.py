@@ -124,6 +124,9 @@ class ToyStreet(DrivingScene):
         gain = self.camera_gains[view.camera_name]
         return (colours.float() * gain).round().to(torch.uint8).view(height, width, 3)
 
+    def read_column(self, sweep, name):
+        return getattr(self.read_sweep(sweep), name)
+
     def read_sweep(self, sweep):
         azimuth = torch.deg2rad(torch.arange(-36, 36, 0.3))
         elevation = torch.deg2rad(torch.arange(-20, 14, 0.5))
