@@ -1,7 +1,7 @@
 """Judge a finished run again, or under another protocol; a query, so no server is needed."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from catalog.store import Store
@@ -35,6 +35,8 @@ class EvaluationRequest:
     """Who paints then; None takes the run's own."""
     changes: Mapping[str, Any]
     """Fields of the run's parameters that are replaced, such as weights of distances."""
+    judges_all: bool = False
+    """Judge every held-out view, not a sample of them."""
     previous: tuple[SequenceConfig, ...] = ()
     """For flicker: what else may become of the frame painted before."""
 
@@ -53,6 +55,9 @@ def evaluate_run(store: Store, request: EvaluationRequest) -> dict[str, Any]:
     """
     finished = open_run(store, request.run)
     parameters = with_changes(view_parameters(finished), request.changes)
+    if request.judges_all:
+        scoring = replace(parameters.scoring, most_views=0)
+        parameters = with_changes(parameters, {"scoring": scoring})
     about = {
         "run_id": finished.run_id,
         "scene": finished.scene_id,

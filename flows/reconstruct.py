@@ -212,6 +212,9 @@ def _result(course: Course, scores: dict[str, Scores], final: FittedRef) -> dict
         "computed_now": {name: stage.is_new for name, stage in stages.items()},
         "peak_memory_bytes": max(stage.peak_memory_bytes for stage in stages.values()),
         "num_gaussians": last_fit.summary["num_gaussians"],
+        "stopped_early": any(
+            stage.summary.get("stopped_early", False) for stage in stages.values()
+        ),
         **scores.get("painted", UNJUDGED),
         "unpainted": scores.get("unpainted"),
         "view_time": scores.get("view-time"),

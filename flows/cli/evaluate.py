@@ -39,6 +39,9 @@ def evaluate(  # noqa: PLR0913 - the options of a command
     lpips_heads: Annotated[
         Path | None, typer.Option(help="LPIPS heads (version 0.1) of the same network.")
     ] = None,
+    all_views: Annotated[
+        bool, typer.Option("--all-views", help="Judge every held-out view, not a sample of them.")
+    ] = False,
     previous: Annotated[
         str | None,
         typer.Option(help="For flicker: also lean on the frame before, mixed or shown (or both)."),
@@ -66,18 +69,15 @@ def evaluate(  # noqa: PLR0913 - the options of a command
         is_painted=postpaint,
         painter=painter,
         changes=_weights(feature_weights, lpips_backbone, lpips_heads),
+        judges_all=all_views,
         previous=previously,
     )
     with shown_progress():
         result = evaluate_run(existing_store(), request)
     if as_json:
         print_json(result)
-    elif protocol == FLICKER:
-        _show_flicker(result)
-    elif protocol == CROSS_CAMERA:
-        _show_strips(result)
     else:
-        _show(result)
+        {FLICKER: _show_flicker, CROSS_CAMERA: _show_strips}.get(protocol, _show)(result)
 
 
 def _check(protocol: str, previous: str | None) -> None:

@@ -6,10 +6,20 @@ from typing import Annotated, Any
 import typer
 
 from flows.cli.output import Cell, format_bytes, print_json, print_pairs, print_table, say_status
-from flows.cli.shared_options import AsJson, DeviceName, Painter, Settings, parse_names
+from flows.cli.shared_options import (
+    AsJson,
+    DeviceName,
+    Painter,
+    Settings,
+    parse_bytes,
+    parse_names,
+    parse_seconds,
+)
 from lidarpainter_models.errors import ConfigError
 
 FITS = ("fit", "refine")
+FIRST_FIT_SHARE = 0.6
+"""Of a time limit; the rounds after it share the rest, as they do the steps of a preset."""
 Sideways = Annotated[
     str | None, typer.Option(help="Metres to both sides to paint at, such as 2,3; at most 8.")
 ]
@@ -17,6 +27,13 @@ Upwards = Annotated[str | None, typer.Option(help="Metres up to paint at, such a
 Rounds = Annotated[
     int | None,
     typer.Option(help="How often to paint and go on, 0 or more; the preset's if absent."),
+]
+Memory = Annotated[
+    str | None,
+    typer.Option(help="Most of a fit's process on a CPU, such as 6GB: fewer Gaussians if need be."),
+]
+TimeLimit = Annotated[
+    str | None, typer.Option(help="Of all fits together, such as 10min: fewer steps if need be.")
 ]
 Split = Annotated[
     str | None,
@@ -41,6 +58,8 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     seed: Annotated[
         int | None, typer.Option(min=0, help="Decides in which order the fit sees its views.")
     ] = None,
+    memory: Memory = None,
+    time_limit: TimeLimit = None,
     evaluate: Annotated[
         bool, typer.Option("--evaluate/--no-evaluate", help="Judge the scene, or later.")
     ] = True,
@@ -72,11 +91,10 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
         "report": report,
     }
     changes = {name: value for name, value in changes.items() if value is not None}
-    if seed is not None:
-        changes |= {name: replace(getattr(parameters, name), seed=seed) for name in FITS}
     if shift is not None or up is not None:
         changes["novel"] = shifted(parameters.novel, shift, up)
     parameters = with_overrides(with_changes(parameters, changes), settings or [])
+    parameters = with_changes(parameters, of_fits(parameters, seed, memory, time_limit))
     say_status(f"opening {scene}")
     result = run_reconstruction(parameters, existing_store())
     if as_json:
@@ -97,6 +115,29 @@ def shifted(novel: Any, shift: str | None, up: str | None) -> Any:  # noqa: ANN4
     return replace(novel, shifts=(*sideways, *(Shift(up_m=metres) for metres in _distances(up))))
 
 
+def of_fits(
+    parameters: Any,  # noqa: ANN401 - imported late
+    seed: int | None,
+    memory: str | None,
+    time_limit: str | None,
+) -> dict[str, Any]:
+    """The fits with what was asked of all of them.
+
+    Raises:
+        ConfigError: memory or time limit cannot be read.
+    """
+    asked = {"seed": seed, "memory_bytes": None if memory is None else parse_bytes(memory)}
+    common = {name: value for name, value in asked.items() if value is not None}
+    fits = {name: replace(getattr(parameters, name), **common) for name in FITS}
+    if time_limit is not None:
+        limit_s, rounds = parse_seconds(time_limit), parameters.rounds
+        first_s = limit_s * FIRST_FIT_SHARE if rounds else limit_s
+        fits["fit"] = replace(fits["fit"], time_limit_s=first_s)
+        if rounds:
+            fits["refine"] = replace(fits["refine"], time_limit_s=(limit_s - first_s) / rounds)
+    return fits
+
+
 def show(result: dict[str, Any]) -> None:
     """The result as tables."""
     from lidarpainter_models.evaluation.score_tables import SCORE_NOTE, score_columns, score_rows
@@ -108,6 +149,7 @@ def show(result: dict[str, Any]) -> None:
     pairs: dict[str, Cell] = {
         "run": result["run_id"],
         "Gaussians": result["num_gaussians"],
+        **({"stopped early": "at its time limit"} if result.get("stopped_early") else {}),
         "peak memory": format_bytes(result["peak_memory_bytes"]),
         **{f"{name}, s": seconds for name, seconds in result["seconds"].items()},
         "report": result["report"],

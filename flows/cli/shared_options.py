@@ -138,3 +138,29 @@ def parse_previous(text: str | None) -> tuple["SequenceConfig", ...]:
     if not names.keys() <= uses.keys():
         raise ConfigError(f"--previous {text!r}: expected {', '.join(uses)}")
     return tuple(SequenceConfig(previous=uses[name]) for name in names)
+
+
+def parse_bytes(text: str) -> int:
+    """Bytes of a size such as 6GB or 800MB.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    return round(_amount(text, {"MB": 1e6, "GB": 1e9}, "a size such as 6GB"))
+
+
+def parse_seconds(text: str) -> float:
+    """Seconds of a time such as 90s, 10min or 2h.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    return _amount(text, {"s": 1.0, "min": 60.0, "h": 3600.0}, "a time such as 10min")
+
+
+def _amount(text: str, units: dict[str, float], expected: str) -> float:
+    """A positive number with one of the units behind it, in the basic one."""
+    found = re.fullmatch(rf"(\d+(?:\.\d+)?) ?({'|'.join(units)})", text.strip())
+    if not found or float(found[1]) == 0:
+        raise ConfigError(f"{text!r}: expected {expected}, in {', '.join(units)}")
+    return float(found[1]) * units[found[2]]

@@ -5,6 +5,7 @@ there is none. Colours are those of the scene before any camera's exposure, unle
 named whose exposure all of them then take.
 """
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -30,12 +31,17 @@ from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT, PaintingConditions
 from lidarpainter_models.scenes.records import ViewKey
 
+MOST_SOURCE_BYTES = 1_000_000_000
+"""Of training views that are kept as sources: all of a short log, the last ones of a long one."""
+SOURCE_PIXEL_BYTES = 20
+"""Of a source: colour, depth and opacity."""
+
 
 class ConditionBuilder:
     """Gathers painting conditions at any camera and time of one scene.
 
     They lie where the scene does. Depth and opacity of a training view are rendered when it first
-    serves as a source and kept.
+    serves as a source and kept as long as there is room.
     """
 
     def __init__(
@@ -61,7 +67,7 @@ class ConditionBuilder:
             )
             for view in training_views
         }
-        self._sources: dict[ViewKey, SourceImage] = {}
+        self._sources: OrderedDict[ViewKey, SourceImage] = OrderedDict()
 
     def forget_sources(self) -> None:
         """Free what was kept of training views; what is asked for again is rendered again."""
@@ -98,6 +104,10 @@ class ConditionBuilder:
             if view.hidden is not None:
                 source = source.without(view.hidden, render.rgb)
             self._sources[key] = source
+            most = max(MOST_SOURCE_BYTES // (SOURCE_PIXEL_BYTES * source.alpha.numel()), 1)
+            while len(self._sources) > most:
+                self._sources.popitem(last=False)
+        self._sources.move_to_end(key)
         return self._sources[key]
 
     def sources_for(

@@ -6,7 +6,7 @@ the log's own. The two are reported side by side and never mixed.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -42,6 +42,19 @@ class HeldOut:
     @cached_property
     def _moving(self) -> MovingBoxes:
         return MovingBoxes([track for track in self.scene.tracks if track.is_moving])
+
+    def sampled(self, most_views: int) -> "HeldOut":
+        """With so many of the views at most, each camera's evenly over time; 0 keeps all."""
+        views = self.test_views
+        if most_views == 0 or len(views) <= most_views:
+            return self
+        names = dict.fromkeys(view.camera_name for view in views)
+        share, kept = max(most_views // len(names), 1), set()
+        for name in names:
+            own = [view.key for view in views if view.camera_name == name]
+            count = min(share, len(own))
+            kept |= {own[(2 * place + 1) * len(own) // (2 * count)] for place in range(count)}
+        return replace(self, test_views=tuple(view for view in views if view.key in kept))
 
     def image_of(self, view: RecordedView) -> Float[Tensor, "height width 3"]:
         """The recorded image at fit size, decoded at the first call."""

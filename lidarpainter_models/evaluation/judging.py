@@ -37,13 +37,14 @@ class Judgement:
     config: JudgeConfig
 
     def scores(self, shown: ShownScene, progress: Callable[[int, int], None]) -> Scores:
-        """Recorded views, views beside the path, and depth at both."""
+        """Recorded views, views beside the path, and depth at both, over a sample of the views."""
         shifts = self.config.scoring.shifts
+        held_out = self.held_out.sampled(self.config.scoring.most_views)
         distances = load_distances(
             self.config.feature_weights, self.config.lpips, shown.scene.device
         )
-        cameras = tuple(dict.fromkeys(view.camera_name for view in self.held_out.test_views))
-        num_views, is_known = len(self.held_out.test_views), known_street(self.held_out.scene)
+        cameras = tuple(dict.fromkeys(view.camera_name for view in held_out.test_views))
+        num_views, is_known = len(held_out.test_views), known_street(held_out.scene)
         # every view is rendered at both poses, where truth is known at every shift, and for depth
         total = num_views * (3 + (len(shifts) if is_known else 0))
         done = itertools.count(1)
@@ -51,28 +52,30 @@ class Judgement:
         def told(_done: int = 0, _total: int = 0) -> None:
             progress(next(done), total)
 
-        parts = {name: self._of_camera(shown, name, distances, told) for name in cameras}
+        parts = {name: self._of_camera(shown, held_out, name, distances, told) for name in cameras}
         recorded = _mean([recorded for recorded, _novel in parts.values()])
         novel = {
             shift.name: _mean([novel[shift.name] for _recorded, novel in parts.values()])
             for shift in shifts
         }
-        fractions = score_geometry(self.held_out, shown.scene, shifts, progress=told)
+        fractions = score_geometry(held_out, shown.scene, shifts, progress=told)
         for name, fraction in fractions.items():
             novel.get(name, recorded)[DEPTH] = fraction
+        recorded["num_held_out"] = len(self.held_out.test_views)
         by_camera = {name: recorded for name, (recorded, _novel) in parts.items()}
         return {"recorded": recorded, "novel": novel, "recorded_by_camera": by_camera}
 
     def _of_camera(
         self,
         shown: ShownScene,
+        held_out: HeldOut,
         name: str,
         distances: PerceptualDistances,
         told: Callable[[], None],
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
         shifts = self.config.scoring.shifts
-        views = [view for view in self.held_out.test_views if view.camera_name == name]
-        part = replace(self.held_out, test_views=views)
+        views = [view for view in held_out.test_views if view.camera_name == name]
+        part = replace(held_out, test_views=views)
         fitted, shows = shown.scene, shown.renderer(name)
 
         def render(camera: Camera, timestamp_ns: int) -> Float[Tensor, "height width 3"]:

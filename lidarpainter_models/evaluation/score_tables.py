@@ -67,7 +67,7 @@ def _numbers(values: Mapping[str, Any]) -> list[tuple[str, float | None]]:
     return [
         (name, None if value is None else float(value))
         for name, value in values.items()
-        if name != "num_views" and (value is None or isinstance(value, (int, float)))
+        if not name.startswith("num_") and (value is None or isinstance(value, (int, float)))
     ]
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lidarpainter_models.conditioning.settings import ConditionConfig
+from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.observations.settings import ObservationConfig
@@ -20,10 +21,18 @@ JUDGED_SHIFTS = (
 
 @dataclass(frozen=True, kw_only=True)
 class ScoringConfig:
-    """Which trajectories are judged."""
+    """Which views and trajectories are judged."""
 
     shifts: tuple[Shift, ...] = JUDGED_SHIFTS
     """Where the recorded cameras are moved to, to be judged there."""
+    most_views: int = 48
+    """Held-out views that are judged, evenly over cameras and time, so that judging does not grow
+    with the log; 0 judges all."""
+
+    def __post_init__(self) -> None:
+        """Refuse a number that is none of views."""
+        if self.most_views < 0:
+            raise ConfigError(f"scoring.most_views must not be negative, got {self.most_views}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

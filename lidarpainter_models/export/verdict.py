@@ -22,7 +22,12 @@ def verdict(result: Mapping[str, Any]) -> list[str]:
         return ["Nobody judged this scene: `lidarpainter evaluate` does."]
     return [
         sentence
-        for sentence in (_recorded(result["recorded"]), _aside(result), _actors(result["recorded"]))
+        for sentence in (
+            _recorded(result["recorded"]),
+            _aside(result),
+            _actors(result["recorded"]),
+            _early(result),
+        )
         if sentence
     ]
 
@@ -37,7 +42,13 @@ def _recorded(scores: Mapping[str, Any]) -> str:
         words = "Fair: along the recorded path it shows what is there, fine detail is soft"
     else:
         words = "Poor: even along the recorded path it is blurred or torn"
-    return f"{words} ({psnr:.1f} dB over {scores['num_views']} held-out views)."
+    judged, held_out = scores["num_views"], scores.get("num_held_out", scores["num_views"])
+    of_all = "" if judged == held_out else f" of {held_out}"
+    return f"{words} ({psnr:.1f} dB over {judged}{of_all} held-out views)."
+
+
+def _early(result: Mapping[str, Any]) -> str:
+    return "The fit ended early, at its time limit." if result.get("stopped_early") else ""
 
 
 def _aside(result: Mapping[str, Any]) -> str:

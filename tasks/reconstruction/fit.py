@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from catalog.artefacts import ArtefactRef, Workplace
+from lidarpainter_models.export.images import write_png
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
@@ -29,6 +30,8 @@ from tasks.weights import file_digests
 _LOG = logging.getLogger("lidarpainter")
 CHECKPOINT_EVERY_S = 10.0
 """A killed fit repeats at most this much."""
+LOOK_FILE = "first-look.png"
+"""The scene after a tenth of its first fit, where the checkpoints lie, until the fit is done."""
 
 
 @stage_task
@@ -87,7 +90,16 @@ def _build(  # noqa: PLR0913 - all that a fit is made from
     config: FitConfig,
     device: torch.device,
 ) -> dict[str, Any]:
-    plan = ""
+    seen, plan, shown = observations(), "", ""
+
+    def look(scene: GaussianScene) -> None:
+        nonlocal shown
+        view = seen.views[len(seen.views) // 2]
+        image = scene.render(
+            view.camera, view.timestamp_ns, camera_name=view.key[1], view_key=view.key
+        )
+        shown = f", first look: {write_png(image.rgb.clamp(0, 1).cpu(), place.scratch / LOOK_FILE)}"
+        _LOG.info("a fit of %d steps%s", config.steps, shown)
 
     def told(step: int, steps: int, entry: dict[str, float]) -> None:
         nonlocal plan
@@ -98,10 +110,11 @@ def _build(  # noqa: PLR0913 - all that a fit is made from
             note = f"placing Gaussians, {100 * entry['initialised']:.0f} %"
         else:
             note = f"{entry['psnr']:.2f} dB, {entry['num_gaussians'] / 1000:.0f}k Gaussians, {plan}"
+            note += shown
         progress(step, steps, note)
 
     result = fit_gaussians(
-        observations(),
+        seen,
         config,
         start=copy_scene(start()) if start else None,  # the fit moves what it is given
         guidance=guidance() if guidance else (),
@@ -109,6 +122,7 @@ def _build(  # noqa: PLR0913 - all that a fit is made from
             path=place.scratch, identity=place.scratch.name, every_seconds=CHECKPOINT_EVERY_S
         ),
         progress=told,
+        first_look=None if start else look,
         perceptual=perceptual() if perceptual else None,
         device=device,
     )
@@ -119,4 +133,5 @@ def _build(  # noqa: PLR0913 - all that a fit is made from
         "train_psnr": last["psnr"],
         "cpu_s": last["cpu_s"],
         "steps": int(last["step"]),
+        "stopped_early": last["step"] < config.steps,
     }

@@ -53,3 +53,15 @@ def test_nothing_is_said_of_painting_where_nobody_painted():
 def test_unjudged_scene_is_not_praised():
     (sentence,) = verdict(run(recorded=None))
     assert "Nobody judged" in sentence
+
+
+def test_a_sample_of_the_held_out_views_is_called_one():
+    recorded = {"psnr": 28.0, "actors_psnr": None, "num_views": 48, "num_held_out": 500}
+    assert "(28.0 dB over 48 of 500 held-out views)" in verdict(run(recorded=recorded))[0]
+    recorded = {**recorded, "num_held_out": 48}
+    assert "(28.0 dB over 48 held-out views)" in verdict(run(recorded=recorded))[0]
+
+
+def test_a_fit_that_ended_at_its_time_limit_is_called_early():
+    assert verdict(run(stopped_early=True))[-1] == "The fit ended early, at its time limit."
+    assert "early" not in " ".join(verdict(run(stopped_early=False)))

@@ -110,6 +110,8 @@ def refused(words, expected, place):
         ((*TOY, "--painter", "{file}"), "expected one of none, overlay, warp"),
         ((*TOY, "--painter", "{tmp}"), "expected a diffusers folder"),
         ((*TOY, "--device", "tpu"), "no device 'tpu', expected auto, cpu, cuda or cuda:N"),
+        ((*TOY, "--memory", "6"), "'6': expected a size such as 6GB, in MB, GB"),
+        ((*TOY, "--time-limit", "0min"), "'0min': expected a time such as 10min, in s, min, h"),
         ((*TOY, "--rounds", "-1"), "rounds: Input should be greater than or equal to 0"),
         ((*TOY, "--split", "nonsense"), "expected alternate, forward:N:M or all"),
         ((*TOY, "--split", "forward:0:0"), "forward:0:0"),

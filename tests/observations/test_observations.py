@@ -108,17 +108,17 @@ def test_half_size_keeps_the_nearest_depth_of_each_cell():
 def test_pixels_are_told_apart(world):
     view = world.observations.views[0]
     for image in (full_image(view), half_image(view)):
-        kind = image.facts.kind
+        kind = image.kind
         assert kind.shape == (image.camera.height_px, image.camera.width_px)
         assert {int(value) for value in kind.unique()} <= {0, SKY, SOLID, OPEN}
-    assert bool((full_image(view).facts.kind[view.sky_mask] == SKY).all())
+    assert bool((full_image(view).kind[view.sky_mask] == SKY).all())
 
 
 def test_only_where_some_view_has_sky_can_a_pixel_be_open(world):
     nowhere = torch.zeros_like(world.observations.views[0].sky_mask)
     view = replace(world.observations.views[0], sky_mask=nowhere)
     for make in (full_image, half_image):
-        kind, kind_without = make(view).facts.kind, make(view, nowhere).facts.kind
+        kind, kind_without = make(view).kind, make(view, nowhere).kind
         assert bool((kind == OPEN).any())
         assert not bool((kind_without == OPEN).any())
         assert torch.equal(kind[kind != OPEN], kind_without[kind != OPEN])

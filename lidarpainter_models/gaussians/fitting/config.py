@@ -82,6 +82,12 @@ class FitConfig:
     LiDAR's reach) is then left to the Gaussians and not split between the two."""
     log_every: int = 50
     """Steps between two entries of the history."""
+    memory_bytes: int | None = None
+    """Of the whole process, on a CPU: fewer Gaussians are made where more would be taken. None
+    sets no limit."""
+    time_limit_s: float | None = None
+    """Of the steps, by the clock: as many are made as there is time for, and the schedules are
+    those of so many. None sets no limit."""
 
     @property
     def weighs_perceptual(self) -> bool:
@@ -94,6 +100,10 @@ class FitConfig:
             raise ConfigError(
                 f"steps and log_every must be positive, got {self.steps} and {self.log_every}"
             )
+        for name in ("memory_bytes", "time_limit_s"):
+            value = getattr(self, name)
+            if value is not None and value <= 0:
+                raise ConfigError(f"{name} must be positive, got {value}")
         if not 0 <= self.half_resolution <= 1:
             raise ConfigError(f"half_resolution must be in [0, 1], got {self.half_resolution}")
         if not 0 <= self.guidance.probability <= 1:

@@ -19,7 +19,7 @@ from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.densification import densify, prune
 from lidarpainter_models.gaussians.fitting.images import FitImage, full_image, half_image
-from lidarpainter_models.gaussians.fitting.memory import planned_memory
+from lidarpainter_models.gaussians.fitting.memory import planned_memory, within_limit
 from lidarpainter_models.gaussians.fitting.shape_limits import (
     LIMITS_EVERY,
     limit_shapes,
@@ -29,10 +29,13 @@ from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import Perceptual, fit_step
 from lidarpainter_models.gaussians.initialisation.scene import initialise_scene
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.gaussians.model.sky import seen_as_sky
+from lidarpainter_models.gaussians.model.sky import seen_as_sky, sky_layout
 from lidarpainter_models.gaussians.model.stored_scene import copy_scene
 from lidarpainter_models.observations.views import GuidanceView, SceneObservations
 
+FIRST_LOOK = 0.1
+"""Part of the steps after which the scene is shown for the first time."""
+FirstLook = Callable[[GaussianScene], None]
 Progress = Callable[[int, int, dict[str, float]], None]
 """Told the steps done, the steps in all and the newest entry of the history; before the first step
 `initialised`, the part of the first scene that is made, and `planned_bytes` (see `memory`)."""
@@ -47,6 +50,29 @@ class FitResult:
     """Every so many steps: step, loss, psnr (training views), num_gaussians, cpu_s."""
 
 
+@dataclass(frozen=True)
+class Told:
+    """Who hears of a running fit."""
+
+    progress: Progress | None
+    first_look: FirstLook | None
+
+
+class _Clock:
+    """How many steps the time has room for, by how long those of this process took."""
+
+    def __init__(self, step: int) -> None:
+        self._first, self._began_s = step, time.monotonic()
+
+    def in_time(self, step: int, config: FitConfig) -> FitConfig:
+        """The config, with fewer steps where the time allowed ends before them."""
+        if config.time_limit_s is None or step <= self._first:
+            return config
+        gone_s = time.monotonic() - self._began_s
+        rest = (config.time_limit_s - gone_s) * (step - self._first) / gone_s
+        return replace(config, steps=min(config.steps, step + max(int(rest), 0)))
+
+
 def fit_gaussians(  # noqa: PLR0913 - what was recorded, and one option each
     observations: SceneObservations,
     config: FitConfig,
@@ -55,6 +81,7 @@ def fit_gaussians(  # noqa: PLR0913 - what was recorded, and one option each
     guidance: Sequence[GuidanceView] = (),
     checkpoints: CheckpointFolder | None = None,
     progress: Progress | None = None,
+    first_look: FirstLook | None = None,
     perceptual: Perceptual | None = None,
     device: torch.device | None = None,
 ) -> FitResult:
@@ -67,18 +94,28 @@ def fit_gaussians(  # noqa: PLR0913 - what was recorded, and one option each
         guidance: painted views.
         checkpoints: where to keep the running fit; an existing checkpoint is taken up.
         progress: told about every entry of the history.
+        first_look: shown the scene after the first tenth of the steps.
         perceptual: distance of a rendered and a true image, such as LPIPS, weighted by
             `losses.perceptual` on recorded views and `guidance.perceptual` on painted ones.
         device: where the fit runs and the scene then lies; None is where the start lies. Where its
             memory runs out, images are left on the CPU: the same fit, a little slower.
 
     Raises:
-        ConfigError: the start belongs to other training views, or a weight lacks its function.
+        ConfigError: the start belongs to other training views, a weight lacks its function, or
+            the memory allowed holds no fit.
         DeviceMemoryError: it does not fit into the device's memory.
     """
     _check(observations, config, start, perceptual)
     device = device or (start.device if start is not None else torch.device("cpu"))
-    steps = partial(_steps, observations, config, guidance, checkpoints, progress, perceptual)
+    config = within_limit(
+        observations,
+        config,
+        sky_layout([view.camera for view in observations.views]),
+        start=None if start is None else start.gaussians,
+        guidance=guidance,
+    )
+    told = Told(progress, first_look)
+    steps = partial(_steps, observations, config, guidance, checkpoints, told, perceptual)
 
     def attempt(spares: bool) -> FitResult:
         kept = checkpoints.load() if checkpoints is not None else None
@@ -96,7 +133,7 @@ def _steps(  # noqa: PLR0913 - as `fit_gaussians`
     config: FitConfig,
     guidance: Sequence[GuidanceView],
     checkpoints: CheckpointFolder | None,
-    progress: Progress | None,
+    told: Told,
     perceptual: Perceptual | None,
     state: FitState,
     *,
@@ -104,7 +141,7 @@ def _steps(  # noqa: PLR0913 - as `fit_gaussians`
 ) -> FitResult:
     """All steps that are left; images lie where the scene does, or are sent there one by one."""
     cpu_before_s = time.process_time() - state.cpu_s
-    if progress is not None:
+    if told.progress is not None:
         plan = planned_memory(
             observations,
             config,
@@ -113,18 +150,24 @@ def _steps(  # noqa: PLR0913 - as `fit_gaussians`
             guidance=guidance,
             keeps_images=keeps_images,
         )
-        progress(state.step, config.steps, {"planned_bytes": float(plan.total)})
+        on_cpu = state.scene.device.type == "cpu"
+        planned = float(plan.of_process if on_cpu else plan.total)
+        told.progress(state.step, config.steps, {"planned_bytes": planned})
     full, half = _images(observations, state.scene, config)
     if keeps_images:
         device = state.scene.device
         full, half = ([image.to(device) for image in images] for images in (full, half))
         guidance = [view.to(device) for view in guidance]
+    clock = _Clock(state.step)
     while state.step < config.steps:
         is_half = state.step < config.half_resolution * config.steps
         _advance(state, half if is_half else full, guidance, config, perceptual)
         state.cpu_s = time.process_time() - cpu_before_s
         if state.step % config.log_every == 0 or state.step == config.steps:
-            _log(state, config, progress)
+            config = clock.in_time(state.step, config)
+            _log(state, config, told.progress)
+        if told.first_look is not None and state.step == math.ceil(config.steps * FIRST_LOOK):
+            told.first_look(state.caught_up())
         if checkpoints is not None and checkpoints.is_due(state.step):
             checkpoints.save(*state.keep())
     return FitResult(scene=_finished(state, config), history=state.history)

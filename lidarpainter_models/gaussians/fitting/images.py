@@ -1,10 +1,10 @@
-"""Training images at full and half size, ready for a step of the fit."""
+"""Training images at full and half size, kept as bytes until a step of the fit asks for one."""
 
 from dataclasses import dataclass, replace
 
 import cv2
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
@@ -21,20 +21,32 @@ class FitImage:
     """As recorded."""
     timestamp_ns: int
     camera_name: str
-    facts: PixelFacts
+    rgb_u8: UInt8[Tensor, "height width 3"]
+    kind: UInt8[Tensor, "height width"]
+    """As in `PixelFacts`."""
+    lidar_depth_m: Float[Tensor, "height width"]
 
     def to(self, device: torch.device) -> "FitImage":
         """The same image on another device, as far as it is not there."""
-        facts = {name: getattr(self.facts, name) for name in ("rgb", "kind", "lidar_depth_m")}
-        if facts["rgb"].device == device:
+        if self.rgb_u8.device == device:
             return self
-        moved = {name: value.to(device, non_blocking=True) for name, value in facts.items()}
-        return replace(self, facts=PixelFacts(**moved))
+        return replace(
+            self,
+            rgb_u8=self.rgb_u8.to(device, non_blocking=True),
+            kind=self.kind.to(device, non_blocking=True),
+            lidar_depth_m=self.lidar_depth_m.to(device, non_blocking=True),
+        )
+
+    def facts(self) -> PixelFacts:
+        """What a step reads: made anew each time, as floats take four times the memory."""
+        return PixelFacts(
+            rgb=self.rgb_u8.float() / 255, kind=self.kind, lidar_depth_m=self.lidar_depth_m
+        )
 
     @property
     def is_open(self) -> Bool[Tensor, "height width"]:
         """Pixels that may be sky without being in its mask."""
-        return self.facts.kind == OPEN
+        return self.kind == OPEN
 
 
 def full_image(
@@ -45,7 +57,9 @@ def full_image(
         camera=view.camera,
         timestamp_ns=view.timestamp_ns,
         camera_name=view.key[1],
-        facts=_facts(view.camera, view.rgb, view.sky_mask, view.lidar_depth_m, may_be_sky),
+        rgb_u8=view.rgb_u8.contiguous(),
+        kind=_kinds(view.camera, view.sky_mask, view.lidar_depth_m, may_be_sky),
+        lidar_depth_m=view.lidar_depth_m.contiguous(),
     )
 
 
@@ -58,7 +72,6 @@ def half_image(
         "height_px": max(view.camera.height_px // 2, 1),
     }
     camera = view.camera.resized(**size)
-    rgb = shrink_image(view.rgb_u8, **size).float() / 255
     depth_m = shrink_depth(view.lidar_depth_m, **size)
     sky_mask = _shrink_mask(view.sky_mask, **size)
     may_be_sky = None if may_be_sky is None else _shrink_mask(may_be_sky, **size)
@@ -66,7 +79,9 @@ def half_image(
         camera=camera,
         timestamp_ns=view.timestamp_ns,
         camera_name=view.key[1],
-        facts=_facts(camera, rgb, sky_mask, depth_m, may_be_sky),
+        rgb_u8=shrink_image(view.rgb_u8, **size).contiguous(),
+        kind=_kinds(camera, sky_mask, depth_m, may_be_sky),
+        lidar_depth_m=depth_m.contiguous(),
     )
 
 
@@ -97,13 +112,12 @@ def _shrink_mask(
     return torch.from_numpy(share) > 0.5
 
 
-def _facts(
+def _kinds(
     camera: Camera,
-    rgb: Float[Tensor, "height width 3"],
     sky_mask: Bool[Tensor, "height width"],
     lidar_depth_m: Float[Tensor, "height width"],
     may_be_sky: Bool[Tensor, "height width"] | None,
-) -> PixelFacts:
+) -> UInt8[Tensor, "height width"]:
     """Tell the pixels apart; solid ones are at most one pixel away from a LiDAR return."""
     beside = torch.nn.functional.max_pool2d((lidar_depth_m > 0).float()[None], 3, 1, 1)[0] > 0
     kind = torch.full(sky_mask.shape, NOTHING, dtype=torch.uint8)
@@ -111,4 +125,4 @@ def _facts(
     kind[is_above if may_be_sky is None else is_above & may_be_sky] = OPEN
     kind[beside] = SOLID
     kind[sky_mask] = SKY
-    return PixelFacts(rgb=rgb.contiguous(), kind=kind, lidar_depth_m=lidar_depth_m.contiguous())
+    return kind

@@ -1,21 +1,27 @@
-"""What memory a fit takes on its device, told before it begins.
+"""What memory a fit takes, told before it begins, and how many Gaussians fit into a limit.
 
 Bytes of what is kept are counted; those of a step are what its parts were seen to take, rounded up.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
+from torch import Tensor
+
+from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.kernels.sky_texture import SkyLayout
 from lidarpainter_models.kernels.sparse_adam.state import VECTOR
+from lidarpainter_models.lidar.lidar_map import MapPoints
 from lidarpainter_models.observations.views import GuidanceView, SceneObservations
 
 FLOAT = 4
 """Bytes of a number."""
-IMAGE_BYTES, GUIDANCE_BYTES = 17, 20
+IMAGE_BYTES, GUIDANCE_BYTES = 8, 20
 """Of a pixel: colour, depth and kind of a recorded image; colour, weight and depth of a painted."""
+PROGRAM_BYTES = 700_000_000
+"""Of the process before it holds anything: the interpreter, torch, numba's kernels, arrow."""
 HALF_IMAGES = 0.25
 """Of a full image's pixels."""
 TEXEL_BYTES = 44
@@ -26,6 +32,8 @@ STEP_FLOATS_PER_TEXEL = 16
 """Gradients of the sky, and what its Adam works with."""
 RASTER_BYTES_PER_GAUSSIAN = 512
 """Projected Gaussians, their gradients, and entries of about eight tiles each, sorted."""
+LEAST_SHARE = 10
+"""A limit that leaves less than one in so many of the Gaussians wanted is refused."""
 ROW_BYTES = 48
 """Of a Gaussian: its body, block, place among blocks, tallies and last step."""
 
@@ -42,11 +50,18 @@ class FitMemory:
     step: int
     """One step: leaves, gradients, images under way."""
     rasteriser: int
+    observed: int
+    """What was recorded, on the host: images as bytes, depths, the LiDAR map."""
 
     @property
     def total(self) -> int:
-        """All of it."""
+        """All of it on the device."""
         return self.gaussians + self.sky + self.images + self.step + self.rasteriser
+
+    @property
+    def of_process(self) -> int:
+        """Of the whole process where the device is the CPU."""
+        return self.total + self.observed + PROGRAM_BYTES
 
     def told(self) -> str:
         """In words, such as `2.1 GB (Gaussians 0.9, images 0.5, ...)`."""
@@ -94,4 +109,62 @@ def planned_memory(
             + texels * STEP_FLOATS_PER_TEXEL
         ),
         rasteriser=count * RASTER_BYTES_PER_GAUSSIAN,
+        observed=_observed_bytes(observations),
     )
+
+
+def within_limit(
+    observations: SceneObservations,
+    config: FitConfig,
+    sky: SkyLayout,
+    *,
+    start: GaussianSet | None = None,
+    guidance: Sequence[GuidanceView] = (),
+) -> FitConfig:
+    """The config with at most as many Gaussians as its `memory_bytes` have room for on a CPU.
+
+    Raises:
+        ConfigError: not even a tenth of them fits, or the start does not.
+    """
+    if config.memory_bytes is None:
+        return config
+
+    def taken(budget: int) -> int:
+        growth = replace(config.densification, budget=budget)
+        at_first = min(config.initialisation.num_gaussians, budget)
+        first = replace(config.initialisation, num_gaussians=at_first)
+        part = replace(config, densification=growth, initialisation=first)
+        return planned_memory(observations, part, sky, start=start, guidance=guidance).of_process
+
+    wanted = config.densification.budget
+    if taken(wanted) <= config.memory_bytes:
+        return config
+    least = max(wanted // LEAST_SHARE, 1 if start is None else len(start))
+    room = config.memory_bytes - taken(least)
+    if room < 0:
+        raise ConfigError(
+            f"memory {config.memory_bytes / 1e9:.1f} GB: this fit takes at least "
+            f"{taken(least) / 1e9:.1f} GB; fewer cameras, frames or pixels "
+            "(observation.width_px) take less"
+        )
+    each = (taken(wanted) - taken(least)) / (wanted - least)
+    budget = least + int(room / each)
+    return replace(
+        config,
+        densification=replace(config.densification, budget=budget),
+        initialisation=replace(
+            config.initialisation,
+            num_gaussians=min(config.initialisation.num_gaussians, budget),
+        ),
+    )
+
+
+def _observed_bytes(observations: SceneObservations) -> int:
+    bodies = (observations.lidar_map.street, *observations.lidar_map.actors.values())
+    columns = [getattr(body, field.name) for body in bodies for field in fields(MapPoints)]
+    images: list[Tensor] = [
+        image
+        for view in observations.views
+        for image in (view.rgb_u8, view.sky_mask, view.lidar_depth_m)
+    ]
+    return sum(value.nbytes for value in (*columns, *images))

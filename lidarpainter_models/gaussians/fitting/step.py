@@ -81,6 +81,7 @@ def _recorded_step(
 ) -> Float[Tensor, "2"]:
     """Collect the Gaussians' gradients from a recorded view; step poses, exposure and sky."""
     (camera, bodies), weights, sky = view, config.losses, state.scene.sky
+    facts = image.facts()
     with_actors = _wants_actor_term(state, config)
     screen_gradient = torch.zeros(len(seen), device=seen.means.device)
     splat = draw_gaussians(
@@ -92,11 +93,11 @@ def _recorded_step(
     )
     rays = sky.rays(camera, (splat.alpha.detach() < OPAQUE) | image.is_open)
     sky_rgb = sky.sample(rays).requires_grad_(True)
-    terms = pixel_terms(splat, sky_rgb, image.facts, _pixel_rules(config))
+    terms = pixel_terms(splat, sky_rgb, facts, _pixel_rules(config))
     shown = state.refinement.exposed(terms.shown, image.camera_name)
-    loss = l1_ssim_loss(shown, image.facts.rgb, ssim_weight=weights.ssim)
+    loss = l1_ssim_loss(shown, facts.rgb, ssim_weight=weights.ssim)
     if perceptual is not None and weights.perceptual > 0:
-        loss = loss + weights.perceptual * perceptual(shown, image.facts.rgb)
+        loss = loss + weights.perceptual * perceptual(shown, facts.rgb)
     loss = loss + weights.sky * terms.sky + weights.depth * terms.depth
     if with_actors:
         loss = loss + weights.actors * _actor_term(state, splat, image, camera)
@@ -106,7 +107,7 @@ def _recorded_step(
     state.tally.add(seen.rows, screen_gradient, splat.visible)
     state.refinement.step(state.step, image.camera_name)
     _step_sky(state, sky_rgb, rays, splat.alpha.detach(), config, image)
-    squared_error = (shown.detach() - image.facts.rgb).square().mean()
+    squared_error = (shown.detach() - facts.rgb).square().mean()
     return torch.stack([loss.detach() + prior.detach(), squared_error.double()])
 
 
@@ -188,7 +189,7 @@ def _step_sky(
     clear = 1 - alpha
     learns = clear > MIN_TRANSMITTANCE
     if config.sky_in_mask_only:
-        learns &= image.facts.kind == SKY
+        learns &= image.kind == SKY
     ratio = FINAL_LEARNING_RATE / LEARNING_RATE
     state.scene.sky.observe(
         sky_rgb.grad,

@@ -46,6 +46,11 @@ ACTOR_VOXEL_M = 0.05
 MOST_ACTOR_SHARE = 0.4  # actors get at most this part of the start size
 UNSEEN_SHARE = 0.2
 """Part of the street's share for points that only a camera moved aside would see."""
+MOST_VIEWS_PER_CAMERA = 60
+"""Views that tell where the street is seen and how finely; those between see the same, and asking
+every point for every view would take the square of a log's length."""
+MOST_STREET_POINTS = 5_000_000
+"""Of the street's points so many are looked at, evenly: dozens for each Gaussian."""
 _MOST_VIEWS_PER_ACTOR = 24
 _APART_M = 64.0  # longer than any vehicle, short enough for float32 to stay exact
 
@@ -95,7 +100,7 @@ def _scene_around(gaussians: GaussianSet, observations: SceneObservations) -> Ga
         sky=sky_from_images(
             sky_layout(cameras),
             cameras,
-            [view.rgb for view in views],
+            (view.rgb for view in views),  # one at a time as floats
             [view.sky_mask for view in views],
         ),
         cameras=CameraCorrections.none(
@@ -141,8 +146,10 @@ def _street_gaussians(
     points: MapPoints, views: Sequence[TrainingView], config: InitialisationConfig, budget: int
 ) -> GaussianSet:
     """Surfels on the street: most where images show it, some where only a moved camera would."""
-    cameras = [view.camera for view in views]
-    footprint, in_image = pixel_footprint(points.xyz_m, cameras, aside_m=config.aside_m)
+    points = points.keep(torch.arange(0, len(points), math.ceil(len(points) / MOST_STREET_POINTS)))
+    footprint, in_image = pixel_footprint(
+        points.xyz_m, _spread_cameras(views), aside_m=config.aside_m
+    )
     is_aside = ~in_image & footprint.isfinite()
     for_aside = int(budget * UNSEEN_SHARE)
     seen = _street_voxels(points, footprint, in_image, config, max(budget - for_aside, 1))
@@ -159,6 +166,18 @@ def _street_gaussians(
         sh_degree=config.sh_degree,
         most_sigma_m=torch.cat([2 * seen.size_m, SPACING_SIGMA * aside.size_m]),
     )
+
+
+def _spread_cameras(views: Sequence[TrainingView]) -> list[Camera]:
+    """At most so many views of each camera, evenly over the log."""
+    cameras: dict[str, list[Camera]] = {}
+    for view in views:
+        cameras.setdefault(view.key[1], []).append(view.camera)
+    return [
+        camera
+        for own in cameras.values()
+        for camera in own[:: math.ceil(len(own) / MOST_VIEWS_PER_CAMERA)]
+    ]
 
 
 def _street_voxels(

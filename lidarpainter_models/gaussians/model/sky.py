@@ -7,7 +7,7 @@ image shows are filled in from their neighbours by push and pull (Gortler et al.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -133,7 +133,7 @@ def sky_layout(cameras: Sequence[Camera]) -> SkyLayout:
 def sky_from_images(
     layout: SkyLayout,
     cameras: Sequence[Camera],
-    images: Sequence[Float[Tensor, "height width 3"]],
+    images: Iterable[Float[Tensor, "height width 3"]],
     masks: Sequence[Bool[Tensor, "height width"]],
 ) -> SkyTexture:
     """The mean colour of the images' sky pixels by direction, filled in where there is none."""

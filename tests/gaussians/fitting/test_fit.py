@@ -237,3 +237,27 @@ def test_perceptual_weight_without_a_distance_is_refused(world):
     config = short_fit(losses=replace(short_fit().losses, perceptual=0.1))
     with pytest.raises(ConfigError, match="perceptual"):
         fit_gaussians(world.observations, config)
+
+
+def test_a_fit_out_of_time_ends_early_and_is_whole(world):
+    found = fit_gaussians(world.observations, short_fit(log_every=4, time_limit_s=1e-9))
+    assert found.history[-1]["step"] == 4
+    assert found.scene.num_gaussians > 0
+
+
+def test_a_limit_that_is_not_reached_changes_nothing(world, undisturbed):
+    found = fit_gaussians(world.observations, short_fit(time_limit_s=1e9))
+    assert_same_scene(found.scene, undisturbed.scene)
+
+
+def test_the_first_look_comes_once_after_a_tenth_of_the_steps(world, undisturbed):
+    looks, steps = [], []
+    found = fit_gaussians(
+        world.observations,
+        short_fit(),
+        progress=lambda done, _total, _entry: steps.append(done),
+        first_look=lambda scene: looks.append((steps[-1], scene.num_gaussians)),
+    )
+    assert looks == [(STEPS // 10, looks[0][1])]
+    assert looks[0][1] > 0
+    assert_same_scene(found.scene, undisturbed.scene)

@@ -1,0 +1,52 @@
+"""A fit is planned into the memory that is allowed."""
+
+from dataclasses import replace
+
+import pytest
+
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.gaussians.fitting.config import FitConfig
+from lidarpainter_models.gaussians.fitting.memory import planned_memory, within_limit
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+
+CONFIG = FitConfig()
+
+
+def planned(world, config):
+    return planned_memory(world.observations, config, world.scene.sky.layout).of_process
+
+
+def limited(world, memory_bytes, **start):
+    config = replace(CONFIG, memory_bytes=memory_bytes)
+    return within_limit(world.observations, config, world.scene.sky.layout, **start)
+
+
+def test_what_fits_stays_as_it_is(world):
+    enough = planned(world, CONFIG)
+    assert limited(world, enough) == replace(CONFIG, memory_bytes=enough)
+
+
+@pytest.mark.parametrize("share", [0.9, 0.5])
+def test_less_memory_gives_fewer_gaussians_that_fit_into_it(world, share):
+    few = replace(CONFIG, densification=replace(CONFIG.densification, budget=1))
+    none = planned(world, replace(few, initialisation=replace(few.initialisation, num_gaussians=1)))
+    allowed = int(none + share * (planned(world, CONFIG) - none))
+    config = limited(world, allowed)
+    assert 0.99 * share < config.densification.budget / CONFIG.densification.budget <= share
+    assert config.initialisation.num_gaussians <= config.densification.budget
+    assert planned(world, config) <= allowed
+
+
+def test_a_limit_that_holds_no_fit_is_refused_with_what_it_takes(world):
+    with pytest.raises(ConfigError, match=r"memory 0.1 GB: this fit takes at least 0\.\d GB"):
+        limited(world, 100_000_000)
+
+
+def test_a_start_is_not_made_smaller(world):
+    start = GaussianSet.empty(sh_degree=1)
+    columns = {
+        name: value.new_zeros(100_000, *value.shape[1:]) for name, value in start.columns().items()
+    }
+    start = GaussianSet(**columns)
+    with pytest.raises(ConfigError, match="takes at least"):
+        limited(world, planned(world, CONFIG) - 10_000_000, start=start)
