@@ -3,6 +3,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from lidarpainter_models.conditioning import conditions
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.novel_guidance import (
     guidance_views,
@@ -62,6 +63,21 @@ def test_an_excluded_view_is_no_source(builder, views, camera_at):
     assert nearest[0].key == views[2].key
     assert views[2].key not in [source.key for source in others]
     assert len({source.key for source in nearest}) == len(nearest) == NUM_VIEWS
+
+
+def test_sources_that_there_is_no_room_for_are_rendered_again(
+    builder, views, camera_at, monkeypatch
+):
+    everywhere = builder.conditions(camera_at(0.6, 0.5), 150_000_000)
+    builder.forget_sources()
+    monkeypatch.setattr(conditions, "MOST_SOURCE_BYTES", 1)
+    assert torch.equal(
+        builder.conditions(camera_at(0.6, 0.5), 150_000_000).warp_rgb, everywhere.warp_rgb
+    )
+    kept = builder.source(views[2].key)
+    assert builder.source(views[2].key) is kept
+    builder.source(views[1].key)
+    assert builder.source(views[2].key) is not kept
 
 
 def test_with_every_view_excluded_no_reference_is_valid(builder, views, camera_at):

@@ -107,13 +107,14 @@ def fit_gaussians(  # noqa: PLR0913 - what was recorded, and one option each
     """
     _check(observations, config, start, perceptual)
     device = device or (start.device if start is not None else torch.device("cpu"))
-    config = within_limit(
-        observations,
-        config,
-        sky_layout([view.camera for view in observations.views]),
-        start=None if start is None else start.gaussians,
-        guidance=guidance,
-    )
+    if device.type == "cpu":
+        config = within_limit(
+            observations,
+            config,
+            sky_layout([view.camera for view in observations.views]),
+            start=None if start is None else start.gaussians,
+            guidance=guidance,
+        )
     told = Told(progress, first_look)
     steps = partial(_steps, observations, config, guidance, checkpoints, told, perceptual)
 
@@ -158,7 +159,7 @@ def _steps(  # noqa: PLR0913 - as `fit_gaussians`
         device = state.scene.device
         full, half = ([image.to(device) for image in images] for images in (full, half))
         guidance = [view.to(device) for view in guidance]
-    clock = _Clock(state.step)
+    clock, look = _Clock(state.step), told.first_look
     while state.step < config.steps:
         is_half = state.step < config.half_resolution * config.steps
         _advance(state, half if is_half else full, guidance, config, perceptual)
@@ -166,8 +167,9 @@ def _steps(  # noqa: PLR0913 - as `fit_gaussians`
         if state.step % config.log_every == 0 or state.step == config.steps:
             config = clock.in_time(state.step, config)
             _log(state, config, told.progress)
-        if told.first_look is not None and state.step == math.ceil(config.steps * FIRST_LOOK):
-            told.first_look(state.caught_up())
+        if look is not None and state.step >= config.steps * FIRST_LOOK:
+            look(state.caught_up())
+            look = None
         if checkpoints is not None and checkpoints.is_due(state.step):
             checkpoints.save(*state.keep())
     return FitResult(scene=_finished(state, config), history=state.history)
