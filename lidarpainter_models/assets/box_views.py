@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lidarpainter_models.geometry.box_masks import NEAR_M, project_box
+from lidarpainter_models.geometry.box_masks import NEAR_M, box_outlines
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid
 
@@ -55,9 +55,10 @@ def box_view(
         world_from_box: pose of the box.
         size_m: length, width, height.
     """
-    corners_uv = project_box(camera, world_from_box, size_m)
-    if not len(corners_uv):
+    outlines = box_outlines(camera, world_from_box[None], size_m[None])
+    if not outlines:
         return None
+    corners_uv = torch.from_numpy(outlines[0].pixels_uv)
     limit = torch.tensor([camera.width_px, camera.height_px]).double()
     low = corners_uv.amin(0).floor().clamp(min=0).minimum(limit).long()
     high = corners_uv.amax(0).ceil().clamp(min=0).minimum(limit).long()
