@@ -97,7 +97,7 @@ class ConditionBuilder:
                 key=key,
                 camera=camera,
                 timestamp_ns=view.timestamp_ns,
-                rgb=self._without_exposure(rgb, key[1]),
+                rgb=self.scene.exposure.undone(rgb, key[1], view.timestamp_ns),
                 depth_m=torch.where(sky_mask, 0.0, self.surface_m(render, lidar, camera)),
                 alpha=torch.where(sky_mask, 0.0, render.alpha),
             )
@@ -166,14 +166,17 @@ class ConditionBuilder:
             self.boxes,
             count=self.config.num_references,
         )
-        expose = self.scene.exposure.apply
-        references_rgb = torch.stack([expose(rgb, camera_name) for rgb in references.rgb])
-        nearest = _as_taken(expose(sources[0].rgb, camera_name), camera) if sources else None
+
+        def expose(rgb: Tensor) -> Tensor:
+            return self.scene.exposure.apply(rgb, camera_name, timestamp_ns)
+
+        references_rgb = torch.stack([expose(rgb) for rgb in references.rgb])
+        nearest = _as_taken(expose(sources[0].rgb), camera) if sources else None
         return PaintingConditions(
-            render_rgb=expose(render.rgb, camera_name).clamp(0, 1),
+            render_rgb=expose(render.rgb).clamp(0, 1),
             render_depth_m=render.depth_m,
             render_alpha=render.alpha,
-            lidar_rgb=_masked(expose(lidar.rgb, camera_name), lidar.hit),
+            lidar_rgb=_masked(expose(lidar.rgb), lidar.hit),
             lidar_depth_m=lidar.depth_m,
             lidar_hit=lidar.hit,
             warp_rgb=_masked(references_rgb, references.valid),
@@ -192,16 +195,6 @@ class ConditionBuilder:
         """The best known depth of a view."""
         focal_px = (camera.fx_px + camera.fy_px) / 2
         return surface_depth(render.depth_m, lidar.depth_m, focal_px)
-
-    def _without_exposure(
-        self, rgb: Float[Tensor, "height width 3"], camera_name: str
-    ) -> Float[Tensor, "height width 3"]:
-        """A recorded image in the colours of the scene itself."""
-        exposure = self.scene.exposure
-        if camera_name not in exposure.camera_names:
-            return rgb
-        matrix = exposure.matrix[exposure.camera_names.index(camera_name)].detach()
-        return (rgb - matrix[:, 3]) @ torch.linalg.inv(matrix[:, :3]).T
 
 
 def _as_taken(

@@ -14,6 +14,30 @@ from torch import Tensor
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.transforms import invert_rigid, is_rigid, transform_points
 
+_READ_ROUNDS = 2  # a second guess of where a point is read moves it by less than 0.01 px
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Shutter:
+    """How an image is read while its camera moves on.
+
+    A pixel (u, v) is read `across_s @ (u / width - 0.5, v / height - 0.5)` after the middle of the
+    image, when the camera stands where it is said to.
+    """
+
+    across_s: tuple[float, float] = (0.0, 0.0)
+    """From the left end of the image to the right, and from the top to the bottom; both 0 where
+    all of it is read at once."""
+    late_s: float = 0.0
+    """How much after its timestamp the image was taken."""
+    twist_per_s: Float[Tensor, "6"]
+    """Turn (rad/s) and velocity (m/s) of the camera in its own frame."""
+
+    @property
+    def is_rolling(self) -> bool:
+        """Whether the image is read bit by bit."""
+        return self.across_s != (0.0, 0.0)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Camera:
@@ -26,6 +50,8 @@ class Camera:
     cy_px: float
     width_px: int
     height_px: int
+    shutter: Shutter | None = None
+    """Of a recorded image; None for a view that is taken at once."""
 
     def __post_init__(self) -> None:
         """Refuse poses and focal lengths that cannot project."""
@@ -51,8 +77,23 @@ class Camera:
         return self.world_from_camera[:3, 3]
 
     def at(self, world_from_camera: Float[Tensor, "4 4"]) -> "Camera":
-        """The same lens at another pose."""
+        """The same lens at another pose, where nothing was recorded: without a shutter."""
+        return replace(self, world_from_camera=world_from_camera, shutter=None)
+
+    def refined(self, world_from_camera: Float[Tensor, "4 4"]) -> "Camera":
+        """The same recorded image, taken from a better known pose: with its shutter."""
         return replace(self, world_from_camera=world_from_camera)
+
+    def taken_ns(self, timestamp_ns: int) -> int:
+        """When an image with a timestamp was really taken."""
+        return timestamp_ns + (0 if self.shutter is None else round(self.shutter.late_s * 1e9))
+
+    def read_s(self, pixels_uv: Float[Tensor, "points 2"]) -> Float[Tensor, " points"]:
+        """How long after the middle of the image pixels are read; beyond it, as at its edge."""
+        columns_s, rows_s = (0.0, 0.0) if self.shutter is None else self.shutter.across_s
+        u, v = pixels_uv.unbind(-1)
+        across = (u / self.width_px - 0.5).clamp(-0.5, 0.5)
+        return columns_s * across + rows_s * (v / self.height_px - 0.5).clamp(-0.5, 0.5)
 
     def resized(self, *, width_px: int, height_px: int) -> "Camera":
         """The same view on another pixel grid (pixel edges stay aligned)."""
@@ -72,15 +113,28 @@ class Camera:
     ) -> tuple[Float[Tensor, "points 2"], Float[Tensor, " points"]]:
         """Continuous pixel positions and depth (camera z, metres) of world points.
 
-        A point with depth <= 0 is behind the camera: its pixel position means nothing.
+        A point with depth <= 0 is behind the camera: its pixel position means nothing. Points stand
+        still while the image is read.
         """
         camera_from_world = self.camera_from_world.to(points_world, non_blocking=True)
         points = transform_points(camera_from_world, points_world)
+        pixels_uv = self._pixels_of(points)
+        if self.shutter is not None and self.shutter.is_rolling:
+            turn, speed = self.shutter.twist_per_s.to(points).split(3)
+            velocity = -torch.linalg.cross(turn.expand_as(points), points) - speed
+            standing = points
+            for _ in range(_READ_ROUNDS):
+                points = standing + self.read_s(pixels_uv)[:, None] * velocity
+                pixels_uv = self._pixels_of(points)
+        return pixels_uv, points[:, 2]
+
+    def _pixels_of(self, points: Float[Tensor, "points 3"]) -> Float[Tensor, "points 2"]:
+        """Continuous pixel positions of points of the camera's frame."""
         depth_m = points[:, 2]
         safe = torch.where(depth_m.abs() < 1e-9, torch.full_like(depth_m, 1e-9), depth_m)
         u = points[:, 0] / safe * self.fx_px + self.cx_px
         v = points[:, 1] / safe * self.fy_px + self.cy_px
-        return torch.stack([u, v], dim=-1), depth_m
+        return torch.stack([u, v], dim=-1)
 
     def contains(
         self,

@@ -107,7 +107,10 @@ def points_in_view(
     *,
     near_m: float,
 ) -> PointsInView:
-    """Where the points of all bodies stand in an image taken at a time; absent actors have none."""
+    """Where the points of all bodies stand in an image taken at a time; absent actors have none.
+
+    The street stands where a rolling shutter reads it, actors where they are in the middle.
+    """
     lens = torch.tensor(
         [[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]],
         dtype=torch.float64,
@@ -129,6 +132,10 @@ def points_in_view(
             camera.height_px,
             near_m,
         )
+        if body.track is None and camera.shutter is not None and camera.shutter.is_rolling:
+            read_uv, _ = camera.project(body.points.xyz_m[inside].double())
+            size = torch.tensor([camera.width_px, camera.height_px]) - 1e-3
+            pixels_uv = read_uv.clamp(torch.zeros(2), size).to(pixels_uv)
         age_ns = (body.points.timestamp_ns[inside] - timestamp_ns).abs()
         parts.append(
             {

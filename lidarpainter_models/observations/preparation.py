@@ -3,7 +3,8 @@
 Only training views and the sweeps of training frames enter.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 from jaxtyping import UInt8
 from torch import Tensor
@@ -11,11 +12,13 @@ from torch import Tensor
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.lidar.colouring import MapColouring
 from lidarpainter_models.lidar.map_building import gather_points
+from lidarpainter_models.lidar.recording_faults import find_faults
 from lidarpainter_models.lidar.sky_masks import sky_mask
 from lidarpainter_models.lidar.sparse_depth import FramePoints, sparse_lidar_depth
 from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
+from lidarpainter_models.scenes.camera_faults import CameraFault
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.scenes.splits import ViewSplit
@@ -28,7 +31,7 @@ def prepare_observations(
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> SceneObservations:
-    """Prepare what a fit on the split's training views needs.
+    """Prepare what a fit on the split's training views needs, faults of the recording corrected.
 
     Args:
         scene: where it is read from.
@@ -41,16 +44,19 @@ def prepare_observations(
     """
     if not split.train:
         raise SceneError(f"the split of {scene.dataset}/{scene.sequence} has no training views")
+    faults = find_faults(scene, split.train)
+    taken = [_as_taken(view, faults) for view in split.train]
     colouring = MapColouring(
         gather_points(scene, split.train_frames),
         scene.tracks,
-        split.train,
+        taken,
     )
     lidar, views = FramePoints(scene), []
-    for done, recorded in enumerate(split.train, start=1):
+    for done, (recorded, view) in enumerate(zip(split.train, taken, strict=True), start=1):
         image = scene.read_image(recorded)
-        views.append(_training_view(lidar, recorded, image, config))
-        colouring.add(recorded, image)
+        made = _training_view(lidar, view, image, config)
+        views.append(replace(made, timestamp_ns=recorded.timestamp_ns))
+        colouring.add(view, image)
         if progress is not None:
             progress(done, len(split.train) + 1)
     lidar_map = colouring.coloured()
@@ -60,7 +66,17 @@ def prepare_observations(
         views=tuple(views),
         lidar_map=lidar_map,
         tracks=tuple(track for track in scene.tracks if track.is_moving),
+        faults=faults,
     )
+
+
+def _as_taken(view: RecordedView, faults: Mapping[str, CameraFault]) -> RecordedView:
+    """The view where and when its image was really taken."""
+    fault = faults.get(view.camera_name)
+    if fault is None:
+        return view
+    camera = fault.corrected(view.camera)
+    return replace(view, camera=camera, timestamp_ns=camera.taken_ns(view.timestamp_ns))
 
 
 def _training_view(

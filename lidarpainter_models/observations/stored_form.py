@@ -1,14 +1,15 @@
 """Observations as named arrays and JSON-able metadata, so that a fit reads no dataset."""
 
-from dataclasses import fields
+from dataclasses import asdict, fields
 from typing import Any
 
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
-from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
+from lidarpainter_models.scenes.camera_faults import faults_from_records
 from lidarpainter_models.scenes.stored_tracks import COLUMNS as TRACK_COLUMNS
 from lidarpainter_models.scenes.stored_tracks import tracks_from_arrays, tracks_to_arrays
 
@@ -37,12 +38,18 @@ def observations_to_arrays(
             arrays[f"view.{index}.hidden"] = view.hidden.contiguous()
         arrays[f"view.{index}.world_from_camera"] = view.camera.world_from_camera.contiguous()
         lens = {name: getattr(view.camera, name) for name in _LENS}
-        records.append({"key": list(view.key), "timestamp_ns": view.timestamp_ns, "lens": lens})
+        record = {"key": list(view.key), "timestamp_ns": view.timestamp_ns, "lens": lens}
+        shutter = view.camera.shutter
+        if shutter is not None:
+            arrays[f"view.{index}.twist_per_s"] = shutter.twist_per_s.contiguous()
+            record["shutter"] = {"across_s": list(shutter.across_s), "late_s": shutter.late_s}
+        records.append(record)
     metadata = {
         "schema": SCHEMA,
         "views": records,
         "tracks": track_records,
         "map_actors": actor_ids,
+        "faults": {name: asdict(fault) for name, fault in observations.faults.items()},
     }
     return arrays, metadata
 
@@ -76,6 +83,7 @@ def observations_from_arrays(
             street=street, actors=dict(zip(metadata["map_actors"], actors, strict=True))
         ),
         tracks=tracks,
+        faults=faults_from_records(metadata.get("faults", {})),
     )
 
 
@@ -83,10 +91,18 @@ def _stored_view(arrays: dict[str, Tensor], index: int, record: dict[str, Any]) 
     """One view of stored observations."""
     frame_index, camera_name = record["key"]
     images = {name: arrays[f"view.{index}.{name}"] for name in _IMAGES}
+    told = record.get("shutter")
+    shutter = told and Shutter(
+        across_s=tuple(told["across_s"]),
+        late_s=told["late_s"],
+        twist_per_s=arrays[f"view.{index}.twist_per_s"],
+    )
     return TrainingView(
         key=(int(frame_index), str(camera_name)),
         camera=Camera(
-            world_from_camera=arrays[f"view.{index}.world_from_camera"], **record["lens"]
+            world_from_camera=arrays[f"view.{index}.world_from_camera"],
+            shutter=shutter,
+            **record["lens"],
         ),
         timestamp_ns=record["timestamp_ns"],
         hidden=arrays.get(f"view.{index}.hidden"),

@@ -3,7 +3,8 @@
 Frames: world (z up) and camera (x right, y down, z forward); metres.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.lidar_map import LidarMap
+from lidarpainter_models.scenes.camera_faults import CameraFault
 from lidarpainter_models.scenes.records import ViewKey
 from lidarpainter_models.scenes.tracks import ActorTrack
 
@@ -21,7 +23,7 @@ class TrainingView:
 
     key: ViewKey
     camera: Camera
-    """As recorded, at fit size."""
+    """As recorded, faults corrected, at fit size."""
     timestamp_ns: int
     rgb_u8: UInt8[Tensor, "height width 3"]
     sky_mask: Bool[Tensor, "height width"]
@@ -70,6 +72,8 @@ class SceneObservations:
     lidar_map: LidarMap
     tracks: tuple[ActorTrack, ...]
     """Moving actors only."""
+    faults: Mapping[str, CameraFault] = field(default_factory=dict)
+    """What was wrong about the cameras' recordings; the views are corrected already."""
 
     @property
     def camera_names(self) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from jaxtyping import Float, Shaped, UInt8
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
-from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.scenes.records import (
     Distortion,
     ImageRecord,
@@ -24,6 +24,7 @@ from lidarpainter_models.scenes.records import (
     Sweep,
     SweepPoints,
 )
+from lidarpainter_models.scenes.shutters import recorded_shutters
 from lidarpainter_models.scenes.stored import Fetch, StoredScene
 from lidarpainter_models.scenes.tracks import ActorTrack, tracks_from_boxes
 from lidarpainter_models.scenes.undistortion import pinhole_of, undistort
@@ -190,10 +191,14 @@ class DrivingScene:
         cameras = self._stored.table("cameras")
         rows = cameras.drop_columns(["world_from_camera"]).to_pylist()
         poses = _poses(cameras, "world_from_camera")
+        shutters = recorded_shutters(rows, poses)
         self._image_ranges = [(row["offset"], row["num_bytes"]) for row in rows]
         self._lenses = [
-            (_lens(row, pose), Distortion(row["distortion_model"], tuple(row["distortion_terms"])))
-            for row, pose in zip(rows, poses, strict=True)
+            (
+                _lens(row, pose, shutter),
+                Distortion(row["distortion_model"], tuple(row["distortion_terms"])),
+            )
+            for row, pose, shutter in zip(rows, poses, shutters, strict=True)
         ]
         self._shutters = [_shutter(row) for row in rows]
         self.views: tuple[RecordedView, ...] = tuple(
@@ -231,8 +236,9 @@ def _poses(table: pa.Table, column: str) -> Float[Tensor, "rows 4 4"]:
     return torch.from_numpy(np.array(flat, dtype=np.float64)).reshape(-1, 4, 4)
 
 
-def _lens(row: dict[str, Any], world_from_camera: Float[Tensor, "4 4"]) -> Camera:
+def _lens(row: dict[str, Any], world_from_camera: Float[Tensor, "4 4"], shutter: Shutter) -> Camera:
     return Camera(
+        shutter=shutter,
         world_from_camera=world_from_camera,
         fx_px=row["fx_px"],
         fy_px=row["fy_px"],

@@ -47,7 +47,7 @@ class SceneNodes:
             root: name of the node above all others.
             scene: what is shown.
             cameras: recorded cameras with their times, in whose colours it is shown.
-            camera_name: whose exposure it takes.
+            camera_name: whose exposure it takes, as at the first of these times.
         """
         self._scene = scene
         self._root = api.add_frame(root, show_axes=False)
@@ -56,7 +56,7 @@ class SceneNodes:
         for panel in sky_panels(scene.sky):
             api.add_image(
                 f"{root}/sky/{panel.name}",
-                to_bytes(scene.exposure.apply(panel.rgb, camera_name)),
+                to_bytes(scene.exposure.apply(panel.rgb, camera_name, cameras[0][1])),
                 render_width=2 * SKY_M,
                 render_height=2 * SKY_M,
                 format="jpeg",
@@ -66,7 +66,8 @@ class SceneNodes:
                 wxyz=quaternion_from_rotation(panel.world_from_panel).numpy(),
                 position=(SKY_M * panel.world_from_panel[:, 2]).numpy(),
             )
-        rgb = scene.exposure.apply(recorded_rgb(scene, cameras)[None], camera_name)[0]
+        recorded = recorded_rgb(scene, cameras)[None]
+        rgb = scene.exposure.apply(recorded, camera_name, cameras[0][1])[0]
         self._bodies: dict[int, viser.GaussianSplatHandle] = {}
         for body, splats in splats_by_body(scene.gaussians, rgb).items():
             if body == _STREET:

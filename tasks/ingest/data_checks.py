@@ -10,6 +10,7 @@ from catalog.store import Store
 from lidarpainter_models.checks.doctor import check_scene, draw_overlay
 from lidarpainter_models.errors import LidarPainterError
 from lidarpainter_models.export.images import write_png
+from lidarpainter_models.lidar.recording_faults import find_faults
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from tasks.health import Finding
@@ -33,7 +34,7 @@ def check_stored_scene(store: Store, scene_id: str, out: Path | None) -> list[Fi
     path = out or store.root / "doctor" / scene.dataset / f"{scene.sequence}.png"
     if path.suffix != ".png":
         path = path / "overlay.png"
-    return _examined(scene, path)
+    return _examined(scene, path, [*_findings(scene), _camera_faults(scene)])
 
 
 def check_dataset(store: Store, dataset: str, root: Path, out: Path | None) -> list[Finding]:
@@ -51,16 +52,17 @@ def check_dataset(store: Store, dataset: str, root: Path, out: Path | None) -> l
             try:
                 path = ingest_scene(dataset, root, sequence, Path(trial), frames=TRIAL_FRAMES)
                 image = (out or store.root / "doctor" / dataset) / f"{sequence}.png"
-                found = _examined(DrivingScene.open(path), image)
+                scene = DrivingScene.open(path)
+                found = _examined(scene, image, _findings(scene))
             except (LidarPainterError, CatalogError) as error:
                 found = [Finding("reading", "fail", str(error))]
         findings += [Finding(f"{sequence}: {f.name}", f.verdict, f.detail) for f in found]
     return findings
 
 
-def _examined(scene: DrivingScene, image: Path) -> list[Finding]:
+def _examined(scene: DrivingScene, image: Path, found: list[Finding]) -> list[Finding]:
     """All findings about a scene, after writing its overlay image and the JSON beside it."""
-    findings = [*_findings(scene), Finding("overlay", "ok", str(_write_overlay(scene, image)))]
+    findings = [*found, Finding("overlay", "ok", str(_write_overlay(scene, image)))]
     report = {
         "scene": f"{scene.dataset}/{scene.sequence}",
         "content_digest": scene.content_digest,
@@ -74,6 +76,15 @@ def _examined(scene: DrivingScene, image: Path) -> list[Finding]:
 
 def _findings(scene: DrivingScene) -> list[Finding]:
     return [Finding(check.name, check.verdict, check.detail) for check in check_scene(scene)]
+
+
+def _camera_faults(scene: DrivingScene) -> Finding:
+    """What a fit would correct about the cameras; a trial of a few frames says too little."""
+    faults = find_faults(scene, scene.views)
+    said = [f"{name} {fault}" for name, fault in faults.items()]
+    if not said:
+        return Finding("camera faults", "ok", "clocks, angles and readouts are as stored")
+    return Finding("camera faults", "warn", f"{'; '.join(said)} in a fit")
 
 
 def _write_overlay(scene: DrivingScene, path: Path) -> Path:

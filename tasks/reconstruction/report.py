@@ -121,6 +121,7 @@ def _pictures(subject: Subject, shifts: Sequence[Shift], progress: Progress) -> 
         moving=recorded_beside(held_out, fitted, beside),
         worst=worst_views(held_out, fitted),
         actor_gaussians=dict(zip(names, counts, strict=True)),
+        faults=[f"{name} {fault}." for name, fault in fitted.cameras.faults.items()],
     )
 
 

@@ -20,6 +20,7 @@ class FitImage:
     camera: Camera
     """As recorded."""
     timestamp_ns: int
+    """When it was really taken."""
     camera_name: str
     rgb_u8: UInt8[Tensor, "height width 3"]
     kind: UInt8[Tensor, "height width"]
@@ -55,7 +56,7 @@ def full_image(
     """The view as it is; only pixels that may be sky can be OPEN, by default all."""
     return FitImage(
         camera=view.camera,
-        timestamp_ns=view.timestamp_ns,
+        timestamp_ns=view.camera.taken_ns(view.timestamp_ns),
         camera_name=view.key[1],
         rgb_u8=view.rgb_u8.contiguous(),
         kind=_kinds(view.camera, view.sky_mask, view.lidar_depth_m, may_be_sky),
@@ -77,7 +78,7 @@ def half_image(
     may_be_sky = None if may_be_sky is None else _shrink_mask(may_be_sky, **size)
     return FitImage(
         camera=camera,
-        timestamp_ns=view.timestamp_ns,
+        timestamp_ns=view.camera.taken_ns(view.timestamp_ns),
         camera_name=view.key[1],
         rgb_u8=shrink_image(view.rgb_u8, **size).contiguous(),
         kind=_kinds(camera, sky_mask, depth_m, may_be_sky),

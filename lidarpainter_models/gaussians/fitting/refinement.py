@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.gaussians.fitting.config import FitConfig
+from lidarpainter_models.gaussians.fitting.images import FitImage
 from lidarpainter_models.gaussians.fitting.losses import pose_prior
 from lidarpainter_models.gaussians.fitting.optimiser import RowAdam
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
@@ -28,6 +29,7 @@ class Refinement:
             "camera_adam": RowAdam(scene.cameras.view_tangent),
             "actor_adam": RowAdam(scene.actors.tangent.flatten(0, 1)),
             "exposure_adam": RowAdam(scene.exposure.matrix.flatten(1)),
+            "gain_adam": RowAdam(scene.exposure.log_gain.view(-1, 1)),
         }
         refinement = cls(scene=scene, config=config, adams=adams)
         for table in refinement._tables():
@@ -56,10 +58,12 @@ class Refinement:
         return pose if self.refines_cameras(step) else pose.detach()
 
     def exposed(
-        self, rgb: Float[Tensor, "height width 3"], camera_name: str
+        self, rgb: Float[Tensor, "height width 3"], image: FitImage
     ) -> Float[Tensor, "height width 3"]:
         """The image as its camera exposes it."""
-        return self.scene.exposure.apply(rgb, camera_name) if self.refines_exposure else rgb
+        if not self.refines_exposure:
+            return rgb
+        return self.scene.exposure.apply(rgb, image.camera_name, image.timestamp_ns)
 
     def prior(self, row: int, timestamp_ns: int, step: int) -> Float[Tensor, ""]:
         """Corrections are small, and an actor's change little from one knot to the next."""
@@ -86,12 +90,12 @@ class Refinement:
                 total = total + weights.actor_smoothness * pose_prior(jump, **noise)
         return total
 
-    def step(self, step: int, camera_name: str) -> None:
+    def step(self, step: int, image: FitImage) -> None:
         """Move the corrections that are refined by the gradients they received; drop these.
 
         Args:
             step: of the fit.
-            camera_name: whose image gave the gradients.
+            image: what gave the gradients.
         """
         if self.refines_cameras(step):
             table = self.scene.cameras.view_tangent
@@ -104,16 +108,18 @@ class Refinement:
                 rate = self._rate("actor", step)
                 self.adams["actor_adam"].step(tangent.view(-1, 6), gradient, rate)
         if self.refines_exposure:
-            self._step_exposure(step, camera_name)
+            self._step_exposure(step, image)
         for table in self._tables():
             table.grad = None
 
-    def _step_exposure(self, step: int, camera_name: str) -> None:
-        names, matrix = self.scene.exposure.camera_names, self.scene.exposure.matrix
-        row = names.index(camera_name)
+    def _step_exposure(self, step: int, image: FitImage) -> None:
+        exposure = self.scene.exposure
+        names, matrix = exposure.camera_names, exposure.matrix
+        row = names.index(image.camera_name)
+        rate = self.config.learning_rates.at("exposure", step / self.config.steps)
+        self._step_gain(row, image.timestamp_ns, rate)
         if row == 0 and len(names) > 1:
             return  # the reference: all cameras together would be free to drift
-        rate = self.config.learning_rates.at("exposure", step / self.config.steps)
         with torch.no_grad():
             self.adams["exposure_adam"].step(
                 matrix.view(-1, 12),
@@ -122,6 +128,23 @@ class Refinement:
                 slice(row, row + 1),
             )
 
+    def _step_gain(self, row: int, timestamp_ns: int, rate: float) -> None:
+        """Move a camera's gain at the knots around a time; what is common to all its knots stays.
+
+        One knot has nothing to differ from.
+        """
+        log_gain = self.scene.exposure.log_gain
+        before, after, _ = self.scene.exposure.neighbours(timestamp_ns)
+        knots = log_gain.shape[1]
+        with torch.no_grad():
+            self.adams["gain_adam"].step(
+                log_gain.view(-1, 1),
+                _gradient(log_gain).view(-1, 1),
+                log_gain.new_full((1,), rate),
+                slice(row * knots + before, row * knots + after + 1),
+            )
+            log_gain[row] -= log_gain[row].mean()
+
     def _rate(self, kind: str, step: int) -> Float[Tensor, "6"]:
         """Step sizes of a tangent's columns."""
         rates, fraction = self.config.learning_rates, step / self.config.steps
@@ -129,9 +152,14 @@ class Refinement:
         translation_m = rates.at(f"{kind}_translation_m", fraction)
         return torch.tensor([rotation_rad] * 3 + [translation_m] * 3, dtype=torch.float64)
 
-    def _tables(self) -> tuple[Tensor, Tensor, Tensor]:
-        scene = self.scene
-        return scene.cameras.view_tangent, scene.actors.tangent, scene.exposure.matrix
+    def _tables(self) -> tuple[Tensor, ...]:
+        scene, exposure = self.scene, self.scene.exposure
+        return (
+            scene.cameras.view_tangent,
+            scene.actors.tangent,
+            exposure.matrix,
+            exposure.log_gain,
+        )
 
 
 def _gradient(table: Tensor) -> Tensor:

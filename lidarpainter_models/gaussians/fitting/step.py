@@ -15,6 +15,7 @@ from lidarpainter_models.gaussians.fitting.images import FitImage
 from lidarpainter_models.gaussians.fitting.losses import ACTOR_TERM_EVERY, actor_boundary_loss
 from lidarpainter_models.gaussians.fitting.spatial_blocks import View
 from lidarpainter_models.gaussians.fitting.state import FitState
+from lidarpainter_models.gaussians.model.rolling_shutter import as_read
 from lidarpainter_models.gaussians.model.scene_rendering import (
     OPAQUE,
     camera_from_body,
@@ -57,7 +58,7 @@ def fit_step(
     Returns the loss and the mean squared error of the recorded image, where the scene lies.
     """
     pose = state.refinement.world_from_camera(row, state.step)
-    recorded = image.camera.at(pose.detach())
+    recorded = image.camera.refined(pose.detach())
     actors = state.scene.actors.corrected_poses(image.timestamp_ns)
     views = [(recorded, camera_from_body(pose, *actors))]
     if guidance is not None:
@@ -85,7 +86,7 @@ def _recorded_step(
     with_actors = _wants_actor_term(state, config)
     screen_gradient = torch.zeros(len(seen), device=seen.means.device)
     splat = draw_gaussians(
-        seen,
+        as_read(seen, bodies, camera, state.scene.actors, image.timestamp_ns),
         bodies,
         camera,
         with_actor_alpha=with_actors,
@@ -94,7 +95,7 @@ def _recorded_step(
     rays = sky.rays(camera, (splat.alpha.detach() < OPAQUE) | image.is_open)
     sky_rgb = sky.sample(rays).requires_grad_(True)
     terms = pixel_terms(splat, sky_rgb, facts, _pixel_rules(config))
-    shown = state.refinement.exposed(terms.shown, image.camera_name)
+    shown = state.refinement.exposed(terms.shown, image)
     loss = l1_ssim_loss(shown, facts.rgb, ssim_weight=weights.ssim)
     if perceptual is not None and weights.perceptual > 0:
         loss = loss + weights.perceptual * perceptual(shown, facts.rgb)
@@ -105,7 +106,7 @@ def _recorded_step(
     # as a sum its gradient, which is the CPU's, would have to come from the device
     torch.autograd.backward([loss, prior] if prior.requires_grad else [loss])
     state.tally.add(seen.rows, screen_gradient, splat.visible)
-    state.refinement.step(state.step, image.camera_name)
+    state.refinement.step(state.step, image)
     _step_sky(state, sky_rgb, rays, splat.alpha.detach(), config, image)
     squared_error = (shown.detach() - facts.rgb).square().mean()
     return torch.stack([loss.detach() + prior.detach(), squared_error.double()])

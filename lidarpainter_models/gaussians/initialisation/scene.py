@@ -107,8 +107,11 @@ def _scene_around(gaussians: GaussianSet, observations: SceneObservations) -> Ga
             [view.key for view in views],
             timestamps_ns,
             torch.stack([camera.world_from_camera.double() for camera in cameras]),
+            observations.faults,
         ),
-        exposure=ExposureCorrections.none(observations.camera_names),
+        exposure=ExposureCorrections.none(
+            observations.camera_names, [view.timestamp_ns for view in views]
+        ),
     )
 
 

@@ -74,7 +74,7 @@ class Actors:
 
     def corrected_poses(self, timestamp_ns: int) -> ActorPoses:
         """Recorded poses at a time with the correction of that time; differentiable."""
-        recorded, present = self._recorded_poses(timestamp_ns)
+        recorded, present = self.recorded_poses(timestamp_ns)
         return recorded @ rigid_from_tangent(self.tangent_at(timestamp_ns)), present
 
     def likely_poses(self, timestamp_ns: int) -> ActorPoses:
@@ -82,7 +82,7 @@ class Actors:
 
         At training times these are the refined poses; in between see `pose_blending`.
         """
-        recorded, present = self._recorded_poses(timestamp_ns)
+        recorded, present = self.recorded_poses(timestamp_ns)
         known = self._motions().likely_at
         if timestamp_ns not in known:
             actors = present.nonzero()[:, 0]
@@ -111,7 +111,8 @@ class Actors:
     def _recorded(self) -> TrackPoses:
         return TrackPoses.of(self.recorded_tracks)
 
-    def _recorded_poses(self, timestamp_ns: int) -> ActorPoses:
+    def recorded_poses(self, timestamp_ns: int) -> ActorPoses:
+        """Poses at a time as they were recorded."""
         if timestamp_ns not in self._recorded_at:
             poses = self._recorded.all_at(timestamp_ns)
             present = self._recorded.present(timestamp_ns, PRESENCE_MARGIN_NS)

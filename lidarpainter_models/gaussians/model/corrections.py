@@ -7,8 +7,9 @@ radians, translation in metres), float64, and stay on the CPU: a step reads one 
 4x4 to wherever the Gaussians are. Colours are changed where the image is.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import torch
@@ -18,7 +19,11 @@ from torch import Tensor
 from lidarpainter_models.gaussians.model.pose_blending import RefinedTracks
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
+from lidarpainter_models.scenes.camera_faults import CameraFault
 from lidarpainter_models.scenes.records import ViewKey
+
+GAIN_KNOTS_NS = 1_000_000_000
+"""Between knots of a camera's gain: exposures are controlled slowly."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -31,6 +36,8 @@ class CameraCorrections:
     view_tangent: Float[Tensor, "views 6"]
     camera_names: tuple[str, ...]
     camera_tangent: Float[Tensor, "cameras 6"]
+    faults: Mapping[str, CameraFault] = field(default_factory=dict)
+    """What was found wrong before the fit; `recorded_world_from_camera` is without it."""
 
     @classmethod
     def none(
@@ -38,6 +45,7 @@ class CameraCorrections:
         keys: Sequence[ViewKey],
         timestamps_ns: Int[Tensor, " views"],
         recorded_world_from_camera: Float[Tensor, "views 4 4"],
+        faults: Mapping[str, CameraFault] | None = None,
     ) -> "CameraCorrections":
         """Nothing corrected yet."""
         names = tuple(sorted({name for _, name in keys}))
@@ -48,6 +56,7 @@ class CameraCorrections:
             view_tangent=torch.zeros(len(keys), 6, dtype=torch.float64),
             camera_names=names,
             camera_tangent=torch.zeros(len(names), 6, dtype=torch.float64),
+            faults=faults or {},
         )
 
     @cached_property
@@ -87,13 +96,16 @@ class CameraCorrections:
     ) -> Camera:
         """The camera at its most likely pose; a camera never trained on stays as recorded."""
         row = None if key is None else self.row_of(key)
+        if camera_name in self.faults:
+            camera = self.faults[camera_name].corrected(camera)
         if row is not None:
             with torch.no_grad():
-                return camera.at(self.world_from_camera(row))
+                return camera.refined(self.world_from_camera(row))
         track = self.track_of(camera_name)
         if track is None:
             return camera
-        return camera.at(track.pose_at(0, timestamp_ns * 1e-9, camera.world_from_camera.double()))
+        pose = track.pose_at(0, timestamp_ns * 1e-9, camera.world_from_camera.double())
+        return camera.refined(pose)
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything to be stored besides keys and names."""
@@ -115,28 +127,71 @@ class CameraCorrections:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ExposureCorrections:
-    """An affine map of colours per camera: shown = matrix @ (rgb, 1)."""
+    """Colours as a camera shows them: shown = gain(time) * matrix @ rgb + offset.
+
+    The gain follows what a camera does to its exposure during a log; over its knots the mean of its
+    logarithm is held at 0, so that the matrix alone says how cameras differ.
+    """
 
     camera_names: tuple[str, ...]
     matrix: Float[Tensor, "cameras 3 4"]
+    """The offset is the last column."""
+    knots_ns: Int[Tensor, " knots"]
+    """Evenly spaced; on the CPU."""
+    log_gain: Float[Tensor, "cameras knots"]
+    """Linear in time between knots."""
 
     @classmethod
-    def none(cls, camera_names: Sequence[str]) -> "ExposureCorrections":
-        """Colours as they are."""
+    def none(
+        cls, camera_names: Sequence[str], timestamps_ns: Sequence[int] = (0,)
+    ) -> "ExposureCorrections":
+        """Colours as they are, in a log with images of these times."""
+        first_ns, last_ns = min(timestamps_ns), max(timestamps_ns)
+        count = 1 + math.ceil((last_ns - first_ns) / GAIN_KNOTS_NS)
+        steps = torch.arange(count) * ((last_ns - first_ns) // max(count - 1, 1))
         return cls(
             camera_names=tuple(camera_names),
             matrix=torch.eye(3, 4).repeat(len(camera_names), 1, 1),
+            knots_ns=first_ns + steps,
+            log_gain=torch.zeros(len(camera_names), count),
         )
 
     def to(self, device: torch.device) -> "ExposureCorrections":
         """The same on another device."""
-        return replace(self, matrix=self.matrix.to(device))
+        return replace(self, matrix=self.matrix.to(device), log_gain=self.log_gain.to(device))
+
+    def neighbours(self, timestamp_ns: int) -> tuple[int, int, float]:
+        """The knots before and after a time, and the weight of the later one."""
+        last = self.knots_ns.numel() - 1
+        span_ns = max(int(self.knots_ns[-1] - self.knots_ns[0]), 1)
+        place = (timestamp_ns - int(self.knots_ns[0])) / span_ns * last
+        place = min(max(place, 0.0), float(last))
+        before = min(int(place), max(last - 1, 0))
+        return before, min(before + 1, last), place - before
 
     def apply(
-        self, rgb: Float[Tensor, "height width 3"], camera_name: str | None
+        self, rgb: Float[Tensor, "height width 3"], camera_name: str | None, timestamp_ns: int
     ) -> Float[Tensor, "height width 3"]:
-        """The image as this camera exposes it; unchanged for a camera never trained on."""
+        """The image as this camera exposes it then; unchanged for a camera never trained on."""
         if camera_name is None or camera_name not in self.camera_names:
             return rgb
-        matrix = self.matrix[self.camera_names.index(camera_name)]
-        return rgb @ matrix[:, :3].T + matrix[:, 3]
+        matrix, offset = self._map_at(camera_name, timestamp_ns)
+        return rgb @ matrix.T + offset
+
+    def undone(
+        self, rgb: Float[Tensor, "height width 3"], camera_name: str, timestamp_ns: int
+    ) -> Float[Tensor, "height width 3"]:
+        """A recorded image in the colours of the scene itself; no gradient."""
+        if camera_name not in self.camera_names:
+            return rgb
+        with torch.no_grad():
+            matrix, offset = self._map_at(camera_name, timestamp_ns)
+            return (rgb - offset) @ torch.linalg.inv(matrix).T
+
+    def _map_at(
+        self, camera_name: str, timestamp_ns: int
+    ) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
+        row = self.camera_names.index(camera_name)
+        before, after, weight = self.neighbours(timestamp_ns)
+        log_gain = (1 - weight) * self.log_gain[row, before] + weight * self.log_gain[row, after]
+        return log_gain.exp() * self.matrix[row, :, :3], self.matrix[row, :, 3]

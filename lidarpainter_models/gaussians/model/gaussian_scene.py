@@ -11,6 +11,7 @@ from torch import Tensor
 from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.model.rolling_shutter import as_read
 from lidarpainter_models.gaussians.model.scene_rendering import (
     SceneRender,
     camera_from_body,
@@ -62,12 +63,14 @@ class GaussianScene:
         """Draw the view of `camera`, taken as it stands, at a time.
 
         With `view_key` (a training view) the camera is first moved to its refined pose; with
-        `camera_name` the colours are exposed as that camera's.
+        `camera_name` the colours are exposed as that camera's. A recorded camera's image is drawn
+        as its shutter reads it; a scene in a style is drawn all at once.
         """
         with torch.no_grad():
             row = None if view_key is None else self.cameras.row_of(view_key)
             if row is not None:
-                camera = camera.at(self.cameras.world_from_camera(row))
+                camera = camera.refined(self.cameras.world_from_camera(row))
+            timestamp_ns = camera.taken_ns(timestamp_ns)
             dressed = self._dressed
             strengths = {} if dressed is None else dressed.style.strengths(timestamp_ns)
             if dressed is not None and strengths:
@@ -75,8 +78,9 @@ class GaussianScene:
             else:
                 poses = self.actors.likely_poses(timestamp_ns)
                 bodies = camera_from_body(camera.world_from_camera, *poses)
-                drawn = draw_over_sky(self.gaussians, bodies, self.sky, camera, backend=backend)
-            return replace(drawn, rgb=self.exposure.apply(drawn.rgb, camera_name))
+                read = as_read(self.gaussians, bodies, camera, self.actors, timestamp_ns)
+                drawn = draw_over_sky(read, bodies, self.sky, camera, backend=backend)
+            return replace(drawn, rgb=self.exposure.apply(drawn.rgb, camera_name, timestamp_ns))
 
     def corrected_camera(
         self,

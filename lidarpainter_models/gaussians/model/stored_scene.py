@@ -13,6 +13,7 @@ from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.sky import SkyTexture
 from lidarpainter_models.gaussians.model.styling.scene_style import style_from_arrays
 from lidarpainter_models.kernels.sky_texture import SkyLayout, TexelMoments
+from lidarpainter_models.scenes.camera_faults import faults_from_records
 from lidarpainter_models.scenes.stored_tracks import tracks_from_arrays, tracks_to_arrays
 
 SCHEMA = 1
@@ -34,7 +35,11 @@ def scene_to_arrays(scene: GaussianScene) -> tuple[dict[str, Tensor], dict[str, 
         "tracks": track_arrays,
         "cameras": cameras.tensors(),
         "actors": {"knots_ns": scene.actors.knots_ns, "tangent": scene.actors.tangent},
-        "exposure": {"matrix": scene.exposure.matrix},
+        "exposure": {
+            "matrix": scene.exposure.matrix,
+            "knots_ns": scene.exposure.knots_ns,
+            "log_gain": scene.exposure.log_gain,
+        },
         "style": {} if scene.style is None else scene.style.place.tensors(),
     }
     arrays = {
@@ -47,6 +52,7 @@ def scene_to_arrays(scene: GaussianScene) -> tuple[dict[str, Tensor], dict[str, 
         "tracks": track_records,
         "view_keys": [list(key) for key in cameras.keys],
         "camera_names": list(cameras.camera_names),
+        "camera_faults": {name: asdict(fault) for name, fault in cameras.faults.items()},
         "exposure_camera_names": list(scene.exposure.camera_names),
         "sky_layout": asdict(sky.layout),
     }
@@ -81,11 +87,10 @@ def scene_from_arrays(arrays: dict[str, Tensor], metadata: dict[str, Any]) -> Ga
             cameras=CameraCorrections(
                 keys=tuple((int(frame), str(name)) for frame, name in metadata["view_keys"]),
                 camera_names=tuple(metadata["camera_names"]),
+                faults=faults_from_records(metadata.get("camera_faults", {})),
                 **groups["cameras"],
             ),
-            exposure=ExposureCorrections(
-                camera_names=tuple(metadata["exposure_camera_names"]), **groups["exposure"]
-            ),
+            exposure=_exposure(groups["exposure"], metadata["exposure_camera_names"]),
             style=style_from_arrays(groups["style"], metadata["style"])
             if "style" in metadata
             else None,
@@ -99,6 +104,17 @@ def copy_scene(scene: GaussianScene) -> GaussianScene:
     arrays, metadata = scene_to_arrays(scene)
     copied = scene_from_arrays({name: value.clone() for name, value in arrays.items()}, metadata)
     return copied.to(scene.device)
+
+
+def _exposure(arrays: dict[str, Tensor], camera_names: list[str]) -> ExposureCorrections:
+    """Scenes stored before there were gains have none."""
+    unknown = ExposureCorrections.none(camera_names)
+    return ExposureCorrections(
+        camera_names=tuple(camera_names),
+        matrix=arrays["matrix"],
+        knots_ns=arrays.get("knots_ns", unknown.knots_ns),
+        log_gain=arrays.get("log_gain", unknown.log_gain),
+    )
 
 
 def _sky(arrays: dict[str, Tensor], layout: SkyLayout) -> SkyTexture:

@@ -155,6 +155,7 @@ class PandasetLog:
         camera = Camera(
             world_from_camera=self.world_from_global @ recorded.global_from_camera[frame_index],
             **recorded.intrinsics,
+            shutter=None,
             width_px=width_px,
             height_px=height_px,
         )

@@ -1,8 +1,13 @@
+from dataclasses import replace
+
+import pytest
 import torch
 from gaussian_world import camera_at, car_track
 
 from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
+from lidarpainter_models.geometry.cameras import Shutter
+from lidarpainter_models.scenes.camera_faults import CameraFault
 
 
 def two_cameras():
@@ -59,5 +64,37 @@ def test_exposure_of_an_unknown_camera_is_neutral():
     exposure = ExposureCorrections.none(["front"])
     exposure.matrix[0, :, 3] = 0.1
     rgb = torch.rand(3, 4, 3)
-    assert torch.equal(exposure.apply(rgb, None), rgb)
-    assert torch.allclose(exposure.apply(rgb, "front"), rgb + 0.1)
+    assert torch.equal(exposure.apply(rgb, None, 0), rgb)
+    assert torch.allclose(exposure.apply(rgb, "front", 0), rgb + 0.1)
+
+
+def test_gain_is_linear_between_knots_and_constant_beyond():
+    second = 1_000_000_000
+    exposure = ExposureCorrections.none(["front"], [5 * second, 7 * second])
+    exposure.log_gain[0] = torch.tensor([0.0, 0.2, 0.1])
+    grey = torch.full((1, 1, 3), 0.5)
+    times_s = (0.0, 5.0, 5.5, 6.5, 7.0, 9.0)
+    shown = [float(exposure.apply(grey, "front", round(t * second))[0, 0, 0]) for t in times_s]
+    expected = (0.5 * torch.tensor([0.0, 0.0, 0.1, 0.15, 0.1, 0.1]).exp()).tolist()
+    assert shown == pytest.approx(expected, rel=1e-5)
+
+
+def test_exposure_is_undone():
+    exposure = ExposureCorrections.none(["front"], [0, 2_000_000_000])
+    exposure.matrix[0, :, 3] = 0.1
+    exposure.log_gain[0, 1] = 0.3
+    rgb = torch.rand(3, 4, 3)
+    taken = exposure.apply(rgb, "front", 900_000_000)
+    assert torch.allclose(exposure.undone(taken, "front", 900_000_000), rgb, atol=1e-6)
+    assert not torch.allclose(taken, rgb, atol=0.05)
+
+
+def test_a_fault_of_a_camera_reaches_its_other_times():
+    cameras = replace(two_cameras(), faults={"left": CameraFault(late_s=0.05)})
+    moving = Shutter(twist_per_s=torch.tensor([0.0, 0, 0, 0, 0, 10.0], dtype=torch.float64))
+    camera = replace(camera_at(0.5), shutter=moving)
+    late = cameras.corrected(camera, key=(7, "left"), timestamp_ns=1, camera_name="left")
+    sound = cameras.corrected(camera, key=(7, "front"), timestamp_ns=1, camera_name="front")
+    assert float(late.centre_world[0]) == pytest.approx(1.0)
+    assert late.taken_ns(0) == 50_000_000
+    assert float(sound.centre_world[0]) == pytest.approx(0.5)

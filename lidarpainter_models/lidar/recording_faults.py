@@ -1,0 +1,350 @@
+"""Find what a camera's recording gets wrong: its clock, its mounting angles, how it reads its rows.
+
+LiDAR points of what stands still have a known place, so a point must look alike in all images that
+show it. For each camera a turn, a lateness and a readout are sought under which the points do:
+photometric bundle adjustment (Alismail et al. 2016) whose structure is measured and whose colours
+are eliminated (each point's mean over its images), by Gauss-Newton with a robust weight (Geman and
+McClure, 1987), after a search over the lateness. That the structure is held is what makes the
+readout visible: geometry that is free to move absorbs it at constant speed.
+
+The variance is divided by the strength of what is compared, else it would be least where images
+show least. A fault is believed where it is larger than what is found in sound recordings and stands
+out from the scatter between groups of images (Liang and Zeger, 1986). A car that stands shows
+neither clock nor readout. Camera frame: x right, y down, z forward.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidarpainter_models.geometry.cameras import Camera, Shutter
+from lidarpainter_models.lidar.contrast_images import LEVELS_PER_OCTAVE, ContrastImage
+from lidarpainter_models.lidar.moving_boxes import BACKGROUND, MovingBoxes
+from lidarpainter_models.lidar.sparse_depth import sparse_lidar_depth
+from lidarpainter_models.scenes.camera_faults import CameraFault
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.records import RecordedView
+
+LEAST_TURN_RAD = np.radians([0.25, 0.25, 0.75])
+"""Sound cameras of synthetic streets are found within 0.1 degrees, in roll within 0.4."""
+LEAST_LATE_S, LEAST_READOUT_S = 0.015, 0.01
+"""Sound cameras of synthetic streets are found within 10 and 5 ms."""
+MIN_STANDS_OUT = 4.0  # standard errors
+MIN_SPEED_MPS = 2.0  # a slower car's images look alike whenever they were taken
+MIN_PX_PER_DEG = 2.2  # as in the doctor's check of calibration
+_TURN, _LATE, _READOUT = slice(0, 3), 3, 4
+_WIDTH_PX = 480
+_HUBS, _NEIGHBOURS, _POINTS = 8, 2, 1000
+"""Images whose points are followed, into how many before and after, and of how many points."""
+_SEARCHED_S = np.linspace(-0.06, 0.06, 7)
+_SEARCH_LEVEL, _SEARCH_ROUNDS, _SEARCH_STRIDE = 3, 3, 3
+_SCHEDULE = ((3, 5), (2, 14))  # level and rounds of Gauss-Newton
+_STEP = 1.5  # derivatives of images that do not fit yet are too small
+_OUTLIER = 5.0  # medians from which on a difference counts little
+_EXPECTED = np.array([0.01, 0.01, 0.01, 0.05, 0.03])
+_SAMPLES_OF_PRIOR = 500.0  # neighbouring points look alike
+_NEAR_M, _FAR_M, _BORDER_PX = 1.0, 80.0, 3
+_HIDDEN, _HIDDEN_M = 1.15, 0.5  # a point farther behind a return than this is hidden
+_EDGE_PX, _LEAST_SHARE, _MOST_SHARE = 11, 0.7, 1.4  # of its own depth, all around a point
+
+
+class Found(NamedTuple):
+    """A camera's turn (rad), lateness and readout (s), and their standard errors."""
+
+    values: Float[np.ndarray, "5"]
+    errors: Float[np.ndarray, "5"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Image:
+    """One image, what it moved like, and the returns of its frame's sweeps in it."""
+
+    camera: Camera
+    twist_per_s: Float[np.ndarray, "6"]
+    contrast: ContrastImage
+    standing: Float[Tensor, "points 3"]
+    """Points of the frame outside moving boxes, in the world."""
+    depth_m: Float[np.ndarray, "height width"]
+    """0 where there is no return."""
+    nearest_m: Float[np.ndarray, "height width"]
+    """Nearest return around, very far where there is none."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Hub:
+    """Points of one image and the images that show them, it among them."""
+
+    points: Float[np.ndarray, "points 3"]
+    images: Sequence[_Image]
+    own: int
+
+
+def find_faults(scene: DrivingScene, views: Sequence[RecordedView]) -> dict[str, CameraFault]:
+    """What is wrong about the cameras of some views, by name; cameras that are sound are left out.
+
+    Args:
+        scene: where images and sweeps are read from.
+        views: those that may be looked at, each camera's in order of time.
+    """
+    faults = {}
+    for name in sorted({view.camera_name for view in views}):
+        own = [view for view in views if view.camera_name == name]
+        found = measured_faults(scene, own)
+        fault = None if found is None else believed(found)
+        if fault is not None:
+            faults[name] = fault
+    return faults
+
+
+def believed(found: Found) -> CameraFault | None:
+    """Those parameters that are large and sure enough, None if there are none."""
+    size, error = np.abs(found.values), np.maximum(found.errors, 1e-9)
+    is_sure = size > MIN_STANDS_OUT * error
+    turn = found.values[_TURN] * (size[_TURN] > LEAST_TURN_RAD) * is_sure[_TURN]
+    late = found.values[_LATE] * (size[_LATE] > LEAST_LATE_S) * is_sure[_LATE]
+    readout = found.values[_READOUT] * (size[_READOUT] > LEAST_READOUT_S) * is_sure[_READOUT]
+    if not (turn.any() or late or readout):
+        return None
+    x, y, z = turn.tolist()
+    return CameraFault(turn_rad=(x, y, z), late_s=float(late), readout_s=float(readout))
+
+
+def measured_faults(scene: DrivingScene, views: Sequence[RecordedView]) -> Found | None:
+    """The parameters of one camera under which its images agree; a told readout is kept.
+
+    Args:
+        scene: where images and sweeps are read from.
+        views: of one camera, in order of time.
+
+    Returns:
+        None where too little is seen: three images or fewer, coarse ones, or a car that stands.
+    """
+    shutters = [view.camera.shutter for view in views if view.camera.shutter is not None]
+    speeds_mps = [float(shutter.twist_per_s[3:].norm()) for shutter in shutters]
+    if len(shutters) <= 3 or np.median(speeds_mps) < MIN_SPEED_MPS:
+        return None
+    camera = views[0].camera
+    share = min(1.0, _WIDTH_PX / camera.width_px)
+    if camera.fx_px * share * np.radians(1) < MIN_PX_PER_DEG:
+        return None
+    boxes = MovingBoxes([track for track in scene.tracks if track.is_moving])
+    images = [_image(scene, *pair, boxes) for pair in zip(views, shutters, strict=True)]
+    hubs = []
+    for place in np.unique(np.linspace(0, len(images) - 1, min(_HUBS, len(images))).round()):
+        first = max(int(place) - _NEIGHBOURS, 0)
+        shown_by = images[first : int(place) + _NEIGHBOURS + 1]
+        points = _hub_points(images[int(place)])
+        if len(points):
+            hubs.append(_Hub(points, shown_by, int(place) - first))
+    if not hubs:
+        return None
+    is_told = any(shutter.is_rolling for shutter in shutters)
+    free = np.arange(_READOUT if is_told else _READOUT + 1)
+    return _refined(hubs, _searched(hubs, free), free)
+
+
+def _image(scene: DrivingScene, view: RecordedView, shutter: Shutter, boxes: MovingBoxes) -> _Image:
+    share = min(1.0, _WIDTH_PX / view.camera.width_px)
+    camera = view.camera.resized(
+        width_px=round(view.camera.width_px * share),
+        height_px=round(view.camera.height_px * share),
+    )
+    size = (camera.width_px, camera.height_px)
+    rgb = cv2.resize(scene.read_image(view).numpy(), size, interpolation=cv2.INTER_AREA)
+    clouds = [(scene.read_sweep(s).xyz_m, s) for s in scene.sweeps_of(view.frame_index)]
+    standing = [
+        xyz_m[boxes.owners(xyz_m, sweep.timestamp_ns, floor_m=-torch.inf) == BACKGROUND]
+        for xyz_m, sweep in clouds
+    ]
+    everything = torch.cat([xyz_m for xyz_m, _ in clouds]) if clouds else torch.zeros(0, 3)
+    depth_m = sparse_lidar_depth(everything, camera).numpy()
+    far_m = np.where(depth_m > 0, depth_m, np.float32(1e6))
+    return _Image(
+        camera=camera,
+        twist_per_s=shutter.twist_per_s.numpy(),
+        contrast=ContrastImage.of(rgb),
+        standing=torch.cat(standing) if standing else everything,
+        depth_m=depth_m,
+        nearest_m=cv2.erode(far_m, np.ones((5, 5), np.uint8)),
+    )
+
+
+def _hub_points(image: _Image) -> Float[np.ndarray, "points 3"]:
+    """Visible points of what stands, away from depth edges; a random choice, always the same."""
+    pixels_uv, depth_m = image.camera.project(image.standing)
+    inside = image.camera.contains(pixels_uv, depth_m, near_m=_NEAR_M).nonzero()[:, 0]
+    column, row = pixels_uv[inside].long().numpy().T
+    depth = depth_m[inside].numpy()
+    window = np.ones((_EDGE_PX, _EDGE_PX), np.uint8)
+    known = np.where(image.depth_m > 0, image.depth_m, np.float32(1e6))
+    nearest, furthest = cv2.erode(known, window), cv2.dilate(image.depth_m, window)
+    is_good = np.abs(depth - image.depth_m[row, column]) < 0.02 * depth
+    is_good &= (nearest[row, column] > _LEAST_SHARE * depth) & (depth < _FAR_M)
+    is_good &= furthest[row, column] < _MOST_SHARE * depth
+    chosen = np.random.default_rng(0).permutation(np.flatnonzero(is_good))[:_POINTS]
+    return image.standing[inside[torch.from_numpy(chosen)]].double().numpy()
+
+
+def _projected(
+    points: Float[np.ndarray, "points 3"], image: _Image, values: Float[np.ndarray, "5"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels (points, 2), depth, and derivatives of the pixels (points, 2, 5)."""
+    camera, across_s = image.camera, np.array([0.0, values[_READOUT]])
+    if camera.shutter is not None and camera.shutter.is_rolling:
+        across_s = np.array(camera.shutter.across_s)
+    camera_from_world = camera.camera_from_world.numpy()
+    start = points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+    flow = -(np.cross(image.twist_per_s[:3], start) + image.twist_per_s[3:])
+    turned_from_camera = cv2.Rodrigues(-values[_TURN])[0]
+    focal, centre = np.array([camera.fx_px, camera.fy_px]), np.array([camera.cx_px, camera.cy_px])
+    size, after_s = np.array([camera.width_px, camera.height_px]), np.full(len(points), 0.0)
+    for _ in range(3):
+        moved = start + (values[_LATE] + after_s)[:, None] * flow
+        x, y, depth = (moved @ turned_from_camera.T).T
+        ahead = np.maximum(depth, 0.1)
+        pixels_uv = focal * np.stack([x, y], 1) / ahead[:, None] + centre
+        share = np.clip(pixels_uv / size - 0.5, -0.5, 0.5)
+        after_s = share @ across_s
+    change = np.zeros((len(points), 3, 5))
+    change[:, 0, 1], change[:, 0, 2] = -depth, y
+    change[:, 1, 0], change[:, 1, 2] = depth, -x
+    change[:, 2, 0], change[:, 2, 1] = -y, x
+    change[:, :, _LATE] = flow @ turned_from_camera.T
+    change[:, :, _READOUT] = change[:, :, _LATE] * share[:, 1:]
+    slant = (pixels_uv - centre)[..., None] / ahead[:, None, None]
+    return (
+        pixels_uv,
+        depth,
+        focal[:, None] * change[:, :2] / ahead[:, None, None] - slant * change[:, 2:],
+    )
+
+
+class _Compared(NamedTuple):
+    """What the images of a hub show of its points."""
+
+    contrast: Float[np.ndarray, "images points"]
+    is_seen: Bool[np.ndarray, "images points"]
+    slope: Float[np.ndarray, "images points 5"]
+    """Derivative of the contrast by the parameters."""
+    shared_slope: Float[np.ndarray, "images points 5"]
+    """The same with the mean gradient of a point, which has less noise."""
+
+
+def _compared(hub: _Hub, values: Float[np.ndarray, "5"], level: int, stride: int) -> _Compared:
+    points = hub.points[::stride]
+    placed = [_projected(points, image, values) for image in hub.images]
+    hub_depth = np.maximum(placed[hub.own][1], 0.5)
+    contrast, is_seen, slope, gradient, motion = [], [], [], [], []
+    for image, (pixels_uv, depth, change) in zip(hub.images, placed, strict=True):
+        size = np.array([image.camera.width_px, image.camera.height_px])
+        octaves = np.log2(hub_depth / np.maximum(depth, 0.5))
+        seen = (depth > _NEAR_M) & (np.abs(octaves) < 1)
+        seen &= ((pixels_uv > _BORDER_PX) & (pixels_uv < size - _BORDER_PX)).all(1)
+        column, row = np.clip(pixels_uv.astype(int), 0, size - 1).T
+        seen &= depth <= image.nearest_m[row, column] * _HIDDEN + _HIDDEN_M
+        found = image.contrast.sample(pixels_uv, level + LEVELS_PER_OCTAVE * octaves)
+        scale = np.maximum(depth, 1)[:, None]  # a gradient per metre of the surface
+        contrast.append(found[:, 0])
+        is_seen.append(seen)
+        slope.append(np.einsum("pa,pab->pb", found[:, 1:], change))
+        gradient.append(found[:, 1:] / scale * seen[:, None])
+        motion.append(change * scale[..., None])
+    mean = np.sum(gradient, 0) / np.maximum(np.sum(is_seen, 0), 1)[:, None]
+    shared = np.einsum("pa,ipab->ipb", mean, np.array(motion))
+    return _Compared(np.array(contrast), np.array(is_seen), np.array(slope), shared)
+
+
+class _Equations(NamedTuple):
+    """A step's normal equations, one right side for each hub."""
+
+    matrix: Float[np.ndarray, "5 5"]
+    sides: Float[np.ndarray, "hubs 5"]
+    difference: float
+    """Variance of what images show of a point, over the strength of what they show."""
+    noise: float
+    outlier: float
+
+
+def _equations(
+    hubs: Sequence[_Hub],
+    values: Float[np.ndarray, "5"],
+    level: int,
+    outlier: float | None,
+    stride: int = 1,
+) -> _Equations:
+    compared = [_compared(hub, values, level, stride) for hub in hubs]
+    if outlier is None:
+        away = [np.abs(c.contrast - _mean(c.is_seen, c.contrast))[c.is_seen] for c in compared]
+        outlier = _OUTLIER * float(np.median(np.concatenate(away)))
+    matrix, sides, slopes, sums = np.zeros((5, 5)), [], [], np.zeros(3)
+    for c in compared:
+        weight = c.is_seen.astype(float)
+        for _ in range(3):
+            away = c.contrast - _mean(weight, c.contrast)
+            weight = c.is_seen / (1 + (away / outlier) ** 2) ** 2
+        weight *= c.is_seen.sum(0) > 1
+        away = c.contrast - _mean(weight, c.contrast)
+        slope = c.slope - _mean(weight, c.slope)
+        shared = c.shared_slope - _mean(weight, c.shared_slope)
+        matrix += np.einsum("ipa,ip,ipb->ab", shared, weight, shared)
+        matrix += 0.1 * np.einsum("ipa,ip,ipb->ab", slope, weight, slope)
+        sides.append(np.einsum("ipa,ip->a", slope, weight * away))
+        slopes.append(np.einsum("ipa,ip->a", c.slope, weight * c.contrast))
+        sums += (weight * away**2).sum(), (weight * c.contrast**2).sum(), weight.sum()
+    difference = sums[0] / max(sums[1], 1e-9)
+    # of the quotient: what only makes the images weaker is no progress
+    right = np.array(sides) - difference * np.array(slopes)
+    return _Equations(matrix, right, difference, sums[0] / max(sums[2], 1e-9), outlier)
+
+
+def _mean(weight: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Over the images, point by point."""
+    weight = weight.reshape(*weight.shape, *[1] * (values.ndim - 2))
+    return (weight * values).sum(0) / np.maximum(weight.sum(0), 1e-9)
+
+
+def _stepped(
+    found: _Equations, values: np.ndarray, free: np.ndarray, samples: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The values after a step, and the inverse of the matrix of the free ones."""
+    prior = samples * found.noise / _EXPECTED**2
+    inverse = np.linalg.inv((found.matrix + np.diag(prior))[np.ix_(free, free)])
+    stepped = values.copy()
+    stepped[free] -= _STEP * inverse @ (found.sides.sum(0) + prior * values)[free]
+    return stepped, inverse
+
+
+def _searched(hubs: Sequence[_Hub], free: np.ndarray) -> Float[np.ndarray, "5"]:
+    """Of several latenesses the best one, each with its own turn."""
+    tried: list[tuple[float, int, np.ndarray]] = []
+    outlier = None
+    for late_s in _SEARCHED_S:
+        values = np.zeros(5)
+        values[_LATE] = late_s
+        for _ in range(_SEARCH_ROUNDS):
+            found = _equations(hubs, values, _SEARCH_LEVEL, outlier, _SEARCH_STRIDE)
+            outlier, before = found.outlier, values
+            values, _ = _stepped(found, values, free[_TURN], _SAMPLES_OF_PRIOR / _SEARCH_STRIDE)
+        tried.append((found.difference, len(tried), before))
+    return min(tried)[2]
+
+
+def _refined(hubs: Sequence[_Hub], values: Float[np.ndarray, "5"], free: np.ndarray) -> Found:
+    """All free parameters, and how much they scatter between hubs."""
+    for level, rounds in _SCHEDULE:
+        outlier = None
+        for _ in range(rounds):
+            found = _equations(hubs, values, level, outlier)
+            outlier = found.outlier
+            values, inverse = _stepped(found, values, free, _SAMPLES_OF_PRIOR)
+    scatter = found.sides[:, free].T @ found.sides[:, free]
+    covariance = inverse @ scatter @ inverse * len(hubs) / max(len(hubs) - 1, 1)
+    errors = np.zeros(5)
+    errors[free] = np.sqrt(np.diag(covariance))
+    return Found(values, errors)

@@ -1,0 +1,66 @@
+"""Faults of a recording, found from what LiDAR points look like in several images."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lidarpainter_models.lidar.contrast_images import ContrastImage
+from lidarpainter_models.lidar.recording_faults import Found, believed, find_faults
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.splits import split_views
+from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street
+from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS, RigLidar
+
+FRONT, _, FRONT_RIGHT = DEFAULT_CAMERAS
+SURE = np.full(5, 1e-6)
+
+
+def faults_of(tmp_path, *cameras):
+    street = SyntheticStreetConfig(
+        seed=7,
+        num_frames=20,
+        width_px=320,
+        height_px=180,
+        speed_mps=(15.0, 15.0),
+        cameras=cameras,
+        lidar=RigLidar(columns=1200),
+        is_readout_told=False,
+    )
+    scene = DrivingScene.open(write_street(street, tmp_path))
+    return find_faults(scene, split_views(scene, "alternate").train)
+
+
+def test_small_and_uncertain_departures_are_no_faults():
+    large = np.array([0.0, 0.009, 0.0, 0.05, 0.0])
+    assert believed(Found(0.1 * large, SURE)) is None
+    assert believed(Found(large, large)) is None
+    fault = believed(Found(large, SURE))
+    assert (fault.turn_rad, fault.late_s, fault.readout_s) == ((0.0, 0.009, 0.0), 0.05, 0.0)
+
+
+def test_contrast_does_not_see_exposure():
+    rgb = np.random.default_rng(0).integers(60, 120, (64, 64, 3)).astype(np.uint8)
+    middle, level = np.full((1, 2), 32.0), np.array([3.0])
+    dark, bright = (ContrastImage.of(image).sample(middle, level) for image in (rgb, 2 * rgb))
+    assert np.allclose(dark, bright, atol=0.1)  # black is not quite black
+
+
+def test_samples_of_contrast_are_linear_between_pixels_and_levels():
+    image = ContrastImage(np.zeros((2, 3, 4, 3), np.float32))
+    image.levels[1, 1, 2] = 8.0
+    at = np.array([[2.5, 1.5], [2.0, 1.5], [2.5, 1.0], [2.5, 1.5]])
+    found = image.sample(at, np.array([0.999, 0.999, 0.999, 0.5]))[:, 0]
+    assert found == pytest.approx([8.0, 4.0, 4.0, 4.0], abs=0.02)
+
+
+@pytest.mark.slow
+def test_clock_and_yaw_of_one_camera_are_found(tmp_path):
+    yaw_rad = math.radians(0.5)
+    wrong = replace(FRONT_RIGHT, delay_s=0.05, yaw_error_rad=yaw_rad)
+    faults = faults_of(tmp_path, FRONT, wrong)
+    assert list(faults) == [FRONT_RIGHT.name]
+    fault = faults[FRONT_RIGHT.name]
+    assert fault.late_s == pytest.approx(0.05, rel=0.2)
+    assert fault.turn_rad[1] == pytest.approx(-yaw_rad, rel=0.2)  # y is down: to the left
