@@ -92,12 +92,12 @@ class ReconstructParameters(ViewParameters):
 
     @property
     def stages(self) -> dict[str, int | None]:
-        """What a run goes through, in order: the steps of fits, None for all else."""
+        """What a run goes through, in order: the steps of fits that are set, None for all else."""
         paints = fitted_on(self.painter) == "painted"
-        stages: dict[str, int | None] = {"prepare": None, "fit": self.fit.steps}
+        stages: dict[str, int | None] = {"prepare": None, "fit": self.fit.steps or None}
         for number in range(1, self.rounds + 1):
             stages |= {f"paint-{number}": None} if paints else {}
-            stages[f"refine-{number}"] = self.refine.steps
+            stages[f"refine-{number}"] = self.refine.steps or None
         judged = ["evaluate-unpainted", "evaluate"]
         judged += ["evaluate-view-time"] if self.judge_view_time and paints else []
         last = [*(judged if self.judge else ()), *(["report"] if self.report else ())]

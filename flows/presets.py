@@ -1,17 +1,24 @@
-"""Full parameters by name; every number of a run stands here or in the library's defaults."""
+"""Full parameters by name: an effort and a width, from which steps and Gaussians follow.
+
+Every number of a run stands here or in the library's defaults.
+"""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 from flows.parameters import ReconstructParameters
 from lidarpainter_models.conditioning.settings import ConditionConfig, NovelGuidanceConfig
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.settings import ScoringConfig
-from lidarpainter_models.gaussians.fitting.config import FitConfig, GuidanceConfig, continuation
+from lidarpainter_models.gaussians.fitting.config import (
+    EffortConfig,
+    FitConfig,
+    GuidanceConfig,
+    continuation,
+)
 from lidarpainter_models.observations.settings import ObservationConfig
 
-SHORT_REFINE_STEPS = 500
-"""A round of the CPU preset: fourteen looks at each of 35 painted views."""
+SHORT_REFINE_LOOKS = 250.0
+"""A round of the CPU preset: on one front camera fourteen looks at each of 35 painted views."""
 
 
 def preview(scene: str) -> ReconstructParameters:
@@ -26,15 +33,14 @@ def preview(scene: str) -> ReconstructParameters:
         novel=NovelGuidanceConfig(),
         conditions=ConditionConfig(),
         rounds=2,
-        refine=continuation(fit, steps=SHORT_REFINE_STEPS, guidance=GuidanceConfig()),
+        refine=continuation(fit, looks=SHORT_REFINE_LOOKS, guidance=GuidanceConfig()),
         scoring=ScoringConfig(),
     )
 
 
 def balanced(scene: str) -> ReconstructParameters:
     """The best trade on one GPU."""
-    fit = FitConfig(steps=7_000)
-    fit = replace(fit, densification=replace(fit.densification, budget=600_000))
+    fit = FitConfig(effort=EffortConfig(looks=1_500.0))
     return ReconstructParameters(
         scene=scene,
         preset="balanced",
@@ -44,18 +50,18 @@ def balanced(scene: str) -> ReconstructParameters:
         novel=NovelGuidanceConfig(),
         conditions=ConditionConfig(),
         rounds=2,
-        refine=continuation(fit, steps=3_000, guidance=GuidanceConfig()),
+        refine=continuation(fit, looks=500.0, guidance=GuidanceConfig()),
         scoring=ScoringConfig(),
     )
 
 
 def paper(scene: str) -> ReconstructParameters:
-    """The paper's numbers: 7000 steps, then novel views up to step 30000, at 1024 pixels.
+    """The paper's schedule: 7 parts recorded views alone, 23 with novel ones, 1024 pixels wide.
 
     Its LPIPS counts where weights are given: `--set lpips.backbone=FILE --set lpips.heads=FILE`
     with `fit.losses.perceptual=1`, `refine.losses.perceptual=1` and `refine.guidance.perceptual=1`.
     """
-    fit = FitConfig(steps=7_000, half_resolution=0.0)
+    fit = FitConfig(effort=EffortConfig(looks=3_500.0), half_resolution=0.0)
     guidance = GuidanceConfig(probability=0.4, weight=0.2, ssim=0.1, freedom="all")
     return ReconstructParameters(
         scene=scene,
@@ -66,7 +72,7 @@ def paper(scene: str) -> ReconstructParameters:
         novel=NovelGuidanceConfig(every_nth=1),
         conditions=ConditionConfig(),
         rounds=1,
-        refine=continuation(fit, steps=23_000, guidance=guidance),
+        refine=continuation(fit, looks=11_500.0, guidance=guidance),
         scoring=ScoringConfig(),
     )
 

@@ -64,6 +64,7 @@ def _expected(store: Store, parameters: "ReconstructParameters") -> dict[str, fl
     if not views:  # the scene is not drawn yet
         return None
     stages = [
-        PlannedStage(name=name, amount=steps or views) for name, steps in parameters.stages.items()
+        PlannedStage(name=name, amount=steps or views, has_steps=steps is not None)
+        for name, steps in parameters.stages.items()
     ]
     return expected_seconds(stages, parameters.preset, past)

@@ -1,8 +1,9 @@
 """How long a stage and the whole run still take: by past runs, and by how fast this one goes.
 
 A stage goes on at the speed it has shown. Before that, and for the stages that come after it, the
-newest past run of the same preset tells, in proportion to steps (fits) or views (all else), and to
-how much faster or slower this run is than that one so far. Where nothing tells, nothing is said.
+newest past run of the same preset tells, in proportion to steps (fits for which they are set) or
+views (all else), and to how much faster or slower this run is than that one so far. Where nothing
+tells, nothing is said.
 """
 
 import json
@@ -25,7 +26,8 @@ class PlannedStage:
 
     name: str
     amount: float
-    """What its time grows with: steps of a fit, views of anything else."""
+    """What its time grows with: steps of a fit where they are set, views of anything else."""
+    has_steps: bool = False
 
 
 def expected_seconds(
@@ -41,25 +43,24 @@ def expected_seconds(
     complete = [row for row in past if row["status"] == "complete" and row["preset"] == preset]
     for row in sorted(complete, key=lambda row: row["finished_at"], reverse=True):
         rates = _rates(row)
-        if all(_kind(stage.name) in rates for stage in stages):
-            return {stage.name: rates[_kind(stage.name)] * stage.amount for stage in stages}
+        kinds = [(_kind(stage.name), stage.has_steps) for stage in stages]
+        if all(kind in rates for kind in kinds):
+            amounts = zip(stages, kinds, strict=True)
+            return {stage.name: rates[kind] * stage.amount for stage, kind in amounts}
     return None
 
 
-def _rates(row: Mapping[str, Any]) -> dict[str, float]:
-    """Seconds for a step or a view, by kind of stage, as far as the row of a run tells."""
+def _rates(row: Mapping[str, Any]) -> dict[tuple[str, bool], float]:
+    """Seconds for a view or a step, by kind of stage and which of them, as far as a run tells."""
     parameters = json.loads(row["parameters"] or "{}")
     took: dict[str, list[float]] = {}
     for name, seconds in json.loads(row["stage_seconds"] or "{}").items():
         took.setdefault(_kind(name), []).append(seconds)
-    amounts = {
-        kind: parameters.get(kind, {}).get("steps") if kind in FITS else row["num_views"]
-        for kind in took
-    }
+    steps = {kind: parameters.get(kind, {}).get("steps") for kind in FITS}
     return {
-        kind: sum(seconds) / len(seconds) / amount
+        (kind, bool(steps.get(kind))): sum(seconds) / len(seconds) / amount
         for kind, seconds in took.items()
-        if (amount := amounts[kind])
+        if (amount := steps.get(kind) or row["num_views"])
     }
 
 

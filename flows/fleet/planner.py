@@ -136,7 +136,8 @@ class Planner:
         return Effort(
             views=views,
             view_pixels=float(parameters.observation.width_px) ** 2,
-            steps=parameters.fit.steps + parameters.rounds * parameters.refine.steps,
+            steps=parameters.fit.most_steps(views)
+            + parameters.rounds * parameters.refine.most_steps(views),
             painted_views=views * parameters.rounds if paints else 0.0,
             read_views=read_views,
             drawn_pixels=drawn_pixels,

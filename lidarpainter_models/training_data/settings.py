@@ -6,10 +6,14 @@ from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.fitting.config import FitConfig, RefinementConfig
 from lidarpainter_models.gaussians.fitting.settings import DensificationConfig
+from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.observations.settings import ObservationConfig
 
 AS_GIVEN = RefinementConfig(cameras=False, extrinsics=False, actors=False)
 """Poses are not refined: those given are the best known, and the truth stands in their frame."""
+
+WEAK_START = 55_000
+"""Gaussians that a fit stopped early starts with, more than it ends with."""
 
 
 def weak_fit(steps: int = 250, *, budget: int = 50_000) -> FitConfig:
@@ -17,6 +21,7 @@ def weak_fit(steps: int = 250, *, budget: int = 50_000) -> FitConfig:
     return FitConfig(
         steps=steps,
         refinement=AS_GIVEN,
+        initialisation=InitialisationConfig(num_gaussians=WEAK_START),
         densification=DensificationConfig(budget=budget),
     )
 

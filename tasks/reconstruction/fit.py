@@ -104,12 +104,12 @@ def _build(  # noqa: PLR0913 - all that a fit is made from
     def told(step: int, steps: int, entry: dict[str, float]) -> None:
         nonlocal plan
         if "planned_bytes" in entry:
-            note = plan = f"{entry['planned_bytes'] / 1e9:.2g} GB planned on {device}"
-            _LOG.info("a fit of %d steps: %s", steps, plan)
+            note = plan = _told_plan(steps, entry, device)
+            _LOG.info("a fit: %s", plan)
         elif "initialised" in entry:
             note = f"placing Gaussians, {100 * entry['initialised']:.0f} %"
         else:
-            note = f"{entry['psnr']:.2f} dB, {entry['num_gaussians'] / 1000:.0f}k Gaussians, {plan}"
+            note = f"{entry['psnr']:.2f} dB, {entry['num_gaussians'] / 1000:.0f}k Gaussians; {plan}"
             note += shown
         progress(step, steps, note)
 
@@ -133,5 +133,14 @@ def _build(  # noqa: PLR0913 - all that a fit is made from
         "train_psnr": last["psnr"],
         "cpu_s": last["cpu_s"],
         "steps": int(last["step"]),
-        "stopped_early": last["step"] < config.steps,
+        "stopped_early": result.stopped_early,
     }
+
+
+def _told_plan(steps: int, entry: dict[str, float], device: torch.device) -> str:
+    """Such as `84 views, 0.9 Mpx of surface, at most 210k Gaussians, 4,800 steps, 1 GB on cpu`."""
+    return (
+        f"{entry['num_views']:.0f} views, {entry['surface_pixels'] / 1e6:.2g} Mpx of surface, "
+        f"at most {entry['most_gaussians'] / 1000:.3g}k Gaussians, {steps:,} steps, "
+        f"{entry['planned_bytes'] / 1e9:.2g} GB on {device}"
+    )

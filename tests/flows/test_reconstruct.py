@@ -148,7 +148,7 @@ def test_two_runs_at_once_share_every_computation(store):
         ([TOY_SCENE, "--shift", "2,x"], "expected positive metres"),
         ([TOY_SCENE, "--up", "-1"], "expected positive metres"),
         ([TOY_SCENE, "--set", "fit.stepz=5"], "no setting 'fit.stepz'"),
-        ([TOY_SCENE, "--set", "fit.steps=0"], "steps"),
+        ([TOY_SCENE, "--set", "fit.steps=-1"], "steps"),
         ([TOY_SCENE, "--split", "sometimes"], "split 'sometimes' is not understood"),
         ([TOY_SCENE, "--train-cameras", "back"], "no camera 'back'"),
         ([TOY_SCENE, "--painter", "picasso"], "no painter 'picasso'"),

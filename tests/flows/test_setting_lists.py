@@ -26,8 +26,8 @@ def test_every_setting_has_a_type_and_a_reason_and_can_be_set_to_its_default(nam
 
 def test_a_setting_says_what_its_class_says():
     (budget,) = known_settings(preset("balanced", "a/b"), "fit.densification.budget")
-    assert (budget.type, budget.default) == ("int", 600_000)
-    assert budget.reason.startswith("Never more than this")
+    assert (budget.type, budget.default) == ("int", 0)
+    assert budget.reason.startswith("Never more Gaussians than this")
     (device,) = known_settings(preset("preview", "a/b"), "device")
     assert device.type == "str"
 
@@ -37,7 +37,7 @@ def test_the_command_lists_a_part_or_all():
     assert "fit.densification.budget" in shown
     assert "fit.steps" not in shown
     listed = succeed("settings", "--preset", "paper", "--json").json["settings"]
-    assert {"path": "fit.steps", "type": "int", "default": 7000} in [
+    assert {"path": "fit.effort.looks", "type": "float", "default": 3500.0} in [
         {key: one[key] for key in ("path", "type", "default")} for one in listed
     ]
     trained = succeed("settings", "training", "--of", "train", "--json").json["settings"]

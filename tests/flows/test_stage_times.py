@@ -8,6 +8,7 @@ import pytest
 from flows.cli.output import set_loudness
 from flows.cli.progress import how_far, shown_progress
 from flows.cli.stage_times import Clock, PlannedStage, as_clock, expected_seconds
+from flows.overrides import with_overrides
 from flows.presets import preview
 from tasks.progress import listener
 
@@ -47,10 +48,14 @@ def past(day=1, **changes):
     return row | changes
 
 
-def planned(views=28, **changes):
-    parameters = preview("a/b").model_copy(update=changes)
+def planned(views=28, steps=STEPS, **changes):
+    parameters = with_overrides(
+        preview("a/b").model_copy(update=changes),
+        [f"{name}.steps={count}" for name, count in steps.items()],
+    )
     return [
-        PlannedStage(name=name, amount=steps or views) for name, steps in parameters.stages.items()
+        PlannedStage(name=name, amount=steps or views, has_steps=steps is not None)
+        for name, steps in parameters.stages.items()
     ]
 
 
@@ -101,6 +106,15 @@ def test_the_newest_complete_run_of_the_preset_tells():
     assert found["prepare"] == pytest.approx(6.7)
     assert found["refine-1"] == pytest.approx(2 * 40.0)
     assert list(found) == [name for name in RECORDED_S if name != "total"]
+
+
+def test_where_steps_follow_the_views_their_time_does_too():
+    left_open = json.dumps({name: {"steps": 0} for name in STEPS})
+    rows = [past(day=1, parameters=left_open), past(day=2)]
+    found = expected_seconds(planned(views=56, steps={}), "preview", rows)
+    assert found["fit"] == pytest.approx(2 * 88.0)
+    assert found["prepare"] == pytest.approx(2 * 6.7)
+    assert expected_seconds(planned(steps={}), "preview", [past()]) is None
 
 
 def test_no_past_run_no_word_about_the_run():

@@ -123,7 +123,7 @@ def refused(words, expected, place):
         ((*TOY, "--set", "fit.steps"), "expected a setting as key=value"),
         ((*TOY, "--set", "fit.stepz=3"), "no setting 'fit.stepz': fit has steps, "),
         ((*TOY, "--set", "fit.steps=three"), "fit.steps=three: Input should be a valid integer"),
-        ((*TOY, "--set", "fit.steps=0"), "steps and log_every must be positive"),
+        ((*TOY, "--set", "fit.steps=-1"), "steps must not be negative"),
         ((*TOY, "--set", "fit=3"), "fit=3: Input should be"),
         ((*TOY, "--set", "painter.name=x"), "no setting 'painter.name'"),
         ((*TOY, "--set", "observation.width_px=100000"), "expected at most the 240 px"),

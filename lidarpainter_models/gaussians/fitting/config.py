@@ -60,12 +60,31 @@ class GuidanceConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FitConfig:
-    """How a Gaussian scene is fitted; the defaults suit one front camera and two CPU cores."""
+class EffortConfig:
+    """How much a fit spends on what the views show; see `planned_fit`."""
 
-    steps: int = 1500
-    """Optimiser steps, one recorded view each. More of them sharpen the recorded views and cost the
-    neighbouring lanes (docs/benchmarks.md)."""
+    looks: float = 750.0
+    """Steps for every view's worth of new surface. More of them sharpen the recorded views and cost
+    the neighbouring lanes (docs/benchmarks.md)."""
+    gaussians_per_pixel: float = 0.375
+    """Most Gaussians for a pixel of surface, at the knee of their curve (docs/benchmarks.md)."""
+
+    def __post_init__(self) -> None:
+        """Refuse an effort that comes to nothing."""
+        if not (self.looks > 0 and self.gaussians_per_pixel > 0):
+            raise ConfigError(
+                f"effort.looks and effort.gaussians_per_pixel must be positive, got {self.looks} "
+                f"and {self.gaussians_per_pixel}"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitConfig:
+    """How a Gaussian scene is fitted; the defaults suit two CPU cores."""
+
+    effort: EffortConfig = field(default_factory=EffortConfig)
+    steps: int = 0
+    """Optimiser steps, one recorded view each; 0 follows the effort."""
     half_resolution: float = 0.3
     """First part of the steps at half the image size: a quarter of the pixels."""
     seed: int = 0
@@ -89,6 +108,10 @@ class FitConfig:
     """Of the steps, by the clock: as many are made as there is time for, and the schedules are
     those of so many. None sets no limit."""
 
+    def most_steps(self, num_views: float) -> float:
+        """Steps that are set, or those that follow if every view is new all over."""
+        return self.steps or self.effort.looks * num_views
+
     @property
     def weighs_perceptual(self) -> bool:
         """Whether a perceptual distance takes part, which must then be given."""
@@ -96,9 +119,10 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         """Refuse settings that make no fit."""
-        if self.steps < 1 or self.log_every < 1:
+        if self.steps < 0 or self.log_every < 1:
             raise ConfigError(
-                f"steps and log_every must be positive, got {self.steps} and {self.log_every}"
+                f"steps must not be negative and log_every positive, got {self.steps} and "
+                f"{self.log_every}"
             )
         for name in ("memory_bytes", "time_limit_s"):
             value = getattr(self, name)
@@ -113,15 +137,20 @@ class FitConfig:
 
 
 def continuation(
-    config: FitConfig, *, steps: int, guidance: GuidanceConfig | None = None
+    config: FitConfig,
+    *,
+    steps: int = 0,
+    looks: float | None = None,
+    guidance: GuidanceConfig | None = None,
 ) -> FitConfig:
-    """Settings for going on from a fitted scene, usually with painted views.
+    """How a fit goes on from a fitted scene, for so many steps or looks.
 
     Full images and free poses from the first step; growth and rates as in the first fit. Rates
     started lower held nothing better and took in a fifth less of what was painted.
     """
     return replace(
         config,
+        effort=replace(config.effort, looks=looks or config.effort.looks),
         steps=steps,
         half_resolution=0.0,
         refinement=replace(config.refinement, start_step=0),

@@ -20,6 +20,8 @@ from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.densification import densify, prune
 from lidarpainter_models.gaussians.fitting.images import FitImage, full_image, half_image
 from lidarpainter_models.gaussians.fitting.memory import planned_memory, within_limit
+from lidarpainter_models.gaussians.fitting.planned_size import planned_fit
+from lidarpainter_models.gaussians.fitting.seen_surface import SeenSurface, seen_surface
 from lidarpainter_models.gaussians.fitting.shape_limits import (
     LIMITS_EVERY,
     limit_shapes,
@@ -38,7 +40,8 @@ FIRST_LOOK = 0.1
 FirstLook = Callable[[GaussianScene], None]
 Progress = Callable[[int, int, dict[str, float]], None]
 """Told the steps done, the steps in all and the newest entry of the history; before the first step
-`initialised`, the part of the first scene that is made, and `planned_bytes` (see `memory`)."""
+`initialised`, the part of the first scene that is made, then `planned_bytes` (see `memory`),
+`num_views`, `surface_pixels` and `most_gaussians`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,6 +50,8 @@ class FitResult:
 
     scene: GaussianScene
     history: list[dict[str, float]]
+    stopped_early: bool
+    """Whether a limit of time left it fewer steps than planned."""
     """Every so many steps: step, loss, psnr (training views), num_gaussians, cpu_s."""
 
 
@@ -107,6 +112,8 @@ def fit_gaussians(  # noqa: PLR0913 - what was recorded, and one option each
     """
     _check(observations, config, start, perceptual)
     device = device or (start.device if start is not None else torch.device("cpu"))
+    surface = seen_surface(observations.views)
+    config = planned_fit(config, surface)
     if device.type == "cpu":
         config = within_limit(
             observations,
@@ -116,7 +123,7 @@ def fit_gaussians(  # noqa: PLR0913 - what was recorded, and one option each
             guidance=guidance,
         )
     told = Told(progress, first_look)
-    steps = partial(_steps, observations, config, guidance, checkpoints, told, perceptual)
+    steps = partial(_steps, observations, surface, config, guidance, checkpoints, told, perceptual)
 
     def attempt(spares: bool) -> FitResult:
         kept = checkpoints.load() if checkpoints is not None else None
@@ -131,6 +138,7 @@ def fit_gaussians(  # noqa: PLR0913 - what was recorded, and one option each
 
 def _steps(  # noqa: PLR0913 - as `fit_gaussians`
     observations: SceneObservations,
+    surface: SeenSurface,
     config: FitConfig,
     guidance: Sequence[GuidanceView],
     checkpoints: CheckpointFolder | None,
@@ -152,17 +160,23 @@ def _steps(  # noqa: PLR0913 - as `fit_gaussians`
             keeps_images=keeps_images,
         )
         on_cpu = state.scene.device.type == "cpu"
-        planned = float(plan.of_process if on_cpu else plan.total)
-        told.progress(state.step, config.steps, {"planned_bytes": planned})
+        sizes = {
+            "planned_bytes": float(plan.of_process if on_cpu else plan.total),
+            "num_views": float(len(observations.views)),
+            "surface_pixels": surface.num_pixels,
+            "most_gaussians": float(config.densification.budget),
+        }
+        told.progress(state.step, config.steps, sizes)
     full, half = _images(observations, state.scene, config)
     if keeps_images:
         device = state.scene.device
         full, half = ([image.to(device) for image in images] for images in (full, half))
         guidance = [view.to(device) for view in guidance]
-    clock, look = _Clock(state.step), told.first_look
+    clock, look, planned_steps = _Clock(state.step), told.first_look, config.steps
     while state.step < config.steps:
         is_half = state.step < config.half_resolution * config.steps
-        _advance(state, half if is_half else full, guidance, config, perceptual)
+        row = state.next_view(surface.groups)
+        _advance(state, half if is_half else full, row, guidance, config, perceptual)
         state.cpu_s = time.process_time() - cpu_before_s
         if state.step % config.log_every == 0 or state.step == config.steps:
             config = clock.in_time(state.step, config)
@@ -172,7 +186,11 @@ def _steps(  # noqa: PLR0913 - as `fit_gaussians`
             look = None
         if checkpoints is not None and checkpoints.is_due(state.step):
             checkpoints.save(*state.keep())
-    return FitResult(scene=_finished(state, config), history=state.history)
+    return FitResult(
+        scene=_finished(state, config),
+        history=state.history,
+        stopped_early=config.steps < planned_steps,
+    )
 
 
 def _first_scene(
@@ -199,12 +217,12 @@ def _images(
 def _advance(
     state: FitState,
     images: Sequence[FitImage],
+    row: int,
     guidance: Sequence[GuidanceView],
     config: FitConfig,
     perceptual: Perceptual | None,
 ) -> None:
     """One step: gradients, optimisers, and at their times the rounds that change the set."""
-    row = state.next_view(len(images))
     painted = None
     if guidance and state.random() < config.guidance.probability:
         painted = guidance[int(torch.randint(len(guidance), (), generator=state.generator))]

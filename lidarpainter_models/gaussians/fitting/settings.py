@@ -9,8 +9,8 @@ from lidarpainter_models.errors import ConfigError
 class DensificationConfig:
     """When and how far the number of Gaussians changes."""
 
-    budget: int = 80_000
-    """Never more than this; beyond it the gain per CPU second is small on one front camera."""
+    budget: int = 0
+    """Never more Gaussians than this; 0 follows the effort of the fit."""
     start: float = 0.1
     """Fraction of the fit after which splitting begins: gradients must mean something."""
     stop: float = 0.6
@@ -22,9 +22,9 @@ class DensificationConfig:
 
     def __post_init__(self) -> None:
         """Refuse a schedule that runs backwards."""
-        if not 0 <= self.start <= self.stop <= 1 or self.every < 1 or self.budget < 1:
+        if not 0 <= self.start <= self.stop <= 1 or self.every < 1 or self.budget < 0:
             raise ConfigError(
-                f"densification needs 0 <= start <= stop <= 1, every >= 1 and a positive budget, "
+                f"densification needs 0 <= start <= stop <= 1, every >= 1 and budget >= 0, "
                 f"got start {self.start}, stop {self.stop}, every {self.every}, "
                 f"budget {self.budget}"
             )

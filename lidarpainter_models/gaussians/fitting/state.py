@@ -45,7 +45,7 @@ class FitState:
     tally: GradientTally
     generator: torch.Generator
     waiting: list[int] = field(default_factory=list)
-    """Views still to be drawn in this pass."""
+    """Groups of views still to be drawn from in this pass."""
     step: int = 0
     cpu_s: float = 0.0
     """Process CPU seconds spent so far, earlier runs included."""
@@ -70,11 +70,17 @@ class FitState:
             generator=generator,
         )
 
-    def next_view(self, num_views: int) -> int:
-        """The next view of a random order that shows every view once before any twice."""
+    def next_view(self, groups: Sequence[Sequence[int]]) -> int:
+        """Any view of the next group, of a random order that has each group once before any twice.
+
+        Views that show the same count as one (see `seen_surface`).
+        """
         if not self.waiting:
-            self.waiting = torch.randperm(num_views, generator=self.generator).tolist()
-        return self.waiting.pop()
+            self.waiting = torch.randperm(len(groups), generator=self.generator).tolist()
+        group = groups[self.waiting.pop()]
+        if len(group) == 1:
+            return group[0]
+        return group[int(torch.randint(len(group), (), generator=self.generator))]
 
     def random(self) -> float:
         """A uniform number in [0, 1)."""
@@ -116,7 +122,7 @@ class FitState:
                 "gaussian_adam": self.gaussian_adam.tensors(),
                 "blocks": {"block_of_row": self.blocks.block_of_row},
                 **{name: adam.tensors() for name, adam in self.refinement.adams.items()},
-                "tally": {"total": self.tally.total, "visits": self.tally.visits},
+                "tally": vars(self.tally),
                 "random": {"state": self.generator.get_state()},
             }
         )

@@ -5,6 +5,7 @@ near things get small voxels, far ones large. Sizes are powers of two times a fa
 searched so that a given number of voxels comes out. Metres; world or box frame alike.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import torch
@@ -44,53 +45,65 @@ def voxel_keys(
     return key ^ (level * 2_654_435_761_123)
 
 
-def adaptive_sizes(
-    footprint_m: Float[Tensor, " points"], factor: float, *, least_m: float, most_m: float
-) -> Float[Tensor, " points"]:
-    """Voxel edge of each point: about `factor` pixels, as a power of two times the least."""
-    wanted = (footprint_m * factor).clamp(least_m, most_m)
-    return least_m * 2 ** torch.floor(torch.log2(wanted / least_m) + 0.5)
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Cloud:
+    """Points of one body, to be thinned out."""
+
+    xyz_m: Float[Tensor, "points 3"]
+    rgb: Float[Tensor, "points 3"]
+    """In [0, 1]."""
+    has_colour: Bool[Tensor, " points"]
+    """Which of the colours mean anything."""
+    footprint_m: Float[Tensor, " points"]
+    """Size of a pixel at each point."""
+    least_m: float = 0.03
+    """Smallest edge of a voxel."""
+
+    def sizes(self, factor: float, *, most_m: float) -> Float[Tensor, " points"]:
+        """Voxel edge of each point: about `factor` pixels, as a power of two times the least."""
+        wanted = (self.footprint_m * factor).clamp(self.least_m, most_m)
+        return self.least_m * 2 ** torch.floor(torch.log2(wanted / self.least_m) + 0.5)
 
 
 def adaptive_voxels(
-    xyz_m: Float[Tensor, "points 3"],
-    rgb: Float[Tensor, "points 3"],
-    has_colour: Bool[Tensor, " points"],
-    footprint_m: Float[Tensor, " points"],
-    *,
-    budget: int,
-    least_m: float = 0.03,
-    most_m: float = 2.0,
-) -> VoxelPoints:
-    """At most `budget` voxels with the finest detail per pixel that allows.
+    clouds: Sequence[Cloud], *, budget: int, most_m: float = 2.0
+) -> list[VoxelPoints]:
+    """At most `budget` voxels of all clouds, with the finest detail per pixel that allows.
+
+    A pixel asks for the same detail on whatever body it shows.
 
     Args:
-        xyz_m: the cloud.
-        rgb: colours, in [0, 1].
-        has_colour: which of them mean anything.
-        footprint_m: size of a pixel at each point.
-        budget: how many voxels are wanted; fewer come out if the cloud is smaller.
-        least_m: smallest edge.
+        clouds: one for each body.
+        budget: how many voxels are wanted; fewer come out if the clouds are smaller.
         most_m: largest edge.
     """
+
+    def count(factor: float) -> int:
+        sizes = [cloud.sizes(factor, most_m=most_m) for cloud in clouds]
+        keys = [voxel_keys(cloud.xyz_m, size) for cloud, size in zip(clouds, sizes, strict=True)]
+        return sum(torch.unique(key).numel() for key in keys)
+
     low, high = 0.25, 1024.0
-    keys = voxel_keys(xyz_m, adaptive_sizes(footprint_m, low, least_m=least_m, most_m=most_m))
     best = low
-    if torch.unique(keys).numel() > budget:
+    if count(low) > budget:
         for _ in range(9):
             middle = (low * high) ** 0.5
-            sizes = adaptive_sizes(footprint_m, middle, least_m=least_m, most_m=most_m)
-            is_few = torch.unique(voxel_keys(xyz_m, sizes)).numel() <= budget
-            low, high = (low, middle) if is_few else (middle, high)
+            low, high = (low, middle) if count(middle) <= budget else (middle, high)
         best = high
-    sizes = adaptive_sizes(footprint_m, best, least_m=least_m, most_m=most_m)
-    voxels = mean_by_voxel(xyz_m, rgb, has_colour, sizes)
+    voxels = [
+        mean_by_voxel(cloud.xyz_m, cloud.rgb, cloud.has_colour, cloud.sizes(best, most_m=most_m))
+        for cloud in clouds
+    ]
+    share = budget / max(sum(part.size_m.numel() for part in voxels), 1)
+    return voxels if share >= 1 else [_evenly_chosen(part, share) for part in voxels]
+
+
+def _evenly_chosen(voxels: VoxelPoints, share: float) -> VoxelPoints:
+    """An even choice of them, where even the largest voxels are too many."""
     count = voxels.size_m.numel()
-    if count <= budget:
-        return voxels
-    # even the largest voxels are too many: an even choice of them
+    places = (torch.arange(int(count * share)) / share).long()
     chosen = torch.zeros(count, dtype=torch.bool)
-    chosen[(torch.arange(budget) * count) // budget] = True
+    chosen[places] = True
     return voxels.keep(chosen)
 
 

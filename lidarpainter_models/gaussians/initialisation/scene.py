@@ -13,6 +13,7 @@ from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.initialisation.adaptive_voxels import (
+    Cloud,
     VoxelPoints,
     adaptive_voxels,
 )
@@ -43,16 +44,14 @@ LEAST_ACTOR_POINTS = 20
 """An actor with fewer points is not modelled."""
 ACTOR_VOXEL_M = 0.05
 """Smallest voxel on an actor; its points come from the whole log."""
-MOST_ACTOR_SHARE = 0.4  # actors get at most this part of the start size
 UNSEEN_SHARE = 0.2
-"""Part of the street's share for points that only a camera moved aside would see."""
+"""Part of the start size for points that only a camera moved aside would see."""
 MOST_VIEWS_PER_CAMERA = 60
 """Views that tell where the street is seen and how finely; those between see the same, and asking
 every point for every view would take the square of a log's length."""
 MOST_STREET_POINTS = 5_000_000
 """Of the street's points so many are looked at, evenly: dozens for each Gaussian."""
 _MOST_VIEWS_PER_ACTOR = 24
-_APART_M = 64.0  # longer than any vehicle, short enough for float32 to stay exact
 
 
 def initialise_scene(
@@ -65,20 +64,19 @@ def initialise_scene(
 
     Args:
         observations: what was recorded.
-        config: see there.
+        config: see there; `num_gaussians` must be given.
         progress: told which part of the work is done, 0 to 1, as far as that is known.
 
     Raises:
-        ConfigError: no LiDAR point lies where a training camera could see it.
+        ConfigError: no LiDAR point lies where a training camera could see it, or no start size.
     """
+    if config.num_gaussians == 0:
+        raise ConfigError("the start needs num_gaussians, which `planned_fit` takes from the views")
     views = observations.views
-    actors = _actor_gaussians(observations, config)
-    progress(0.25)
     for_unreached = int(config.num_gaussians * MOST_SHARE)
-    for_street = config.num_gaussians - for_unreached - sum(len(part) for part in actors)
-    gaussians = _street_gaussians(observations.lidar_map.street, views, config, max(for_street, 1))
-    for part in actors:
-        gaussians = gaussians.append(part)
+    gaussians = _on_surfaces(
+        observations, config, max(config.num_gaussians - for_unreached, 1), progress
+    )
     if len(gaussians) == 0:
         raise ConfigError("no LiDAR point lies where a training camera could see it")
     progress(0.5)
@@ -100,18 +98,15 @@ def _scene_around(gaussians: GaussianSet, observations: SceneObservations) -> Ga
         sky=sky_from_images(
             sky_layout(cameras),
             cameras,
-            (view.rgb for view in views),  # one at a time as floats
+            [view.rgb for view in views],
             [view.sky_mask for view in views],
         ),
         cameras=CameraCorrections.none(
             [view.key for view in views],
             timestamps_ns,
             torch.stack([camera.world_from_camera.double() for camera in cameras]),
-            observations.faults,
         ),
-        exposure=ExposureCorrections.none(
-            observations.camera_names, [view.timestamp_ns for view in views]
-        ),
+        exposure=ExposureCorrections.none(observations.camera_names),
     )
 
 
@@ -145,32 +140,6 @@ def pixel_footprint(
     return footprint, in_image
 
 
-def _street_gaussians(
-    points: MapPoints, views: Sequence[TrainingView], config: InitialisationConfig, budget: int
-) -> GaussianSet:
-    """Surfels on the street: most where images show it, some where only a moved camera would."""
-    points = points.keep(torch.arange(0, len(points), math.ceil(len(points) / MOST_STREET_POINTS)))
-    footprint, in_image = pixel_footprint(
-        points.xyz_m, _spread_cameras(views), aside_m=config.aside_m
-    )
-    is_aside = ~in_image & footprint.isfinite()
-    for_aside = int(budget * UNSEEN_SHARE)
-    seen = _street_voxels(points, footprint, in_image, config, max(budget - for_aside, 1))
-    aside = _street_voxels(points, footprint, is_aside, config, max(for_aside, 1))
-    # no image will ever shrink a lone blob there, and beside the lane it is large in the view
-    aside = aside.keep(aside.num_points >= LEAST_UNSEEN_POINTS)
-    xyz_m = torch.cat([seen.xyz_m, aside.xyz_m])
-    if xyz_m.shape[0] == 0:
-        return GaussianSet.empty(sh_degree=config.sh_degree)
-    rgb = torch.cat([seen.rgb, aside.rgb])
-    return surfels_from_points(
-        xyz_m,
-        fill_colours(xyz_m, rgb, torch.cat([seen.has_colour, aside.has_colour])),
-        sh_degree=config.sh_degree,
-        most_sigma_m=torch.cat([2 * seen.size_m, SPACING_SIGMA * aside.size_m]),
-    )
-
-
 def _spread_cameras(views: Sequence[TrainingView]) -> list[Camera]:
     """At most so many views of each camera, evenly over the log."""
     cameras: dict[str, list[Camera]] = {}
@@ -183,65 +152,77 @@ def _spread_cameras(views: Sequence[TrainingView]) -> list[Camera]:
     ]
 
 
-def _street_voxels(
-    points: MapPoints,
-    footprint: Float[Tensor, " points"],
-    chosen: Bool[Tensor, " points"],
+def _on_surfaces(
+    observations: SceneObservations,
     config: InitialisationConfig,
     budget: int,
-) -> VoxelPoints:
-    """The chosen points, thinned out to a budget."""
-    return adaptive_voxels(
-        points.xyz_m[chosen],
-        points.rgb_u8[chosen].float() / 255,
-        points.has_colour[chosen],
-        footprint[chosen],
-        budget=budget,
-        least_m=config.street_voxel_m,
-    )
-
-
-def _actor_gaussians(
-    observations: SceneObservations, config: InitialisationConfig
-) -> list[GaussianSet]:
-    """Surfels of every actor with enough points in sight, at most the actors' share."""
-    clouds = []
-    for index, track in enumerate(observations.tracks):
+    progress: Callable[[float], None],
+) -> GaussianSet:
+    """Surfels where images show LiDAR surfaces, and some where only a moved camera would."""
+    street = observations.lidar_map.street
+    street = street.keep(torch.arange(0, len(street), math.ceil(len(street) / MOST_STREET_POINTS)))
+    cameras = _spread_cameras(observations.views)
+    footprint, in_image = pixel_footprint(street.xyz_m, cameras, aside_m=config.aside_m)
+    is_aside = ~in_image & footprint.isfinite()
+    for_aside = int(budget * UNSEEN_SHARE)
+    least_m = config.street_voxel_m
+    (aside,) = adaptive_voxels([_cloud(street, footprint, is_aside, least_m)], budget=for_aside)
+    # no image will ever shrink a lone blob there, and beside the lane it is large in the view
+    aside = aside.keep(aside.num_points >= LEAST_UNSEEN_POINTS)
+    progress(0.25)
+    clouds = {0: _cloud(street, footprint, in_image, least_m)}
+    for index, track in enumerate(observations.tracks, start=1):
         points = observations.lidar_map.actors.get(track.actor_id)
         if points is None:
             continue
         footprint = _actor_footprint(points, track, observations.views, config)
         in_sight = footprint.isfinite()
         if int(in_sight.sum()) >= LEAST_ACTOR_POINTS:
-            clouds.append((index + 1, points.keep(in_sight), footprint[in_sight]))
-    if not clouds:
-        return []
-    body = torch.cat([torch.full((len(part),), index) for index, part, _ in clouds])
-    # one search over all actors: their boxes are set far apart so that no voxel is shared
-    apart_m = body.float()[:, None] * torch.tensor([_APART_M, 0.0, 0.0])
-    voxels = adaptive_voxels(
-        torch.cat([part.xyz_m for _, part, _ in clouds]) + apart_m,
-        torch.cat([part.rgb_u8 for _, part, _ in clouds]).float() / 255,
-        torch.cat([part.has_colour for _, part, _ in clouds]),
-        torch.cat([footprint for _, _, footprint in clouds]),
-        budget=max(int(config.num_gaussians * MOST_ACTOR_SHARE), 1),
-        least_m=ACTOR_VOXEL_M,
+            clouds[index] = _cloud(points, footprint, in_sight, ACTOR_VOXEL_M)
+    seen = adaptive_voxels(list(clouds.values()), budget=max(budget - for_aside, 1))
+    gaussians = _surfels([seen[0], aside], [2.0, SPACING_SIGMA], config)
+    for body, voxels in zip(list(clouds)[1:], seen[1:], strict=True):
+        gaussians = gaussians.append(_surfels([voxels], [2.0], config, body=body))
+    return gaussians
+
+
+def _cloud(
+    points: MapPoints,
+    footprint: Float[Tensor, " points"],
+    chosen: Bool[Tensor, " points"],
+    least_m: float,
+) -> Cloud:
+    """The chosen points, to be thinned out."""
+    return Cloud(
+        xyz_m=points.xyz_m[chosen],
+        rgb=points.rgb_u8[chosen].float() / 255,
+        has_colour=points.has_colour[chosen],
+        footprint_m=footprint[chosen],
+        least_m=least_m,
     )
-    owner = torch.round(voxels.xyz_m[:, 0] / _APART_M).long()
-    parts = []
-    for index, _, _ in clouds:
-        rows = (owner == index).nonzero()[:, 0]
-        xyz_m = voxels.xyz_m[rows] - index * torch.tensor([_APART_M, 0.0, 0.0])
-        parts.append(
-            surfels_from_points(
-                xyz_m,
-                fill_colours(xyz_m, voxels.rgb[rows], voxels.has_colour[rows]),
-                body=index,
-                sh_degree=config.sh_degree,
-                most_sigma_m=2 * voxels.size_m[rows],
-            )
-        )
-    return parts
+
+
+def _surfels(
+    parts: Sequence[VoxelPoints],
+    most_sigma: Sequence[float],
+    config: InitialisationConfig,
+    *,
+    body: int = 0,
+) -> GaussianSet:
+    """Surfels of one body; the largest deviation of each part is in edges of its voxels."""
+    xyz_m = torch.cat([part.xyz_m for part in parts])
+    if len(xyz_m) == 0:
+        return GaussianSet.empty(sh_degree=config.sh_degree)
+    rgb = torch.cat([part.rgb for part in parts])
+    has_colour = torch.cat([part.has_colour for part in parts])
+    limits = zip(parts, most_sigma, strict=True)
+    return surfels_from_points(
+        xyz_m,
+        fill_colours(xyz_m, rgb, has_colour),
+        body=body,
+        sh_degree=config.sh_degree,
+        most_sigma_m=torch.cat([part.size_m * sigma for part, sigma in limits]),
+    )
 
 
 def _actor_footprint(

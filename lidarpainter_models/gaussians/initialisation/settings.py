@@ -9,8 +9,8 @@ from lidarpainter_models.errors import ConfigError
 class InitialisationConfig:
     """How many Gaussians a fit starts with, and where."""
 
-    num_gaussians: int = 55_000
-    """Start size; densification brings it to the budget of the fit."""
+    num_gaussians: int = 0
+    """Start size, which densification brings to the budget; 0 follows the budget."""
     aside_m: float = 3.5
     """How far aside such a camera may stand."""
     sh_degree: int = 1
@@ -19,6 +19,6 @@ class InitialisationConfig:
     """Smallest voxel on the street."""
 
     def __post_init__(self) -> None:
-        """Refuse a start without Gaussians."""
-        if self.num_gaussians < 1:
-            raise ConfigError(f"num_gaussians must be positive, got {self.num_gaussians}")
+        """Refuse a negative start."""
+        if self.num_gaussians < 0:
+            raise ConfigError(f"num_gaussians must not be negative, got {self.num_gaussians}")

@@ -6,6 +6,7 @@ from gaussian_world import camera_at, map_points
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.initialisation.adaptive_voxels import (
+    Cloud,
     adaptive_voxels,
     mean_by_voxel,
 )
@@ -36,30 +37,35 @@ def test_points_of_one_voxel_become_their_mean():
     assert voxels.num_points[order].tolist() == [2, 1]
 
 
+def cloud_of(xyz_m, footprint_m):
+    count = len(xyz_m)
+    return Cloud(
+        xyz_m=xyz_m,
+        rgb=torch.rand(count, 3),
+        has_colour=torch.ones(count, dtype=torch.bool),
+        footprint_m=torch.as_tensor(footprint_m).expand(count),
+    )
+
+
 @pytest.mark.parametrize("budget", [1, 50, 300, 10_000])
 def test_voxel_budget_is_kept(budget):
-    xyz_m = plane(2000)
-    voxels = adaptive_voxels(
-        xyz_m,
-        torch.rand(2000, 3),
-        torch.ones(2000, dtype=torch.bool),
-        torch.full((2000,), 0.01),
-        budget=budget,
-        most_m=8.0,
-    )
+    (voxels,) = adaptive_voxels([cloud_of(plane(2000), 0.01)], budget=budget, most_m=8.0)
     assert 1 <= len(voxels.xyz_m) <= budget
+
+
+@pytest.mark.parametrize("budget", [300, 2000])
+def test_a_pixel_asks_for_as_much_on_every_body(budget):
+    """Of two like surfaces, one with four times the points, each gets its half."""
+    street, car = cloud_of(plane(20_000), 0.01), cloud_of(plane(80_000), 0.01)
+    on_street, on_car = adaptive_voxels([street, car], budget=budget)
+    assert len(on_street.xyz_m) + len(on_car.xyz_m) <= budget
+    assert len(on_street.xyz_m) == pytest.approx(len(on_car.xyz_m), rel=0.1)
 
 
 def test_far_points_get_larger_voxels():
     near, far = plane(3000), plane(3000) + torch.tensor([100.0, 0, 0])
     footprint = torch.cat([torch.full((3000,), 0.01), torch.full((3000,), 0.08)])
-    voxels = adaptive_voxels(
-        torch.cat([near, far]),
-        torch.rand(6000, 3),
-        torch.ones(6000, dtype=torch.bool),
-        footprint,
-        budget=1500,
-    )
+    (voxels,) = adaptive_voxels([cloud_of(torch.cat([near, far]), footprint)], budget=1500)
     is_far = voxels.xyz_m[:, 0] > 50
     assert float(voxels.size_m[is_far].mean()) > 4 * float(voxels.size_m[~is_far].mean())
 

@@ -1,0 +1,101 @@
+"""How much surface the training views show, and which of them show something new.
+
+A surface counts at the finest it was seen: A square metres at a pixel's footprint of f metres are
+A / f^2 pixels. A view that sees it after others at footprint g adds (1 - (f / g)^2) of its own
+pixels, or none where g <= f. So views from one place count once, views of a moving car add up to
+the finest of them, and cameras that overlap share. Occlusion is not looked at: what traffic
+uncovers before a standing car counts as seen. Metres; the world frame.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.gaussians.fitting.images import shrink_depth
+from lidarpainter_models.gaussians.initialisation.unreached import FARTHEST_M, depth_from_below
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.observations.views import TrainingView
+
+CELL_PX = 12
+"""A cell of pixels is judged by one point: LiDAR leaves few of them empty."""
+LEAST_NEW = 0.02
+"""A view that adds less of itself shows nothing new: depths are noisy, engines shake."""
+COMPARED_VIEWS = 32
+"""Earlier views that showed something new, the nearest ones, with which a view is compared."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SeenSurface:
+    """What a set of training views shows."""
+
+    num_pixels: float
+    """Of surface, each at the finest it was seen."""
+    whole_views: float
+    """The same in views: the first one counts 1, each other by what is new in it."""
+    groups: tuple[tuple[int, ...], ...]
+    """Positions of the views: one that shows something new, and those after it of its camera that
+    add nothing to it."""
+
+
+def seen_surface(views: Sequence[TrainingView]) -> SeenSurface:
+    """Measure what the views show, in the order in which they were taken."""
+    order = sorted(range(len(views)), key=lambda index: views[index].timestamp_ns)
+    num_pixels = whole_views = 0.0
+    groups: dict[str, list[list[int]]] = {}
+    kept: list[Camera] = []
+    for index in order:
+        view = views[index]
+        new = _new_shares(view, _nearest(kept, view.camera))
+        share = float(new.mean()) if len(new) else 0.0
+        of_camera = groups.setdefault(view.key[1], [])
+        if of_camera and share < LEAST_NEW:
+            of_camera[-1].append(index)
+            continue
+        of_camera.append([index])
+        kept.append(view.camera)
+        whole_views += share
+        num_pixels += share * int((~view.sky_mask).sum())
+    return SeenSurface(
+        num_pixels=num_pixels,
+        whole_views=whole_views,
+        groups=tuple(tuple(group) for of_camera in groups.values() for group in of_camera),
+    )
+
+
+def _new_shares(view: TrainingView, earlier: Sequence[Camera]) -> Float[Tensor, " cells"]:
+    """Of each cell that is not sky: which part of its pixels no earlier camera saw as finely."""
+    points_world, footprint_m = _cells(view)
+    known = torch.zeros_like(footprint_m)
+    for camera in earlier:
+        pixels_uv, depth_m = camera.project(points_world)
+        as_fine = (footprint_m * camera.fx_px / depth_m.clamp(min=1e-3)).square()
+        known = torch.maximum(known, as_fine * camera.contains(pixels_uv, depth_m))
+    return (1 - known).clamp(min=0)
+
+
+def _cells(view: TrainingView) -> tuple[Float[Tensor, "cells 3"], Float[Tensor, " cells"]]:
+    """A point for each cell of pixels that is not sky, and the footprint of a pixel there."""
+    grid = {
+        "width_px": max(view.camera.width_px // CELL_PX, 1),
+        "height_px": max(view.camera.height_px // CELL_PX, 1),
+    }
+    depth_m = shrink_depth(view.lidar_depth_m, **grid)
+    depth_m = depth_from_below(depth_m, fallback_m=FARTHEST_M)
+    size = (grid["height_px"], grid["width_px"])
+    sky = torch.nn.functional.adaptive_avg_pool2d(view.sky_mask.float()[None], size)[0]
+    is_solid = sky < 0.5
+    points_world = view.camera.resized(**grid).unproject(depth_m)[is_solid]
+    return points_world, depth_m[is_solid] / view.camera.fx_px
+
+
+def _nearest(cameras: Sequence[Camera], to: Camera) -> list[Camera]:
+    """The cameras that stand nearest, in their order."""
+    if len(cameras) <= COMPARED_VIEWS:
+        return list(cameras)
+    centres = torch.stack([camera.centre_world for camera in cameras])
+    distance_m = (centres - to.centre_world).norm(dim=1)
+    nearest = distance_m.argsort(stable=True)[:COMPARED_VIEWS]
+    return [cameras[int(row)] for row in nearest.sort().values]

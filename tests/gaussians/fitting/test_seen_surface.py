@@ -1,0 +1,111 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from lidarpainter_models.gaussians.fitting.seen_surface import seen_surface
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.observations.views import TrainingView
+
+WIDTH_PX, HEIGHT_PX, FOCAL_PX = 240, 120, 200.0
+PIXELS = WIDTH_PX * HEIGHT_PX
+WALL_M = 40.0
+FRAME_NS = 100_000_000
+
+
+def view_at(forward_m, frame=0, *, camera="front", yaw_rad=0.0, sky=False):
+    """A camera that looks along x at a wall across the road, 40 m from the origin."""
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.tensor([[sin, 0, cos], [-cos, 0, sin], [0, -1, 0]], dtype=torch.float64)
+    pose[0, 3] = forward_m
+    return TrainingView(
+        key=(frame, camera),
+        camera=Camera(
+            world_from_camera=pose,
+            fx_px=FOCAL_PX,
+            fy_px=FOCAL_PX,
+            cx_px=WIDTH_PX / 2,
+            cy_px=HEIGHT_PX / 2,
+            width_px=WIDTH_PX,
+            height_px=HEIGHT_PX,
+        ),
+        timestamp_ns=frame * FRAME_NS,
+        rgb_u8=torch.zeros(HEIGHT_PX, WIDTH_PX, 3, dtype=torch.uint8),
+        sky_mask=torch.full((HEIGHT_PX, WIDTH_PX), sky),
+        lidar_depth_m=torch.full((HEIGHT_PX, WIDTH_PX), WALL_M - forward_m),
+    )
+
+
+def test_one_view_shows_all_its_pixels():
+    surface = seen_surface([view_at(0.0)])
+    assert (surface.num_pixels, surface.whole_views) == (PIXELS, 1.0)
+    assert surface.groups == ((0,),)
+
+
+def test_a_standing_car_shows_one_view_however_long_it_stands():
+    generator = torch.Generator().manual_seed(0)
+    views = [view_at(0.0, frame) for frame in range(50)]
+    shaken = [
+        replace(
+            view, lidar_depth_m=view.lidar_depth_m + 0.05 * torch.randn((), generator=generator)
+        )
+        for view in views
+    ]
+    for standing in (views, shaken):
+        surface = seen_surface(standing)
+        assert (surface.num_pixels, surface.whole_views) == (PIXELS, 1.0)
+        assert surface.groups == (tuple(range(50)),)
+
+
+@pytest.mark.parametrize("steps", [5, 10, 20])
+def test_a_wall_counts_at_the_finest_it_was_seen_whatever_the_way_there(steps):
+    """From 40 m to 20 m: the first image, then what comes closer; 4 times the pixels of a metre."""
+    views = [view_at(20.0 * step / steps, step) for step in range(steps + 1)]
+    expected = 1 + sum(
+        1 - ((40 - 20 * (step + 1) / steps) / (40 - 20 * step / steps)) ** 2
+        for step in range(steps)
+    )
+    assert seen_surface(views).whole_views == pytest.approx(expected, rel=1e-3)
+    assert seen_surface(views[::-1]).num_pixels == seen_surface(views).num_pixels
+
+
+def test_driving_back_shows_nothing_new_of_a_wall():
+    near, far = view_at(20.0, 0), view_at(0.0, 1)
+    inside = seen_surface([near, far]).whole_views
+    assert inside == pytest.approx(1 + 0.75, abs=0.1)  # its rim was out of the nearer image
+
+
+def test_cameras_that_overlap_share_and_those_that_do_not_add_up():
+    right = view_at(0.0, camera="right", yaw_rad=-math.pi / 2)
+    assert seen_surface([view_at(0.0), right]).whole_views == pytest.approx(2.0)
+    same = view_at(0.0, camera="twin")
+    surface = seen_surface([view_at(0.0), same])
+    assert surface.whole_views == pytest.approx(1.0)
+    assert len(surface.groups) == 2  # each camera has its own pose and colours to be found
+
+
+def street_drive(num_frames, *, metres_a_frame=1.0):
+    """Along walls 8 m to both sides, on a road 1.6 m below, with nothing nearer than 60 m ahead."""
+    views = []
+    for frame in range(num_frames):
+        view = view_at(frame * metres_a_frame, frame)
+        across, down, _ = view.camera.pixel_directions().abs().clamp(min=1e-3).unbind(dim=-1)
+        depth_m = torch.minimum(8.0 / across, 1.6 / down).clamp(max=60.0)
+        views.append(replace(view, lidar_depth_m=depth_m))
+    return views
+
+
+def test_a_street_four_times_as_long_has_four_times_the_surface():
+    short, long = seen_surface(street_drive(12)), seen_surface(street_drive(48))
+    assert 3.0 < long.num_pixels / short.num_pixels <= 4.2
+    assert 3.0 < long.whole_views / short.whole_views <= 4.2
+    denser = seen_surface(street_drive(24, metres_a_frame=0.5))
+    assert denser.num_pixels == pytest.approx(short.num_pixels, rel=0.1)
+
+
+def test_sky_is_no_surface():
+    surface = seen_surface([view_at(0.0, sky=True)])
+    assert (surface.num_pixels, surface.whole_views) == (0.0, 0.0)
+    assert surface.groups == ((0,),)
