@@ -50,9 +50,9 @@ class FitResult:
 
     scene: GaussianScene
     history: list[dict[str, float]]
+    """Every so many steps: step, loss, psnr (training views), num_gaussians, cpu_s."""
     stopped_early: bool
     """Whether a limit of time left it fewer steps than planned."""
-    """Every so many steps: step, loss, psnr (training views), num_gaussians, cpu_s."""
 
 
 @dataclass(frozen=True)
