@@ -40,7 +40,7 @@ def preview(scene: str) -> ReconstructParameters:
 
 def balanced(scene: str) -> ReconstructParameters:
     """The best trade on one GPU."""
-    fit = FitConfig(effort=EffortConfig(looks=1_500.0))
+    fit = FitConfig(effort=EffortConfig(looks=1_000.0))
     return ReconstructParameters(
         scene=scene,
         preset="balanced",
@@ -50,7 +50,7 @@ def balanced(scene: str) -> ReconstructParameters:
         novel=NovelGuidanceConfig(),
         conditions=ConditionConfig(),
         rounds=2,
-        refine=continuation(fit, looks=500.0, guidance=GuidanceConfig()),
+        refine=continuation(fit, looks=350.0, guidance=GuidanceConfig()),
         scoring=ScoringConfig(),
     )
 
