@@ -4,23 +4,27 @@ from dataclasses import dataclass
 
 from flows.fleet.manifest import Configuration
 
-STARTED = 0.6875
-"""Part of the Gaussians that a fit starts with, as in the presets."""
+LOOKS, REFINE_LOOKS, GAUSSIANS_PER_PIXEL = 750.0, 250.0, 0.375
+"""The effort of the preset; what a scene shows makes steps and Gaussians of it."""
 
 
 def _way(name: str, *settings: str, painter: str | None = None) -> Configuration:
     return Configuration(name=name, painter=painter, set=settings)
 
 
-def _steps(fit: int, refine: int) -> tuple[str, str]:
-    return f"fit.steps={fit}", f"refine.steps={refine}"
+def _steps(times: float) -> Configuration:
+    return _way(
+        f"steps-x{times:g}",
+        f"fit.effort.looks={LOOKS * times}",
+        f"refine.effort.looks={REFINE_LOOKS * times}",
+    )
 
 
-def _gaussians(budget: int) -> tuple[str, ...]:
-    return (
-        f"fit.initialisation.num_gaussians={round(budget * STARTED)}",
-        f"fit.densification.budget={budget}",
-        f"refine.densification.budget={budget}",
+def _gaussians(times: float) -> Configuration:
+    number = GAUSSIANS_PER_PIXEL * times
+    return _way(
+        f"gaussians-x{times:g}",
+        *(f"{fit}.effort.gaussians_per_pixel={number}" for fit in ("fit", "refine")),
     )
 
 
@@ -34,12 +38,9 @@ CHART = (
     _way("warp", painter="warp"),
     _way("first-fit", "rounds=0"),
     _way("one-round", "rounds=1"),
-    _way("steps-x0.25", *_steps(375, 125)),
-    _way("steps-x0.5", *_steps(750, 250)),
-    _way("steps-x2", *_steps(3000, 1000)),
+    *(_steps(times) for times in (0.25, 0.5, 2)),
     _way("painted-views-x0.5", "novel.every_nth=4"),
-    _way("gaussians-x0.5", *_gaussians(40_000)),
-    _way("gaussians-x2", *_gaussians(160_000)),
+    *(_gaussians(times) for times in (0.5, 2)),
 )
 """Speed against accuracy: painters, rounds, steps, painted views, size."""
 
@@ -61,11 +62,8 @@ SIZE = (
     Factor(
         name="gaussians",
         cost="num_gaussians",
-        levels=tuple(
-            _way(f"gaussians-{budget // 1000}k", *_gaussians(budget))
-            for budget in (20_000, 40_000, 80_000, 160_000, 320_000)
-        ),
-        default="gaussians-80k",
+        levels=tuple(_gaussians(times) for times in (0.25, 0.5, 1, 2, 4)),
+        default="gaussians-x1",
     ),
     Factor(
         name="harmonics",
@@ -79,10 +77,8 @@ SIZE = (
     Factor(
         name="steps",
         cost="cpu_seconds",
-        levels=tuple(
-            _way(f"steps-{steps}", *_steps(steps, steps // 3)) for steps in (375, 750, 1500, 3000)
-        ),
-        default="steps-1500",
+        levels=tuple(_steps(times) for times in (0.25, 0.5, 1, 2)),
+        default="steps-x1",
     ),
     Factor(
         name="rounds",

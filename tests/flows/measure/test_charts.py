@@ -99,7 +99,7 @@ def test_each_level_is_held_against_the_one_before(tmp_path):
     ]
     result = sizes_of(points, [factor], tmp_path)
     recorded = next(one for one in result["says"] if "held-out" in one)
-    assert "gaussians-40k +2, gaussians-80k +1, gaussians-160k +0 (within the noise)" in recorded
+    assert "gaussians-x0.5 +2, gaussians-x1 +1, gaussians-x2 +0 (within the noise)" in recorded
     assert [path.rsplit("/", 1)[1] for path in result["pictures"]] == [
         "size-gaussians.svg",
         "size-gaussians.png",
