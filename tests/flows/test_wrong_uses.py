@@ -121,7 +121,7 @@ def refused(words, expected, place):
         ((*TOY, "--up", "20"), "at most 8 metres from the recorded path"),
         ((*TOY, "--up", "x"), "expected positive metres"),
         ((*TOY, "--set", "fit.steps"), "expected a setting as key=value"),
-        ((*TOY, "--set", "fit.stepz=3"), "no setting 'fit.stepz': fit has steps, "),
+        ((*TOY, "--set", "fit.stepz=3"), "no setting 'fit.stepz': fit has effort, steps, "),
         ((*TOY, "--set", "fit.steps=three"), "fit.steps=three: Input should be a valid integer"),
         ((*TOY, "--set", "fit.steps=-1"), "steps must not be negative"),
         ((*TOY, "--set", "fit=3"), "fit=3: Input should be"),
