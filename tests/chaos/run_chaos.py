@@ -1,7 +1,8 @@
 """Chaos: a deployed fleet whose processes are killed thirty times, and what must hold after it.
 
 `python tests/chaos/run_chaos.py` prints one JSON object and exits with 0 if all of it holds. It
-needs Debian's postgresql, and to be root for the small disk (a tmpfs) that is full once.
+needs Debian's postgresql, and to be root for the small disk (a tmpfs) that is full once. With
+`--bucket` the store lies in a stand-in for S3 instead, which refuses and delays requests.
 """
 
 import argparse
@@ -12,16 +13,19 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from contextlib import contextmanager
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support")]
 
+from bucket_stand_in import BUCKET, running_stand_in  # noqa: E402
 from chaos import Chaos, Site  # noqa: E402
 from production_services import NO_POSTGRES  # noqa: E402
 from stub_fleet import stub_ledger, write_stub_manifest  # noqa: E402
 from stub_stages import make, stages_ledger, write_inputs  # noqa: E402
 
+from catalog.artefacts import ArtefactRef  # noqa: E402
 from catalog.digests import digest_file  # noqa: E402
 from catalog.store import open_store  # noqa: E402
 from flows.fleet.asked import wishes  # noqa: E402
@@ -43,6 +47,7 @@ def main() -> None:
     parser.add_argument("--corrupted", type=int, default=10)
     parser.add_argument("--kills", type=int, default=30)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--bucket", action="store_true")
     parser.add_argument("--pace-s", type=float, default=2.0, help="what a stage takes")
     arguments = parser.parse_args()
     if NO_POSTGRES:
@@ -52,46 +57,73 @@ def main() -> None:
     sys.exit(0 if found["holds"] else 1)
 
 
-def run_chaos(*, sequences, corrupted, kills, seed, pace_s):
+def run_chaos(*, sequences, corrupted, kills, seed, pace_s, bucket=False):
     """What was killed, what came of the fleet, and what is amiss."""
     folder = Path(tempfile.mkdtemp(prefix="lp-chaos-"))
-    disk = folder / "disk"
-    disk.mkdir()
-    is_disk_small = os.geteuid() == 0 and mounted(disk)
     scenes = [f"synthetic/street-{seed:04d}" for seed in range(1, sequences + 1)]
     bad = scenes[3 :: max(1, sequences // corrupted)][:corrupted]
     write_inputs(folder / "inputs", scenes, bad)
     manifest = write_stub_manifest(folder, NAME, sequences)
     began = time.monotonic()
-    site = Site(
-        folder=folder, store=disk / "store", inputs=folder / "inputs", name=NAME, pace_s=pace_s
-    )
-    try:
-        site.deploy(manifest, EVERY_S)
-        site.start_process_workers()
-        chaos = Chaos(site=site, seed=seed, kills=kills, is_disk_small=is_disk_small, say=tell)
-        chaos.run()
-        retried = calm(site, sequences)
-        open_runs = settled(site)
-        status = fleet_status(stub_ledger(site.store), NAME)
-    finally:
-        site.close()
-    wrong = faults(site.store, status, scenes, bad, undisturbed(folder, manifest))
+    with in_bucket(folder) if bucket else on_small_disk(folder) as (store, disturb, is_small):
+        site = Site(folder=folder, store=store, inputs=folder / "inputs", name=NAME, pace_s=pace_s)
+        try:
+            site.deploy(manifest, EVERY_S)
+            site.start_process_workers()
+            chaos = Chaos(
+                site=site,
+                seed=seed,
+                kills=kills,
+                is_disk_small=is_small,
+                disturb_bucket=disturb,
+                say=tell,
+            )
+            chaos.run()
+            retried = calm(site, sequences)
+            open_runs = settled(site)
+            status = fleet_status(stub_ledger(site.store), NAME)
+        finally:
+            site.close()
+        wrong = faults(site.store, status, scenes, bad, undisturbed(folder, manifest))
     if open_runs:
         wrong.append(f"open in Prefect: {open_runs}")
-    if is_disk_small:
-        subprocess.run(["umount", disk], check=True)  # noqa: S607
     return {
         "holds": not wrong,
         "wrong": wrong,
         "counts": status["counts"],
         "killed": chaos.killed,
-        "disk_was_full": is_disk_small,
+        "disk_was_full": is_small,
+        "bucket": bucket,
         "retried_after_three_kills": retried,
         "attempts": status["cost"]["attempts"],
         "minutes": round((time.monotonic() - began) / 60, 1),
         "folder": str(folder),
     }
+
+
+@contextmanager
+def on_small_disk(folder):
+    """A place for a store on a disk of its own, if this user may mount one."""
+    disk = folder / "disk"
+    disk.mkdir()
+    is_small = os.geteuid() == 0 and mounted(disk)
+    try:
+        yield str(disk / "store"), None, is_small
+    finally:
+        if is_small:
+            subprocess.run(["umount", disk], check=True)  # noqa: S607
+
+
+@contextmanager
+def in_bucket(folder):
+    """A place for a store in a bucket, and what makes that refuse and delay requests for a while."""
+    with running_stand_in() as stand_in:
+        os.environ.update(stand_in.environment, LIDARPAINTER_CACHE=str(folder / "cache"))
+
+        def disturb():
+            stand_in.fail(before=40, after=20, every=5, slow_s=0.02)
+
+        yield f"s3://{BUCKET}/chaos", disturb, False
 
 
 def mounted(disk: Path) -> bool:
@@ -161,8 +193,9 @@ def faults(store, status, scenes, bad, calm_store):
     ledger = stub_ledger(store)
     held = [*ledger.leases.held(), *ledger.flow_runs.held()]
     wrong += [f"lease {lease.name} is held" for lease in held]
-    left = sorted(str(path) for name in ("aside", "work") for path in (store / name).glob("*"))
-    wrong += [f"{path} is left over" for path in left]
+    if ledger.store.mirror is None:
+        left = [path for name in ("aside", "work") for path in (Path(store) / name).glob("*")]
+        wrong += [f"{path} is left over" for path in sorted(left)]
     return wrong + wrong_rows(ledger.store.tables, stub_ledger(calm_store).store.tables)
 
 
@@ -185,11 +218,15 @@ def wrong_rows(tables, calm_tables):
     return wrong
 
 
-def files(store: Path) -> dict[str, str]:
+def files(store) -> dict[str, str]:
     """Digest of every file of every artefact but its manifest, which says when it was made."""
-    folder = store / "artefacts"
-    found = (path for path in folder.rglob("*") if path.is_file() and path.name != "manifest.json")
-    return {str(path.relative_to(folder)): digest_file(path) for path in found}
+    artefacts = open_store(store).artefacts
+    return {
+        f"{artefact_id}/{path.name}": digest_file(path)
+        for artefact_id in artefacts.ids()
+        for path in artefacts.files(ArtefactRef.of_id(artefact_id)).iterdir()
+        if path.name != "manifest.json"
+    }
 
 
 def tell(line: str) -> None:

@@ -30,7 +30,8 @@ class Site:
     """A fleet in production, small."""
 
     folder: Path
-    store: Path
+    store: str
+    """A folder or an address."""
     inputs: Path
     name: str
     num_workers: int = 2
@@ -45,7 +46,7 @@ class Site:
     def environment(self):
         return {
             **self.prefect.environment,
-            "LIDARPAINTER_STORE": str(self.store),
+            "LIDARPAINTER_STORE": self.store,
             "STUB_INPUTS": str(self.inputs),
             "STUB_PACE_S": str(self.pace_s),
             "PREFECT_RUNNER_POLL_FREQUENCY": "5",
@@ -160,6 +161,8 @@ class Chaos:
     kills: int
     is_disk_small: bool
     """Whether the store lies on a disk that can be filled."""
+    disturb_bucket: object = None
+    """Called where a disk would be filled; None where there is no bucket."""
     say: object = print
     killed: dict = field(default_factory=dict)
 
@@ -170,7 +173,7 @@ class Chaos:
         order = (order * (self.kills // len(order) + 1))[: self.kills]
         events = {
             self.kills // 3: ("PostgreSQL restarted", lambda: self.site.restart_postgres(5.0)),
-            self.kills // 2: ("disk full", self.fill_disk),
+            self.kills // 2: ("storage disturbed", self.fill_disk),
             2 * self.kills // 3: ("PostgreSQL restarted", lambda: self.site.restart_postgres(5.0)),
         }
         for number, target in enumerate(order):
@@ -201,9 +204,11 @@ class Chaos:
         self.killed[target] = self.killed.get(target, 0) + 1
 
     def fill_disk(self, full_s=20.0):
+        if self.disturb_bucket is not None:
+            self.disturb_bucket()
         if not self.is_disk_small:
             return
-        ballast = self.site.store.parent / "ballast"
+        ballast = Path(self.site.store).parent / "ballast"
         with suppress(OSError), ballast.open("wb") as file:
             while True:
                 file.write(bytes(1 << 16))

@@ -14,7 +14,7 @@ from stub_fleet import TIME_TO_LIVE_S
 
 from catalog.artefacts import Recipe
 from catalog.code_closure import Code
-from catalog.leases import FolderObjects, Leases
+from catalog.leases import Leases
 from catalog.records import artefact_row
 from catalog.store import open_store
 from flows.fleet import deployed, flow_runs, work
@@ -75,7 +75,7 @@ def _build(source, place):
 
 
 def stages_ledger(store):
-    leases = Leases(FolderObjects(store.root / "leases"), time_to_live_s=5 * TIME_TO_LIVE_S)
+    leases = Leases(store.objects("leases"), time_to_live_s=5 * TIME_TO_LIVE_S)
     return _Ledger(store, leases=leases, first_pause_s=FIRST_PAUSE_S)
 
 
