@@ -2,7 +2,7 @@
 
 import json
 import platform
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, Literal
@@ -93,11 +93,14 @@ class MetricRecord:
     name: str
     value: float | None
     reason: str | None = None
+    by_view: Mapping[str, float] | None = None
 
     def row(self) -> dict[str, Any]:
         """The row."""
         names = [self.run_id, self.protocol, self.trajectory, self.variant, self.name]
-        return {"metric_id": digest_text(canonical_json(names)), **asdict(self)}
+        by_view = None if self.by_view is None else canonical_json(self.by_view)
+        row = {**asdict(self), "by_view": by_view}
+        return {"metric_id": digest_text(canonical_json(names)), **row}
 
 
 def artefact_row(ref: ArtefactRef, manifest: Manifest) -> dict[str, Any]:

@@ -162,6 +162,7 @@ METRICS = TableSchema(
         Column("name", "text", "what was measured: psnr, ssim, ..."),
         Column("value", "number", "the number, or null with a reason", "see name"),
         Column("reason", "text", "why there is no number"),
+        Column("by_view", "text", "PSNR of each view, where the number is their mean, JSON", "dB"),
     ),
 )
 

@@ -106,7 +106,7 @@ class HeldOut:
             camera = self.shifted_camera(fitted, view, shift)
             judged.append(
                 JudgedView(
-                    name=f"{shift.name}/{view.frame_index}",
+                    name=f"{view.camera_name}/{view.frame_index}",
                     camera=camera,
                     timestamp_ns=view.timestamp_ns,
                     truth_rgb=street.render(camera, view.timestamp_ns).rgb,

@@ -47,7 +47,8 @@ class ViewScores:
     lpips_reason: str | None
     """Why there is no LPIPS."""
     num_views: int
-    per_view_psnr: tuple[float, ...]
+    psnr_by_view: dict[str, float]
+    """By the names of the views."""
 
 
 def actor_mask(
@@ -92,5 +93,5 @@ def score_views(
         lpips=sum(lpips) / len(lpips) if lpips else None,
         lpips_reason=distances.lpips_missing,
         num_views=len(scores),
-        per_view_psnr=tuple(score.psnr_db for score in scores),
+        psnr_by_view={view.name: score.psnr_db for view, score in zip(views, scores, strict=True)},
     )

@@ -23,7 +23,6 @@ def _view_scores(scores: ViewScores | None) -> dict[str, Any]:
     if scores is None:
         return {"psnr": None, "ssim": None, "num_views": 0}
     found = asdict(scores)
-    found.pop("per_view_psnr")
     if scores.lpips is not None:
         found.pop("lpips_reason")
     return found

@@ -47,6 +47,19 @@ def metric_values(
     return found
 
 
+def values_by_view(scores: Mapping[str, Any]) -> dict[tuple[str, str, str], dict[str, float]]:
+    """What means over views are the mean of: by protocol, trajectory and name, then by view."""
+    recorded = scores.get("recorded") or {}
+    found = {("recorded", "recorded"): recorded}
+    found |= {("recorded-poses", "recorded"): recorded.get("recorded_poses", {})}
+    found |= {("truth", name): values for name, values in (scores.get("novel") or {}).items()}
+    return {
+        (*place, "psnr"): values["psnr_by_view"]
+        for place, values in found.items()
+        if "psnr_by_view" in values
+    }
+
+
 def _reason(values: Mapping[str, Any], name: str, value: float | None) -> str | None:
     """Why there is no number."""
     if value is None and name == "feature_distance":

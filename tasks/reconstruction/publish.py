@@ -11,7 +11,7 @@ from catalog.artefacts import ArtefactRef
 from catalog.digests import canonical_json, plain
 from catalog.records import MetricRecord, RunRecord, RunStatus, metric_rows
 from catalog.store import Store, open_store
-from lidarpainter_models.evaluation.score_tables import metric_values
+from lidarpainter_models.evaluation.score_tables import metric_values, values_by_view
 from tasks.json_files import finite_or_none
 from tasks.opened import opened
 from tasks.specs import RunSpec
@@ -118,8 +118,10 @@ def record_scores(
             name=name,
             value=value,
             reason=reason,
+            by_view=by_view.get((protocol, trajectory, name)),
         )
         for variant, found in scores.items()
+        for by_view in [values_by_view(found)]
         for protocol, trajectory, name, value, reason in metric_values(found)
     ]
     store.tables.merge("metrics", metric_rows(records))

@@ -116,7 +116,7 @@ def on_small_disk(folder):
 
 @contextmanager
 def in_bucket(folder):
-    """A place for a store in a bucket, and what makes that refuse and delay requests for a while."""
+    """A place for a store in a bucket, and what makes it refuse and delay requests for a while."""
     with running_stand_in() as stand_in:
         os.environ.update(stand_in.environment, LIDARPAINTER_CACHE=str(folder / "cache"))
 

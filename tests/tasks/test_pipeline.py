@@ -226,6 +226,15 @@ def test_a_run_is_found_with_its_numbers(store, run):
         for metric in metrics
         if metric["name"] == "psnr"
     )
+    (psnr,) = (
+        metric
+        for metric in metrics
+        if [metric[key] for key in ("protocol", "variant", "name")]
+        == ["recorded", "painted", "psnr"]
+    )
+    by_view = json.loads(psnr["by_view"])
+    assert set(by_view) == {"front/1", "front/3"}
+    assert psnr["value"] == pytest.approx(sum(by_view.values()) / 2)
 
 
 def test_a_failed_run_says_why(store, parameters):
