@@ -36,7 +36,8 @@ def test_a_table_is_read_as_it_was(tables):
     assert frames(tables, as_of=datetime.now(UTC)) == frames(tables) == {"toy/1": 7, "toy/2": 1}
     history = DeltaTable(f"{tables.root}/scenes").history()
     then = next(one["timestamp"] for one in history if one["version"] == 2)
-    assert frames(tables, as_of=datetime.fromtimestamp(then / 1000, UTC)) == frames(tables, as_of=2)
+    moment = datetime.fromtimestamp(0, UTC) + timedelta(milliseconds=then)
+    assert frames(tables, as_of=moment) == frames(tables, as_of=2)
     assert tables.rows("runs", as_of=1) == []
 
 
