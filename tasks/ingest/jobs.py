@@ -20,7 +20,7 @@ from typing import Any
 
 import lidarpainter_models
 from catalog.errors import CatalogError
-from catalog.store import open_store
+from catalog.store import open_store, split_scene_id
 from lidarpainter_models.errors import ConfigError, LidarPainterError
 from tasks.ingest.bucket_roots import normal_root
 from tasks.ingest.ingest import STAGE as ONE_SEQUENCE
@@ -103,8 +103,10 @@ def ingest_or_recall(request: IngestRequest, name: str, again: bool) -> dict[str
     """The row of one sequence: noted when it was done before, else made now and noted.
 
     Raises:
+        UnknownRecordError: the name would lead out of the store.
         ConfigError: the scene is in the store, read with another choice than this.
     """
+    split_scene_id(f"{request.dataset}/{name}")
     notes = open_store(request.store_path).objects(f"ingested/{request.dataset}")
     noted = notes.read(f"{name}.json")
     if not again and (row := _known(noted and noted[0], request, name)) is not None:

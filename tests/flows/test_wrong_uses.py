@@ -204,7 +204,10 @@ def refused(words, expected, place):
         # the store
         (("--store", "{file}", "catalog", "list"), "is a file, expected a folder"),
         (("--store", "{file}/x", "catalog", "list"), "no store at {file}/x"),
-        (("--store", "{file}/x", "ingest", "pandaset", "{root}"), "cannot be written: Not a dir"),
+        (
+            ("--store", "{file}/x", "ingest", "pandaset", "{root}"),
+            "a part of the path is not a folder",
+        ),
         (
             ("--store", "/proc/x", "ingest", "pandaset", "{root}"),
             "/proc/x cannot be written",

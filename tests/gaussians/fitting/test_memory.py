@@ -7,9 +7,15 @@ import pytest
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.memory import planned_memory, within_limit
+from lidarpainter_models.gaussians.fitting.settings import DensificationConfig
+from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 
-CONFIG = FitConfig()
+CONFIG = FitConfig(
+    steps=1500,
+    initialisation=InitialisationConfig(num_gaussians=55_000),
+    densification=DensificationConfig(budget=80_000),
+)
 
 
 def planned(world, config):
