@@ -6,10 +6,10 @@ from dataclasses import asdict
 from functools import partial
 from typing import Any
 
+import cv2
 import torch
 
 from catalog.artefacts import ArtefactRef, Workplace
-from lidarpainter_models.export.images import write_png
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
@@ -98,7 +98,11 @@ def _build(  # noqa: PLR0913 - all that a fit is made from
         image = scene.render(
             view.camera, view.timestamp_ns, camera_name=view.key[1], view_key=view.key
         )
-        shown = f", first look: {write_png(image.rgb.clamp(0, 1).cpu(), place.scratch / LOOK_FILE)}"
+        path = place.scratch / LOOK_FILE
+        rgb_u8 = (image.rgb.clamp(0, 1).cpu() * 255).round().to(torch.uint8).numpy()
+        # by OpenCV alone: how files are exported is no part of a fit's key
+        cv2.imwrite(str(path), cv2.cvtColor(rgb_u8, cv2.COLOR_RGB2BGR))
+        shown = f", first look: {path}"
         _LOG.info("a fit of %d steps%s", config.steps, shown)
 
     def told(step: int, steps: int, entry: dict[str, float]) -> None:
