@@ -7,6 +7,7 @@ from commands import call, succeed
 
 from lidarpainter_models.export.spz_files import read_spz
 from lidarpainter_models.gaussians.model.ply_files import read_ply
+from lidarpainter_models.scenes.driving_scene import DrivingScene
 
 
 @pytest.fixture(scope="module")
@@ -40,17 +41,18 @@ def test_list_filters_and_sorts(library):
     assert "--limit shows more" in first.out
 
 
-def test_show_tells_sightings_and_goes_back_to_the_files_of_the_log(library, actor):
+def test_show_tells_sightings_and_goes_back_to_what_the_scene_was_read_from(library, actor):
     name = actor["asset_id"][:10]
     found = succeed("assets", "show", name, "--json", store=library).json
     assert found["asset_id"] == actor["asset_id"]
     assert [one["actor_id"] for one in found["sightings"]] == [actor["actor_id"]]
     scene = found["made_from"]["inputs"]["scene"]
     assert scene["name"] == actor["scene_ids"][0]
-    assert scene["read_from"]
+    manifest = DrivingScene.open(library.scene_folder(scene["name"])).manifest
+    assert scene["read_from"] == manifest["provenance"]
     assert "gaussians" in found["made_from"]["inputs"]
     said = succeed("assets", "show", name, store=library).out
-    assert all(text in said for text in (actor["name"], "sightings", "made from", "read_from"))
+    assert all(text in said for text in (actor["name"], "sightings", "made from"))
 
 
 def test_query_answers_sql_and_nothing_else(library):

@@ -105,8 +105,8 @@ def test_a_fleet_publishes_a_scene_and_its_variants(own_run, published):  # noqa
         assets=True,
         variants=("night",),
     )
-    made = make_sequence(asked, store.root)
-    assert made.is_new
+    made = make_sequence(asked, store.root, "a-1")
+    assert made.num_bytes > 0
     plain = rows(store, "sightings", kind="actor", run_id=made.run_id)
     styled = rows(store, kind="actor", style="night:1")
     assert {row["derived_from"] for row in styled} == {row["asset_id"] for row in plain}
@@ -114,7 +114,7 @@ def test_a_fleet_publishes_a_scene_and_its_variants(own_run, published):  # noqa
     twice = [row for row in rows(store, kind="actor", style=None) if row["num_sightings"] == 2]
     assert twice  # in both runs of the scene
     tables = [store.tables.rows(table) for table in ("assets", "sightings")]
-    assert not make_sequence(asked, store.root).is_new
+    assert make_sequence(asked, store.root, "a-2").num_bytes == 0
     assert [store.tables.rows(table) for table in ("assets", "sightings")] == tables
     succeed("catalog", "delete", made.run_id, "--yes", store=store)
     assert {row["num_sightings"] for row in rows(store, kind="actor", style=None)} == {1}
