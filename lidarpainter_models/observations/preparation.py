@@ -44,7 +44,7 @@ def prepare_observations(
     """
     if not split.train:
         raise SceneError(f"the split of {scene.dataset}/{scene.sequence} has no training views")
-    faults = find_faults(scene, split.train)
+    faults = find_faults(scene, split.train) if config.corrects_cameras else {}
     taken = [_as_taken(view, faults) for view in split.train]
     colouring = MapColouring(
         gather_points(scene, split.train_frames),
