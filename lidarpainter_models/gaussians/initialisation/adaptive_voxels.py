@@ -1,8 +1,8 @@
-"""Thin out a point cloud so that every view keeps about the same detail per pixel.
+"""Thin out point clouds so that voxels lie where images gain most by them.
 
-A voxel's size follows the size of a pixel at its distance from the nearest camera that sees it:
-near things get small voxels, far ones large. Sizes are powers of two times a factor that is
-searched so that a given number of voxels comes out. Metres; world or box frame alike.
+A voxel's size follows a spacing that is asked for at each point: near things get small voxels, far
+ones large. Sizes are powers of two times a factor that is searched so that a given number of
+voxels comes out. Metres; world or box frame alike.
 """
 
 from collections.abc import Sequence
@@ -54,23 +54,23 @@ class Cloud:
     """In [0, 1]."""
     has_colour: Bool[Tensor, " points"]
     """Which of the colours mean anything."""
-    footprint_m: Float[Tensor, " points"]
-    """Size of a pixel at each point."""
+    spacing_m: Float[Tensor, " points"]
+    """What is asked for at each point, up to a factor for all."""
     least_m: float = 0.03
     """Smallest edge of a voxel."""
 
     def sizes(self, factor: float, *, most_m: float) -> Float[Tensor, " points"]:
-        """Voxel edge of each point: about `factor` pixels, as a power of two times the least."""
-        wanted = (self.footprint_m * factor).clamp(self.least_m, most_m)
+        """Voxel edge of each point: about `factor` spacings, as a power of two times the least."""
+        wanted = (self.spacing_m * factor).clamp(self.least_m, most_m)
         return self.least_m * 2 ** torch.floor(torch.log2(wanted / self.least_m) + 0.5)
 
 
 def adaptive_voxels(
     clouds: Sequence[Cloud], *, budget: int, most_m: float = 2.0
 ) -> list[VoxelPoints]:
-    """At most `budget` voxels of all clouds, with the finest detail per pixel that allows.
+    """At most `budget` voxels of all clouds, of the smallest size that allows.
 
-    A pixel asks for the same detail on whatever body it shows.
+    A spacing asks for the same detail on whatever body.
 
     Args:
         clouds: one for each body.

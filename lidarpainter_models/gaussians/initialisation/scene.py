@@ -98,15 +98,18 @@ def _scene_around(gaussians: GaussianSet, observations: SceneObservations) -> Ga
         sky=sky_from_images(
             sky_layout(cameras),
             cameras,
-            [view.rgb for view in views],
+            (view.rgb for view in views),  # one at a time as floats
             [view.sky_mask for view in views],
         ),
         cameras=CameraCorrections.none(
             [view.key for view in views],
             timestamps_ns,
             torch.stack([camera.world_from_camera.double() for camera in cameras]),
+            observations.faults,
         ),
-        exposure=ExposureCorrections.none(observations.camera_names),
+        exposure=ExposureCorrections.none(
+            observations.camera_names, [view.timestamp_ns for view in views]
+        ),
     )
 
 
@@ -120,24 +123,29 @@ def _frame_times(views: Sequence[TrainingView]) -> Int[Tensor, " frames"]:
 
 def pixel_footprint(
     xyz_m: Float[Tensor, "points 3"], cameras: Sequence[Camera], *, aside_m: float
-) -> tuple[Float[Tensor, " points"], Bool[Tensor, " points"]]:
-    """Size of a pixel at each point (smallest over the cameras), and whether it is in an image.
+) -> tuple[Float[Tensor, " points"], Float[Tensor, " points"]]:
+    """Size of a pixel at each point, smallest over the cameras, and how dense detail pays there.
 
-    A point in no image, but in that of a camera up to `aside_m` away, counts too; one beyond has
-    an infinite footprint. Occlusion is not looked at.
+    A point in no image, but in that of a camera up to `aside_m` away, has a footprint too; one
+    beyond has an infinite one. Occlusion is not looked at.
+
+    Where n Gaussians a square metre leave an image with footprint f an error of 1 / (n f^2) a
+    pixel, so many of them make the error of all images least where n follows the root of the sum
+    of f^-4 over the images; that root is the density, 0 for a point in no image.
     """
     footprint = torch.full((xyz_m.shape[0],), torch.inf)
-    in_image = torch.zeros(xyz_m.shape[0], dtype=torch.bool)
+    total = torch.zeros(xyz_m.shape[0])
     for camera in cameras:
         pixels_uv, depth_m = camera.project(xyz_m)
-        in_image |= camera.contains(pixels_uv, depth_m, near_m=0.5)
+        is_inside = camera.contains(pixels_uv, depth_m, near_m=0.5)
         margin_px = camera.fx_px * aside_m / depth_m.clamp(min=0.5)
         u, v = pixels_uv.unbind(-1)
         is_near = (u > -margin_px) & (u < camera.width_px + margin_px) & (depth_m > 0.5)
         is_near &= (v > -margin_px) & (v < camera.height_px + margin_px)
         size_m = torch.where(is_near, depth_m / camera.fx_px, torch.inf)
+        total += torch.where(is_inside, size_m**-4, 0.0)
         footprint = torch.minimum(footprint, size_m)
-    return footprint, in_image
+    return footprint, total.sqrt()
 
 
 def _spread_cameras(views: Sequence[TrainingView]) -> list[Camera]:
@@ -162,7 +170,9 @@ def _on_surfaces(
     street = observations.lidar_map.street
     street = street.keep(torch.arange(0, len(street), math.ceil(len(street) / MOST_STREET_POINTS)))
     cameras = _spread_cameras(observations.views)
-    footprint, in_image = pixel_footprint(street.xyz_m, cameras, aside_m=config.aside_m)
+    footprint, density = pixel_footprint(street.xyz_m, cameras, aside_m=config.aside_m)
+    density *= math.sqrt(len(observations.views) / len(cameras))
+    in_image = density > 0
     is_aside = ~in_image & footprint.isfinite()
     for_aside = int(budget * UNSEEN_SHARE)
     least_m = config.street_voxel_m
@@ -170,15 +180,15 @@ def _on_surfaces(
     # no image will ever shrink a lone blob there, and beside the lane it is large in the view
     aside = aside.keep(aside.num_points >= LEAST_UNSEEN_POINTS)
     progress(0.25)
-    clouds = {0: _cloud(street, footprint, in_image, least_m)}
+    clouds = {0: _cloud(street, density**-0.5, in_image, least_m)}
     for index, track in enumerate(observations.tracks, start=1):
         points = observations.lidar_map.actors.get(track.actor_id)
         if points is None:
             continue
-        footprint = _actor_footprint(points, track, observations.views, config)
-        in_sight = footprint.isfinite()
+        spacing_m = _actor_spacing(points, track, observations.views, config)
+        in_sight = spacing_m.isfinite()
         if int(in_sight.sum()) >= LEAST_ACTOR_POINTS:
-            clouds[index] = _cloud(points, footprint, in_sight, ACTOR_VOXEL_M)
+            clouds[index] = _cloud(points, spacing_m, in_sight, ACTOR_VOXEL_M)
     seen = adaptive_voxels(list(clouds.values()), budget=max(budget - for_aside, 1))
     gaussians = _surfels([seen[0], aside], [2.0, SPACING_SIGMA], config)
     for body, voxels in zip(list(clouds)[1:], seen[1:], strict=True):
@@ -188,7 +198,7 @@ def _on_surfaces(
 
 def _cloud(
     points: MapPoints,
-    footprint: Float[Tensor, " points"],
+    spacing_m: Float[Tensor, " points"],
     chosen: Bool[Tensor, " points"],
     least_m: float,
 ) -> Cloud:
@@ -197,7 +207,7 @@ def _cloud(
         xyz_m=points.xyz_m[chosen],
         rgb=points.rgb_u8[chosen].float() / 255,
         has_colour=points.has_colour[chosen],
-        footprint_m=footprint[chosen],
+        spacing_m=spacing_m[chosen],
         least_m=least_m,
     )
 
@@ -225,21 +235,26 @@ def _surfels(
     )
 
 
-def _actor_footprint(
+def _actor_spacing(
     points: MapPoints,
     track: ActorTrack,
     views: Sequence[TrainingView],
     config: InitialisationConfig,
 ) -> Float[Tensor, " points"]:
-    """Size of a pixel at each point of an actor over its time; infinite if never near an image."""
+    """Distance at which detail pays at each point of an actor over its time, as on the street.
+
+    A point in no image counts as in the nearest it might be in; one beyond is infinite.
+    """
     footprint = torch.full((len(points),), torch.inf)
+    total = torch.zeros(len(points))
     stride = math.ceil(len(views) / _MOST_VIEWS_PER_ACTOR)
     for view in views[::stride]:
         if not track.is_present(view.timestamp_ns):
             continue
         world_from_box = track.pose_at(view.timestamp_ns).float()
-        at_time, _ = pixel_footprint(
+        at_time, density = pixel_footprint(
             transform_points(world_from_box, points.xyz_m), [view.camera], aside_m=config.aside_m
         )
         footprint = torch.minimum(footprint, at_time)
-    return footprint
+        total += stride * density.square()
+    return torch.maximum(total.sqrt(), footprint**-2) ** -0.5

@@ -37,13 +37,13 @@ def test_points_of_one_voxel_become_their_mean():
     assert voxels.num_points[order].tolist() == [2, 1]
 
 
-def cloud_of(xyz_m, footprint_m):
+def cloud_of(xyz_m, spacing_m):
     count = len(xyz_m)
     return Cloud(
         xyz_m=xyz_m,
         rgb=torch.rand(count, 3),
         has_colour=torch.ones(count, dtype=torch.bool),
-        footprint_m=torch.as_tensor(footprint_m).expand(count),
+        spacing_m=torch.as_tensor(spacing_m).expand(count),
     )
 
 
@@ -54,7 +54,7 @@ def test_voxel_budget_is_kept(budget):
 
 
 @pytest.mark.parametrize("budget", [300, 2000])
-def test_a_pixel_asks_for_as_much_on_every_body(budget):
+def test_a_spacing_asks_for_as_much_on_every_body(budget):
     """Of two like surfaces, one with four times the points, each gets its half."""
     street, car = cloud_of(plane(20_000), 0.01), cloud_of(plane(80_000), 0.01)
     on_street, on_car = adaptive_voxels([street, car], budget=budget)
@@ -107,8 +107,11 @@ def test_points_without_colour_take_that_of_their_neighbours():
 def test_footprint_knows_in_beside_and_out_of_the_image():
     camera = camera_at(0.0)
     points = torch.tensor([[8.0, 0, 1.0], [8.0, 7.0, 1.0], [8.0, 30.0, 1.0], [-5.0, 0, 1.0]])
-    footprint, in_image = pixel_footprint(points, [camera], aside_m=3.5)
-    assert in_image.tolist() == [True, False, False, False]
+    footprint, density = pixel_footprint(points, [camera], aside_m=3.5)
+    assert (density > 0).tolist() == [True, False, False, False]
+    assert float(density[0]) == pytest.approx((camera.fx_px / 8.0) ** 2)
+    _, of_four = pixel_footprint(points, 4 * [camera], aside_m=3.5)
+    assert float(of_four[0]) == pytest.approx(2 * float(density[0]))
     assert footprint.isfinite().tolist() == [True, True, False, False]
     assert abs(float(footprint[0]) - 8.0 / camera.fx_px) < 1e-6
 
