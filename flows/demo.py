@@ -9,7 +9,7 @@ from torch import Tensor
 
 from catalog.store import open_store
 from flows.parameters import ReconstructParameters
-from flows.presets import preview
+from flows.presets import brief
 from flows.reconstruct import reconstruct
 from lidarpainter_models.export.images import write_png
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
@@ -58,4 +58,4 @@ def _first_view(config: SyntheticStreetConfig) -> Float[Tensor, "height width 3"
 @flow(name="demo-scene")
 def demo_scene(store: str | None = None) -> dict[str, Any]:
     """Run the demo as a worker is asked to, in the worker's store."""
-    return demo.fn(demo_street(), preview(street_id(DEMO_SEED)), open_store(store).address)
+    return demo.fn(demo_street(), brief(street_id(DEMO_SEED)), open_store(store).address)

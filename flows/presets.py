@@ -38,6 +38,13 @@ def preview(scene: str) -> ReconstructParameters:
     )
 
 
+def brief(scene: str) -> ReconstructParameters:
+    """Half the steps of `preview` and two thirds of its Gaussians: what the demo shows."""
+    fit = FitConfig(effort=EffortConfig(looks=375.0, gaussians_per_pixel=0.25))
+    refine = continuation(fit, looks=SHORT_REFINE_LOOKS / 2, guidance=GuidanceConfig())
+    return preview(scene).model_copy(update={"preset": "brief", "fit": fit, "refine": refine})
+
+
 def balanced(scene: str) -> ReconstructParameters:
     """The best trade on one GPU."""
     fit = FitConfig(effort=EffortConfig(looks=1_000.0))
@@ -78,6 +85,7 @@ def paper(scene: str) -> ReconstructParameters:
 
 
 PRESETS: dict[str, Callable[[str], ReconstructParameters]] = {
+    "brief": brief,
     "preview": preview,
     "balanced": balanced,
     "paper": paper,

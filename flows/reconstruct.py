@@ -96,7 +96,7 @@ def reconstruct_scene(
 
     Args:
         scene: `<dataset>/<sequence>` of the store.
-        preset: `preview`, `balanced` or `paper`.
+        preset: `brief`, `preview`, `balanced` or `paper`.
         settings: other settings, `key=value` as the command's `--set`.
         store: folder of the store; by default what `LIDARPAINTER_STORE` says on the worker.
     """

@@ -41,10 +41,10 @@ def demo(
     from flows.cli.reconstruct import show
     from flows.cli.running import run_demo
     from flows.overrides import with_changes, with_overrides
-    from flows.presets import preview
+    from flows.presets import brief
     from tasks.specs import street_id
 
-    parameters = preview(street_id(seed))
+    parameters = brief(street_id(seed))
     if painter is not None:
         parameters = with_changes(parameters, {"painter": painter})
     parameters = with_overrides(parameters, settings or [])

@@ -45,7 +45,7 @@ Split = Annotated[
 
 def reconstruct(  # noqa: PLR0913 - the options of a command
     scene: Annotated[str, typer.Argument(help="dataset/sequence, as ingested.")],
-    preset: Annotated[str, typer.Option(help="preview, balanced or paper.")] = "preview",
+    preset: Annotated[str, typer.Option(help="brief, preview, balanced or paper.")] = "preview",
     painter: Painter = None,
     device: DeviceName = "auto",
     shift: Sideways = None,

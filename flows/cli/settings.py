@@ -15,7 +15,7 @@ def settings(
         str, typer.Argument(help="Only these: fit, fit.densification, ...; all if absent.")
     ] = "",
     preset: Annotated[
-        str, typer.Option(help="Whose defaults are shown: preview, balanced or paper.")
+        str, typer.Option(help="Whose defaults are shown: brief, preview, balanced or paper.")
     ] = "preview",
     of: Annotated[
         Literal["reconstruct", "train"],

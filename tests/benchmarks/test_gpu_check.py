@@ -51,11 +51,20 @@ def test_the_page_sets_a_painter_beside_the_papers():
     assert "| the paper, at 1024x576 |  | 870 | 10.5 |" in page
 
 
+INTERPRETED_LONG = ("sparse_adam", "ssim")
+
+
 def test_without_a_gpu_the_first_line_says_so():
     assert findings_of(is_gpu=False).page().startswith("No GPU was found. On the CPU instead")
 
 
-@pytest.mark.parametrize("kernel", kernel_trials.TRIALS)
+@pytest.mark.parametrize(
+    "kernel",
+    [
+        pytest.param(kernel, marks=[pytest.mark.slow] if kernel in INTERPRETED_LONG else [])
+        for kernel in kernel_trials.TRIALS
+    ],
+)
 def test_a_trial_runs_on_another_device_and_gives_what_the_cpu_gives(kernel, monkeypatch):
     trial = kernel_trials.TRIALS[kernel]
     with strict_runs(monkeypatch) as device:

@@ -103,7 +103,10 @@ def refused(words, expected, place):
         (("reconstruct", "nonsense"), "is no scene id, expected dataset/sequence such as"),
         (("reconstruct", "../../etc"), "is no scene id, expected dataset/sequence such as"),
         (("reconstruct", "toy/other"), "ingest it first (there is toy/street)"),
-        ((*TOY, "--preset", "fast"), "no preset 'fast', expected one of preview, balanced, paper"),
+        (
+            (*TOY, "--preset", "fast"),
+            "no preset 'fast', expected one of brief, preview, balanced, paper",
+        ),
         ((*TOY, "--painter", "miro"), "no painter 'miro': expected one of none, overlay, warp"),
         ((*TOY, "--painter", "{tmp}/gone.safetensors"), "no painter weights at"),
         ((*TOY, "--painter", "{garbage}"), "{garbage}"),
