@@ -12,6 +12,7 @@ import pytest
 from tiny_diffusion import write_model
 from toy_store import SMALL, TOY_SCENE, write_toy_scene
 
+from catalog.artefacts import ArtefactRef
 from catalog.store import open_store
 from flows.cli.main import main
 
@@ -135,7 +136,7 @@ def test_two_runs_at_once_share_every_computation(store):
     for stage, computed in first["computed_now"].items():
         assert computed != second["computed_now"][stage], stage
     for row in store.tables.rows("artefacts"):
-        store.artefacts.verified(store.artefacts.ref(row["kind"], row["digest"]))
+        store.artefacts.verified(ArtefactRef.of_id(row["artefact_id"]))
 
 
 @pytest.mark.parametrize(
