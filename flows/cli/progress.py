@@ -19,13 +19,16 @@ LINE_EVERY_S = 30.0
 
 
 def how_far(clock: Clock, stage: str, done: float, total: float | None, note: str = "") -> str:
-    """What is known of a stage that goes on: `620/1500 41 %, 0:31 gone, 0:48 left; run ...`."""
+    """What is known of a stage that goes on: `620/1500 41 %, 0:31 gone, 0:48 left; run ...`.
+
+    What is left goes unsaid where a stage, or the last of a run, takes longer than was thought.
+    """
     share = f"{100 * done / max(total, 1e-9):.0f} %" if total else ""
     if total and total > 1:
         share = f"{done:.0f}/{total:.0f} {share}"
     times = _times(clock.elapsed(stage), clock.left(stage))
-    if (run_left := clock.run_left(stage)) is not None:
-        times += f"; run {_times(clock.elapsed(), run_left)}"
+    if stage in clock.expected:
+        times += f"; run {_times(clock.elapsed(), clock.run_left(stage))}"
     return ", ".join(part for part in (share, times, note) if part)
 
 

@@ -118,7 +118,7 @@ class Clock:
         return total - self.elapsed(stage)
 
     def run_left(self, stage: str) -> float | None:
-        """Of the whole run, of which this stage is going on; None without a past run."""
+        """Of the whole run, of which this stage goes on; None where nothing tells, as in `left`."""
         if stage not in self.expected:
             return None
         coming = sum(

@@ -84,7 +84,7 @@ def _scene(gaussians, cameras):
             torch.stack([camera.world_from_camera for camera in cameras]),
         ),
         actors=Actors.uncorrected((), times),
-        exposure=ExposureCorrections.none(["front"]),
+        exposure=ExposureCorrections.none(["front"], [0]),
     )
 
 

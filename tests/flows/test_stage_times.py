@@ -178,3 +178,14 @@ def test_lines_say_what_bars_say_and_quiet_says_nothing(capsys, monkeypatch):
     assert said[0].startswith("fit: 750/1500 50 %, 0:01 gone")
     assert "; run 0:01 gone" in said[0]
     assert said[0].endswith("left, 25 dB")
+
+
+def test_a_last_stage_that_takes_longer_than_was_thought_still_tells_of_the_run():
+    class Now:
+        s = 0.0
+
+    clock = Clock(expected={"report": 2.0}, now=lambda: Now.s)
+    clock.started("report")
+    Now.s = 5.0
+    assert clock.run_left("report") is None
+    assert how_far(clock, "report", 1, 1) == "100 %, 0:05 gone; run 0:05 gone"

@@ -176,7 +176,7 @@ def scene(views, board):
         sky=SkyTexture.constant(layout, torch.tensor([0.5, 0.7, 0.9])),
         cameras=CameraCorrections.none(keys, times, poses),
         actors=Actors.uncorrected((), times),
-        exposure=ExposureCorrections.none(["front"]),
+        exposure=ExposureCorrections.none(["front"], [0]),
     )
 
 

@@ -93,7 +93,7 @@ def scene_of(gaussians, cameras, tracks=(), *, sky_rgb=SKY_RGB, timestamps_ns=No
             torch.stack([camera.world_from_camera for camera in cameras]),
         ),
         actors=Actors.uncorrected(tracks, times),
-        exposure=ExposureCorrections.none(["front"]),
+        exposure=ExposureCorrections.none(["front"], [0]),
     )
 
 

@@ -143,7 +143,7 @@ class ExposureCorrections:
 
     @classmethod
     def none(
-        cls, camera_names: Sequence[str], timestamps_ns: Sequence[int] = (0,)
+        cls, camera_names: Sequence[str], timestamps_ns: Sequence[int]
     ) -> "ExposureCorrections":
         """Colours as they are, in a log with images of these times."""
         first_ns, last_ns = min(timestamps_ns), max(timestamps_ns)

@@ -108,7 +108,7 @@ def copy_scene(scene: GaussianScene) -> GaussianScene:
 
 def _exposure(arrays: dict[str, Tensor], camera_names: list[str]) -> ExposureCorrections:
     """Scenes stored before there were gains have none."""
-    unknown = ExposureCorrections.none(camera_names)
+    unknown = ExposureCorrections.none(camera_names, [0])
     return ExposureCorrections(
         camera_names=tuple(camera_names),
         matrix=arrays["matrix"],

@@ -18,6 +18,7 @@ from lidarpainter_models.gaussians.initialisation.surfels import (
 )
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 from lidarpainter_models.lidar.lidar_map import LidarMap
+from lidarpainter_models.scenes.camera_faults import CameraFault
 
 
 def plane(count=400, seed=0):
@@ -135,6 +136,20 @@ def test_actor_never_near_a_image_is_not_modelled(world):
     away = replace(world.observations, tracks=(replace(track, world_from_box=behind),))
     scene = initialise_scene(away, config)
     assert int((scene.gaussians.body_index > 0).sum()) == 0
+
+
+def test_first_scene_holds_what_was_found_of_the_cameras(world):
+    late = CameraFault(late_s=0.012)
+    views = tuple(
+        replace(view, timestamp_ns=view.timestamp_ns + index * 3_000_000_000)
+        for index, view in enumerate(world.observations.views)
+    )
+    known = replace(world.observations, views=views, faults={"front": late})
+    scene = initialise_scene(known, InitialisationConfig(num_gaussians=300, street_voxel_m=0.1))
+    assert scene.cameras.faults == {"front": late}
+    times_ns = [view.timestamp_ns for view in views]
+    assert scene.exposure.knots_ns[0] == min(times_ns)
+    assert scene.exposure.knots_ns[-1] == pytest.approx(max(times_ns), abs=len(times_ns))
 
 
 def test_map_out_of_sight_is_one_clear_error(world):

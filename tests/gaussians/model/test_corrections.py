@@ -61,7 +61,7 @@ def test_actor_corrections_are_linear_between_knots_and_constant_beyond():
 
 
 def test_exposure_of_an_unknown_camera_is_neutral():
-    exposure = ExposureCorrections.none(["front"])
+    exposure = ExposureCorrections.none(["front"], [0])
     exposure.matrix[0, :, 3] = 0.1
     rgb = torch.rand(3, 4, 3)
     assert torch.equal(exposure.apply(rgb, None, 0), rgb)
