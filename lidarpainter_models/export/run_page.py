@@ -59,6 +59,8 @@ class RunPage:
     provenance: Mapping[str, str]
     settings: Mapping[str, str]
     """Every setting of the run by its dotted name, as `--set` takes it."""
+    has_lidar: bool
+    """Whether a LiDAR swept in training frames."""
 
     def report(
         self,
@@ -78,7 +80,7 @@ class RunPage:
         return Report(
             title=f"LidarPainter: {self.result['scene']}",
             summary=[_scene_in_words(scene), _summary(self.result)],
-            verdict=[*verdict(self.result), *pictures.faults],
+            verdict=[*verdict(self.result), *self._without_lidar(), *pictures.faults],
             moving=pictures.moving,
             worst=pictures.worst,
             repeat=_repeat(self.result, json.loads(self.settings.get("train_cameras", "null"))),
@@ -91,6 +93,14 @@ class RunPage:
                 "Settings": self.settings,
             },
         )
+
+    def _without_lidar(self) -> list[str]:
+        if self.has_lidar:
+            return []
+        return [
+            "No LiDAR swept in the training frames: points are estimated from their images, and "
+            "what guided the painter is as uncertain as they are."
+        ]
 
 
 def _scene_in_words(scene: DrivingScene) -> str:

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -54,15 +53,9 @@ class FramePoints:
         self._sweeps: list[tuple[int, Float[Tensor, "_ 3"], Int[Tensor, " _"]]] = []
 
     def measured(self, frame_index: int) -> Float[Tensor, "points 3"]:
-        """The points in the world, where the LiDARs met them.
-
-        Raises:
-            SceneError: no LiDAR swept in that frame.
-        """
-        sweeps = self._of(frame_index)
-        if not sweeps:
-            raise SceneError(f"{self._scene.path}: frame {frame_index} has no LiDAR sweep")
-        return torch.cat([points_world for _, points_world, _ in sweeps])
+        """The points in the world, where the LiDARs met them; none where none swept."""
+        swept = [points_world for _, points_world, _ in self._of(frame_index)]
+        return torch.cat(swept) if swept else torch.zeros(0, 3)
 
     def at_exposure(self, view: RecordedView) -> Float[Tensor, "points 3"]:
         """The points in the world, moving actors where they are in the view's image."""

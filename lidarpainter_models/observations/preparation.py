@@ -1,27 +1,33 @@
 """Read everything that a fit needs of a scene, each image once.
 
-Only training views and the sweeps of training frames enter.
+Only training views and the sweeps of training frames enter; without any sweep, points come from
+the images.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.lidar.colouring import MapColouring
+from lidarpainter_models.lidar.lidar_map import MapPoints
 from lidarpainter_models.lidar.map_building import gather_points
 from lidarpainter_models.lidar.recording_faults import find_faults
 from lidarpainter_models.lidar.sky_masks import sky_mask
 from lidarpainter_models.lidar.sparse_depth import FramePoints, sparse_lidar_depth
 from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
+from lidarpainter_models.observations.image_points import points_from_images
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
 from lidarpainter_models.scenes.camera_faults import CameraFault
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.scenes.splits import ViewSplit
+
+SAME_SWEEP_NS = 100_000_000
+"""Points measured within this of one another are of one turn of the LiDAR, or of one image."""
 
 
 def prepare_observations(
@@ -46,15 +52,18 @@ def prepare_observations(
         raise SceneError(f"the split of {scene.dataset}/{scene.sequence} has no training views")
     faults = find_faults(scene, split.train) if config.corrects_cameras else {}
     taken = [_as_taken(view, faults) for view in split.train]
-    colouring = MapColouring(
-        gather_points(scene, split.train_frames),
-        scene.tracks,
-        taken,
-    )
+    if scene.has_lidar(split.train_frames):
+        points = gather_points(scene, split.train_frames)
+    else:
+        points = points_from_images(scene, taken)
+    colouring = MapColouring(points, scene.tracks, taken)
     lidar, views = FramePoints(scene), []
     for done, (recorded, view) in enumerate(zip(split.train, taken, strict=True), start=1):
         image = scene.read_image(recorded)
-        made = _training_view(lidar, view, image, config)
+        near = lidar.measured(view.frame_index)
+        if len(near) == 0:
+            near = _nearest_in_time(points.street, view.timestamp_ns)
+        made = _training_view(view, image, config, near=near, exposed=lidar.at_exposure(view))
         views.append(replace(made, timestamp_ns=recorded.timestamp_ns))
         colouring.add(view, image)
         if progress is not None:
@@ -79,13 +88,29 @@ def _as_taken(view: RecordedView, faults: Mapping[str, CameraFault]) -> Recorded
     return replace(view, camera=camera, timestamp_ns=camera.taken_ns(view.timestamp_ns))
 
 
+def _nearest_in_time(street: MapPoints, timestamp_ns: int) -> Float[Tensor, "near 3"]:
+    """The points measured at most so long before or after that time as any must be."""
+    age_ns = (street.timestamp_ns - timestamp_ns).abs()
+    return street.xyz_m[age_ns <= age_ns.min() + SAME_SWEEP_NS]
+
+
 def _training_view(
-    lidar: FramePoints,
     recorded: RecordedView,
     image: UInt8[Tensor, "recorded_height recorded_width 3"],
     config: ObservationConfig,
+    *,
+    near: Float[Tensor, "points 3"],
+    exposed: Float[Tensor, "placed 3"],
 ) -> TrainingView:
-    """A recorded image at fit size, with its sky and its frame's LiDAR depth."""
+    """A recorded image at fit size, with its sky and its frame's LiDAR depth.
+
+    Args:
+        recorded: which image.
+        image: as it was recorded.
+        config: see there.
+        near: points measured about then, in the world: no sky is where they are.
+        exposed: its frame's LiDAR points, moving actors where they are in the image.
+    """
     camera = fit_camera(recorded, config)
     rgb_u8 = shrink_image(image, width_px=camera.width_px, height_px=camera.height_px)
     return TrainingView(
@@ -93,6 +118,6 @@ def _training_view(
         camera=camera,
         timestamp_ns=recorded.timestamp_ns,
         rgb_u8=rgb_u8,
-        sky_mask=sky_mask(rgb_u8, lidar.measured(recorded.frame_index), camera),
-        lidar_depth_m=sparse_lidar_depth(lidar.at_exposure(recorded), camera),
+        sky_mask=sky_mask(rgb_u8, near, camera),
+        lidar_depth_m=sparse_lidar_depth(exposed, camera),
     )

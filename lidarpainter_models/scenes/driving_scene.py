@@ -4,6 +4,7 @@ World: x forward, y left, z up, origin at the first ego pose. A `DrivingScene` i
 tables are in memory, images and points are read when asked for.
 """
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -157,6 +158,10 @@ class DrivingScene:
         """One field of `read_sweep`, for whoever needs no other."""
         array = _POINT_COLUMNS[name]
         return torch.from_numpy(self._stored.read_rows(array, sweep.offset, sweep.num_points))
+
+    def has_lidar(self, frame_indices: Collection[int]) -> bool:
+        """Whether a LiDAR swept in any of these frames."""
+        return any(sweep.frame_index in frame_indices for sweep in self.sweeps)
 
     def sweeps_of(self, frame_index: int) -> tuple[Sweep, ...]:
         """The sweeps of all LiDARs in one frame."""

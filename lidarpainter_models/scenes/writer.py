@@ -280,7 +280,7 @@ class SceneWriter:
         return frame_index, where
 
     def _require_complete(self) -> None:
-        for table, what in (("frames", "frames"), ("cameras", "images"), ("sweeps", "points")):
+        for table, what in (("frames", "frames"), ("cameras", "images")):
             if not self._rows[table]:
                 raise DataError(f"{self._name}: zero {what}, expected at least one")
 

@@ -34,7 +34,7 @@ def _lost_pictures(frame: Frame, level: float, _dice: np.random.Generator) -> Fr
 CAUSES = {
     cause.name: cause
     for cause in (
-        Cause("beams", "beams", (32, 16, 8, 4, 1), sweeps.beams),
+        Cause("beams", "beams", (32, 16, 8, 4, 1, 0), sweeps.beams),
         Cause("reach", "m", (60, 40, 20, 10), sweeps.reach),
         Cause("dropout", "share", (0.25, 0.5, 0.75, 0.9), sweeps.dropout),
         Cause("clutter", "share", (0.02, 0.05, 0.1, 0.2), sweeps.clutter),

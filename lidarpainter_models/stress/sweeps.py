@@ -14,10 +14,12 @@ CLUTTER_M = 12.0
 
 
 def beams(frame: Frame, level: float, _dice: np.random.Generator) -> Frame:
-    """So many of the lasers are left, evenly spread.
+    """So many of the lasers are left, evenly spread; 0 is a car without LiDAR.
 
     Where rings are not known they are told by elevation, as a sensor of 64 has them.
     """
+    if level == 0:
+        return replace(frame, turns=())
     return _each(frame, lambda turn: turn.kept(_beam_mask(turn, int(level))))
 
 

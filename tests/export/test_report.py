@@ -123,7 +123,9 @@ def test_page_begins_with_what_the_scene_is(tmp_path):
         **judged,
         "unpainted": judged,
     }
-    page = RunPage(result=result, costs=[], provenance={}, settings={"fit.steps": "40"})
+    page = RunPage(
+        result=result, costs=[], provenance={}, settings={"fit.steps": "40"}, has_lidar=True
+    )
     report = page.report(scene, Pictures(), {}, {"processor": "abacus"})
     assert report.summary[0].startswith(
         "Sequence street-0005 of the dataset synthetic: 6 frames in 0.5 s; 12 images of 2 cameras "

@@ -19,8 +19,10 @@ from scene_parts import (
     some_record,
 )
 
+from lidarpainter_models.checks.doctor import check_scene, draw_overlay
 from lidarpainter_models.errors import DataError, SceneError
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
+from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import Distortion, SweepPoints
 from lidarpainter_models.scenes.validation import require_jpeg
 from lidarpainter_models.scenes.writer import SceneWriter
@@ -61,15 +63,11 @@ def test_name_that_is_no_plain_folder_is_refused(tmp_path, name, position):
     assert files_below(tmp_path) == []
 
 
-@pytest.mark.parametrize("missing", ["frames", "images", "points"])
-def test_scene_without_frames_images_or_points_is_refused(tmp_path, missing):
+@pytest.mark.parametrize("missing", ["frames", "images"])
+def test_scene_without_frames_or_images_is_refused(tmp_path, missing):
     def write(writer):
-        if missing == "frames":
-            return
-        writer.add_frame(0, timestamp_ns=0, world_from_ego=IDENTITY)
-        if missing == "points":
-            writer.add_image(some_record(), some_jpeg())
-        else:
+        if missing == "images":
+            writer.add_frame(0, timestamp_ns=0, world_from_ego=IDENTITY)
             add_sweep(writer, some_points())
 
     with (
@@ -78,6 +76,20 @@ def test_scene_without_frames_images_or_points_is_refused(tmp_path, missing):
     ):
         write(writer)
     assert files_below(tmp_path) == []
+
+
+def test_scene_without_lidar_is_read_back_and_examined(tmp_path):
+    with SceneWriter(tmp_path, "rig", "a", HEADER) as writer:
+        for frame in range(2):
+            writer.add_frame(frame, timestamp_ns=frame, world_from_ego=IDENTITY)
+            writer.add_image(replace(some_record(), timestamp_ns=frame), some_jpeg())
+    scene = DrivingScene.open(writer.path)
+    assert (scene.lidar_names, scene.sweeps, scene.has_lidar({0, 1})) == ((), (), False)
+    found = {check.name: check for check in check_scene(scene)}
+    assert found["LiDAR"].verdict == "warn"
+    assert found["stored content"].verdict == "ok"
+    assert not {"ground", "sweeps agree", "boxes hold points"} & found.keys()
+    assert draw_overlay(scene, 0, scene.camera_names[0]).shape[2] == 3
 
 
 def ego_pose(degrees, axis, place_m=(0.0, 0.0, 0.0)):

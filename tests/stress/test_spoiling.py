@@ -44,7 +44,7 @@ def same(one, other):
         and a[2].fx_px == b[2].fx_px
         for a, b in zip(shots, others, strict=True)
     )
-    points = all(
+    points = len(one.turns) == len(other.turns) and all(
         torch.equal(a.points.xyz_m, b.points.xyz_m)
         for a, b in zip(one.turns, other.turns, strict=True)
     )
@@ -104,6 +104,7 @@ def test_beams_are_counted(clean, spoilt):
     before = frame_of(clean, TRAINS).turns[0].points.num_points
     counts = [frame_of(spoilt("beams", n), TRAINS).turns[0].points.num_points for n in (16, 4, 1)]
     assert before > counts[0] > counts[1] > counts[2] > 0
+    assert frame_of(spoilt("beams", 0), TRAINS).turns == ()
 
 
 def test_drops_lie_between_the_sensor_and_what_it_saw(clean, spoilt):

@@ -11,16 +11,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lidarpainter_models.gaussians.initialisation.plane_sweep import (
-    choose_depth,
-    sweep_cost,
-    sweep_depths,
-)
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
 from lidarpainter_models.geometry.box_masks import project_boxes
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation
 from lidarpainter_models.lidar.ground_heights import GroundHeights
+from lidarpainter_models.observations.plane_sweep import (
+    choose_depth,
+    sweep_cost,
+    sweep_depths,
+)
 from lidarpainter_models.observations.views import TrainingView
 
 COMPARED_VIEWS = 3

@@ -2,62 +2,15 @@ from dataclasses import replace
 
 import torch
 from gaussian_world import FRAME_NS, camera_at, round_gaussians, scene_of
+from wall_images import image_of_wall, sideways_cameras
 
 from lidarpainter_models.gaussians.initialisation import unreached
-from lidarpainter_models.gaussians.initialisation.plane_sweep import (
-    choose_depth,
-    sweep_cost,
-    sweep_depths,
-)
 from lidarpainter_models.gaussians.initialisation.unreached import (
     depth_from_below,
     unreached_gaussians,
 )
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.observations.views import TrainingView
-
-
-def sideways_cameras():
-    """Three cameras 0.5 m apart, across their viewing direction."""
-    base = camera_at(0.0, width_px=96, height_px=64)
-    poses = []
-    for step in range(3):
-        pose = base.world_from_camera.clone()
-        pose[1, 3] = 0.5 * step
-        poses.append(base.at(pose))
-    return poses
-
-
-def image_of_wall(camera: Camera, wall_x_m: float):
-    """A wall with a smooth pattern, seen exactly."""
-    directions = camera.pixel_directions() @ camera.world_from_camera[:3, :3].float().T
-    centre = camera.centre_world.float()
-    points = centre + directions * ((wall_x_m - centre[0]) / directions[..., :1])
-    y, z = points[..., 1], points[..., 2]
-    return torch.stack([torch.sin(3 * y), torch.sin(4 * z + y), torch.cos(2 * y - z)], -1) / 2 + 0.5
-
-
-def test_sweep_finds_the_depth_of_a_wall():
-    cameras = sideways_cameras()
-    images = [image_of_wall(camera, 10.0) for camera in cameras]
-    depths_m = sweep_depths(4.0, 100.0, 25)
-    others = list(zip(cameras[1:], images[1:], strict=True))
-    cost = sweep_cost(cameras[0], images[0], others, depths_m)
-    unknown = torch.full(images[0].shape[:2], 100.0)
-    found = choose_depth(cost, depths_m, unknown, prior=0.0)[16:-16, 16:-32]
-    nearest = depths_m[(depths_m - 10.0).abs().argmin()]
-    assert float((found == nearest).float().mean()) > 0.9
-
-
-def test_without_texture_the_surroundings_decide():
-    cameras = sideways_cameras()
-    plain = torch.full((64, 96, 3), 0.5)
-    depths_m = sweep_depths(4.0, 100.0, 25)
-    cost = sweep_cost(cameras[0], plain, [(cameras[1], plain)], depths_m)
-    expected_m = torch.full((64, 96), 20.0)
-    found = choose_depth(cost, depths_m, expected_m, prior=0.03)[20:-20, 30:-30]
-    assert float((found - 20.0).abs().max()) < 3.0
 
 
 def test_depth_goes_straight_up_over_gaps():

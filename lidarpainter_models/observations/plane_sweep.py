@@ -27,20 +27,20 @@ def sweep_depths(nearest_m: float, farthest_m: float, count: int) -> Float[Tenso
 
 def sweep_cost(
     camera: Camera,
-    rgb: Float[Tensor, "height width 3"],
-    others: Sequence[tuple[Camera, Float[Tensor, "rows columns 3"]]],
+    image: Float[Tensor, "height width channels"],
+    others: Sequence[tuple[Camera, Float[Tensor, "rows columns channels"]]],
     depths_m: Float[Tensor, " depths"],
 ) -> Float[Tensor, "depths height width"]:
-    """How badly the other images agree with this one at each depth: mean colour difference.
+    """How badly the other images agree with this one at each depth: mean difference.
 
     Averaged over a small window (detail) and a large one (where there is little texture).
     """
-    target = rgb.permute(2, 0, 1)[None]
+    target = image.permute(2, 0, 1)[None]
     rows = []
     for depth_m in depths_m:
-        total = torch.zeros(rgb.shape[:2])
-        for other_camera, other_rgb in others:
-            warped, inside = warp_plane(camera, other_camera, other_rgb, float(depth_m))
+        total = torch.zeros(image.shape[:2])
+        for other_camera, other_image in others:
+            warped, inside = warp_plane(camera, other_camera, other_image, float(depth_m))
             difference = (warped - target)[0].abs().mean(dim=0).clamp(max=_HIDDEN_DIFFERENCE)
             total += torch.where(inside, difference, _HIDDEN_DIFFERENCE)
         total = (total / max(len(others), 1))[None, None]
@@ -49,8 +49,11 @@ def sweep_cost(
 
 
 def warp_plane(
-    camera: Camera, other: Camera, other_rgb: Float[Tensor, "rows columns 3"], depth_m: float
-) -> tuple[Float[Tensor, "1 3 height width"], Bool[Tensor, "height width"]]:
+    camera: Camera,
+    other: Camera,
+    other_image: Float[Tensor, "rows columns channels"],
+    depth_m: float,
+) -> tuple[Float[Tensor, "1 channels height width"], Bool[Tensor, "height width"]]:
     """The other image on the camera's plane at a depth, and where it lies inside the other."""
     other_from_camera = (
         invert_rigid(other.world_from_camera.double()) @ camera.world_from_camera.double()
@@ -62,7 +65,7 @@ def warp_plane(
     v = (points[..., 1] / z * other.fy_px + other.cy_px) / other.height_px * 2 - 1
     inside = (u.abs() < 1) & (v.abs() < 1) & (points[..., 2] > 0.5)
     warped = torch.nn.functional.grid_sample(
-        other_rgb.permute(2, 0, 1)[None],
+        other_image.permute(2, 0, 1)[None],
         torch.stack([u, v], dim=-1)[None],
         mode="bilinear",
         padding_mode="border",

@@ -1,0 +1,94 @@
+"""A log without LiDAR gets its points from training images."""
+
+import pytest
+import torch
+from toy_street import CAR_SIZE_M, ToyStreet, world_from_car
+from wall_images import image_of_wall, sideways_cameras
+
+from lidarpainter_models.errors import SceneError
+from lidarpainter_models.geometry.box_masks import project_boxes
+from lidarpainter_models.observations.preparation import prepare_observations
+from lidarpainter_models.observations.settings import ObservationConfig
+from lidarpainter_models.scenes.records import RecordedView
+from lidarpainter_models.scenes.splits import split_views
+
+FRAME_NS = 100_000_000
+WALL_X_M = 14.0
+
+
+class WallDrive(ToyStreet):
+    """A car that slides past a wall and sees a moving box before it; nothing measures."""
+
+    def __init__(self, num_frames=4):
+        super().__init__(num_frames)
+        self.sweeps = ()
+        self.views = tuple(
+            RecordedView(
+                frame_index=frame,
+                camera_name="front",
+                timestamp_ns=frame * FRAME_NS,
+                camera=camera,
+                index=0,
+            )
+            for frame, camera in enumerate(
+                sideways_cameras(num_frames, width_px=240, height_px=135)
+            )
+        )
+
+    def read_image(self, view):
+        image = image_of_wall(view.camera, WALL_X_M)
+        pose = world_from_car(view.timestamp_ns * 1e-9)
+        is_there = torch.ones(1, dtype=torch.bool)
+        image[project_boxes(view.camera, pose[None], [CAR_SIZE_M], is_there, margin=1.0)] = 0.1
+        return (image * 255).round().to(torch.uint8)
+
+
+@pytest.fixture(scope="module")
+def prepared():
+    street = WallDrive()
+    return prepare_observations(street, split_views(street, "all"), ObservationConfig(width_px=160))
+
+
+def test_points_lie_on_what_stands_still(prepared):
+    street = prepared.lidar_map.street
+    assert len(street) > 10_000
+    off_m = (street.xyz_m[:, 0] - WALL_X_M).abs()
+    assert float(off_m.median()) < 0.1
+    assert float((off_m < 0.05 * WALL_X_M).float().mean()) > 0.93
+    assert float(street.has_colour.float().mean()) > 0.9
+    assert set(street.frame_index.tolist()) == set(range(4))
+
+
+def test_a_moving_actor_gets_points_on_its_box(prepared):
+    (actor,) = prepared.lidar_map.actors.values()
+    share = actor.xyz_m.abs() / (CAR_SIZE_M / 2)
+    assert float(share.amax(dim=1).min()) == pytest.approx(0.95)
+    assert float(actor.has_colour.float().mean()) > 0.2
+    seen = actor.rgb_u8[actor.has_colour].float()
+    assert float(seen.median()) == pytest.approx(26, abs=6)
+
+
+def test_no_pixel_pretends_to_have_been_measured(prepared):
+    assert all(not bool(view.lidar_depth_m.any()) for view in prepared.views)
+    assert all(float(view.sky_mask.float().mean()) < 0.05 for view in prepared.views)
+
+
+def test_images_from_one_place_are_one_clear_error():
+    street = ToyStreet()
+    street.sweeps = ()
+    with pytest.raises(SceneError, match="toy/street: no LiDAR, and no depth in the images either"):
+        prepare_observations(street, split_views(street, "all"), ObservationConfig(width_px=120))
+
+
+def test_a_frame_that_no_lidar_swept_takes_its_sky_from_the_nearest():
+    street = ToyStreet()
+    swept = prepare_observations(
+        street, split_views(street, "all"), ObservationConfig(width_px=240)
+    )
+    street.sweeps = tuple(sweep for sweep in street.sweeps if sweep.frame_index != 2)
+    gap = prepare_observations(street, split_views(street, "all"), ObservationConfig(width_px=240))
+    assert not bool(gap.views[2].lidar_depth_m.any())
+    differs = gap.views[2].sky_mask != swept.views[2].sky_mask
+    assert float(differs.float().mean()) < 0.02
+    assert bool(swept.views[2].sky_mask.any())
+    assert torch.equal(gap.views[1].lidar_depth_m, swept.views[1].lidar_depth_m)

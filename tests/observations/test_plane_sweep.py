@@ -1,0 +1,26 @@
+import torch
+from wall_images import image_of_wall, sideways_cameras
+
+from lidarpainter_models.observations.plane_sweep import choose_depth, sweep_cost, sweep_depths
+
+
+def test_sweep_finds_the_depth_of_a_wall():
+    cameras = sideways_cameras()
+    images = [image_of_wall(camera, 10.0) for camera in cameras]
+    depths_m = sweep_depths(4.0, 100.0, 25)
+    others = list(zip(cameras[1:], images[1:], strict=True))
+    cost = sweep_cost(cameras[0], images[0], others, depths_m)
+    unknown = torch.full(images[0].shape[:2], 100.0)
+    found = choose_depth(cost, depths_m, unknown, prior=0.0)[16:-16, 16:-32]
+    nearest = depths_m[(depths_m - 10.0).abs().argmin()]
+    assert float((found == nearest).float().mean()) > 0.9
+
+
+def test_without_texture_the_surroundings_decide():
+    cameras = sideways_cameras()
+    plain = torch.full((64, 96, 3), 0.5)
+    depths_m = sweep_depths(4.0, 100.0, 25)
+    cost = sweep_cost(cameras[0], plain, [(cameras[1], plain)], depths_m)
+    expected_m = torch.full((64, 96), 20.0)
+    found = choose_depth(cost, depths_m, expected_m, prior=0.03)[20:-20, 30:-30]
+    assert float((found - 20.0).abs().max()) < 3.0
