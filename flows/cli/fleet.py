@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from flows.fleet.manifest import Manifest
 
 NOT_OVER = 2
+TOLD_APART_BY = ("configuration", "cameras", "fit_seed")
+"""Shown of sequences where not all of a fleet have the same."""
 MOST_WORKERS = 150
 """Beyond 200 flow runs that wait, Prefect's queues starve (its issue 19403)."""
 Fleet = Annotated[
@@ -225,8 +227,10 @@ def _show(status: dict[str, Any], *, as_json: bool) -> None:
     if as_json:
         print_json(status)
         return
-    columns = ("scene", "state", "seconds", "attempts", "run_id", "reason")
-    cells = [[one[name] for name in columns] for one in status["sequences"]]
+    rows = status["sequences"]
+    apart = [name for name in TOLD_APART_BY if len({str(one[name]) for one in rows}) > 1]
+    columns = ["scene", *apart, "state", "seconds", "attempts", "run_id", "reason"]
+    cells = [[_in_words(one[name]) for name in columns] for one in rows]
     counts = ", ".join(f"{count} {state}" for state, count in status["counts"].items())
     error = status["planner_error"]
     notes = [
@@ -234,7 +238,18 @@ def _show(status: dict[str, Any], *, as_json: bool) -> None:
         *([f"held back: {status['held_back']}"] if status["held_back"] else []),
         *([] if error is None else [f"the planner was off by {error:.0%} (median)"]),
     ]
-    print_table(f"fleet {status['fleet']}", columns, cells, "\n".join(notes), num_text_columns=2)
+    num_text_columns = 2 + len(apart)
+    print_table(
+        f"fleet {status['fleet']}",
+        columns,
+        cells,
+        "\n".join(notes),
+        num_text_columns=num_text_columns,
+    )
+
+
+def _in_words(value: Any) -> Any:  # noqa: ANN401 - any cell
+    return ", ".join(value) if isinstance(value, list) else value
 
 
 def _show_scenes(fleet: str, state: str, scenes: list[str], *, as_json: bool) -> None:

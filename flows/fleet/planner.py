@@ -133,9 +133,12 @@ class Planner:
             drawn_pixels = street.num_frames * len(street.cameras) * float(street.width_px) ** 2
         elif not is_stored:
             read_views = views
+        width_px = parameters.observation.width_px
+        if asked.seed is not None:
+            width_px = min(width_px, asked.street.width_px)  # images are never enlarged
         return Effort(
             views=views,
-            view_pixels=float(parameters.observation.width_px) ** 2,
+            view_pixels=float(width_px) ** 2,
             steps=parameters.fit.most_steps(views)
             + parameters.rounds * parameters.refine.most_steps(views),
             painted_views=views * parameters.rounds if paints else 0.0,

@@ -125,3 +125,8 @@ def test_a_fleet_on_a_busy_machine_is_predicted_by_its_end(seed):
         wall = (own + compiling) * generator.uniform(1.0, 4.0)
         attempts.append({**true, **took, "seconds": wall, "predicted_cpu_seconds": predicted})
     assert planner_error(attempts) < 0.25  # the bound of a fleet of fifteen
+
+
+def test_a_street_drawn_narrower_than_it_may_be_seen_is_counted_as_drawn():
+    narrow = street().model_copy(update={"settings": ()})
+    assert Planner([], []).effort(narrow).view_pixels == 320**2

@@ -263,3 +263,12 @@ def test_a_fault_of_the_manifest_leaves_no_store(tmp_path, monkeypatch):
     answer = call("fleet", "run", tmp_path / "absent.toml")
     assert (answer.code, answer.err.count("\n")) == (2, 1)
     assert not (tmp_path / "store").exists()
+
+
+def test_sequences_of_one_scene_are_told_apart(stubbed, tmp_path):
+    path = write_stub_manifest(tmp_path, sequences=1)
+    assert "fit_seed" not in stubbed("run", path).out
+    path.write_text("fit_seeds = [0, 7]\n" + path.read_text())
+    said = stubbed("run", path).out
+    assert "fit_seed" in said
+    assert "cameras" not in said
