@@ -182,12 +182,8 @@ class ArtefactStore:
         """The artefact of a recipe, made now if nobody made it before.
 
         Of several processes that ask at once, one computes and the others wait for it; where it
-        dies, the next one takes over, with the scratch folder as it was left.
-
-        Args:
-            recipe: what to make.
-            build: makes it.
-            on_wait: called once with the other process's id if there is one to wait for.
+        dies, the next one takes over, with the scratch folder as it was left. `on_wait` is told the
+        id of a process that must be waited for.
 
         Returns:
             The artefact, and whether this call computed it.

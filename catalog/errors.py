@@ -63,9 +63,6 @@ def storage_errors(doing: str) -> Iterator[None]:
 
     Writers in Rust (safetensors, Delta) report a full disk only in their text, as `(os error 28)`
     or `Os { code: 28, ...`, so that is read too.
-
-    Args:
-        doing: what was being done and where, for the message.
     """
     try:
         yield

@@ -100,9 +100,8 @@ class FleetLedger:
     def ask(self, wishes: Sequence[Wish], *, accept_stale: bool = False) -> None:
         """Enter what a manifest asks for; what is done as asked stays done.
 
-        Args:
-            wishes: all of one fleet; what it no longer asks for is forgotten, but not its attempts.
-            accept_stale: leave what was done by other code as it is.
+        What is no longer among the wishes is forgotten, but not its attempts; `accept_stale` leaves
+        what was done by other code as it is.
         """
         fleet = wishes[0].fleet
         known = {r["sequence_id"]: r for r in self.store.tables.rows(TABLE) if r["fleet"] == fleet}
@@ -126,12 +125,7 @@ class FleetLedger:
             tables.delete(TABLE, "sequence_id", dropped)
 
     def take(self, row: Row, facts: Mapping[str, Any]) -> Lease | None:
-        """Begin to work on a sequence that waits, or None if somebody else does or has.
-
-        Args:
-            row: as it was read, perhaps some time ago.
-            facts: what others may know of the work.
-        """
+        """Begin to work on a sequence that waits, or None if somebody else does or has."""
         named = {"fleet": row["fleet"], "scene_id": row["scene_id"], **facts}
         lease = self.leases.take(row["sequence_id"], above=row["fence"], facts=named)
         if lease is None:
@@ -159,8 +153,7 @@ class FleetLedger:
     def reconcile(self, why: Ending | None = None) -> list[str]:
         """Enter the end of every attempt whose worker is gone; returns a line for each.
 
-        Args:
-            why: it is gone, where that is known; else it counts as killed.
+        Where it is not known `why` it is gone, it counts as killed.
         """
         ended = []
         for lease in self.leases.held():

@@ -197,10 +197,7 @@ class Leases:
     def take(self, name: str, *, above: int, facts: dict[str, Any]) -> Lease | None:
         """Begin to work on something, or None if it is in anybody's hands, expired ones too.
 
-        Args:
-            name: of the work.
-            above: the highest fencing number that is known of it.
-            facts: what others may know of it.
+        `above` is the highest fencing number that is known of it; others may read the `facts`.
         """
         now = self._now()
         lease = Lease(

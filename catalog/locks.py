@@ -21,9 +21,7 @@ POLL_S = 0.2
 def held_lock(path: Path, *, on_wait: Callable[[str], None] | None = None) -> Iterator[bool]:
     """Hold the lock while the block runs; wait for as long as another process holds it.
 
-    Args:
-        path: the lock file, made if absent.
-        on_wait: called once, with the holder's process id as text, when the lock is taken.
+    `on_wait` is told the holder's process id, once.
 
     Yields:
         Whether another holder had to be waited for.

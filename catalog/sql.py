@@ -80,10 +80,7 @@ class CatalogSql:
     ) -> Answer:
         """Answer one SELECT.
 
-        Args:
-            sql: one statement that only reads.
-            parameters: values of its `$name`s.
-            most_rows: rows that are wanted at most.
+        `parameters` are the values of its `$name`s.
 
         Raises:
             CatalogError: it is no such statement, or it takes more than it may.

@@ -148,10 +148,7 @@ class CatalogTables:
     ) -> pa.Table:
         """A table as Arrow, with exactly the columns of its schema.
 
-        Args:
-            table: its name.
-            columns: only these; none means all.
-            as_of: its version, or the time at which it stood so; None means now.
+        No columns mean all; `as_of` is a version or a moment, None means now.
 
         Raises:
             UnknownRecordError: there is no such version, or its files were vacuumed.

@@ -16,10 +16,6 @@ def publish_run(store: Store, run: str) -> dict[str, Any]:
 
     The same run again changes nothing.
 
-    Args:
-        store: where the run is.
-        run: a run id, a unique prefix of one, or `latest`.
-
     Returns:
         What `--json` prints.
 

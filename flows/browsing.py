@@ -26,12 +26,7 @@ def view_run(
 ) -> None:
     """Show a run in a browser on this machine until stopped.
 
-    Args:
-        store: where the run is.
-        path: which run, and whose camera is followed.
-        port: to listen on; None takes a free one.
-        opened_at: is told the address.
-        stopped: ends it.
+    Without a `port` a free one is taken; `opened_at` is told the address.
     """
     finished = open_run(store, path.run)
     run = view_parameters(finished).run_spec(store.address)

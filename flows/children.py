@@ -22,10 +22,7 @@ def start_child(
 ) -> subprocess.Popen[bytes]:
     """Start the interpreter with some arguments, for as long as this process lives.
 
-    Args:
-        arguments: such as `-m` and a module.
-        log: descriptor of a file for what it has to say.
-        environment: all of its own.
+    `log` is the descriptor of a file for what it has to say; `environment` is all of its own.
     """
     return subprocess.Popen(  # noqa: S603 - our own interpreter and arguments
         [sys.executable, "-c", LAUNCHER, str(os.getpid()), *arguments],

@@ -37,11 +37,7 @@ def demo(
 ) -> dict[str, Any]:
     """Make the street, then reconstruct it.
 
-    Args:
-        street: what is drawn.
-        parameters: how it is reconstructed.
-        store_path: where both are kept.
-        first_image: file for what the first camera sees at first, long before the rest is done.
+    `first_image` shows what the first camera sees at first, long before the rest is done.
     """
     if first_image is not None:
         write_png(_first_view(street), first_image)

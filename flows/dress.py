@@ -18,11 +18,7 @@ STYLE = "style"
 def dress_run(store: Store, run: str, mix: StyleMix, *, seed: int) -> dict[str, Any]:
     """Derive a run in a style, or recall the one that was; see `flows.derive`.
 
-    Args:
-        store: where the run is.
-        run: a run id, a unique prefix of one, or `latest`.
-        mix: the styles.
-        seed: decides which windows are lit and where puddles stand.
+    The seed decides which windows are lit and where puddles stand.
     """
     source = open_run(store, run)
     recorded = open_scene(store, source.scene_id)

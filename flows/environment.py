@@ -31,8 +31,7 @@ CPU_LIMIT = Path("/sys/fs/cgroup/cpu.max")
 def prepare_environment(*, log_level: str | None = "CRITICAL") -> None:
     """Set what Prefect, OpenMP and numba read at import, and keep freed memory.
 
-    Args:
-        log_level: from which level on Prefect shows its log lines; None leaves it to Prefect.
+    Without a `log_level` Prefect decides which of its log lines are shown.
     """
     threads = str(usable_cores())
     counts = {"NUMBA_NUM_THREADS": threads, "OMP_NUM_THREADS": threads}

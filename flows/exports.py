@@ -49,11 +49,7 @@ def export_request(
 ) -> ExportRequest:
     """Put a request together.
 
-    Args:
-        wanted: one of `FORMATS`.
-        scene: fields of a `SceneRequest` that were asked for, without its format.
-        path: which run, and where to look from.
-        fps: of a film.
+    `scene` holds the fields of a `SceneRequest` that were asked for, but its format.
 
     Raises:
         ConfigError: no such format or version, or an option that the format has no use for.
@@ -104,13 +100,7 @@ def _options_of(wanted: str) -> tuple[str, ...]:
 
 
 def export_run(store: Store, request: ExportRequest, out: Path) -> dict[str, Any]:
-    """Write a run in one format.
-
-    Args:
-        store: where the run is.
-        request: what is wanted.
-        out: the file, or a new folder.
-    """
+    """Write a run in one format."""
     finished = open_run(store, request.path.run)
     run = view_parameters(finished).run_spec(store.address, painter=request.path.painter)
     made = _export(store, request, finished, run, out)

@@ -15,10 +15,8 @@ Parameters = TypeVar("Parameters", bound=BaseModel)
 def with_overrides(parameters: Parameters, assignments: Sequence[str]) -> Parameters:
     """The same parameters with some settings changed, each checked against its type.
 
-    Args:
-        parameters: a model whose fields may be config dataclasses, at any depth.
-        assignments: `path=value`; the value is JSON, or plain text, or values with commas
-            between for a sequence.
+    An assignment is `path=value`; the value is JSON, or plain text, or values with commas between
+    for a sequence.
 
     Raises:
         ConfigError: no such setting, or a value that does not fit it.

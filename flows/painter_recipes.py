@@ -14,10 +14,8 @@ from lidarpainter_models.painter.training_jobs import PainterTraining, recipe_fo
 def started_at(base: str | None, start: Path | None, lpips: LpipsFiles) -> dict[str, Any]:
     """What is trained and where it starts, as parameters; the small painter unless said.
 
-    Args:
-        base: a model for the one-step painter, with a preset after a colon.
-        start: weights to go on from, of either painter.
-        lpips: for the loss of the one-step painter.
+    `base` is a model for the one-step painter, with a preset after a colon; `start` holds weights
+    of either painter to go on from.
 
     Raises:
         ConfigError: both a model and weights, or no such preset.

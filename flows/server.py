@@ -42,9 +42,6 @@ SERVICES = (
 def prefect_server(log_path: Path) -> Iterator[None]:
     """Run the block against the user's Prefect API, or against a server of its own.
 
-    Args:
-        log_path: file for what a server of its own has to say.
-
     Raises:
         RuntimeError: the server does not start.
     """

@@ -182,10 +182,7 @@ def training_cost(result: StageResult) -> dict[str, Any]:
 def write_painter(weights: Path, record: dict[str, Any], out: Path) -> dict[str, str]:
     """Copy a painter out of the store; returns where its two files are.
 
-    Args:
-        weights: the file in the store.
-        record: how it was trained.
-        out: a folder, or a `.safetensors` file beside which the record goes.
+    `out` is a folder, or a `.safetensors` file beside which the record goes.
 
     Raises:
         WriteError: the disk refuses.

@@ -49,16 +49,7 @@ def render_run(
     sequence: SequenceConfig,
     kinds: ViewKinds,
 ) -> dict[str, Any]:
-    """Render a finished run where nobody drove.
-
-    Args:
-        store: where the run is.
-        path: where to look from.
-        out: folder for the images.
-        prompt: what a painter that was trained for styles is asked for.
-        sequence: what becomes of the image painted before.
-        kinds: which files are written.
-    """
+    """Render a finished run where nobody drove."""
     finished = open_run(store, path.run)
     run = view_parameters(finished).run_spec(store.address, painter=path.painter)
     request = render_request(store, finished, path, kinds)
@@ -131,14 +122,7 @@ def stylize_run(
 ) -> dict[str, Any]:
     """Show a finished run in another weather or at night, and how well its edges are kept.
 
-    Args:
-        store: where the run is.
-        path: where to look from.
-        out: folder for the images.
-        mix: the styles.
-        images: whether renders are styled, or what the camera recorded.
-        width_px: of the images, at most as recorded; None takes that of the fit.
-        seed: decides lit windows, drops and noise.
+    Without a `width_px` that of the fit is taken; the seed decides lit windows, drops and noise.
 
     Raises:
         ConfigError: images wider than recorded.

@@ -55,10 +55,7 @@ def chosen_device(name: Device) -> "torch.device":
 def within_memory(work: Callable[[bool], Made], device: "torch.device", what: str) -> Made:
     """Do some work; where its device's memory runs out, once more and sparingly.
 
-    Args:
-        work: told whether to spare memory.
-        device: where it runs.
-        what: names the work in the error, with what takes less.
+    `work` is told whether to spare memory; `what` names it in the error, with what takes less.
 
     Raises:
         DeviceMemoryError: even the second try did not fit.

@@ -33,11 +33,7 @@ class Finding:
 
 
 def check_environment(store_path: Path) -> list[Finding]:
-    """Check everything a reconstruction needs here.
-
-    Args:
-        store_path: folder of the store, which must be writable and have room.
-    """
+    """Check everything a reconstruction needs here."""
     packages: list[Callable[[], Finding]] = [
         _python,
         *(_package_check(name) for name in REQUIRED),

@@ -65,15 +65,8 @@ def run_stage(
 ) -> StageResult:
     """Produce the artefact of a stage, or take the one that is there, and catalogue it.
 
-    Args:
-        store: where it is kept.
-        stage: its name for the listener.
-        kind: its kind for the catalog.
-        inputs: digest of every input, by the part it plays.
-        config: every setting that its content depends on.
-        build: a function of a module, or a `partial` of one, that writes the files and tells how
-            far it is.
-        kernels: with which it is built; what is made by another choice has a key of its own.
+    `inputs` are digests by the part they play. `build`, a function of a module or a `partial` of
+    one, writes the files. What other `kernels` make has a key of its own.
 
     Raises:
         IdentityError: the code that `build` runs cannot be found from the source.

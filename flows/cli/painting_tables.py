@@ -33,9 +33,7 @@ def painting_rows(
 ) -> list[list[Cell]]:
     """A row for the render, one for the mean of the warps, and one per painter.
 
-    Args:
-        scores: those of every painter, by label.
-        source: the set of pairs to show; None for all together.
+    `source` is the set of pairs to show, None all together.
     """
     found = {
         label: one["total"] if source is None else one["sources"][source]

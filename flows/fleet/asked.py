@@ -108,11 +108,7 @@ class Asked(BaseModel):
 
 
 def wishes(manifest: Manifest, folder: Path) -> list[Wish]:
-    """What a manifest asks for, as the catalog keeps it.
-
-    Args:
-        manifest: that was read.
-        folder: that relative roots count from.
+    """What a manifest asks for, as the catalog keeps it; relative roots count from `folder`.
 
     Raises:
         ConfigError: a variant is no style, or a source asks for what is not there or cannot be;

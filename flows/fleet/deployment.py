@@ -27,11 +27,8 @@ MODULE = "flows.fleet.deployed"
 def deploy(name: str, parameters: dict[str, Any], *, pool: str, cron: str | None) -> dict[str, Any]:
     """Make or update the pool and the deployments of a fleet; without a schedule, fire once.
 
-    Args:
-        name: of the fleet.
-        parameters: of its firings, see `deployed.fleet`.
-        pool: of type process; made if it is not there.
-        cron: when it fires, in UTC.
+    `parameters` are those of `deployed.fleet`; the pool is of type process, made if it is not
+    there; `cron` is in UTC.
 
     Returns:
         What `fleet run --deploy --json` prints.

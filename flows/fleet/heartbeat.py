@@ -34,14 +34,9 @@ class Heartbeat:
         on_lost: Callable[[], object],
         on_late: Callable[[], object],
     ) -> None:
-        """Prepare it.
+        """`on_lost` is called in the thread when the lease is no longer this worker's.
 
-        Args:
-            leases: of the store.
-            lease: just taken.
-            limit_s: the longest that the block may take; None lets it.
-            on_lost: called in the thread when the lease is no longer this worker's.
-            on_late: likewise when the block takes longer.
+        `on_late` is called likewise when the block takes longer than `limit_s`, which None allows.
         """
         self.lease = lease
         self.peak_memory_bytes = 0

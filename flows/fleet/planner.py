@@ -91,12 +91,7 @@ class Planner:
     """Predicts from the attempts of one store."""
 
     def __init__(self, attempts: Sequence[Row], scenes: Sequence[Row]) -> None:
-        """Learn.
-
-        Args:
-            attempts: rows of the table.
-            scenes: likewise; whose views are known.
-        """
+        """Learn from rows of the tables, of scenes whose views are known."""
         self._scenes = {row["scene_id"]: row for row in scenes}
         done = [row for row in attempts if row["cause"] == "done" and row["effort"]]
         self._past = sorted(done, key=lambda row: row["ended_at"])[-MOST_ATTEMPTS:]
@@ -200,9 +195,7 @@ def _fitted(
 ) -> Float[np.ndarray, " amounts"]:
     """Non-negative weights whose sums come nearest to the costs, in relative terms.
 
-    Args:
-        amounts: of attempts, oldest first.
-        costs: likewise; what is not known is no larger than 0.
+    Attempts are oldest first; a cost that is not known is 0 or less.
     """
     from scipy.optimize import nnls
 

@@ -19,10 +19,6 @@ TIME = "cpu_seconds"
 def chart_of(points: Sequence[Point], out: Path) -> dict[str, Any]:
     """Draw speed against accuracy.
 
-    Args:
-        points: of `configurations.CHART` or some of them.
-        out: folder of the pictures.
-
     Returns:
         What `chart --json` prints: `points`, `pictures`, and what they say.
     """
@@ -40,11 +36,6 @@ def chart_of(points: Sequence[Point], out: Path) -> dict[str, Any]:
 
 def sizes_of(points: Sequence[Point], factors: Sequence[Factor], out: Path) -> dict[str, Any]:
     """Draw quality against how much of each thing there is.
-
-    Args:
-        points: of the levels of these factors.
-        factors: a picture each.
-        out: folder of the pictures.
 
     Returns:
         What `size --json` prints: `points`, `pictures`, and what they say.

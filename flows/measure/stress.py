@@ -41,13 +41,7 @@ class Trial:
 def trials_of(
     store: Store, scenes: Sequence[str], causes: Sequence[str], num_levels: int
 ) -> list[Trial]:
-    """Spoil scenes by causes, unless they are there.
-
-    Args:
-        store: where they are, and the spoilt ones will be.
-        scenes: to be spoilt.
-        causes: names of `stress.causes.CAUSES`.
-        num_levels: of each cause, from mild on.
+    """Spoil scenes by causes, each at so many levels from mild on, unless they are there.
 
     Raises:
         ConfigError: there is no such cause.
@@ -68,10 +62,7 @@ def trials_of(
 def stress_of(points: Sequence[Point], trials: Sequence[Trial], out: Path) -> dict[str, Any]:
     """Draw every cause with and without painting.
 
-    Args:
-        points: of all trials, and of the scenes as recorded.
-        trials: what was spoilt.
-        out: folder of the pictures.
+    The points are of all trials, and of the scenes as recorded.
 
     Returns:
         What `stress --json` prints: `points`, `pictures`, and what they say.

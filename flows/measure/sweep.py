@@ -51,12 +51,7 @@ def run_sweep(
 ) -> list[Point]:
     """Make the points that are not there yet; returns all.
 
-    Args:
-        sweep: the points.
-        store: where the scenes are, and the points will be.
-        workers: processes, of one thread each.
-        accept_stale: leave what older code has done as it is.
-        say: takes a line of progress.
+    `accept_stale` leaves what older code has done as it is; `say` takes a line of progress.
 
     Raises:
         CatalogError: a point could not be made; the others are done.

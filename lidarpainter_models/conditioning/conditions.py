@@ -144,12 +144,8 @@ class ConditionBuilder:
     ) -> PaintingConditions:
         """Gather what is known about a view.
 
-        Args:
-            camera: Taken as it stands; correct it first if it was recorded.
-            timestamp_ns: When the actors stand where they are drawn.
-            exclude: Training views that must not serve as references.
-            camera_name: Give all images this camera's exposure.
-            prompt: Passed on to the painter.
+        The camera is taken as it stands: correct it first if it was recorded. Views of `exclude`
+        serve as no references; all images take the exposure of `camera_name`.
         """
         render = self.scene.render(camera, timestamp_ns)
         lidar = self.lidar_image(camera, timestamp_ns)

@@ -82,12 +82,8 @@ def novel_cameras(
 ) -> list[NovelCamera]:
     """The training cameras of every n-th training frame, at every shift.
 
-    Args:
-        training_views: Whose cameras are moved.
-        frame_indices: Frames of `world_from_ego`, in order of time.
-        world_from_ego: The path driven, which gives the road's direction.
-        config: Shifts and spacing.
-        start: Training frame counted from, so that another round may paint other frames.
+    `frame_indices` are those of `world_from_ego`, in order of time. Training frames are counted
+    from `start`, so that another round may paint other frames.
 
     Raises:
         ConfigError: a view's frame is not among `frame_indices`, or a camera named in the config
@@ -147,15 +143,7 @@ def paint_novel_views(
     config: NovelGuidanceConfig | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[NovelPainting]:
-    """Paint every view that has room to stand in.
-
-    Args:
-        builder: Gives conditions of the scene as it is now.
-        painter: Repairs the views.
-        cameras: Where from, see `novel_cameras`.
-        config: What becomes of previous frames.
-        progress: Told after each camera how many of how many are done.
-    """
+    """Paint every view that has room to stand in."""
     config = config or NovelGuidanceConfig()
     paintings = []
     paths: dict[tuple[Shift, str], SequencePainter] = {}

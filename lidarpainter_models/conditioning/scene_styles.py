@@ -72,13 +72,8 @@ def styled_scene(
 ) -> GaussianScene:
     """The scene in a style; one that wears another style changes it.
 
-    Args:
-        scene: fitted.
-        seen: what it was fitted to.
-        recorded: the drive; its poses say where the car that recorded was.
-        mix: the styles.
-        seed: decides which windows are lit and where puddles stand.
-        progress: told of every view that was looked at, and of all.
+    The poses of `recorded` say where the car that recorded was; the seed decides which windows are
+    lit and where puddles stand.
     """
     clear = replace(scene, style=None)
     builder = ConditionBuilder(clear, seen.lidar_map, seen.views)

@@ -50,12 +50,8 @@ class SequencePainter:
     ) -> None:
         """Begin a path.
 
-        Args:
-            builder: gives the conditions of the scene.
-            painter: repairs the views.
-            config: what becomes of previous frames.
-            camera_name: whose exposure all images take.
-            prompt: what the painter is asked for.
+        `config` says what becomes of previous frames; all images take the exposure of
+        `camera_name`.
         """
         self._builder = builder
         self._painter = painter

@@ -17,12 +17,7 @@ def style_view(
 ) -> tuple[StyleView, Float[Tensor, "height width"]]:
     """An image of the scene with what styles it, and the LiDAR depth that supports it.
 
-    Args:
-        builder: of the scene.
-        camera: where the image was taken.
-        timestamp_ns: and when.
-        image: rendered, painted or recorded there, in [0, 1].
-        sky_mask: of a recorded image; by default what the Gaussians leave open is sky.
+    `sky_mask` is that of a recorded image; by default what the Gaussians leave open is sky.
 
     Returns:
         The view, its depth that of the render corrected by LiDAR; and camera z in metres where the

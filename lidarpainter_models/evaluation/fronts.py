@@ -47,12 +47,7 @@ class Gain:
 
 
 def paired_gain(ours: Sequence[float], theirs: Sequence[float]) -> Gain:
-    """The mean difference of pairs and its interval (paired t).
-
-    Args:
-        ours: one figure of each pair.
-        theirs: the other, in the same order.
-    """
+    """The mean difference of pairs and its interval (paired t)."""
     difference = Spread.of(np.subtract(ours, theirs).tolist())
     return Gain(
         difference.mean,
@@ -75,11 +70,7 @@ def knee(costs: Sequence[float], qualities: Sequence[float]) -> int:
     """The point of a front that lies farthest above the line between its ends.
 
     Cost counts by its logarithm: twice as much is one step, whatever it was (Satopaa et al.,
-    "Finding a 'Kneedle' in a Haystack", 2011).
-
-    Args:
-        costs: positive, ascending.
-        qualities: likewise ascending.
+    "Finding a 'Kneedle' in a Haystack", 2011). Costs are positive; both ascend.
     """
     across, up = np.log(np.asarray(costs, float)), np.asarray(qualities, float)
     spans = across[-1] - across[0], up[-1] - up[0]

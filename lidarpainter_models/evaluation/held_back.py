@@ -183,12 +183,8 @@ def hold_back(
     """Part the pairs into those to learn from and those to judge by; no target is in both.
 
     Of every folder's targets the same share is held back, chosen by a digest of their names, so
-    neither the order nor the other folders matter.
-
-    Args:
-        folders: pairs by name.
-        share: part of the targets to hold back, in [0, 1).
-        known: targets learnt before: of those held back they judge nothing.
+    neither the order nor the other folders matter. The share is in [0, 1). Targets `known` from
+    before judge nothing if they are held back.
 
     Returns:
         Pairs to learn from and pairs to judge by, by name; empty sets are left out.
@@ -232,10 +228,6 @@ def unseen_pairs(
     folders: Mapping[str, PairFolder], known: Iterable[frozenset[str]]
 ) -> dict[str, PairSubset]:
     """The pairs that no painter was trained on, so that all of them are judged alike.
-
-    Args:
-        folders: pairs by name.
-        known: the targets that each painter was trained on.
 
     Raises:
         DataError: every pair's target was trained on.

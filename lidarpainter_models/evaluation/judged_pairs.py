@@ -75,10 +75,7 @@ def unseen_views(
 ) -> list[RecordedView]:
     """The views of a scene of which no painter was trained on an image, from whatever place.
 
-    Args:
-        views: held-out views.
-        scene_id: `<dataset>/<sequence>`.
-        trained: targets that painters were trained on (`held_back.target_of`).
+    `trained` holds targets that painters were trained on (`held_back.target_of`).
     """
     known = {target_view(target) for target in trained}
     return [view for view in views if (scene_id, view.frame_index, view.camera_name) not in known]

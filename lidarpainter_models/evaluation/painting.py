@@ -119,12 +119,6 @@ def score_painter(
 ) -> PaintingScores:
     """Paint every pair and compare with the truth.
 
-    Args:
-        painter: who paints.
-        sources: pairs by the name their table gets.
-        feature_distance: also compare in feature space.
-        progress: told after each pair how many of how many are done.
-
     Raises:
         DataError: a source without a pair whose target is known anywhere, or a damaged pair.
     """

@@ -43,11 +43,8 @@ class Chart:
 def draw_chart(chart: Chart, cost: str, qualities: Sequence[str], stem: Path) -> list[Path]:
     """Draw qualities over one cost, as SVG and PNG; returns both files.
 
-    Args:
-        chart: what is drawn.
-        cost: figure on the x axis, logarithmic.
-        qualities: a row of panels each; a panel where nobody knows it stays empty.
-        stem: of the files, without suffix.
+    Each quality has a row of panels; a panel where nobody knows it stays empty. `stem` has no
+    suffix.
 
     Raises:
         WriteError: a file cannot be written.
@@ -131,11 +128,8 @@ def draw_lines(
 ) -> list[Path]:
     """Draw small multiples, a panel for each title, as SVG and PNG; returns both files.
 
-    Args:
-        panels: the first line of each is set off.
-        label: of the y axis, which all share.
-        stem: of the files, without suffix.
-        columns: panels in a row.
+    The first line of each panel is set off; all share the label of the y axis. `stem` has no
+    suffix.
 
     Raises:
         WriteError: a file cannot be written.

@@ -87,12 +87,8 @@ def scene_contents(
 ) -> SceneContents:
     """Take a scene apart.
 
-    Args:
-        scene: the fitted scene.
-        name: what it is called.
-        timestamps_ns: when poses are wanted, ascending.
-        actors: ids of those to take along; None takes all.
-        with_sky: whether far Gaussians show the sky.
+    Poses are wanted at `timestamps_ns`, ascending; None takes all actors; `with_sky` shows the sky
+    by far Gaussians.
 
     Raises:
         SceneError: the scene has no such actor.

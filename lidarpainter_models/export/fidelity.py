@@ -40,12 +40,7 @@ def fidelity(
 ) -> Fidelity:
     """Compare at some cameras, all at the time of the export.
 
-    Args:
-        scene: what was exported, in its style.
-        exported_world: what others read of it.
-        timestamp_ns: when actors stand where they do.
-        cameras: where to look from.
-        sky: drawn behind what has no sky of its own; None draws it over black.
+    `exported_world` is what others read of it; without a `sky` it is drawn over black.
     """
     errors = []
     for camera in cameras:

@@ -31,10 +31,8 @@ def write_gallery(
 ) -> int:
     """Write the page and what it shows to a folder; returns how many assets have a picture.
 
-    Args:
-        folder: where it goes; the page is `index.html` there.
-        assets: values by `FIELDS`; others are left out.
-        picture_of: the strip of pictures of an asset, azimuths side by side, each of 4 by 3.
+    Assets are values by `FIELDS`; `picture_of` gives the strip of pictures of one, azimuths side by
+    side, each of 4 by 3.
 
     Raises:
         WriteError: the disk refuses.

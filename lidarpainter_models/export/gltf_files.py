@@ -62,10 +62,7 @@ class _Buffer:
 def write_gltf(path: Path, contents: SceneContents, *, time: int = 0) -> None:
     """Write a scene and how it moves, aside and renamed whole.
 
-    Args:
-        path: ends in .glb.
-        contents: the scene.
-        time: which of its times is shown by readers that play no animation.
+    `time` is which of its times readers show that play no animation.
 
     Raises:
         DataError: the scene is larger than such a file can be.

@@ -69,14 +69,7 @@ class RunPage:
         histories: Mapping[str, Sequence[Mapping[str, float]]],
         machine: Mapping[str, str],
     ) -> Report:
-        """The page, with images and the course of every fit by stage.
-
-        Args:
-            scene: what the run is about.
-            pictures: what is shown of it.
-            histories: of every fit, by stage.
-            machine: names and values of what the page is made on.
-        """
+        """The page, with images and the course of every fit by stage."""
         return Report(
             title=f"LidarPainter: {self.result['scene']}",
             summary=[_scene_in_words(scene), _summary(self.result)],

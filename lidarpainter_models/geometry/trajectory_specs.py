@@ -70,13 +70,8 @@ class Trajectory:
     ) -> Float[Tensor, "moments 4 4"]:
         """`world_from_body` at every moment.
 
-        Args:
-            bodies: where it was.
-            road: the path that gives the road: the ego's for cameras and for itself, an actor's
-                own for the actor.
-            moments: when, and at which poses of the road.
-            path_of: looks actors up.
-            is_camera: the body is one camera: it turns about itself, and looks where the path says.
+        `road` is the ego's path for cameras and for itself, an actor's own for the actor; `path_of`
+        looks actors up. A camera turns about itself, and looks where the path says.
 
         Raises:
             ConfigError: it leads too far out of the ends of the recorded path, or an actor is
@@ -117,11 +112,8 @@ def parse_trajectory(spec: str, *, max_shift_m: float | None = MAX_SHIFT_M) -> T
 
     Lateral is to the left of the driving direction, along is ahead; a turn is counter-clockwise
     seen from above. `lane-change:3.5@2s+3s` begins after two seconds of the log and takes three,
-    the heading following; without times it takes all that is followed, the heading kept.
-
-    Args:
-        spec: what a user wrote.
-        max_shift_m: how far steps may lead off the recorded path; other paths go anywhere.
+    the heading following; without times it takes all that is followed, the heading kept. Steps may
+    lead `max_shift_m` off the recorded path; other paths go anywhere.
 
     Raises:
         ConfigError: the text is no trajectory, or one that leads too far away.

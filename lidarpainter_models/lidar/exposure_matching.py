@@ -22,11 +22,8 @@ _MOST_POINTS = 40_000
 def match_exposure(samples: BestSamples, view_camera: np.ndarray) -> np.ndarray:
     """Gains (views, 3) float32 that bring every view to the exposure of camera 0.
 
-    A camera that shares too few points with those joined to camera 0 keeps gain 1.
-
-    Args:
-        samples: of every point.
-        view_camera: (views,) camera of each view.
+    A camera that shares too few points with those joined to camera 0 keeps gain 1. `view_camera`
+    (views,) is the camera of each view.
     """
     several = np.flatnonzero(samples.weight[:, 1] > 0)
     several = several[:: max(1, len(several) // _MOST_POINTS)]

@@ -42,10 +42,7 @@ def build_lidar_map(
 ) -> LidarMap:
     """Gather the sweeps of some frames into one map, coloured by some images.
 
-    Args:
-        scene: where sweeps, images and tracks are read from.
-        split_frames: frames whose sweeps may be used.
-        colour_views: images that may give colours: those of the training set, no others.
+    `colour_views` are those of the training set, no others.
 
     Raises:
         SceneError: the frames hold no point in range.

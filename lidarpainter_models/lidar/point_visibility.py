@@ -63,13 +63,7 @@ def surface_visibility(
 ) -> Visibility:
     """What a cloud of discs and boxes lets a camera see.
 
-    Args:
-        cells_uv: column and row of each point.
-        depth_m: camera z.
-        radius_px: radius of each point's disc.
-        grid: its pixels are the cells.
-        around: see there.
-        box_m: as `box_far_ends` gives it.
+    The cells are pixels of `grid`; `box_m` is as `box_far_ends` gives it.
     """
     seen = splat_points(
         cells_uv,
@@ -107,9 +101,7 @@ def box_far_ends(
 ) -> Float[Tensor, "rows columns"]:
     """Depth of the far end of the nearest box over each pixel, very far where there is none.
 
-    Args:
-        boxes: `world_from_box` and size of each.
-        camera: its pixels are the cells.
+    Each box is `world_from_box` and its size; the camera's pixels are the cells.
     """
     far_ends = np.full((camera.height_px, camera.width_px), _FAR_M, np.float32)
     if boxes:

@@ -88,9 +88,7 @@ class _Hub:
 def find_faults(scene: DrivingScene, views: Sequence[RecordedView]) -> dict[str, CameraFault]:
     """What is wrong about the cameras of some views, by name; cameras that are sound are left out.
 
-    Args:
-        scene: where images and sweeps are read from.
-        views: those that may be looked at, each camera's in order of time.
+    Views are each camera's in order of time.
     """
     faults = {}
     for name in sorted({view.camera_name for view in views}):
@@ -118,9 +116,7 @@ def believed(found: Found) -> CameraFault | None:
 def measured_faults(scene: DrivingScene, views: Sequence[RecordedView]) -> Found | None:
     """The parameters of one camera under which its images agree; a told readout is kept.
 
-    Args:
-        scene: where images and sweeps are read from.
-        views: of one camera, in order of time.
+    Views are in order of time.
 
     Returns:
         None where too little is seen: three images or fewer, coarse ones, or a car that stands.

@@ -52,13 +52,8 @@ def rim_samples(
 
     On the rim of a surface a small error of pose takes the colour of what is beside it. Where the
     colour there is more like that beyond the rim than like that of the nearest inner cell, the
-    inner one is taken.
-
-    Args:
-        levels: the image.
-        points: those that nothing hides.
-        visibility: what stands around.
-        cells_per_pixel: of the grid, in u and v.
+    inner one is taken. `points` are those that nothing hides; `cells_per_pixel` is of the grid, in
+    u and v.
     """
     rgb = levels.sample(points.pixels_uv)
     trust = torch.ones_like(points.depth_m)

@@ -38,10 +38,7 @@ def sky_mask(
 ) -> Bool[Tensor, "height width"]:
     """Sky in a recorded image.
 
-    Args:
-        rgb_u8: the image.
-        points_world: LiDAR points of the same frame.
-        camera: on the same grid as the image.
+    The points are of the same frame; the camera is on the same grid as the image.
     """
     pixels_uv, depth_m = camera.project(points_world)
     column, row = pixels_uv[camera.contains(pixels_uv, depth_m)].long().unbind(-1)
@@ -57,10 +54,7 @@ def sky_from_returns(
 ) -> Bool[Tensor, "height width"]:
     """Sky in an image whose LiDAR returns are known.
 
-    Args:
-        rgb_u8: the image.
-        has_return: pixels that a LiDAR point falls into.
-        camera: on the same grid; the world's z is up.
+    The camera is on the same grid; the world's z is up.
 
     Raises:
         ShapeError: image, returns and camera differ in size.

@@ -39,11 +39,8 @@ def prepare_observations(
 ) -> SceneObservations:
     """Prepare what a fit on the split's training views needs, faults of the recording corrected.
 
-    Args:
-        scene: where it is read from.
-        split: its training views give images, its training frames give sweeps.
-        config: see there.
-        progress: told how many parts of how many are done: the views, and the colours of the map.
+    The split's training views give images, its training frames give sweeps. `progress` counts the
+    views, and the colours of the map.
 
     Raises:
         SceneError: the split has no training views.

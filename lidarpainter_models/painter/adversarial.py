@@ -123,11 +123,7 @@ def discriminator_loss(
 ) -> DiscriminatorLoss:
     """Hinge and gradient penalty; the painter gets no gradient from it.
 
-    Args:
-        discriminator: who judges.
-        true: true images.
-        painted: painted ones.
-        penalty_weight: gamma of R1, half of which counts; 0 saves its second backward pass.
+    `penalty_weight` is gamma of R1, half of which counts; 0 saves its second backward pass.
     """
     hinge = discriminator_hinge_loss(discriminator(true), discriminator(painted.detach()))
     penalty = hinge.new_zeros(())

@@ -91,14 +91,7 @@ def draw_batch(
 ) -> TrainingBatch:
     """Draw windows from the sources, each source by its share, and vary them.
 
-    Args:
-        sources: sets of pairs.
-        source_shares: how likely each is.
-        batch_size: samples.
-        num_warps: warps of each.
-        prompts: the first restores; the others are styles that targets are put into.
-        config: see there.
-        generator: decides everything.
+    The first prompt restores; the others are styles that targets are put into.
     """
     shares = torch.tensor(source_shares, dtype=torch.float64)
     pairs = []

@@ -36,10 +36,8 @@ def input_hull(
 ) -> InputHull:
     """The hull of render, LiDAR hits and valid warps around every pixel.
 
-    Args:
-        conditions: what is known about a view.
-        inputs: those that count beside the render, of `lidar`, `warp` and `reference`.
-        margin: added on both sides.
+    `inputs` are those that count beside the render, of `lidar`, `warp` and `reference`; the margin
+    is added on both sides.
     """
     render = conditions.render_rgb.permute(2, 0, 1).contiguous()
     lower = upper = render

@@ -108,9 +108,7 @@ class PainterChoice:
     def load(self, device: torch.device, precision: torch.dtype | None = None) -> Painter:
         """The painter; whoever asks for the same one again gets the one that is in memory.
 
-        Args:
-            device: where it paints.
-            precision: of a learned painter; None takes what the device computes faster.
+        The default precision is the one that the device computes faster.
 
         Raises:
             WeightsError: weights are missing, damaged, or do not belong together.

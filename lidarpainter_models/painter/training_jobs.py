@@ -32,13 +32,8 @@ def job_for(
 ) -> TrainingJob:
     """The job of a recipe; what it needs is checked, and not yet read whole.
 
-    Args:
-        config: the recipe.
-        start: for the small painter weights to go on from, or None; for the one-step painter its
-            model or weights to go on from.
-        lpips: weights for the loss of the one-step painter.
-        device: where the one-step painter is trained in one process; the small one takes the CPU.
-        num_processes: in which the one-step painter is trained.
+    The start is weights to go on from, or for the one-step painter its model. The device is that of
+    a one-step painter in one process; the small one takes the CPU.
 
     Raises:
         ConfigError: the one-step painter has no model, its loss lacks what it weighs, several

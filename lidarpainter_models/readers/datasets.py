@@ -78,12 +78,8 @@ def open_log(
 ) -> SourceLog:
     """Open one sequence of a dataset.
 
-    Args:
-        dataset: one of `known_datasets`.
-        root: the folder as downloaded.
-        sequence: one of `list_sequences`.
-        frames: which frames to take, by position; all of them if None.
-        cameras: which cameras to take, by name; all of them if None.
+    The root is the folder as downloaded. Frames are taken by position, cameras by name; None takes
+    all.
 
     Raises:
         DataError: the dataset is not known, or the log is missing something, damaged or senseless.

@@ -77,9 +77,7 @@ class DrivingScene:
     def open(cls, path: Path, fetch: Fetch | None = None) -> "DrivingScene":
         """Open the scene at a path.
 
-        Args:
-            path: its folder.
-            fetch: brings files there before they are read; None if all are there.
+        `fetch` brings files there before they are read; None if all are there.
 
         Raises:
             SceneError: there is no scene, or it is incomplete or damaged.

@@ -39,9 +39,7 @@ def twists_per_s(
 ) -> Float[Tensor, "times 6"]:
     """Turn (rad/s) and velocity (m/s) of a camera in its own frame, from its neighbours in time.
 
-    Args:
-        timestamps_ns: ascending.
-        world_from_camera: float64. A single pose does not move.
+    Times ascend. A single pose does not move.
     """
     last = len(timestamps_ns) - 1
     places = torch.arange(last + 1)

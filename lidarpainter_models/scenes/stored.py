@@ -45,9 +45,7 @@ def stored_digest(path: Path) -> str | None:
 def read_manifest(path: Path, *, is_all_here: bool = True) -> dict[str, Any]:
     """The manifest of a scene, after checking that every file it lists is there.
 
-    Args:
-        path: folder of the scene.
-        is_all_here: otherwise files are fetched later, and not looked for.
+    Unless all is here, files are fetched later, and not looked for.
 
     Raises:
         SceneError: there is no scene, it is incomplete, or another version wrote it.

@@ -25,11 +25,7 @@ class Shot:
     jpeg: bytes
 
     def with_pixels(self, change: Callable[[np.ndarray], np.ndarray]) -> "Shot":
-        """The same with other pixels.
-
-        Args:
-            change: takes and returns BGR in [0, 255], float32 (height, width, 3).
-        """
+        """The same with its pixels changed: BGR in [0, 255], float32 (height, width, 3)."""
         bgr = cv2.imdecode(np.frombuffer(self.jpeg, np.uint8), cv2.IMREAD_COLOR)
         if bgr is None:
             raise SceneError(f"an image of camera {self.record.camera_name} cannot be decoded")
@@ -77,8 +73,7 @@ class Frame:
     def moved(self, motion: Float[Tensor, "4 4"]) -> "Frame":
         """The frame as if the car had stood elsewhere: all that it saw moves with it.
 
-        Args:
-            motion: of the world, rigid, float64.
+        The motion is of the world, rigid, float64.
         """
         shots = tuple(
             shot.seen_from(motion @ shot.record.camera.world_from_camera) for shot in self.shots

@@ -33,12 +33,8 @@ def write_spoilt(
 ) -> Path:
     """Write a scene anew with a fault; returns the folder of the new scene.
 
-    Args:
-        scene: as it was recorded.
-        cause: of `causes.CAUSES`.
-        level: one of its own, or another.
-        store: where it is written, as `stress/DATASET-SEQUENCE-CAUSE-LEVEL`.
-        progress: told how many frames of all are done.
+    It is written as `stress/DATASET-SEQUENCE-CAUSE-LEVEL`; the level is one of the cause's own, or
+    another.
 
     Raises:
         ConfigError: there is no such cause.

@@ -48,11 +48,8 @@ def returns_mask(
 ) -> np.ndarray:
     """Which rays come back: bright, near and met head-on ones mostly, through panes seldom.
 
-    Args:
-        range_m: (columns, beams), inf for no hit.
-        surface: (columns, beams, 3): brightness, gloss and cosine of incidence.
-        lidar: its losses.
-        rng: three numbers are drawn per ray.
+    Ranges are (columns, beams), inf for no hit; `surface` (columns, beams, 3) is brightness, gloss
+    and cosine of incidence. Three numbers are drawn per ray.
     """
     bright, gloss, cosine = (surface[..., i].astype(float) for i in range(3))
     energy = (bright + FLOOR_BRIGHTNESS) * np.maximum(cosine, 0.0) ** 0.75

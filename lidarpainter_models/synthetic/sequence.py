@@ -40,11 +40,6 @@ def write_street(
 ) -> Path:
     """Record a street as `<store>/scenes/synthetic/street-<seed>`.
 
-    Args:
-        config: the street, the rig and how well it records.
-        store: where scenes are kept.
-        progress: told after each frame how many of how many are done.
-
     Returns:
         The folder of the scene.
     """

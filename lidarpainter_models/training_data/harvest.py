@@ -83,16 +83,9 @@ def harvest_left_out(
 ) -> int:
     """Judge weak fits at training frames left out of them, and store the pairs.
 
-    A harvest that was killed goes on where it stopped. All poses are those of one long fit to
-    every training view, so that the true image lies exactly over the render.
-
-    Args:
-        scene: the recorded log.
-        split: only its training views and training frames are ever read.
-        plans: the weak fits.
-        writer: where pairs go.
-        config: see there.
-        progress: told after every fit.
+    A harvest that was killed goes on where it stopped. All poses are those of one long fit to every
+    training view, so that the true image lies exactly over the render. Only the split's training
+    views and training frames are ever read.
 
     Returns:
         Number of pairs added.

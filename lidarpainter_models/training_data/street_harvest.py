@@ -57,15 +57,8 @@ def harvest_shifted_street(
     """Fit a street several times and pair shifted renders with the truth.
 
     A harvest that was killed goes on where it stopped: a fit whose pairs are all stored is not
-    repeated.
-
-    Args:
-        street: the world itself, free of noise.
-        scene: its recording, as `write_street` stored it.
-        plans: the fits.
-        writer: where pairs go.
-        config: see there; its reference fit is not used, a street's poses are known.
-        progress: told after every fit.
+    repeated. The scene is its recording, as `write_street` stored it. The config's reference fit is
+    not used, a street's poses are known.
 
     Returns:
         Number of pairs added.

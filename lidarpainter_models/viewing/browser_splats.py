@@ -66,10 +66,8 @@ def recorded_rgb(
 ) -> Float[Tensor, "gaussians 3"]:
     """The colour of every Gaussian, on average over the cameras that have it in their image.
 
-    Args:
-        scene: whose Gaussians.
-        cameras: recorded cameras, each with its time in nanoseconds; where there are many, some
-            of them are taken. A Gaussian that none of them sees keeps its constant colour.
+    Each camera comes with its time in nanoseconds; where there are many, some of them are taken. A
+    Gaussian that none of them sees keeps its constant colour.
     """
     gaussians = scene.gaussians
     total, weight = torch.zeros(len(gaussians), 3), torch.zeros(len(gaussians), 1)

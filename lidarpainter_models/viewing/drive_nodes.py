@@ -84,12 +84,7 @@ class DriveNodes:
             nodes.visible = nodes is self._shown
 
     def place(self, timestamp_ns: int, seat: Camera) -> None:
-        """Show a moment from a seat.
-
-        Args:
-            timestamp_ns: when the actors stand where they are shown.
-            seat: the camera in whose place the browser's viewer sits.
-        """
+        """Show a moment from a seat."""
         self._shown.with_actors = self.with_actors
         self._shown.place(timestamp_ns, seat.centre_world)
         self.tracks.place(self._drive.path.builder.scene.actors.likely_poses(timestamp_ns))

@@ -42,12 +42,8 @@ class SceneNodes:
     ) -> None:
         """Send the scene, its actors where they stand at the first camera's time.
 
-        Args:
-            api: where the nodes go.
-            root: name of the node above all others.
-            scene: what is shown.
-            cameras: recorded cameras with their times, in whose colours it is shown.
-            camera_name: whose exposure it takes, as at the first of these times.
+        Recorded cameras come with their times; the scene is shown in their colours, with the
+        exposure of `camera_name` at the first of these times.
         """
         self._scene = scene
         self._root = api.add_frame(root, show_axes=False)

@@ -25,9 +25,7 @@ class LocalServer(viser.ViserServer):
 def local_server(*, label: str = "", port: int | None = None) -> Iterator[LocalServer]:
     """A server for as long as the block runs.
 
-    Args:
-        label: title of its panel.
-        port: the port to listen on; 0 takes any, None the first free one from `FIRST_PORT` on.
+    Port 0 takes any, None the first free one from `FIRST_PORT` on.
 
     Raises:
         ConfigError: the port is in use or not allowed.

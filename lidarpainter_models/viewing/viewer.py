@@ -58,10 +58,7 @@ class LiveViewer:
     ) -> None:
         """Send the drive's first moment, and answer the panel from now on.
 
-        Args:
-            server: where it is shown.
-            drive: what is shown.
-            painting: who paints the own renderer's images if asked; None never paints.
+        Without `painting` the own renderer's images are never painted.
         """
         self._server, self._drive, self._painting = server, drive, painting
         self._lock = threading.RLock()

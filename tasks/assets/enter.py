@@ -32,14 +32,7 @@ LEAST_ID_LENGTH = 16
 def enter_published(
     store: Store, run: FinishedRun, published: StageResult, style: str | None
 ) -> list[str]:
-    """Enter the sightings of a published run; returns the ids of their assets.
-
-    Args:
-        store: where both are.
-        run: that was published.
-        published: its artefact.
-        style: the words of the style that it is in, or None.
-    """
+    """Enter the sightings of a published run; returns the ids of their assets."""
     scene = open_scene(store, run.scene_id)
     manifest = store.artefacts.manifest(published.ref)
     same = {

@@ -30,12 +30,7 @@ def evaluate_flicker(
 ) -> StageResult:
     """Compare neighbouring frames of the first trained camera at every judged shift.
 
-    Args:
-        run: whose painter paints; all frames of its camera are looked at.
-        stage: its name for the listener.
-        fitted: what is rendered.
-        config: the shifts, and how conditions are gathered.
-        previous: what else may become of the frame painted before.
+    `previous` says what else may become of the frame painted before.
     """
     this = opened(run)
     shifts = config.scoring.shifts

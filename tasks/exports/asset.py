@@ -29,12 +29,6 @@ AssetFormat = Literal["ply", "spz", "gltf"]
 def export_asset(store: Store, asset: Row, format_: AssetFormat, out: Path) -> dict[str, Any]:
     """Write an actor or a block of street in its own frame.
 
-    Args:
-        store: where its files are.
-        asset: its row.
-        format_: what is written.
-        out: the file.
-
     Raises:
         ConfigError: the name ends otherwise, or the asset is a sky or a trajectory.
         CatalogError: its files are gone.

@@ -24,11 +24,8 @@ TRIAL_FRAMES = slice(0, 6)
 def check_stored_scene(store: Store, scene_id: str, out: Path | None) -> list[Finding]:
     """Check a scene of the store; writes an overlay image and all findings as JSON.
 
-    Args:
-        store: where the scene is.
-        scene_id: `<dataset>/<sequence>`.
-        out: file or folder of the overlay image; by default in the store's folder `doctor`. The
-            JSON lies beside it under the same name.
+    `out` is a file or folder for the overlay image, by default the store's folder `doctor`; the
+    JSON lies beside it under the same name.
     """
     scene = open_scene(store, scene_id)
     path = out or store.root / "doctor" / scene.dataset / f"{scene.sequence}.png"
@@ -40,11 +37,7 @@ def check_stored_scene(store: Store, scene_id: str, out: Path | None) -> list[Fi
 def check_dataset(store: Store, dataset: str, root: Path, out: Path | None) -> list[Finding]:
     """Check the first frames of every sequence of a dataset, read into a folder then removed.
 
-    Args:
-        store: the overlay images and JSON files go to its folder `doctor`.
-        dataset: name of the reader.
-        root: the dataset's folder, as downloaded.
-        out: another folder for them.
+    Overlay images and JSON files go to `out`, by default to the store's folder `doctor`.
     """
     findings = []
     for sequence in find_sequences(dataset, root):

@@ -70,12 +70,8 @@ def ingest_sequences(
 ) -> Ingested:
     """Ingest sequences, `jobs` of them at once in processes of their own.
 
-    Args:
-        request: what to read.
-        names: the sequences.
-        jobs: with 1, everything happens in this process.
-        again: read even what is done.
-        on_failure: told the one-line error of each sequence that fails.
+    A single job reads in this process; `again` reads even what is done; `on_failure` is told the
+    one-line error of each sequence that fails.
 
     Raises:
         LidarPainterError: the only sequence asked for failed.

@@ -47,14 +47,9 @@ def judge_painters(
 ) -> dict[str, Any]:
     """Scores of several painters on the same pairs, those left out that any was trained on.
 
-    Args:
-        painters: names or weights files of painters, by what tables call them.
-        sets: the pairs.
-        fits: runs whose held-out views are judged as pairs too.
-        feature_weights: SqueezeNet 1.1, for the feature distance.
-        keep_below: judge the small painter a second time, leaving tiles unpainted on which all that
-            is known differs by less than this.
-        device: where they paint.
+    Painters are names or weights files by what tables call them. Held-out views of the `fits` are
+    judged as pairs too. With `keep_below` the small painter is judged a second time, leaving tiles
+    unpainted on which all that is known differs by less than this.
 
     Returns:
         `painters`: scores by label; `pairs`: how many of every set were judged and left out;

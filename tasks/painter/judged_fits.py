@@ -32,11 +32,7 @@ class JudgedFit:
     settings: JudgeConfig
 
     def open(self, trained: AbstractSet[str]) -> "OpenedFit":
-        """Its pairs, by scene and trajectory, without frames that painters were trained on.
-
-        Args:
-            trained: targets that painters were trained on.
-        """
+        """Its pairs, by scene and trajectory, without frames that painters were trained on."""
         store = open_store(self.store_path)
         recorded, views = open_split(store, self.split)
         unseen = unseen_views(views.test, self.split.scene_id, trained)

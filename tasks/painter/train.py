@@ -65,13 +65,7 @@ def _tell(progress: Progress, training: TrainingProgress) -> None:
 def publish_painter(
     store_path: Path, trained: ArtefactRef, scores: dict[str, Any] | None
 ) -> dict[str, Any]:
-    """Enter a painter into the catalog; returns its row.
-
-    Args:
-        store_path: the store.
-        trained: what `train` made.
-        scores: its figures on held-back pairs, if there are any.
-    """
+    """Enter a painter into the catalog; returns its row."""
     store = open_store(store_path)
     weights = weights_path(store, trained)
     manifest = store.artefacts.verified(trained)

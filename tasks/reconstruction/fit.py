@@ -47,14 +47,8 @@ def fit(
 ) -> StageResult:
     """Fit a scene to what was recorded.
 
-    Args:
-        run: whose scene it is.
-        stage: name of this fit.
-        observations: what was recorded.
-        config: see there.
-        start: the fitted scene to go on from; None starts from the LiDAR map.
-        guidance: painted views to go on with; None, for an equally long control, has none.
-        lpips: weights of the perceptual distance that the config may weigh.
+    Without a `start` it begins with the LiDAR map; one that goes on without guidance is the
+    control of one with it.
     """
     this = opened(run)
     weighed = lpips if config.weighs_perceptual else None

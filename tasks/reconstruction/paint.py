@@ -34,13 +34,7 @@ def paint(
 ) -> StageResult:
     """Render shifted views of a fitted scene, paint them and weigh every pixel.
 
-    Args:
-        run: whose recorded path is shifted, and who paints.
-        stage: name of this round's painting.
-        fitted: what is rendered.
-        novel: which views.
-        conditions: what the painter is shown of them.
-        start_frame: training frame counted from, so that rounds paint different frames.
+    Training frames are counted from `start_frame`, so that rounds paint different frames.
     """
     this = opened(run)
     return run_stage(

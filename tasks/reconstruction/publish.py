@@ -31,14 +31,7 @@ def begin_run(
 ) -> RunRecord:
     """Enter a run as running.
 
-    Args:
-        run: what it works on.
-        run_id: its identity; the same run entered again takes the place of the first.
-        source_digest: of the code behind it.
-        preset: name of the preset it started from.
-        parameters: all of them.
-        derived_from: the run that it is changed from, if any.
-        change: what is changed then.
+    The same run entered again takes the place of the first.
     """
     this = opened(run)
     record = RunRecord(
@@ -76,12 +69,8 @@ def complete_run(
 ) -> dict[str, Any]:
     """Enter a finished run and every number of it.
 
-    Args:
-        store_path: the store.
-        record: as it was begun.
-        result: what the command prints, with names relative to the store for paths.
-        scores: evaluations by variant (`unpainted`, `painted`, ...).
-        artefacts: everything made or reused.
+    `result` is what the command prints, with names relative to the store for paths; scores are by
+    variant (`unpainted`, `painted`, ...).
 
     Returns:
         The result, as stored.

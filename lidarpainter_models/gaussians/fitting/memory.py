@@ -81,13 +81,8 @@ def planned_memory(
 ) -> FitMemory:
     """What a fit takes when it has as many Gaussians as it may have and all are in view.
 
-    Args:
-        observations: what it is fitted to.
-        config: see there.
-        sky: texels of its sky.
-        start: Gaussians it goes on from; they may be more than the budget.
-        guidance: painted views.
-        keeps_images: whether images lie on the device, or are sent there one by one.
+    Gaussians of the `start` may be more than the budget; `keeps_images` says whether images lie on
+    the device, or are sent there one by one.
     """
     at_first = config.initialisation.num_gaussians if start is None else len(start)
     degree = config.initialisation.sh_degree if start is None else start.sh_degree

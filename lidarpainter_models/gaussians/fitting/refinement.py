@@ -91,12 +91,7 @@ class Refinement:
         return total
 
     def step(self, step: int, image: FitImage) -> None:
-        """Move the corrections that are refined by the gradients they received; drop these.
-
-        Args:
-            step: of the fit.
-            image: what gave the gradients.
-        """
+        """Move the corrections that are refined by the gradients they received; drop these."""
         if self.refines_cameras(step):
             table = self.scene.cameras.view_tangent
             self.adams["camera_adam"].step(table, _gradient(table), self._rate("camera", step))

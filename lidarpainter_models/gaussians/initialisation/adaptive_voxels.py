@@ -70,12 +70,8 @@ def adaptive_voxels(
 ) -> list[VoxelPoints]:
     """At most `budget` voxels of all clouds, of the smallest size that allows.
 
-    A spacing asks for the same detail on whatever body.
-
-    Args:
-        clouds: one for each body.
-        budget: how many voxels are wanted; fewer come out if the clouds are smaller.
-        most_m: largest edge.
+    A spacing asks for the same detail on whatever body. Fewer come out if the clouds are smaller;
+    `most_m` is the largest edge.
     """
 
     def count(factor: float) -> int:

@@ -62,10 +62,8 @@ def initialise_scene(
 ) -> GaussianScene:
     """Build the first scene of a fit; deterministic.
 
-    Args:
-        observations: what was recorded.
-        config: see there; `num_gaussians` must be given.
-        progress: told which part of the work is done, 0 to 1, as far as that is known.
+    `config.num_gaussians` must be given; `progress` is told which part of the work is done, 0 to 1,
+    as far as that is known.
 
     Raises:
         ConfigError: no LiDAR point lies where a training camera could see it, or no start size.

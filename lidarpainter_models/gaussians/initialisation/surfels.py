@@ -77,12 +77,8 @@ def surfels_from_points(
 ) -> GaussianSet:
     """One flat Gaussian per point, in the points' own frame.
 
-    Args:
-        xyz_m: where.
-        rgb: colours, in [0, 1].
-        body: the body that they belong to.
-        sh_degree: degree of the harmonics, which start at zero but for the constant.
-        most_sigma_m: largest standard deviation of each (lone points have far neighbours).
+    Harmonics start at zero but for the constant; `most_sigma_m` limits the standard deviation of
+    each (lone points have far neighbours).
     """
     count = xyz_m.shape[0]
     if count == 0:

@@ -186,14 +186,8 @@ def _samples(
     """Samples around each query and the weights of the polynomial through them (Lagrange).
 
     Outside the samples, where a polynomial would swing away, it is the line through the last two.
-
-    Args:
-        known_s: the samples' times.
-        count: how many there are, without the one left out.
-        after: how many of them are earlier than the query.
-        query_s: the time asked for.
-        num_points: how many are taken, if there are as many.
-        left_out: a sample that is not taken.
+    `count` is without the one that is `left_out`, `after` says how many are earlier than the query;
+    `num_points` are taken, if there are as many.
     """
     is_end = (after == 0) | (after == count)
     points = torch.where(is_end, _LINE, num_points).minimum(count)

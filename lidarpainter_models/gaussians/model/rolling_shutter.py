@@ -39,12 +39,8 @@ def as_read(
 ) -> AnyGaussians:
     """The Gaussians as the camera's shutter reads them; differentiable in the centres.
 
-    Args:
-        gaussians: in the frames of their bodies.
-        bodies: where these stand before the camera in the middle of the image.
-        camera: one without a rolling shutter gets the Gaussians back as they are.
-        actors: whose bodies they are.
-        timestamp_ns: the middle of the image.
+    Bodies stand before the camera in the middle of the image, at `timestamp_ns`. A camera without a
+    rolling shutter gets the Gaussians back as they are.
     """
     shutter = camera.shutter
     if shutter is None or not shutter.is_rolling:

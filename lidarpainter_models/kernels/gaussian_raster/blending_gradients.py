@@ -266,12 +266,8 @@ def entry_sums(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sums over the pixels of each entry of the tile lists.
 
-    Args:
-        records: from `projection.project`.
-        features: of the Gaussians, float32.
-        lists: from `binning.list_tiles`.
-        drawn: from `blending.blend`.
-        gradients: of the loss with respect to each image; that of `light` is not read.
+    `records` are those of `projection.project`, `lists` of `binning.list_tiles`, `drawn` of
+    `blending.blend`. The gradient of `light` is not read.
 
     Returns:
         Sums in the order of the constants above, `SUMS` numbers for each entry, and those

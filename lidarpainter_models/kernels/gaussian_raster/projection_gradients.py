@@ -308,14 +308,9 @@ def unproject(
 ) -> None:
     """Write, or add to what other views gave, the gradients of everything `project` read.
 
-    Args:
-        gaussians: as they were drawn.
-        view: as they were drawn.
-        records: from `projection.project`.
-        lists: from `binning.list_tiles`.
-        slots: from `blending_gradients.entry_sums`.
-        gradients: room, or the sums so far; the transforms' must be zeros. Every row is written.
-        adds: whether other views came before.
+    `records` are those of `projection.project`, `lists` of `binning.list_tiles`, `slots` of
+    `blending_gradients.entry_sums`. `gradients` is room, or the sums so far if `adds`; the
+    transforms' must be zeros. Every row is written.
     """
     jump = jump_of(CHUNKS)
     for place in numba.prange(CHUNKS):

@@ -60,14 +60,8 @@ def step_rows(
 ) -> None:
     """The next step: move every given row whose gradient is not zero throughout, in place.
 
-    Args:
-        state: moments of all rows.
-        kept: parameters of all rows.
-        rows: those that `seen` holds.
-        seen: the rows as `present_rows` gave them.
-        gradients: what they collected.
-        rates: learning rate of each kind of parameter.
-        backend: which implementation steps.
+    `rows` are those that `seen` holds as `present_rows` gave them; `gradients` is what these
+    collected; each kind of parameter has its rate.
 
     Raises:
         ShapeError: the parameters differ in their number of rows.

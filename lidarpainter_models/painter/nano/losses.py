@@ -79,14 +79,8 @@ def painting_loss(
 ) -> LossTerms:
     """All terms of a batch and `total`, the sum that is minimised.
 
-    Args:
-        output: what the network says.
-        conditions: what it was shown.
-        target: what it should say.
-        target_valid: where that is known.
-        weights: how much each term counts.
-        restyled: views whose target is in another style; they have nothing to keep.
-        sees_render: whether the network was shown the render; the base stands for it otherwise.
+    Views that are `restyled` have a target in another style and nothing to keep. Where the network
+    was not shown the render, the base stands for it.
     """
     kept = target_valid
     if restyled is not None:

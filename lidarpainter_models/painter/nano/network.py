@@ -214,11 +214,7 @@ class NanoNetwork(nn.Module):
     ) -> NanoOutput:
         """Mix the candidates of every view.
 
-        Args:
-            conditions: the views.
-            prompts: one per view.
-            half_precision: run a U-Net of float32 weights in bfloat16; the images stay in
-                float32.
+        `half_precision` runs a U-Net of float32 weights in bfloat16; the images stay in float32.
 
         Raises:
             ConfigError: the network was not trained for a prompt.

@@ -47,13 +47,9 @@ class NanoPainter:
     ) -> None:
         """Take a trained network.
 
-        Args:
-            network: the fusion network; frozen and laid out for speed here. It stays in its own
-                precision, and a copy of it paints.
-            provenance: where its weights come from, as stored beside them.
-            precision: of the convolutions, bfloat16 or float32; None takes the faster one.
-            keep_below: leave tiles unpainted on which what is known differs from the render by less
-                than this on average; None paints the whole image.
+        It is frozen and laid out for speed here; it stays in its own precision, and a copy of it
+        paints: in bfloat16 or float32, None takes the faster one. Tiles on which what is known
+        differs from the render by less than `keep_below` on average are left unpainted.
 
         Raises:
             ConfigError: a negative limit.

@@ -119,13 +119,7 @@ def train_nano(
 ) -> TrainingResult:
     """Train the small painter, continuing from a checkpoint of the same training if there is one.
 
-    Args:
-        sources: sets of pairs; at least one pair in all.
-        config: the whole recipe.
-        start: weights to go on from; None starts from nothing.
-        checkpoint_folder: where checkpoints are kept; None keeps none.
-        progress: called at every entry of the history.
-        device: where the network runs.
+    Without a `start` it begins with nothing; `progress` is called at every entry of the history.
 
     Raises:
         DataError: no pairs, or a damaged pair.

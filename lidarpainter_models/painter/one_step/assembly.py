@@ -35,12 +35,8 @@ def assemble(
 ) -> OneStepNetwork:
     """Wire the parts; new weights follow from the seed and have the type of the U-Net's.
 
-    Args:
-        config: the wiring.
-        unet: with the configured number of input channels.
-        autoencoder: of the configured kind.
-        has_adapters: put adapters in, which change nothing before they are trained.
-        seed: of the adapters and the fusion.
+    The U-Net has the configured number of input channels; adapters change nothing before they are
+    trained.
     """
     dtype = next(unet.parameters()).dtype
     with torch.random.fork_rng(devices=[]):

@@ -27,10 +27,7 @@ class SkipAutoencoder(nn.Module):
     def __init__(self, vae: Any, *, has_skips: bool, skip_bias: bool = False) -> None:  # noqa: ANN401
         """Take the parts of a diffusers `AutoencoderKL`.
 
-        Args:
-            vae: the autoencoder; its modules are used, its own `forward` is not.
-            has_skips: add the four skip convolutions.
-            skip_bias: give them a bias.
+        Its modules are used, its own `forward` is not. `has_skips` adds the four skip convolutions.
 
         Raises:
             ConfigError: the autoencoder does not reduce images eightfold to four channels.
@@ -125,9 +122,8 @@ def check_latents(num_halvings: int, num_channels: int) -> None:
 def mix_skips(skips: Skips, weights: Float[Tensor, "inputs batch weights rows columns"]) -> Skips:
     """The skips of several inputs as one, weighed as the latents were.
 
-    Args:
-        skips: features whose batch holds one input after the other.
-        weights: shares of the inputs at the latents' size; their mean over channels counts.
+    Their batch holds one input after the other; the weights are at the latents' size, and their
+    mean over channels counts.
     """
     num_inputs = len(weights)
     shares = weights.mean(dim=2)

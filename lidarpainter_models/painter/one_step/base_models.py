@@ -71,9 +71,8 @@ class BaseParts:
 def open_base(name: str, *, may_download: bool = False) -> BaseModel:
     """Find a model and read what it declares.
 
-    Args:
-        name: a folder, an id of the hub, or `sd-turbo`.
-        may_download: fetch it into the user's cache if it is not there.
+    The name is that of a folder, an id of the hub, or `sd-turbo`; what is downloaded goes to the
+    user's cache.
 
     Raises:
         WeightsError: it is not there, or not in diffusers' layout.

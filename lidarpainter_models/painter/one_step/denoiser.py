@@ -65,10 +65,7 @@ def widen_first_layer(
 ) -> Float[Tensor, "out channels rows columns"]:
     """The weights of a first layer for more input channels than it was trained for.
 
-    Args:
-        weight: as trained, for the first latent.
-        num_channels: input channels in the end.
-        start: `zero`, or `copy` for every further latent; channels of masks start at zero.
+    `start` is `zero`, or `copy` for every further latent; channels of masks start at zero.
     """
     wide = weight.new_zeros(weight.shape[0], num_channels, *weight.shape[2:])
     copies = num_channels // LATENT_CHANNELS if start == "copy" else 1

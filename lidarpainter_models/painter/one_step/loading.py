@@ -55,13 +55,9 @@ def load_one_step(
 ) -> OneStepPainter:
     """A painter on a device.
 
-    Args:
-        name: see the module.
-        device: where it paints.
-        dtype: type of the weights; the step, the fusion and the U-Net's last layer stay float32.
-            None takes what the device computes faster.
-        merges: merge adapters into the model and make it lean; without, it can be trained on.
-        may_download: fetch a model of the hub that is not in the user's cache.
+    `dtype` is that of the weights, None what the device computes faster; the step, the fusion and
+    the U-Net's last layer stay float32. `merges` merges adapters into
+    the model and makes it lean; without, it can be trained on.
 
     Raises:
         WeightsError: model or weights are missing, damaged, or do not belong together.
@@ -130,12 +126,9 @@ def load_trainable(
 ) -> Trainable:
     """A network to train, on the CPU.
 
-    Args:
-        name: a model, or a weights file of ours to go on from.
-        config: the wiring; a weights file must have the same.
-        prompts: what it will be trained for.
-        dtype: of the weights that stay as they are; the others are float32.
-        seed: of the adapters and the fusion, where they are new.
+    The name is that of a model, or of a weights file of ours, of the same wiring, to go on from.
+    `dtype` is that of the weights that stay as they are; the others are float32. The seed is that
+    of the adapters and the fusion, where they are new.
 
     Raises:
         WeightsError: model or weights are missing, damaged, or do not belong together.

@@ -63,13 +63,9 @@ class OneStepNetwork(nn.Module):
     ) -> OneStepOutput:
         """Repair every view.
 
-        Args:
-            images: the inputs in the configured order, rgb in [0, 1]; height and width are
-                multiples of 64.
-            text: the encoded prompt of every view.
-            masks: shares of hits per latent position, if the configuration has them.
-            encodes_at_once: all inputs in one batch; otherwise one after the other, which needs
-                less memory and more time.
+        Images are the inputs in the configured order, rgb in [0, 1], height and width multiples of
+        64; masks are shares of hits per latent position, if the configuration has them. Encoding
+        one input after the other needs less memory and more time.
         """
         latents, skips = self._encode(images, encodes_at_once=encodes_at_once)
         weights = self._weights(latents)

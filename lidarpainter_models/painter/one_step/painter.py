@@ -42,10 +42,7 @@ class OneStepPainter:
     ) -> None:
         """Take a network with its weights.
 
-        Args:
-            network: frozen and laid out for speed here.
-            prompts: encoded prompts.
-            provenance: base model, licence and training of the weights.
+        It is frozen and laid out for speed here.
         """
         frozen = network.eval().requires_grad_(False)
         # torch's stub lacks memory_format

@@ -36,9 +36,7 @@ class PromptBook:
     ) -> None:
         """Begin with what is encoded already.
 
-        Args:
-            encoded: features by prompt.
-            folder: of a model in diffusers' layout, to encode others with.
+        The folder is that of a model in diffusers' layout, to encode others with.
         """
         self._encoded = dict(encoded)
         self._folder = folder

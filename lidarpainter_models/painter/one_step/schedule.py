@@ -119,11 +119,7 @@ def denoise(
 ) -> Float[Tensor, "batch channels height width"]:
     """Take one step in float32; nothing random is added.
 
-    Args:
-        latent: the latent before the step, in the units of the schedule.
-        predicted: the noise that the network sees in it.
-        step: its factors.
-        kind: `posterior` is the mean above; `residual` adds the prediction to the latent.
+    The kind `posterior` is the mean above; `residual` adds the prediction to the latent.
     """
     latent, predicted = latent.float(), predicted.float()
     if kind == "residual":

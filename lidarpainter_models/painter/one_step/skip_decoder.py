@@ -28,13 +28,10 @@ class SkipDecoder(nn.Module):
         has_skips: bool,
         skip_bias: bool,
     ) -> None:
-        """Take a decoder.
+        """Take the decoder of a diffusers `AutoencoderKL`.
 
-        Args:
-            decoder: of a diffusers `AutoencoderKL`.
-            widths: the autoencoder's channels, finest level first.
-            has_skips: add skip convolutions.
-            skip_bias: give them a bias, zero at first.
+        `widths` are the autoencoder's channels, finest level first; a bias of the skip convolutions
+        is zero at first.
         """
         super().__init__()
         self.base = decoder

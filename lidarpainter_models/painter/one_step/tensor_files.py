@@ -34,13 +34,9 @@ def fill_from_file(
 ) -> None:
     """Give a module on the meta device the weights of a file.
 
-    Args:
-        module: every parameter of it must stand in the file, and nothing else.
-        path: the file.
-        dtype: type of the weights in the module.
-        renamed: name in the module of a name in the file.
-        widened: other shapes that weights may have in the file; `adapt` makes them fit.
-        adapt: applied to every tensor.
+    Every parameter of it must stand in the file, under a name that `renamed` makes the module's,
+    and nothing else. Weights may have the `widened` shapes there; `adapt`, applied to
+    every tensor, makes them fit.
 
     Raises:
         WeightsError: a weight is missing, too many, of a wrong shape, or not finite.

@@ -120,11 +120,7 @@ class OneStepTrainee:
     ) -> None:
         """Take a network with adapters; it is made ready for training here, in place.
 
-        Args:
-            network: on its device.
-            texts: every prompt of the recipe, encoded.
-            config: the recipe.
-            judges: what the loss looks through.
+        `texts` holds every prompt of the recipe.
 
         Raises:
             ConfigError: a loss without what it weighs, or another wiring than the recipe's.
@@ -230,13 +226,6 @@ def train_one_step(
     processes: Processes = ALONE,
 ) -> dict[str, Any]:
     """Train a network in place; afterwards it holds the averaged weights.
-
-    Args:
-        trainee: the network, its recipe and what its loss looks through.
-        sources: sets of pairs; at least one pair in all.
-        checkpoint_folder: where checkpoints are kept; None keeps none.
-        progress: called at every entry of the history.
-        processes: who trains.
 
     Returns:
         How it was trained, as JSON types.

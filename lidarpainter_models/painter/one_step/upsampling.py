@@ -40,9 +40,7 @@ class PhasedUpsampling(nn.Module):
     ) -> Float[Tensor, "batch out doubled_height doubled_width"]:
         """The doubled and convolved features.
 
-        Args:
-            features: what is doubled.
-            output_size: as diffusers passes it; twice the size of the input.
+        `output_size` is passed by diffusers: twice the size of the input.
 
         Raises:
             ValueError: another output size is asked for.

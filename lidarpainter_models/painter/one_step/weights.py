@@ -61,14 +61,8 @@ def save_trained(
 ) -> None:
     """Write what training changed, aside and renamed whole.
 
-    Args:
-        network: with its adapters, not merged.
-        path: the file.
-        prompts: encoded prompts by their name.
-        base: folder or hub id of the model underneath.
-        mark: biases of that model (`base_models.BaseParts`).
-        licence: of the result.
-        provenance: what it was trained on and how, as JSON types.
+    The network has its adapters, not merged. `mark` holds biases of the model underneath
+    (`base_models.BaseParts`); `provenance` holds JSON types.
 
     Raises:
         WeightsError: a weight is not finite.

@@ -49,11 +49,7 @@ def apply_mix(
 ) -> Float[Tensor, "height width 3"]:
     """The view under all styles of a mix: first it gets wet, then dark, then fog comes up.
 
-    Args:
-        view: what is styled.
-        mix: the styles.
-        generator: lights windows, draws drops and noise.
-        progress: share of the log's time that has passed, which strengths may follow.
+    `progress` is the share of the log's time that has passed, which strengths may follow.
     """
     strengths = mix.strengths(progress)
     for prompt in ("rain", "night", "foggy"):

@@ -153,9 +153,7 @@ def fit_ground(
 ) -> Ground | None:
     """The plane of the lowest near surfaces; None where too little of it is seen.
 
-    Args:
-        points_m: metres from the camera centre, z up.
-        known: pixels whose point means something.
+    Points are metres from the camera centre, z up; those of `known` pixels mean something.
     """
     near = known & (points_m.norm(dim=-1) < NEAR_GROUND_M)
     if int(near.sum()) < _LEAST_GROUND_PX:

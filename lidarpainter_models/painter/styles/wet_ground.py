@@ -44,12 +44,8 @@ def mirrored(
 ) -> Float[Tensor, "height width 3"]:
     """What each ground pixel mirrors, blurred along the column as by a rough film.
 
-    Args:
-        light: the image, linear.
-        sky_light: stands in where the image does not show what is mirrored.
-        camera: of the image, world z up.
-        points_m: metres from its centre; sky at infinity.
-        on_ground: pixels to follow.
+    `light` is linear, world z up; points are metres from the camera's centre, sky at infinity.
+    `sky_light` stands in where the image does not show what is mirrored.
     """
     starts = points_m[on_ground]
     directions = torch.nn.functional.normalize(starts, dim=-1) * torch.tensor([1.0, 1.0, -1.0])

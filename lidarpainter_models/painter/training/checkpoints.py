@@ -76,10 +76,7 @@ def training_digest(
 ) -> str:
     """SHA-256 of what shapes the weights.
 
-    Args:
-        config: the settings.
-        pair_digests: of every source of pairs.
-        start: weights that the training goes on from, in a fixed order; None starts from nothing.
+    The weights of the `start` come in a fixed order.
     """
     shaping = {key: value for key, value in config.items() if key not in UNSHAPING}
     text = json.dumps([shaping, list(pair_digests)], sort_keys=True)

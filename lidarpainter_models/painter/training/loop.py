@@ -60,16 +60,9 @@ def run_training(
 ) -> dict[str, Any]:
     """Train in place, continuing from a checkpoint of the same training if there is one.
 
-    Afterwards the network holds the averaged weights.
-
-    Args:
-        trainee: the network and what it lowers.
-        sources: sets of pairs; at least one pair in all.
-        config: the schedule.
-        digest: of everything that shapes the weights; a checkpoint of another one is refused.
-        checkpoint_folder: where checkpoints are kept; None keeps none.
-        progress: called at every entry of the history.
-        processes: who trains.
+    Afterwards the network holds the averaged weights. A checkpoint of another `digest`, that of
+    everything that shapes the weights, is refused. `progress` is called at every entry of the
+    history.
 
     Returns:
         How the network came to be: settings, pairs, steps, losses and duration as JSON types.

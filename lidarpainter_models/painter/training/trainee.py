@@ -39,10 +39,7 @@ class Trainee(Protocol):
     def learn(self, batch: TrainingBatch, *, step: int, share: float) -> dict[str, float]:
         """Add the gradients of a batch to those of the trained weights and of the opponent.
 
-        Args:
-            batch: on the network's device.
-            step: steps taken so far.
-            share: how much the batch counts among those of the step.
+        `share` is how much the batch counts among those of the step.
 
         Returns:
             What enters the history; `total` is the loss, and has to be finite.

@@ -62,11 +62,8 @@ class ForeignScene:
     ) -> None:
         """Check one scene folder, all of it.
 
-        Args:
-            root: the folder that holds the scene folders, or the scene folder itself.
-            sequence: a folder name below the root.
-            frames: which frames to take, by position; all of them if None.
-            cameras: which cameras to take, by name; all of them if None.
+        The root holds the scene folders, or is the scene folder itself. Frames are taken by
+        position, cameras by name; None takes all.
 
         Raises:
             DataError: something of the scene is missing, damaged or makes no sense.

@@ -76,11 +76,8 @@ class NuscenesLog:
     ) -> None:
         """Open a scene.
 
-        Args:
-            root: the folder that holds `v1.0-*`, `samples` and `sweeps`.
-            sequence: the name of a scene.
-            frames: which sweeps to take, by position; all of them if None.
-            cameras: which cameras to take, by channel; all of them if None.
+        The root holds `v1.0-*`, `samples` and `sweeps`. Sweeps are taken by position, cameras by
+        channel; None takes all.
 
         Raises:
             DataError: something in the tables is missing, damaged or makes no sense.

@@ -86,11 +86,7 @@ class PandasetLog:
     ) -> None:
         """Open a sequence.
 
-        Args:
-            root: the folder that holds the sequences.
-            sequence: a folder name below the root.
-            frames: which frames to take, by position; all of them if None.
-            cameras: which cameras to take, by name; all of them if None.
+        Frames are taken by position, cameras by name; None takes all.
 
         Raises:
             DataError: something in the log is missing, damaged or makes no sense.

@@ -57,11 +57,7 @@ def write_log(
 ) -> Path:
     """Write a log into the store as a canonical scene; gives the scene's path.
 
-    Args:
-        log: the opened log.
-        store: where scenes live.
-        progress: told after every frame.
-        num_ahead: how many frames are prepared before they are due.
+    `num_ahead` frames are prepared before they are due.
 
     Raises:
         DataError: something in the log is missing, damaged or makes no sense.

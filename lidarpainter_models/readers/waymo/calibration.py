@@ -124,13 +124,8 @@ def camera_calibration(
 ) -> CameraCalibration:
     """Check the calibration of a camera and bring it into our axes.
 
-    Args:
-        name: of the camera.
-        intrinsics: f_u f_v c_u c_v k1 k2 p1 p2 k3.
-        vehicle_from_sensor: 16 numbers, the sensor in Waymo's axes.
-        size_px: width and height.
-        readout: a number of `READOUT_DIRECTIONS`, or another one.
-        where: the place to name in errors.
+    Intrinsics are f_u f_v c_u c_v k1 k2 p1 p2 k3, `vehicle_from_sensor` is 16 numbers in Waymo's
+    axes, `readout` a number of `READOUT_DIRECTIONS`, or another one.
 
     Raises:
         DataError: a number is missing or no lens could have it.

@@ -174,13 +174,8 @@ def checked_image(
 ) -> WaymoImage:
     """An image with a pose, velocities and times that make sense.
 
-    Args:
-        camera_name: which camera took it.
-        jpeg: the image as stored.
-        global_from_vehicle: 16 numbers.
-        velocity: v_x v_y v_z in m/s, w_x w_y w_z in rad/s.
-        times_s: of the pose, the shutter's opening, the trigger, the end of the readout.
-        place: to name in errors.
+    The pose is 16 numbers, `velocity` v_x v_y v_z in m/s and w_x w_y w_z in rad/s; `times_s` are of
+    the pose, the shutter's opening, the trigger, the end of the readout.
 
     Raises:
         DataError: something is missing or senseless.

@@ -82,11 +82,7 @@ class WaymoLog:
     ) -> None:
         """Open a segment.
 
-        Args:
-            root: the folder that holds the segments.
-            sequence: a segment's name.
-            frames: which frames to take, by position; all of them if None.
-            cameras: which cameras to take, by name; all of them if None.
+        Frames are taken by position, cameras by name; None takes all.
 
         Raises:
             DataError: something in the segment is missing, damaged or makes no sense.

@@ -62,13 +62,8 @@ def cast_sweep(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """First hit of every ray.
 
-    Args:
-        scene: the street.
-        instances: moving objects at the time of each column.
-        world_from_lidar: float64 (columns, 3, 4), at the time of each column.
-        azimuth_rad: (columns), counter-clockwise from ahead.
-        inclination_rad: (beams), up.
-        max_range_m: no hits beyond.
+    Instances and `world_from_lidar`, float64 (columns, 3, 4), are those at the time of each column.
+    Azimuths go counter-clockwise from ahead, inclinations up.
 
     Returns:
         range float64 (columns, beams), inf where nothing was hit; brightness, gloss and cosine of

@@ -253,11 +253,7 @@ def stencil(
 ) -> None:
     """White letters on the road, readable for who drives along +s (tops point ahead).
 
-    Args:
-        canvas: where to paint.
-        text: what.
-        place: (s, d) of the middle.
-        size_m: length along s and width across.
+    The place is (s, d) of the middle, the size is length along s and width across.
     """
     height, width = round(size_m[0] * canvas.per_m), round(size_m[1] * canvas.per_m)
     mask = text_mask(text, width_px=width, height_px=height, weight=0.17)

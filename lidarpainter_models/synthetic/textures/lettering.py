@@ -16,14 +16,10 @@ def draw_text(
 ) -> None:
     """Fit a line of text into a box (left, top, right, bottom in pixels), centred.
 
-    Drawn at several times the size and shrunk, so that thin strokes stay smooth.
-
-    Args:
-        image: uint8 or float32 (height, width, channels), changed in place.
-        text: what to write.
-        box: where; the text is scaled to touch either its sides or its top and bottom.
-        colour: one value per channel.
-        weight: thickness of a stroke relative to the height of a capital.
+    Drawn at several times the size and shrunk, so that thin strokes stay smooth. The image, uint8
+    or float32 (height, width, channels), is changed in place. The text touches either the sides of
+    the box or its top and bottom. `weight` is the thickness of a stroke relative to the height of a
+    capital.
     """
     left, top, right, bottom = (round(edge) for edge in box)
     left, top = max(left, 0), max(top, 0)

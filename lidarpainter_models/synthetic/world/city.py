@@ -59,11 +59,8 @@ def build_city(
 ) -> City:
     """Draw a street; each part has its own stream of random numbers.
 
-    Args:
-        seed: decides everything.
-        speed_mps: first and last speed of the recording car, in place of a drawn one.
-        are_people_walking: whether people who move swing arms and legs.
-        change: who stands in it in place of those drawn, moving ones first; all else stays.
+    First and last speed of the recording car may be given, and in `change` who stands in the street
+    in place of those drawn, moving ones first; all else stays.
     """
     streams = np.random.SeedSequence([seed, 20_261]).spawn(9)
     plan_rng, ground_rng, house_rng, green_rng, thing_rng, car_rng, sky_rng, ego_rng, lot_rng = (

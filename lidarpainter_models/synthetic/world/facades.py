@@ -187,13 +187,8 @@ def add_facade(
 ) -> None:
     """Hang a facade up in the world.
 
-    Args:
-        builder: takes the primitives.
-        facade: what was drawn.
-        origin: lower left corner as seen from the street.
-        right: unit vector to the right as seen from the street.
-        surface: with the facade's texture.
-        is_flat: whether to leave the recesses away (far buildings).
+    `origin` is its lower left corner, `right` a unit vector to the right, both as seen from the
+    street; a flat one has no recesses (far buildings).
     """
     up = np.array([0.0, 0.0, 1.0])
     panel = _Panel(builder, facade, np.asarray(origin, float), right, np.cross(right, up), surface)

@@ -103,12 +103,9 @@ class MeshBuilder:
     ) -> None:
         """Many primitives by three corners each.
 
-        Args:
-            corners: (primitives, 3, 3): the corner, past the first edge, past the second edge.
-            uv: (primitives, 3, 2), alike.
-            surface: one for all, or one each.
-            normals: (primitives, 3, 3), alike; flat where absent.
-            is_parallelogram: whether the fourth corner is spanned too.
+        Corners (primitives, 3, 3) are the corner, past the first edge, past the second edge; `uv`
+        (primitives, 3, 2) and `normals`, flat where absent, alike. A parallelogram spans the fourth
+        corner too.
         """
         count = corners.shape[0]
         geometry = np.zeros((count, GEOMETRY_COLUMNS))

@@ -45,12 +45,8 @@ def pack_scene(
 ) -> tuple[layout.SceneArrays, np.ndarray, np.ndarray]:
     """Everything a ray needs.
 
-    Args:
-        street: all that stands still, in the world.
-        street_actor: (primitives) actor index of each of its primitives, -1 for none.
-        moving: what moves.
-        surfaces: that the meshes name.
-        light: of the day.
+    The street stands still, in the world; `street_actor` (primitives) is the actor index of each of
+    its primitives, -1 for none.
 
     Returns:
         The arrays, and the root node (int32) and radius (metres) of every moving mesh.

@@ -38,13 +38,8 @@ def add_glare(
 ) -> Float[Tensor, "height width 3"]:
     """The displayed image with lamps in it.
 
-    Args:
-        rgb: as displayed.
-        depth_m: camera z of what is seen; 0 is sky.
-        camera: of the image.
-        heads: the lamps of the moment.
-        strength: of the night.
-        extinction_per_m: of the air before the lamps.
+    `depth_m` is camera z of what is seen, 0 for sky; `strength` is the night's; the extinction is
+    that of the air before the lamps.
     """
     pixels, power = _seen_power(depth_m, camera, heads, extinction_per_m)
     power = strength * power

@@ -44,10 +44,7 @@ def find_ground(
 ) -> Ground:
     """The low surfaces that continue the road.
 
-    Args:
-        points_world: centres of the street's Gaussians.
-        opacity: theirs.
-        road: points of the road that was driven.
+    `points_world` are centres of the street's Gaussians, `road` points of the road that was driven.
     """
     margin_m = 80.0
     low, high = road[:, :2].amin(dim=0) - margin_m, road[:, :2].amax(dim=0) + margin_m

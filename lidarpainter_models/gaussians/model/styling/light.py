@@ -80,13 +80,8 @@ def styled_light(
 ) -> StyledLight:
     """First everything gets wet, then dark, then fog comes up.
 
-    Args:
-        gaussians: of the scene.
-        sky: on a clear day.
-        traits: of the Gaussians.
-        style: what the place knows.
-        strengths: of every style that changes anything.
-        lamp_light: see `fixed_irradiance`.
+    `sky` is that of a clear day; `strengths` are of every style that changes anything; for
+    `lamp_light` see `fixed_irradiance`.
     """
     rain, night = strengths.get("rain", 0.0), strengths.get("night", 0.0)
     wetness = WETNESS * (0.5 + 0.5 * traits.ground)[:, None]

@@ -38,11 +38,7 @@ def find_skylines(
 ) -> Skylines:
     """Skylines of the places where the ground is wet.
 
-    Args:
-        points_world: centres of the Gaussians.
-        day_light: theirs, linear.
-        wet: above 0 on the ground.
-        is_obstacle: above 0 for what stands on it.
+    `day_light` is linear; `wet` is above 0 on the ground, `is_obstacle` for what stands on it.
     """
     rows = (wet > 0).nonzero()[:, 0]
     place = (points_world[rows, :2] / SPACING_M).round()
