@@ -9,7 +9,7 @@ from lidarpainter_models.gaussians.fitting.settings import DensificationConfig
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.observations.settings import ObservationConfig
 
-AS_GIVEN = RefinementConfig(cameras=False, extrinsics=False, actors=False)
+AS_GIVEN = RefinementConfig(cameras=False, actors=False)
 """Poses are not refined: those given are the best known, and the truth stands in their frame."""
 
 WEAK_START = 55_000

@@ -1,7 +1,6 @@
 """Every setting of a fit, each with its reason."""
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.fitting.settings import (
@@ -12,8 +11,6 @@ from lidarpainter_models.gaussians.fitting.settings import (
 )
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 
-GuidanceFreedom = Literal["all", "appearance"]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RefinementConfig:
@@ -21,22 +18,12 @@ class RefinementConfig:
 
     cameras: bool = True
     """Refine the pose of every training view (+0.9 dB on a real log)."""
-    extrinsics: bool = True
-    """Let a camera's corrections have a mean: its mounting angles are off as a rule."""
     actors: bool = True
     """Refine the pose of every actor over time (+1.2 dB inside boxes)."""
     exposure: bool = False
     """Fit a colour matrix per camera even if there is one camera only."""
     start_step: int = 100
     """Before this the image is too coarse to align anything."""
-    camera_noise_rad: float = 2e-3
-    """Expected error of a recorded camera angle."""
-    camera_noise_m: float = 0.03
-    """Expected error of a recorded camera position."""
-    actor_noise_rad: float = 0.03
-    """Expected error of a box's angle."""
-    actor_noise_m: float = 0.2
-    """Expected error of a box's position."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,11 +39,9 @@ class GuidanceConfig:
     """Of 1 - SSIM in its loss, as in the paper."""
     perceptual: float = 0.0
     """Of the perceptual distance in its loss, where one is given to the fit (1 in the paper)."""
-    freedom: GuidanceFreedom = "all"
-    """What painted views may change: everything, or only colour and opacity. A painted guess in a
-    hole would otherwise pull surfaces off their LiDAR depth."""
     depth: float = 0.01
-    """Of the LiDAR depth term on painted views; without meaning when freedom is `appearance`."""
+    """Of the LiDAR depth term on painted views: a painted guess in a hole would otherwise pull
+    surfaces off their LiDAR depth."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,9 +81,6 @@ class FitConfig:
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
     shapes: ShapeLimits = field(default_factory=ShapeLimits)
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
-    sky_in_mask_only: bool = True
-    """The sky texture learns only inside the sky masks: what is far but solid (towers beyond the
-    LiDAR's reach) is then left to the Gaussians and not split between the two."""
     log_every: int = 50
     """Steps between two entries of the history."""
     memory_bytes: int | None = None

@@ -3,7 +3,7 @@
 Every Gaussian collects the absolute screen gradient of its centre (Ye et al. 2024, "AbsGS"), in
 pixels of the full fit size. At intervals the faint ones and those that left their actor's box are
 dropped, and the ones with the largest mean gradient are split in two along their longest axis. The
-number never exceeds the budget.
+number never exceeds what is asked for.
 """
 
 from collections.abc import Sequence
@@ -13,13 +13,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lidarpainter_models.gaussians.fitting.settings import DensificationConfig
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 
 BOX_MARGIN, BOX_MARGIN_M = 1.1, 0.1
 """An actor's Gaussian may lie this far out, in half sizes of its box, and this much further:
 mirrors and antennas."""
+MIN_OPACITY = 0.02
+"""Fainter Gaussians are dropped."""
 
 
 @dataclass(eq=False, kw_only=True)
@@ -65,13 +66,12 @@ def densify(
     gaussians: GaussianSet,
     tally: GradientTally,
     box_sizes_m: Sequence[Float[Tensor, "3"]],
-    config: DensificationConfig,
     *,
     target: int,
 ) -> SetChange:
-    """Drop the useless, then split the most wanted until there are `target` or the budget."""
-    stays = keeps_its_place(gaussians, box_sizes_m, config)
-    room = min(target, config.budget) - int(stays.sum())
+    """Drop the useless, then split the most wanted until there are `target`."""
+    stays = keeps_its_place(gaussians, box_sizes_m)
+    room = target - int(stays.sum())
     score = torch.where(stays & (tally.visits > 0), tally.mean, torch.zeros_like(tally.mean))
     num_split = max(min(room, int((score > 0).sum())), 0)
     # a stable sort, so that equal scores never depend on the machine
@@ -85,24 +85,18 @@ def densify(
     )
 
 
-def prune(
-    gaussians: GaussianSet,
-    box_sizes_m: Sequence[Float[Tensor, "3"]],
-    config: DensificationConfig,
-) -> SetChange:
+def prune(gaussians: GaussianSet, box_sizes_m: Sequence[Float[Tensor, "3"]]) -> SetChange:
     """Drop the useless and nothing else."""
-    kept = keeps_its_place(gaussians, box_sizes_m, config).nonzero()[:, 0]
+    kept = keeps_its_place(gaussians, box_sizes_m).nonzero()[:, 0]
     return SetChange(gaussians=gaussians.select(kept), kept=kept, num_added=0)
 
 
 def keeps_its_place(
-    gaussians: GaussianSet,
-    box_sizes_m: Sequence[Float[Tensor, "3"]],
-    config: DensificationConfig,
+    gaussians: GaussianSet, box_sizes_m: Sequence[Float[Tensor, "3"]]
 ) -> Bool[Tensor, " gaussians"]:
     """Which Gaussians are finite, not faint and, on an actor, still in its box."""
     columns = gaussians.columns()
-    stays = columns["opacity_logit"].sigmoid() >= config.min_opacity
+    stays = columns["opacity_logit"].sigmoid() >= MIN_OPACITY
     for name in ("means", "log_scale"):
         stays &= columns[name].isfinite().all(dim=1)
     if box_sizes_m:

@@ -187,7 +187,7 @@ def _steps(  # noqa: PLR0913 - as `fit_gaussians`
         if checkpoints is not None and checkpoints.is_due(state.step):
             checkpoints.save(*state.keep())
     return FitResult(
-        scene=_finished(state, config),
+        scene=_finished(state),
         history=state.history,
         stopped_early=config.steps < planned_steps,
     )
@@ -246,14 +246,14 @@ def _change_set(state: FitState, config: FitConfig) -> None:
     sizes = [track.size_m for track in state.scene.actors.recorded_tracks]
     gaussians = state.caught_up().gaussians
     if fraction > settings.stop:
-        state.apply(prune(gaussians, sizes, settings))
+        state.apply(prune(gaussians, sizes))
         return
     first = min(len(gaussians), settings.budget)
     progress = (fraction - settings.start) / max(settings.stop - settings.start, 1e-9)
     rounds_left = max((1 - progress) * (settings.stop - settings.start), 0) * config.steps
     rounds_left = 1 + rounds_left // settings.every
     target = first + math.ceil((settings.budget - first) / rounds_left)
-    state.apply(densify(gaussians, state.tally, sizes, settings, target=target))
+    state.apply(densify(gaussians, state.tally, sizes, target=target))
 
 
 def _log(state: FitState, config: FitConfig, progress: Progress | None) -> None:
@@ -272,11 +272,11 @@ def _log(state: FitState, config: FitConfig, progress: Progress | None) -> None:
         progress(state.step, config.steps, entry)
 
 
-def _finished(state: FitState, config: FitConfig) -> GaussianScene:
+def _finished(state: FitState) -> GaussianScene:
     """The scene without gradients, useless Gaussians or unseen sky."""
     scene = copy_scene(state.caught_up())
     sizes = [track.size_m for track in scene.actors.recorded_tracks]
-    change = prune(scene.gaussians, sizes, config.densification)
+    change = prune(scene.gaussians, sizes)
     return replace(scene, gaussians=change.gaussians, sky=scene.sky.filled())
 
 

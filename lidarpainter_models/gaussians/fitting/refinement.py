@@ -12,6 +12,17 @@ from lidarpainter_models.gaussians.fitting.losses import pose_prior
 from lidarpainter_models.gaussians.fitting.optimiser import RowAdam
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 
+CAMERA_NOISE = {"rotation_rad": 2e-3, "translation_m": 0.03}
+"""Expected error of a recorded camera pose."""
+ACTOR_NOISE = {"rotation_rad": 0.03, "translation_m": 0.2}
+"""Expected error of a box's pose."""
+CAMERA_PRIOR = 1e-4
+"""Weight of squared camera corrections in units of the expected noise."""
+ACTOR_PRIOR = 1e-6
+"""Of squared actor corrections, likewise: an actor fills a small part of the image."""
+ACTOR_SMOOTHNESS = 1e-5
+"""Of squared jumps between an actor's neighbouring corrections, likewise."""
+
 
 @dataclass(eq=False, kw_only=True)
 class Refinement:
@@ -67,27 +78,18 @@ class Refinement:
 
     def prior(self, row: int, timestamp_ns: int, step: int) -> Float[Tensor, ""]:
         """Corrections are small, and an actor's change little from one knot to the next."""
-        settings, weights = self.config.refinement, self.config.losses
         tangent, actors = self.scene.cameras.tangent(row), self.scene.actors
         total = tangent.new_zeros(())
         if self.refines_cameras(step):
-            total = total + weights.pose_prior * pose_prior(
-                tangent[None],
-                rotation_rad=settings.camera_noise_rad,
-                translation_m=settings.camera_noise_m,
-            )
+            total = total + CAMERA_PRIOR * pose_prior(tangent[None], **CAMERA_NOISE)
         if self.refines_actors(step):
-            noise = {
-                "rotation_rad": settings.actor_noise_rad,
-                "translation_m": settings.actor_noise_m,
-            }
             now = actors.tangent_at(timestamp_ns)
-            total = total + weights.actor_prior * pose_prior(now, **noise)
+            total = total + ACTOR_PRIOR * pose_prior(now, **ACTOR_NOISE)
             before, after, _ = actors.neighbours(timestamp_ns)
             last = actors.knots_ns.numel() - 1
             for neighbour in {max(before - 1, 0), min(after + 1, last)}:
                 jump = now - actors.tangent[:, neighbour].detach()
-                total = total + weights.actor_smoothness * pose_prior(jump, **noise)
+                total = total + ACTOR_SMOOTHNESS * pose_prior(jump, **ACTOR_NOISE)
         return total
 
     def step(self, step: int, image: FitImage) -> None:
@@ -95,7 +97,7 @@ class Refinement:
         if self.refines_cameras(step):
             table = self.scene.cameras.view_tangent
             self.adams["camera_adam"].step(table, _gradient(table), self._rate("camera", step))
-            self.scene.cameras.recentre(keep_mean=self.config.refinement.extrinsics)
+            self.scene.cameras.recentre()
         if self.refines_actors(step):
             tangent = self.scene.actors.tangent
             with torch.no_grad():

@@ -17,8 +17,6 @@ class DensificationConfig:
     """Fraction of the fit after which it ends: new Gaussians need time to settle."""
     every: int = 100
     """Steps between two rounds; several passes over the views of a short log."""
-    min_opacity: float = 0.02
-    """Fainter Gaussians are dropped."""
 
     def __post_init__(self) -> None:
         """Refuse a schedule that runs backwards."""
@@ -49,12 +47,6 @@ class FitLossWeights:
     """Of the LiDAR depth term."""
     depth_tolerance: float = 0.05
     """Relative depth error from which on the pull of the LiDAR weakens."""
-    pose_prior: float = 1e-4
-    """Of squared camera corrections in units of the expected noise."""
-    actor_prior: float = 1e-6
-    """Of squared actor corrections, likewise: an actor fills a small part of the image."""
-    actor_smoothness: float = 1e-5
-    """Of squared jumps between an actor's neighbouring corrections, likewise."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

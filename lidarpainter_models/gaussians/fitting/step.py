@@ -126,13 +126,8 @@ def add_guidance_gradients(
     config: FitConfig,
     perceptual: Perceptual | None = None,
 ) -> None:
-    """Add one painted view's gradients to the Gaussians; nothing else is changed by it.
-
-    With the freedom `appearance` only colour and opacity receive any.
-    """
+    """Add one painted view's gradients to the Gaussians; nothing else is changed by it."""
     sky, settings = state.scene.sky, config.guidance
-    if settings.freedom == "appearance":
-        seen = seen.with_fixed_geometry()
     splat = draw_gaussians(seen, _guidance_bodies(state, view), view.camera)
     sky_rgb = sky.sample(sky.rays(view.camera, splat.alpha.detach() < OPAQUE))
     shown = splat.rgb + (1 - splat.alpha)[..., None] * sky_rgb
@@ -143,7 +138,7 @@ def add_guidance_gradients(
         trusted = torch.where(view.weight[..., None] > 0, shown, view.rgb)
         distance = view.weight.mean() * perceptual(trusted, view.rgb)
         loss = loss + settings.weight * settings.perceptual * distance
-    if settings.depth > 0 and settings.freedom == "all":
+    if settings.depth > 0:
         loss = loss + settings.depth * depth_loss(
             splat.depth_m, splat.alpha, view.lidar_depth_m, tolerance=config.losses.depth_tolerance
         )
@@ -184,13 +179,14 @@ def _step_sky(
     config: FitConfig,
     image: FitImage,
 ) -> None:
-    """Move the texels that were seen clearly enough."""
+    """Move the texels that were seen clearly enough, inside the sky mask alone.
+
+    What is far but solid (towers beyond the LiDAR's reach) is left to the Gaussians.
+    """
     if sky_rgb.grad is None:
         return
     clear = 1 - alpha
-    learns = clear > MIN_TRANSMITTANCE
-    if config.sky_in_mask_only:
-        learns &= image.kind == SKY
+    learns = (clear > MIN_TRANSMITTANCE) & (image.kind == SKY)
     ratio = FINAL_LEARNING_RATE / LEARNING_RATE
     state.scene.sky.observe(
         sky_rgb.grad,

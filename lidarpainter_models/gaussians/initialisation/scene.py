@@ -46,6 +46,8 @@ ACTOR_VOXEL_M = 0.05
 """Smallest voxel on an actor; its points come from the whole log."""
 UNSEEN_SHARE = 0.2
 """Part of the start size for points that only a camera moved aside would see."""
+ASIDE_M = 3.5
+"""How far aside such a camera may stand."""
 MOST_VIEWS_PER_CAMERA = 60
 """Views that tell where the street is seen and how finely; those between see the same, and asking
 every point for every view would take the square of a log's length."""
@@ -120,11 +122,11 @@ def _frame_times(views: Sequence[TrainingView]) -> Int[Tensor, " frames"]:
 
 
 def pixel_footprint(
-    xyz_m: Float[Tensor, "points 3"], cameras: Sequence[Camera], *, aside_m: float
+    xyz_m: Float[Tensor, "points 3"], cameras: Sequence[Camera]
 ) -> tuple[Float[Tensor, " points"], Float[Tensor, " points"]]:
     """Size of a pixel at each point, smallest over the cameras, and how dense detail pays there.
 
-    A point in no image, but in that of a camera up to `aside_m` away, has a footprint too; one
+    A point in no image, but in that of a camera up to `ASIDE_M` away, has a footprint too; one
     beyond has an infinite one. Occlusion is not looked at.
 
     Where n Gaussians a square metre leave an image with footprint f an error of 1 / (n f^2) a
@@ -136,7 +138,7 @@ def pixel_footprint(
     for camera in cameras:
         pixels_uv, depth_m = camera.project(xyz_m)
         is_inside = camera.contains(pixels_uv, depth_m, near_m=0.5)
-        margin_px = camera.fx_px * aside_m / depth_m.clamp(min=0.5)
+        margin_px = camera.fx_px * ASIDE_M / depth_m.clamp(min=0.5)
         u, v = pixels_uv.unbind(-1)
         is_near = (u > -margin_px) & (u < camera.width_px + margin_px) & (depth_m > 0.5)
         is_near &= (v > -margin_px) & (v < camera.height_px + margin_px)
@@ -168,7 +170,7 @@ def _on_surfaces(
     street = observations.lidar_map.street
     street = street.keep(torch.arange(0, len(street), math.ceil(len(street) / MOST_STREET_POINTS)))
     cameras = _spread_cameras(observations.views)
-    footprint, density = pixel_footprint(street.xyz_m, cameras, aside_m=config.aside_m)
+    footprint, density = pixel_footprint(street.xyz_m, cameras)
     density *= math.sqrt(len(observations.views) / len(cameras))
     in_image = density > 0
     is_aside = ~in_image & footprint.isfinite()
@@ -183,7 +185,7 @@ def _on_surfaces(
         points = observations.lidar_map.actors.get(track.actor_id)
         if points is None:
             continue
-        spacing_m = _actor_spacing(points, track, observations.views, config)
+        spacing_m = _actor_spacing(points, track, observations.views)
         in_sight = spacing_m.isfinite()
         if int(in_sight.sum()) >= LEAST_ACTOR_POINTS:
             clouds[index] = _cloud(points, spacing_m, in_sight, ACTOR_VOXEL_M)
@@ -234,10 +236,7 @@ def _surfels(
 
 
 def _actor_spacing(
-    points: MapPoints,
-    track: ActorTrack,
-    views: Sequence[TrainingView],
-    config: InitialisationConfig,
+    points: MapPoints, track: ActorTrack, views: Sequence[TrainingView]
 ) -> Float[Tensor, " points"]:
     """Distance at which detail pays at each point of an actor over its time, as on the street.
 
@@ -250,9 +249,8 @@ def _actor_spacing(
         if not track.is_present(view.timestamp_ns):
             continue
         world_from_box = track.pose_at(view.timestamp_ns).float()
-        at_time, density = pixel_footprint(
-            transform_points(world_from_box, points.xyz_m), [view.camera], aside_m=config.aside_m
-        )
+        xyz_world_m = transform_points(world_from_box, points.xyz_m)
+        at_time, density = pixel_footprint(xyz_world_m, [view.camera])
         footprint = torch.minimum(footprint, at_time)
         total += stride * density.square()
     return torch.maximum(total.sqrt(), footprint**-2) ** -0.5

@@ -11,8 +11,6 @@ class InitialisationConfig:
 
     num_gaussians: int = 0
     """Start size, which densification brings to the budget; 0 follows the budget."""
-    aside_m: float = 3.5
-    """How far aside such a camera may stand."""
     sh_degree: int = 1
     """One degree: few views see a surface from far-apart directions."""
     street_voxel_m: float = 0.03

@@ -112,17 +112,13 @@ class CameraCorrections:
         names = ("timestamps_ns", "recorded_world_from_camera", "view_tangent", "camera_tangent")
         return {name: getattr(self, name) for name in names}
 
-    def recentre(self, *, keep_mean: bool) -> None:
-        """Take the mean off each camera's view corrections, in place.
-
-        With `keep_mean` it goes into the camera's constant, so that no pose changes.
-        """
+    def recentre(self) -> None:
+        """Move the mean of each camera's view corrections into its constant; no pose changes."""
         with torch.no_grad():
             for index, rows in enumerate(self._rows_of_cameras):
                 mean = self.view_tangent[rows].mean(dim=0)
                 self.view_tangent[rows] -= mean
-                if keep_mean:
-                    self.camera_tangent[index] += mean
+                self.camera_tangent[index] += mean
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,6 +1,6 @@
 """The Gaussians that one step of a fit may see, as leaves that collect its gradients."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import torch
@@ -52,15 +52,6 @@ class SeenGaussians:
     def opacity(self) -> Float[Tensor, " seen"]:
         """In (0, 1)."""
         return self.opacity_logit.sigmoid()
-
-    def with_fixed_geometry(self) -> "SeenGaussians":
-        """The same Gaussians, of which only colour and opacity collect gradients."""
-        return replace(
-            self,
-            means=self.means.detach(),
-            rotation_wxyz=self.rotation_wxyz.detach(),
-            log_scale=self.log_scale.detach(),
-        )
 
     def values(self) -> dict[str, Tensor]:
         """The leaves by name, detached."""

@@ -11,8 +11,6 @@ from lidarpainter_models.gaussians.fitting.densification import (
 )
 from lidarpainter_models.gaussians.fitting.settings import DensificationConfig
 
-CONFIG = DensificationConfig(budget=12)
-
 
 def ten(*, body=0):
     return round_gaussians(torch.randn(10, 3), torch.rand(10, 3), sigma_m=0.1, body=body)
@@ -26,17 +24,17 @@ def tally_of(*scores):
     return tally
 
 
-def test_the_most_wanted_are_split_and_the_budget_holds():
+def test_the_most_wanted_are_split_up_to_the_target():
     gaussians = ten()
     tally = tally_of(*[float(score) for score in range(10)])
-    change = densify(gaussians, tally, [], CONFIG, target=100)
+    change = densify(gaussians, tally, [], target=12)
     assert len(change.gaussians) == 12
     assert change.num_added == 4
     assert change.kept.tolist() == list(range(8))
 
 
 def test_nothing_is_split_without_gradient():
-    change = densify(ten(), GradientTally.zeros(10), [], CONFIG, target=12)
+    change = densify(ten(), GradientTally.zeros(10), [], target=12)
     assert len(change.gaussians) == 10
     assert change.num_added == 0
 
@@ -53,16 +51,16 @@ def test_faint_and_broken_gaussians_are_dropped():
     gaussians.opacity_logit[0] = -9.0
     gaussians.means[1, 2] = torch.nan
     gaussians.log_scale[2, 0] = torch.inf
-    assert prune(gaussians, [], CONFIG).kept.tolist() == [3, 4, 5, 6, 7, 8, 9]
+    assert prune(gaussians, []).kept.tolist() == [3, 4, 5, 6, 7, 8, 9]
 
 
 def test_actor_gaussians_outside_their_box_are_dropped():
     gaussians = ten(body=1)
     gaussians.means[:] = 0.0
     gaussians.means[4, 0] = 2.0  # half the length is 1 m
-    assert prune(gaussians, [CAR_SIZE_M], CONFIG).kept.tolist() == [0, 1, 2, 3, 5, 6, 7, 8, 9]
+    assert prune(gaussians, [CAR_SIZE_M]).kept.tolist() == [0, 1, 2, 3, 5, 6, 7, 8, 9]
     gaussians.body_index[:] = 0
-    assert len(prune(gaussians, [CAR_SIZE_M], CONFIG).gaussians) == 10
+    assert len(prune(gaussians, [CAR_SIZE_M]).gaussians) == 10
 
 
 def test_halves_keep_the_mean_and_nearly_the_spread():

@@ -108,10 +108,10 @@ def test_points_without_colour_take_that_of_their_neighbours():
 def test_footprint_knows_in_beside_and_out_of_the_image():
     camera = camera_at(0.0)
     points = torch.tensor([[8.0, 0, 1.0], [8.0, 7.0, 1.0], [8.0, 30.0, 1.0], [-5.0, 0, 1.0]])
-    footprint, density = pixel_footprint(points, [camera], aside_m=3.5)
+    footprint, density = pixel_footprint(points, [camera])
     assert (density > 0).tolist() == [True, False, False, False]
     assert float(density[0]) == pytest.approx((camera.fx_px / 8.0) ** 2)
-    _, of_four = pixel_footprint(points, 4 * [camera], aside_m=3.5)
+    _, of_four = pixel_footprint(points, 4 * [camera])
     assert float(of_four[0]) == pytest.approx(2 * float(density[0]))
     assert footprint.isfinite().tolist() == [True, True, False, False]
     assert abs(float(footprint[0]) - 8.0 / camera.fx_px) < 1e-6

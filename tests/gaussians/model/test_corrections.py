@@ -21,18 +21,11 @@ def test_recentring_changes_no_pose_and_empties_the_mean():
     cameras = two_cameras()
     cameras.view_tangent.add_(0.01 * torch.randn(4, 6).double())
     before = torch.stack([cameras.world_from_camera(row) for row in range(4)])
-    cameras.recentre(keep_mean=True)
+    cameras.recentre()
     after = torch.stack([cameras.world_from_camera(row) for row in range(4)])
     assert torch.allclose(before, after, atol=1e-12)
     assert float(cameras.view_tangent[:2].mean(0).abs().max()) < 1e-15
     assert float(cameras.camera_tangent.abs().max()) > 0
-
-
-def test_recentring_without_keeping_drops_the_mean():
-    cameras = two_cameras()
-    cameras.view_tangent.add_(0.01)
-    cameras.recentre(keep_mean=False)
-    assert float(cameras.tangent(0).abs().max()) < 1e-15
 
 
 def test_camera_without_training_views_stays_as_recorded():
