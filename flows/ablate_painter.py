@@ -105,11 +105,7 @@ def check_ablation(parameters: AblationParameters) -> None:
 
 
 def _tables(parameters: AblationParameters) -> Tables:
-    """The recipes of the chosen tables.
-
-    Raises:
-        ConfigError: there is no such table.
-    """
+    """The recipes of the chosen tables."""
     tables = parameters.tables
     training = parameters.training
     if tables is None and isinstance(training, NanoTrainingConfig):

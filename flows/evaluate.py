@@ -110,11 +110,7 @@ def _flicker(
 
 
 def _with_truth(scores: Scores, scene_id: str) -> Scores:
-    """Only views whose true image is known beside the path.
-
-    Raises:
-        ConfigError: the scene has no such truth.
-    """
+    """Only views whose true image is known beside the path."""
     known = {name: found for name, found in scores["novel"].items() if found.get("psnr")}
     if not known:
         raise ConfigError(

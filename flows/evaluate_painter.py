@@ -49,11 +49,7 @@ def evaluate_painters(
 
 
 def _first_fit(run: str) -> JudgedFit:
-    """The first fit of a finished run, and the views that it was not fitted to.
-
-    Raises:
-        UnknownRecordError: there is no such run, or it did not complete.
-    """
+    """The first fit of a finished run, and the views that it was not fitted to."""
     store = existing_store()
     finished = open_run(store, run)
     parameters = view_parameters(finished)

@@ -113,11 +113,7 @@ def describe_tables(as_json: AsJson = False) -> None:
 
 
 def _version_or_time(text: str) -> "int | datetime":
-    """What `--as-of` means; a time without a zone is UTC, as all times of the catalog.
-
-    Raises:
-        ConfigError: it is neither a number nor a time.
-    """
+    """What `--as-of` means; a time without a zone is UTC, as all times of the catalog."""
     from datetime import UTC, datetime
 
     from lidarpainter_models.errors import ConfigError

@@ -113,11 +113,7 @@ def _list(run: str, *, as_json: bool) -> None:
 
 
 def _operation(words: list[str]) -> dict[str, Any]:
-    """`move car-3 trajectory=lateral:2` as an operation of a script.
-
-    Raises:
-        ConfigError: names and fields stand in no such order.
-    """
+    """`move car-3 trajectory=lateral:2` as an operation of a script."""
     op, *rest = words
     names = [word for word in rest if "=" not in word]
     found: dict[str, Any] = {"op": op}
@@ -148,11 +144,7 @@ def _value(field: str, text: str) -> str | float:
 
 
 def _read_script(path: Path) -> list[Any]:
-    """The operations of a file, checked.
-
-    Raises:
-        ConfigError: it cannot be read, or is no list of operations.
-    """
+    """The operations of a file, checked."""
     from lidarpainter_models.editing.operations import parse_script
 
     try:

@@ -81,11 +81,7 @@ def evaluate(  # noqa: PLR0913 - the options of a command
 
 
 def _check(protocol: str, previous: str | None) -> None:
-    """Refuse what cannot be judged before anything is loaded.
-
-    Raises:
-        ConfigError: no such protocol, or one that has no frames before.
-    """
+    """Refuse what cannot be judged before anything is loaded."""
     if protocol not in PROTOCOLS:
         raise ConfigError(f"no protocol {protocol!r}, expected {', '.join(PROTOCOLS)}")
     if previous is not None and protocol != FLICKER:

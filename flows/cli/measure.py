@@ -127,11 +127,7 @@ def stress(  # noqa: PLR0913 - the options of a command
 
 
 def _known(only: str | None, names: Sequence[str]) -> tuple[str, ...]:
-    """The names that were chosen, or all.
-
-    Raises:
-        ConfigError: one is not known.
-    """
+    """The names that were chosen, or all."""
     chosen = parse_names(only) or tuple(names)
     if unknown := [name for name in chosen if name not in names]:
         raise ConfigError(

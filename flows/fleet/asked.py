@@ -249,11 +249,7 @@ def _matching(source: Source, root: Path, table: str) -> list[str]:
 
 
 def _with_shared_reading(asked: Sequence[Asked]) -> list[Asked]:
-    """Let all that mean one scene read it alike, with the cameras of all.
-
-    Raises:
-        ConfigError: one scene is asked for twice, or read differently.
-    """
+    """Let all that mean one scene read it alike, with the cameras of all."""
     by_scene: dict[str, list[Asked]] = {}
     for one in asked:
         by_scene.setdefault(one.scene_id, []).append(one)

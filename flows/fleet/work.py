@@ -104,12 +104,7 @@ def _ref(folder: str) -> ArtefactRef:
 
 
 def _bring_in(asked: Asked, store: Store) -> None:
-    """Read or draw the scene unless the store has it as it is asked for.
-
-    Raises:
-        SceneError: the store was to have it.
-        ConfigError: the store has it, read or drawn otherwise; other runs may stand on it.
-    """
+    """Read or draw the scene unless the store has it as it is asked for."""
     if asked.is_stored:
         open_scene(store, asked.scene_id)
         return

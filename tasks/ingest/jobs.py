@@ -118,11 +118,7 @@ def ingest_or_recall(request: IngestRequest, name: str, again: bool) -> dict[str
 
 
 def _known(note: bytes | None, request: IngestRequest, name: str) -> dict[str, Any] | None:
-    """The row of the scene if it is there as asked for; None where it has to be read.
-
-    Raises:
-        ConfigError: it is there, with other cameras, other frames or from another root.
-    """
+    """The row of the scene if it is there as asked for; None where it has to be read."""
     asked, row, earlier = request.key(), {}, {}
     try:
         noted = json.loads(note or b"")

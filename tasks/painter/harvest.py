@@ -126,11 +126,7 @@ def _unfinished(place: Workplace) -> PairWriter:
 
 
 def _finished(place: Workplace, scene: DrivingScene) -> dict[str, Any]:
-    """Move the pairs to where they stay, and count them.
-
-    Raises:
-        DataError: there are none.
-    """
+    """Move the pairs to where they stay, and count them."""
     unfinished = place.scratch / PAIRS_FOLDER
     if not unfinished.exists():
         raise DataError(f"{scene.path}: no view could be made into a pair")

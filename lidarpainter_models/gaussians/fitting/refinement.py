@@ -160,11 +160,7 @@ class Refinement:
 
 
 def _gradient(table: Tensor) -> Tensor:
-    """What the backward pass left.
-
-    Raises:
-        RuntimeError: it never reached this table.
-    """
+    """What the backward pass left."""
     if table.grad is None:
         raise RuntimeError(f"no gradient reached a table of shape {tuple(table.shape)}")
     return table.grad

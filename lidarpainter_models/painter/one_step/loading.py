@@ -212,11 +212,7 @@ def _base_of(file: TrainedFile, *, may_download: bool = False) -> BaseModel:
 
 
 def _open_prompts(base: BaseModel, encoded: dict[str, torch.Tensor]) -> PromptBook:
-    """The prompts, the default one encoded now: before the U-Net is there, memory is free.
-
-    Raises:
-        WeightsError: they are not what the U-Net expects.
-    """
+    """The prompts, the default one encoded now: before the U-Net is there, memory is free."""
     prompts = PromptBook(encoded, base.folder)
     prompts.encode(DEFAULT_PROMPT)
     expected = (TEXT_TOKENS, base.architecture.text_width)
