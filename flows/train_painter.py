@@ -23,24 +23,14 @@ from lidarpainter_models.painter.training_jobs import job_for
 from lidarpainter_models.storage.whole_files import write_whole
 from lidarpainter_models.training_data.pair_sets import PairSet, named_sets
 from tasks.opened import open_split
-from tasks.painter.harvest import (
-    harvest_recorded,
-    harvest_street,
-    keep_street,
-    pair_set,
-)
+from tasks.painter.harvest import harvest_recorded, harvest_street, keep_street, pair_set
 from tasks.painter.judge import (
     feature_distance_of,
     judge_held_back,
     load_painting_scores,
     samples_path,
 )
-from tasks.painter.train import (
-    publish_painter,
-    train,
-    training_record,
-    weights_path,
-)
+from tasks.painter.train import publish_painter, train, training_record, weights_path
 from tasks.specs import SplitSpec, street_id
 from tasks.stages import StageResult
 

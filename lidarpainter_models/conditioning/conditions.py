@@ -21,10 +21,7 @@ from lidarpainter_models.conditioning.warping import SKY_ALPHA, SourceImage, sou
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.scene_rendering import SceneRender
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.lidar.lidar_images import (
-    LidarImage,
-    render_lidar,
-)
+from lidarpainter_models.lidar.lidar_images import LidarImage, render_lidar
 from lidarpainter_models.lidar.lidar_map import LidarMap
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.observations.views import TrainingView

@@ -9,11 +9,7 @@ from lidarpainter_models.evaluation.judged_views import Renderer, ViewScores, sc
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.lidar.sparse_depth import FramePoints
-from lidarpainter_models.metrics.depth import (
-    DepthScores,
-    pooled_inlier_fraction,
-    score_depth,
-)
+from lidarpainter_models.metrics.depth import DepthScores, pooled_inlier_fraction, score_depth
 from lidarpainter_models.metrics.perceptual import PerceptualDistances
 from lidarpainter_models.synthetic.street import SyntheticStreet
 

@@ -25,12 +25,7 @@ from lidarpainter_models.kernels.colour_sampling import project_inside
 from lidarpainter_models.kernels.point_blend import blend_points
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
-from lidarpainter_models.lidar.point_surfaces import (
-    curtain,
-    disc_surface,
-    spread,
-    surface_gaps,
-)
+from lidarpainter_models.lidar.point_surfaces import curtain, disc_surface, spread, surface_gaps
 
 WINDOW_S = 1.0
 """Street points measured this long before or after the image are drawn first; where no

@@ -7,11 +7,7 @@ from lidarpainter_models.errors import DataError
 from lidarpainter_models.readers.canonical.reader import ForeignScene, list_canonical_scenes
 from lidarpainter_models.readers.nuscenes.reader import NuscenesLog, list_nuscenes_scenes
 from lidarpainter_models.readers.pandaset.reader import PandasetLog, list_pandaset_sequences
-from lidarpainter_models.readers.source_logs.log import (
-    Progress,
-    SourceLog,
-    write_log,
-)
+from lidarpainter_models.readers.source_logs.log import Progress, SourceLog, write_log
 from lidarpainter_models.readers.waymo.reader import WaymoLog, list_waymo_segments
 from lidarpainter_models.scenes.validation import require_name
 

@@ -17,11 +17,7 @@ from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation
 from lidarpainter_models.scenes.tracks import ActorTrack
-from lidarpainter_models.viewing.browser_splats import (
-    BrowserSplats,
-    recorded_rgb,
-    splats_by_body,
-)
+from lidarpainter_models.viewing.browser_splats import BrowserSplats, recorded_rgb, splats_by_body
 from lidarpainter_models.viewing.sky_panels import SKY_M, sky_panels
 
 _STREET = 0

@@ -11,11 +11,7 @@ from catalog.artefacts import ArtefactRef, Workplace
 from catalog.digests import DIGEST_LENGTH, digest_file
 from catalog.store import Store, open_store
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.evaluation.held_back import (
-    PairSubset,
-    hold_back,
-    learnt_targets,
-)
+from lidarpainter_models.evaluation.held_back import PairSubset, hold_back, learnt_targets
 from lidarpainter_models.evaluation.painting import JudgingPairs, score_painter
 from lidarpainter_models.evaluation.painting_samples import painting_samples
 from lidarpainter_models.export.images import write_png

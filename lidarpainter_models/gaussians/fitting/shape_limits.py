@@ -16,10 +16,7 @@ from lidarpainter_models.gaussians.fitting.settings import ShapeLimits
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
-from lidarpainter_models.geometry.transforms import (
-    invert_rigid,
-    rotation_from_quaternion,
-)
+from lidarpainter_models.geometry.transforms import invert_rigid, rotation_from_quaternion
 
 _ALONG = math.cos(math.radians(45))
 _MOST_CAMERAS = 16

@@ -23,10 +23,7 @@ from lidarpainter_models.gaussians.initialisation.surfels import (
     fill_colours,
     surfels_from_points,
 )
-from lidarpainter_models.gaussians.initialisation.unreached import (
-    MOST_SHARE,
-    unreached_gaussians,
-)
+from lidarpainter_models.gaussians.initialisation.unreached import MOST_SHARE, unreached_gaussians
 from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene

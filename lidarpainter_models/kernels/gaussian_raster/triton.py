@@ -18,11 +18,7 @@ from torch import Tensor
 from lidarpainter_models.errors import BackendError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import TANGENT_MARGIN, TILE_PX
-from lidarpainter_models.kernels.gaussian_raster.projection import (
-    IS_VISIBLE,
-    RECORD_FLOATS,
-    SIGMA,
-)
+from lidarpainter_models.kernels.gaussian_raster.projection import IS_VISIBLE, RECORD_FLOATS, SIGMA
 from lidarpainter_models.kernels.gaussian_raster.splats import DrawnImages, Splats
 from lidarpainter_models.kernels.gaussian_raster.triton_kernels.blending import blend
 from lidarpainter_models.kernels.gaussian_raster.triton_kernels.blending_gradients import (

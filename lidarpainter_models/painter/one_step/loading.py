@@ -15,11 +15,7 @@ import torch
 
 from lidarpainter_models.errors import ConfigError, WeightsError
 from lidarpainter_models.painter.one_step.architectures import TEXT_TOKENS
-from lidarpainter_models.painter.one_step.assembly import (
-    assemble,
-    made_lean,
-    trained_in_float32,
-)
+from lidarpainter_models.painter.one_step.assembly import assemble, made_lean, trained_in_float32
 from lidarpainter_models.painter.one_step.base_models import (
     SD_TURBO,
     BaseModel,

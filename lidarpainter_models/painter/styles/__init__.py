@@ -9,12 +9,7 @@ from lidarpainter_models.painter.styles.fog import FogConfig, add_fog
 from lidarpainter_models.painter.styles.night import NightConfig, turn_to_night
 from lidarpainter_models.painter.styles.rain import RainConfig, add_rain
 from lidarpainter_models.painter.styles.view import StyleView
-from lidarpainter_models.weather.mix import (
-    FOG_VISIBILITY_M,
-    STYLE_PROMPTS,
-    StyleMix,
-    check_prompt,
-)
+from lidarpainter_models.weather.mix import FOG_VISIBILITY_M, STYLE_PROMPTS, StyleMix, check_prompt
 
 __all__ = ["STYLE_PROMPTS", "StyleView", "apply_mix", "apply_style", "check_prompt"]
 

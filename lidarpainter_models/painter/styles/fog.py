@@ -14,12 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.painter.styles.view import StyleView, distances, elevations
-from lidarpainter_models.weather.air import (
-    FOG_BRIGHTNESS,
-    FOG_GREYNESS,
-    FOG_LAYER_M,
-    transmittance,
-)
+from lidarpainter_models.weather.air import FOG_BRIGHTNESS, FOG_GREYNESS, FOG_LAYER_M, transmittance
 from lidarpainter_models.weather.light import luminance, to_display, to_linear
 from lidarpainter_models.weather.mix import FOG_VISIBILITY_M
 

@@ -23,10 +23,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.geometry.transforms import (
-    interpolate_rigid,
-    invert_rigid,
-)
+from lidarpainter_models.geometry.transforms import interpolate_rigid, invert_rigid
 from lidarpainter_models.readers.nuscenes.dataset import NuscenesTables, Sample
 from lidarpainter_models.readers.nuscenes.recordings import LIDAR_NAME, Recording
 from lidarpainter_models.readers.nuscenes.rows import TableRow

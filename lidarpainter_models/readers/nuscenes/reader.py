@@ -23,11 +23,7 @@ from lidarpainter_models.geometry.boxes import count_points_in_boxes
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.readers.nuscenes.boxes import Annotations
-from lidarpainter_models.readers.nuscenes.dataset import (
-    find_scene,
-    open_versions,
-    read_samples,
-)
+from lidarpainter_models.readers.nuscenes.dataset import find_scene, open_versions, read_samples
 from lidarpainter_models.readers.nuscenes.recordings import (
     CAMERA_NAMES,
     LIDAR_NAME,
@@ -36,11 +32,7 @@ from lidarpainter_models.readers.nuscenes.recordings import (
     form_frames,
     read_recordings,
 )
-from lidarpainter_models.readers.nuscenes.sweeps import (
-    TURN_NS,
-    LidarPoints,
-    read_lidar_points,
-)
+from lidarpainter_models.readers.nuscenes.sweeps import TURN_NS, LidarPoints, read_lidar_points
 from lidarpainter_models.readers.source_logs.drive_poses import level_frame, pose_at
 from lidarpainter_models.readers.source_logs.folder import SourceFolder
 from lidarpainter_models.readers.source_logs.frame_content import (

@@ -13,10 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.geometry.transforms import (
-    rigid_from_rotation,
-    rotation_from_quaternion,
-)
+from lidarpainter_models.geometry.transforms import rigid_from_rotation, rotation_from_quaternion
 from lidarpainter_models.readers.source_logs.drive_poses import nanoseconds
 from lidarpainter_models.readers.source_logs.folder import SourceFolder
 from lidarpainter_models.scenes.validation import require_time

@@ -29,12 +29,7 @@ from lidarpainter_models.readers.source_logs.swept_boxes import (
 )
 from lidarpainter_models.readers.waymo.calibration import CameraCalibration
 from lidarpainter_models.readers.waymo.cameras import ImageClock
-from lidarpainter_models.readers.waymo.log import (
-    UprightBox,
-    WaymoFrame,
-    WaymoImage,
-    WaymoLabel,
-)
+from lidarpainter_models.readers.waymo.log import UprightBox, WaymoFrame, WaymoImage, WaymoLabel
 from lidarpainter_models.scenes.records import BoxRecord
 
 _US_PER_S = 1_000_000

@@ -39,11 +39,7 @@ from lidarpainter_models.readers.waymo.log import (
     checked_image,
     echoes_present,
 )
-from lidarpainter_models.readers.waymo.parquet_rows import (
-    FrameStream,
-    ParquetRow,
-    ParquetRows,
-)
+from lidarpainter_models.readers.waymo.parquet_rows import FrameStream, ParquetRow, ParquetRows
 from lidarpainter_models.readers.waymo.range_images import shaped_matrix
 
 RANGE_CHANNELS, POSE_CHANNELS = 4, 6

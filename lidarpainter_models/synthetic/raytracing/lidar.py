@@ -17,11 +17,7 @@ from lidarpainter_models.synthetic.raytracing.scene_arrays import (
     InstanceArrays,
     SceneArrays,
 )
-from lidarpainter_models.synthetic.raytracing.shade import (
-    classify,
-    hit_normal,
-    paint_at,
-)
+from lidarpainter_models.synthetic.raytracing.shade import classify, hit_normal, paint_at
 from lidarpainter_models.synthetic.raytracing.texture import sample_texture
 from lidarpainter_models.synthetic.raytracing.trace import INLINED, RAY, WORK_ROWS, trace_scene
 

@@ -15,11 +15,7 @@ from lidarpainter_models.synthetic.raytracing.scene_arrays import (
     SceneArrays,
     ViewArrays,
 )
-from lidarpainter_models.synthetic.raytracing.shade import (
-    classify,
-    paint_at,
-    shade,
-)
+from lidarpainter_models.synthetic.raytracing.shade import classify, paint_at, shade
 from lidarpainter_models.synthetic.raytracing.sky import sky_radiance
 from lidarpainter_models.synthetic.raytracing.trace import INLINED, RAY, WORK_ROWS, trace_scene
 

@@ -10,12 +10,7 @@ from lidarpainter_models.synthetic.plan.layout import KERB_HEIGHT_M, StreetPlan,
 from lidarpainter_models.synthetic.raytracing.scene_arrays import KIND_CUT_OUT, SceneArrays
 from lidarpainter_models.synthetic.textures.noise import as_rgba
 from lidarpainter_models.synthetic.textures.surfaces import StreetClass, Surface, SurfaceSet
-from lidarpainter_models.synthetic.world.buildings import (
-    Lot,
-    add_buildings,
-    add_skyline,
-    draw_lots,
-)
+from lidarpainter_models.synthetic.world.buildings import Lot, add_buildings, add_skyline, draw_lots
 from lidarpainter_models.synthetic.world.furniture import StreetFurniture
 from lidarpainter_models.synthetic.world.ground import add_ground
 from lidarpainter_models.synthetic.world.meshes import Mesh, MeshBuilder

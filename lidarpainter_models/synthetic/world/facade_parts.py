@@ -22,12 +22,7 @@ from lidarpainter_models.synthetic.textures.surfaces import (
     tint_from_bytes,
 )
 from lidarpainter_models.synthetic.textures.walls import WallCanvas
-from lidarpainter_models.synthetic.world.facades import (
-    FLOOR_M,
-    GROUND_FLOOR_M,
-    Facade,
-    FacadeStyle,
-)
+from lidarpainter_models.synthetic.world.facades import FLOOR_M, GROUND_FLOOR_M, Facade, FacadeStyle
 from lidarpainter_models.synthetic.world.meshes import MeshBuilder
 from lidarpainter_models.synthetic.world.solids import add_box, add_tube
 

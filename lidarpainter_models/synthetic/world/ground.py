@@ -11,11 +11,7 @@ from lidarpainter_models.synthetic.plan.layout import (
     StreetPlan,
 )
 from lidarpainter_models.synthetic.raytracing.scene_arrays import KIND_ROAD
-from lidarpainter_models.synthetic.textures.ground import (
-    asphalt_detail,
-    lot_ground,
-    sidewalk_slabs,
-)
+from lidarpainter_models.synthetic.textures.ground import asphalt_detail, lot_ground, sidewalk_slabs
 from lidarpainter_models.synthetic.textures.road_paint import paint_road
 from lidarpainter_models.synthetic.textures.surfaces import (
     StreetClass,

@@ -13,12 +13,7 @@ from lidarpainter_models.gaussians.model.sky import SkyTexture
 from lidarpainter_models.gaussians.model.styling.lamps import fixed_lamps
 from lidarpainter_models.gaussians.model.styling.scene_style import SceneStyle, StyledPlace
 from lidarpainter_models.gaussians.model.styling.traits import SurfaceTraits
-from lidarpainter_models.kernels.scene_light import (
-    LEAST_BASE,
-    Appearance,
-    Surroundings,
-    irradiance,
-)
+from lidarpainter_models.kernels.scene_light import LEAST_BASE, Appearance, Surroundings, irradiance
 from lidarpainter_models.weather.air import (
     CLOUD_LIGHT,
     COLOUR_WITHOUT_SUN,
