@@ -20,9 +20,14 @@ from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_tangent, rotation_from_vector
 from lidarpainter_models.kernels.point_splat import splat_points
-from lidarpainter_models.metrics.colour import MIN_PIXELS, apply_affine_colour, fit_affine_colour
 from lidarpainter_models.metrics.depth import visible_points
-from lidarpainter_models.metrics.images import psnr_from_error, squared_error
+from lidarpainter_models.metrics.images import (
+    MIN_PIXELS,
+    apply_affine_colour,
+    fit_affine_colour,
+    psnr_from_error,
+    squared_error,
+)
 
 GROW_PX = 1
 """The strip mask is grown by this much around its LiDAR pixels."""

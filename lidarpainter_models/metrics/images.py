@@ -1,4 +1,4 @@
-"""How close an image comes to the truth.
+"""How close an image comes to the truth, after an affine change of colour where cameras differ.
 
 Images are (height, width, 3) rgb in [0, 1]. PSNR follows 10 log10(1 / MSE) with the squared
 error averaged over pixels and channels; SSIM is Wang et al. (2004) as `kernels.ssim` defines it
@@ -14,6 +14,9 @@ from torch import Tensor
 
 from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.kernels.ssim import ssim
+
+MIN_PIXELS = 100
+"""Fewer samples than this do not pin twelve numbers down."""
 
 
 def squared_error(
@@ -70,3 +73,29 @@ def pooled_psnr(scores: Sequence[ImageScores]) -> float | None:
     if pixels == 0:
         return None
     return psnr_from_error(sum(score.masked_squared_error for score in scores) / pixels)
+
+
+def fit_affine_colour(
+    source_rgb: Float[Tensor, "pixels 3"], target_rgb: Float[Tensor, "pixels 3"]
+) -> Float[Tensor, "3 4"]:
+    """Least-squares `target = A source + b` as a 3x4 matrix.
+
+    Raises:
+        ShapeError: too few pixels to fit twelve numbers.
+    """
+    if len(source_rgb) < MIN_PIXELS or source_rgb.shape != target_rgb.shape:
+        raise ShapeError(
+            f"an affine colour needs at least {MIN_PIXELS} matching pixels, got "
+            f"{len(source_rgb)} and {len(target_rgb)}"
+        )
+    ones = torch.ones_like(source_rgb[:, :1])
+    design = torch.cat([source_rgb, ones], dim=1).double()
+    solution = torch.linalg.lstsq(design, target_rgb.double()).solution
+    return solution.T.to(source_rgb.dtype).contiguous()
+
+
+def apply_affine_colour(
+    rgb: Float[Tensor, "*pixels 3"], affine: Float[Tensor, "3 4"]
+) -> Float[Tensor, "*pixels 3"]:
+    """Map colours with a 3x4 matrix; the result may leave [0, 1]."""
+    return rgb @ affine[:, :3].T + affine[:, 3]

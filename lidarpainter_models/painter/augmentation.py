@@ -1,4 +1,4 @@
-"""Turn pairs into training batches: random windows, flips, light, and things taken away.
+"""Turn pairs into training batches: random windows, flips, light, styles, and things taken away.
 
 Everything follows from one generator per step, so a batch depends on the seed and the step alone
 and a resumed training sees the batches it would have seen.
@@ -15,9 +15,9 @@ from torch import Generator, Tensor
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.batches import ConditionBatch, stack_conditions
 from lidarpainter_models.painter.examples import PaintingPair, PairSource, Window
-from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
+from lidarpainter_models.painter.protocol import DEFAULT_PROMPT, PaintingConditions
 from lidarpainter_models.painter.render_damage import damage_render
-from lidarpainter_models.painter.style_pairs import styled_pair
+from lidarpainter_models.painter.styles import StyleView, apply_style
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -248,3 +248,39 @@ def _chosen(share: float, size: int, generator: Generator) -> Tensor:
 def _signed(shape: tuple[int, ...], generator: Generator) -> Tensor:
     """Uniform in [-1, 1)."""
     return 2 * torch.rand(shape, generator=generator) - 1
+
+
+def styled_pair(pair: PaintingPair, prompt: str, generator: Generator) -> PaintingPair:
+    """The pair with a styled target and the prompt that asks for it; whole images only.
+
+    The conditions stay clear; the target is styled by the depth of its own view: LiDAR where it
+    hit, the render elsewhere. Pairs keep no camera, so depth stands for distance, and what needs to
+    know the ground (the low beam, windows, wet roads) is left out.
+
+    Raises:
+        ConfigError: there is no such style.
+    """
+    conditions = replace(pair.conditions, prompt=prompt)
+    if prompt == DEFAULT_PROMPT:
+        return replace(pair, conditions=conditions)
+    target = apply_style(target_view(pair), prompt, generator)
+    return replace(pair, conditions=conditions, target_rgb=target)
+
+
+def target_view(pair: PaintingPair) -> StyleView:
+    """The target with the depth and the sky of its view."""
+    old = pair.conditions
+    return StyleView(
+        rgb=pair.target_rgb,
+        depth_m=torch.where(old.lidar_hit, old.lidar_depth_m, old.render_depth_m),
+        sky=_sky(old),
+    )
+
+
+def _sky(conditions: PaintingConditions) -> Float[Tensor, "height width"]:
+    """What the Gaussians leave open, above the topmost LiDAR hit of its column.
+
+    Below it, what is open is a hole of the render.
+    """
+    below_a_hit = conditions.lidar_hit.int().cumsum(dim=0) > 0
+    return torch.where(below_a_hit, 0.0, 1 - conditions.render_alpha.clamp(0, 1))

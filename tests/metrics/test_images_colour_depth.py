@@ -7,9 +7,13 @@ import torch
 
 from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.metrics.colour import apply_affine_colour, fit_affine_colour
 from lidarpainter_models.metrics.depth import score_depth, visible_points
-from lidarpainter_models.metrics.images import pooled_psnr, score_image
+from lidarpainter_models.metrics.images import (
+    apply_affine_colour,
+    fit_affine_colour,
+    pooled_psnr,
+    score_image,
+)
 
 
 def flat_camera() -> Camera:

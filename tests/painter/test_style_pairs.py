@@ -7,14 +7,13 @@ import torch
 from quiet_augmentation import QUIET
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.painter.augmentation import draw_batch
+from lidarpainter_models.painter.augmentation import draw_batch, styled_pair, target_view
 from lidarpainter_models.painter.examples import Window
 from lidarpainter_models.painter.nano.more_prompts import with_more_prompts
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.nano.painter import NanoPainter
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig, train_nano
 from lidarpainter_models.painter.nano.weights import load_weights, save_weights
-from lidarpainter_models.painter.style_pairs import styled_pair, target_view
 
 SMALL = NanoConfig(widths=(8, 16, 16), blocks=(1, 1, 1))
 STYLED = replace(SMALL, prompts=("clear", "foggy", "night"))

@@ -20,8 +20,11 @@ from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.densification import densify, prune
 from lidarpainter_models.gaussians.fitting.images import FitImage, full_image, half_image
 from lidarpainter_models.gaussians.fitting.memory import planned_memory, within_limit
-from lidarpainter_models.gaussians.fitting.planned_size import planned_fit
-from lidarpainter_models.gaussians.fitting.seen_surface import SeenSurface, seen_surface
+from lidarpainter_models.gaussians.fitting.seen_surface import (
+    SeenSurface,
+    planned_fit,
+    seen_surface,
+)
 from lidarpainter_models.gaussians.fitting.shape_limits import (
     LIMITS_EVERY,
     limit_shapes,

@@ -9,7 +9,6 @@ from torch import Tensor
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.images import FitImage
 from lidarpainter_models.gaussians.fitting.losses import pose_prior
-from lidarpainter_models.gaussians.fitting.optimiser import RowAdam
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 
 CAMERA_NOISE = {"rotation_rad": 2e-3, "translation_m": 0.03}
@@ -22,6 +21,62 @@ ACTOR_PRIOR = 1e-6
 """Of squared actor corrections, likewise: an actor fills a small part of the image."""
 ACTOR_SMOOTHNESS = 1e-5
 """Of squared jumps between an actor's neighbouring corrections, likewise."""
+
+
+class RowAdam:
+    """Adam (Kingma and Ba, 2015) on a table whose rows have their own step sizes and counts.
+
+    A row whose gradient is exactly zero is left alone: value, moments and count. A dense Adam would
+    let a correction drift on momentum for the dozen steps until its view is drawn again.
+    """
+
+    def __init__(self, table: Tensor, *, betas: tuple[float, float] = (0.9, 0.99)) -> None:
+        """Start with empty moments; rows are the first dimension (or the first two, flattened)."""
+        self.betas = betas
+        self.first = torch.zeros_like(table)
+        self.second = torch.zeros_like(table)
+        self.count = torch.zeros(table.shape[0], dtype=torch.int64, device=table.device)
+
+    def step(
+        self,
+        table: Tensor,
+        gradient: Tensor,
+        rate: Float[Tensor, "columns"],
+        rows: slice | None = None,
+    ) -> None:
+        """One step in place on the rows with a gradient; `rate` is per column.
+
+        Whoever knows these rows names them: to look for them, the host waits for the device.
+        """
+        if rows is not None:
+            self._step(table, gradient, rate, rows)
+        elif (found := gradient.abs().sum(dim=1).nonzero()[:, 0]).numel():
+            self._step(table, gradient, rate, found)
+
+    def _step(
+        self, table: Tensor, gradient: Tensor, rate: Float[Tensor, "columns"], rows: slice | Tensor
+    ) -> None:
+        beta1, beta2 = self.betas
+        g = gradient[rows]
+        self.count[rows] += 1
+        count = self.count[rows, None].to(g.dtype)
+        first = beta1 * self.first[rows] + (1 - beta1) * g
+        second = beta2 * self.second[rows] + (1 - beta2) * g * g
+        self.first[rows], self.second[rows] = first, second
+        spread = (second / (1 - beta2**count)).sqrt() + 1e-15
+        with torch.no_grad():
+            table[rows] -= rate * (first / (1 - beta1**count)) / spread
+
+    def tensors(self) -> dict[str, Tensor]:
+        """State to be kept in a checkpoint."""
+        return {"first": self.first, "second": self.second, "count": self.count}
+
+    def load(self, tensors: dict[str, Tensor]) -> None:
+        """Take over kept state."""
+        device = self.first.device
+        self.first, self.second, self.count = (
+            tensors[name].to(device, copy=True) for name in ("first", "second", "count")
+        )
 
 
 @dataclass(eq=False, kw_only=True)

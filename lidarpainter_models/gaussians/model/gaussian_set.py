@@ -124,3 +124,18 @@ class GaussianSet:
             sh_rest=torch.zeros(0, (sh_degree + 1) ** 2 - 1, 3),
             body_index=torch.zeros(0, dtype=torch.int32),
         )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ShownGaussians:
+    """Gaussians ready to be drawn, with colours for one view."""
+
+    means: Float[Tensor, "gaussians 3"]
+    rotation_wxyz: Float[Tensor, "gaussians 4"]
+    scale_m: Float[Tensor, "gaussians 3"]
+    opacity: Float[Tensor, " gaussians"]
+    sh: Float[Tensor, "gaussians coefficients 3"]
+    body_index: Int[Tensor, " gaussians"]
+
+    def __len__(self) -> int:
+        return self.means.shape[0]

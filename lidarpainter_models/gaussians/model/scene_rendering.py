@@ -11,9 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, ShownGaussians
 from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
-from lidarpainter_models.gaussians.model.shown_gaussians import ShownGaussians
 from lidarpainter_models.gaussians.model.sky import SkyTexture
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid

@@ -17,11 +17,11 @@ from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
     TILE_PX,
 )
 from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry
-from lidarpainter_models.kernels.gaussian_raster.lane_exponential import lane_exp
 from lidarpainter_models.kernels.gaussian_raster.lanes import (
     choose,
     lane_array,
     lane_centres,
+    lane_exp,
     largest,
     load,
     magnitude,

@@ -20,8 +20,7 @@ from lidarpainter_models.readers.source_logs.frame_content import (
     SourceImage,
     SourceSweep,
 )
-from lidarpainter_models.readers.source_logs.log import naming
-from lidarpainter_models.readers.source_logs.selection import chosen_cameras, chosen_frames
+from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames, naming
 from lidarpainter_models.scenes import schema
 from lidarpainter_models.scenes.records import (
     BoxRecord,

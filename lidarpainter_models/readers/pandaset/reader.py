@@ -48,7 +48,7 @@ from lidarpainter_models.readers.source_logs.frame_content import (
     SourceImage,
     SourceSweep,
 )
-from lidarpainter_models.readers.source_logs.selection import chosen_cameras, chosen_frames
+from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames
 from lidarpainter_models.readers.source_logs.swept_boxes import SweepTimes, moving_actors
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord
 from lidarpainter_models.scenes.validation import jpeg_header_size, require_classes

@@ -6,7 +6,7 @@ is stored does not depend on it, and never more than `num_ahead` + 1 frames are 
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -131,3 +131,30 @@ def _in_order(
             yield waiting.popleft().result()
     while waiting:
         yield waiting.popleft().result()
+
+
+def chosen_frames(num_frames: int, frames: slice | None, where: object) -> list[int]:
+    """Positions of the frames asked for; all of them if None.
+
+    Raises:
+        DataError: none is left.
+    """
+    chosen = list(range(num_frames))[frames or slice(None)]
+    if not chosen:
+        raise DataError(f"{where}: the frames asked for select none of its {num_frames} frames")
+    return chosen
+
+
+def chosen_cameras(
+    wanted: tuple[str, ...] | None, known: Iterable[str], where: object
+) -> tuple[str, ...]:
+    """Names of the cameras asked for, each once; all that are known if None.
+
+    Raises:
+        DataError: there is no such camera.
+    """
+    names = tuple(known)
+    for name in wanted or ():
+        if name not in names:
+            raise DataError(f"{where}: no camera {name!r}, expected some of {', '.join(names)}")
+    return names if wanted is None else tuple(dict.fromkeys(wanted))

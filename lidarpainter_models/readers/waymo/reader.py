@@ -22,6 +22,7 @@ its pixel poses (some derived files have none of these), is refused.
 
 import re
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -29,19 +30,25 @@ import torch
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
-from lidarpainter_models.readers.source_logs.drive_checks import require_timely
+from lidarpainter_models.readers.source_logs.drive_checks import (
+    apart,
+    require_motion,
+    require_timely,
+)
 from lidarpainter_models.readers.source_logs.drive_poses import NS_PER_S, level_frame, nanoseconds
 from lidarpainter_models.readers.source_logs.frame_content import (
     FrameContent,
     SourceImage,
     SourceSweep,
 )
-from lidarpainter_models.readers.source_logs.log import naming
-from lidarpainter_models.readers.source_logs.selection import chosen_cameras, chosen_frames
+from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames, naming
 from lidarpainter_models.readers.waymo.boxes import FramePoints, box_records, moving_ids
 from lidarpainter_models.readers.waymo.calibration import CAMERA_NAMES, TOP
-from lidarpainter_models.readers.waymo.cameras import exposure_s, image_record
-from lidarpainter_models.readers.waymo.checks import require_agreement, require_drive
+from lidarpainter_models.readers.waymo.cameras import (
+    exposure_s,
+    global_from_vehicle_at,
+    image_record,
+)
 from lidarpainter_models.readers.waymo.log import (
     MAX_LAG_S,
     WaymoFrame,
@@ -64,6 +71,10 @@ _TURN_S = 0.1
 _TURN_LIMITS_S = (0.05, 0.2)
 _US_PER_S = 1_000_000
 _SAME_POSE_M = 0.01
+MAX_POSE_GAP_M = 1.0
+MAX_POSE_GAP_RAD = 0.05
+"""An image's pose, carried to the frame's time, agrees with the frame's to some centimetres."""
+NS_PER_US = 1000
 
 
 def list_waymo_segments(root: Path) -> tuple[str, ...]:
@@ -258,3 +269,28 @@ def _turn_s(frames: dict[int, WaymoFrame]) -> float:
     usual_s = float(np.median(steps_s)) if steps_s else _TURN_S
     low_s, high_s = _TURN_LIMITS_S
     return usual_s if low_s <= usual_s <= high_s else _TURN_S
+
+
+def require_drive(frames: list[WaymoFrame]) -> None:
+    """Refuse frames whose times do not ascend, or between which no car could have driven."""
+    for before, after in pairwise(frames):
+        if after.start_us <= before.start_us:
+            raise DataError(
+                f"{after.place}, timestamp: {after.start_us} us, expected more than the frame "
+                f"before, {before.start_us} us"
+            )
+        require_motion(
+            (before.start_us * NS_PER_US, before.global_from_vehicle),
+            (after.start_us * NS_PER_US, after.global_from_vehicle),
+            after.place,
+        )
+
+
+def require_agreement(image: WaymoImage, frame: WaymoFrame, time_s: float) -> None:
+    """Refuse an image that states another place of the vehicle than its frame does."""
+    apart_m, apart_rad = apart(global_from_vehicle_at(image, time_s), frame.global_from_vehicle)
+    if apart_m > MAX_POSE_GAP_M or apart_rad > MAX_POSE_GAP_RAD:
+        raise DataError(
+            f"{image.place}, pose: {apart_m:.2f} m and {apart_rad:.3f} rad from the frame's, "
+            f"expected {MAX_POSE_GAP_M:g} m and {MAX_POSE_GAP_RAD:g} rad at most"
+        )

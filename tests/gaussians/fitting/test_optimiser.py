@@ -1,6 +1,6 @@
 import torch
 
-from lidarpainter_models.gaussians.fitting.optimiser import RowAdam
+from lidarpainter_models.gaussians.fitting.refinement import RowAdam
 from lidarpainter_models.gaussians.fitting.settings import LearningRates
 
 

@@ -4,8 +4,7 @@ import pytest
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.fitting.config import EffortConfig, FitConfig, continuation
-from lidarpainter_models.gaussians.fitting.planned_size import START_SHARE, planned_fit
-from lidarpainter_models.gaussians.fitting.seen_surface import SeenSurface
+from lidarpainter_models.gaussians.fitting.seen_surface import START_SHARE, SeenSurface, planned_fit
 from lidarpainter_models.gaussians.fitting.settings import DensificationConfig
 
 SURFACE = SeenSurface(num_pixels=200_000.0, whole_views=2.5, groups=((0,), (1,)))

@@ -13,13 +13,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.gaussians.model.actors import ActorPoses, Actors
-from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, ShownGaussians
 from lidarpainter_models.gaussians.model.scene_rendering import (
     SceneRender,
     camera_from_body,
     draw_over_sky,
 )
-from lidarpainter_models.gaussians.model.shown_gaussians import ShownGaussians
 from lidarpainter_models.gaussians.model.sky import SkyTexture
 from lidarpainter_models.gaussians.model.styling.glare import add_glare
 from lidarpainter_models.gaussians.model.styling.lamps import (
