@@ -48,18 +48,13 @@ def brief(scene: str) -> ReconstructParameters:
 def balanced(scene: str) -> ReconstructParameters:
     """The best trade on one GPU."""
     fit = FitConfig(effort=EffortConfig(looks=1_000.0))
-    return ReconstructParameters(
-        scene=scene,
-        preset="balanced",
-        observation=ObservationConfig(width_px=960),
-        fit=fit,
-        painter="nano",
-        novel=NovelGuidanceConfig(),
-        conditions=ConditionConfig(),
-        rounds=2,
-        refine=continuation(fit, looks=350.0, guidance=GuidanceConfig()),
-        scoring=ScoringConfig(),
-    )
+    changes = {
+        "preset": "balanced",
+        "observation": ObservationConfig(width_px=960),
+        "fit": fit,
+        "refine": continuation(fit, looks=350.0, guidance=GuidanceConfig()),
+    }
+    return preview(scene).model_copy(update=changes)
 
 
 def paper(scene: str) -> ReconstructParameters:
@@ -70,18 +65,15 @@ def paper(scene: str) -> ReconstructParameters:
     """
     fit = FitConfig(effort=EffortConfig(looks=3_500.0), half_resolution=0.0)
     guidance = GuidanceConfig(probability=0.4, weight=0.2, ssim=0.1)
-    return ReconstructParameters(
-        scene=scene,
-        preset="paper",
-        observation=ObservationConfig(width_px=1024),
-        fit=fit,
-        painter="nano",
-        novel=NovelGuidanceConfig(every_nth=1),
-        conditions=ConditionConfig(),
-        rounds=1,
-        refine=continuation(fit, looks=11_500.0, guidance=guidance),
-        scoring=ScoringConfig(),
-    )
+    changes = {
+        "preset": "paper",
+        "observation": ObservationConfig(width_px=1024),
+        "fit": fit,
+        "novel": NovelGuidanceConfig(every_nth=1),
+        "rounds": 1,
+        "refine": continuation(fit, looks=11_500.0, guidance=guidance),
+    }
+    return preview(scene).model_copy(update=changes)
 
 
 PRESETS: dict[str, Callable[[str], ReconstructParameters]] = {

@@ -117,34 +117,19 @@ def stylize_run(
     *,
     mix: StyleMix,
     images: Images,
-    width_px: int | None,
     seed: int,
 ) -> dict[str, Any]:
     """Show a finished run in another weather or at night, and how well its edges are kept.
 
-    Without a `width_px` that of the fit is taken; the seed decides lit windows, drops and noise.
+    The seed decides lit windows, drops and noise.
 
     Raises:
         ConfigError: images wider than recorded.
     """
     finished = open_run(store, path.run)
-    parameters = view_parameters(finished)
-    observation = parameters.observation
-    if width_px is not None:
-        observation = replace(observation, width_px=width_px)
-        views = open_scene(store, finished.scene_id).views
-        require_recorded_width(width_px, views, "--width")
-    view = RenderRequest(
-        trajectory=path.trajectory,
-        camera=path.camera,
-        frames=path.frames,
-        is_painted=path.is_painted,
-        observation=observation,
-        conditions=parameters.conditions,
-        allows_collisions=path.allows_collisions,
-    )
+    view = render_request(store, finished, path, ViewKinds())
     request = StylizeRequest(mix=mix, view=view, images=images, seed=seed)
-    run = parameters.run_spec(store.address, painter=path.painter)
+    run = view_parameters(finished).run_spec(store.address, painter=path.painter)
     made = stylize.fn(run, finished.final, request, out)
     return {
         "run_id": finished.run_id,

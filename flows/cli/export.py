@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from flows.cli.output import print_json, print_pairs, say_status
+from flows.cli.output import print_json, print_pairs
 from flows.cli.shared_options import (
     AllowCollisions,
     AsJson,
@@ -18,8 +18,7 @@ from flows.cli.shared_options import (
     PostpaintPainter,
     RunName,
     TrajectorySpec,
-    check_painter,
-    parse_frames,
+    followed_path,
     parse_names,
 )
 from lidarpainter_models.errors import ConfigError
@@ -89,32 +88,23 @@ def export(  # noqa: PLR0913 - the options of a command
     """
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
-    from lidarpainter_models.geometry.trajectory_words import read_trajectory_words
-    from tasks.runs import open_run
 
-    read_trajectory_words(trajectory)
-    chosen = parse_frames(frames)
     time_s, frame = parse_time(time)
     scene = {"time_s": time_s, "frame": frame, "actors": parse_actors(actors), "with_sky": sky}
     scene |= {"is_per_actor": per_actor, "spz_version": spz_version}
-    open_run(existing_store(), run)
-    say_status(f"opening run {run}")
-    check_painter(painter)
-    from flows.exports import export_request, export_run
-    from flows.views import PathRequest
-    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
-
-    path = PathRequest(
-        run=run,
-        trajectory=parse_trajectory(trajectory),
+    path = followed_path(
+        run,
+        trajectory,
+        frames,
+        painter,
         camera=camera,
-        frames=chosen,
         is_painted=postpaint or painter is not None,
-        painter=painter,
         allows_collisions=allow_collisions,
         width_px=width,
         beside=beside,
     )
+    from flows.exports import export_request, export_run
+
     request = export_request(format_, scene, path, fps)
     with shown_progress():
         result = export_run(existing_store(), request, out.absolute())

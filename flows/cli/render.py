@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from flows.cli.output import print_json, print_pairs, say_status
+from flows.cli.output import print_json, print_pairs
 from flows.cli.shared_options import (
     AllowCollisions,
     AsJson,
@@ -17,8 +17,7 @@ from flows.cli.shared_options import (
     PostpaintPainter,
     RunName,
     TrajectorySpec,
-    check_painter,
-    parse_frames,
+    followed_path,
     parse_previous,
     with_told_collisions,
 )
@@ -71,30 +70,22 @@ def render(  # noqa: PLR0913 - the options of a command
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
     from lidarpainter_models.conditioning.settings import SequenceConfig
-    from lidarpainter_models.geometry.trajectory_words import read_trajectory_words
-    from tasks.runs import open_run
 
-    read_trajectory_words(trajectory)
-    chosen = parse_frames(frames)
     sequence = SequenceConfig() if previous is None else parse_previous(previous)[0]
-    open_run(existing_store(), run)
-    say_status(f"opening run {run}")
-    check_painter(painter)
-    from flows.views import PathRequest, render_run
-    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
-    from tasks.views.files import ViewKinds
-
-    path = PathRequest(
-        run=run,
-        trajectory=parse_trajectory(trajectory),
+    path = followed_path(
+        run,
+        trajectory,
+        frames,
+        painter,
         camera=camera,
-        frames=chosen,
         is_painted=postpaint or painter is not None,
-        painter=painter,
         allows_collisions=allow_collisions,
         width_px=width,
         beside=beside,
     )
+    from flows.views import render_run
+    from tasks.views.files import ViewKinds
+
     kinds = ViewKinds(depth=depth, semantics=semantics, video=video, fps=fps)
     with shown_progress():
         result = render_run(

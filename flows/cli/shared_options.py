@@ -5,9 +5,11 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
+from flows.cli.output import say_status
 from lidarpainter_models.errors import ConfigError
 
 if TYPE_CHECKING:
+    from flows.views import PathRequest
     from lidarpainter_models.conditioning.settings import SequenceConfig
 
 RANGE = re.compile(r"(\d*):(\d*)")
@@ -70,6 +72,36 @@ BesideWhat = Annotated[
 FollowedFrames = Annotated[
     str | None, typer.Option(help="Recorded frames A:B to follow, B excluded.")
 ]
+
+
+def followed_path(
+    run: str,
+    trajectory: str,
+    frames: str | None,
+    painter: str | None = None,
+    **fields: Any,  # noqa: ANN401 - of the request, as it has them
+) -> "PathRequest":
+    """Which path of a run is followed; wrong words are refused before anything slow is imported.
+
+    Raises:
+        LidarPainterError: no such trajectory, frames or painter.
+        CatalogError: no such run.
+    """
+    from catalog.store import existing_store
+    from lidarpainter_models.geometry.trajectory_words import read_trajectory_words
+    from tasks.runs import open_run
+
+    read_trajectory_words(trajectory)
+    chosen = parse_frames(frames)
+    open_run(existing_store(), run)
+    say_status(f"opening run {run}")
+    check_painter(painter)
+    from flows.views import PathRequest
+    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+
+    return PathRequest(
+        run=run, trajectory=parse_trajectory(trajectory), frames=chosen, painter=painter, **fields
+    )
 
 
 def with_told_collisions(result: dict[str, Any]) -> dict[str, Any]:

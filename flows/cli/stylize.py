@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from flows.cli.output import print_json, print_pairs, say_status
+from flows.cli.output import print_json, print_pairs
 from flows.cli.shared_options import (
     AllowCollisions,
     AsJson,
@@ -13,8 +13,7 @@ from flows.cli.shared_options import (
     FollowedFrames,
     RunName,
     TrajectorySpec,
-    check_painter,
-    parse_frames,
+    followed_path,
 )
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.weather.mix import StyleMix
@@ -70,32 +69,24 @@ def stylize(  # noqa: PLR0913 - the options of a command
     mix = StyleMix.parse(prompt, strength=strength, visibility_m=visibility)
     if in_scene == (out is not None):
         raise ConfigError("stylize needs --out FOLDER for images, or --in-scene for a new run")
-    chosen = parse_frames(frames)
-    from catalog.store import existing_store
-    from flows.cli.progress import shown_progress
-    from lidarpainter_models.geometry.trajectory_words import read_trajectory_words
-    from tasks.runs import open_run
-
-    read_trajectory_words(trajectory)
-    open_run(existing_store(), run)
-    say_status(f"opening run {run}")
+    path = followed_path(
+        run,
+        trajectory,
+        frames,
+        painter,
+        camera=camera,
+        is_painted=painter is not None,
+        allows_collisions=allow_collisions,
+        width_px=width,
+    )
     if out is None:
         _dress(run, mix, seed, as_json=as_json)
         return
-    check_painter(painter)
-    from flows.views import PathRequest, stylize_run
-    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+    from catalog.store import existing_store
+    from flows.cli.progress import shown_progress
+    from flows.views import stylize_run
 
-    path = PathRequest(
-        run=run,
-        trajectory=parse_trajectory(trajectory),
-        camera=camera,
-        frames=chosen,
-        is_painted=painter is not None,
-        painter=painter,
-        allows_collisions=allow_collisions,
-    )
-    asked: dict[str, Any] = {"images": images, "width_px": width, "seed": seed}
+    asked: dict[str, Any] = {"images": images, "seed": seed}
     with shown_progress():
         result = stylize_run(existing_store(), path, out.absolute(), mix=mix, **asked)
     if as_json:

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from flows.cli.output import clear_status, say_status
-from flows.cli.shared_options import FollowedCamera, FollowedFrames, RunName, parse_frames
+from flows.cli.output import clear_status
+from flows.cli.shared_options import FollowedCamera, FollowedFrames, RunName, followed_path
 
 
 def view(
@@ -31,15 +31,10 @@ def view(
     Example: lidarpainter view latest
     """
     from catalog.store import existing_store
-    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
     from lidarpainter_models.geometry.trajectory_words import RECORDED
-    from tasks.runs import open_run
 
-    chosen = parse_frames(frames)
-    open_run(existing_store(), run)
-    say_status(f"opening run {run}")
+    path = followed_path(run, RECORDED, frames, camera=camera)
     from flows.browsing import view_run
-    from flows.views import PathRequest
 
     def opened_at(address: str) -> None:
         clear_status()
@@ -48,5 +43,4 @@ def view(
         if browser:
             webbrowser.open(address)
 
-    path = PathRequest(run=run, trajectory=parse_trajectory(RECORDED), camera=camera, frames=chosen)
     view_run(existing_store(), path, port=port, opened_at=opened_at, stopped=threading.Event())
