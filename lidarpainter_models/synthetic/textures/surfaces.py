@@ -6,6 +6,7 @@ share of paint on roads and gloss elsewhere.
 
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import Any
 
 import cv2
 import numpy as np
@@ -93,6 +94,18 @@ class SurfaceSet:
             self._known[surface] = len(self.surfaces)
             self.surfaces.append(surface)
         return self._known[surface]
+
+    def painted(
+        self,
+        rgba: np.ndarray,
+        semantics: StreetClass,
+        *,
+        repeats: bool = False,
+        **looks: Any,  # noqa: ANN401 - fields of `Surface`
+    ) -> int:
+        """Index of a surface that shows an image."""
+        texture = self.add_texture(rgba, repeats=repeats)
+        return self.add(Surface(semantics=semantics, texture=texture, **looks))
 
     def texture_arrays(self) -> tuple[np.ndarray, np.ndarray]:
         """`texels` and `texture_index` of `SceneArrays`."""

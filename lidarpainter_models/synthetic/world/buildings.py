@@ -8,13 +8,7 @@ import numpy as np
 from lidarpainter_models.synthetic.plan.layout import KERB_HEIGHT_M, SIDEWALK_M, StreetPlan
 from lidarpainter_models.synthetic.textures.surfaces import StreetClass, Surface, SurfaceSet
 from lidarpainter_models.synthetic.textures.walls import wall_tile
-from lidarpainter_models.synthetic.world.facade_parts import (
-    add_awnings,
-    add_bays,
-    add_boards,
-    add_cornice,
-    add_roof_things,
-)
+from lidarpainter_models.synthetic.world.facade_parts import HungFacade
 from lidarpainter_models.synthetic.world.facades import (
     FLOOR_M,
     GROUND_FLOOR_M,
@@ -120,14 +114,21 @@ class _Building:
         per_m = 44.0 if lot.is_near and not is_background else 16.0
         front = self._hang(style, (width, height), per_m, origin, right)
         self._add_body(style, (width, depth, height), origin, right)
-        outward = np.cross(right, [0, 0, 1.0])
-        place = (origin, right, outward)
-        add_cornice(self.builder, self.surfaces, style, front, place)
-        add_roof_things(self.builder, self.surfaces, front, place, depth, rng)
+        hung = HungFacade(
+            builder=self.builder,
+            surfaces=self.surfaces,
+            style=style,
+            facade=front,
+            origin=origin,
+            right=right,
+            rng=rng,
+        )
+        hung.add_cornice()
+        hung.add_roof_things(depth)
         if not is_background and lot.start_m < 150:
-            add_boards(self.builder, self.surfaces, style, front, place, rng)
-            add_awnings(self.builder, self.surfaces, style, front, place, rng)
-            add_bays(self.builder, self.surfaces, style, front, place, rng)
+            hung.add_boards()
+            hung.add_awnings()
+            hung.add_bays()
 
     def _hang(
         self,
@@ -139,10 +140,7 @@ class _Building:
     ) -> Facade:
         """Draw a facade and hang it up."""
         facade = draw_facade(style, size[0], size[1], per_m, self.rng)
-        texture = self.surfaces.add_texture(facade.rgba)
-        surface = self.surfaces.add(
-            Surface(semantics=StreetClass.BUILDING, texture=texture, gloss=1.0)
-        )
+        surface = self.surfaces.painted(facade.rgba, StreetClass.BUILDING, gloss=1.0)
         add_facade(self.builder, facade, origin, right, surface, is_flat=not self.lot.is_near)
         return facade
 
@@ -157,12 +155,7 @@ class _Building:
         width, depth, height = size
         inward = -np.cross(right, [0, 0, 1.0])
         tile = wall_tile(style.wall, style.colour, self.rng, size_m=TILE_M, per_m=16.0)
-        wall = self.surfaces.add(
-            Surface(
-                semantics=StreetClass.BUILDING,
-                texture=self.surfaces.add_texture(tile, repeats=True),
-            )
-        )
+        wall = self.surfaces.painted(tile, StreetClass.BUILDING, repeats=True)
         low = {-1: "right", 1: "left"}[self.lot.side]  # which end the street comes from
         corner = {low: self.lot.is_corner_start}
         corner["left" if low == "right" else "right"] = self.lot.is_corner_end
@@ -198,21 +191,14 @@ def add_skyline(
         if index < 3:
             offset, distance, size[2] = (index - 1) * 34.0, 30.0, rng.uniform(12, 24)
         centre = end + ahead * distance + left * offset + np.array([0, 0, size[2] / 2 - 2])
-        surface = surfaces.add(
-            Surface(
-                semantics=StreetClass.BUILDING,
-                texture=surfaces.add_texture(_tower(size, rng)),
-                gloss=0.5,
-            )
-        )
+        surface = surfaces.painted(_tower(size, rng), StreetClass.BUILDING, gloss=0.5)
         add_box(builder, centre, size, surface, yaw_rad=heading + rng.uniform(-0.3, 0.3))
     for side in (-1, 1):  # what stands at the ends of the cross street
         middle = (plan.cross_start_m + plan.cross_end_m) / 2
         kerb = plan.left_kerb_m if side > 0 else plan.right_kerb_m
         place = plan.line.place(middle, kerb + side * 84.0)
         size = np.array([40.0, 16.0, rng.uniform(12, 26)])
-        texture = surfaces.add_texture(_tower(size, rng))
-        surface = surfaces.add(Surface(semantics=StreetClass.BUILDING, texture=texture, gloss=0.5))
+        surface = surfaces.painted(_tower(size, rng), StreetClass.BUILDING, gloss=0.5)
         yaw = float(plan.line.heading_at(middle))
         add_box(builder, place + np.array([0, 0, size[2] / 2 - 1]), size, surface, yaw_rad=yaw)
 

@@ -11,7 +11,6 @@ from lidarpainter_models.synthetic.raytracing.scene_arrays import KIND_CUT_OUT, 
 from lidarpainter_models.synthetic.textures.noise import as_rgba, fractal_noise
 from lidarpainter_models.synthetic.textures.surfaces import (
     StreetClass,
-    Surface,
     SurfaceSet,
     srgb_from_linear,
 )
@@ -175,10 +174,8 @@ def _fence_surface(surfaces: SurfaceSet) -> int:
     opacity[:, :5] = 1
     opacity[8:13], opacity[-22:-17] = 1, 1
     colour = np.full((rows, columns, 3), 30.0)
-    texture = surfaces.add_texture(as_rgba(colour, opacity), repeats=True)
-    return surfaces.add(
-        Surface(semantics=StreetClass.FURNITURE, texture=texture, kind=KIND_CUT_OUT)
-    )
+    fence = as_rgba(colour, opacity)
+    return surfaces.painted(fence, StreetClass.FURNITURE, repeats=True, kind=KIND_CUT_OUT)
 
 
 def draw_clouds(rng: np.random.Generator, *, cover: float) -> np.ndarray:

@@ -93,8 +93,8 @@ class StreetFurniture:
         from lidarpainter_models.synthetic.textures.signs import blade_board
 
         words = ("JAZZ", "OPERA", "FAIR", "SPORT")[int(self.rng.integers(4))]
-        texture = self.surfaces.add_texture(blade_board(words, self.rng, size_m=(0.75, 1.6)))
-        face = self.surfaces.add(Surface(semantics=StreetClass.SIGN, texture=texture))
+        cloth = blade_board(words, self.rng, size_m=(0.75, 1.6))
+        face = self.surfaces.painted(cloth, StreetClass.SIGN)
         faces = {"front": face, "back": face}
         grey = self.plain((90, 90, 90), StreetClass.SIGN)
         add_box(self.builder, centre, (0.03, 0.75, 1.6), grey, yaw_rad=heading, faces=faces)
@@ -113,8 +113,7 @@ class StreetFurniture:
         both: bool = False,
     ) -> None:
         """A thin plate whose front looks along `yaw_rad`."""
-        texture = self.surfaces.add_texture(rgba)
-        face = self.surfaces.add(Surface(semantics=StreetClass.SIGN, texture=texture, gloss=0.5))
+        face = self.surfaces.painted(rgba, StreetClass.SIGN, gloss=0.5)
         back = self.plain((128, 130, 130), StreetClass.SIGN)
         faces = {"front": face, "back": face if both else back}
         size = (0.025, *size_m)
@@ -228,10 +227,7 @@ class StreetFurniture:
                 plate = street_name_plate(STREET_NAMES[int(rng.integers(len(STREET_NAMES)))])
                 centre = foot + z * UP
                 self._add_plate(centre, (1.3, 0.3), plate, heading + turn + np.pi, both=True)
-            texture = self.surfaces.add_texture(stop_plate())
-            face = self.surfaces.add(
-                Surface(semantics=StreetClass.SIGN, texture=texture, kind=KIND_CUT_OUT)
-            )
+            face = self.surfaces.painted(stop_plate(), StreetClass.SIGN, kind=KIND_CUT_OUT)
             outward = heading + (np.pi / 2 if side > 0 else -np.pi / 2)
             right = np.array([-np.sin(outward), np.cos(outward), 0])
             front = np.array([np.cos(outward), np.sin(outward), 0])
@@ -290,8 +286,8 @@ class StreetFurniture:
         wood = self.plain((126, 88, 58), StreetClass.FURNITURE)
         add_box(self.builder, bench, (2.6, 0.4, 0.06), wood, yaw_rad=heading)
         words = ("MOVIES", "MUSEUM", "FLY NOW", "LEMONADE")[int(self.rng.integers(4))]
-        texture = self.surfaces.add_texture(blade_board(words, self.rng, size_m=(1.2, 1.8)))
-        face = self.surfaces.add(Surface(semantics=StreetClass.SIGN, texture=texture, gloss=0.8))
+        poster = blade_board(words, self.rng, size_m=(1.2, 1.8))
+        face = self.surfaces.painted(poster, StreetClass.SIGN, gloss=0.8)
         for end in (-2.0, 2.0):
             place = middle + end * ahead + 1.3 * UP
             faces = {"front": face, "back": face}

@@ -58,12 +58,7 @@ def add_ground(
     kerb = surfaces.add(
         Surface(semantics=StreetClass.SIDEWALK, tint=tint_from_bytes((150, 148, 142)))
     )
-    lot = surfaces.add(
-        Surface(
-            semantics=StreetClass.TERRAIN,
-            texture=surfaces.add_texture(lot_ground(rng), repeats=True),
-        )
-    )
+    lot = surfaces.painted(lot_ground(rng), StreetClass.TERRAIN, repeats=True)
     for start, end in plan.blocks:
         for near, far in _sides(plan):
             _add_block(builder, plan, (start, end), (near, far), (surfaces.add(slabs), kerb, lot))
@@ -93,16 +88,13 @@ def _add_road(
     texels = [BEHIND_TEXELS_PER_M, *(per_m for _, per_m in STRETCHES_M)]
     stretches = zip(starts[:-1], starts[1:], texels, strict=True)
     for start, end, per_m in stretches:
-        texture = surfaces.add_texture(paint_road(plan, rng, start, end, per_m))
-        surface = surfaces.add(
-            Surface(
-                semantics=StreetClass.ROAD,
-                texture=texture,
-                kind=KIND_ROAD,
-                detail_texture=detail,
-                detail_per_m=0.45,
-                detail_strength=0.4,
-            )
+        surface = surfaces.painted(
+            paint_road(plan, rng, start, end, per_m),
+            StreetClass.ROAD,
+            kind=KIND_ROAD,
+            detail_texture=detail,
+            detail_per_m=0.45,
+            detail_strength=0.4,
         )
         s = np.linspace(start, end, round((end - start) / STEP_M) + 1)
         d = np.array([plan.left_kerb_m, 0.0, plan.right_kerb_m])

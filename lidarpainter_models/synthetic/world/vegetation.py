@@ -69,10 +69,8 @@ def bark_surface(surfaces: SurfaceSet, rng: np.random.Generator) -> int:
     """Brown bark with ridges."""
     ridges = fractal_noise(rng, (128, 64), (6, 12), octaves=4)
     tone = 0.45 + 0.8 * ridges
-    texture = surfaces.add_texture(
-        as_rgba(tone[..., None] * np.array([96, 80, 64.0])), repeats=True
-    )
-    return surfaces.add(Surface(semantics=StreetClass.VEGETATION, texture=texture))
+    bark = as_rgba(tone[..., None] * np.array([96, 80, 64.0]))
+    return surfaces.painted(bark, StreetClass.VEGETATION, repeats=True)
 
 
 def add_crown(
