@@ -45,19 +45,19 @@ class PaperLossWeights:
         refuse_negative(self)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PaperLoss:
-    """The terms before weighting, and their weighted sum; a term of weight 0 is 0."""
+LossTerms = dict[str, Float[Tensor, ""]]
+"""By the names of their weights before weighting, and `total`, the weighted sum."""
 
-    lpips: Float[Tensor, ""]
-    squared: Float[Tensor, ""]
-    structure: Float[Tensor, ""]
-    adversarial: Float[Tensor, ""]
-    total: Float[Tensor, ""]
 
-    def to_dict(self) -> dict[str, float]:
-        """Plain numbers for a log."""
-        return {field.name: float(getattr(self, field.name).detach()) for field in fields(self)}
+def weighed(terms: LossTerms, weights: "DataclassInstance") -> LossTerms:
+    """The terms and their total."""
+    total = torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum()
+    return terms | {"total": total}
+
+
+def as_numbers(terms: LossTerms) -> dict[str, float]:
+    """Plain numbers for a log."""
+    return {name: float(term.detach()) for name, term in terms.items()}
 
 
 def refuse_negative(weights: "DataclassInstance") -> None:
@@ -79,8 +79,8 @@ def paper_loss(
     *,
     lpips: BatchDistance | None = None,
     discriminator: Discriminator | None = None,
-) -> PaperLoss:
-    """The painter's loss of the paper.
+) -> LossTerms:
+    """The painter's loss of the paper; a term of weight 0 is 0.
 
     LPIPS and the discriminator look at whole images, so where the target is unknown they see it
     in place of the image, and no gradient passes there.
@@ -104,8 +104,7 @@ def paper_loss(
         if discriminator is None:
             raise ConfigError("the loss weighs a discriminator but has none: give adversarial=0")
         terms["adversarial"] = generator_hinge_loss(discriminator(known))
-    total = torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum()
-    return PaperLoss(**terms, total=total)
+    return weighed(terms, weights)
 
 
 def known_image(

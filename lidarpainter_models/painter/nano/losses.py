@@ -4,7 +4,7 @@ Images are (batch, 3, height, width); masks (batch, height, width), 1 where the 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from lidarpainter_models.painter.batches import ConditionBatch
 from lidarpainter_models.painter.losses import (
+    LossTerms,
     absolute_loss,
     agreement_mask,
     gradient_loss,
@@ -19,6 +20,7 @@ from lidarpainter_models.painter.losses import (
     refuse_negative,
     squared_loss,
     structure_loss,
+    weighed,
 )
 from lidarpainter_models.painter.nano.network import NanoOutput
 
@@ -49,24 +51,6 @@ class NanoLossWeights:
         refuse_negative(self)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LossTerms:
-    """The terms before weighting, and their weighted sum."""
-
-    absolute: Float[Tensor, ""]
-    squared: Float[Tensor, ""]
-    structure: Float[Tensor, ""]
-    gradient: Float[Tensor, ""]
-    expected_error: Float[Tensor, ""]
-    keep: Float[Tensor, ""]
-    harm: Float[Tensor, ""]
-    total: Float[Tensor, ""]
-
-    def to_dict(self) -> dict[str, float]:
-        """Plain numbers for a log."""
-        return {field.name: float(getattr(self, field.name).detach()) for field in fields(self)}
-
-
 def painting_loss(
     output: NanoOutput,
     conditions: ConditionBatch,
@@ -77,7 +61,7 @@ def painting_loss(
     restyled: Bool[Tensor, " batch"] | None = None,
     sees_render: bool = True,
 ) -> LossTerms:
-    """All terms of a batch and `total`, the sum that is minimised.
+    """All terms of a batch and their total, which is minimised.
 
     Views that are `restyled` have a target in another style and nothing to keep. Where the network
     was not shown the render, the base stands for it.
@@ -96,8 +80,7 @@ def painting_loss(
         "keep": absolute_loss(output.rgb, output.base, agreeing),
         "harm": harm_loss(output.rgb, before, target, kept),
     }
-    total = torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum()
-    return LossTerms(**terms, total=total)
+    return weighed(terms, weights)
 
 
 def harm_loss(

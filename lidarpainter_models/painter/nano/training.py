@@ -11,6 +11,7 @@ from torch import nn
 from lidarpainter_models.errors import TrainingError
 from lidarpainter_models.painter.augmentation import TrainingBatch
 from lidarpainter_models.painter.examples import PairSource
+from lidarpainter_models.painter.losses import as_numbers
 from lidarpainter_models.painter.nano.losses import NanoLossWeights, painting_loss
 from lidarpainter_models.painter.nano.more_prompts import with_more_prompts
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
@@ -92,8 +93,8 @@ class NanoTrainee:
             restyled=batch.restyled,
             sees_render="render" in self.config.network.inputs,
         )
-        (share * terms.total).backward()
-        return terms.to_dict() | {"spread": float(output.log_error.detach().std())}
+        (share * terms["total"]).backward()
+        return as_numbers(terms) | {"spread": float(output.log_error.detach().std())}
 
     def check(self, step: int, means: Mapping[str, float]) -> None:
         """Refuse a network that says the same everywhere.

@@ -26,6 +26,7 @@ from lidarpainter_models.painter.examples import PairSource
 from lidarpainter_models.painter.losses import (
     BatchDistance,
     PaperLossWeights,
+    as_numbers,
     known_image,
     paper_loss,
 )
@@ -154,16 +155,16 @@ class OneStepTrainee:
             lpips=self.judges.lpips,
             discriminator=self.opponent,
         )
-        (share * terms.total).backward()
+        (share * terms["total"]).backward()
         if self.opponent is None:
-            return terms.to_dict()
+            return as_numbers(terms)
         self.opponent.requires_grad_(True)
         seen = known_image(image.detach(), batch.target, batch.target_valid)
         every = self.config.penalty_every_steps
         weight = 0.0 if step % every else every * self.config.penalty_weight
         verdict = discriminator_loss(self.opponent, batch.target, seen, penalty_weight=weight)
         (share * verdict.total).backward()
-        return terms.to_dict() | {
+        return as_numbers(terms) | {
             "discriminator": float(verdict.hinge.detach()),
             "gradient_penalty": every * float(verdict.gradient_penalty.detach()),
         }
