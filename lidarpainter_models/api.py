@@ -61,11 +61,8 @@ def camera_beside(
     fitted: GaussianScene, scene: DrivingScene, view: TrainingView, shift: Shift
 ) -> Camera:
     """The camera of a training view as the fit found it, moved aside, up or turned."""
-    frame_index, camera_name = view.key
-    camera = fitted.corrected_camera(
-        view.camera, timestamp_ns=view.timestamp_ns, camera_name=camera_name, key=view.key
-    )
-    direction = road_directions(scene.world_from_ego)[scene.frame_position(frame_index)]
+    camera = fitted.found_camera(view)
+    direction = road_directions(scene.world_from_ego)[scene.frame_position(view.key[0])]
     return camera.at(shift_pose(camera.world_from_camera, direction, shift))
 
 

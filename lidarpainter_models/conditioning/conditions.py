@@ -55,15 +55,7 @@ class ConditionBuilder:
         self.config = config or ConditionConfig()
         self.boxes = MovingBoxes(scene.tracks)
         self._views = {view.key: view for view in training_views}
-        self._cameras = {
-            view.key: scene.corrected_camera(
-                view.camera,
-                timestamp_ns=view.timestamp_ns,
-                camera_name=view.key[1],
-                key=view.key,
-            )
-            for view in training_views
-        }
+        self._cameras = {view.key: scene.found_camera(view) for view in training_views}
         self._sources: OrderedDict[ViewKey, SourceImage] = OrderedDict()
 
     def forget_sources(self) -> None:

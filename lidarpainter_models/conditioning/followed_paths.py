@@ -110,22 +110,13 @@ class FollowedPath:
         scene = self.builder.scene
         fitted = scene.cameras.camera_names
         if view.camera_name in fitted or not fitted:
-            return scene.corrected_camera(
-                camera,
-                timestamp_ns=view.timestamp_ns,
-                camera_name=view.camera_name,
-                key=view.key,
-            )
+            return scene.found_camera(view, camera)
         other = self._fitted_views.get(view.frame_index)
         if other is None:
             return camera
-        found = scene.corrected_camera(
-            other.camera,
-            timestamp_ns=other.timestamp_ns,
-            camera_name=other.camera_name,
-            key=other.key,
+        found_from_logged = (
+            scene.found_camera(other).world_from_camera @ other.camera.camera_from_world
         )
-        found_from_logged = found.world_from_camera @ other.camera.camera_from_world
         return camera.at(found_from_logged @ camera.world_from_camera)
 
     @cached_property

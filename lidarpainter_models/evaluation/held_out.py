@@ -83,19 +83,10 @@ class HeldOut:
 
     def recorded_views(self, fitted: GaussianScene, poses: Poses) -> list[JudgedView]:
         """The held-out images."""
-        judged = []
-        for view in self.test_views:
-            camera = self.camera_of(fitted, view, poses)
-            judged.append(
-                JudgedView(
-                    name=f"{view.camera_name}/{view.frame_index}",
-                    camera=camera,
-                    timestamp_ns=view.timestamp_ns,
-                    truth_rgb=self.image_of(view),
-                    actor_mask=actor_mask(camera, self._moving, view.timestamp_ns),
-                )
-            )
-        return judged
+        return [
+            self._judged(view, self.camera_of(fitted, view, poses), self.image_of(view))
+            for view in self.test_views
+        ]
 
     def synthetic_views(
         self, fitted: GaussianScene, street: SyntheticStreet, shift: Shift
@@ -104,13 +95,16 @@ class HeldOut:
         judged = []
         for view in self.test_views:
             camera = self.shifted_camera(fitted, view, shift)
-            judged.append(
-                JudgedView(
-                    name=f"{view.camera_name}/{view.frame_index}",
-                    camera=camera,
-                    timestamp_ns=view.timestamp_ns,
-                    truth_rgb=street.render(camera, view.timestamp_ns).rgb,
-                    actor_mask=actor_mask(camera, self._moving, view.timestamp_ns),
-                )
-            )
+            judged.append(self._judged(view, camera, street.render(camera, view.timestamp_ns).rgb))
         return judged
+
+    def _judged(
+        self, view: RecordedView, camera: Camera, truth_rgb: Float[Tensor, "height width 3"]
+    ) -> JudgedView:
+        return JudgedView(
+            name=f"{view.camera_name}/{view.frame_index}",
+            camera=camera,
+            timestamp_ns=view.timestamp_ns,
+            truth_rgb=truth_rgb,
+            actor_mask=actor_mask(camera, self._moving, view.timestamp_ns),
+        )

@@ -7,7 +7,7 @@ the strip: pixels whose LiDAR surface the fitted camera sees as well.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -204,13 +204,8 @@ def score_strips(
     for view in views:
         mask = strip_mask(view)
         raw = render_at_fitted_detail(render, view)
-        turned_view = StripView(
-            camera=view.camera.at(view.camera.world_from_camera @ turn),
-            timestamp_ns=view.timestamp_ns,
-            truth_rgb=view.truth_rgb,
-            fitted_camera=view.fitted_camera,
-            points_world=view.points_world,
-        )
+        turned_camera = view.camera.at(view.camera.world_from_camera @ turn)
+        turned_view = replace(view, camera=turned_camera)
         turned = apply_affine_colour(render_at_fitted_detail(render, turned_view), affine)
         wrong = squared_error(raw, view.truth_rgb).double()
         raw_error += float(wrong[mask].sum())

@@ -141,12 +141,7 @@ class LiveViewer:
         for view in path.recorded.views:
             if view.frame_index != frame_index:
                 continue
-            camera = scene.corrected_camera(
-                fit_camera(view, size),
-                timestamp_ns=view.timestamp_ns,
-                camera_name=view.camera_name,
-                key=view.key,
-            )
+            camera = scene.found_camera(view, fit_camera(view, size))
             rgb_u8 = shrink_image(
                 path.recorded.read_image(view),
                 width_px=camera.width_px,

@@ -184,12 +184,4 @@ def _read_back(
 def _compared_cameras(scene: GaussianScene, seen: SceneObservations) -> list[Camera]:
     last = len(seen.views) - 1
     rows = sorted({round(last * part / (_NUM_COMPARED - 1)) for part in range(_NUM_COMPARED)})
-    return [
-        scene.corrected_camera(
-            seen.views[row].camera,
-            timestamp_ns=seen.views[row].timestamp_ns,
-            camera_name=seen.views[row].key[1],
-            key=seen.views[row].key,
-        )
-        for row in rows
-    ]
+    return [scene.found_camera(seen.views[row]) for row in rows]

@@ -22,8 +22,9 @@ from lidarpainter_models.gaussians.model.styling.dressed import DressedScene
 from lidarpainter_models.gaussians.model.styling.scene_style import SceneStyle
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.backends import Backend
+from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.scenes.driving_scene import ActorTrack
-from lidarpainter_models.scenes.records import ViewKey
+from lidarpainter_models.scenes.records import RecordedView, ViewKey
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -97,6 +98,17 @@ class GaussianScene:
         """
         return self.cameras.corrected(
             camera, key=key, timestamp_ns=timestamp_ns, camera_name=camera_name
+        )
+
+    def found_camera(
+        self, view: TrainingView | RecordedView, camera: Camera | None = None
+    ) -> Camera:
+        """A view's camera, or the same at another size, as the fit found it."""
+        return self.corrected_camera(
+            view.camera if camera is None else camera,
+            timestamp_ns=view.timestamp_ns,
+            camera_name=view.key[1],
+            key=view.key,
         )
 
     @property
