@@ -20,10 +20,9 @@ from lidarpainter_models.painter.batches import ConditionBatch
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-BatchDistance = Callable[
-    [Float[Tensor, "batch 3 height width"], Float[Tensor, "batch 3 height width"]],
-    Float[Tensor, " batch"],
-]
+Images = Float[Tensor, "batch 3 height width"]
+Mask = Float[Tensor, "batch height width"]
+BatchDistance = Callable[[Images, Images], Float[Tensor, " batch"]]
 """Of images to their targets, differentiable, such as `metrics.lpips.Lpips.of_batch`."""
 
 
@@ -72,9 +71,9 @@ def refuse_negative(weights: "DataclassInstance") -> None:
 
 
 def paper_loss(
-    image: Float[Tensor, "batch 3 height width"],
-    target: Float[Tensor, "batch 3 height width"],
-    mask: Float[Tensor, "batch height width"],
+    image: Images,
+    target: Images,
+    mask: Mask,
     weights: PaperLossWeights,
     *,
     lpips: BatchDistance | None = None,
@@ -107,38 +106,22 @@ def paper_loss(
     return weighed(terms, weights)
 
 
-def known_image(
-    image: Float[Tensor, "batch 3 height width"],
-    target: Float[Tensor, "batch 3 height width"],
-    mask: Float[Tensor, "batch height width"],
-) -> Float[Tensor, "batch 3 height width"]:
+def known_image(image: Images, target: Images, mask: Mask) -> Images:
     """The image where the target is known, the target elsewhere."""
     return torch.where(mask[:, None] > 0, image, target)
 
 
-def absolute_loss(
-    image: Float[Tensor, "batch 3 height width"],
-    target: Float[Tensor, "batch 3 height width"],
-    mask: Float[Tensor, "batch height width"],
-) -> Float[Tensor, ""]:
+def absolute_loss(image: Images, target: Images, mask: Mask) -> Float[Tensor, ""]:
     """Mean absolute difference inside the mask."""
     return masked_mean((image - target).abs().mean(dim=1), mask)
 
 
-def squared_loss(
-    image: Float[Tensor, "batch 3 height width"],
-    target: Float[Tensor, "batch 3 height width"],
-    mask: Float[Tensor, "batch height width"],
-) -> Float[Tensor, ""]:
+def squared_loss(image: Images, target: Images, mask: Mask) -> Float[Tensor, ""]:
     """Mean squared difference inside the mask."""
     return masked_mean((image - target).square().mean(dim=1), mask)
 
 
-def structure_loss(
-    image: Float[Tensor, "batch 3 height width"],
-    target: Float[Tensor, "batch 3 height width"],
-    mask: Float[Tensor, "batch height width"],
-) -> Float[Tensor, ""]:
+def structure_loss(image: Images, target: Images, mask: Mask) -> Float[Tensor, ""]:
     """Mean of 1 - SSIM inside the mask; outside it the image counts as equal to the target."""
     known = known_image(image, target, mask)
     rows = zip(known.permute(0, 2, 3, 1), target.permute(0, 2, 3, 1), strict=True)
@@ -146,11 +129,7 @@ def structure_loss(
     return masked_mean(1 - similarity, mask)
 
 
-def gradient_loss(
-    image: Float[Tensor, "batch 3 height width"],
-    target: Float[Tensor, "batch 3 height width"],
-    mask: Float[Tensor, "batch height width"],
-) -> Float[Tensor, ""]:
+def gradient_loss(image: Images, target: Images, mask: Mask) -> Float[Tensor, ""]:
     """Mean absolute difference of horizontal and vertical steps between known neighbours."""
     gap = image - target
     across = (gap[..., 1:] - gap[..., :-1]).abs().mean(dim=1)
@@ -159,9 +138,7 @@ def gradient_loss(
     return horizontal + masked_mean(down, mask[..., 1:, :] * mask[..., :-1, :])
 
 
-def agreement_mask(
-    conditions: ConditionBatch, difference: float
-) -> Float[Tensor, "batch height width"]:
+def agreement_mask(conditions: ConditionBatch, difference: float) -> Mask:
     """1 where a warp is valid and every valid warp agrees with the render."""
     gaps = (conditions.warp - conditions.render[:, None]).abs().mean(dim=2)
     disagreeing = (gaps > difference) & (conditions.warp_valid > 0)

@@ -12,7 +12,9 @@ from torch import Tensor
 
 from lidarpainter_models.painter.batches import ConditionBatch
 from lidarpainter_models.painter.losses import (
+    Images,
     LossTerms,
+    Mask,
     absolute_loss,
     agreement_mask,
     gradient_loss,
@@ -54,8 +56,8 @@ class NanoLossWeights:
 def painting_loss(
     output: NanoOutput,
     conditions: ConditionBatch,
-    target: Float[Tensor, "batch 3 height width"],
-    target_valid: Float[Tensor, "batch height width"],
+    target: Images,
+    target_valid: Mask,
     weights: NanoLossWeights,
     *,
     restyled: Bool[Tensor, " batch"] | None = None,
@@ -84,10 +86,10 @@ def painting_loss(
 
 
 def harm_loss(
-    image: Float[Tensor, "batch 3 height width"],
-    before: Sequence[Float[Tensor, "batch 3 height width"]],
-    target: Float[Tensor, "batch 3 height width"],
-    mask: Float[Tensor, "batch height width"],
+    image: Images,
+    before: Sequence[Images],
+    target: Images,
+    mask: Mask,
 ) -> Float[Tensor, ""]:
     """Mean rise of a pixel's squared error over the least of those before; a fall counts as 0."""
     error, *errors_before = ((each - target).square().mean(dim=1) for each in (image, *before))
@@ -95,11 +97,7 @@ def harm_loss(
     return masked_mean((error - least).clamp_min(0), mask)
 
 
-def expected_error_loss(
-    output: NanoOutput,
-    target: Float[Tensor, "batch 3 height width"],
-    mask: Float[Tensor, "batch height width"],
-) -> Float[Tensor, ""]:
+def expected_error_loss(output: NanoOutput, target: Images, mask: Mask) -> Float[Tensor, ""]:
     """Negative log likelihood of the error under a Laplace law of scale exp(log_error).
 
     The error is taken as given, so this term never changes the image.
