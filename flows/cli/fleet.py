@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flows.cli import fleet_report
 from flows.cli.output import complain, loudness, print_json, print_pairs, print_table, say_status
 from flows.cli.shared_options import AsJson
 
@@ -24,7 +23,6 @@ Fleet = Annotated[
 ]
 
 app = typer.Typer(help="Many sequences from one manifest.", no_args_is_help=True)
-app.add_typer(fleet_report.app)
 
 
 @app.command("run")
@@ -151,6 +149,33 @@ def work(fleet: Annotated[str, typer.Argument(help="Name of the fleet.")]) -> No
     log = EventLog(fleet, sys.stderr.write)
     with listening(log):
         Worker(ledger=ledger, fleet=fleet, work=make_sequence, say=log).run()
+
+
+@app.command("report")
+def report(
+    fleet: Fleet = None,
+    out: Annotated[Path, typer.Option(help="The page to write.")] = Path("fleet.html"),
+    as_json: AsJson = False,
+) -> None:
+    """Write one page about a fleet: throughput, failures, cost, quality, worst scenes, planner.
+
+    The page stands alone: nothing is loaded from elsewhere.
+
+    Example: lidarpainter fleet report night-of-monday --out night.html
+    """
+    ledger = _ledger()
+    name = fleet or ledger.latest()
+    ledger.rows(name)
+    say_status(f"writing about {name}")
+    from flows.fleet.report import fleet_page
+    from lidarpainter_models.export.report import render_report
+    from lidarpainter_models.storage.whole_files import write_whole
+
+    write_whole(out, render_report(fleet_page(ledger, name)).encode())
+    if as_json:
+        print_json({"fleet": name, "path": str(out), "num_bytes": out.stat().st_size})
+    else:
+        sys.stdout.write(f"{out}\n")
 
 
 def _run_here(

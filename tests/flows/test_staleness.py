@@ -141,7 +141,7 @@ cameras = ["front_camera"]
 [budget]
 free_disk_gb = 0
 """
-LOSS = "lidarpainter_models/gaussians/fitting/losses.py"
+LOSS = "lidarpainter_models/gaussians/fitting/refinement.py"
 
 
 class Fleet:
@@ -182,11 +182,11 @@ def test_one_changed_line_in_a_loss_redoes_fits_and_what_follows_but_not_ingest(
         assert stale["total"]["cpu_seconds"] > 0
         for one in stale["runs"]:
             assert {name.partition("/")[0] for name in one["artefacts"]} == {"gaussians"}
-            assert one["changed"] == ["lidarpainter_models.gaussians.fitting.losses"]
+            assert one["changed"] == ["lidarpainter_models.gaussians.fitting.refinement"]
         told = answer("catalog", "explain", first[0][1])
         stages = {name.partition("/")[0]: one for name, one in told["inputs"].items()}
         assert stages["gaussians"]["is_stale"]
-        assert "fitting.losses" in stages["gaussians"]["stale"][0]
+        assert "fitting.refinement" in stages["gaussians"]["stale"][0]
         assert not stages["observations"]["is_stale"]
         assert fleet.run("--accept-stale") == first
         assert fleet.made() == before

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.images import FitImage
-from lidarpainter_models.gaussians.fitting.losses import pose_prior
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 
 CAMERA_NOISE = {"rotation_rad": 2e-3, "translation_m": 0.03}
@@ -212,6 +211,14 @@ class Refinement:
             exposure.matrix,
             exposure.log_gain,
         )
+
+
+def pose_prior(
+    tangents: Float[Tensor, "rows 6"], *, rotation_rad: float, translation_m: float
+) -> Float[Tensor, ""]:
+    """Sum of squared corrections in units of the noise that is expected."""
+    unit = torch.tensor([rotation_rad] * 3 + [translation_m] * 3, dtype=tangents.dtype)
+    return (tangents / unit).square().sum()
 
 
 def _gradient(table: Tensor) -> Tensor:

@@ -7,12 +7,11 @@ and images lie on the device of the scene; poses (float64, a few 4x4 a step) on 
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.images import FitImage
-from lidarpainter_models.gaussians.fitting.losses import ACTOR_TERM_EVERY, actor_boundary_loss
 from lidarpainter_models.gaussians.fitting.spatial_blocks import View
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.model.rolling_shutter import as_read
@@ -35,6 +34,9 @@ from lidarpainter_models.kernels.sky_texture import SkyRays
 from lidarpainter_models.kernels.ssim import l1_ssim_loss
 from lidarpainter_models.observations.views import GuidanceView
 
+ACTOR_TERM_EVERY = 10
+"""Steps between two actor terms: it needs one more blended channel."""
+_EDGE = 1e-4  # keeps logarithms finite
 WAITS = 3
 """Of the host for the device in a step, without the rasteriser's own: how many Gaussians are in
 view, how many of them lag and by how much, and the gradients of the bodies' poses."""
@@ -143,6 +145,16 @@ def add_guidance_gradients(
             splat.depth_m, splat.alpha, view.lidar_depth_m, tolerance=config.losses.depth_tolerance
         )
     loss.backward()
+
+
+def actor_boundary_loss(
+    actor_alpha: Float[Tensor, "height width"], in_boxes: Bool[Tensor, "height width"]
+) -> Float[Tensor, ""]:
+    """Mean of -log(1 - actor_alpha) outside the projected boxes, of its entropy inside."""
+    inside = actor_alpha.clamp(_EDGE, 1 - _EDGE)
+    log_clear = torch.log1p(-inside)
+    entropy = -(inside * inside.log() + (1 - inside) * log_clear)
+    return torch.where(in_boxes, entropy, -log_clear).mean()
 
 
 def _pixel_rules(config: FitConfig) -> PixelRules:
