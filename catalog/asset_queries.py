@@ -6,14 +6,13 @@ They are SQL with values beside it, see `catalog.sql`; what an asset was made fr
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from catalog.errors import UnknownRecordError
 from catalog.sql import Answer, CatalogSql
 from catalog.tables import Row
 
 Sort = Literal["score", "coverage", "psnr_db", "length_m", "num_views", "num_points", "created_at"]
-SORTS: tuple[Sort, ...] = get_args(Sort)
 SIDES = ("front", "rear", "left", "right", "top")
 AS_RECORDED = "recorded"
 """The style of what wears none."""

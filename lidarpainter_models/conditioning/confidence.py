@@ -23,6 +23,7 @@ locally and, if it does so on the whole, as a view; far beyond that it is refuse
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
@@ -55,7 +56,7 @@ REFUSE_EXCESS = 0.05  # a view that exceeds the render by this mean difference i
 MIN_EVIDENCE = 0.02  # share of pixels with evidence under which no view is gated as a whole
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class GuidanceGate:
     """What the comparison with recorded pixels says about one painting."""
 
@@ -65,9 +66,11 @@ class GuidanceGate:
     """Mean absolute difference from the evidence; NaN without evidence."""
     render_difference: float
     """The same for the render before painting."""
-    evidence_share: float
-    """Share of pixels with evidence."""
-    is_refused: bool
+
+    @cached_property
+    def is_refused(self) -> bool:
+        """Whether nothing of the painting counts."""
+        return bool((self.weight == 0).all())
 
 
 def is_seen(
@@ -181,7 +184,7 @@ def guidance_gate(painting: Painting, conditions: PaintingConditions) -> Guidanc
     painted = (painting.rgb - evidence).abs().mean(dim=-1) * known
     rendered = (conditions.render_rgb - evidence).abs().mean(dim=-1) * known
     if share == 0:
-        return _gate(torch.ones_like(painted), float("nan"), float("nan"), share)
+        return GuidanceGate(torch.ones_like(painted), float("nan"), float("nan"))
     count = known.sum()
     painted_mean, render_mean = float(painted.sum() / count), float(rendered.sum() / count)
     view_weight = 1.0
@@ -192,7 +195,7 @@ def guidance_gate(painting: Painting, conditions: PaintingConditions) -> Guidanc
         known.to(torch.float32), GATE_WINDOW_PX
     ).clamp(min=1.0)
     fall = torch.exp(-(local - GATE_SLACK).clamp(min=0) / GATE_SCALE)
-    return _gate(view_weight * fall, painted_mean, render_mean, share)
+    return GuidanceGate(view_weight * fall, painted_mean, render_mean)
 
 
 def _evidence(
@@ -219,15 +222,3 @@ def _box_sum(image: Float[Tensor, "height width"], side_px: int) -> Float[Tensor
         image[None, None], side_px, stride=1, padding=side_px // 2
     )
     return mean[0, 0] * side_px**2
-
-
-def _gate(
-    weight: Float[Tensor, "height width"], painted: float, rendered: float, share: float
-) -> GuidanceGate:
-    return GuidanceGate(
-        weight=weight,
-        painted_difference=painted,
-        render_difference=rendered,
-        evidence_share=share,
-        is_refused=bool((weight == 0).all()),
-    )

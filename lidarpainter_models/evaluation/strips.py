@@ -74,9 +74,6 @@ class StripScores:
     calibration: StripCalibration
 
 
-Rendered = tuple[Float[Tensor, "height width 3"], Bool[Tensor, "height width"]]
-
-
 def strip_mask(view: StripView) -> Bool[Tensor, "height width"]:
     """Pixels of the judging camera whose LiDAR surface both cameras see, grown a little."""
     pixels, depth_m = visible_points(view.camera, view.points_world)

@@ -30,7 +30,7 @@ from lidarpainter_models.scenes.stored import Fetch, StoredScene
 from lidarpainter_models.scenes.tracks import ActorTrack, tracks_from_boxes
 from lidarpainter_models.scenes.undistortion import pinhole_of, undistort
 
-__all__ = ["ActorTrack", "DrivingScene", "RecordedView", "Sweep", "SweepPoints", "scene_path"]
+__all__ = ["ActorTrack", "DrivingScene", "RecordedView", "Sweep", "SweepPoints"]
 
 # the lens belongs to the pixels as they lie in the file, whatever way up a viewer should show them
 _AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
@@ -42,11 +42,6 @@ _POINT_COLUMNS = {
     "return_index": "point_return",
     "lidar": "point_lidar",
 }
-
-
-def scene_path(store: Path, dataset: str, sequence: str) -> Path:
-    """Where a scene lies in a store."""
-    return Path(store) / "scenes" / dataset / sequence
 
 
 class DrivingScene:

@@ -10,7 +10,7 @@ import zarr
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.transforms import is_rigid
 from lidarpainter_models.scenes import schema
-from lidarpainter_models.scenes.driving_scene import DrivingScene, scene_path
+from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.stored import StoredScene, stored_digest
 
 
@@ -24,7 +24,7 @@ def copied_scene(small_scene, tmp_path):
 
 def test_scene_is_where_the_store_keeps_scenes(small_scene):
     store = small_scene.path.parents[2]
-    assert scene_path(store, "pandaset", "002") == small_scene.path
+    assert store / "scenes" / "pandaset" / "002" == small_scene.path
 
 
 def test_every_table_has_the_columns_of_the_schema(small_scene):

@@ -12,7 +12,6 @@ SECTORS = 24
 FARTHEST_M = 80.0
 NEAREST_M = 1.0
 MOST_OBSTACLES = 20_000
-LEAST_OPACITY = 0.5
 HIGH_SHARE = 0.9
 """A sector is as high as this share of what stands in it."""
 CHUNK = 64
