@@ -43,7 +43,8 @@ class Selection:
 def select(store: Store, named: Iterable[tuple[str, Row]]) -> Selection:
     """Choose runs with all that they need, or scenes and artefacts by themselves.
 
-    A run needs its scene, its artefacts and metrics, and the run that it was changed from.
+    A run needs its scene, its artefacts and metrics, and the run that it was changed from. From a
+    bucket all of it is fetched.
 
     Args:
         store: where they are.
@@ -72,7 +73,7 @@ def select(store: Store, named: Iterable[tuple[str, Row]]) -> Selection:
     }
     rows["metrics"] = [r for r in store.rows("metrics") if r["run_id"] in wanted["runs"]]
     refs = [ArtefactRef.of_id(row["artefact_id"]) for row in rows["artefacts"]]
-    scenes = [store.scene_folder(row["scene_id"]) for row in rows["scenes"]]
+    scenes = [store.whole_scene(row["scene_id"]) for row in rows["scenes"]]
     return Selection(rows=rows, folders=[*map(store.artefacts.files, refs), *scenes])
 
 

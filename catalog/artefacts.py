@@ -236,14 +236,18 @@ class ArtefactStore:
         return manifest
 
     def adopt(self, ref: ArtefactRef, folder: Path) -> None:
-        """Take in a folder on the same disk that holds a checked artefact; one that is there stays.
+        """Take in a folder on the disk of `root`, a checked artefact; one that is there stays.
 
         Raises:
             StorageError: the store cannot be written.
         """
         with held_lock(self.root / "locks" / f"{ref.digest}.lock"):
             if not self.is_complete(ref):
-                _put_in_place(folder, self.folder(ref))
+                self._place(ref, folder)
+
+    def _place(self, ref: ArtefactRef, folder: Path) -> None:
+        """Give a folder its name; the caller holds the lock."""
+        _put_in_place(folder, self.folder(ref))
 
     def _build(self, recipe: Recipe, build: Build) -> bool:
         """Write aside, then rename; the caller holds the lock. Whether it is what counts."""

@@ -16,7 +16,7 @@ import hashlib
 import os
 import re
 import secrets
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from functools import cached_property
@@ -36,7 +36,7 @@ from obstore.store import S3Store
 from catalog.errors import CatalogError, StorageError, UnreachableError, reason_of
 
 if TYPE_CHECKING:
-    from obstore import PutMode
+    from obstore import ObjectMeta, PutMode
 
 SCHEME = "s3://"
 _ADDRESS = re.compile(r"s3:/{1,2}([a-z0-9][a-z0-9.-]{1,61}[a-z0-9])(/.*)?")
@@ -126,7 +126,7 @@ class Bucket:
             obstore.put(self._objects, name, path, chunk_size=PART_BYTES)
 
     def download(self, name: str, path: Path) -> str | None:
-        """Read an object into a new file; the SHA-256 of its bytes, or None if it is not there."""
+        """Read an object into a file; the SHA-256 of its bytes, or None if it is not there."""
         digest = hashlib.sha256()
         with self._errors(f"cannot read {self.where(name)}"), path.open("wb") as file:
             try:
@@ -137,18 +137,21 @@ class Bucket:
                 return None
         return digest.hexdigest()
 
-    def sizes(self, folder: str) -> dict[str, int]:
-        """Bytes of every object below a folder, by name.
+    def objects(self, folder: str) -> "Sequence[ObjectMeta]":
+        """Every object below a folder: `path`, `size` and `last_modified`.
 
         Raises:
             StorageError: the bucket is not there.
         """
         with self._errors(f"cannot list {self.where(folder)}"):
-            found = obstore.list(self._objects, folder).collect()
-        return {one["path"]: one["size"] for one in found}
+            return obstore.list(self._objects, folder).collect()
+
+    def sizes(self, folder: str) -> dict[str, int]:
+        """Bytes of every object below a folder, by name; raises what `objects` does."""
+        return {one["path"]: one["size"] for one in self.objects(folder)}
 
     def holds(self, folder: str) -> bool:
-        """Whether any object lies below a folder; raises what `sizes` does."""
+        """Whether any object lies below a folder; raises what `objects` does."""
         with self._errors(f"cannot list {self.where(folder)}"):
             return any(obstore.list(self._objects, folder, chunk_size=1))
 

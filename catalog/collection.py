@@ -2,23 +2,44 @@
 
 What is needed is said in `needs`. Young things stay: a stage may just have made them. What a
 process holds a lock on is not touched, and `leases/` and `locks/` are left alone: whoever deletes
-a lock file lets two processes hold locks of one name.
+a lock file lets two processes hold locks of one name, and a bucket deletes without a condition,
+maybe what was taken up this moment.
+
+In a bucket other machines hold no locks that could be seen here. What is published there got its
+listing last, so files that no listing names are of somebody who publishes now, or was killed. A
+lease in `running/` or `flow-runs/` has a name that is used once, so one without a heartbeat for
+long is nobody's, given back or not.
 """
 
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from catalog.artefacts import ArtefactRef
 from catalog.deletion import Doomed, doomed_rows
+from catalog.errors import DamagedArtefactError
 from catalog.locks import is_held
 from catalog.needs import Needs
-from catalog.store import Store
+from catalog.store import Store, changed_at, scene_entry
+
+if TYPE_CHECKING:
+    from obstore import ObjectMeta
+
+    from catalog.mirrors import Mirror
 
 LEFTOVERS = "leftovers"
 """In place of a table: files that no row stands for."""
 SETTLED_AFTER = timedelta(hours=1)
 """Older folders that nobody has locked belong to nobody."""
+ABANDONED_AFTER = timedelta(days=1)
+"""Of a bucket: no file takes so long to come up, no heartbeat so long to follow."""
+OWN_NAMES = ("running", "flow-runs")
+"""Folders of leases whose names are used once."""
+ENTRY_PARTS = 3
+"""Of the name of an entry; the place of a publication follows it."""
 
 
 def plan_collection(store: Store, since: datetime) -> list[Doomed]:
@@ -34,34 +55,67 @@ def plan_collection(store: Store, since: datetime) -> list[Doomed]:
     known = {row["artefact_id"] for row in needs.artefacts}
     free = {name for name in known - kept.artefacts if not _is_locked(store, name)}
     scenes = {row["scene_id"] for row in needs.scenes} - kept.scenes
-    old = [name for name in scenes if _changed_at(store.scene_folder(name)) < since]
+    changed = store.changed("scenes")
+    young = {entry for entry, at in changed.items() if at >= since}
     return [
         *doomed_rows(store, "runs", runs),
         *doomed_rows(store, "artefacts", free),
-        *doomed_rows(store, "scenes", old),
+        *doomed_rows(store, "scenes", (one for one in scenes if scene_entry(one) not in young)),
         *_leftovers(store, known, since),
+        *([] if store.mirror is None else _abandoned(store.mirror, since)),
     ]
 
 
 def _leftovers(store: Store, known: set[str], since: datetime) -> Iterator[Doomed]:
     """Artefacts without a row, scratch of nobody, folders that were being written or removed."""
     settled = datetime.now(UTC) - SETTLED_AFTER
-    for name in sorted(store.artefacts.ids() - known):
-        folder = store.artefacts.folder(ArtefactRef.of_id(name))
-        if _changed_at(folder) < since and not _is_locked(store, name):
-            yield _leftover(store, folder)
+    made = store.changed("artefacts")
+    unknown = made.keys() - {ArtefactRef.of_id(name).entry for name in known}
+    for entry in sorted(unknown):
+        if made[entry] < since and not _is_locked(store, entry):
+            yield _leftover(store, store.root / entry)
+    digests = {entry.rpartition("/")[2] for entry in made}
     for folder in store.root.glob("work/*"):
-        is_made = any(store.root.glob(f"artefacts/*/{folder.name}"))
-        if (is_made or _changed_at(folder) < since) and not _is_locked(store, folder.name):
+        is_old = folder.name in digests or changed_at(folder) < since
+        if is_old and not _is_locked(store, folder.name):
             yield _leftover(store, folder)
-    for folder in (*store.root.glob("aside/*"), *store.root.glob("scenes/*/.*")):
+    for folder in (*store.root.glob("aside/*/"), *store.root.glob("scenes/*/.*")):
         owner = folder.name.partition("-")[0]
         if (
-            _changed_at(folder) < settled
+            changed_at(folder) < settled
             and not _is_locked(store, owner)
             and not _is_written(folder)
         ):
             yield _leftover(store, folder)
+
+
+def _abandoned(mirror: "Mirror", since: datetime) -> Iterator[Doomed]:
+    """Files of publications that were never finished, and leases of nobody."""
+    settled = min(since, datetime.now(UTC) - ABANDONED_AFTER)
+    places: dict[str, dict[str, list[ObjectMeta]]] = defaultdict(lambda: defaultdict(list))
+    for one in (*mirror.bucket.objects("artefacts"), *mirror.bucket.objects("scenes")):
+        parts = one["path"].split("/")
+        places["/".join(parts[:ENTRY_PARTS])][parts[ENTRY_PARTS]].append(one)
+    listed = {*mirror.entries("artefacts"), *mirror.entries("scenes")}
+    for entry, found in places.items():
+        if entry in listed and len(found) == 1:  # the listed one: no need to ask
+            continue
+        with suppress(DamagedArtefactError):  # `verify` names it
+            listing = mirror.listing(entry)
+            for place, files in found.items():
+                is_old = max(one["last_modified"] for one in files) < settled
+                if is_old and (listing is None or place != listing.place):
+                    yield _objects(f"{entry}/{place}", files)
+    for folder in OWN_NAMES:
+        old = [one for one in mirror.bucket.objects(folder) if one["last_modified"] < settled]
+        if old:
+            yield _objects(folder, old)
+
+
+def _objects(name: str, found: "Sequence[ObjectMeta]") -> Doomed:
+    names = tuple(one["path"] for one in found)
+    num_bytes = sum(one["size"] for one in found)
+    return Doomed(table=LEFTOVERS, row_id=name, folder=None, num_bytes=num_bytes, objects=names)
 
 
 def _leftover(store: Store, folder: Path) -> Doomed:
@@ -77,11 +131,3 @@ def _is_locked(store: Store, name: str) -> bool:
 def _is_written(folder: Path) -> bool:
     """Whether somebody writes a scene there, see the library's `storage.whole_folders`."""
     return is_held(folder / ".writing")
-
-
-def _changed_at(folder: Path) -> datetime:
-    """When the folder was last changed; long ago if it is gone."""
-    try:
-        return datetime.fromtimestamp(folder.stat().st_mtime, UTC)
-    except FileNotFoundError:
-        return datetime.fromtimestamp(0, UTC)

@@ -36,6 +36,8 @@ class Doomed:
     folder: Path | None
     """Its files; a run has none of its own."""
     num_bytes: int
+    objects: tuple[str, ...] = ()
+    """Of a bucket, where they are no entry with a folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +100,8 @@ def delete(store: Store, doomed: Sequence[Doomed]) -> None:
     for table in ("runs", "artefacts"):  # assets are what is left of their sightings
         forget_sightings(store, KEYS[table], names[table])
     for one in doomed:
+        if store.mirror is not None:
+            store.mirror.bucket.remove(one.objects)
         if one.folder is None:
             continue
         if store.mirror is not None:

@@ -13,7 +13,7 @@ import tarfile
 import uuid
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path, PurePosixPath
@@ -30,6 +30,7 @@ from catalog.archives import (
 from catalog.artefacts import MANIFEST_NAME, ArtefactRef, ArtefactStore
 from catalog.digests import canonical_json, digest_text
 from catalog.errors import CatalogError, DamagedArtefactError, UnknownRecordError, storage_errors
+from catalog.locks import held_lock
 from catalog.schemas import TABLES
 from catalog.store import Store, split_scene_id
 from catalog.tables import Row
@@ -70,7 +71,8 @@ def import_archive(store: Store, path: Path) -> dict[str, int]:
     """
     store.make()
     aside = store.root / "aside" / f"import-{uuid.uuid4().hex}"
-    with storage_errors(f"cannot import {path}"):
+    lock = held_lock(store.root / "locks" / "import.lock")  # `gc` leaves what it stands for
+    with lock, storage_errors(f"cannot import {path}"):
         try:
             with _opened(path) as tar:
                 declared = _read_manifest(tar, path)
@@ -257,18 +259,26 @@ def _has_scene(staged: Store, store: Store, scene_id: str, path: Path) -> bool:
     Raises:
         ArchiveError: it has one of the same name with another content.
     """
-    ours, theirs = (_content_digest(one.scene_folder(scene_id)) for one in (store, staged))
+    ours, theirs = (_content_digest(one, scene_id) for one in (store, staged))
     if theirs is None:
         raise ArchiveError(f"{path}: the scene {scene_id} has no manifest")
     if ours not in (None, theirs):
         raise ArchiveError(
-            f"{path}: scene {scene_id} is in {store.root} with another content; nothing was "
+            f"{path}: scene {scene_id} is in {store.name} with another content; nothing was "
             f"imported, `catalog delete {scene_id}` makes room"
         )
     return ours == theirs
 
 
-def _content_digest(folder: Path) -> str | None:
+def _content_digest(store: Store, scene_id: str) -> str | None:
+    """What a scene holds, by its manifest; None where there is no scene."""
+    with suppress(UnknownRecordError):
+        if (files := store.scene_files(scene_id)) is not None:
+            files([MANIFEST_NAME])
+    return _digest_in(store.scene_folder(scene_id))
+
+
+def _digest_in(folder: Path) -> str | None:
     try:
         return str(json.loads((folder / MANIFEST_NAME).read_text("utf-8"))["content_digest"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -281,8 +291,10 @@ def _place(store: Store, folder: Path, name: str) -> None:
     if root == "artefacts":
         store.artefacts.adopt(ArtefactRef.of_id(what), folder)
         return
+    if _content_digest(store, what) is not None:  # it came meanwhile
+        return
     final = store.scene_folder(what)
     with store.scene_lock(what):
-        if _content_digest(final) is None:
+        if _digest_in(final) is None:
             final.parent.mkdir(parents=True, exist_ok=True)
             folder.rename(final)

@@ -58,6 +58,13 @@ class MirroredArtefacts(ArtefactStore):
         self._mirror.fetch(ref.entry, [MANIFEST_NAME])
         return super().manifest(ref)
 
+    def _place(self, ref: ArtefactRef, folder: Path) -> None:
+        """Publish a folder, in place of a damaged artefact if there is one."""
+        before = self._mirror.version(ref.entry)
+        self._mirror.forget(ref.entry)
+        super()._place(ref, folder)
+        self._mirror.publish(ref.entry, replacing=before)
+
     def _build(self, recipe: Recipe, build: Build) -> bool:
         """Make it here, then publish it, in place of a damaged one if there is one."""
         entry = ArtefactRef(recipe.kind, recipe.digest).entry

@@ -21,6 +21,7 @@ from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -37,6 +38,7 @@ AT_ONCE = 8
 """Files that go up or come down at the same time."""
 LISTINGS = "published"
 
+_NOWHERE = Path(os.devnull)
 _IN_USE: dict[Path, int] = {}
 """Lock files of this process and their descriptors."""
 
@@ -87,10 +89,25 @@ class Mirror:
         there = self.bucket.sizes(place)
         return all(there.get(f"{place}/{name}") == size for name, size in listing.sizes.items())
 
-    def entries(self, kind: str) -> set[str]:
-        """Names of all that is published below a folder."""
-        names = self.bucket.sizes(f"{LISTINGS}/{kind}")
-        return {name.removeprefix(f"{LISTINGS}/").removesuffix(".json") for name in names}
+    def verify(self, entry: str) -> Listing:
+        """What is published of an entry, after every byte of it was read from the bucket.
+
+        Raises:
+            UnknownRecordError: nothing is published under this name.
+            DamagedArtefactError: a file is not there or is not what was published.
+        """
+        listing = self._published(entry)
+        with ThreadPoolExecutor(AT_ONCE) as pool:
+            read = self._download
+            list(pool.map(lambda name: read(entry, name, listing, _NOWHERE), listing.files))
+        return listing
+
+    def entries(self, kind: str) -> dict[str, datetime]:
+        """Names of all that is published below a folder, and when it was."""
+        return {
+            one["path"].removeprefix(f"{LISTINGS}/").removesuffix(".json"): one["last_modified"]
+            for one in self.bucket.objects(f"{LISTINGS}/{kind}")
+        }
 
     def fetch(self, entry: str, names: Collection[str] | None = None) -> Path:
         """Folder with the files of an entry, all or the named ones, in use from now on.
@@ -109,9 +126,7 @@ class Mirror:
         Raises:
             UnknownRecordError: nothing is published under this name.
         """
-        listing = self.listing(entry)
-        if listing is None:
-            raise UnknownRecordError(f"nothing is published as {self.bucket.where(entry)}")
+        listing = self._published(entry)
         with self._used(entry):
             self._agree(entry, listing)
         return EntryFiles(entry, listing.place, self, listing)
@@ -192,6 +207,12 @@ class Mirror:
         for path in [path for path in _IN_USE if path.is_relative_to(self.root)]:
             os.close(_IN_USE.pop(path))
 
+    def _published(self, entry: str) -> Listing:
+        listing = self.listing(entry)
+        if listing is None:
+            raise UnknownRecordError(f"nothing is published as {self.bucket.where(entry)}")
+        return listing
+
     def _agree(self, entry: str, listing: Listing) -> None:
         """Let go what is kept of something else that was published under this name."""
         with suppress(OSError, ValueError, KeyError):
@@ -225,20 +246,24 @@ class Mirror:
 
     def _fetch(self, entry: str, name: str, listing: Listing) -> None:
         """Bring one file here, whole and checked, or not at all."""
-        path, where = self.root / entry / name, f"{entry}/{listing.place}/{name}"
+        path = self.root / entry / name
         aside = self.root / "aside" / f"fetched-{secrets.token_hex(8)}"
         with storage_errors(f"cannot write {path}"):
             path.parent.mkdir(parents=True, exist_ok=True)
             aside.parent.mkdir(exist_ok=True)
             try:
-                if self.bucket.download(where, aside) != listing.files[name]["sha256"]:
-                    raise DamagedArtefactError(
-                        f"{self.bucket.where(where)} is missing or not what was published; "
-                        f"delete {self.bucket.where(entry)} and make it again"
-                    )
+                self._download(entry, name, listing, aside)
                 aside.replace(path)
             finally:
                 aside.unlink(missing_ok=True)
+
+    def _download(self, entry: str, name: str, listing: Listing, path: Path) -> None:
+        where = f"{entry}/{listing.place}/{name}"
+        if self.bucket.download(where, path) != listing.files[name]["sha256"]:
+            raise DamagedArtefactError(
+                f"{self.bucket.where(where)} is missing or not what was published; "
+                f"delete {self.bucket.where(entry)} and make it again"
+            )
 
     @contextmanager
     def _used(self, entry: str) -> Iterator[None]:

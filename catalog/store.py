@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -89,15 +90,6 @@ class Store:
         if self.mirror is not None:
             self.mirror.bucket.holds("tables")
 
-    def require_folder(self, what: str) -> None:
-        """Refuse what works on folders alone.
-
-        Raises:
-            CatalogError: the store is a bucket.
-        """
-        if self.mirror is not None:
-            raise CatalogError(f"{what} works on a store in a folder, {self.name} is a bucket")
-
     def scene_folder(self, scene_id: str) -> Path:
         """Folder of the scene `<dataset>/<sequence>` on this machine, whether it exists or not.
 
@@ -113,6 +105,25 @@ class Store:
             UnknownRecordError: there is no such scene in the bucket.
         """
         return None if self.mirror is None else self.mirror.opened(scene_entry(scene_id))
+
+    def whole_scene(self, scene_id: str) -> Path:
+        """Folder of a scene with all its files; from a bucket they are fetched.
+
+        Raises:
+            UnknownRecordError: there is no such scene in the bucket.
+        """
+        if self.mirror is not None:
+            self.mirror.fetch(scene_entry(scene_id))
+        return self.scene_folder(scene_id)
+
+    def changed(self, kind: str) -> dict[str, datetime]:
+        """When the entries of `artefacts` or `scenes` got their names, by folder from the root."""
+        if self.mirror is not None:
+            return self.mirror.entries(kind)
+        return {
+            path.relative_to(self.root).as_posix(): changed_at(path)
+            for path in self.root.glob(f"{kind}/*/[!.]*")
+        }
 
     def scene_ids(self) -> list[str]:
         """The scenes whose folders are there."""
@@ -266,6 +277,14 @@ def existing_store() -> Store:
     if not is_there:
         raise CatalogError(f"no store at {store.name}: `ingest` or `demo` makes one, see --store")
     return store
+
+
+def changed_at(path: Path) -> datetime:
+    """When a file or a folder was last changed; long ago if it is gone."""
+    try:
+        return datetime.fromtimestamp(path.stat().st_mtime, UTC)
+    except FileNotFoundError:
+        return datetime.fromtimestamp(0, UTC)
 
 
 def make_writable(folder: Path, what: str) -> None:

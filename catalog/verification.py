@@ -2,7 +2,8 @@
 
 Artefacts have a digest of every file in their manifest. What a scene's manifest says is known to
 whoever reads scenes, so that check is handed in. Tables have no digests of their own: all of their
-columns are read and decoded.
+columns are read and decoded. A bucket has a digest of every file, of scenes too, in its listings:
+the bytes are read from there and not kept, whatever the mirror holds of them.
 """
 
 from collections.abc import Callable, Iterator
@@ -12,7 +13,7 @@ from pathlib import Path
 from catalog.artefacts import ArtefactRef
 from catalog.errors import CatalogError, StorageError
 from catalog.schemas import TABLES
-from catalog.store import Store
+from catalog.store import Store, scene_entry
 
 SceneCheck = Callable[[Path], str | None]
 """What is wrong with the scene in a folder, after reading all of it; None if nothing is."""
@@ -35,7 +36,7 @@ def verify(store: Store, check_scene: SceneCheck) -> Iterator[Checked]:
     for name in sorted(store.artefacts.ids() | _ids(store, "artefacts", "artefact_id")):
         yield Checked(name=name, damage=_artefact_damage(store, name))
     for name in sorted({*store.scene_ids()} | _ids(store, "scenes", "scene_id")):
-        yield Checked(name=f"scene {name}", damage=check_scene(store.scene_folder(name)))
+        yield Checked(name=f"scene {name}", damage=_scene_damage(store, name, check_scene))
 
 
 def _ids(store: Store, table: str, key: str) -> set[str]:
@@ -53,9 +54,26 @@ def _table_damage(store: Store, table: str) -> str | None:
     return None
 
 
-def _artefact_damage(store: Store, name: str) -> str | None:
+def _scene_damage(store: Store, name: str, check_scene: SceneCheck) -> str | None:
+    if store.mirror is None:
+        return check_scene(store.scene_folder(name))
     try:
-        manifest = store.artefacts.verified(ArtefactRef.of_id(name))
+        store.mirror.verify(scene_entry(name))
+    except CatalogError as error:
+        return str(error)
+    return None
+
+
+def _artefact_damage(store: Store, name: str) -> str | None:
+    ref = ArtefactRef.of_id(name)
+    try:
+        if store.mirror is None:
+            manifest = store.artefacts.verified(ref)
+        else:
+            listed = store.mirror.verify(ref.entry).files
+            manifest = store.artefacts.manifest(ref)
+            if any(listed.get(file) != known for file, known in manifest.files.items()):
+                return "its manifest says otherwise than its listing"
     except (CatalogError, OSError) as error:
         return str(error)
     made = f"{manifest.kind}/{manifest.digest}"

@@ -37,7 +37,6 @@ def collect(days: Days = 30.0, for_real: ForReal = False, as_json: AsJson = Fals
     from catalog.store import existing_store
 
     store = existing_store()
-    store.require_folder("gc")
     doomed = plan_collection(store, datetime.now(UTC) - timedelta(days=days))
     if for_real:
         delete(store, doomed)
@@ -127,7 +126,6 @@ def verify_store(as_json: AsJson = False) -> None:
         return None
 
     store = existing_store()
-    store.require_folder("verify")
     say_status(f"reading {store.name}")
     checked = list(verify(store, scene_damage))
     damaged = [one for one in checked if one.damage]
@@ -161,7 +159,6 @@ def export_selection(
     from flows.cli.catalog import find_row
 
     store = existing_store()
-    store.require_folder("export")
     chosen = select(store, [find_row(store, name) for name in selection])
     num_bytes = write_archive(store, chosen, out)
     counts = {table: len(rows) for table, rows in chosen.rows.items() if rows}
@@ -184,7 +181,6 @@ def import_selection(
     from catalog.store import open_store
 
     store = open_store()
-    store.require_folder("import")
     counts = import_archive(store, archive)
     if as_json:
         print_json({"store": store.name, "new_rows": counts})

@@ -13,11 +13,12 @@ from catalog.store import open_store
 class Shop:
     """See above."""
 
-    def __init__(self, folder):
-        self.store = open_store(folder / "store")
+    def __init__(self, folder, address=None):
+        self.store = open_store(address or folder / "store")
         scene = self.store.root / "scenes/toy/street"
-        scene.mkdir(parents=True)
-        (scene / "manifest.json").write_text("12345")
+        with self.store.scene_lock("toy/street"):
+            scene.mkdir(parents=True)
+            (scene / "manifest.json").write_text('{"content_digest": "scene-digest"}')
         row = {"scene_id": "toy/street", "content_digest": "scene-digest"}
         self.store.tables.merge("scenes", [row])
         self.fit = self.made("fit", scene="scene-digest")
