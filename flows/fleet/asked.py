@@ -5,6 +5,7 @@ different cameras: it is read once with all of them, and each run trains on its 
 """
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from functools import cached_property
@@ -24,12 +25,12 @@ from flows.overrides import with_changes, with_overrides
 from flows.parameters import ReconstructParameters
 from flows.presets import preset as preset_named
 from flows.recall import START
-from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.painter.selection import PainterChoice
 from lidarpainter_models.painter.styles import check_prompt
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS, SyntheticStreetConfig
 from tasks.ingest.bucket_roots import is_in_bucket
-from tasks.ingest.sequences import find_sequences
+from tasks.ingest.sequences import find_scene_id, find_sequences
 from tasks.source import code_behind
 from tasks.specs import street_id
 from tasks.weights import file_digests
@@ -46,6 +47,8 @@ class Asked(BaseModel):
 
     dataset: str
     sequence: str
+    scene: str | None = None
+    """What it is called in the store, if that could be read and may be another name than these."""
     root: Path | None = None
     frames: tuple[int, int] | None = None
     seed: int | None = None
@@ -68,8 +71,8 @@ class Asked(BaseModel):
 
     @property
     def scene_id(self) -> str:
-        """`<dataset>/<sequence>`."""
-        return f"{self.dataset}/{self.sequence}"
+        """`<dataset>/<sequence>` in the store."""
+        return self.scene or f"{self.dataset}/{self.sequence}"
 
     @cached_property
     def parameters(self) -> ReconstructParameters:
@@ -207,7 +210,10 @@ def _of_source(manifest: Manifest, source: Source, folder: Path, table: str) -> 
     if not is_in_bucket(root):
         root = (folder / root).resolve()
     for name in _matching(source, root, table):
-        asked = Asked(sequence=name, root=root, **same)
+        called: str | None = None
+        with suppress(DataError):  # the worker that reads it says what is wrong
+            called = find_scene_id(source.dataset, root, name)
+        asked = Asked(sequence=name, scene=called, root=root, **same)
         try:
             split_scene_id(asked.scene_id)
         except UnknownRecordError as error:
@@ -255,7 +261,7 @@ def _with_shared_reading(asked: Sequence[Asked]) -> list[Asked]:
         by_scene.setdefault(one.scene_id, []).append(one)
     cameras: dict[str, tuple[str, ...] | None] = {}
     for scene_id, same in by_scene.items():
-        readings = {(one.root, one.frames, one.width_px) for one in same}
+        readings = {(one.root, one.sequence, one.frames, one.width_px) for one in same}
         if len(readings) > 1:
             raise ConfigError(
                 f"{scene_id} is asked for with different roots, frames or widths; "

@@ -5,6 +5,7 @@ from lidarpainter_models.readers.datasets import (
     known_datasets,
     list_sequences,
     open_log,
+    scene_id_of,
 )
 
-__all__ = ["ingest_scene", "known_datasets", "list_sequences", "open_log"]
+__all__ = ["ingest_scene", "known_datasets", "list_sequences", "open_log", "scene_id_of"]

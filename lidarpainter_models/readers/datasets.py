@@ -4,7 +4,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.readers.canonical.reader import ForeignScene, list_canonical_scenes
+from lidarpainter_models.readers.canonical.reader import (
+    ForeignScene,
+    list_canonical_scenes,
+    own_scene_id,
+)
 from lidarpainter_models.readers.nuscenes.reader import NuscenesLog, list_nuscenes_scenes
 from lidarpainter_models.readers.pandaset.reader import PandasetLog, list_pandaset_sequences
 from lidarpainter_models.readers.source_logs.log import Progress, SourceLog, write_log
@@ -16,11 +20,14 @@ ListSequences = Callable[[Path], tuple[str, ...]]
 OpenLog = Callable[[Path, str, slice | None, tuple[str, ...] | None], SourceLog]
 """Takes the root, the sequence, and which frames and cameras to take, all of them if None."""
 
+CANONICAL = "canonical"
+"""In place of a dataset: scenes that were written elsewhere, whatever dataset they are of."""
+
 _READERS: dict[str, tuple[ListSequences, OpenLog]] = {
     "pandaset": (list_pandaset_sequences, PandasetLog),
     "nuscenes": (list_nuscenes_scenes, NuscenesLog),
     "waymo": (list_waymo_segments, WaymoLog),
-    "canonical": (list_canonical_scenes, ForeignScene),
+    CANONICAL: (list_canonical_scenes, ForeignScene),
 }
 
 
@@ -42,6 +49,15 @@ def list_sequences(dataset: str, root: Path) -> tuple[str, ...]:
     if not found:
         raise DataError(f"{root}: no {dataset} sequence found")
     return found
+
+
+def scene_id_of(dataset: str, root: Path, sequence: str) -> str:
+    """What a sequence will be called in a store: `dataset/sequence`, or as its own manifest says.
+
+    Raises:
+        DataError: it is a scene from elsewhere whose manifest says no names.
+    """
+    return own_scene_id(root, sequence) if dataset == CANONICAL else f"{dataset}/{sequence}"
 
 
 def ingest_scene(

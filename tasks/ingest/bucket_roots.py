@@ -44,8 +44,8 @@ def sequences_in_bucket(root: Path) -> tuple[str, ...]:
 
 
 @contextmanager
-def root_at_hand(root: Path, sequence: str) -> Iterator[Path]:
-    """A folder that holds this sequence of a root while the block runs.
+def root_at_hand(root: Path, sequence: str, *, only: str | None = None) -> Iterator[Path]:
+    """A folder that holds this sequence of a root, or one file of it, while the block runs.
 
     Raises:
         DataError: the bucket has nothing of this sequence, or a name that leads elsewhere.
@@ -55,7 +55,7 @@ def root_at_hand(root: Path, sequence: str) -> Iterator[Path]:
         yield root
         return
     bucket = Bucket(str(root))
-    names = list(bucket.sizes(sequence))
+    names = [one for one in bucket.sizes(sequence) if only in (None, Path(one).name)]
     if not names:
         names = [name for name in bucket.sizes("") if name.startswith(f"{sequence}.")]
     if not names:

@@ -9,7 +9,7 @@ from typing import Any
 import lidarpainter_models
 from catalog.records import SceneRecord
 from catalog.store import Store, open_store
-from lidarpainter_models.readers import ingest_scene
+from lidarpainter_models.readers import ingest_scene, scene_id_of
 from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street
 from tasks.ingest.bucket_roots import root_at_hand
 from tasks.measuring import measured
@@ -34,7 +34,10 @@ def ingest_sequence(
     """Read one sequence of a dataset into the store; returns its row in `scenes`."""
     store = open_store(store_path)
     store.make()
-    with root_at_hand(root, sequence) as folder, writing(store, f"{dataset}/{sequence}"):
+    with (
+        root_at_hand(root, sequence) as folder,
+        writing(store, scene_id_of(dataset, folder, sequence)),
+    ):
         path = ingest_scene(
             dataset,
             folder,

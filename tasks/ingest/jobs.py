@@ -25,6 +25,7 @@ from lidarpainter_models.errors import ConfigError, LidarPainterError
 from tasks.ingest.bucket_roots import normal_root
 from tasks.ingest.ingest import STAGE as ONE_SEQUENCE
 from tasks.ingest.ingest import ingest_sequence
+from tasks.ingest.sequences import find_scene_id
 from tasks.opened import open_scene
 from tasks.progress import listener
 
@@ -125,7 +126,7 @@ def _known(note: bytes | None, request: IngestRequest, name: str) -> dict[str, A
         row, earlier = dict(noted["row"]), dict(noted["request"])
         scene_id, digest = row["scene_id"], row["content_digest"]
     except (ValueError, KeyError, TypeError):  # no note, or one that cannot be read
-        scene_id, digest = f"{request.dataset}/{name}", None
+        scene_id, digest = find_scene_id(request.dataset, request.root, name), None
     try:
         stored = open_scene(open_store(request.store_path), scene_id).manifest
     except (LidarPainterError, CatalogError):

@@ -5,8 +5,10 @@ from contextlib import suppress
 from pathlib import Path
 
 from lidarpainter_models.errors import DataError, LidarPainterError
-from lidarpainter_models.readers import known_datasets, list_sequences
-from tasks.ingest.bucket_roots import is_in_bucket, sequences_in_bucket
+from lidarpainter_models.readers import known_datasets, list_sequences, scene_id_of
+from lidarpainter_models.readers.datasets import CANONICAL
+from lidarpainter_models.scenes.schema import MANIFEST_NAME
+from tasks.ingest.bucket_roots import is_in_bucket, root_at_hand, sequences_in_bucket
 
 
 def find_sequences(dataset: str, root: Path, named: Sequence[str] = ()) -> list[str]:
@@ -32,6 +34,19 @@ def find_sequences(dataset: str, root: Path, named: Sequence[str] = ()) -> list[
                 f"which holds {_some(above)}"
             )
     return list(dict.fromkeys(named or found or list_sequences(dataset, root)))
+
+
+def find_scene_id(dataset: str, root: Path, sequence: str) -> str:
+    """What a sequence will be called in a store; see `readers.scene_id_of`.
+
+    Raises:
+        DataError: it is a scene from elsewhere whose manifest says no names.
+        StorageError: the bucket does not answer.
+    """
+    if dataset != CANONICAL:
+        return f"{dataset}/{sequence}"
+    with root_at_hand(root, sequence, only=MANIFEST_NAME) as folder:
+        return scene_id_of(dataset, folder, sequence)
 
 
 def _some(names: Sequence[str], most: int = 5) -> str:

@@ -14,7 +14,11 @@ import torch
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.readers.canonical.checks import read_foreign_manifest
+from lidarpainter_models.readers.canonical.checks import (
+    MAX_MANIFEST_BYTES,
+    read_foreign_manifest,
+    read_small_json,
+)
 from lidarpainter_models.readers.source_logs.frame_content import (
     FrameContent,
     SourceImage,
@@ -30,7 +34,7 @@ from lidarpainter_models.scenes.records import (
     SweepPoints,
 )
 from lidarpainter_models.scenes.stored import StoredScene
-from lidarpainter_models.scenes.validation import SHUTTER_DIRECTIONS, require_pose
+from lidarpainter_models.scenes.validation import SHUTTER_DIRECTIONS, require_name, require_pose
 from lidarpainter_models.scenes.writer import SceneHeader
 
 _MAX_JPEG_BYTES = 64_000_000
@@ -51,6 +55,23 @@ def list_canonical_scenes(root: Path) -> tuple[str, ...]:
     return tuple(sorted(file.parent.name for file in root.glob(f"*/{schema.MANIFEST_NAME}")))
 
 
+def own_scene_id(root: Path, sequence: str) -> str:
+    """The dataset and sequence that the manifest of a scene folder says; nothing else is read.
+
+    Raises:
+        DataError: there is no manifest, or it says no names.
+    """
+    file = _scene_folder(root, sequence) / schema.MANIFEST_NAME
+    manifest = read_small_json(file, MAX_MANIFEST_BYTES)
+    names = (str(manifest.get(key, "")) for key in ("dataset", "sequence"))
+    return "/".join(require_name(name, f"{file}: dataset or sequence") for name in names)
+
+
+def _scene_folder(root: Path, sequence: str) -> Path:
+    is_scene = (root / schema.MANIFEST_NAME).is_file() and root.resolve().name == sequence
+    return root if is_scene else root / sequence
+
+
 class ForeignScene:
     """The tables of a checked scene folder, by frame."""
 
@@ -67,8 +88,7 @@ class ForeignScene:
         Raises:
             DataError: something of the scene is missing, damaged or makes no sense.
         """
-        is_scene = (root / schema.MANIFEST_NAME).is_file() and root.resolve().name == sequence
-        self.folder = root if is_scene else root / sequence
+        self.folder = _scene_folder(root, sequence)
         if not self.folder.is_dir():
             raise DataError(f"{self.folder}: no such scene folder")
         self.place = str(self.folder)

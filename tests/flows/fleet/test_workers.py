@@ -3,6 +3,7 @@
 import shutil
 import signal
 import time
+from types import SimpleNamespace
 
 import pytest
 from commands import call
@@ -15,6 +16,7 @@ from stub_fleet import (
     stub_worker,
     write_stub_manifest,
 )
+from toy_store import write_toy_scene
 
 from catalog.attempts import Ending
 from catalog.errors import DamagedArtefactError, StorageError
@@ -24,7 +26,10 @@ from flows.fleet.asked import wishes
 from flows.fleet.causes import cause_of
 from flows.fleet.limits import admits
 from flows.fleet.manifest import Budget, read_manifest
+from flows.fleet.work import make_sequence
+from flows.fleet.worker import Worker
 from lidarpainter_models.errors import BackendError, SceneError, WriteError
+from tasks.opened import open_scene
 
 STREETS = [f"synthetic/street-{seed:04d}" for seed in range(1, 5)]
 
@@ -272,3 +277,41 @@ def test_sequences_of_one_scene_are_told_apart(stubbed, tmp_path):
     said = stubbed("run", path).out
     assert "fit_seed" in said
     assert "cameras" not in said
+
+
+def asked_of_elsewhere(store, folder):
+    path = folder / "night.toml"
+    source = '[[source]]\ndataset = "canonical"\nroot = "logs"\n'
+    path.write_text(f'name = "stub"\npainter = "none"\n{source}[budget]\nfree_disk_gb = 0\n')
+    ledger = stub_ledger(store.root)
+    ledger.ask(wishes(read_manifest(path), path.parent))
+    return ledger
+
+
+def test_a_scene_from_elsewhere_is_made_under_its_own_name(store, tmp_path, monkeypatch):
+    shutil.copytree(write_toy_scene(tmp_path / "elsewhere"), tmp_path / "logs/drive-7")
+    ledger = asked_of_elsewhere(store, tmp_path)
+
+    def reconstructed(parameters, address):
+        assert open_scene(open_store(address), parameters.scene).frame_indices
+        made = {"artefacts": {}, "computed_now": {}, "peak_memory_bytes": None}
+        return {"run_id": f"run of {parameters.scene}", **made}
+
+    monkeypatch.setattr("flows.fleet.work.reconstruct", SimpleNamespace(fn=reconstructed))
+    said = []
+    Worker(ledger=ledger, fleet="stub", work=make_sequence, say=said.append, poll_s=0.2).run()
+    (row,) = ledger.rows("stub")
+    assert (row["scene_id"], row["state"]) == ("toy/street", "done"), said
+    assert row["run_id"] == "run of toy/street"
+    assert store.scene_ids() == ["toy/street"]
+
+
+def test_a_scene_from_elsewhere_without_a_name_is_set_aside(store, tmp_path):
+    folder = tmp_path / "logs/drive-7"
+    folder.mkdir(parents=True)
+    (folder / "manifest.json").write_text("{")
+    ledger = asked_of_elsewhere(store, tmp_path)
+    Worker(ledger=ledger, fleet="stub", work=make_sequence, say=print, poll_s=0.2).run()
+    (row,) = ledger.rows("stub")
+    assert (row["scene_id"], row["state"]) == ("canonical/drive-7", "set-aside")
+    assert "drive-7/manifest.json: cannot be read" in row["reason"]
