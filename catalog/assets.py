@@ -6,7 +6,6 @@ takes the columns of the sighting with the best score. Both tables are written u
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager
 
 import numpy as np
 import pyarrow as pa
@@ -14,12 +13,13 @@ import pyarrow.compute as pc
 
 from catalog.digests import canonical_json, digest_text
 from catalog.errors import UnknownRecordError
-from catalog.locks import held_lock
 from catalog.schemas import ASSETS, SIGHTINGS
 from catalog.store import Store
 from catalog.tables import Row
 
 ID_LENGTH = 16
+LOCK = "assets"
+"""Held by whoever writes: what is one asset is decided from all that is there."""
 NEAR_M = 10.0
 """Sightings farther apart along x or y are not compared: no car is so long."""
 
@@ -41,7 +41,7 @@ def enter_sightings(store: Store, rows: Sequence[Row], is_same: IsSame) -> list[
         ConflictError: other writers won every attempt.
         StorageError: a table cannot be written.
     """
-    with _alone(store):
+    with store.alone(LOCK):
         known = store.tables.arrow(SIGHTINGS.name)
         names = SIGHTINGS.arrow.names
         new: list[Row] = [{name: row.get(name) for name in names} for row in rows]
@@ -66,7 +66,7 @@ def enter_sightings(store: Store, rows: Sequence[Row], is_same: IsSame) -> list[
 
 def forget_sightings(store: Store, column: str, values: Iterable[str]) -> None:
     """Take sightings out whose run or artefact (`column`) is gone; assets without any go too."""
-    with _alone(store):
+    with store.alone(LOCK):
         known = store.tables.arrow(SIGHTINGS.name)
         gone = _where(known, column, values)
         if not gone:
@@ -87,8 +87,9 @@ def find_asset(store: Store, name: str) -> Row:
     Raises:
         UnknownRecordError: there is none, or several begin so.
     """
-    sightings = store.tables.arrow(SIGHTINGS.name)
-    for column in ("asset_id", "occurrence_id"):  # an id that was merged into another one
+    columns = ("asset_id", "occurrence_id")  # the second finds what was merged into another one
+    sightings = store.tables.arrow(SIGHTINGS.name, columns=columns)
+    for column in columns:
         begins = pc.starts_with(sightings[column], pattern=name)
         found = set(sightings.filter(begins)["asset_id"].to_pylist())
         if len(found) == 1:
@@ -99,11 +100,6 @@ def find_asset(store: Store, name: str) -> Row:
     raise UnknownRecordError(
         f"no asset {name!r} in {store.root}: `assets list` names them, `assets publish` makes them"
     )
-
-
-def _alone(store: Store) -> AbstractContextManager[bool]:
-    """Held by whoever writes: what is one asset is decided from all that is there."""
-    return held_lock(store.root / "locks" / "assets.lock")
 
 
 class _Groups:

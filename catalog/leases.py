@@ -34,6 +34,8 @@ TIME_TO_LIVE_S = 120.0
 """Without a heartbeat; clocks of machines that share a store must agree far better than this."""
 BEATS = 12
 """Heartbeats in a time to live."""
+POLL_S = 0.2
+"""Between two looks at a lease that somebody else holds."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,159}")
 _PROC = Path("/proc")
 _STARTED, _STATE = 19, 0
@@ -225,10 +227,28 @@ class Leases:
     @contextmanager
     def kept(self, name: str) -> Iterator[None]:
         """Hold a lease of a name of one's own while the block runs; a thread renews it."""
-        lease, over = self.take(name, above=0, facts={}), threading.Event()
+        lease = self.take(name, above=0, facts={})
         if lease is None:
             raise LeaseLostError(f"the lease {name} is in other hands")
-        last = [lease]
+        with self._beating(lease):
+            yield
+
+    @contextmanager
+    def alone(self, name: str) -> Iterator[None]:
+        """Hold a lease while the block runs; wait for as long as anybody else holds it."""
+        while (lease := self.take(name, above=0, facts={})) is None:
+            found = self._objects.read(name)
+            if found is not None and self.has_expired(other := _parsed(name, *found)):
+                self.give_back(other)
+            else:
+                time.sleep(POLL_S)
+        with self._beating(lease):
+            yield
+
+    @contextmanager
+    def _beating(self, lease: Lease) -> Iterator[None]:
+        """Renew a lease from a thread, and give it back at the end."""
+        last, over = [lease], threading.Event()
 
         def beat() -> None:
             while not over.wait(self.time_to_live_s / BEATS):

@@ -34,6 +34,20 @@ assert Leases(FolderObjects(Path(sys.argv[1]))).take("a", above=6, facts={"scene
 """
 
 
+WAITER = """
+import sys
+from pathlib import Path
+from catalog.leases import FolderObjects, Leases
+folder = Path(sys.argv[1])
+leases = Leases(FolderObjects(folder / "leases"))
+for _ in range(5):
+    with leases.alone("table"):
+        count = folder / "count"
+        before = int(count.read_text()) if count.exists() else 0
+        count.write_text(str(before + 1))
+"""
+
+
 class Clock:
     now = 1000.0
 
@@ -107,3 +121,21 @@ def test_eight_processes_count_and_none_is_lost(tmp_path):
     ]
     assert [counter.wait(timeout=120) for counter in counters] == [0] * 8
     assert [(tmp_path / name).read_text() for name in "abc"] == ["80"] * 3
+
+
+def test_who_waits_for_a_lease_is_alone_with_it(tmp_path):
+    words = [sys.executable, "-c", WAITER, tmp_path]
+    processes = [subprocess.Popen(words, cwd=ROOT) for _ in range(4)]
+    assert [process.wait() for process in processes] == [0] * 4
+    assert (tmp_path / "count").read_text() == "20"
+    assert Leases(FolderObjects(tmp_path / "leases")).held() == []
+
+
+def test_a_lease_that_its_holder_left_behind_is_not_waited_for(leases, clock):
+    lost = leases.take("table", above=0, facts={})
+    clock.now += 2 * leases.time_to_live_s
+    with leases.alone("table"):
+        assert len(leases.held()) == 1
+        with pytest.raises(LeaseLostError):
+            leases.renew(lost, {})
+    assert leases.held() == []
