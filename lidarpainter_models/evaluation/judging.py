@@ -109,6 +109,8 @@ def _mean(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         values = [part[name] for part in parts]
         if name == "num_views":
             merged[name] = sum(values)
+        elif name == "psnr_by_view":
+            merged[name] = {view: psnr for part in values for view, psnr in part.items()}
         elif isinstance(first, Mapping):
             merged[name] = _mean(values)
         elif all(isinstance(value, (int, float)) for value in values):
