@@ -13,7 +13,7 @@ from typing import Literal
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from lidarpainter_models.evaluation.judged_views import JudgedView, actor_mask
+from lidarpainter_models.evaluation.judged_views import JudgedView, actors_in_view
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.shifts import Shift
@@ -101,10 +101,12 @@ class HeldOut:
     def _judged(
         self, view: RecordedView, camera: Camera, truth_rgb: Float[Tensor, "height width 3"]
     ) -> JudgedView:
+        actor_ids, actor_index = actors_in_view(camera, self._moving, view.timestamp_ns)
         return JudgedView(
             name=f"{view.camera_name}/{view.frame_index}",
             camera=camera,
             timestamp_ns=view.timestamp_ns,
             truth_rgb=truth_rgb,
-            actor_mask=actor_mask(camera, self._moving, view.timestamp_ns),
+            actor_ids=actor_ids,
+            actor_index=actor_index,
         )

@@ -10,17 +10,25 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarpainter_models.geometry.box_masks import box_outlines
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
-from lidarpainter_models.metrics.images import ImageScores, pooled_psnr, score_image
+from lidarpainter_models.metrics.images import (
+    ImageScores,
+    pooled_psnr,
+    psnr_from_error,
+    score_image,
+    squared_error,
+)
 from lidarpainter_models.metrics.perceptual import PerceptualDistances
 
 Renderer = Callable[[Camera, int], Float[Tensor, "height width 3"]]
 """Image of a camera (fit resolution) at a time in nanoseconds."""
+NOBODY = -1
+"""Actor index of a pixel outside all boxes."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,8 +39,18 @@ class JudgedView:
     camera: Camera
     timestamp_ns: int
     truth_rgb: Float[Tensor, "height width 3"]
-    actor_mask: Bool[Tensor, "height width"]
-    """Pixels inside the projected boxes of moving actors."""
+    actor_ids: tuple[str, ...]
+    """The moving actors that are there."""
+    actor_index: Int[Tensor, "height width"]
+    """Whose projected box is in front, by position in `actor_ids`, or `NOBODY`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ActorScore:
+    """PSNR over the pixels of an actor's box in all views together."""
+
+    psnr: float
+    num_pixels: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,20 +67,27 @@ class ViewScores:
     num_views: int
     psnr_by_view: dict[str, float]
     """By the names of the views."""
+    psnr_by_actor: dict[str, ActorScore]
+    """By the ids of the moving actors that any view sees."""
 
 
-def actor_mask(
+def actors_in_view(
     camera: Camera, actors: MovingBoxes, timestamp_ns: int
-) -> Bool[Tensor, "height width"]:
-    """Pixels inside the projected boxes of the actors present at that time."""
-    mask = np.zeros((camera.height_px, camera.width_px), np.uint8)
-    if placed := actors.placed(timestamp_ns):
+) -> tuple[tuple[str, ...], Int[Tensor, "height width"]]:
+    """Ids of the actors present at a time, and whose projected box is in front at each pixel.
+
+    In front is the box whose furthest corner is nearest.
+    """
+    index = np.full((camera.height_px, camera.width_px), NOBODY, np.int32)
+    placed = actors.placed(timestamp_ns)
+    if placed:
         tracks, poses = zip(*placed, strict=True)
         sizes_m = torch.stack([track.size_m for track in tracks])
-        for outline in box_outlines(camera, torch.stack(poses), sizes_m):
+        outlines = box_outlines(camera, torch.stack(poses), sizes_m)
+        for outline in sorted(outlines, key=lambda outline: -outline.far_m):
             hull = cv2.convexHull(outline.pixels_uv.astype(np.float32))
-            cv2.fillConvexPoly(mask, np.round(hull - 0.5).astype(np.int32), 1)
-    return torch.from_numpy(mask.astype(bool))
+            cv2.fillConvexPoly(index, np.round(hull - 0.5).astype(np.int32), outline.box)
+    return tuple(track.actor_id for track, _pose in placed), torch.from_numpy(index)
 
 
 def score_views(
@@ -77,10 +102,14 @@ def score_views(
     scores: list[ImageScores] = []
     features: list[float] = []
     lpips: list[float] = []
+    of_actors: dict[str, list[Tensor]] = {}
     for view in views:
         image = render(view.camera, view.timestamp_ns).clamp(0, 1)
         truth = view.truth_rgb.to(image.device)
-        scores.append(score_image(image, truth, view.actor_mask.to(image.device)))
+        is_actor = (view.actor_index != NOBODY).to(image.device)
+        scores.append(score_image(image, truth, is_actor))
+        for actor_id, errors in _actor_errors(image, truth, view).items():
+            of_actors.setdefault(actor_id, []).append(errors)
         if distances.features is not None:
             features.append(float(distances.features(image, truth)))
         if distances.lpips is not None:
@@ -94,4 +123,18 @@ def score_views(
         lpips_reason=distances.lpips_missing,
         num_views=len(scores),
         psnr_by_view={view.name: score.psnr_db for view, score in zip(views, scores, strict=True)},
+        psnr_by_actor={name: _actor_score(torch.cat(found)) for name, found in of_actors.items()},
     )
+
+
+def _actor_errors(
+    image: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"], view: JudgedView
+) -> dict[str, Float[Tensor, " pixels"]]:
+    """Squared errors of the pixels of each actor that the view sees."""
+    error = squared_error(image, truth).double().cpu()
+    seen = view.actor_index[view.actor_index != NOBODY].unique().tolist()
+    return {view.actor_ids[number]: error[view.actor_index == number] for number in seen}
+
+
+def _actor_score(errors: Float[Tensor, " pixels"]) -> ActorScore:
+    return ActorScore(psnr=psnr_from_error(float(errors.mean())), num_pixels=len(errors))

@@ -1,6 +1,7 @@
 """Every figure of one fitted scene under one way of rendering it, camera by camera."""
 
 import itertools
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -19,6 +20,7 @@ from lidarpainter_models.evaluation.score_tables import DEPTH, Scores
 from lidarpainter_models.evaluation.settings import JudgeConfig
 from lidarpainter_models.evaluation.shown import ShownScene
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.metrics.images import psnr_from_error
 from lidarpainter_models.metrics.perceptual import PerceptualDistances, load_distances
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.synthetic.street import SyntheticStreet
@@ -104,13 +106,18 @@ def _mean(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         return dict(parts[0])
     if not parts:
         return _unknown(0)
+    joins: dict[str, Callable[[Sequence[Any]], Any]] = {
+        "num_views": sum,
+        "psnr_by_view": lambda values: {
+            view: psnr for part in values for view, psnr in part.items()
+        },
+        "psnr_by_actor": _pooled,
+    }
     merged: dict[str, Any] = {}
     for name, first in parts[0].items():
         values = [part[name] for part in parts]
-        if name == "num_views":
-            merged[name] = sum(values)
-        elif name == "psnr_by_view":
-            merged[name] = {view: psnr for part in values for view, psnr in part.items()}
+        if name in joins:
+            merged[name] = joins[name](values)
         elif isinstance(first, Mapping):
             merged[name] = _mean(values)
         elif all(isinstance(value, (int, float)) for value in values):
@@ -120,6 +127,20 @@ def _mean(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         else:
             merged[name] = first if isinstance(first, str) else None
     return merged
+
+
+def _pooled(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """PSNR of each actor over the pixels of all cameras together."""
+    pixels, errors = Counter[str](), dict[str, float]()
+    for part in parts:
+        for actor_id, found in part.items():
+            pixels[actor_id] += found["num_pixels"]
+            error = found["num_pixels"] * 10 ** (-found["psnr"] / 10)
+            errors[actor_id] = errors.get(actor_id, 0.0) + error
+    return {
+        actor_id: {"psnr": psnr_from_error(errors[actor_id] / num), "num_pixels": num}
+        for actor_id, num in pixels.items()
+    }
 
 
 def _unknown(num_views: int) -> dict[str, Any]:

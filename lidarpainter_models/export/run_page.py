@@ -78,7 +78,10 @@ class RunPage:
             worst=pictures.worst,
             repeat=_repeat(self.result, json.loads(self.settings.get("train_cameras", "null"))),
             comparisons=pictures.comparisons,
-            tables=[*_tables(self.result, self.costs), *_actors(scene, pictures.actor_gaussians)],
+            tables=[
+                *_tables(self.result, self.costs),
+                *_actors(scene, pictures.actor_gaussians, self.result["recorded"] or {}),
+            ],
             plots=_plots(histories),
             facts={
                 "Provenance": self.provenance,
@@ -171,8 +174,11 @@ def _in_words(name: str) -> str:
     return name.removeprefix("num_").replace("_", " ")
 
 
-def _actors(scene: DrivingScene, num_gaussians: Mapping[str, int]) -> list[Table]:
-    """The actors that LiDAR saw best, and how much of the scene each has."""
+def _actors(
+    scene: DrivingScene, num_gaussians: Mapping[str, int], scores: Mapping[str, Any]
+) -> list[Table]:
+    """The actors that LiDAR saw best, how much of the scene each has, how well each is seen."""
+    by_actor = scores.get("psnr_by_actor", {})  # older results have none
     seen = [int(track.num_points.sum()) for track in scene.tracks]
     best = sorted(range(len(seen)), key=lambda index: -seen[index])[:MOST_ACTORS]
     rows: list[list[Cell]] = [
@@ -183,14 +189,16 @@ def _actors(scene: DrivingScene, num_gaussians: Mapping[str, int]) -> list[Table
             len(track.timestamps_ns),
             seen[index],
             num_gaussians.get(track.actor_id),
+            by_actor.get(track.actor_id, {}).get("psnr"),
         ]
         for index in best
     ]
     if not rows:
         return []
-    columns = ["actor", "moves", "size, m", "frames", "LiDAR points", "Gaussians"]
+    columns = ["actor", "moves", "size, m", "frames", "LiDAR points", "Gaussians", "PSNR"]
     note = (
-        f"{len(rows)} of {len(seen)}, most points first. What stands still is part of the street."
+        f"{len(rows)} of {len(seen)}, most points first. What stands still is part of the street. "
+        "PSNR: inside the actor's box in held-out views, without what nearer moving boxes cover."
     )
     return [Table(title="Actors", columns=columns, rows=rows, note=note)]
 

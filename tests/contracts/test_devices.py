@@ -58,7 +58,8 @@ def scores(world, device, *, view_time):
             camera=view.camera,
             timestamp_ns=view.timestamp_ns,
             truth_rgb=view.rgb,
-            actor_mask=view.lidar_depth_m > 0,
+            actor_ids=("lit",),
+            actor_index=(view.lidar_depth_m > 0).int() - 1,
         )
         for view in seen.views[:2]
     ]

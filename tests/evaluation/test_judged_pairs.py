@@ -84,7 +84,8 @@ def places(monkeypatch):
                 camera=CAMERA,
                 timestamp_ns=one.timestamp_ns,
                 truth_rgb=torch.full((4, 6, 3), 1.5),
-                actor_mask=torch.zeros(4, 6, dtype=torch.bool),
+                actor_ids=(),
+                actor_index=torch.full((4, 6), -1),
             )
             for one in held_out.test_views
         ]

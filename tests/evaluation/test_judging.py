@@ -1,14 +1,26 @@
-"""Scores of several cameras, and what they make together."""
+"""Scores of several cameras and of each actor, and what they make together."""
+
+import math
+from dataclasses import replace
 
 import pytest
+import torch
 from gaussian_world import scene_trained_on
-from toy_street import ToyStreet
+from toy_street import ToyStreet, world_from_car
 
 from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.evaluation.held_out import HeldOut
+from lidarpainter_models.evaluation.judged_views import (
+    NOBODY,
+    JudgedView,
+    actors_in_view,
+    score_views,
+)
 from lidarpainter_models.evaluation.judging import Judgement
 from lidarpainter_models.evaluation.settings import JudgeConfig, ScoringConfig
 from lidarpainter_models.evaluation.shown import ShownScene
+from lidarpainter_models.lidar.moving_boxes import MovingBoxes
+from lidarpainter_models.metrics.perceptual import PerceptualDistances
 from lidarpainter_models.observations.settings import ObservationConfig
 
 FRONT, SIDE = "front", "side"
@@ -38,3 +50,55 @@ def test_views_of_all_cameras_have_their_score(scores):
     for name in (FRONT, SIDE):
         own = scores["recorded_by_camera"][name]["psnr_by_view"]
         assert own.items() <= by_view.items()
+
+
+def test_an_actor_is_scored_over_the_pixels_of_all_cameras(scores):
+    whole = scores["recorded"]["psnr_by_actor"]["car"]
+    parts = [scores["recorded_by_camera"][name]["psnr_by_actor"]["car"] for name in (FRONT, SIDE)]
+    assert whole["num_pixels"] == sum(part["num_pixels"] for part in parts)
+    error = sum(part["num_pixels"] * 10 ** (-part["psnr"] / 10) for part in parts)
+    assert whole["psnr"] == pytest.approx(-10 * math.log10(error / whole["num_pixels"]), abs=1e-9)
+    assert parts[0]["psnr"] != pytest.approx(parts[1]["psnr"], abs=0.1)
+
+
+@pytest.fixture
+def hidden():
+    """A view of two cars, the far one listed last and half behind the near one."""
+    street = ToyStreet()
+    (near,), view = street.tracks, street.views[2]
+    back = torch.eye(4, dtype=torch.float64)
+    back[:2, 3] = torch.tensor([5.0, 2.0])
+    far = replace(near, actor_id="far", world_from_box=back @ near.world_from_box)
+    actor_ids, index = actors_in_view(view.camera, MovingBoxes([near, far]), view.timestamp_ns)
+    alone, of_far = actors_in_view(view.camera, MovingBoxes([far]), view.timestamp_ns)
+    assert (actor_ids, alone) == (("car", "far"), ("far",))
+    return view, index, of_far == 0
+
+
+def test_a_pixel_is_that_of_the_nearest_box(hidden):
+    view, index, of_far = hidden
+    centre = world_from_car(view.timestamp_ns * 1e-9)[None, :3, 3]
+    u, v = view.camera.project(centre)[0][0].long().tolist()
+    assert index[v, u] == 0
+    assert bool((of_far & (index == 0)).any())
+    assert torch.equal(index == 1, of_far & (index != 0))
+
+
+def test_what_hides_an_actor_does_not_count_for_it(hidden):
+    view, index, _of_far = hidden
+    wrong = {NOBODY: 0.3, 0: 0.1, 1: 0.01}
+    image = torch.zeros(*index.shape, 3)
+    for number, error in wrong.items():
+        image[index == number] = error
+    judged = JudgedView(
+        name="front/2",
+        camera=view.camera,
+        timestamp_ns=view.timestamp_ns,
+        truth_rgb=torch.zeros_like(image),
+        actor_ids=("car", "far"),
+        actor_index=index,
+    )
+    scores = score_views(lambda *_place: image, [judged], distances=PerceptualDistances())
+    assert scores.psnr_by_actor["car"].psnr == pytest.approx(20, abs=1e-4)
+    assert scores.psnr_by_actor["far"].psnr == pytest.approx(40, abs=1e-4)
+    assert scores.psnr_by_actor["far"].num_pixels == int((index == 1).sum())

@@ -11,6 +11,7 @@ import pytest
 import torch
 from drawn_streets import drawn_street
 from tiny_street import tiny_street
+from toy_street import ToyStreet
 
 from lidarpainter_models.errors import WriteError
 from lidarpainter_models.export.images import to_bytes, write_png
@@ -29,6 +30,16 @@ from lidarpainter_models.synthetic import record_street
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 WIDTHS_PX = (1400, 400)
 INPUTS = ("LiDAR", "warped recording", "painted at view time", "confidence")
+RESULT = {
+    "run_id": "0" * 16,
+    "scene": "synthetic/street-0005",
+    "preset": "preview",
+    "painter": "nano",
+    "split": "alternate",
+    "rounds": 1,
+    "num_gaussians": 5,
+    "guidance": {},
+}
 
 
 def sample_report(title: str = "run") -> Report:
@@ -111,18 +122,7 @@ def test_page_begins_with_what_the_scene_is(tmp_path):
     scene = DrivingScene.open(record_street(drawn_street(tiny_street()), tmp_path))
     scores = {"psnr": 1.0, "num_views": 3}
     judged = {"recorded": scores, "novel": {}}
-    result = {
-        "run_id": "0" * 16,
-        "scene": "synthetic/street-0005",
-        "preset": "preview",
-        "painter": "nano",
-        "split": "alternate",
-        "rounds": 1,
-        "num_gaussians": 5,
-        "guidance": {},
-        **judged,
-        "unpainted": judged,
-    }
+    result = {**RESULT, **judged, "unpainted": judged}
     page = RunPage(
         result=result, costs=[], provenance={}, settings={"fit.steps": "40"}, has_lidar=True
     )
@@ -135,6 +135,29 @@ def test_page_begins_with_what_the_scene_is(tmp_path):
     assert text.index("Sequence street-0005") < text.index("<h2>")
     assert "abacus" in text
     assert "fit.steps" in text
+
+
+def test_actors_have_their_psnr_and_results_without_it_a_dash():
+    street = ToyStreet()
+    street.manifest = {"counts": {"frames": 4, "images": 4, "points": 1000}}
+    street.lidar_names, street.frame_timestamps_ns = ("top",), [0, 300_000_000]
+    cells = []
+    for of_actors in ({"psnr_by_actor": {"car": {"psnr": 25.5, "num_pixels": 9}}}, {}):
+        judged = {"recorded": {"psnr": 1.0, "num_views": 3, **of_actors}, "novel": {}}
+        page = RunPage(
+            result={**RESULT, **judged, "unpainted": judged},
+            costs=[],
+            provenance={},
+            settings={},
+            has_lidar=True,
+        )
+        (table,) = [
+            table
+            for table in page.report(street, Pictures(), {}, {}).tables
+            if table.title == "Actors"
+        ]
+        cells.append(dict(zip(table.columns, table.rows[0], strict=True))["PSNR"])
+    assert cells == [25.5, None]
 
 
 @pytest.fixture(scope="session")
