@@ -24,7 +24,7 @@ prepare_environment()
 
 import psutil  # noqa: E402
 from bucket_stand_in import BUCKET, running_stand_in  # noqa: E402
-from production_services import Postgres, PrefectService, kill_session  # noqa: E402
+from production_services import Postgres, PrefectService  # noqa: E402
 from stub_fleet import stub_ledger, stub_work, stub_worker, write_stub_manifest  # noqa: E402
 
 from flows.fleet import work  # noqa: E402
@@ -80,10 +80,12 @@ def _prefect(folder: Path) -> Iterator[None]:
     postgres = Postgres()
     service = PrefectService(folder, postgres.url)
     try:
+        postgres.start()
+        service.start()
         with temporary_settings({PREFECT_API_URL: service.url}):
             yield
     finally:
-        kill_session(service.process)
+        service.end()
         postgres.remove()
 
 

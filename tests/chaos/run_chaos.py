@@ -2,12 +2,14 @@
 
 `python tests/chaos/run_chaos.py` prints one JSON object and exits with 0 if all of it holds. It
 needs Debian's postgresql, and to be root for the small disk (a tmpfs) that is full once. With
-`--bucket` the store lies in a stand-in for S3 instead, which refuses and delays requests.
+`--bucket` the store lies in a stand-in for S3 instead, which refuses and delays requests. Whatever
+ends it ends all that it started.
 """
 
 import argparse
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -38,6 +40,7 @@ NAME = "chaos"
 EVERY_S = 30
 DISK_MEGABYTES = 256
 CALM_S = 1800.0
+ENDINGS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
 def main() -> None:
@@ -52,9 +55,18 @@ def main() -> None:
     arguments = parser.parse_args()
     if NO_POSTGRES:
         sys.exit(NO_POSTGRES)
+    for number in ENDINGS:
+        signal.signal(number, end)
     found = run_chaos(**vars(arguments))
     print(json.dumps(found, indent=1))  # noqa: T201
     sys.exit(0 if found["holds"] else 1)
+
+
+def end(number, _frame):
+    """Leave as after an error; a second signal does not keep what was started from being ended."""
+    for one in ENDINGS:
+        signal.signal(one, signal.SIG_IGN)
+    sys.exit(128 + number)
 
 
 def run_chaos(*, sequences, corrupted, kills, seed, pace_s, bucket=False):
@@ -66,8 +78,9 @@ def run_chaos(*, sequences, corrupted, kills, seed, pace_s, bucket=False):
     manifest = write_stub_manifest(folder, NAME, sequences)
     began = time.monotonic()
     with in_bucket(folder) if bucket else on_small_disk(folder) as (store, disturb, is_small):
-        site = Site(folder=folder, store=store, inputs=folder / "inputs", name=NAME, pace_s=pace_s)
-        try:
+        with Site(
+            folder=folder, store=store, inputs=folder / "inputs", name=NAME, pace_s=pace_s
+        ) as site:
             site.deploy(manifest, EVERY_S)
             site.start_process_workers()
             chaos = Chaos(
@@ -82,8 +95,6 @@ def run_chaos(*, sequences, corrupted, kills, seed, pace_s, bucket=False):
             retried = calm(site, sequences)
             open_runs = settled(site)
             status = fleet_status(stub_ledger(site.store), NAME)
-        finally:
-            site.close()
         wrong = faults(site.store, status, scenes, bad, undisturbed(folder, manifest))
     if open_runs:
         wrong.append(f"open in Prefect: {open_runs}")
@@ -106,11 +117,10 @@ def on_small_disk(folder):
     """A place for a store on a disk of its own, if this user may mount one."""
     disk = folder / "disk"
     disk.mkdir()
-    is_small = os.geteuid() == 0 and mounted(disk)
     try:
-        yield str(disk / "store"), None, is_small
+        yield str(disk / "store"), None, os.geteuid() == 0 and mounted(disk)
     finally:
-        if is_small:
+        if disk.is_mount():
             subprocess.run(["umount", disk], check=True)  # noqa: S607
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import psutil
-from production_services import ROOT, Postgres, PrefectService, kill_session
+from production_services import ROOT, Postgres, PrefectService
 from stub_fleet import stub_ledger
 
 from catalog.errors import UnknownRecordError
@@ -27,7 +27,7 @@ TARGETS = {"flow at work": 13, "flow that begins": 6, "process worker": 7, "serv
 
 @dataclass(kw_only=True)
 class Site:
-    """A fleet in production, small."""
+    """A fleet in production, small; `with` it, its services run."""
 
     folder: Path
     store: str
@@ -41,6 +41,19 @@ class Site:
 
     def __post_init__(self):
         self.prefect = PrefectService(self.folder / "prefect", self.postgres.url)
+
+    def __enter__(self):
+        try:
+            self.postgres.start()
+            self.prefect.start()
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_error):
+        self.prefect.end()
+        self.postgres.remove()
 
     @property
     def environment(self):
@@ -136,16 +149,6 @@ class Site:
         self.postgres.stop()
         time.sleep(down_s)
         self.postgres.start()
-
-    def close(self):
-        for process in self.process_workers:
-            kill_session(process)
-        for processes in self.flows().values():
-            for process in processes:
-                with suppress(psutil.Error):
-                    process.kill()
-        kill_session(self.prefect.process)
-        self.postgres.remove()
 
     def _process_worker(self, number):
         words = ["worker", "start", "--pool", POOL, "--limit", "2", "--name", f"worker-{number}"]

@@ -1,4 +1,7 @@
-"""PostgreSQL and a Prefect server as a fleet runs on them: real ones, on loopback, in a folder."""
+"""PostgreSQL and a Prefect server as a fleet runs on them: real ones, on loopback, in a folder.
+
+Nothing runs before `start`, so whoever made one can end it whatever comes in between.
+"""
 
 import os
 import shutil
@@ -11,6 +14,8 @@ import time
 import urllib.request
 from contextlib import suppress
 from pathlib import Path
+
+import psutil
 
 SCRIPTS = Path(__file__).resolve().parent
 ROOT = SCRIPTS.parents[1]
@@ -31,24 +36,27 @@ class Postgres:
         self._user = OWNER if os.geteuid() == 0 else None
         if self._user:
             shutil.chown(self.folder, self._user)
-        self._call("initdb", "-D", self._data, "-A", "trust", "-U", OWNER, "--no-sync")
-        self.start()
-        self._call("createdb", "-h", self.folder, "-U", OWNER, "prefect")
 
     @property
     def url(self):
         return f"postgresql+asyncpg://{OWNER}@/prefect?host={self.folder}"
 
     def start(self):
+        is_new = not self._data.exists()
+        if is_new:
+            self._call("initdb", "-D", self._data, "-A", "trust", "-U", OWNER, "--no-sync")
         options = f"-k {self.folder} -c listen_addresses='' -c fsync=off -c max_connections=60"
         log = self.folder / "log"
         self._call("pg_ctl", "-D", self._data, "-l", log, "-w", "-o", options, "start")
+        if is_new:
+            self._call("createdb", "-h", self.folder, "-U", OWNER, "prefect")
 
-    def stop(self, mode="immediate"):
-        self._call("pg_ctl", "-D", self._data, "-m", mode, "-w", "stop")
+    def stop(self):
+        self._call("pg_ctl", "-D", self._data, "-m", "immediate", "-w", "stop")
 
     def remove(self):
-        self.stop()
+        """Also one that is stopped, or just about to start."""
+        end_processes(self._data, signal.SIGQUIT)  # PostgreSQL's word for a stop at once
         shutil.rmtree(self.folder)
 
     @property
@@ -63,6 +71,7 @@ class Postgres:
             stderr=subprocess.DEVNULL,
             cwd=self.folder,
             user=self._user,
+            start_new_session=True,  # Ctrl-C is for those who end it
         )
 
 
@@ -77,7 +86,7 @@ class PrefectService:
             self._port = probe.getsockname()[1]
         self.url = f"http://127.0.0.1:{self._port}/api"
         self._database_url, self._settings = database_url, settings
-        self.start()
+        self._spawned = []
 
     @property
     def environment(self):
@@ -115,9 +124,9 @@ class PrefectService:
             return False
 
     def spawn(self, words, name, environment=None):
-        """`prefect ...` with a log of its own and a session that `kill_session` ends."""
+        """`prefect ...` with a log and a session of its own, until `end`."""
         with (self.folder / f"{name}.log").open("ab") as log:
-            return subprocess.Popen(
+            process = subprocess.Popen(
                 [sys.executable, "-m", "prefect", *words],
                 stdout=log,
                 stderr=log,
@@ -125,14 +134,34 @@ class PrefectService:
                 cwd=self.folder,
                 start_new_session=True,
             )
+        self._spawned.append(process)
+        return process
 
     def kill(self):
         self.process.kill()
         self.process.wait()
 
+    def end(self):
+        """The server, process workers, and flows that they left behind."""
+        end_processes(self.folder, signal.SIGKILL)
+        for process in self._spawned:
+            process.wait()
 
-def kill_session(process):
-    """End a process and those that it has started."""
-    with suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+
+def end_processes(folder, number):
+    """Send a signal to all processes whose words or environment name a folder, until none is left.
+
+    So orphans in sessions of their own are found too.
+    """
+    while found := [process for process in psutil.process_iter() if _names(process, folder)]:
+        for process in found:
+            with suppress(psutil.NoSuchProcess):
+                process.send_signal(number)
+        time.sleep(0.1)
+
+
+def _names(process, folder):
+    with suppress(psutil.Error):  # it is gone by now, or somebody else's
+        words = (*process.cmdline(), *process.environ().values())
+        return any(str(folder) in word for word in words)
+    return False

@@ -107,22 +107,16 @@ def test_a_schedule_fires_by_itself_and_makes_only_what_is_new(tmp_path):
     scenes = [f"synthetic/street-{seed:04d}" for seed in (1, 2, 3)]
     write_inputs(tmp_path / "inputs", scenes, ())
     manifest = write_stub_manifest(tmp_path, "twice", sequences=2)
-    site = Site(
-        folder=tmp_path,
-        store=tmp_path / "store",
-        inputs=tmp_path / "inputs",
-        name="twice",
-        num_workers=1,
-    )
-    try:
+    inputs = tmp_path / "inputs"
+    with Site(
+        folder=tmp_path, store=tmp_path / "store", inputs=inputs, name="twice", num_workers=1
+    ) as site:
         site.deploy(manifest, every_s=30)
         site.start_process_workers()
         _until(lambda: site.status()["done"] == 2)
         first = stub_ledger(site.store).store.tables.rows("attempts")
         write_stub_manifest(tmp_path, "twice", sequences=3)
         _until(lambda: site.status()["done"] == 3)
-    finally:
-        site.close()
     attempts = stub_ledger(site.store).store.tables.rows("attempts")
     new = [row["scene_id"] for row in attempts if row not in first]
     assert (len(first), new) == (2, [scenes[2]])
