@@ -15,6 +15,8 @@ SCHEMA_VERSION = 1
 """Raised when a reader of the last version could misread the new one."""
 MANIFEST_NAME = "manifest.json"
 ARRAYS_NAME = "scene.zarr"
+GLOBAL_FRAME = "global_frame"
+"""Entry of a manifest that may be left out: scenes with the same name in it share that frame."""
 MAX_NAME_LENGTH = 128
 """File systems allow a folder 255 bytes, and names are parts of longer ones."""
 NAME_PATTERN = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_NAME_LENGTH - 1}}}")

@@ -14,14 +14,13 @@ import cv2
 from catalog.assets import digest_of, enter_sightings
 from catalog.store import Store
 from catalog.tables import Row
+from lidarpainter_models.scenes.schema import GLOBAL_FRAME
 from tasks.assets.publish import SIGHTINGS_FILE
 from tasks.json_files import read_json
 from tasks.opened import open_scene
 from tasks.runs import FinishedRun
 from tasks.stages import StageResult
 
-GLOBAL_FRAME = "global_frame"
-"""Entry of a scene's manifest: scenes with the same one have one global frame."""
 LEAST_OVERLAP = 0.25
 """Intersection over union from above: boxes of one car drawn twice share more, cars that park side
 by side touch none of it."""
@@ -39,7 +38,7 @@ def enter_published(
         "dataset": run.scene_id.partition("/")[0],
         "licence": scene.manifest["licence"],
         "scene_id": run.scene_id,
-        "frame": _global_frame(scene.manifest, run.scene_id),
+        "frame": global_frame(scene.manifest, run.scene_id),
         "run_id": run.run_id,
         "style": style,
         "artefact_id": published.ref.artefact_id,
@@ -98,6 +97,6 @@ def ids_of(same: Mapping[str, Any], record: Mapping[str, Any]) -> Row:
     }
 
 
-def _global_frame(manifest: Mapping[str, Any], scene_id: str) -> str:
+def global_frame(manifest: Mapping[str, Any], scene_id: str) -> str:
     """What the global frame is called: its own scene's, unless the manifest says otherwise."""
     return str(manifest.get(GLOBAL_FRAME) or scene_id)

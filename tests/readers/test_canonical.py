@@ -92,6 +92,8 @@ def test_lens_and_shutter_survive(foreign, tmp_path):
         (lambda m: m.update(global_from_world=[1.0] * 15), "no list of 16 numbers"),
         (lambda m: m.update(global_from_world=[float("nan")] * 16), "no list of 16 numbers"),
         (lambda m: m.update(licence=None), "licence is no text"),
+        (lambda m: m.update(global_frame=["map"]), "global_frame is no text"),
+        (lambda m: m.update(global_frame="pandaset/002"), "name 'pandaset/002' cannot be used"),
         (lambda m: m["files"].update({"../../x": 1}), "leaves the scene"),
         (lambda m: m["files"].update({"/etc/passwd": 1}), "leaves the scene"),
         (lambda m: m["files"].update({"missing": 1}), "missing, but the manifest lists it"),

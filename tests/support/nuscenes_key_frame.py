@@ -134,11 +134,13 @@ class _Tables:
 
     def write(self, time_s):
         scene = {"token": token_of("scene"), "name": SCENE_NAME, "nbr_samples": 1}
+        scene["log_token"] = token_of("log")
+        log = {"token": token_of("log"), "location": "singapore-onenorth"}
         sample = {"token": token_of("sample"), "scene_token": scene["token"]}
         sample["timestamp"] = round(1e6 * time_s)
         folder = self.root / "v1.0-mini"
         folder.mkdir()
-        for name, rows in {**self.rows, "scene": [scene], "sample": [sample]}.items():
+        for name, rows in {**self.rows, "scene": [scene], "sample": [sample], "log": [log]}.items():
             (folder / f"{name}.json").write_text(json.dumps(rows, indent=0))
 
 

@@ -76,15 +76,16 @@ def read_small_json(file: Path, max_bytes: int) -> dict[str, Any]:
 
 
 def _require_texts(manifest: dict[str, Any], where: str) -> None:
-    for key in ("dataset", "sequence", "licence"):
+    names = ("dataset", "sequence", *({schema.GLOBAL_FRAME} & manifest.keys()))
+    for key in (*names, "licence"):
         if not isinstance(manifest.get(key), str):
             raise DataError(f"{where}: {key} is no text")
+    for name in names:
+        require_name(manifest[name], f"{where}: {name}")
     for key in ("camera_names", "lidar_names"):
-        names = manifest.get(key)
-        if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
+        found = manifest.get(key)
+        if not (isinstance(found, list) and all(isinstance(name, str) for name in found)):
             raise DataError(f"{where}: {key} is no list of names")
-    for name in (manifest["dataset"], manifest["sequence"]):
-        require_name(name, f"{where}: dataset or sequence")
     for name in (*manifest["camera_names"], *manifest["lidar_names"]):
         require_name(name, f"{where}: camera or LiDAR")
     if not isinstance(manifest.get("semantic_classes"), dict):

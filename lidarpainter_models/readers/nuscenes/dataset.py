@@ -14,6 +14,7 @@ from typing import NamedTuple
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.readers.nuscenes.rows import TableRow, shown
 from lidarpainter_models.readers.nuscenes.tables import NuscenesTable
+from lidarpainter_models.scenes.validation import require_name
 
 _FIRST_VERSIONS = ("v1.0-trainval", "v1.0-test", "v1.0-mini")
 _KEYS = {
@@ -26,6 +27,7 @@ _KEYS = {
     "sensor": "token",
     "instance": "token",
     "category": "token",
+    "log": "token",
 }
 """The tables that are read and the column each is looked up by."""
 
@@ -96,6 +98,16 @@ def find_scene(root: Path, name: str) -> tuple[NuscenesTables, TableRow]:
             return tables, tables["scene"].row(name, str(root))
     folders = ", ".join(tables.folder.name for tables in versions)
     raise DataError(f"{root}: no scene {shown(name)} in {folders}")
+
+
+def read_global_frame(tables: NuscenesTables, scene: TableRow) -> str:
+    """Name of the frame that the poses of a scene are in: that of the map of its location.
+
+    Raises:
+        DataError: the log of the scene is missing, or its location makes no name.
+    """
+    log = tables["log"].row(scene.text("log_token"), scene.where)
+    return require_name(f"nuscenes-{log.text('location')}", f"{log.where}: location")
 
 
 def read_samples(tables: NuscenesTables, scene: TableRow) -> list[Sample]:

@@ -9,8 +9,9 @@ Frames. Ego (`ego_pose`) is on the ground below the rear axle, x forward, y left
 image and every sweep has an ego pose of its own time. The time of a frame is that of its sweep,
 the end of the turn; a canonical sweep has its time in the middle, where the LiDAR's pose lies
 between those recorded. The scene's world has its origin at the first ego pose read, x along that
-heading in the level plane, z up. Images are undistorted in the dataset; sensors are calibrated
-once a scene.
+heading in the level plane, z up. Poses of all scenes of a location are in the frame of its map: a
+car that is parked there stands at one place in all of them. Images are undistorted in the dataset;
+sensors are calibrated once a scene.
 """
 
 from pathlib import Path
@@ -23,7 +24,12 @@ from lidarpainter_models.geometry.boxes import count_points_in_boxes
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.readers.nuscenes.boxes import Annotations
-from lidarpainter_models.readers.nuscenes.dataset import find_scene, open_versions, read_samples
+from lidarpainter_models.readers.nuscenes.dataset import (
+    find_scene,
+    open_versions,
+    read_global_frame,
+    read_samples,
+)
 from lidarpainter_models.readers.nuscenes.recordings import (
     CAMERA_NAMES,
     LIDAR_NAME,
@@ -42,6 +48,7 @@ from lidarpainter_models.readers.source_logs.frame_content import (
 )
 from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, SweepPoints
+from lidarpainter_models.scenes.schema import GLOBAL_FRAME
 from lidarpainter_models.scenes.writer import SceneHeader
 
 DATASET = "nuscenes"
@@ -86,7 +93,11 @@ class NuscenesLog:
         self.frame_indices = chosen_frames(len(self._frames), frames, scene.where)
         first = self._frames[self.frame_indices[0]]
         self.global_from_world = level_frame(first.sweep.global_from_ego)
-        self.header = SceneHeader(licence=LICENCE, global_from_world=self.global_from_world)
+        self.header = SceneHeader(
+            licence=LICENCE,
+            global_from_world=self.global_from_world,
+            more={GLOBAL_FRAME: read_global_frame(self._tables, scene)},
+        )
         self._world_from_global = invert_rigid(self.global_from_world)
         self._sweep_ns = [sweep.timestamp_ns for sweep in self._sweeps]
         self._global_from_lidar = torch.stack([sweep.global_from_sensor for sweep in self._sweeps])

@@ -127,7 +127,9 @@ def test_table_that_breaks_off_is_named_with_what_was_expected(log, store, conte
         assert str(raised.value) == line
 
 
-@pytest.mark.parametrize("table", ["sample_data", "ego_pose", "sample_annotation", "instance"])
+@pytest.mark.parametrize(
+    "table", ["sample_data", "ego_pose", "sample_annotation", "instance", "log"]
+)
 def test_missing_table(log, store, table):
     (log.folder / f"{table}.json").unlink()
     assert refusal(log, store).endswith(f"{table}.json: the table is missing")
