@@ -27,7 +27,7 @@ class AssetFilter:
 
     kind: str | None = None
     category: str | None = None
-    """A word of a data set, or its last part (`car` finds `vehicle.car` and `Car`), or `sedan`."""
+    """Such as `car`, which also finds `vehicle.car` and `Car` of earlier software, or `sedan`."""
     dataset: str | None = None
     licence: str | None = None
     """A part of it: `BY` finds `CC BY 4.0`."""

@@ -250,7 +250,7 @@ ATTEMPTS = TableSchema(
 
 _SIGHTED = (
     Column("kind", "text", "actor, street, sky or trajectory"),
-    Column("category", "text", "word of the data set (car, ...); of a street or sky: its kind"),
+    Column("category", "text", "car, truck, pedestrian, ...; of a street or sky: its kind"),
     Column("name", "text", "what people call it"),
     Column("dataset", "text", "where the log comes from"),
     Column("licence", "text", "terms of the data, which hold for the asset too"),

@@ -22,9 +22,7 @@ MOST_SHOWN = 1000
 AssetName = Annotated[
     str, typer.Argument(help="An asset id, or the beginning of one.", show_default=False)
 ]
-Category = Annotated[
-    str | None, typer.Option(help="A word of a data set: car also finds vehicle.car; or sedan.")
-]
+Category = Annotated[str | None, typer.Option(help="car, truck, pedestrian, ...; or sedan.")]
 MinScore = Annotated[float | None, typer.Option(help="Least score, 0 to 1.")]
 SortName = Literal[  # `catalog.asset_queries.Sort`, known before anything is imported
     "score", "coverage", "psnr_db", "length_m", "num_views", "num_points", "created_at"

@@ -14,6 +14,7 @@ import cv2
 from catalog.assets import digest_of, enter_sightings
 from catalog.store import Store
 from catalog.tables import Row
+from lidarpainter_models.assets.categories import category_of
 from lidarpainter_models.scenes.schema import GLOBAL_FRAME
 from tasks.assets.publish import SIGHTINGS_FILE
 from tasks.json_files import read_json
@@ -46,8 +47,14 @@ def enter_published(
         "software_version": manifest.software_version,
     }
     records = read_json(store.artefacts.folder(published.ref) / SIGHTINGS_FILE)
-    rows = [same | record | ids_of(same, record) for record in records]
+    rows = [sighting(same, record) for record in records]
     return enter_sightings(store, rows, is_same)
+
+
+def sighting(same: Mapping[str, Any], record: Mapping[str, Any]) -> Row:
+    """The row of a record, with what it has in common with all of its run."""
+    category = category_of(record["category"])
+    return {**same, **record, "category": category, **ids_of(same, record)}
 
 
 def is_same(one: Row, other: Row) -> bool:

@@ -11,7 +11,7 @@ from catalog.store import open_store
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from tasks.assets.enter import global_frame, ids_of, is_same
+from tasks.assets.enter import global_frame, is_same, sighting
 
 SCENES = {"v1.0-trainval": "scene-0001", "v1.0-mini": "scene-0002"}
 
@@ -49,7 +49,7 @@ def num_sightings(root, store):
         same["frame"] = global_frame(scene.manifest, scene_id)
         standing = [track for track in scene.tracks if not track.is_moving]
         records = [record(track, scene.global_from_world) for track in standing]
-        enter_sightings(store, [same | one | ids_of(same, one) for one in records], is_same)
+        enter_sightings(store, [sighting(same, one) for one in records], is_same)
     return [row["num_sightings"] for row in store.rows("assets")]
 
 
