@@ -20,6 +20,8 @@ from catalog.tables import Row
 ID_LENGTH = 16
 LOCK = "assets"
 """Held by whoever writes: what is one asset is decided from all that is there."""
+LEAST_ID_LENGTH = 16
+"""A track id of so many characters is given once, not counted anew in every sequence."""
 NEAR_M = 10.0
 """Sightings farther apart along x or y are not compared: no car is so long."""
 
@@ -42,9 +44,9 @@ def enter_sightings(store: Store, rows: Sequence[Row], is_same: IsSame) -> list[
         StorageError: a table cannot be written.
     """
     with store.alone(LOCK):
-        known = store.tables.arrow(SIGHTINGS.name)
         names = SIGHTINGS.arrow.names
         new: list[Row] = [{name: row.get(name) for name in names} for row in rows]
+        known = store.tables.arrow(SIGHTINGS.name, where=_in_question(new))
         old = _where(known, "sighting_id", [row["sighting_id"] for row in new])
         others = _leaving(_candidates(known, new), new)
         groups = _Groups()
@@ -54,12 +56,12 @@ def enter_sightings(store: Store, rows: Sequence[Row], is_same: IsSame) -> list[
             for other in (*others, *new[:number]):
                 if is_same(row, other):
                     groups.join(row["sighting_id"], other["asset_id"] or other["sighting_id"])
-        touched = groups.names & set(known["asset_id"].to_pylist())
-        members = _leaving(_where(known, "asset_id", touched), new)
+        before = _stored(store, "asset_id", groups.names)
+        members = _leaving(before, new)
         for row in members:
             groups.join(row["sighting_id"], row["asset_id"])
         entered = _named([*new, *members], groups)
-        _write(store, known, entered, touched)
+        _write(store, before, entered)
         ids = {row["sighting_id"]: row["asset_id"] for row in entered}
         return [ids[row["sighting_id"]] for row in new]
 
@@ -67,18 +69,16 @@ def enter_sightings(store: Store, rows: Sequence[Row], is_same: IsSame) -> list[
 def forget_sightings(store: Store, column: str, values: Iterable[str]) -> None:
     """Take sightings out whose run or artefact (`column`) is gone; assets without any go too."""
     with store.alone(LOCK):
-        known = store.tables.arrow(SIGHTINGS.name)
-        gone = _where(known, column, values)
+        gone = _stored(store, column, values)
         if not gone:
             return
-        touched = {row["asset_id"] for row in gone}
+        before = _stored(store, "asset_id", {row["asset_id"] for row in gone})
         names = {row["sighting_id"] for row in gone}
         store.tables.delete(SIGHTINGS.name, "sighting_id", sorted(names))
-        known = store.tables.arrow(SIGHTINGS.name)
-        members, groups = _where(known, "asset_id", touched), _Groups()
+        members, groups = _leaving(before, gone), _Groups()
         for row in members:
             groups.join(row["sighting_id"], row["asset_id"])
-        _write(store, known, _named(members, groups), touched)
+        _write(store, before, _named(members, groups))
 
 
 def find_asset(store: Store, name: str) -> Row:
@@ -124,12 +124,27 @@ class _Groups:
         return name
 
 
+def _in_question(new: Sequence[Row]) -> dict[str, set[str]]:
+    """Values of columns without which a known sighting can be of nothing new."""
+    return {
+        "sighting_id": {row["sighting_id"] for row in new},
+        "occurrence_id": {row["occurrence_id"] for row in new},
+        "actor_id": _unique_ids(new),
+        "frame": {row["frame"] for row in new if row["is_moving"] is False},
+    }
+
+
+def _unique_ids(rows: Sequence[Row]) -> set[str]:
+    ids = (row["actor_id"] or "" for row in rows)
+    return {name for name in ids if len(name) >= LEAST_ID_LENGTH}
+
+
 def _candidates(known: pa.Table, new: Sequence[Row]) -> list[Row]:
     """The known sightings that one of some new ones may be of the same thing as."""
     mask = np.zeros(known.num_rows, dtype=bool)
-    for column in ("occurrence_id", "actor_id"):
-        names = pa.array([row[column] for row in new if row[column] is not None], pa.string())
-        is_in = pc.is_in(known[column], value_set=names)
+    occurrences = {row["occurrence_id"] for row in new}
+    for column, names in (("occurrence_id", occurrences), ("actor_id", _unique_ids(new))):
+        is_in = pc.is_in(known[column], value_set=pa.array(names, pa.string()))
         mask |= is_in.to_numpy(zero_copy_only=False).astype(bool)
     x_m, y_m = (known[name].to_numpy() for name in ("x_m", "y_m"))
     standing = [row for row in new if row["is_moving"] is False]
@@ -150,28 +165,26 @@ def _named(rows: Sequence[Row], groups: _Groups) -> list[Row]:
     return [row | {"asset_id": least[groups.root(row["sighting_id"])]} for row in rows]
 
 
-def _write(store: Store, known: pa.Table, entered: Sequence[Row], touched: set[str]) -> None:
-    """Bring both tables to what the sightings of some assets are now."""
-    names = [row["sighting_id"] for row in entered]
-    before = {row["sighting_id"]: row for row in _where(known, "sighting_id", names)}
-    changed = [row for row in entered if before.get(row["sighting_id"]) != row]
+def _write(store: Store, before: Sequence[Row], entered: Sequence[Row]) -> None:
+    """Bring both tables from what the sightings of some assets were to what they are now."""
+    stood = {row["sighting_id"]: row for row in before}
+    changed = [row for row in entered if stood.get(row["sighting_id"]) != row]
     store.tables.merge(SIGHTINGS.name, changed)
-    sightings = store.tables.arrow(SIGHTINGS.name) if changed else known
     # what wears a style names the asset that it is a style of, which may be another one by now
-    styled = _where(sightings, "base_id", {row["occurrence_id"] for row in entered})
+    styled = _stored(store, "base_id", {row["occurrence_id"] for row in entered})
     ids = {row["asset_id"] for row in (*entered, *styled)}
     members: dict[str, list[Row]] = {name: [] for name in ids}
-    for row in _where(sightings, "asset_id", ids):
+    for row in _stored(store, "asset_id", ids):
         members[row["asset_id"]].append(row)
     bases = {row["base_id"] for rows in members.values() for row in rows if row["base_id"]}
     base_of = {
-        row["occurrence_id"]: row["asset_id"] for row in _where(sightings, "occurrence_id", bases)
+        row["occurrence_id"]: row["asset_id"] for row in _stored(store, "occurrence_id", bases)
     }
-    assets = store.tables.arrow(ASSETS.name)
-    stood = {row["asset_id"]: row for row in _where(assets, "asset_id", ids)}
+    stood = {row["asset_id"]: row for row in _stored(store, "asset_id", ids, ASSETS.name)}
     rows = [_asset_row(found, base_of) for found in members.values()]
     store.tables.merge(ASSETS.name, [row for row in rows if stood.get(row["asset_id"]) != row])
-    store.tables.delete(ASSETS.name, "asset_id", sorted(touched - ids))
+    gone = {row["asset_id"] for row in before} - ids
+    store.tables.delete(ASSETS.name, "asset_id", sorted(gone))
 
 
 def _asset_row(members: Sequence[Row], base_of: dict[str, str]) -> Row:
@@ -184,6 +197,13 @@ def _asset_row(members: Sequence[Row], base_of: dict[str, str]) -> Row:
         "num_sightings": len(members),
         "derived_from": bases[0] if bases else None,
     }
+
+
+def _stored(
+    store: Store, column: str, values: Iterable[str], table: str = SIGHTINGS.name
+) -> list[Row]:
+    """The rows of a table in the store with one of these values in a column."""
+    return store.tables.arrow(table, where={column: set(values)}).to_pylist()
 
 
 def _where(table: pa.Table, column: str, values: Iterable[str]) -> list[Row]:

@@ -31,6 +31,7 @@ from catalog.errors import (
     storage_errors,
 )
 from catalog.schemas import TABLES, TableSchema
+from catalog.stored_rows import read_rows
 
 COMMIT_ATTEMPTS = 25
 FIRST_PAUSE_S = 0.05
@@ -99,7 +100,7 @@ class CatalogTables:
         """
         schema = _schema(table)
         quoted = ", ".join("'{}'".format(value.replace("'", "''")) for value in values)
-        if values and self.arrow(table).num_rows:
+        if self.arrow(table, columns=[column], where={column: values}).num_rows:
             self._committed(schema, lambda: self._try_delete(schema, f"{column} IN ({quoted})"))
 
     def _merged(
@@ -144,11 +145,17 @@ class CatalogTables:
         return arrow.sort_by(_schema(table).key).to_pylist()
 
     def arrow(
-        self, table: str, *, columns: Collection[str] = (), as_of: int | datetime | None = None
+        self,
+        table: str,
+        *,
+        columns: Collection[str] = (),
+        where: Mapping[str, Collection[str]] | None = None,
+        as_of: int | datetime | None = None,
     ) -> pa.Table:
         """A table as Arrow, with exactly the columns of its schema.
 
-        No columns mean all; `as_of` is a version or a moment, None means now.
+        No columns mean all; `where` takes the rows that have one of some values in any of these
+        columns; `as_of` is a version or a moment, None means now.
 
         Raises:
             UnknownRecordError: there is no such version, or its files were vacuumed.
@@ -159,25 +166,15 @@ class CatalogTables:
             found = self.delta(table, as_of=as_of)
             if found is None:
                 return schema.arrow.empty_table()
-            # pyarrow's threads may outlive the read and abort the interpreter as it ends
-            there = found.to_pyarrow_dataset()
             wanted = [field for field in schema.arrow if not columns or field.name in columns]
-            names = [field.name for field in wanted if field.name in there.schema.names]
             try:
-                stored = there.to_table(columns=names, use_threads=False)
+                return read_rows(found.to_pyarrow_dataset(), pa.schema(wanted), where)
             except FileNotFoundError:
                 if as_of is None:
                     raise
                 raise UnknownRecordError(
                     f"{table} as of {as_of} was vacuumed, expected a later version"
                 ) from None
-        found_columns = [
-            stored[field.name].cast(field.type)
-            if field.name in names
-            else pa.nulls(stored.num_rows, field.type)
-            for field in wanted
-        ]
-        return pa.table(found_columns, schema=pa.schema(wanted))
 
     def delta(self, table: str, *, as_of: int | datetime | None = None) -> DeltaTable | None:
         """The Delta table itself, as it is or was; None if nothing was ever written.

@@ -11,7 +11,7 @@ from typing import Any
 
 import cv2
 
-from catalog.assets import digest_of, enter_sightings
+from catalog.assets import LEAST_ID_LENGTH, digest_of, enter_sightings
 from catalog.store import Store
 from catalog.tables import Row
 from lidarpainter_models.assets.categories import category_of
@@ -25,8 +25,6 @@ from tasks.stages import StageResult
 LEAST_OVERLAP = 0.25
 """Intersection over union from above: boxes of one car drawn twice share more, cars that park side
 by side touch none of it."""
-LEAST_ID_LENGTH = 16
-"""A track id of so many characters is given once, not counted anew in every sequence."""
 
 
 def enter_published(

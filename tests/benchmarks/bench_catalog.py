@@ -3,10 +3,11 @@
     PYTHONPATH=.:tests/support python tests/benchmarks/bench_catalog.py [ROWS ...]
 
 CPU seconds of one thread, each in a process of its own, with the largest resident memory of that
-process. `new` merges 50 assets of a scene that is new, `again` those of a scene that is there;
-`rewritten` is the share of the table's bytes that `again` wrote. `open` begins a session of SQL,
-`night sedans` asks for sedans seen from three sides at night with LPIPS under 0.1, `one` for an
-asset by the beginning of its id, `by category` counts all of them.
+process. `new` enters 50 sightings of a scene that is new, and so their assets, `again` those of a
+scene that is there, seen otherwise; `rewritten` is the share of both tables' bytes that `again`
+wrote. `open` begins a session of SQL, `night sedans` asks for sedans seen from three sides at night
+with LPIPS under 0.1, `one` for an asset by the beginning of its id, `by category` counts all of
+them.
 """
 
 import json
@@ -14,19 +15,22 @@ import subprocess
 import sys
 import tempfile
 import time
+from pathlib import Path
 from resource import RUSAGE_SELF, getrusage
 
-import pyarrow as pa
-from asset_rows import ACTORS_A_SCENE, asset_id, asset_rows
+from asset_rows import ACTORS_A_SCENE, asset_id, asset_rows, sighting_rows
 from deltalake import DeltaTable, write_deltalake
 from rich.console import Console
 from rich.table import Table
 
 from catalog.asset_queries import AssetFilter, find_asset, find_assets
+from catalog.assets import enter_sightings
 from catalog.sql import CatalogSql
-from catalog.tables import FILE_BYTES, CatalogTables
+from catalog.store import open_store
+from catalog.tables import FILE_BYTES
 from flows.interruption import leave
 
+TABLES = {"assets": asset_rows, "sightings": sighting_rows}
 MEASURED = ("new", "again", "ask")
 AT_ONCE = 100_000
 NIGHT_SEDANS = AssetFilter(category="sedan", style="night", min_sides=3, max_lpips=0.1)
@@ -34,12 +38,14 @@ NIGHT_SEDANS = AssetFilter(category="sedan", style="night", min_sides=3, max_lpi
 
 def fill(root, count):
     """A library as merges have left it: written scene after scene, its files as large as theirs."""
-    tables = CatalogTables(root)
-    tables.merge("assets", asset_rows(1).to_pylist())
-    for first in range(1, count, AT_ONCE):
-        rows = asset_rows(min(AT_ONCE, count - first), first=first)
-        write_deltalake(f"{root}/assets", rows, mode="append", target_file_size=FILE_BYTES)
-    DeltaTable(f"{root}/assets").optimize.compact(target_size=FILE_BYTES)
+    tables = open_store(root).tables
+    for name, drawn in TABLES.items():
+        tables.merge(name, drawn(1).to_pylist())
+        uri = f"{tables.root}/{name}"
+        for first in range(1, count, AT_ONCE):
+            rows = drawn(min(AT_ONCE, count - first), first=first)
+            write_deltalake(uri, rows, mode="append", target_file_size=FILE_BYTES)
+        DeltaTable(uri).optimize.compact(target_size=FILE_BYTES)
 
 
 def measure(what, root, count):
@@ -47,19 +53,23 @@ def measure(what, root, count):
     if what == "ask":
         return ask(root, count)
     first = count if what == "new" else count // 3 // ACTORS_A_SCENE * ACTORS_A_SCENE
-    rows = asset_rows(ACTORS_A_SCENE, first=first).to_pylist()
-    tables = CatalogTables(root)
+    rows = sighting_rows(ACTORS_A_SCENE, first=first).to_pylist()
+    store = open_store(root)
     before = sizes(root)
-    seconds = timed(lambda: tables.merge("assets", rows))
+    seconds = timed(lambda: enter_sightings(store, rows, is_same))
     after = sizes(root)
     written = sum(size for path, size in after.items() if path not in before)
     return {what: seconds, f"{what} wrote": written / sum(after.values())}
 
 
+def is_same(one, other):
+    return one["occurrence_id"] == other["occurrence_id"]
+
+
 def ask(root, count):
     """The questions, one after the other."""
     opened = []
-    found = {"open": timed(lambda: opened.append(CatalogSql(CatalogTables(root))))}
+    found = {"open": timed(lambda: opened.append(CatalogSql(open_store(root).tables)))}
     (sql,) = opened
     questions = {
         "night sedans": lambda: find_assets(sql, NIGHT_SEDANS, sort="score", most=50),
@@ -76,9 +86,9 @@ def timed(action):
 
 
 def sizes(root):
-    """Bytes of the table's files, by path."""
-    actions = pa.table(DeltaTable(f"{root}/assets").get_add_actions())
-    return dict(zip(*(actions[name].to_pylist() for name in ("path", "size_bytes")), strict=True))
+    """Bytes of the tables' files, by path."""
+    tables = open_store(root).tables
+    return {path: Path(path).stat().st_size for name in TABLES for path in tables.files(name)}
 
 
 def measured_apart(what, root, count):

@@ -63,6 +63,24 @@ def test_one_car_in_two_runs_is_one_asset_and_the_better_sighting_serves(store):
     assert assets[1]["actor_id"] == "b"
 
 
+def test_only_what_may_be_the_same_is_compared(store):
+    unique = "e0b1a2c4-9f6d-4f7e"
+    elsewhere = [
+        sighting("a", run="far", place=500.0, scene="toy/1"),
+        sighting("b", run="other", scene="toy/2", frame="village"),
+        sighting(unique, run="third", scene="toy/3", frame="village"),
+    ]
+    entered(store, elsewhere)
+    asked = []
+
+    def noted(one, other):
+        asked.append((one["run_id"], other["run_id"]))
+        return False
+
+    enter_sightings(store, [sighting(name, scene="toy/4") for name in ("a", "b", unique)], noted)
+    assert {other for _one, other in asked} == {"run", "third"}  # others count their tracks
+
+
 def test_the_same_again_changes_nothing(store):
     rows = [sighting("a"), sighting("b", place=50.0)]
     before = entered(store, rows)

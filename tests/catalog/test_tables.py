@@ -99,6 +99,19 @@ def test_a_table_of_older_software_gets_the_new_columns(tables):
     assert [row["num_bytes"] for row in tables.rows("painters")] == [None, 5]
 
 
+def test_rows_are_found_by_some_of_their_values_in_whichever_file_they_lie(tables):
+    old = pa.table({"painter_id": ["a", "b"], "name": ["nano", "lama"]})
+    write_deltalake(f"{tables.root}/painters", old)  # of software that knew no other columns
+    assert tables.arrow("painters", where={"record": ["copy"]}).num_rows == 0
+    tables.merge("painters", [{"painter_id": "c", "record": "copy"}, {"painter_id": "d"}])
+    where = {"painter_id": ["d", "z"], "name": ["nano"], "record": ["copy"]}
+    found = tables.arrow("painters", columns=["painter_id", "num_bytes"], where=where)
+    assert sorted(found["painter_id"].to_pylist()) == ["a", "c", "d"]
+    assert found["num_bytes"].to_pylist() == [None] * 3
+    assert tables.arrow("painters", where={"name": []}).num_rows == 0
+    assert tables.arrow("runs", where={"run_id": ["a"]}).num_rows == 0
+
+
 def test_four_processes_at_once_lose_nothing(tables):
     writers = [
         subprocess.Popen([sys.executable, "-c", WRITER, tables.root, str(index)], cwd=ROOT)

@@ -63,7 +63,25 @@ def asset_rows(count, *, first=0):
         "created_at": created_at,
         "software_version": ["0.2.0"] * count,
     }
-    schema = TABLES["assets"].arrow
+    return _table("assets", columns, count)
+
+
+def sighting_rows(count, *, first=0):
+    """A sighting of each of these assets, standing far from all others of its scene, as Arrow."""
+    assets = asset_rows(count, first=first)
+    numbers = np.arange(first, first + count)
+    scene_ids = [one for (one,) in assets["scene_ids"].to_pylist()]
+    columns = {name: assets[name].combine_chunks() for name in assets.column_names}
+    columns |= dict.fromkeys(("sighting_id", "occurrence_id"), columns["asset_id"])
+    columns |= {"is_moving": [False] * count}
+    columns |= {"scene_id": scene_ids, "frame": scene_ids}
+    columns |= {"x_m": numbers % ACTORS_A_SCENE * 100.0, "y_m": np.zeros(count)}
+    return _table("sightings", columns, count)
+
+
+def _table(name, columns, count):
+    """Rows of a table; what is not given is null."""
+    schema = TABLES[name].arrow
     arrays = [
         pa.array(columns[field.name], field.type)
         if field.name in columns
