@@ -84,6 +84,12 @@ def open_split(store: Store, split: SplitSpec) -> tuple[DrivingScene, ViewSplit]
     return scene, split_views(scene, split.spec, split.cameras)
 
 
+def forget_opened() -> None:
+    """Let go of the scenes and the run that this process has opened."""
+    _opened.cache_clear()
+    _scene.cache_clear()
+
+
 @lru_cache(maxsize=4)
 def _scene(folder: Path, files: Fetch | None, _inode: int, _changed_ns: int) -> DrivingScene:
     return DrivingScene.open(folder, files)

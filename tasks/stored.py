@@ -64,6 +64,12 @@ def _scene(store: Store, ref: ArtefactRef, path: Path, *_as_it_is: int) -> Gauss
     return scene_from_arrays(*read_tensors(path))
 
 
+def forget_stored() -> None:
+    """Let go of the artefacts that this process has read."""
+    _observations.cache_clear()
+    _scene.cache_clear()
+
+
 def _as_it_is(path: Path) -> tuple[int, int]:
     """What changes when a file does: what was kept of it is then read and checked again."""
     try:

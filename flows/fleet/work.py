@@ -21,11 +21,14 @@ from flows.fleet.asked import Asked
 from flows.fleet.flow_runs import SEQUENCE, store_tag
 from flows.reconstruct import reconstruct
 from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.evaluation.judging import known_street
 from lidarpainter_models.synthetic.street import WORLD_VERSION
 from lidarpainter_models.weather.mix import StyleMix
+from tasks.evaluation.shown import forget_shown
 from tasks.ingest.ingest import ingest_street
 from tasks.ingest.jobs import IngestRequest, ingest_or_recall
-from tasks.opened import open_scene
+from tasks.opened import forget_opened, open_scene
+from tasks.stored import forget_stored
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,6 +76,8 @@ def make_sequence(asked: Asked, store_path: Path, attempt: str) -> Made:
 
 
 def _made(asked: Asked, store_path: Path) -> Made:
+    for forget in (forget_opened, forget_stored, forget_shown, known_street.cache_clear):
+        forget()  # what stages kept of the sequence before
     store = open_store(store_path)
     _bring_in(asked, store)
     run = reconstruct.fn(asked.parameters, store.address)

@@ -64,6 +64,11 @@ def condition_builder(
     return _builder(load_scene(store, fitted.gaussians), seen, config, device)
 
 
+def forget_shown() -> None:
+    """Let go of what was gathered for a painter: views of up to 1 GB."""
+    _builder.cache_clear()
+
+
 @lru_cache(maxsize=1)
 def _builder(
     scene: GaussianScene, seen: SceneObservations, config: ConditionConfig, device: torch.device

@@ -1,8 +1,10 @@
 """Workers take, die, refuse and go on; the catalog holds each thing once."""
 
+import gc
 import shutil
 import signal
 import time
+import weakref
 from types import SimpleNamespace
 
 import pytest
@@ -279,10 +281,11 @@ def test_sequences_of_one_scene_are_told_apart(stubbed, tmp_path):
     assert "cameras" not in said
 
 
-def asked_of_elsewhere(store, folder):
+def asked_of_elsewhere(store, folder, fit_seeds="[0]"):
     path = folder / "night.toml"
     source = '[[source]]\ndataset = "canonical"\nroot = "logs"\n'
-    path.write_text(f'name = "stub"\npainter = "none"\n{source}[budget]\nfree_disk_gb = 0\n')
+    head = f'name = "stub"\npainter = "none"\nfit_seeds = {fit_seeds}\n'
+    path.write_text(f"{head}{source}[budget]\nfree_disk_gb = 0\n")
     ledger = stub_ledger(store.root)
     ledger.ask(wishes(read_manifest(path), path.parent))
     return ledger
@@ -304,6 +307,22 @@ def test_a_scene_from_elsewhere_is_made_under_its_own_name(store, tmp_path, monk
     assert (row["scene_id"], row["state"]) == ("toy/street", "done"), said
     assert row["run_id"] == "run of toy/street"
     assert store.scene_ids() == ["toy/street"]
+
+
+def test_a_worker_lets_go_of_what_a_sequence_had_opened(store, tmp_path, monkeypatch):
+    shutil.copytree(write_toy_scene(tmp_path / "elsewhere"), tmp_path / "logs/drive-7")
+    ledger, opened, kept = asked_of_elsewhere(store, tmp_path, "[0, 7]"), [], []
+
+    def reconstructed(parameters, address):
+        gc.collect()
+        kept.extend(known for known in opened if known() is not None)
+        opened.append(weakref.ref(open_scene(open_store(address), parameters.scene)))
+        made = {"artefacts": {}, "computed_now": {}, "peak_memory_bytes": None}
+        return {"run_id": str(len(opened)), **made}
+
+    monkeypatch.setattr("flows.fleet.work.reconstruct", SimpleNamespace(fn=reconstructed))
+    Worker(ledger=ledger, fleet="stub", work=make_sequence, say=print, poll_s=0.2).run()
+    assert (len(opened), kept) == (2, [])
 
 
 def test_a_scene_from_elsewhere_without_a_name_is_set_aside(store, tmp_path):
