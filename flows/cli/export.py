@@ -85,6 +85,8 @@ def export(  # noqa: PLR0913 - the options of a command
     Example: lidarpainter export latest --format gltf --out street.glb
 
     Images with poses: lidarpainter export latest --format colmap --out dataset --camera all
+
+    A film of the whole rig: lidarpainter export latest --format video --camera all --out rig.mp4
     """
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress

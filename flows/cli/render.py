@@ -33,7 +33,9 @@ Previous = Annotated[
     str | None,
     typer.Option(help="Lean on the image painted before: mixed into the next, or shown."),
 ]
-Video = Annotated[bool, typer.Option("--video", help="Add a film of each camera, video.mp4.")]
+Video = Annotated[
+    bool, typer.Option("--video", help="Add video.mp4: a film of each camera, and one of all.")
+]
 Depth = Annotated[bool, typer.Option("--depth", help="Add depth: 16-bit PNG, 256ths of a metre.")]
 Semantics = Annotated[
     bool, typer.Option("--semantics", help="Add who is where: 16-bit PNG and a legend.")

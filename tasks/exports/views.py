@@ -16,23 +16,26 @@ VIDEO_ENDING = ".mp4"
 def export_video(
     run: RunSpec, fitted: FittedRef, request: RenderRequest, out: Path
 ) -> dict[str, Any]:
-    """Write one camera's film as a file, those of several cameras into a folder.
+    """Write a film: to a name in `.mp4` all cameras together, else a folder with one of each.
 
     Raises:
         SceneError: the scene has no such camera, or no frame is left.
-        ConfigError: the name does not end as films do, or a folder is there already.
+        ConfigError: one camera's film is not called as films are, or a folder is there already.
         WriteError: the disk refuses; nothing is left half-written.
     """
     paths = followed_paths(run, fitted, request)
-    if len(paths) == 1:
-        if out.suffix.lower() != VIDEO_ENDING:
-            raise ConfigError(f"{out.name}: expected a name in {VIDEO_ENDING}")
-        (made,) = write_paths(run, paths, request, [out.parent], [out])
-        return {"path": str(out), **_said([made])}
+    is_film = out.suffix.lower() == VIDEO_ENDING
+    if len(paths) == 1 and not is_film:
+        raise ConfigError(f"{out.name}: expected a name in {VIDEO_ENDING}")
+    if is_film:
+        films, together = ([out], None) if len(paths) == 1 else ([], out)
+        places = [out.parent] * len(paths)
+        made = write_paths(run, paths, request, places, films=films, together=together)
+        return {"path": str(out), **_said(made)}
     with new_folder(out) as folder:
         films = [folder / f"{path.camera_name}{VIDEO_ENDING}" for path in paths]
-        made_films = write_paths(run, paths, request, [folder] * len(paths), [*films])
-    return {"path": str(out), **_said(made_films)}
+        made = write_paths(run, paths, request, [folder] * len(paths), films=films)
+    return {"path": str(out), **_said(made)}
 
 
 @stage_task

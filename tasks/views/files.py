@@ -1,7 +1,7 @@
 """What is written of a followed path: images, depth, who is where, films, pairs side by side."""
 
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -16,10 +16,12 @@ from lidarpainter_models.conditioning.followed_paths import (
     image_record,
 )
 from lidarpainter_models.export.images import write_depth_png, write_index_png, write_png
-from lidarpainter_models.export.videos import VideoWriter, images_per_second, video_file
+from lidarpainter_models.export.rig_images import rig_rows, tiled
+from lidarpainter_models.export.videos import images_per_second, video_file
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.instance_images import SKY, STREET, instance_image
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.observations.fit_size import shrink_image
 from lidarpainter_models.scenes.records import RecordedView
 from tasks.json_files import write_json
@@ -75,70 +77,106 @@ def recorded_image(
 
 
 def write_views(
-    path: FollowedPath,
+    paths: Sequence[FollowedPath],
+    folders: Sequence[Path],
     kinds: ViewKinds,
-    folder: Path,
     *,
     companion: Companion | None = None,
-    video: Path | None = None,
+    films: Sequence[Path] = (),
+    together: Path | None = None,
     advanced: Callable[[], None],
-) -> dict[str, Any]:
-    """Write everything that is wanted of a path.
+) -> list[dict[str, Any]]:
+    """Write everything that is wanted of the paths of a rig, moment by moment.
 
     Args:
-        path: where to look from.
+        paths: where to look from, a path for each camera.
+        folders: where files of each, and the poses they were taken from, are put.
         kinds: what is wanted.
-        folder: where files and the poses they were taken from are put.
-        companion: what stands to the left, in films and in `beside/`.
-        video: another place for the film than `video.mp4` in the folder.
+        companion: what stands to the left in films and in `beside/`, above in `together`.
+        films: one for each path; none if empty.
+        together: a film that shows all cameras at once.
         advanced: called after every view.
     """
-    recorded_fps = images_per_second([view.timestamp_ns for view in path.views])
-    fps = recorded_fps if kinds.fps is None else kinds.fps
-    film = video_file(video or folder / VIDEO_FILE, fps) if kinds.video else nullcontext()
-    rows = []
-    with film as frames:
-        for number in range(len(path.views)):
-            rows.append(_write_view(path, number, kinds, folder, companion, frames))
-            advanced()
+    rates = [_images_per_second(path, kinds) for path in paths]
+    numbers = [{view.frame_index: n for n, view in enumerate(path.views)} for path in paths]
+    rows: list[list[dict[str, Any]]] = [[] for _ in paths]
+    with ExitStack() as stack:
+        writers = [
+            stack.enter_context(video_file(film, rate))
+            for film, rate in zip(films, rates, strict=False)
+        ]
+        rig = stack.enter_context(video_file(together, max(rates))) if together else None
+        for frame_index in sorted({index for own in numbers for index in own}):
+            seen: dict[int, list[Tensor]] = {}
+            for place, path in enumerate(paths):
+                if (number := numbers[place].get(frame_index)) is None:
+                    continue
+                row, seen[place] = _write_view(path, number, kinds, folders[place], companion)
+                rows[place].append(row)
+                if writers:
+                    writers[place].add(torch.cat(seen[place], dim=1))
+                advanced()
+            if rig is not None:
+                rig.add(_rig_image(paths, seen))
+    made = [
+        _described(path, own, kinds, folder)
+        for path, own, folder in zip(paths, rows, folders, strict=True)
+    ]
+    return [one | ({"fps": max(rates)} if kinds.video else {}) for one in made]
+
+
+def _images_per_second(path: FollowedPath, kinds: ViewKinds) -> float:
+    if kinds.fps is not None:
+        return kinds.fps
+    return images_per_second([view.timestamp_ns for view in path.views])
+
+
+def _rig_image(paths: Sequence[FollowedPath], seen: dict[int, list[Tensor]]) -> Tensor:
+    """What all cameras see at a moment, the companion above; black where one took no image."""
+    rows = rig_rows(torch.stack([_ego_from_camera(path) for path in paths]))
+    cameras = [path.camera(0) for path in paths]
+    black = [torch.zeros(camera.height_px, camera.width_px, 3) for camera in cameras]
+    layers = [
+        [seen[place][layer] if place in seen else black[place] for place in range(len(paths))]
+        for layer in range(len(next(iter(seen.values()))))
+    ]
+    return torch.cat([tiled(images, rows) for images in layers])
+
+
+def _ego_from_camera(path: FollowedPath) -> Float[Tensor, "4 4"]:
+    view, recorded = path.views[0], path.recorded
+    world_from_ego = recorded.world_from_ego[recorded.frame_position(view.frame_index)]
+    return invert_rigid(world_from_ego) @ view.camera.world_from_camera
+
+
+def _described(
+    path: FollowedPath, rows: list[dict[str, Any]], kinds: ViewKinds, folder: Path
+) -> dict[str, Any]:
+    """What was made of a camera's path; where its images were taken is put beside them."""
     collisions = [found.to_dict() for found in path.collisions()]
-    wants_folder = kinds.images or kinds.depth or kinds.semantics
     if kinds.semantics:
         write_json(folder / LEGEND_FILE, legend(path.builder.scene))
-    if wants_folder:
+    if kinds.images or kinds.depth or kinds.semantics:
         about = {"trajectory": path.trajectory.spec, "collisions": collisions}
         write_json(folder / POSES_FILE, {**about, "images": rows})
-    made: dict[str, Any] = {
-        "camera": path.camera_name,
-        "num_images": len(rows),
-        "collisions": collisions,
-    }
-    return made | ({"video": str(video or folder / VIDEO_FILE), "fps": fps} if kinds.video else {})
+    return {"camera": path.camera_name, "num_images": len(rows), "collisions": collisions}
 
 
 def _write_view(
-    path: FollowedPath,
-    number: int,
-    kinds: ViewKinds,
-    folder: Path,
-    companion: Companion | None,
-    frames: VideoWriter | None,
-) -> dict[str, Any]:
-    """One view's files, and where it was taken."""
+    path: FollowedPath, number: int, kinds: ViewKinds, folder: Path, companion: Companion | None
+) -> tuple[dict[str, Any], list[Tensor]]:
+    """One view's files: where it was taken, and what films show of it."""
     view, camera = path.views[number], path.camera(number)
     shown = path.shown(camera, view)
-    pair = shown.rgb
+    seen = [shown.rgb]
     if companion is not None:
-        other = companion.image(path, camera, view, shown)
-        pair = torch.cat([other.to(shown.rgb.device), shown.rgb], dim=1)
-    if frames is not None:
-        frames.add(pair)
+        seen.insert(0, companion.image(path, camera, view, shown).to(shown.rgb.device))
     wanted: list[tuple[str, Callable[..., Path], Tensor | None]] = []
     if kinds.images:
         wanted += [
             ("file", write_png, shown.rgb),
             (UNPAINTED_FOLDER, write_png, shown.unpainted_rgb),
-            ("beside", write_png, pair if companion else None),
+            ("beside", write_png, torch.cat(seen, dim=1) if companion else None),
         ]
     if kinds.depth:
         wanted.append(("depth", write_depth_png, shown.depth_m))
@@ -151,7 +189,7 @@ def _write_view(
         if pixels is not None:
             row[kind] = name if kind == "file" else f"{kind}/{name}"
             write(pixels, folder / row[kind])
-    return row
+    return row, seen
 
 
 def legend(scene: GaussianScene) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Render a finished run along a trajectory, painted at view time if asked for."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +22,7 @@ from tasks.progress import listener
 from tasks.specs import FittedRef, RunSpec
 from tasks.stages import stage_task
 from tasks.stored import load_observations, load_scene
-from tasks.views.files import POSES_FILE, Companion, ViewKinds, write_views
+from tasks.views.files import POSES_FILE, VIDEO_FILE, Companion, ViewKinds, write_views
 
 __all__ = ["POSES_FILE", "RenderRequest", "followed_path", "followed_paths", "render"]
 
@@ -67,16 +68,18 @@ def render(run: RunSpec, fitted: FittedRef, request: RenderRequest, out: Path) -
     """Write what is wanted for every recorded moment, and where each image was taken.
 
     What is painted lies at `0007.png`, the render that it was painted from at
-    `unpainted/0007.png`. Several cameras get a folder each.
+    `unpainted/0007.png`. Several cameras get a folder each, their films one more of all together.
 
     Raises:
         SceneError: the scene has no such camera, or no frame is left.
     """
     paths = followed_paths(run, fitted, request)
     folders = [out / path.camera_name if len(paths) > 1 else out for path in paths]
-    made = write_paths(run, paths, request, folders)
+    films = [folder / VIDEO_FILE for folder in folders] if request.kinds.video else []
+    together = out / VIDEO_FILE if len(films) > 1 else None
+    made = write_paths(run, paths, request, folders, films=films, together=together)
     first = made[0]
-    videos = [one["video"] for one in made if "video" in one]
+    videos = [str(film) for film in (*([together] if together else []), *films)]
     return {
         "folder": str(out),
         "num_images": sum(one["num_images"] for one in made),
@@ -92,10 +95,11 @@ def write_paths(
     paths: list[FollowedPath],
     request: RenderRequest,
     folders: list[Path],
-    videos: list[Path | None] | None = None,
+    *,
+    films: Sequence[Path] = (),
+    together: Path | None = None,
 ) -> list[dict[str, Any]]:
     """Write every path's files to its folder; tells how far it is."""
-    companion = _companion(run, request)
     done, total = 0, sum(len(path.views) for path in paths)
     listener().started(STAGE)
 
@@ -104,12 +108,15 @@ def write_paths(
         done += 1
         listener().advanced(STAGE, done, total, "")
 
-    return [
-        write_views(
-            path, request.kinds, folder, companion=companion, video=video, advanced=advanced
-        )
-        for path, folder, video in zip(paths, folders, videos or [None] * len(paths), strict=True)
-    ]
+    return write_views(
+        paths,
+        folders,
+        request.kinds,
+        companion=_companion(run, request),
+        films=films,
+        together=together,
+        advanced=advanced,
+    )
 
 
 def _companion(run: RunSpec, request: RenderRequest) -> Companion | None:

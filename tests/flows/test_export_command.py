@@ -60,6 +60,24 @@ def test_render_shows_all_cameras_wider_and_beside_the_recording(tiny_run, tmp_p
         seen_image(tmp_path / camera / "beside" / "0001.png", WIDTH_PX, HEIGHT_PX // 2)
         film = cv2.VideoCapture(str(tmp_path / camera / "video.mp4"))
         assert film.get(cv2.CAP_PROP_FPS) == pytest.approx(5)
+    assert made["video"].split(", ")[0] == str(tmp_path / "video.mp4")
+    together = (WIDTH_PX, HEIGHT_PX // 2 * 2, 2)  # two cameras in a row, the recording above
+    assert film_size(tmp_path / "video.mp4") == together
+
+
+def film_size(path):
+    film = cv2.VideoCapture(str(path))
+    kinds = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_COUNT)
+    return tuple(int(film.get(kind)) for kind in kinds)
+
+
+def test_one_film_shows_all_cameras(tiny_run, tmp_path):
+    words = ("--format", "video", "--camera", "all", "--frames", "0:2", "--json")
+    out = tmp_path / "drive.mp4"
+    made = succeed("export", tiny_run.run_id, *words, "--out", out, store=tiny_run.store).json
+    assert (made["path"], made["num_images"], made["fps"]) == (str(out), 4, pytest.approx(10))
+    assert film_size(out) == (2 * WIDTH_PX, HEIGHT_PX, 2)
+    assert list(tmp_path.iterdir()) == [out]
 
 
 def test_a_camera_that_no_fit_used_rides_on_the_rig_as_the_fit_found_it(tiny_run, tmp_path):
