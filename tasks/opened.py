@@ -19,7 +19,7 @@ from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.painter.selection import PainterChoice
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.schema import MANIFEST_NAME
+from lidarpainter_models.scenes.schema import GLOBAL_FRAME, MANIFEST_NAME
 from lidarpainter_models.scenes.splits import ViewSplit, split_views
 from lidarpainter_models.scenes.stored import Fetch
 from tasks.specs import RunSpec, SplitSpec
@@ -76,6 +76,14 @@ def open_scene(store: Store, scene_id: str) -> DrivingScene:
             f"(there {'is' if len(known) == 1 else 'are'} {', '.join(known) or 'none'})"
         ) from None
     return _scene(folder, files, manifest.st_ino, manifest.st_mtime_ns)
+
+
+def global_frame_of(scene: DrivingScene) -> str:
+    """Name of a scene's global frame: that of its own sequence, unless its manifest names one.
+
+    Scenes of one name have one global frame.
+    """
+    return str(scene.manifest.get(GLOBAL_FRAME) or f"{scene.dataset}/{scene.sequence}")
 
 
 def open_split(store: Store, split: SplitSpec) -> tuple[DrivingScene, ViewSplit]:

@@ -15,6 +15,8 @@ MANY = ("remove",)
 """Operations on any number of actors."""
 NOBODY = ("freeze", "crop")
 """Operations on nobody in particular."""
+NAMED = {"insert": "name", "join": "run"}
+"""What the name of an operation is, where it is not an actor that is there."""
 MOST_SCRIPT_BYTES = 10_000_000
 _NUMBER = re.compile(r"factor|speed|.*_(m|s|deg|mps)")
 """Fields whose name says that they are numbers."""
@@ -122,7 +124,7 @@ def _operation(words: list[str]) -> dict[str, Any]:
     elif op not in NOBODY:
         if len(names) != 1:
             raise ConfigError(f"edit: {op} takes one name, got {', '.join(names) or 'none'}")
-        found["name" if op == "insert" else "actor"] = names[0]
+        found[NAMED.get(op, "actor")] = names[0]
     elif names:
         raise ConfigError(f"edit: {op} takes no name, got {', '.join(names)}")
     for word in rest:

@@ -93,13 +93,8 @@ class ActorModel:
         )
 
     def of_degree(self, sh_degree: int) -> "ActorModel":
-        """The same with harmonics of another degree: what is more is left out, what lacks is 0."""
-        columns = self.gaussians.columns()
-        wanted = (sh_degree + 1) ** 2 - 1
-        rest = torch.zeros(len(self.gaussians), wanted, 3)
-        kept = min(wanted, columns["sh_rest"].shape[1])
-        rest[:, :kept] = columns["sh_rest"][:, :kept]
-        return replace(self, gaussians=GaussianSet(**(columns | {"sh_rest": rest})))
+        """The same with harmonics of another degree."""
+        return replace(self, gaussians=of_degree(self.gaussians, sh_degree))
 
     def with_shadow(self) -> "ActorModel":
         """The same with a soft shadow where it touches the road; one that it had goes."""
@@ -120,6 +115,16 @@ def exposure_gain(
     brightness = (road_rgb.mean() / own_road_rgb.mean()).clamp(1 / MAX_GAIN, MAX_GAIN)
     cast = (road_rgb / road_rgb.mean()) / (own_road_rgb / own_road_rgb.mean())
     return brightness * cast.clamp(1 / MAX_CAST, MAX_CAST)
+
+
+def of_degree(gaussians: GaussianSet, sh_degree: int) -> GaussianSet:
+    """Gaussians with harmonics of another degree: what is more is left out, what lacks is 0."""
+    columns = gaussians.columns()
+    wanted = (sh_degree + 1) ** 2 - 1
+    rest = torch.zeros(len(gaussians), wanted, 3)
+    kept = min(wanted, columns["sh_rest"].shape[1])
+    rest[:, :kept] = columns["sh_rest"][:, :kept]
+    return GaussianSet(**(columns | {"sh_rest": rest}))
 
 
 def exposed(gaussians: GaussianSet, gain: Float[Tensor, "3"]) -> GaussianSet:

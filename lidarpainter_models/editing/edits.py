@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from lidarpainter_models.editing.actor_models import ActorModel
+from lidarpainter_models.editing.joins import OtherRun, joined
 from lidarpainter_models.editing.motions import (
     LogTimes,
     beside_ego,
@@ -21,6 +22,7 @@ from lidarpainter_models.editing.operations import (
     Drive,
     Freeze,
     Insert,
+    Join,
     Move,
     Operation,
     Remove,
@@ -39,6 +41,8 @@ from lidarpainter_models.scenes.tracks import ActorTrack
 
 Models = Mapping[ActorSource, ActorModel]
 """What actors of other runs and of files look like."""
+Others = Mapping[Join, OtherRun]
+"""What is joined."""
 CROP_MARGIN_M = 30.0
 """So far to the side of the path a cropped street goes on."""
 
@@ -54,7 +58,9 @@ class Encounter:
         return f"{self.actor_id} meets {self.collision}"
 
 
-def edited(world: EditedWorld, operations: Sequence[Operation], models: Models) -> EditedWorld:
+def edited(
+    world: EditedWorld, operations: Sequence[Operation], models: Models, others: Others
+) -> EditedWorld:
     """The world after all operations.
 
     Raises:
@@ -63,7 +69,7 @@ def edited(world: EditedWorld, operations: Sequence[Operation], models: Models) 
     """
     for number, operation in enumerate(operations, start=1):
         try:
-            world = _edited_once(world, operation, models)
+            world = _edited_once(world, operation, models, others)
         except ValueError as error:  # the errors of a scene and of settings are such
             raise ConfigError(f"operation {number}, {operation.op}: {error}") from None
     return world
@@ -92,9 +98,13 @@ def refuse_walls(found: Sequence[Encounter]) -> None:
         raise ConfigError(f"a path into a wall: {walls[0]}; --allow-collisions goes through")
 
 
-def _edited_once(world: EditedWorld, operation: Operation, models: Models) -> EditedWorld:
+def _edited_once(
+    world: EditedWorld, operation: Operation, models: Models, others: Others
+) -> EditedWorld:
     if isinstance(operation, Drive | Style):  # a style is put on last, over what was mended
         return world
+    if isinstance(operation, Join):
+        return joined(world, others[operation])
     if isinstance(operation, Crop):
         return _cropped(world, operation)
     if isinstance(operation, Insert):

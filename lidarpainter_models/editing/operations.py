@@ -158,6 +158,16 @@ class Crop(_Words):
         return self
 
 
+class Join(_Words):
+    """Take from another run of the same place what it saw better."""
+
+    op: Literal["join"]
+    run: _Name
+    """Fitted to the same sequence, or to one whose frame of reference is known to be the same."""
+    store: _Name | None = None
+    """Folder of its store; this one if absent."""
+
+
 class Drive(_Words):
     """Where the camera goes when the edited run is shown with the script; changes no scene."""
 
@@ -192,7 +202,7 @@ class Style(_Words):
 
 
 Operation = Annotated[
-    Remove | Move | Insert | Swap | Scale | Retime | Stop | Freeze | Crop | Drive | Style,
+    Remove | Move | Insert | Swap | Scale | Retime | Stop | Freeze | Crop | Join | Drive | Style,
     Field(discriminator="op"),
 ]
 _SCRIPT: TypeAdapter[tuple[Operation, ...]] = TypeAdapter(

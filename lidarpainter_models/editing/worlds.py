@@ -143,13 +143,23 @@ class EditedWorld:
         """
         if any(one.actor_id == track.actor_id for one in self.tracks):
             raise ConfigError(f"an actor {track.actor_id!r} is there already, expected a new name")
+        degree = self.scene.gaussians.sh_degree
+        fitting = model.exposed_like(self.road_rgb).of_degree(degree).with_shadow()
+        whole = self._with_body(fitting, track)
+        return replace(whole, came=(*self.came, whole.scene.actors.recorded_tracks[-1]))
+
+    def with_recorded_actor(self, model: ActorModel, track: ActorTrack) -> "EditedWorld":
+        """The same world with somebody more who was there, as the recorded images show."""
+        fitting = model.exposed_like(self.road_rgb).of_degree(self.scene.gaussians.sh_degree)
+        return self._with_body(fitting, track)
+
+    def _with_body(self, model: ActorModel, track: ActorTrack) -> "EditedWorld":
         own, actors = self.scene.gaussians, self.scene.actors
-        fitting = model.exposed_like(self.road_rgb).of_degree(own.sh_degree).with_shadow()
-        columns = fitting.gaussians.columns()
+        columns = model.gaussians.columns()
         columns["body_index"] = torch.full_like(
             columns["body_index"], len(actors.recorded_tracks) + 1
         )
-        moving = replace(track, is_moving=True, size_m=fitting.size_m)
+        moving = replace(track, is_moving=True, size_m=model.size_m)
         more = torch.zeros(1, *actors.tangent.shape[1:], dtype=actors.tangent.dtype)
         scene = replace(
             self.scene,
@@ -160,9 +170,9 @@ class EditedWorld:
                 tangent=torch.cat([actors.tangent, more]),
             ),
         )
-        points = {**self.lidar_map.actors, track.actor_id: fitting.points}
+        points = {**self.lidar_map.actors, track.actor_id: model.points}
         lidar_map = LidarMap(street=self.lidar_map.street, actors=points)
-        return replace(self, scene=scene, lidar_map=lidar_map, came=(*self.came, moving))
+        return replace(self, scene=scene, lidar_map=lidar_map)
 
     def rows_of(self, track: ActorTrack) -> Int[Tensor, " rows"]:
         """The Gaussians that are an actor's; of a parked car those of the street."""

@@ -15,10 +15,9 @@ from catalog.assets import LEAST_ID_LENGTH, digest_of, enter_sightings
 from catalog.store import Store
 from catalog.tables import Row
 from lidarpainter_models.assets.categories import category_of
-from lidarpainter_models.scenes.schema import GLOBAL_FRAME
 from tasks.assets.publish import SIGHTINGS_FILE
 from tasks.json_files import read_json
-from tasks.opened import open_scene
+from tasks.opened import global_frame_of, open_scene
 from tasks.runs import FinishedRun
 from tasks.stages import StageResult
 
@@ -37,7 +36,7 @@ def enter_published(
         "dataset": run.scene_id.partition("/")[0],
         "licence": scene.manifest["licence"],
         "scene_id": run.scene_id,
-        "frame": global_frame(scene.manifest, run.scene_id),
+        "frame": global_frame_of(scene),
         "run_id": run.run_id,
         "style": style,
         "artefact_id": published.ref.artefact_id,
@@ -100,8 +99,3 @@ def ids_of(same: Mapping[str, Any], record: Mapping[str, Any]) -> Row:
         "occurrence_id": digest_of(same["scene_id"], *named, same["style"]),
         "base_id": None if same["style"] is None else base,
     }
-
-
-def global_frame(manifest: Mapping[str, Any], scene_id: str) -> str:
-    """What the global frame is called: its own scene's, unless the manifest says otherwise."""
-    return str(manifest.get(GLOBAL_FRAME) or scene_id)

@@ -18,10 +18,12 @@ from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.editing.actor_models import ActorModel
 from lidarpainter_models.editing.edits import Encounter, edited, encounters
 from lidarpainter_models.editing.filled_scenes import filled, masked_observations
+from lidarpainter_models.editing.joins import OtherRun
 from lidarpainter_models.editing.motions import LogTimes
 from lidarpainter_models.editing.operations import (
     ActorSource,
     Insert,
+    Join,
     Move,
     Operation,
     Style,
@@ -33,9 +35,10 @@ from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene, de
 from lidarpainter_models.gaussians.model.ply_files import read_ply
 from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.painter.selection import NO_PAINTER, PainterChoice
 from lidarpainter_models.storage.tensor_files import write_tensors
-from tasks.opened import open_scene
+from tasks.opened import global_frame_of, open_scene
 from tasks.progress import Progress
 from tasks.runs import FinishedRun, open_run
 from tasks.stored import load_observations, load_scene, save_observations, save_scene
@@ -61,19 +64,46 @@ class Edits:
         for number, operation in enumerate(self.operations, start=1):
             if isinstance(operation, Insert | Swap):
                 found |= _digests(f"actor-{number}", self._donor(operation.source))
+            if isinstance(operation, Join):
+                found |= self._digests_of_joined(f"run-{number}", operation)
             if isinstance(operation, Insert | Move):
                 way = parse_trajectory(operation.trajectory, max_shift_m=None)
                 found |= {f"waypoints-{number}": digest_file(path) for path in way.files}
         return found
 
     def world(self) -> EditedWorld:
-        """The run as it is before them."""
-        return opened_world(self.store, self.source)
+        """The run as it is after them.
 
-    def models(self) -> Mapping[ActorSource, ActorModel]:
+        Raises:
+            ConfigError: an operation cannot be done.
+        """
+        before = opened_world(self.store, self.source)
+        return edited(before, self.operations, self._models(), self._others())
+
+    def _models(self) -> Mapping[ActorSource, ActorModel]:
         """What actors of other runs and of files look like."""
         sources = [one.source for one in self.operations if isinstance(one, Insert | Swap)]
         return {one: self._model(one) for one in sources if one.run or one.ply or one.asset}
+
+    def _others(self) -> dict[Join, OtherRun]:
+        """The runs that are joined."""
+        return {one: self._other(one) for one in self.operations if isinstance(one, Join)}
+
+    def _other(self, operation: Join) -> OtherRun:
+        store = self._store_of(operation)
+        run = open_run(store, operation.run)
+        ours = open_scene(self.store, self.source.scene_id)
+        theirs = open_scene(store, run.scene_id)
+        if global_frame_of(ours) != global_frame_of(theirs):
+            raise ConfigError(
+                f"join {operation.run}: nothing ties the frame of {run.scene_id} to that of "
+                f"{self.source.scene_id}, expected the same sequence or the same global_frame"
+            )
+        return OtherRun(
+            world=opened_world(store, run),
+            world_from_other=invert_rigid(ours.global_from_world) @ theirs.global_from_world,
+            is_same_drive=run.scene_id == self.source.scene_id,
+        )
 
     def _donor(self, source: ActorSource) -> "FinishedRun | LibraryActor | str | None":
         """The run, asset or file that an actor comes from; None is the edited run itself."""
@@ -96,7 +126,13 @@ class Edits:
             return read_asset(donor.path)
         return ActorModel.of_gaussians(read_ply(_file(str(donor))), CATEGORY)
 
-    def _store_of(self, source: ActorSource) -> Store:
+    def _digests_of_joined(self, part: str, operation: Join) -> dict[str, str]:
+        store = self._store_of(operation)
+        run = open_run(store, operation.run)
+        scene = open_scene(store, run.scene_id)
+        return {**_digests(part, run), f"{part}-scene": scene.content_digest}
+
+    def _store_of(self, source: ActorSource | Join) -> Store:
         return self.store if source.store is None else open_store(source.store)
 
 
@@ -155,7 +191,7 @@ def checked_encounters(edits: Edits) -> list[Encounter]:
     Raises:
         ConfigError: an operation cannot be done.
     """
-    return encounters(edited(edits.world(), edits.operations, edits.models()))
+    return encounters(edits.world())
 
 
 def edit_build(
@@ -179,7 +215,7 @@ def _build(
     painter: PainterChoice,
     device: torch.device,
 ) -> dict[str, Any]:
-    world = edited(edits.world(), edits.operations, edits.models())
+    world = edits.world()
     paints = painter.name != NO_PAINTER
     found = filled(world, conditions, painter.load(device) if paints else None)
     scene = _styled(found.scene, edits)
@@ -205,7 +241,7 @@ def _styled(scene: GaussianScene, edits: Edits) -> GaussianScene:
 
 
 def _build_observations(place: Workplace, _progress: Progress, *, edits: Edits) -> dict[str, Any]:
-    world = edited(edits.world(), edits.operations, edits.models())
+    world = edits.world()
     seen = masked_observations(world)
     save_observations(place.output, seen)
     hidden = [float(view.hidden.float().mean()) for view in seen.views if view.hidden is not None]

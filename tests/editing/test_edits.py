@@ -57,7 +57,7 @@ def world():
 
 
 def done(world, *operations, models=None):
-    return edited(world, parse_operations([*operations], "test"), models or {})
+    return edited(world, parse_operations([*operations], "test"), models or {}, {})
 
 
 def places(world, name="car"):

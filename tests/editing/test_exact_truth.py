@@ -73,7 +73,7 @@ def world(street, tmp_path_factory):
 
 def figures(street, world, truth, operation, name, came=False):
     """PSNR inside what is uncovered and elsewhere: before, bare, filled."""
-    after = edited(world, parse_operations([operation], "test"), {})
+    after = edited(world, parse_operations([operation], "test"), {}, {})
     mended = filled(after, ConditionConfig(), load_painter("nano"))
     scenes = {"bare": after.scene, "filled": mended.scene}
     index = [actor.actor_id for actor in street.actors(street.timestamps_ns[0])].index(name)

@@ -72,6 +72,9 @@ def test_edits_of_an_edited_run_are_added_to_its_list(own_run, ahead):
         (("fly", AHEAD), "does not match any of the expected"),
         (("insert", "new", "source.ply=nowhere.ply"), "no file nowhere.ply"),
         (("insert", "new", "source.run=nobody", "source.actor=a"), "no run_id 'nobody'"),
+        (("join", "nobody"), "no run_id 'nobody'"),
+        (("join",), "join takes one name, got none"),
+        (("join", "latest"), "that run has seen nothing much better than this one"),
         ((), "expected at least one operation"),
         (("--script", "nowhere.json"), "script nowhere.json cannot be read"),
     ],
@@ -83,3 +86,11 @@ def test_what_cannot_be_done_is_one_line_and_leaves_nothing(own_run, words, comp
     assert complaint in answer.err
     assert answer.err.count("\n") == 1
     assert own_run.store.tables.rows("runs") == before
+
+
+def test_runs_of_places_that_nothing_ties_are_not_joined(own_run, monkeypatch):
+    names = iter(("here", "there"))
+    monkeypatch.setattr("tasks.editing.edit.global_frame_of", lambda _scene: next(names))
+    answer = call("edit", own_run.run_id, "join", own_run.run_id, store=own_run.store)
+    assert answer.code == 2
+    assert "nothing ties the frame of synthetic/street-0005 to that of" in answer.err

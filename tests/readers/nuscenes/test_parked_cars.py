@@ -11,7 +11,8 @@ from catalog.store import open_store
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from tasks.assets.enter import global_frame, is_same, sighting
+from tasks.assets.enter import is_same, sighting
+from tasks.opened import global_frame_of
 
 SCENES = {"v1.0-trainval": "scene-0001", "v1.0-mini": "scene-0002"}
 
@@ -46,7 +47,7 @@ def num_sightings(root, store):
     for scene in read(root, store.root):
         run_id, scene_id = scene.sequence, f"nuscenes/{scene.sequence}"
         same = {"dataset": "nuscenes", "scene_id": scene_id, "run_id": run_id, "style": None}
-        same["frame"] = global_frame(scene.manifest, scene_id)
+        same["frame"] = global_frame_of(scene)
         standing = [track for track in scene.tracks if not track.is_moving]
         records = [record(track, scene.global_from_world) for track in standing]
         enter_sightings(store, [sighting(same, one) for one in records], is_same)
