@@ -70,8 +70,9 @@ class _Lamps(NamedTuple):
     heading: np.ndarray
     power: np.ndarray
     reach_m: np.ndarray
-    num_fixed: int
-    """These come first."""
+    of_bodies: np.ndarray
+    starts: np.ndarray
+    """Lamps that may reach body b are those of_bodies[starts[b] : starts[b + 1]]."""
 
 
 class _Surroundings(NamedTuple):
@@ -85,7 +86,8 @@ def irradiance(surfaces: parts.Surfaces, world_from_body: Tensor, lamps: parts.L
     """See `scene_light.irradiance`."""
     found = np.zeros((len(surfaces.means), 3), np.float32)
     with ONE_AT_A_TIME:
-        _irradiance(_surfaces(surfaces, world_from_body), _lamps(lamps), found)
+        every = torch.ones(len(world_from_body), len(lamps.reach_m))
+        _irradiance(_surfaces(surfaces, world_from_body), _lamps(lamps, every > 0), found)
     return torch.from_numpy(found)
 
 
@@ -120,7 +122,7 @@ def seen_harmonics(
             _surfaces(surfaces, world_from_body),
             own,
             around,
-            _lamps(lamps),
+            _lamps(lamps, parts.lamps_that_reach(surfaces, world_from_body, lamps)),
             _sides(frustum),
             _array(camera_from_body),
             found,
@@ -151,14 +153,16 @@ def _surfaces(surfaces: parts.Surfaces, world_from_body: Tensor) -> _Surfaces:
     )
 
 
-def _lamps(lamps: parts.Lamps) -> _Lamps:
-    order = torch.argsort(lamps.is_fixed, stable=True, descending=True)
+def _lamps(lamps: parts.Lamps, counts: Tensor) -> _Lamps:
+    """Lamps, and those that count for each body."""
+    starts = torch.nn.functional.pad(counts.sum(dim=1).cumsum(0), (1, 0))
     return _Lamps(
-        _array(lamps.position_world[order]),
-        _array(lamps.heading_world[order]),
-        _array(lamps.power_rgb[order]),
-        _array(lamps.reach_m[order]),
-        int(lamps.is_fixed.sum()),
+        _array(lamps.position_world),
+        _array(lamps.heading_world),
+        _array(lamps.power_rgb),
+        _array(lamps.reach_m),
+        _array(counts.nonzero()[:, 1], torch.int32),
+        _array(starts, torch.int32),
     )
 
 
@@ -170,8 +174,7 @@ def _turned(pose, row, v):
 @numba.njit(**_INNER)
 def _beam(aside, up, squared):
     """Share of a dipped beam by tangents to its axis; see `weather.darkness.dipped_beam`."""
-    aside *= _PER_ACROSS
-    level = -_HALF * aside * aside
+    level = -_HALF * (aside * _PER_ACROSS) ** 2
     below = _BEAM_CUT - up
     if below > _ZERO:
         return math.exp(level - below * _PER_DOWN)
@@ -196,31 +199,31 @@ def _facing(surfaces, i, pose, x, y, z, away_m):
 @numba.njit(**_INNER)
 def _lamp_share(lamps, j, x, y, z, squared):
     """What a lamp throws onto a surface that faces it; 0 beyond its reach and its beam."""
-    reach = lamps.reach_m[j]
-    if squared >= reach * reach:
+    fade = _ONE - squared / (lamps.reach_m[j] * lamps.reach_m[j])
+    if fade <= _ZERO:
         return _ZERO
-    heading = lamps.heading[j]
-    share = _ONE - squared / (reach * reach)
-    share *= share / (squared + _NEAREST_M2)
-    if heading[0] == _ZERO and heading[1] == _ZERO:
-        return share
-    ahead = x * heading[0] + y * heading[1]
-    level = max(ahead, _LEAST_LEVEL_M)
-    across = y * heading[0] - x * heading[1]
-    if not ahead > _ZERO or abs(across) > _WIDEST_BEAM * level:
-        return _ZERO
-    return share * _beam(across / level, z / level, squared)
+    along_x, along_y = lamps.heading[j, 0], lamps.heading[j, 1]
+    beam = _ONE
+    if along_x != _ZERO or along_y != _ZERO:
+        ahead, across = x * along_x + y * along_y, y * along_x - x * along_y
+        level = max(ahead, _LEAST_LEVEL_M)
+        if not ahead > _ZERO or abs(across) > _WIDEST_BEAM * level:
+            return _ZERO
+        beam = _beam(across / level, z / level, squared)
+    return beam * fade * fade / (squared + _NEAREST_M2)
 
 
 @numba.njit(**_INNER)
-def _add_lamps(surfaces, i, lamps, with_fixed, sums):
+def _add_lamps(surfaces, i, lamps, sums):
     """Add the irradiance of the lamps to sums, as far as the surface sends it back."""
-    pose = surfaces.world_from_body[surfaces.body[i]]
+    body = surfaces.body[i]
+    pose = surfaces.world_from_body[body]
     mean = surfaces.means[i]
     px = _turned(pose, 0, mean) + pose[0, 3]
     py = _turned(pose, 1, mean) + pose[1, 3]
     pz = _turned(pose, 2, mean) + pose[2, 3]
-    for j in range(0 if with_fixed else lamps.num_fixed, len(lamps.reach_m)):
+    for place in range(lamps.starts[body], lamps.starts[body + 1]):
+        j = lamps.of_bodies[place]
         x, y, z = px - lamps.position[j, 0], py - lamps.position[j, 1], pz - lamps.position[j, 2]
         squared = x * x + y * y + z * z
         share = _lamp_share(lamps, j, x, y, z, squared)
@@ -233,7 +236,7 @@ def _add_lamps(surfaces, i, lamps, with_fixed, sums):
 @numba.njit(**_COMPILED, parallel=True)
 def _irradiance(surfaces, lamps, found):
     for i in numba.prange(len(surfaces.means)):
-        _add_lamps(surfaces, i, lamps, True, found[i])
+        _add_lamps(surfaces, i, lamps, found[i])
 
 
 @numba.njit(**_INNER)
@@ -277,9 +280,8 @@ def _is_in_view(point, reach_m, sides):
         return False
     for axis in range(2):
         most = reach_m * sides[2, axis]
-        if point[axis] - sides[1, axis] * point[2] > most:
-            return False
-        if sides[0, axis] * point[2] - point[axis] > most:
+        above = point[axis] - sides[1, axis] * point[2]
+        if max(above, sides[0, axis] * point[2] - point[axis]) > most:
             return False
     return True
 
@@ -314,18 +316,14 @@ def _see(  # noqa: PLR0913 - all that a surface's colour hangs on
     """Write the harmonics of a surface that lies at a point in the camera frame."""
     light, shown = scratch[0], scratch[1]
     light[0] = light[1] = light[2] = _ZERO
-    if len(lamps.reach_m):
-        _add_lamps(surfaces, i, lamps, surfaces.body[i] > 0, light)
+    if len(lamps.of_bodies):
+        _add_lamps(surfaces, i, lamps, light)
     for c in range(3):
         light[c] = own.light[i, c] + own.reflectance[i, c] * light[c]
         shown[c] = light[c]
     if own.shine[i] > 0.0:
-        street, world = camera_from_body[0], surfaces.world_from_body[0]
-        in_street = (
-            street[0, 0] * point[0] + street[1, 0] * point[1] + street[2, 0] * point[2],
-            street[0, 1] * point[0] + street[1, 1] * point[1] + street[2, 1] * point[2],
-            street[0, 2] * point[0] + street[1, 2] * point[1] + street[2, 2] * point[2],
-        )
+        back, world = camera_from_body[0].T, surfaces.world_from_body[0]
+        in_street = (_turned(back, 0, point), _turned(back, 1, point), _turned(back, 2, point))
         x, y = _turned(world, 0, in_street), _turned(world, 1, in_street)
         _mirror(own, around, i, x, y, _turned(world, 2, in_street), shown)
     distance_m = math.sqrt(point[0] * point[0] + point[1] * point[1] + point[2] * point[2])

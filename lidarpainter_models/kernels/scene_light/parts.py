@@ -4,7 +4,9 @@ World: z up, metres. Light is linear, in units of display white.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -38,6 +40,13 @@ class Surfaces:
     """Share of a lamp's light that it sends back when it faces the lamp."""
     least_facing: Float[Tensor, " gaussians"]
     """The same at a grazing angle."""
+
+    @cached_property
+    def body_radius_m(self) -> Float[Tensor, " bodies"]:
+        """How far the centres of each body lie from its origin."""
+        bodies = int(self.body_index.max()) + 1 if len(self.body_index) else 0
+        farthest = self.means.new_zeros(bodies)
+        return farthest.scatter_reduce(0, self.body_index.long(), self.means.norm(dim=1), "amax")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,3 +92,16 @@ FAINT = 9.0
 STRAY_REACH_M = 15.0
 """Beyond it nothing is left of what a beam loses above its cut-off."""
 SH_CONSTANT = 0.28209479177387814  # value of the harmonic of degree 0
+
+
+def lamps_that_reach(
+    surfaces: Surfaces, world_from_body: Float[Tensor, "bodies 4 4"], lamps: Lamps
+) -> Bool[Tensor, "bodies lamps"]:
+    """Which lamps may reach anything of a body beyond what the light of its surfaces holds."""
+    origins = world_from_body[:, :3, 3].to(lamps.position_world)
+    radius_m = origins.new_zeros(len(origins))  # those of no surface stay 0
+    radius_m[: len(surfaces.body_radius_m)] = surfaces.body_radius_m
+    away_m = torch.cdist(origins, lamps.position_world)
+    reaching = away_m < radius_m[:, None] + lamps.reach_m
+    reaching[:1] &= ~lamps.is_fixed
+    return reaching

@@ -18,6 +18,7 @@ from lidarpainter_models.kernels.scene_light.parts import (
     Lamps,
     Surfaces,
     Surroundings,
+    lamps_that_reach,
 )
 from lidarpainter_models.weather.darkness import (
     BEAM_CUT_RAD,
@@ -53,7 +54,7 @@ def seen_harmonics(
     body = surfaces.body_index.long()
     from_camera = _placed(surfaces.means, camera_from_body, body)
     distance_m = from_camera.norm(dim=-1)
-    counts = ~(lamps.is_fixed[:, None] & (body == 0))
+    counts = lamps_that_reach(surfaces, world_from_body, lamps)[body].T
     thrown = _lamp_light(surfaces, points, normals, lamps, counts)
     light = appearance.light + appearance.reflectance * thrown
     camera_world = _camera_centre(world_from_body, camera_from_body).to(points)
