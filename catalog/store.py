@@ -67,10 +67,11 @@ class Store:
         from catalog.tables import CatalogTables  # Arrow and Delta: help does without
 
         if self.mirror is None:
-            return CatalogTables(str(self.root / "tables"))
+            return CatalogTables(str(self.root / "tables"), alone=self.alone)
         from catalog.buckets import table_options
 
-        return CatalogTables(f"{self.name}/tables", storage_options=table_options())
+        options = table_options()
+        return CatalogTables(f"{self.name}/tables", storage_options=options, alone=self.alone)
 
     def objects(self, folder: str) -> ConditionalObjects:
         """The small objects of a folder of the store."""

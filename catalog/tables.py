@@ -11,7 +11,7 @@ import random
 import shutil
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -34,8 +34,8 @@ from catalog.schemas import TABLES, TableSchema
 from catalog.stored_rows import read_rows
 
 COMMIT_ATTEMPTS = 25
-FIRST_PAUSE_S = 0.05
-LONGEST_PAUSE_S = 2.0
+PAUSE_S = 0.05
+"""Between attempts, against writers that take no turns."""
 MOST_FILES = 24
 """Small ones of a table, before they are written together: each merge and query opens all files."""
 
@@ -54,9 +54,17 @@ Row = dict[str, Any]
 class CatalogTables:
     """The tables below one root."""
 
-    def __init__(self, root: str, *, storage_options: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        root: str,
+        *,
+        storage_options: Mapping[str, str] | None = None,
+        alone: Callable[[str], AbstractContextManager[object]] = nullcontext,
+    ) -> None:
+        """`alone` holds a name for one writer at a time, of all that share the tables."""
         self.root = root.rstrip("/")
         self.storage_options = dict(storage_options or {})
+        self._alone = alone
         self._handles: dict[str, DeltaTable] | None = None
 
     def keep_open(self) -> None:
@@ -114,15 +122,19 @@ class CatalogTables:
         return self._committed(schema, lambda: self._try_merge(schema, source, rule))
 
     def _committed(self, schema: TableSchema, attempted: Callable[[], int | None]) -> int:
-        """Attempt a commit until it wins, a bounded number of times; None is a lost attempt."""
+        """Attempt a commit until it wins, a bounded number of times; None is a lost attempt.
+
+        Writers take turns. Without them nothing is lost either, but who has lost once begins
+        later than the winner and goes on losing to it.
+        """
         with damage_told(f"cannot write table {self._uri(schema)}"):
             self._require_room()
-            for attempt in range(COMMIT_ATTEMPTS):
-                if attempt:
-                    pause_s = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2**attempt)
-                    time.sleep(pause_s * random.random())  # noqa: S311 - jitter, not a secret
-                if (changed := attempted()) is not None:
-                    return changed
+            with self._alone(f"table-{schema.name}"):
+                for attempt in range(COMMIT_ATTEMPTS):
+                    if attempt:
+                        time.sleep(PAUSE_S * random.random())  # noqa: S311 - no secret
+                    if (changed := attempted()) is not None:
+                        return changed
         raise ConflictError(
             f"table {self._uri(schema)} had other writers in {COMMIT_ATTEMPTS} attempts"
         )
