@@ -18,6 +18,7 @@ from typing import Any
 from urllib.parse import unquote
 
 import pyarrow as pa
+import pyarrow.compute as pc
 from deltalake import DeltaTable, Field
 from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
 from deltalake.table import TableMerger
@@ -210,9 +211,8 @@ class CatalogTables:
 
     def find(self, table: str, row_id: str) -> Row | None:
         """The row with exactly this id, or None."""
-        arrow = self.arrow(table)
-        ids = arrow[_schema(table).key].to_pylist()
-        return arrow.slice(ids.index(row_id), 1).to_pylist()[0] if row_id in ids else None
+        found = self.arrow(table, where={_schema(table).key: [row_id]})
+        return found.to_pylist()[0] if found.num_rows else None
 
     def row(self, table: str, id_or_prefix: str) -> Row:
         """The one row with this id, or whose id starts with it.
@@ -220,16 +220,16 @@ class CatalogTables:
         Raises:
             UnknownRecordError: none matches, or more than one.
         """
+        if (exact := self.find(table, id_or_prefix)) is not None:
+            return exact
         key = _schema(table).key
-        rows = self.rows(table)
-        exact = [row for row in rows if row[key] == id_or_prefix]
-        matches = exact or [row for row in rows if row[key].startswith(id_or_prefix)]
-        if len(matches) == 1:
-            return matches[0]
-        if not matches:
-            raise UnknownRecordError(f"no {key} {id_or_prefix!r} among {len(rows)} {table}")
-        ids = ", ".join(row[key] for row in matches[:5])
-        raise UnknownRecordError(f"{key} {id_or_prefix!r} is not unique: {ids}")
+        ids = self.arrow(table, columns=[key])[key]
+        matches = sorted(ids.filter(pc.starts_with(ids, pattern=id_or_prefix)).to_pylist())
+        if len(matches) == 1 and (found := self.find(table, matches[0])) is not None:
+            return found
+        if len(matches) < 2:
+            raise UnknownRecordError(f"no {key} {id_or_prefix!r} among {len(ids)} {table}")
+        raise UnknownRecordError(f"{key} {id_or_prefix!r} is not unique: {', '.join(matches[:5])}")
 
     def _uri(self, schema: TableSchema) -> str:
         return f"{self.root}/{schema.name}"
