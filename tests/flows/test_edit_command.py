@@ -94,3 +94,15 @@ def test_runs_of_places_that_nothing_ties_are_not_joined(own_run, monkeypatch):
     answer = call("edit", own_run.run_id, "join", own_run.run_id, store=own_run.store)
     assert answer.code == 2
     assert "nothing ties the frame of synthetic/street-0005 to that of" in answer.err
+
+
+def test_a_run_that_is_joined_to_itself_stays_as_large_as_it_is(own_run, monkeypatch):
+    monkeypatch.setattr("lidarpainter_models.editing.joins.FINER", 0.5)  # it looked well enough
+    told = succeed("edit", own_run.run_id, "join", own_run.run_id, "--json", store=own_run.store)
+    joined = open_run(own_run.store, told.json["run_id"])
+    assert [one["op"] for one in told.json["change"]["parameters"]["operations"]] == ["join"]
+    sizes = [
+        len(load_scene(own_run.store, run.final.gaussians).gaussians)
+        for run in (open_run(own_run.store, own_run.run_id), joined)
+    ]
+    assert sizes[1] == pytest.approx(sizes[0], rel=0.05)
