@@ -23,6 +23,7 @@ from lidarpainter_models.editing.operations import (
     Freeze,
     Insert,
     Join,
+    Lamps,
     Move,
     Operation,
     Remove,
@@ -34,6 +35,7 @@ from lidarpainter_models.editing.operations import (
 )
 from lidarpainter_models.editing.worlds import EditedWorld, as_moving
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.gaussians.model.styling.scene_style import LampChange
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.lidar.collisions import Collision, MovingBody, find_collisions
 from lidarpainter_models.lidar.lidar_map import LidarMap
@@ -111,10 +113,10 @@ def _edited_once(
         return _inserted(world, operation, _model(world, operation.source, models))
     if isinstance(operation, Freeze):
         return _frozen(world, operation)
+    if isinstance(operation, Lamps):
+        return _switched(world, operation)
     if isinstance(operation, Remove):
-        for name in operation.actors:
-            world = world.without(world.find(name))
-        return world
+        return _removed(world, operation)
     return _put_elsewhere(world, operation, models)
 
 
@@ -190,6 +192,35 @@ def _inserted(world: EditedWorld, operation: Insert, model: ActorModel) -> Edite
     if not way.is_recorded:
         track = rerouted(track, way, world.log, world.ground, world.path_of)
     return world.with_actor(model, track)
+
+
+def _removed(world: EditedWorld, operation: Remove) -> EditedWorld:
+    for name in operation.actors:
+        world = world.without(world.find(name))
+    return world
+
+
+def _switched(world: EditedWorld, operation: Lamps) -> EditedWorld:
+    """The world with an actor's lamps switched; a parked car gets a body, and so lamps."""
+    track, log = world.find(operation.actor), world.log
+    last_ns = log.end_ns
+    if operation.until_s is not None:
+        last_ns = log.time_ns(operation.until_s, "until_s")
+    change = LampChange(
+        actor_id=track.actor_id,
+        state=operation.state,
+        first_ns=log.time_ns(operation.from_s, "from_s"),
+        last_ns=last_ns,
+    )
+    if change.first_ns > change.last_ns:
+        raise ConfigError("expected from_s <= until_s")
+    changes = [change]
+    if track in world.parked:
+        dark = replace(change, state="off", first_ns=log.start_ns, last_ns=log.end_ns)
+        model = world.model_of(track)
+        world = world.without(track).with_recorded_actor(model, as_moving(track, log))
+        changes = [dark, change]
+    return replace(world, lamps=(*world.lamps, *changes))
 
 
 def _frozen(world: EditedWorld, operation: Freeze) -> EditedWorld:

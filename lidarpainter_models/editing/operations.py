@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.gaussians.model.styling.scene_style import LampState
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.weather.mix import StyleMix
 
@@ -144,6 +145,17 @@ class Freeze(_Words):
     at_s: _Seconds
 
 
+class Lamps(_Words):
+    """Switch an actor's lamps at night, and let it brake; of a parked car they are off before."""
+
+    op: Literal["lamps"]
+    actor: _Name
+    state: LampState
+    from_s: _Seconds = 0.0
+    until_s: _Seconds | None = None
+    """The end of the log if absent."""
+
+
 class Crop(_Words):
     """Keep a stretch of road only, counted along the ego's path."""
 
@@ -202,7 +214,19 @@ class Style(_Words):
 
 
 Operation = Annotated[
-    Remove | Move | Insert | Swap | Scale | Retime | Stop | Freeze | Crop | Join | Drive | Style,
+    Remove
+    | Move
+    | Insert
+    | Swap
+    | Scale
+    | Retime
+    | Stop
+    | Lamps
+    | Freeze
+    | Crop
+    | Join
+    | Drive
+    | Style,
     Field(discriminator="op"),
 ]
 _SCRIPT: TypeAdapter[tuple[Operation, ...]] = TypeAdapter(

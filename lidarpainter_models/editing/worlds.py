@@ -19,6 +19,7 @@ from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.placing import carried_gaussians
+from lidarpainter_models.gaussians.model.styling.scene_style import LampChange
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
@@ -56,6 +57,8 @@ class EditedWorld:
     """Where somebody was who is not there any more; `is_moving` as recorded."""
     came: tuple[ActorTrack, ...] = ()
     """Where somebody is who was not there."""
+    lamps: tuple[LampChange, ...] = ()
+    """What was switched, in order."""
 
     @cached_property
     def moving(self) -> tuple[ActorTrack, ...]:

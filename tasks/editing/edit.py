@@ -24,6 +24,7 @@ from lidarpainter_models.editing.operations import (
     ActorSource,
     Insert,
     Join,
+    Lamps,
     Move,
     Operation,
     Style,
@@ -33,6 +34,7 @@ from lidarpainter_models.editing.worlds import EditedWorld
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene, describe
 from lidarpainter_models.gaussians.model.ply_files import read_ply
+from lidarpainter_models.gaussians.model.styling.scene_style import LampChange
 from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.geometry.transforms import invert_rigid
@@ -71,14 +73,30 @@ class Edits:
                 found |= {f"waypoints-{number}": digest_file(path) for path in way.files}
         return found
 
+    @property
+    def style(self) -> Style | None:
+        """The last one that is asked for."""
+        return next((one for one in reversed(self.operations) if isinstance(one, Style)), None)
+
     def world(self) -> EditedWorld:
         """The run as it is after them.
 
         Raises:
             ConfigError: an operation cannot be done.
         """
+        if any(isinstance(one, Lamps) for one in self.operations):
+            self._require_night()
         before = opened_world(self.store, self.source)
         return edited(before, self.operations, self._models(), self._others())
+
+    def _require_night(self) -> None:
+        worn = load_scene(self.store, self.source.final.gaussians).style
+        mix = self.style.mix if self.style else worn.mix if worn else None
+        if mix is None or "night" not in {share.prompt for share in mix.shares}:
+            raise ConfigError(
+                "lamps are seen at night alone: expected a style with night, among the operations "
+                "or in the run"
+            )
 
     def _models(self) -> Mapping[ActorSource, ActorModel]:
         """What actors of other runs and of files look like."""
@@ -218,7 +236,7 @@ def _build(
     world = edits.world()
     paints = painter.name != NO_PAINTER
     found = filled(world, conditions, painter.load(device) if paints else None)
-    scene = _styled(found.scene, edits)
+    scene = _styled(found.scene, edits, world.lamps)
     save_scene(place.output, scene, [])
     write_tensors(place.output / FILLED_FILE, {"confidence": found.confidence}, {})
     mean = float(found.confidence.mean()) if len(found.confidence) else None
@@ -230,14 +248,19 @@ def _build(
     }
 
 
-def _styled(scene: GaussianScene, edits: Edits) -> GaussianScene:
+def _styled(scene: GaussianScene, edits: Edits, lamps: tuple[LampChange, ...]) -> GaussianScene:
     """The edited scene in the style that it is put in, or else in that of its source."""
     store, final = edits.store, edits.source.final
-    style = next((one for one in reversed(edits.operations) if isinstance(one, Style)), None)
+    before, style = load_scene(store, final.gaussians).style, edits.style
     if style is None:
-        return replace(scene, style=load_scene(store, final.gaussians).style)
-    seen, recorded = load_observations(store, final.observations), edits.source.scene_id
-    return styled_scene(scene, seen, open_scene(store, recorded), style.mix, seed=style.seed)
+        scene = replace(scene, style=before)
+    else:
+        seen, recorded = load_observations(store, final.observations), edits.source.scene_id
+        scene = styled_scene(scene, seen, open_scene(store, recorded), style.mix, seed=style.seed)
+    if scene.style is None:
+        return scene
+    known = () if before is None else before.lamps
+    return replace(scene, style=replace(scene.style, lamps=(*known, *lamps)))
 
 
 def _build_observations(place: Workplace, _progress: Progress, *, edits: Edits) -> dict[str, Any]:

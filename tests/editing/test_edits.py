@@ -26,6 +26,7 @@ from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 
 TIMES_NS = torch.arange(4) * FRAME_NS
 GROUND_M = -0.1
+PARKED_POSE = rigid_from_tangent(torch.tensor([0, 0, 0, 5.0, 3.0, 0.5]).double())
 
 
 def ground(step_m=0.1):
@@ -145,10 +146,11 @@ def test_the_light_of_another_scene_is_taken_and_given_back(world):
     assert float(gain[0]) == pytest.approx(MAX_CAST * brightness, rel=0.02)
 
 
-def test_the_road_under_a_removed_parked_car_is_mended(world):
+@pytest.fixture(scope="module")
+def standing(world):
     """A dark car stands on a road that nobody saw under it."""
     size_m = torch.tensor([3.0, 1.6, 1.2])
-    pose = rigid_from_tangent(torch.tensor([0, 0, 0, 5.0, 3.0, 0.5]).double())
+    pose = PARKED_POSE
     parked = replace(
         world.moving[0],
         actor_id="parked",
@@ -167,17 +169,20 @@ def test_the_road_under_a_removed_parked_car_is_mended(world):
     gaussians = scene.gaussians.select(seen).append(round_gaussians(car_m, dark, sigma_m=0.1))
     wall = len(street) - len(ground())
     points = street.keep(torch.cat([torch.arange(wall), wall + (~hidden).nonzero()[:, 0]]))
-    standing = replace(
+    return replace(
         world,
         scene=scene.with_gaussians(gaussians),
         fitted=scene.with_gaussians(gaussians),
         lidar_map=LidarMap(street=points, actors=world.lidar_map.actors),
         parked=(parked,),
     )
+
+
+def test_the_road_under_a_removed_parked_car_is_mended(standing):
     after = done(standing, {"op": "remove", "actors": ["parked"]})
     mended = filled(after, ConditionConfig(num_references=1, num_sources=1), None)
     camera = camera_at(0.0)
-    above = camera.at(pose @ torch.diag(torch.tensor([1.0, -1, -1, 1])).double())
+    above = camera.at(PARKED_POSE @ torch.diag(torch.tensor([1.0, -1, -1, 1])).double())
     above.world_from_camera[2, 3] = 4.0
     bare, whole = (one.render(above, 0) for one in (after.scene, mended.scene))
     middle = (slice(20, 28), slice(28, 36))
@@ -185,6 +190,25 @@ def test_the_road_under_a_removed_parked_car_is_mended(world):
     assert float(whole.alpha[middle].min()) > 0.8
     assert torch.allclose(whole.rgb[middle], torch.tensor(0.4), atol=0.08)
     assert 0 < float(mended.confidence.min()) <= float(mended.confidence.max()) < 1
+
+
+def test_lamps_are_switched_from_a_time_on(world):
+    after = done(world, {"op": "lamps", "actor": "car", "state": "brake", "from_s": 0.1})
+    (change,) = after.lamps
+    assert (change.actor_id, change.state) == ("car", "brake")
+    assert (change.first_ns, change.last_ns) == (FRAME_NS, int(TIMES_NS[-1]))
+    assert after.scene is world.scene
+
+
+def test_a_parked_car_whose_lamps_are_switched_has_none_before(standing):
+    operation = {"op": "lamps", "actor": "parked", "state": "on", "from_s": 0.1, "until_s": 0.2}
+    after = done(standing, operation)
+    assert [(one.state, one.first_ns) for one in after.lamps] == [("off", 0), ("on", FRAME_NS)]
+    assert after.parked == ()
+    assert torch.allclose(places(after, "parked"), PARKED_POSE[:3, 3].expand(4, 3))
+    own = len(standing.rows_of(standing.parked[0]))
+    assert len(after.rows_of(after.find("parked"))) == own > 100
+    assert not encounters(after)  # it stands where it stood
 
 
 def test_painters_do_not_see_what_was_recorded_where_somebody_was(world):
@@ -219,6 +243,10 @@ def test_who_is_moved_into_a_wall_is_found(world):
         (
             {"op": "insert", "name": "car", "source": {"actor": "car"}},
             "'car' is there already, expected a new name",
+        ),
+        (
+            {"op": "lamps", "actor": "car", "state": "on", "from_s": 0.2, "until_s": 0.1},
+            "operation 1, lamps: expected from_s <= until_s",
         ),
         ({"op": "crop", "from_m": 500, "to_m": 600}, "nothing stands from 500 to 600 m"),
         (

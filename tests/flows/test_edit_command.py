@@ -29,7 +29,8 @@ def test_one_script_takes_out_moves_puts_in_and_shows(own_run, ahead, tmp_path):
         {"op": "re-route", "actor": "guest", "trajectory": f"waypoints:{places}"},
         {"op": "remove", "actors": [ahead]},
         {"op": "drive", "trajectory": "lateral:1"},
-        {"op": "style", "prompt": "foggy"},
+        {"op": "lamps", "actor": "guest", "state": "brake"},
+        {"op": "style", "prompt": "foggy+night:0.5"},
     ]
     script.write_text(json.dumps(operations))
     words = ("edit", own_run.run_id, "--script", script, "--allow-collisions", "--json")
@@ -38,7 +39,8 @@ def test_one_script_takes_out_moves_puts_in_and_shows(own_run, ahead, tmp_path):
     seen_image(tmp_path / "shown" / "0000.png", WIDTH_PX, HEIGHT_PX)
     run = open_run(own_run.store, first["run_id"])
     scene = load_scene(own_run.store, run.final.gaussians)
-    assert scene.style.mix.text == "foggy:1"
+    assert scene.style.mix.text == "foggy:1+night:0.5"
+    assert [change.actor_id for change in scene.style.lamps] == ["guest"]
     names = [track.actor_id for track in scene.tracks]
     assert "guest" in names
     assert ahead not in names
@@ -69,6 +71,8 @@ def test_edits_of_an_edited_run_are_added_to_its_list(own_run, ahead):
         (("move", "trajectory=lateral:2"), "move takes one name, got none"),
         (("stop", AHEAD, "at_s=soon"), "at_s=soon: expected a number"),
         (("stop", AHEAD, "at_s=nan"), "finite number"),
+        (("lamps", AHEAD, "state=blue"), "state: Input should be 'off', 'on' or 'brake'"),
+        (("lamps", AHEAD, "state=off"), "lamps are seen at night alone: expected a style"),
         (("fly", AHEAD), "does not match any of the expected"),
         (("insert", "new", "source.ply=nowhere.ply"), "no file nowhere.ply"),
         (("insert", "new", "source.run=nobody", "source.actor=a"), "no run_id 'nobody'"),

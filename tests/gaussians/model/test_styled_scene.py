@@ -17,6 +17,7 @@ from styled_world import (
 )
 
 from lidarpainter_models.gaussians.model.stored_scene import scene_from_arrays, scene_to_arrays
+from lidarpainter_models.gaussians.model.styling.scene_style import LampChange
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.weather.light import luminance, to_linear
 
@@ -105,6 +106,31 @@ def test_a_car_seen_from_behind_shows_red_and_from_ahead_white(clear):
     assert float(scene.render(ahead, 0).rgb.amin(dim=-1).max()) > 0.9
 
 
+def switched(clear, *states, last_ns=10 * FRAME_NS):
+    """A night in which the car's lamps do one thing after the other said, up to a time."""
+    night = styled("night", scene=clear)
+    changes = [
+        LampChange(actor_id="car", state=state, first_ns=0, last_ns=last_ns) for state in states
+    ]
+    return replace(night, style=replace(night.style, lamps=tuple(changes)))
+
+
+def test_lamps_do_what_they_are_told_as_long_as_they_are(clear):
+    behind, above = camera_at(0.0), camera_above(15.0)
+    usual = styled("night", scene=clear)
+    off, brake = (switched(clear, state, last_ns=FRAME_NS) for state in ("off", "brake"))
+    dark, red, bright = (
+        float(one.render(behind, 0).rgb[..., 0].sum()) for one in (off, usual, brake)
+    )
+    assert bright > 1.05 * red > 1.1 * dark
+    beam = [float(light_of(one.render(above, 0)).sum()) for one in three]
+    assert beam[0] < 0.9 * beam[1]
+    assert beam[2] >= beam[1]
+    for scene in (off, brake, switched(clear, "off", "on")):
+        again = scene.render(behind, 2 * FRAME_NS).rgb
+        assert torch.equal(again, usual.render(behind, 2 * FRAME_NS).rgb)
+
+
 def test_night_falls_while_the_log_passes(clear):
     camera = camera_at(0.0)
     falling, night = styled("night:0..1", scene=clear), styled("night", scene=clear)
@@ -136,10 +162,12 @@ def test_a_baked_scene_shows_the_style_without_having_it(clear, text):
 def test_a_style_is_stored_with_its_scene(clear):
     camera = camera_at(0.0)
     scene = styled(WHOLE_MIX, scene=clear)
+    scene = replace(scene, style=replace(scene.style, lamps=switched(clear, "off").style.lamps))
     arrays, metadata = scene_to_arrays(scene)
     again = scene_from_arrays(arrays, metadata)
     assert again.style is not None
     assert again.style.mix == scene.style.mix
+    assert again.style.lamps == scene.style.lamps
     assert torch.equal(again.render(camera, 0).rgb, scene.render(camera, 0).rgb)
 
 

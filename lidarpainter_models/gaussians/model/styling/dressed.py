@@ -76,7 +76,7 @@ class DressedScene:
                 drawn.rgb,
                 drawn.depth_m,
                 camera,
-                heads_at(self.style.place, self._cars, *poses),
+                heads_at(self.style.place, self._cars, *poses, timestamp_ns),
                 strength=night,
                 extinction_per_m=light.surroundings.extinction_per_m,
             )
@@ -172,4 +172,4 @@ class DressedScene:
 
     @cached_property
     def _cars(self) -> CarLamps:
-        return CarLamps.of(self.actors)
+        return CarLamps.of(self.actors, self.style.lamps)

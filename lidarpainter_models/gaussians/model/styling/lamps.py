@@ -4,6 +4,7 @@ Every moving actor as long as a car has dipped headlamps and tail lamps, at the 
 where cars have them; so has the car that recorded. They go where their box goes.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.gaussians.model.actors import Actors
-from lidarpainter_models.gaussians.model.styling.scene_style import StyledPlace
+from lidarpainter_models.gaussians.model.styling.scene_style import LampChange, StyledPlace
 from lidarpainter_models.kernels.scene_light import Lamps
 from lidarpainter_models.weather.darkness import (
     BEAM,
@@ -32,6 +33,8 @@ INSET_M = 0.25
 HEADLAMP_RADIANCE, TAIL_RADIANCE = 150.0, 12.0
 HEADLAMP_RADIUS_M, TAIL_RADIUS_M, LAMP_RADIUS_M = 0.08, 0.07, 0.12
 TAIL_RGB = (1.0, 0.06, 0.03)
+BRAKE = 15.0
+"""Brake lamps against tail lamps: 60 to 185 cd and 4 to 12 cd (UN Regulation 7)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,14 +57,18 @@ class CarLamps:
     forward: Float[Tensor, " cars"]
     """1, or -1 for a box that drives backwards."""
     size_m: Float[Tensor, "cars 3"]
+    changes: tuple[tuple[LampChange, ...], ...]
+    """Of each car."""
 
     @classmethod
-    def of(cls, actors: Actors) -> "CarLamps":
-        """Those of actors that move and are as long as a car."""
-        cars, forward, sizes = [], [], []
+    def of(cls, actors: Actors, changes: Sequence[LampChange] = ()) -> "CarLamps":
+        """Those of actors that move and are as long as a car, and of whom changes speak of."""
+        cars, forward, sizes, own = [], [], [], []
         for number, track in enumerate(actors.recorded_tracks):
-            if not track.is_moving or float(track.size_m[0]) < LEAST_CAR_M:
+            told = tuple(change for change in changes if change.actor_id == track.actor_id)
+            if not told and (not track.is_moving or float(track.size_m[0]) < LEAST_CAR_M):
                 continue
+            own.append(told)
             path = track.world_from_box[-1, :3, 3] - track.world_from_box[0, :3, 3]
             middle = track.world_from_box[len(track.world_from_box) // 2, :3, 0]
             cars.append(number)
@@ -71,7 +78,18 @@ class CarLamps:
             actor=torch.tensor(cars, dtype=torch.int64),
             forward=torch.tensor(forward, dtype=torch.float64),
             size_m=torch.stack(sizes) if sizes else torch.zeros(0, 3, dtype=torch.float64),
+            changes=tuple(own),
         )
+
+    def brightness(self, timestamp_ns: int) -> Float[Tensor, "cars 2"]:
+        """Of headlamps and of tail lamps at a time: 0 off, 1 on."""
+        shining = {"off": (0.0, 0.0), "on": (1.0, 1.0), "brake": (1.0, BRAKE)}
+        told = [
+            [one.state for one in own if one.first_ns <= timestamp_ns <= one.last_ns]
+            for own in self.changes
+        ]
+        rows = [shining[states[-1] if states else "on"] for states in told]
+        return torch.tensor(rows, dtype=torch.float64).reshape(-1, 2)
 
     def _corners(self, ahead: float, height_m: float) -> Float[Tensor, "cars 2 3"]:
         """Left and right place at one end of each box, at a height above its floor."""
@@ -146,7 +164,7 @@ def lamps_at(
     """All lamps that light anything at a time; fixed ones are those already in the street."""
     like = fixed.position_world
     position, heading = cars.beams(world_from_actor)
-    is_here = present[cars.actor] > 0
+    is_here = (present[cars.actor] > 0) & (cars.brightness(timestamp_ns)[:, 0] > 0)
     ego_position, ego_heading = ego_beam(place, timestamp_ns)
     positions = torch.cat([position[is_here].to(like), ego_position[None].to(like)])
     headings = torch.cat([heading[is_here].to(like), ego_heading[None].to(like)])
@@ -166,20 +184,21 @@ def heads_at(
     cars: CarLamps,
     world_from_actor: Float[Tensor, "actors 4 4"],
     present: Float[Tensor, " actors"],
+    timestamp_ns: int,
 ) -> LampHeads:
     """All lamps that may shine into a camera; those of the car that recorded are never seen."""
     like = place.lamp_rgb
     of_cars = cars.heads(world_from_actor, like)
-    is_here = (present[cars.actor] > 0).repeat_interleave(4).to(like.device)
+    bright = cars.brightness(timestamp_ns).repeat_interleave(2, dim=1).flatten().to(like)
+    is_here = (present[cars.actor] > 0).repeat_interleave(4).to(like.device) & (bright > 0)
+    radiance = of_cars.radiance_rgb * bright[:, None]
     standing = len(place.lamp_position)
     return LampHeads(
         position_world=torch.cat([place.lamp_position, of_cars.position_world[is_here]]),
         heading_world=torch.cat(
             [torch.zeros_like(place.lamp_position), of_cars.heading_world[is_here]]
         ),
-        radiance_rgb=torch.cat(
-            [place.lamp_radiance[:, None] * place.lamp_rgb, of_cars.radiance_rgb[is_here]]
-        ),
+        radiance_rgb=torch.cat([place.lamp_radiance[:, None] * place.lamp_rgb, radiance[is_here]]),
         radius_m=torch.cat([like.new_full((standing,), LAMP_RADIUS_M), of_cars.radius_m[is_here]]),
     )
 

@@ -4,14 +4,37 @@ Everything else follows from the Gaussians as they are, so an edited scene keeps
 z up, metres; light is linear, in units of display white.
 """
 
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, Literal, get_args
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.weather.mix import StyleMix, StyleShare
+
+LampState = Literal["off", "on", "brake"]
+"""Of a car: dark, headlamps and tail lamps, or these and brake lamps."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LampChange:
+    """What an actor's lamps do from one time to another, instead of what they did."""
+
+    actor_id: str
+    state: LampState
+    first_ns: int
+    last_ns: int
+
+    def __post_init__(self) -> None:
+        """Refuse a state that there is not.
+
+        Raises:
+            ConfigError: it is none.
+        """
+        if self.state not in get_args(LampState):
+            raise ConfigError(f"lamps {self.state!r}, expected {', '.join(get_args(LampState))}")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -63,6 +86,8 @@ class SceneStyle:
     seed: int
     """Decides where puddles stand."""
     place: StyledPlace
+    lamps: tuple[LampChange, ...] = ()
+    """Of actors; where two speak of one time the later one holds."""
 
     def strengths(self, timestamp_ns: int) -> dict[str, float]:
         """The strength of every style that changes anything at a time."""
@@ -75,7 +100,12 @@ class SceneStyle:
     def metadata(self) -> dict[str, Any]:
         """All but the tensors, as JSON types."""
         shares = [[share.prompt, share.first, share.last] for share in self.mix.shares]
-        return {"shares": shares, "visibility_m": self.mix.visibility_m, "seed": self.seed}
+        return {
+            "shares": shares,
+            "visibility_m": self.mix.visibility_m,
+            "seed": self.seed,
+            "lamps": [asdict(change) for change in self.lamps],
+        }
 
 
 def style_from_arrays(arrays: dict[str, Tensor], metadata: dict[str, Any]) -> SceneStyle:
@@ -93,4 +123,5 @@ def style_from_arrays(arrays: dict[str, Tensor], metadata: dict[str, Any]) -> Sc
         mix=StyleMix(shares=shares, visibility_m=float(metadata["visibility_m"])),
         seed=int(metadata["seed"]),
         place=StyledPlace(**arrays),
+        lamps=tuple(LampChange(**change) for change in metadata.get("lamps", ())),
     )
