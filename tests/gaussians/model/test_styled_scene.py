@@ -119,9 +119,8 @@ def test_lamps_do_what_they_are_told_as_long_as_they_are(clear):
     behind, above = camera_at(0.0), camera_above(15.0)
     usual = styled("night", scene=clear)
     off, brake = (switched(clear, state, last_ns=FRAME_NS) for state in ("off", "brake"))
-    dark, red, bright = (
-        float(one.render(behind, 0).rgb[..., 0].sum()) for one in (off, usual, brake)
-    )
+    three = (off, usual, brake)
+    dark, red, bright = (float(one.render(behind, 0).rgb[..., 0].sum()) for one in three)
     assert bright > 1.05 * red > 1.1 * dark
     beam = [float(light_of(one.render(above, 0)).sum()) for one in three]
     assert beam[0] < 0.9 * beam[1]
