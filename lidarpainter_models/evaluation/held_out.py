@@ -10,10 +10,10 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from lidarpainter_models.evaluation.judged_views import JudgedView, actors_in_view
+from lidarpainter_models.evaluation.judged_views import NOBODY, JudgedView, actors_in_view
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.shifts import Shift
@@ -83,8 +83,14 @@ class HeldOut:
 
     def recorded_views(self, fitted: GaussianScene, poses: Poses) -> list[JudgedView]:
         """The held-out images."""
+        bodies = fitted.cameras.own_bodies
         return [
-            self._judged(view, self.camera_of(fitted, view, poses), self.image_of(view))
+            self._judged(
+                view,
+                self.camera_of(fitted, view, poses),
+                self.image_of(view),
+                bodies.get(view.camera_name),
+            )
             for view in self.test_views
         ]
 
@@ -99,9 +105,15 @@ class HeldOut:
         return judged
 
     def _judged(
-        self, view: RecordedView, camera: Camera, truth_rgb: Float[Tensor, "height width 3"]
+        self,
+        view: RecordedView,
+        camera: Camera,
+        truth_rgb: Float[Tensor, "height width 3"],
+        hidden: Bool[Tensor, "height width"] | None = None,
     ) -> JudgedView:
         actor_ids, actor_index = actors_in_view(camera, self._moving, view.timestamp_ns)
+        if hidden is not None:
+            actor_index[hidden] = NOBODY
         return JudgedView(
             name=f"{view.camera_name}/{view.frame_index}",
             camera=camera,
@@ -109,4 +121,5 @@ class HeldOut:
             truth_rgb=truth_rgb,
             actor_ids=actor_ids,
             actor_index=actor_index,
+            hidden=hidden,
         )

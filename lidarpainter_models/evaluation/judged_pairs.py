@@ -37,14 +37,15 @@ class JudgedPairs:
         return len(self.held_out.test_views)
 
     def read(self, index: int) -> PaintingPair:
-        """The pair of a held-out view; all of its target is known."""
+        """The pair of a held-out view; its target is known but for the recording car."""
         view = self.held_out.test_views[index]
         judged = self._judged(view)
         conditions = self.builder.conditions(
             judged.camera, judged.timestamp_ns, camera_name=view.camera_name
         )
         truth = judged.truth_rgb.clamp(0, 1)
-        known = torch.ones(truth.shape[:2], dtype=torch.bool)
+        everywhere = torch.ones(truth.shape[:2], dtype=torch.bool)
+        known = everywhere if judged.hidden is None else ~judged.hidden
         return PaintingPair(conditions=conditions, target_rgb=truth, target_valid=known)
 
     def _judged(self, view: RecordedView) -> JudgedView:

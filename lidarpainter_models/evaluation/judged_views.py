@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.geometry.box_masks import box_outlines
@@ -43,6 +43,8 @@ class JudgedView:
     """The moving actors that are there."""
     actor_index: Int[Tensor, "height width"]
     """Whose projected box is in front, by position in `actor_ids`, or `NOBODY`."""
+    hidden: Bool[Tensor, "height width"] | None = None
+    """Where the truth shows the recording car itself: not judged."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,7 +98,10 @@ def score_views(
     *,
     distances: PerceptualDistances,
 ) -> ViewScores | None:
-    """Render every view and average its scores; None without views."""
+    """Render every view and average its scores; None without views.
+
+    Perceptual distances take the truth for what is hidden.
+    """
     if not views:
         return None
     scores: list[ImageScores] = []
@@ -107,7 +112,10 @@ def score_views(
         image = render(view.camera, view.timestamp_ns).clamp(0, 1)
         truth = view.truth_rgb.to(image.device)
         is_actor = (view.actor_index != NOBODY).to(image.device)
-        scores.append(score_image(image, truth, is_actor))
+        hidden = None if view.hidden is None else view.hidden.to(image.device)
+        if hidden is not None:
+            image = torch.where(hidden[..., None], truth, image)
+        scores.append(score_image(image, truth, is_actor, hidden=hidden))
         for actor_id, errors in _actor_errors(image, truth, view).items():
             of_actors.setdefault(actor_id, []).append(errors)
         if distances.features is not None:

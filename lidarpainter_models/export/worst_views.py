@@ -38,7 +38,9 @@ def worst_views(held_out: HeldOut, fitted: GaussianScene) -> list[WorstView]:
         camera = held_out.camera_of(fitted, view, "interpolated")
         rendered = fitted.render(camera, view.timestamp_ns, camera_name=view.camera_name)
         rgb, truth = rendered.rgb.clamp(0, 1).cpu(), held_out.image_of(view)
-        psnr = score_image(rgb, truth).psnr_db
+        hidden = fitted.cameras.own_bodies.get(view.camera_name)
+        judged = rgb if hidden is None else torch.where(hidden[..., None], truth, rgb)
+        psnr = score_image(judged, truth, hidden=hidden).psnr_db
         title = f"frame {view.frame_index}, {view.camera_name}: {psnr:.1f} dB"
         found.append((psnr, WorstView(title=title, rendered_rgb=rgb, truth_rgb=truth)))
         found = sorted(found, key=lambda pair: pair[0])[:NUM_SHOWN]

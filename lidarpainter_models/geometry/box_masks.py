@@ -63,7 +63,7 @@ def box_outlines(
 def project_boxes(
     camera: Camera,
     world_from_boxes: Float[Tensor, "actors 4 4"],
-    sizes_m: Sequence[Float[Tensor, "3"]],
+    sizes_m: Sequence[Float[Tensor, "3"]] | Float[Tensor, "actors 3"],
     present: Bool[Tensor, " actors"],
     *,
     margin: float = 1.1,

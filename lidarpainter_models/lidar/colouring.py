@@ -13,7 +13,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
@@ -80,8 +80,19 @@ class MapColouring:
         self._view_numbers = {view.key: number for number, view in enumerate(views)}
         self._placed = place_actors(views, tracks)
 
-    def add(self, view: RecordedView, image: UInt8[Tensor, "height width 3"]) -> None:
-        """Take samples from the recorded image of one of the views."""
+    def add(
+        self,
+        view: RecordedView,
+        image: UInt8[Tensor, "height width 3"],
+        hidden: Bool[np.ndarray, "rows columns"] | None = None,
+    ) -> None:
+        """Take samples from the recorded image of one of the views, none from hidden pixels.
+
+        Args:
+            view: which one.
+            image: as it was recorded.
+            hidden: what shows nothing of the map, on any grid over the image.
+        """
         actors = self._placed[view.key]
         image = _shrunk(image)
         camera = view.camera.resized(width_px=image.shape[1], height_px=image.shape[0])
@@ -95,6 +106,10 @@ class MapColouring:
         is_visible = visible_points(
             inside.cells_uv, inside.depth_m, visibility, tolerance=HIDDEN_TOLERANCE
         )
+        if hidden is not None:
+            size = torch.tensor([grid.camera.width_px, grid.camera.height_px])
+            column, row = (inside.cells_uv * torch.tensor(hidden.shape[::-1]) // size).unbind(-1)
+            is_visible &= ~torch.from_numpy(hidden)[row, column]
         seen = inside.keep(is_visible.nonzero()[:, 0])
         footprint_px = seen.range_m * FOOTPRINT_RAD * camera.fx_px / seen.depth_m
         levels = ImageLevels(image, footprint_px)

@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lidarpainter_models.geometry.box_masks import project_boxes
+from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.kernels.box_owners import NO_BOX, box_owners
 from lidarpainter_models.scenes.tracks import PRESENCE_MARGIN_NS, ActorTrack, TrackPoses
@@ -61,6 +63,13 @@ class MovingBoxes:
         )
         present = present.to(boxes.device, non_blocking=True)
         return torch.where(boxes == NO_BOX, BACKGROUND, present[boxes])
+
+    def pixels(self, camera: Camera, timestamp_ns: int) -> Bool[Tensor, "height width"]:
+        """The pixels in which a box, slightly grown, is seen at a time."""
+        if self._size_m is None:
+            return torch.zeros(camera.height_px, camera.width_px, dtype=torch.bool)
+        present = self._poses.present(timestamp_ns)
+        return project_boxes(camera, self._poses.all_at(timestamp_ns), self._size_m, present)
 
     def moved(
         self,

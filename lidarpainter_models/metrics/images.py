@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarpainter_models.errors import ShapeError
-from lidarpainter_models.kernels.ssim import ssim
+from lidarpainter_models.kernels.ssim import ssim_map
 
 MIN_PIXELS = 100
 """Fewer samples than this do not pin twelve numbers down."""
@@ -55,13 +55,21 @@ def score_image(
     image: Float[Tensor, "height width 3"],
     truth: Float[Tensor, "height width 3"],
     mask: Bool[Tensor, "height width"] | None = None,
+    *,
+    hidden: Bool[Tensor, "height width"] | None = None,
 ) -> ImageScores:
-    """PSNR and SSIM of the whole image, and the error inside a mask."""
+    """PSNR and SSIM of the image where nothing is hidden, and the error inside a mask.
+
+    Where something is hidden the image must be the truth, which spoils no window of SSIM.
+    """
     error = squared_error(image, truth).double()
     inside = error[mask] if mask is not None else error.new_zeros(0)
+    similarity = ssim_map(image.clamp(0, 1).contiguous(), truth.contiguous())
+    if hidden is not None:
+        error, similarity = error[~hidden], similarity[~hidden]
     return ImageScores(
         psnr_db=psnr_from_error(float(error.mean())),
-        ssim=float(ssim(image.clamp(0, 1).contiguous(), truth.contiguous())),
+        ssim=float(similarity.mean()),
         masked_squared_error=float(inside.sum()),
         masked_pixels=inside.numel(),
     )

@@ -6,7 +6,7 @@ finds at the same place. What moves is left out: its pixels contradict the paral
 Moving actors get points on their boxes, all that is known of their shape.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -17,12 +17,12 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
-from lidarpainter_models.geometry.box_masks import project_boxes
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.colouring import BEAM_SPACING_RAD
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
+from lidarpainter_models.observations.own_body import on_grid
 from lidarpainter_models.observations.plane_sweep import sweep_cost, sweep_depths
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -62,15 +62,20 @@ class _Image:
     contrast: Float[Tensor, "height width 1"]
     """Brightness, its local mean and contrast taken out: exposures differ."""
     moves: Bool[Tensor, "height width"]
-    """Pixels of moving actors."""
+    """Pixels of moving actors and of the recording car."""
 
 
-def points_from_images(scene: DrivingScene, views: Sequence[RecordedView]) -> LidarMap:
+def points_from_images(
+    scene: DrivingScene,
+    views: Sequence[RecordedView],
+    own_bodies: Mapping[str, Bool[np.ndarray, "rows columns"]],
+) -> LidarMap:
     """Points of the street where images show it, and of moving actors on their boxes.
 
     Args:
         scene: where images and tracks are read from.
         views: images that may be used: those of the training set, no others.
+        own_bodies: what of a camera's images is the recording car, on any grid.
 
     Raises:
         SceneError: the images show no parallax that could be measured.
@@ -80,7 +85,12 @@ def points_from_images(scene: DrivingScene, views: Sequence[RecordedView]) -> Li
     parts = [
         part
         for name in scene.camera_names
-        for part in _of_camera(scene, boxes, [view for view in views if view.camera_name == name])
+        for part in _of_camera(
+            scene,
+            boxes,
+            [view for view in views if view.camera_name == name],
+            own_bodies.get(name),
+        )
     ]
     street = MapPoints.concatenate(parts)
     if len(street) == 0:
@@ -92,13 +102,16 @@ def points_from_images(scene: DrivingScene, views: Sequence[RecordedView]) -> Li
 
 
 def _of_camera(
-    scene: DrivingScene, boxes: MovingBoxes, views: Sequence[RecordedView]
+    scene: DrivingScene,
+    boxes: MovingBoxes,
+    views: Sequence[RecordedView],
+    own_body: Bool[np.ndarray, "rows columns"] | None,
 ) -> list[MapPoints]:
     """The points that each image of a camera gives."""
     images: list[_Image] = []
     for view in views[:: max(1, -(-len(views) // MOST_VIEWS_PER_CAMERA))]:
         if not images or _baseline_m(images[-1].view, view) >= LEAST_BASELINE_M:
-            images.append(_made_ready(view, scene.read_image(view), boxes))
+            images.append(_made_ready(view, scene.read_image(view), boxes, own_body))
     depths = [_swept_depth(images, place) for place in range(len(images))]
     confirmed = [torch.zeros_like(depth_m, dtype=torch.bool) for depth_m in depths]
     for first, second in pairwise(range(len(images))):
@@ -115,7 +128,10 @@ def _baseline_m(first: RecordedView, second: RecordedView) -> float:
 
 
 def _made_ready(
-    view: RecordedView, rgb_u8: UInt8[Tensor, "rows columns 3"], boxes: MovingBoxes
+    view: RecordedView,
+    rgb_u8: UInt8[Tensor, "rows columns 3"],
+    boxes: MovingBoxes,
+    own_body: Bool[np.ndarray, "rows columns"] | None,
 ) -> _Image:
     camera = fit_camera(view, WIDTH)
     small = shrink_image(rgb_u8, width_px=camera.width_px, height_px=camera.height_px)
@@ -123,15 +139,14 @@ def _made_ready(
     away = grey - cv2.GaussianBlur(grey, (0, 0), _CONTRAST_SIGMA_PX)
     spread = np.sqrt(cv2.GaussianBlur(away**2, (0, 0), _CONTRAST_SIGMA_PX))
     contrast = np.clip(away / (spread + 4), -_MOST_CONTRAST, _MOST_CONTRAST) / (2 * _MOST_CONTRAST)
-    moves = torch.zeros(grey.shape, dtype=torch.bool)
-    if placed := boxes.placed(view.timestamp_ns):
-        tracks, poses = zip(*placed, strict=True)
-        present = torch.ones(len(tracks), dtype=torch.bool)
-        moves = project_boxes(
-            camera, torch.stack(poses), [track.size_m for track in tracks], present
-        )
+    moves = boxes.pixels(camera, view.timestamp_ns)
+    if own_body is not None:
+        moves |= on_grid(own_body, width_px=camera.width_px, height_px=camera.height_px)
     return _Image(
-        view=view, camera=camera, contrast=torch.from_numpy(contrast)[..., None], moves=moves
+        view=view,
+        camera=camera,
+        contrast=torch.from_numpy(contrast)[..., None],
+        moves=moves,
     )
 
 

@@ -4,10 +4,11 @@ Only training views and the sweeps of training frames enter; without any sweep, 
 the images.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from jaxtyping import Float, UInt8
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
@@ -19,6 +20,7 @@ from lidarpainter_models.lidar.sky_masks import sky_mask
 from lidarpainter_models.lidar.sparse_depth import FramePoints, sparse_lidar_depth
 from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
 from lidarpainter_models.observations.image_points import points_from_images
+from lidarpainter_models.observations.own_body import on_grid, own_bodies
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
 from lidarpainter_models.scenes.camera_faults import CameraFault
@@ -39,6 +41,7 @@ def prepare_observations(
 ) -> SceneObservations:
     """Prepare what a fit on the split's training views needs, faults of the recording corrected.
 
+    Pixels of the recording car itself are hidden, and colour no point.
     The split's training views give images, its training frames give sweeps. `progress` counts the
     views, and the colours of the map.
 
@@ -49,10 +52,12 @@ def prepare_observations(
         raise SceneError(f"the split of {scene.dataset}/{scene.sequence} has no training views")
     faults = find_faults(scene, split.train) if config.corrects_cameras else {}
     taken = [_as_taken(view, faults) for view in split.train]
+    bodies = own_bodies(scene, taken)
+    hidden = {name: _at_fit_size(body, taken, name, config) for name, body in bodies.items()}
     if scene.has_lidar(split.train_frames):
         points = gather_points(scene, split.train_frames)
     else:
-        points = points_from_images(scene, taken)
+        points = points_from_images(scene, taken, bodies)
     colouring = MapColouring(points, scene.tracks, taken)
     lidar, views = FramePoints(scene), []
     for done, (recorded, view) in enumerate(zip(split.train, taken, strict=True), start=1):
@@ -61,8 +66,11 @@ def prepare_observations(
         if len(near) == 0:
             near = _nearest_in_time(points.street, view.timestamp_ns)
         made = _training_view(view, image, config, near=near, exposed=lidar.at_exposure(view))
+        if view.camera_name in hidden:
+            body = hidden[view.camera_name]
+            made = replace(made, hidden=body, sky_mask=made.sky_mask & ~body)
         views.append(replace(made, timestamp_ns=recorded.timestamp_ns))
-        colouring.add(view, image)
+        colouring.add(view, image, bodies.get(view.camera_name))
         if progress is not None:
             progress(done, len(split.train) + 1)
     lidar_map = colouring.coloured()
@@ -73,6 +81,7 @@ def prepare_observations(
         lidar_map=lidar_map,
         tracks=tuple(track for track in scene.tracks if track.is_moving),
         faults=faults,
+        own_bodies=hidden,
     )
 
 
@@ -83,6 +92,17 @@ def _as_taken(view: RecordedView, faults: Mapping[str, CameraFault]) -> Recorded
         return view
     camera = fault.corrected(view.camera)
     return replace(view, camera=camera, timestamp_ns=camera.taken_ns(view.timestamp_ns))
+
+
+def _at_fit_size(
+    body: Bool[np.ndarray, "rows columns"],
+    views: Sequence[RecordedView],
+    camera_name: str,
+    config: ObservationConfig,
+) -> Bool[Tensor, "height width"]:
+    """A camera's own body on the grid of its training views."""
+    camera = fit_camera(next(v for v in views if v.camera_name == camera_name), config)
+    return on_grid(body, width_px=camera.width_px, height_px=camera.height_px)
 
 
 def _nearest_in_time(street: MapPoints, timestamp_ns: int) -> Float[Tensor, "near 3"]:

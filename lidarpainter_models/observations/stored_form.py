@@ -30,11 +30,13 @@ def observations_to_arrays(
         [lidar_map.street, *(lidar_map.actors[name] for name in actor_ids)]
     ):
         arrays |= {f"map.{index}.{name}": value for name, value in part.to_arrays().items()}
+    bodies = observations.own_bodies
+    arrays |= {f"own_body.{name}": body.contiguous() for name, body in bodies.items()}
     records = []
     for index, view in enumerate(observations.views):
         for name in _IMAGES:
             arrays[f"view.{index}.{name}"] = getattr(view, name).contiguous()
-        if view.hidden is not None:
+        if view.hidden is not None and view.hidden is not bodies.get(view.key[1]):
             arrays[f"view.{index}.hidden"] = view.hidden.contiguous()
         arrays[f"view.{index}.world_from_camera"] = view.camera.world_from_camera.contiguous()
         lens = {name: getattr(view.camera, name) for name in _LENS}
@@ -76,7 +78,14 @@ def observations_from_arrays(
         )
         for index in range(len(metadata["map_actors"]) + 1)
     )
-    views = [_stored_view(arrays, index, row) for index, row in enumerate(metadata["views"])]
+    bodies = {
+        name.removeprefix("own_body."): body
+        for name, body in arrays.items()
+        if name.startswith("own_body.")
+    }
+    views = [
+        _stored_view(arrays, index, row, bodies) for index, row in enumerate(metadata["views"])
+    ]
     return SceneObservations(
         views=tuple(views),
         lidar_map=LidarMap(
@@ -84,11 +93,14 @@ def observations_from_arrays(
         ),
         tracks=tracks,
         faults=faults_from_records(metadata.get("faults", {})),
+        own_bodies=bodies,
     )
 
 
-def _stored_view(arrays: dict[str, Tensor], index: int, record: dict[str, Any]) -> TrainingView:
-    """One view of stored observations."""
+def _stored_view(
+    arrays: dict[str, Tensor], index: int, record: dict[str, Any], bodies: dict[str, Tensor]
+) -> TrainingView:
+    """One view of stored observations; what hides no more than its camera's body is stored once."""
     frame_index, camera_name = record["key"]
     images = {name: arrays[f"view.{index}.{name}"] for name in _IMAGES}
     told = record.get("shutter")
@@ -105,6 +117,6 @@ def _stored_view(arrays: dict[str, Tensor], index: int, record: dict[str, Any]) 
             **record["lens"],
         ),
         timestamp_ns=record["timestamp_ns"],
-        hidden=arrays.get(f"view.{index}.hidden"),
+        hidden=arrays.get(f"view.{index}.hidden", bodies.get(str(camera_name))),
         **images,
     )

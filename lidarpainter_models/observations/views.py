@@ -30,13 +30,18 @@ class TrainingView:
     lidar_depth_m: Float[Tensor, "height width"]
     """The own frame's sweeps, 0 where no point falls."""
     hidden: Bool[Tensor, "height width"] | None = None
-    """Where the image shows what an edited scene does not: no reference takes its colours from
-    there. None hides nothing."""
+    """Where the image shows what the scene does not hold: the recording car itself, or what an edit
+    took away. Nothing learns from there or takes its colours. None hides nothing."""
 
     @property
     def rgb(self) -> Float[Tensor, "height width 3"]:
         """The image as floats."""
         return self.rgb_u8.float() / 255
+
+    @property
+    def shows_surface(self) -> Bool[Tensor, "height width"]:
+        """Where the image shows something of the scene that is not sky."""
+        return ~self.sky_mask if self.hidden is None else ~(self.sky_mask | self.hidden)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,6 +79,8 @@ class SceneObservations:
     """Moving actors only."""
     faults: Mapping[str, CameraFault] = field(default_factory=dict)
     """What was wrong about the cameras' recordings; the views are corrected already."""
+    own_bodies: Mapping[str, Bool[Tensor, "height width"]] = field(default_factory=dict)
+    """Where cameras show the recording car itself, at fit size."""
 
     @property
     def camera_names(self) -> tuple[str, ...]:

@@ -186,6 +186,7 @@ def _left_out_targets(
             timestamp_ns=view.timestamp_ns,
             camera_name=view.key[1],
             true_rgb=view.rgb,
+            hidden=view.hidden,
             provenance=provenance | {"target": list(view.key)},
         )
         for view in aligned.views

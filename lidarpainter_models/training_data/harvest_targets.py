@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
@@ -39,6 +39,8 @@ class Target:
     """Whose exposure the true image has; None for that of the scene itself."""
     true_rgb: Float[Tensor, "height width 3"]
     provenance: dict[str, Any]
+    hidden: Bool[Tensor, "height width"] | None = None
+    """Where the true image shows the recording car itself."""
 
 
 def harvest_label(
@@ -101,10 +103,12 @@ def make_pair(builder: ConditionBuilder, target: Target) -> PaintingPair:
     conditions = builder.conditions(
         target.camera, target.timestamp_ns, camera_name=target.camera_name
     )
+    everywhere = torch.ones(conditions.height_width_px, dtype=torch.bool)
+    known = everywhere if target.hidden is None else ~target.hidden
     return PaintingPair(
         conditions=conditions,
         target_rgb=target.true_rgb,
-        target_valid=torch.ones(conditions.height_width_px, dtype=torch.bool),
+        target_valid=known,
     )
 
 

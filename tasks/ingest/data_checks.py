@@ -11,6 +11,7 @@ from lidarpainter_models.checks.doctor import check_scene, draw_overlay
 from lidarpainter_models.errors import LidarPainterError
 from lidarpainter_models.export.images import write_png
 from lidarpainter_models.lidar.recording_faults import find_faults
+from lidarpainter_models.observations.own_body import in_words, own_bodies
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from tasks.health import Finding
@@ -31,7 +32,7 @@ def check_stored_scene(store: Store, scene_id: str, out: Path | None) -> list[Fi
     path = out or store.root / "doctor" / scene.dataset / f"{scene.sequence}.png"
     if path.suffix != ".png":
         path = path / "overlay.png"
-    return _examined(scene, path, [*_findings(scene), _camera_faults(scene)])
+    return _examined(scene, path, [*_findings(scene), _camera_faults(scene), _own_bodies(scene)])
 
 
 def check_dataset(store: Store, dataset: str, root: Path, out: Path | None) -> list[Finding]:
@@ -78,6 +79,13 @@ def _camera_faults(scene: DrivingScene) -> Finding:
     if not said:
         return Finding("camera faults", "ok", "clocks, angles and readouts are as stored")
     return Finding("camera faults", "warn", f"{'; '.join(said)} in a fit")
+
+
+def _own_bodies(scene: DrivingScene) -> Finding:
+    """Which cameras show the recording car, which a fit leaves out."""
+    found = own_bodies(scene, scene.views)
+    said = [in_words(name, body) for name, body in found.items()]
+    return Finding("own body", "ok", " ".join(said) or "no camera shows the recording car")
 
 
 def _write_overlay(scene: DrivingScene, path: Path) -> Path:

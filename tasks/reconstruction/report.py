@@ -21,6 +21,7 @@ from lidarpainter_models.export.run_page import Pictures, RunPage, StageCost
 from lidarpainter_models.export.worst_views import worst_views, write_beside
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.shifts import Shift
+from lidarpainter_models.observations.own_body import in_words
 from tasks.evaluation.shown import view_time_painting
 from tasks.machine import machine
 from tasks.opened import OpenedRun, opened
@@ -122,7 +123,10 @@ def _pictures(subject: Subject, shifts: Sequence[Shift], progress: Progress) -> 
         moving=recorded_beside(held_out, fitted, beside),
         worst=worst_views(held_out, fitted),
         actor_gaussians=dict(zip(names, counts, strict=True)),
-        faults=[f"{name} {fault}." for name, fault in fitted.cameras.faults.items()],
+        faults=[
+            *(f"{name} {fault}." for name, fault in fitted.cameras.faults.items()),
+            *(in_words(name, body) for name, body in fitted.cameras.own_bodies.items()),
+        ],
     )
 
 

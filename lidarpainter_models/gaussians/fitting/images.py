@@ -26,6 +26,8 @@ class FitImage:
     kind: UInt8[Tensor, "height width"]
     """As in `PixelFacts`."""
     lidar_depth_m: Float[Tensor, "height width"]
+    hidden: Bool[Tensor, "height width"] | None = None
+    """Pixels that nothing is learnt from."""
 
     def to(self, device: torch.device) -> "FitImage":
         """The same image on another device, as far as it is not there."""
@@ -36,6 +38,7 @@ class FitImage:
             rgb_u8=self.rgb_u8.to(device, non_blocking=True),
             kind=self.kind.to(device, non_blocking=True),
             lidar_depth_m=self.lidar_depth_m.to(device, non_blocking=True),
+            hidden=None if self.hidden is None else self.hidden.to(device, non_blocking=True),
         )
 
     def facts(self) -> PixelFacts:
@@ -61,6 +64,7 @@ def full_image(
         rgb_u8=view.rgb_u8.contiguous(),
         kind=_kinds(view.camera, view.sky_mask, view.lidar_depth_m, may_be_sky),
         lidar_depth_m=view.lidar_depth_m.contiguous(),
+        hidden=view.hidden,
     )
 
 
@@ -83,6 +87,7 @@ def half_image(
         rgb_u8=shrink_image(view.rgb_u8, **size).contiguous(),
         kind=_kinds(camera, sky_mask, depth_m, may_be_sky),
         lidar_depth_m=depth_m.contiguous(),
+        hidden=None if view.hidden is None else _shrink_mask(view.hidden, **size, least=0.0),
     )
 
 
@@ -106,11 +111,11 @@ def above_horizon(camera: Camera) -> Bool[Tensor, "height width"]:
 
 
 def _shrink_mask(
-    mask: Bool[Tensor, "height width"], *, width_px: int, height_px: int
+    mask: Bool[Tensor, "height width"], *, width_px: int, height_px: int, least: float = 0.5
 ) -> Bool[Tensor, "rows columns"]:
-    """True where most of a cell of the coarser grid is."""
+    """True where more than that share of a cell of the coarser grid is."""
     share = cv2.resize(mask.float().numpy(), (width_px, height_px), interpolation=cv2.INTER_AREA)
-    return torch.from_numpy(share) > 0.5
+    return torch.from_numpy(share) > least
 
 
 def _kinds(

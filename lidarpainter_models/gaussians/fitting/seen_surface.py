@@ -60,7 +60,7 @@ def seen_surface(views: Sequence[TrainingView]) -> SeenSurface:
         of_camera.append([index])
         kept.append(view.camera)
         whole_views += share
-        num_pixels += share * int((~view.sky_mask).sum())
+        num_pixels += share * int(view.shows_surface.sum())
     return SeenSurface(
         num_pixels=num_pixels,
         whole_views=whole_views,
@@ -80,7 +80,7 @@ def _new_shares(view: TrainingView, earlier: Sequence[Camera]) -> Float[Tensor, 
 
 
 def _cells(view: TrainingView) -> tuple[Float[Tensor, "cells 3"], Float[Tensor, " cells"]]:
-    """A point for each cell of pixels that is not sky, and the footprint of a pixel there."""
+    """A point for each cell of pixels that shows surface, and the footprint of a pixel there."""
     grid = {
         "width_px": max(view.camera.width_px // CELL_PX, 1),
         "height_px": max(view.camera.height_px // CELL_PX, 1),
@@ -88,8 +88,8 @@ def _cells(view: TrainingView) -> tuple[Float[Tensor, "cells 3"], Float[Tensor, 
     depth_m = shrink_depth(view.lidar_depth_m, **grid)
     depth_m = depth_from_below(depth_m, fallback_m=FARTHEST_M)
     size = (grid["height_px"], grid["width_px"])
-    sky = torch.nn.functional.adaptive_avg_pool2d(view.sky_mask.float()[None], size)[0]
-    is_solid = sky < 0.5
+    shown = torch.nn.functional.adaptive_avg_pool2d(view.shows_surface.float()[None], size)[0]
+    is_solid = shown > 0.5
     points_world = view.camera.resized(**grid).unproject(depth_m)[is_solid]
     return points_world, depth_m[is_solid] / view.camera.fx_px
 

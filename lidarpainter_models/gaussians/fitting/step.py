@@ -98,6 +98,8 @@ def _recorded_step(
     sky_rgb = sky.sample(rays).requires_grad_(True)
     terms = pixel_terms(splat, sky_rgb, facts, _pixel_rules(config))
     shown = state.refinement.exposed(terms.shown, image)
+    if image.hidden is not None:
+        shown = torch.where(image.hidden[..., None], facts.rgb, shown)
     loss = l1_ssim_loss(shown, facts.rgb, ssim_weight=weights.ssim)
     if perceptual is not None and weights.perceptual > 0:
         loss = loss + weights.perceptual * perceptual(shown, facts.rgb)

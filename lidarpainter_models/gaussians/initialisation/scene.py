@@ -103,6 +103,7 @@ def _scene_around(gaussians: GaussianSet, observations: SceneObservations) -> Ga
             timestamps_ns,
             torch.stack([camera.world_from_camera.double() for camera in cameras]),
             observations.faults,
+            observations.own_bodies,
         ),
         exposure=ExposureCorrections.none(
             observations.camera_names, [view.timestamp_ns for view in views]

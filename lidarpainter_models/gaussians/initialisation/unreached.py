@@ -74,7 +74,7 @@ def _seeds_of_view(
 ) -> GaussianSet:
     """The Gaussians that one view asks for."""
     render = scene.render(view.camera, view.timestamp_ns)
-    is_open = (render.alpha < 0.5) & ~view.sky_mask & ~_moving(scene, view)
+    is_open = (render.alpha < 0.5) & view.shows_surface & ~_moving(scene, view)
     is_open &= ~_thin(is_open)
     count = int(is_open.sum())
     if count == 0 or budget <= 0 or len(of_camera) < 2:

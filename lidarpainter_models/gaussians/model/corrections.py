@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.gaussians.model.pose_blending import RefinedTracks
@@ -38,6 +38,8 @@ class CameraCorrections:
     camera_tangent: Float[Tensor, "cameras 6"]
     faults: Mapping[str, CameraFault] = field(default_factory=dict)
     """What was found wrong before the fit; `recorded_world_from_camera` is without it."""
+    own_bodies: Mapping[str, Bool[Tensor, "height width"]] = field(default_factory=dict)
+    """Where cameras show the recording car itself, at fit size, on the CPU."""
 
     @classmethod
     def none(
@@ -46,6 +48,7 @@ class CameraCorrections:
         timestamps_ns: Int[Tensor, " views"],
         recorded_world_from_camera: Float[Tensor, "views 4 4"],
         faults: Mapping[str, CameraFault] | None = None,
+        own_bodies: Mapping[str, Bool[Tensor, "height width"]] | None = None,
     ) -> "CameraCorrections":
         """Nothing corrected yet."""
         names = tuple(sorted({name for _, name in keys}))
@@ -57,6 +60,7 @@ class CameraCorrections:
             camera_names=names,
             camera_tangent=torch.zeros(len(names), 6, dtype=torch.float64),
             faults=faults or {},
+            own_bodies=own_bodies or {},
         )
 
     @cached_property

@@ -1,0 +1,204 @@
+"""Which pixels of a camera show the recording car itself: what never moves while the car does.
+
+Between two images of a moving car every edge of the street slides along its epipolar line, farther
+the nearer it is; an edge of the car's own bonnet, boot or mirror stays. So brightness is derived
+along the epipolar lines, and the median over images taken far apart (as in Dekel et al. 2017, who
+find watermarks so) keeps only what stays. It is asked only where the street would have moved: below
+the horizon, where even the ground is near. What the edges that stay enclose with the border of the
+image is the body. A car that stands shows no body, and nor does one as dark as the road.
+"""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.lidar.moving_boxes import MovingBoxes
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.records import RecordedView
+
+WIDTH_PX = 480
+"""Width at which images are compared."""
+MOST_IMAGES, LEAST_IMAGES = 24, 8
+"""Images of a camera that are compared, evenly over the way; fewer tell nothing."""
+LEAST_BASELINE_M = 0.2
+"""Images taken nearer to each other than this count as one."""
+LEAST_MOTION_PX = 10.0
+"""A place is judged where the ground would have moved so far from the first image to the last."""
+MOST_HEIGHT_M = 3.0
+"""No camera stands higher above the road; a lower one sees nearer ground, which moves faster."""
+LEAST_EDGE = 1.5  # grey levels a pixel that stay
+STAYS_IN = 0.85
+"""A sure edge is there in so many of the images."""
+STANDS_OUT = 2.4
+"""One that goes on beside sure ones is there so much more often than in half of them, in standard
+deviations (sign test)."""
+SURE_SHARE = 0.25  # of the edges of a body
+GROUP_SHARE = 0.03  # of the width: edges nearer to each other than twice this are of one body
+BORDER_SHARE = 0.03  # of the width: a body comes so near to the border of the image
+LEAST_AREA = 0.005  # of the image
+LEAST_OUTLINE = 0.6  # of a body's outline inside the image: so much of it is an edge that stays
+OUTLINE_PX = 7  # an outline runs along edges at most half of this away
+BLUR_PX = 1.0
+
+
+def own_bodies(
+    scene: DrivingScene, views: Sequence[RecordedView]
+) -> dict[str, Bool[np.ndarray, "height width"]]:
+    """Pixels of the recording car, `WIDTH_PX` wide, by the cameras that show any of it.
+
+    Args:
+        scene: where images and tracks are read from.
+        views: those that may be looked at.
+    """
+    moving = MovingBoxes([track for track in scene.tracks if track.is_moving])
+    found = {}
+    for name in sorted({view.camera_name for view in views}):
+        chosen = _far_apart([view for view in views if view.camera_name == name])
+        if len(chosen) < LEAST_IMAGES:
+            continue
+        cameras = [_small(view.camera) for view in chosen]
+        seen = [
+            _seen_change(scene.read_image(view), camera, _way(cameras, place), moving, view)
+            for place, (view, camera) in enumerate(zip(chosen, cameras, strict=True))
+        ]
+        edges, sure = (mask & _would_have_moved(cameras) for mask in _what_stays(seen))
+        body = _enclosed(edges, sure)
+        if body.any():
+            found[name] = body
+    return found
+
+
+def in_words(camera_name: str, body: Bool[np.ndarray | Tensor, "height width"]) -> str:
+    """What a camera shows of the car, as a sentence."""
+    share = float(np.asarray(body).mean())
+    return f"{camera_name} shows the recording car in {share:.0%} of its image: hidden."
+
+
+def on_grid(
+    body: Bool[np.ndarray, "height width"], *, width_px: int, height_px: int
+) -> Bool[Tensor, "rows columns"]:
+    """The body on the grid of an image of another size."""
+    resized = cv2.resize(
+        body.astype(np.uint8), (width_px, height_px), interpolation=cv2.INTER_NEAREST
+    )
+    return torch.from_numpy(resized > 0)
+
+
+def _far_apart(views: Sequence[RecordedView]) -> list[RecordedView]:
+    """Some of a camera's views, evenly over the way."""
+    kept: list[RecordedView] = []
+    for view in sorted(views, key=lambda view: view.timestamp_ns):
+        if not kept or _baseline_m(kept[-1].camera, view.camera) >= LEAST_BASELINE_M:
+            kept.append(view)
+    return kept[:: max(1, -(-len(kept) // MOST_IMAGES))]
+
+
+def _baseline_m(first: Camera, second: Camera) -> float:
+    return float((first.centre_world - second.centre_world).norm())
+
+
+def _small(camera: Camera) -> Camera:
+    width_px = min(WIDTH_PX, camera.width_px)
+    return camera.resized(
+        width_px=width_px, height_px=max(round(camera.height_px * width_px / camera.width_px), 1)
+    )
+
+
+def _way(cameras: Sequence[Camera], place: int) -> Float[np.ndarray, "3"]:
+    """Where a camera was going, in its own frame, by those before and after it."""
+    before, after = cameras[max(place - 1, 0)], cameras[min(place + 1, len(cameras) - 1)]
+    way = after.centre_world - before.centre_world
+    return (cameras[place].world_from_camera[:3, :3].T.to(way) @ way).double().numpy()
+
+
+def _flow(camera: Camera, way: Float[np.ndarray, "3"]) -> Float[np.ndarray, "height width 2"]:
+    """By how many pixels each point a metre deep moves in the image of a camera that goes so."""
+    rays = camera.pixel_directions().double().numpy()
+    rays /= rays[..., 2:]
+    focal = np.array([camera.fx_px, camera.fy_px])
+    return focal * (rays[..., :2] * way[2] - way[:2])
+
+
+def _seen_change(
+    image: UInt8[Tensor, "recorded_height recorded_width 3"],
+    camera: Camera,
+    way: Float[np.ndarray, "3"],
+    moving: MovingBoxes,
+    view: RecordedView,
+) -> tuple[Float[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
+    """Change of brightness along the epipolar lines, and where no other car may drive along."""
+    size = (camera.width_px, camera.height_px)
+    small = cv2.resize(image.numpy(), size, interpolation=cv2.INTER_AREA)
+    grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    down, right = np.gradient(cv2.GaussianBlur(grey, (0, 0), BLUR_PX))
+    flow = _flow(camera, way)
+    length = np.maximum(np.linalg.norm(flow, axis=-1), 1e-9)
+    change = (right * flow[..., 0] + down * flow[..., 1]) / length
+    return change.astype(np.float32), ~moving.pixels(camera, view.timestamp_ns).numpy()
+
+
+def _what_stays(
+    seen: Sequence[tuple[Float[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]],
+) -> tuple[Bool[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
+    """Pixels on the same edge in most of the images that count, and in nearly all of them."""
+    sign = np.sign(sum(change * counts for change, counts in seen))
+    same = sum((sign * change > LEAST_EDGE) & counts for change, counts in seen)
+    total = np.maximum(sum(counts.astype(int) for _, counts in seen), 1)
+    stands_out = 2 * same - total > STANDS_OUT * np.sqrt(total)
+    return stands_out, stands_out & (same > STAYS_IN * total)
+
+
+def _would_have_moved(cameras: Sequence[Camera]) -> Bool[np.ndarray, "height width"]:
+    """Pixels in which whatever stands on the ground has moved far by the last image."""
+    middle = cameras[len(cameras) // 2]
+    rotation = middle.world_from_camera[:3, :3].double()
+    way = rotation.T @ (cameras[-1].centre_world - cameras[0].centre_world).double()
+    rays = middle.pixel_directions().double()
+    falls = -((rays / rays[..., 2:]) @ rotation[2]).numpy()  # metres a metre of depth
+    motion_px = np.linalg.norm(_flow(middle, way.numpy()), axis=-1)
+    return motion_px * np.maximum(falls, 0) / MOST_HEIGHT_M > LEAST_MOTION_PX
+
+
+def _enclosed(
+    edges: Bool[np.ndarray, "height width"], sure: Bool[np.ndarray, "height width"]
+) -> Bool[np.ndarray, "height width"]:
+    """What groups of edges near the border of the image enclose with that border."""
+    height, width = edges.shape
+    body = np.zeros((height, width), np.uint8)
+    reach = round(GROUP_SHARE * width)
+    window = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    count, groups = cv2.connectedComponents(cv2.dilate(edges.astype(np.uint8), window))
+    for group in range(1, count):
+        row, column = np.nonzero(edges & (groups == group))
+        to_border = np.stack([column, width - 1 - column, height - 1 - row])
+        if sure[row, column].mean() < SURE_SHARE or to_border.min() > BORDER_SHARE * width:
+            continue
+        points = np.stack([column, row], axis=1).astype(np.int32)
+        sides = ((1, height - 1), (0, 0), (0, width - 1))
+        hulls = [_hull_to_border(points, axis, at) for axis, at in sides]
+        sound = [hull for hull in hulls if _outlined(hull, edges) >= LEAST_OUTLINE]
+        largest = max(sound, key=cv2.contourArea, default=None)
+        if largest is not None and cv2.contourArea(largest) >= LEAST_AREA * edges.size:
+            cv2.fillConvexPoly(body, largest, 1)
+    return body > 0
+
+
+def _hull_to_border(points: Int[np.ndarray, "points 2"], axis: int, at: int) -> np.ndarray:
+    """The hull of points and of their feet on one side of the image."""
+    feet = points.copy()
+    feet[:, axis] = at
+    return cv2.convexHull(np.concatenate([points, feet]))
+
+
+def _outlined(hull: np.ndarray, edges: Bool[np.ndarray, "height width"]) -> float:
+    """Part of a hull's outline inside the image that runs along edges."""
+    outline = np.zeros(edges.shape, np.uint8)
+    cv2.polylines(outline, [hull], isClosed=True, color=1)
+    outline[-1], outline[:, 0], outline[:, -1] = 0, 0, 0
+    near = cv2.dilate(edges.astype(np.uint8), np.ones((OUTLINE_PX, OUTLINE_PX), np.uint8))
+    return float(near[outline > 0].mean()) if outline.any() else 0.0
