@@ -28,8 +28,8 @@ from lidarpainter_models.kernels.sparse_adam import MOST_UNITS
 View = tuple[Camera, Float[Tensor, "bodies 4 4"]]
 """A camera and where it has the bodies of the scene."""
 
-CELL_M = 8.0
-"""Side of the smallest cells: a few hundred blocks for a street."""
+CELL_M = 2.0
+"""Side of the smallest cells: of what blocks of 8 m put before a camera half is out of its view."""
 
 
 @dataclass(eq=False, kw_only=True)

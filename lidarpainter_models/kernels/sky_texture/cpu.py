@@ -1,8 +1,8 @@
 """Fast sky texture look-ups on a CPU: sampling, its transpose, and Adam on the texels touched.
 
 A dense Adam over the texture would cost more
-than the look-ups themselves; here only texels that received a gradient are visited. Everything is
-serial: bitwise repeatable, and safe to call from several threads.
+than the look-ups themselves; here only texels that received a gradient are visited. What sums over
+pixels is serial, so everything is bitwise repeatable.
 """
 
 # ruff: noqa: ANN001, ANN202 - numba infers these types
@@ -20,6 +20,8 @@ from lidarpainter_models.kernels.sky_texture.layout import SkyLayout, SkyRays, T
 _HALF_PI = np.float32(math.pi / 2)
 _PI = np.float32(math.pi)
 _TURN = np.float32(2 * math.pi)
+_MOST_VISITS = 1000
+"""Of a texel that count: afterwards Adam's biases are gone."""
 
 
 def locate(camera: Camera, layout: SkyLayout, wanted: Tensor) -> Tensor:
@@ -86,7 +88,7 @@ def _atan2(y, x):
     return -r if y < 0 else r
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, parallel=True)
 def _locate(world_from_camera, lens, layout, wanted):
     """Continuous (column, row) in the texture of the wanted pixels' rays, texel centres at +0.5.
 
@@ -98,7 +100,7 @@ def _locate(world_from_camera, lens, layout, wanted):
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     left, top, texel, columns = layout[0], layout[1], layout[2], layout[3]
     margin = (_TURN - columns * texel) * np.float32(0.5)
-    for v in range(height):
+    for v in numba.prange(height):
         y = (np.float32(v + 0.5) - cy) / fy
         for u in range(width):
             if not wanted[v, u]:
@@ -135,14 +137,14 @@ def _corners(column, row, columns, rows, wraps):
     return c0, c1, r0, min(r0 + 1, rows - 1), wc, wr
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, parallel=True)
 def _sample(texture, places, wanted, wraps):
     """Bilinear colours at the places of the wanted pixels, black elsewhere."""
     rows, columns = texture.shape[:2]
     height, width = places.shape[:2]
     rgb = np.zeros((height, width, 3), np.float32)
     one = np.float32(1.0)
-    for v in range(height):
+    for v in numba.prange(height):
         for u in range(width):
             if not wanted[v, u]:
                 continue
@@ -183,20 +185,22 @@ def _scatter(shape, places, gradient, weight, wraps):
     return texel_gradient, texel_weight
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, parallel=True)
 def _adam(texture, first, second, visits, gradient, weight, rate):
     """One Adam step in place on every texel of positive weight, each with its own step count."""
     beta1, beta2 = np.float32(0.9), np.float32(0.99)
     one, epsilon = np.float32(1.0), np.float32(1e-12)
     rows, columns = weight.shape
-    for r in range(rows):
+    fixes = np.empty((_MOST_VISITS + 1, 2), np.float32)
+    for count in range(_MOST_VISITS + 1):  # powers are too slow for every texel
+        fixes[count, 0] = one - beta1 ** np.float32(count)
+        fixes[count, 1] = one - beta2 ** np.float32(count)
+    for r in numba.prange(rows):
         for c in range(columns):
             if weight[r, c] <= 0:
                 continue
             visits[r, c] += 1
-            count = min(visits[r, c], 1000)
-            fix1 = one - beta1 ** np.float32(count)
-            fix2 = one - beta2 ** np.float32(count)
+            fix1, fix2 = fixes[min(visits[r, c], _MOST_VISITS)]
             for k in range(3):
                 g = gradient[r, c, k]
                 m = beta1 * first[r, c, k] + (one - beta1) * g
