@@ -10,6 +10,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
@@ -34,6 +35,8 @@ MIN_RANGE_M = 1.0  # nearer returns come from the LiDAR's own housing
 EGO_RANGE_M = 2.6  # returns nearer than this are the ego vehicle's own body
 EGO_HALF_WIDTH_M = 1.2
 """... when also less than this to the left or right of the LiDAR; a car beside it is not."""
+LEAST_WAY_M, MOST_PAUSE_NS = 0.05, 500_000_000
+"""A sweep or an image taken nearer to the one before, and sooner after it, shows no new street."""
 MAX_RANGE_M = 300.0  # further returns are left out: there a beam is a metre wide
 
 
@@ -57,16 +60,24 @@ def build_lidar_map(
 def gather_points(scene: DrivingScene, split_frames: Collection[int]) -> LidarMap:
     """The sweeps of some frames in one map that has no colours yet.
 
+    Of a LiDAR that stands a sweep each half second is enough for the street, not for who moves.
+
     Raises:
         SceneError: the frames hold no point in range.
     """
     tracks = [track for track in scene.tracks if track.is_moving]
-    sweeps = [
-        _place_sweep(scene, sweep, tracks)
-        for sweep in scene.sweeps
-        if sweep.frame_index in set(split_frames)
+    taken = [sweep for sweep in scene.sweeps if sweep.frame_index in set(split_frames)]
+    sweeps = [_place_sweep(scene, sweep, tracks) for sweep in taken]
+    are_new = showing_more(
+        [sweep.lidar_name for sweep in taken],
+        [sweep.timestamp_ns for sweep in taken],
+        [sweep.world_from_lidar for sweep in taken],
+    )
+    street_parts = [
+        placed.points.keep(~placed.is_near)
+        for placed, is_new in zip(sweeps, are_new, strict=True)
+        if is_new
     ]
-    street_parts = [placed.points.keep(~placed.is_near) for placed in sweeps]
     if sum(len(part) for part in street_parts) == 0:
         raise SceneError(
             f"{scene.dataset}/{scene.sequence}: no LiDAR point within {MAX_RANGE_M:g} m in "
@@ -74,14 +85,34 @@ def gather_points(scene: DrivingScene, split_frames: Collection[int]) -> LidarMa
         )
     ground = _ground(street_parts)
     actor_parts: dict[str, list[MapPoints]] = {}
-    for placed in sweeps:
+    for placed, is_new in zip(sweeps, are_new, strict=True):
         road, of_actors = _sort_near_points(placed, tracks, ground)
-        street_parts.append(road)
+        if is_new:
+            street_parts.append(road)
         for actor_id, points in of_actors.items():
             actor_parts.setdefault(actor_id, []).append(points)
     street = MapPoints.concatenate(street_parts)
     actors = {actor_id: MapPoints.concatenate(parts) for actor_id, parts in actor_parts.items()}
     return LidarMap(street=street, actors=actors)
+
+
+def showing_more(
+    sensors: Sequence[str], times_ns: Sequence[int], poses: Sequence[Float[Tensor, "4 4"]]
+) -> list[bool]:
+    """Which poses show more of the street than those before of their sensor; in order of time."""
+    last: dict[str, tuple[int, Float[Tensor, 3]]] = {}
+    are_new = []
+    for sensor, time_ns, pose in zip(sensors, times_ns, poses, strict=True):
+        place = pose[:3, 3]
+        is_new = sensor not in last
+        if not is_new:
+            before_ns, before = last[sensor]
+            moved_m = float((place - before).norm())
+            is_new = moved_m >= LEAST_WAY_M or time_ns - before_ns >= MOST_PAUSE_NS
+        if is_new:
+            last[sensor] = (time_ns, place)
+        are_new.append(is_new)
+    return are_new
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -14,7 +14,7 @@ from torch import Tensor
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.lidar.colouring import MapColouring
 from lidarpainter_models.lidar.lidar_map import MapPoints
-from lidarpainter_models.lidar.map_building import gather_points
+from lidarpainter_models.lidar.map_building import gather_points, showing_more
 from lidarpainter_models.lidar.recording_faults import find_faults
 from lidarpainter_models.lidar.sky_masks import sky_mask
 from lidarpainter_models.lidar.sparse_depth import FramePoints, sparse_lidar_depth
@@ -25,7 +25,7 @@ from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
 from lidarpainter_models.scenes.camera_faults import CameraFault
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.records import RecordedView
+from lidarpainter_models.scenes.records import RecordedView, ViewKey
 from lidarpainter_models.scenes.splits import ViewSplit
 
 SAME_SWEEP_NS = 100_000_000
@@ -37,7 +37,7 @@ def prepare_observations(
     split: ViewSplit,
     config: ObservationConfig,
     *,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> SceneObservations:
     """Prepare what a fit on the split's training views needs, faults of the recording corrected.
 
@@ -58,7 +58,7 @@ def prepare_observations(
         points = gather_points(scene, split.train_frames)
     else:
         points = points_from_images(scene, taken, bodies)
-    colouring = MapColouring(points, scene.tracks, taken)
+    colouring, colours = MapColouring(points, scene.tracks, taken), _keys_showing_more(taken)
     lidar, views = FramePoints(scene), []
     for done, (recorded, view) in enumerate(zip(split.train, taken, strict=True), start=1):
         image = scene.read_image(recorded)
@@ -70,12 +70,11 @@ def prepare_observations(
             body = hidden[view.camera_name]
             made = replace(made, hidden=body, sky_mask=made.sky_mask & ~body)
         views.append(replace(made, timestamp_ns=recorded.timestamp_ns))
-        colouring.add(view, image, bodies.get(view.camera_name))
-        if progress is not None:
-            progress(done, len(split.train) + 1)
+        if view.key in colours:
+            colouring.add(view, image, bodies.get(view.camera_name))
+        progress(done, len(split.train) + 1)
     lidar_map = colouring.coloured()
-    if progress is not None:
-        progress(len(split.train) + 1, len(split.train) + 1)
+    progress(len(split.train) + 1, len(split.train) + 1)
     return SceneObservations(
         views=tuple(views),
         lidar_map=lidar_map,
@@ -83,6 +82,16 @@ def prepare_observations(
         faults=faults,
         own_bodies=hidden,
     )
+
+
+def _keys_showing_more(views: Sequence[RecordedView]) -> set[ViewKey]:
+    """The views that show more of the street than those before of their camera."""
+    are_new = showing_more(
+        [view.camera_name for view in views],
+        [view.timestamp_ns for view in views],
+        [view.camera.world_from_camera for view in views],
+    )
+    return {view.key for view, is_new in zip(views, are_new, strict=True) if is_new}
 
 
 def _as_taken(view: RecordedView, faults: Mapping[str, CameraFault]) -> RecordedView:

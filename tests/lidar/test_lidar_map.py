@@ -49,13 +49,21 @@ def test_the_road_beside_a_car_stays_street_and_is_no_part_of_it(lidar_map):
     assert int((near_car & (street.xyz_m[:, 1].abs() < 2)).sum()) > 10
 
 
-def test_a_point_remembers_when_and_from_how_far_it_was_measured(lidar_map):
-    street = lidar_map.street
+def test_a_point_remembers_when_and_from_how_far_it_was_measured(street, monkeypatch):
+    monkeypatch.setattr(map_building, "LEAST_WAY_M", 0.0)  # the street stands
+    street = build_lidar_map(street, split_frames=(0, 2, 3), colour_views=()).street
     assert sorted(street.frame_index.unique().tolist()) == [0, 2, 3]
     away_s = (street.timestamp_ns - street.frame_index * 100_000_000).abs() * 1e-9
     assert float(away_s.max()) <= 0.0501
     eye = torch.tensor([0.0, 0.0, 1.7])
     torch.testing.assert_close(street.range_m, (street.xyz_m - eye).norm(dim=-1))
+
+
+def test_of_a_lidar_that_stands_few_sweeps_show_the_street_and_all_who_moves():
+    standing = build_lidar_map(ToyStreet(num_frames=8), split_frames=range(8), colour_views=())
+    assert sorted(standing.street.frame_index.unique().tolist()) == [0, 5]
+    (car,) = standing.actors.values()
+    assert len(car.frame_index.unique()) > 5
 
 
 def test_ranges_out_of_bounds_are_left_out(street, monkeypatch):
