@@ -46,13 +46,19 @@ def brief(scene: str) -> ReconstructParameters:
 
 
 def balanced(scene: str) -> ReconstructParameters:
-    """The best trade on one GPU."""
-    fit = FitConfig(effort=EffortConfig(looks=1_000.0))
+    """The best trade for a whole log: twice as fine, in under an hour on two CPU cores.
+
+    Fewer Gaussians for each pixel, and one painted round of fewer views: a step takes four times as
+    long as in `preview`.
+    """
+    fit = FitConfig(effort=EffortConfig(looks=400.0, gaussians_per_pixel=0.125))
     changes = {
         "preset": "balanced",
         "observation": ObservationConfig(width_px=960),
         "fit": fit,
-        "refine": continuation(fit, looks=350.0, guidance=GuidanceConfig()),
+        "novel": NovelGuidanceConfig(every_nth=4),
+        "rounds": 1,
+        "refine": continuation(fit, looks=100.0, guidance=GuidanceConfig()),
     }
     return preview(scene).model_copy(update=changes)
 

@@ -134,6 +134,7 @@ def _joined_actor(world: EditedWorld, other: OtherRun, track: ActorTrack) -> Edi
         columns["body_index"] = torch.full_like(columns["body_index"], number + 1)
         own = own.select((~rows).nonzero()[:, 0]).append(replace(look.gaussians, **columns))
         points[track.actor_id] = look.points
+        longer = replace(longer, bending=longer.bending.rigid(number + 1))
     return replace(
         world,
         scene=replace(world.scene, gaussians=own, actors=longer),

@@ -15,7 +15,6 @@ from torch import Tensor
 from lidarpainter_models.editing.actor_models import ActorModel, road_colour
 from lidarpainter_models.editing.motions import LogTimes, standing
 from lidarpainter_models.errors import ConfigError, SceneError
-from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.placing import carried_gaussians
@@ -163,15 +162,10 @@ class EditedWorld:
             columns["body_index"], len(actors.recorded_tracks) + 1
         )
         moving = replace(track, is_moving=True, size_m=model.size_m)
-        more = torch.zeros(1, *actors.tangent.shape[1:], dtype=actors.tangent.dtype)
         scene = replace(
             self.scene,
             gaussians=own.append(GaussianSet(**columns)),
-            actors=Actors(
-                recorded_tracks=(*actors.recorded_tracks, moving),
-                knots_ns=actors.knots_ns,
-                tangent=torch.cat([actors.tangent, more]),
-            ),
+            actors=actors.with_rigid(moving),
         )
         points = {**self.lidar_map.actors, track.actor_id: model.points}
         lidar_map = LidarMap(street=self.lidar_map.street, actors=points)
@@ -226,18 +220,12 @@ class EditedWorld:
 
 def _without_body(scene: GaussianScene, body: int) -> GaussianScene:
     """The scene without an actor that has no Gaussians any more."""
-    actors = scene.actors
-    kept = [row for row in range(len(actors.recorded_tracks)) if row != body - 1]
     columns = scene.gaussians.columns()
     columns["body_index"] = columns["body_index"] - (columns["body_index"] > body).int()
     return replace(
         scene,
         gaussians=GaussianSet(**columns),
-        actors=Actors(
-            recorded_tracks=tuple(actors.recorded_tracks[row] for row in kept),
-            knots_ns=actors.knots_ns,
-            tangent=actors.tangent[kept],
-        ),
+        actors=scene.actors.without(body),
     )
 
 

@@ -87,8 +87,8 @@ def scene_contents(
 ) -> SceneContents:
     """Take a scene apart.
 
-    Poses are wanted at `timestamps_ns`, ascending; None takes all actors; `with_sky` shows the sky
-    by far Gaussians.
+    Poses are wanted at `timestamps_ns`, ascending; at one time alone, people are bent as they are
+    then, else they are at rest. None takes all actors; `with_sky` shows the sky by far Gaussians.
 
     Raises:
         SceneError: the scene has no such actor.
@@ -99,7 +99,10 @@ def scene_contents(
     if missing := [one for one in wanted if one not in places]:
         known = ", ".join(sorted(places)[:20]) or "none that moves"
         raise SceneError(f"scene {name} has no actor {missing[0]!r}, it has {known}")
-    bodies = _bodies(scene.gaussians, len(tracks) + 1)
+    gaussians = scene.gaussians
+    if len(timestamps_ns) == 1:
+        gaussians = scene.actors.bending.bent(gaussians, timestamps_ns[0])
+    bodies = _bodies(gaussians, len(tracks) + 1)
     street = bodies[0].append(sky_gaussians(scene.sky, scene)) if with_sky else bodies[0]
     rows = [places[one] for one in wanted]
     poses = [scene.actors.likely_poses(time_ns) for time_ns in timestamps_ns]

@@ -14,7 +14,7 @@ import cv2
 from catalog.assets import LEAST_ID_LENGTH, digest_of, enter_sightings
 from catalog.store import Store
 from catalog.tables import Row
-from lidarpainter_models.assets.categories import category_of
+from lidarpainter_models.scenes.categories import category_of
 from tasks.assets.publish import SIGHTINGS_FILE
 from tasks.json_files import read_json
 from tasks.opened import global_frame_of, open_scene

@@ -21,6 +21,11 @@ ACTOR_PRIOR = 1e-6
 ACTOR_SMOOTHNESS = 1e-5
 """Of squared jumps between an actor's neighbouring corrections, likewise."""
 
+BEND_PRIOR = 3e-6
+"""Of the squared strain of lattices (`Bending.strain`), likewise."""
+BEND_NOISE_M = 0.1
+"""Expected way of a node."""
+
 
 class RowAdam:
     """Adam (Kingma and Ba, 2015) on a table whose rows have their own step sizes and counts.
@@ -93,6 +98,7 @@ class Refinement:
         adams = {
             "camera_adam": RowAdam(scene.cameras.view_tangent),
             "actor_adam": RowAdam(scene.actors.tangent.flatten(0, 1)),
+            "bend_adam": RowAdam(scene.actors.bending.offset_m.flatten(1)),
             "exposure_adam": RowAdam(scene.exposure.matrix.flatten(1)),
             "gain_adam": RowAdam(scene.exposure.log_gain.view(-1, 1)),
         }
@@ -146,6 +152,12 @@ class Refinement:
                 total = total + ACTOR_SMOOTHNESS * pose_prior(jump, **ACTOR_NOISE)
         return total
 
+    def bend_prior(self, timestamp_ns: int, step: int) -> Float[Tensor, ""] | float:
+        """Limbs stay near where they rest and near each other; lies where the Gaussians do."""
+        if not (self.refines_actors(step) and self._bends):
+            return 0.0
+        return BEND_PRIOR / BEND_NOISE_M**2 * self.scene.actors.bending.strain(timestamp_ns)
+
     def step(self, step: int, image: FitImage) -> None:
         """Move the corrections that are refined by the gradients they received; drop these."""
         if self.refines_cameras(step):
@@ -158,10 +170,25 @@ class Refinement:
                 gradient = _gradient(tangent).view(-1, 6)
                 rate = self._rate("actor", step)
                 self.adams["actor_adam"].step(tangent.view(-1, 6), gradient, rate)
+            if self._bends:
+                self._step_bending(step, image)
         if self.refines_exposure:
             self._step_exposure(step, image)
         for table in self._tables():
             table.grad = None
+
+    @property
+    def _bends(self) -> bool:
+        return len(self.scene.actors.bending.bodies) > 0
+
+    def _step_bending(self, step: int, image: FitImage) -> None:
+        bending = self.scene.actors.bending
+        near, _ = bending.weights_at(image.timestamp_ns)
+        rate = self.config.learning_rates.at("bending_m", step / self.config.steps)
+        with torch.no_grad():
+            table = bending.offset_m.view(len(bending.knots_ns), -1)
+            gradient = _gradient(bending.offset_m).view(table.shape)
+            self.adams["bend_adam"].step(table, gradient, table.new_full((1,), rate), near)
 
     def _step_exposure(self, step: int, image: FitImage) -> None:
         exposure = self.scene.exposure
@@ -208,6 +235,7 @@ class Refinement:
         return (
             scene.cameras.view_tangent,
             scene.actors.tangent,
+            scene.actors.bending.offset_m,
             exposure.matrix,
             exposure.log_gain,
         )

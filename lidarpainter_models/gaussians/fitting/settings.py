@@ -73,6 +73,8 @@ class LearningRates:
     """Boxes are drawn by hand: a degree off is common."""
     actor_translation_m: tuple[float, float] = (1e-2, 1e-3)
     """Boxes are drawn by hand: a decimetre off is common."""
+    bending_m: tuple[float, float] = (1e-2, 1e-3)
+    """Of the lattice of somebody who walks."""
     exposure: tuple[float, float] = (2e-3, 2e-4)
     """Entries of a camera's colour matrix."""
 

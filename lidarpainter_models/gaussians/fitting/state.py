@@ -23,6 +23,7 @@ from lidarpainter_models.gaussians.fitting.densification import GradientTally, S
 from lidarpainter_models.gaussians.fitting.gaussian_adam import GaussianAdam
 from lidarpainter_models.gaussians.fitting.refinement import Refinement
 from lidarpainter_models.gaussians.fitting.spatial_blocks import SpatialBlocks, View
+from lidarpainter_models.gaussians.model.bending import REACH_M
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
 from lidarpainter_models.gaussians.model.stored_scene import (
@@ -93,7 +94,10 @@ class FitState:
         """
         rates, most = self.gaussian_adam.rates, math.sqrt(3.0) * MOST_STEP
         slack = (most * max(rates.actor_translation_m), most * max(rates.actor_rotation_rad))
-        rows = self.blocks.rows_in_view(views, actor_slack=slack if len(views) > 1 else (0.0, 0.0))
+        moved_m, turned_rad = slack if len(views) > 1 else (0.0, 0.0)
+        if len(self.scene.actors.bending.bodies):
+            moved_m += REACH_M
+        rows = self.blocks.rows_in_view(views, actor_slack=(moved_m, turned_rad))
         return self.gaussian_adam.seen(self.scene.gaussians, rows)
 
     def step_gaussians(self, seen: SeenGaussians, fraction: float) -> None:

@@ -39,7 +39,8 @@ ACTOR_TERM_EVERY = 10
 _EDGE = 1e-4  # keeps logarithms finite
 WAITS = 3
 """Of the host for the device in a step, without the rasteriser's own: how many Gaussians are in
-view, how many of them lag and by how much, and the gradients of the bodies' poses."""
+view, how many of them lag and by how much, and the gradients of the bodies' poses. Where somebody
+bends, one more for each view: which Gaussians do."""
 
 Perceptual = Callable[
     [Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]], Float[Tensor, ""]
@@ -87,8 +88,10 @@ def _recorded_step(
     facts = image.facts()
     with_actors = _wants_actor_term(state, config)
     screen_gradient = torch.zeros(len(seen), device=seen.means.device)
+    actors = state.scene.actors
+    bent = actors.bending.bent(seen, image.timestamp_ns)
     splat = draw_gaussians(
-        as_read(seen, bodies, camera, state.scene.actors, image.timestamp_ns),
+        as_read(bent, bodies, camera, actors, image.timestamp_ns),
         bodies,
         camera,
         with_actor_alpha=with_actors,
@@ -106,6 +109,7 @@ def _recorded_step(
     loss = loss + weights.sky * terms.sky + weights.depth * terms.depth
     if with_actors:
         loss = loss + weights.actors * _actor_term(state, splat, image, camera)
+    loss = loss + state.refinement.bend_prior(image.timestamp_ns, state.step)
     prior = state.refinement.prior(row, image.timestamp_ns, state.step)
     # as a sum its gradient, which is the CPU's, would have to come from the device
     torch.autograd.backward([loss, prior] if prior.requires_grad else [loss])
@@ -132,7 +136,8 @@ def add_guidance_gradients(
 ) -> None:
     """Add one painted view's gradients to the Gaussians; nothing else is changed by it."""
     sky, settings = state.scene.sky, config.guidance
-    splat = draw_gaussians(seen, _guidance_bodies(state, view), view.camera)
+    bent = state.scene.actors.bending.bent(seen, view.timestamp_ns)
+    splat = draw_gaussians(bent, _guidance_bodies(state, view), view.camera)
     sky_rgb = sky.sample(sky.rays(view.camera, splat.alpha.detach() < OPAQUE))
     shown = splat.rgb + (1 - splat.alpha)[..., None] * sky_rgb
     loss = settings.weight * l1_ssim_loss(

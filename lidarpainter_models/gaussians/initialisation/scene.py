@@ -32,7 +32,9 @@ from lidarpainter_models.gaussians.model.sky import sky_from_images, sky_layout
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import transform_points
 from lidarpainter_models.lidar.lidar_map import MapPoints
+from lidarpainter_models.lidar.map_building import LEAST_WAY_M
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
+from lidarpainter_models.scenes.categories import category_of
 from lidarpainter_models.scenes.driving_scene import ActorTrack
 
 LEAST_UNSEEN_POINTS = 3
@@ -43,6 +45,12 @@ ACTOR_VOXEL_M = 0.05
 """Smallest voxel on an actor; its points come from the whole log."""
 UNSEEN_SHARE = 0.2
 """Part of the start size for points that only a camera moved aside would see."""
+BENDING = {"pedestrian", "animal", "bicycle", "motorcycle"}
+"""Who is not rigid."""
+LEAST_BENT_PX = 24
+"""Height in an image from which somebody's steps can be seen."""
+MOST_BENT_NS = 250_000_000
+"""Between frames: of two steps, which take a second, four images or more are needed."""
 ASIDE_M = 3.5
 """How far aside such a camera may stand."""
 MOST_VIEWS_PER_CAMERA = 60
@@ -89,9 +97,12 @@ def _scene_around(gaussians: GaussianSet, observations: SceneObservations) -> Ga
     views = observations.views
     timestamps_ns = torch.tensor([view.timestamp_ns for view in views], dtype=torch.int64)
     cameras = [view.camera for view in views]
+    frame_times_ns = _frame_times(views)
     return GaussianScene(
         gaussians=gaussians,
-        actors=Actors.uncorrected(observations.tracks, _frame_times(views)),
+        actors=Actors.uncorrected(
+            observations.tracks, frame_times_ns, _bent(observations.tracks, views, frame_times_ns)
+        ),
         sky=sky_from_images(
             sky_layout(cameras),
             cameras,
@@ -111,6 +122,29 @@ def _scene_around(gaussians: GaussianSet, observations: SceneObservations) -> Ga
     )
 
 
+def _bent(
+    tracks: Sequence[ActorTrack],
+    views: Sequence[TrainingView],
+    frame_times_ns: Int[Tensor, " frames"],
+) -> list[int]:
+    """Rows of the tracks of whoever moves within a box, where images show how."""
+    if len(frame_times_ns) < 2 or int(frame_times_ns.diff().median()) > MOST_BENT_NS:
+        return []
+    rows = [row for row, track in enumerate(tracks) if category_of(track.category) in BENDING]
+    shown: set[int] = set()
+    for view in views:
+        there = [row for row in rows if tracks[row].is_present(view.timestamp_ns)]
+        if not there:
+            continue
+        poses = [tracks[row].pose_at(view.timestamp_ns) for row in there]
+        pixels_uv, depth_m = view.camera.project(torch.stack(poses)[:, :3, 3].float())
+        size_m = torch.stack([tracks[row].size_m[2] for row in there])
+        is_large = view.camera.fy_px * size_m >= LEAST_BENT_PX * depth_m
+        is_large &= view.camera.contains(pixels_uv, depth_m)
+        shown |= {row for row, one in zip(there, is_large.tolist(), strict=True) if one}
+    return sorted(shown)
+
+
 def _frame_times(views: Sequence[TrainingView]) -> Int[Tensor, " frames"]:
     """Mean exposure time of each training frame, over its cameras."""
     of_frame: dict[int, list[int]] = {}
@@ -120,12 +154,13 @@ def _frame_times(views: Sequence[TrainingView]) -> Int[Tensor, " frames"]:
 
 
 def pixel_footprint(
-    xyz_m: Float[Tensor, "points 3"], cameras: Sequence[Camera]
+    xyz_m: Float[Tensor, "points 3"], cameras: Sequence[Camera], images: Sequence[int] | None = None
 ) -> tuple[Float[Tensor, " points"], Float[Tensor, " points"]]:
     """Size of a pixel at each point, smallest over the cameras, and how dense detail pays there.
 
-    A point in no image, but in that of a camera up to `ASIDE_M` away, has a footprint too; one
-    beyond has an infinite one. Occlusion is not looked at.
+    `images` says how many each camera has taken, by default one. A point in no image, but in that
+    of a camera up to `ASIDE_M` away, has a footprint too; one beyond has an infinite one.
+    Occlusion is not looked at.
 
     Where n Gaussians a square metre leave an image with footprint f an error of 1 / (n f^2) a
     pixel, so many of them make the error of all images least where n follows the root of the sum
@@ -133,7 +168,7 @@ def pixel_footprint(
     """
     footprint = torch.full((xyz_m.shape[0],), torch.inf)
     total = torch.zeros(xyz_m.shape[0])
-    for camera in cameras:
+    for camera, count in zip(cameras, images or [1] * len(cameras), strict=True):
         pixels_uv, depth_m = camera.project(xyz_m)
         is_inside = camera.contains(pixels_uv, depth_m, near_m=0.5)
         margin_px = camera.fx_px * ASIDE_M / depth_m.clamp(min=0.5)
@@ -141,21 +176,26 @@ def pixel_footprint(
         is_near = (u > -margin_px) & (u < camera.width_px + margin_px) & (depth_m > 0.5)
         is_near &= (v > -margin_px) & (v < camera.height_px + margin_px)
         size_m = torch.where(is_near, depth_m / camera.fx_px, torch.inf)
-        total += torch.where(is_inside, size_m**-4, 0.0)
+        total += count * torch.where(is_inside, size_m**-4, 0.0)
         footprint = torch.minimum(footprint, size_m)
     return footprint, total.sqrt()
 
 
-def _spread_cameras(views: Sequence[TrainingView]) -> list[Camera]:
-    """At most so many views of each camera, evenly over the log."""
-    cameras: dict[str, list[Camera]] = {}
+def _spread_cameras(views: Sequence[TrainingView]) -> tuple[list[Camera], list[int]]:
+    """At most so many places of each camera, evenly over the log, and the images taken there."""
+    places: dict[str, list[tuple[Camera, int]]] = {}
     for view in views:
-        cameras.setdefault(view.key[1], []).append(view.camera)
-    return [
-        camera
-        for own in cameras.values()
-        for camera in own[:: math.ceil(len(own) / MOST_VIEWS_PER_CAMERA)]
+        own = places.setdefault(view.key[1], [])
+        if own and float((view.camera.centre_world - own[-1][0].centre_world).norm()) < LEAST_WAY_M:
+            own[-1] = (own[-1][0], own[-1][1] + 1)
+        else:
+            own.append((view.camera, 1))
+    chosen = [
+        place
+        for own in places.values()
+        for place in own[:: math.ceil(len(own) / MOST_VIEWS_PER_CAMERA)]
     ]
+    return [camera for camera, _ in chosen], [images for _, images in chosen]
 
 
 def _on_surfaces(
@@ -167,9 +207,9 @@ def _on_surfaces(
     """Surfels where images show LiDAR surfaces, and some where only a moved camera would."""
     street = observations.lidar_map.street
     street = street.keep(torch.arange(0, len(street), math.ceil(len(street) / MOST_STREET_POINTS)))
-    cameras = _spread_cameras(observations.views)
-    footprint, density = pixel_footprint(street.xyz_m, cameras)
-    density *= math.sqrt(len(observations.views) / len(cameras))
+    cameras, images = _spread_cameras(observations.views)
+    footprint, density = pixel_footprint(street.xyz_m, cameras, images)
+    density *= math.sqrt(len(observations.views) / sum(images))
     in_image = density > 0
     is_aside = ~in_image & footprint.isfinite()
     for_aside = int(budget * UNSEEN_SHARE)

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lidarpainter_models.gaussians.model.bending import Bending
 from lidarpainter_models.gaussians.model.pose_blending import RefinedTracks
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses
@@ -43,18 +44,51 @@ class Actors:
     knots_ns: Int[Tensor, " knots"]
     tangent: Float[Tensor, "actors knots 6"]
     """Changed in place by a fit."""
+    bending: Bending = field(default_factory=Bending.none)
+    """Of those that are not rigid; its offsets lie where the Gaussians do."""
     _recorded_at: dict[int, ActorPoses] = field(default_factory=dict, init=False, repr=False)
     _made: list[_Motions] = field(default_factory=list, init=False, repr=False)
     """At most one."""
 
     @classmethod
-    def uncorrected(cls, tracks: Sequence[ActorTrack], knots_ns: Int[Tensor, " knots"]) -> "Actors":
-        """Nothing corrected yet; knots are sorted and taken once."""
+    def uncorrected(
+        cls,
+        tracks: Sequence[ActorTrack],
+        knots_ns: Int[Tensor, " knots"],
+        bent: Sequence[int] = (),
+    ) -> "Actors":
+        """Nothing corrected yet; knots are sorted and taken once, the `bent` tracks may bend."""
         knots = torch.unique(knots_ns)
         return cls(
             recorded_tracks=tuple(tracks),
             knots_ns=knots,
             tangent=torch.zeros(len(tracks), knots.numel(), 6, dtype=torch.float64),
+            bending=Bending.none(
+                [row + 1 for row in bent], [tracks[row].size_m for row in bent], knots
+            ),
+        )
+
+    def to(self, device: torch.device) -> "Actors":
+        """The same for Gaussians on another device; poses stay on the CPU."""
+        return replace(self, bending=self.bending.to(device))
+
+    def with_rigid(self, track: ActorTrack) -> "Actors":
+        """The same and one more, who does not bend, as the last."""
+        more = torch.zeros(1, *self.tangent.shape[1:], dtype=self.tangent.dtype)
+        return replace(
+            self,
+            recorded_tracks=(*self.recorded_tracks, track),
+            tangent=torch.cat([self.tangent, more]),
+        )
+
+    def without(self, body: int) -> "Actors":
+        """The same without one; those after it move up."""
+        kept = [row for row in range(len(self.recorded_tracks)) if row != body - 1]
+        return replace(
+            self,
+            recorded_tracks=tuple(self.recorded_tracks[row] for row in kept),
+            tangent=self.tangent[kept],
+            bending=self.bending.without(body),
         )
 
     def neighbours(self, timestamp_ns: int) -> tuple[int, int, float]:

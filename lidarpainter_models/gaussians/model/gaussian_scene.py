@@ -1,4 +1,4 @@
-"""A dynamic scene: street, rigid actors and sky, and what was corrected about the cameras."""
+"""A dynamic scene: street, actors and sky, and what was corrected about the cameras."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -79,7 +79,8 @@ class GaussianScene:
             else:
                 poses = self.actors.likely_poses(timestamp_ns)
                 bodies = camera_from_body(camera.world_from_camera, *poses)
-                read = as_read(self.gaussians, bodies, camera, self.actors, timestamp_ns)
+                bent = self.actors.bending.bent(self.gaussians, timestamp_ns)
+                read = as_read(bent, bodies, camera, self.actors, timestamp_ns)
                 drawn = draw_over_sky(read, bodies, self.sky, camera, backend=backend)
             return replace(drawn, rgb=self.exposure.apply(drawn.rgb, camera_name, timestamp_ns))
 
@@ -123,6 +124,7 @@ class GaussianScene:
         return replace(
             self,
             gaussians=self.gaussians.to(device),
+            actors=self.actors.to(device),
             sky=self.sky.to(device),
             exposure=self.exposure.to(device),
             style=None if self.style is None else self.style.to(device),
@@ -164,6 +166,7 @@ def describe(scene: GaussianScene) -> dict[str, Any]:
         "num_gaussians": len(scene.gaussians),
         "num_actor_gaussians": int((body > 0).sum()),
         "num_actors": len(scene.actors.recorded_tracks),
+        "num_bent_actors": len(scene.actors.bending.bodies),
         "style": None if scene.style is None else scene.style.mix.text,
         "sky_texels": [scene.sky.layout.rows, scene.sky.layout.columns],
     }

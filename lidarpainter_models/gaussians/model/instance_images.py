@@ -23,7 +23,7 @@ def instance_image(
 
     Only actors that the view shows are drawn, a few at a time, each as a channel of its own.
     """
-    gaussians = scene.gaussians
+    gaussians = scene.actors.bending.bent(scene.gaussians, timestamp_ns)
     with torch.no_grad():
         poses = scene.actors.likely_poses(timestamp_ns)
         bodies = camera_from_body(camera.world_from_camera, *poses).to(scene.device)

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.gaussians.model.actors import Actors
+from lidarpainter_models.gaussians.model.bending import Bending
 from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
@@ -36,6 +37,7 @@ def scene_to_arrays(scene: GaussianScene) -> tuple[dict[str, Tensor], dict[str, 
         "cameras": cameras.tensors(),
         "own_body": dict(cameras.own_bodies),
         "actors": {"knots_ns": scene.actors.knots_ns, "tangent": scene.actors.tangent},
+        "bending": scene.actors.bending.tensors(),
         "exposure": {
             "matrix": scene.exposure.matrix,
             "knots_ns": scene.exposure.knots_ns,
@@ -82,6 +84,7 @@ def scene_from_arrays(arrays: dict[str, Tensor], metadata: dict[str, Any]) -> Ga
             gaussians=GaussianSet(**groups["gaussians"]),
             actors=Actors(
                 recorded_tracks=tracks_from_arrays(groups["tracks"], metadata["tracks"]),
+                bending=Bending(**groups["bending"]) if "bending" in groups else Bending.none(),
                 **groups["actors"],
             ),
             sky=_sky(groups["sky"], SkyLayout(**metadata["sky_layout"])),

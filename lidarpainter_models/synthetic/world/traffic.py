@@ -28,6 +28,8 @@ KINDS = ("sedan", "sedan", "hatch", "suv", "suv", "pickup", "van")
 NUM_PAINTED = 14
 NEAR_M = 70.0
 NUM_POSTURES = 16
+WALKING_CYCLES_PER_S = 0.95
+"""Of two steps each, as people take them; who steps short is slow."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -163,6 +165,8 @@ class Traffic:
             person = draw_person(self.surfaces, rng)
             meshes, size = person.postures(NUM_POSTURES if self.are_people_walking else 1)
             speed = float(rng.choice([-1.0, 1.0])) * rng.uniform(1.0, 1.6)
+            if self.are_people_walking:
+                speed = np.sign(speed) * person.cycle_m * WALKING_CYCLES_PER_S
             self.actors.append(
                 StreetActor(
                     actor_id=f"person-{len(self.actors):03d}",

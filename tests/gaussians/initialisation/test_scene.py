@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from gaussian_world import camera_at, map_points
+from gaussian_world import FRAME_NS, HEIGHT_PX, WIDTH_PX, camera_at, car_track, map_points
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.initialisation.adaptive_voxels import (
@@ -10,7 +10,11 @@ from lidarpainter_models.gaussians.initialisation.adaptive_voxels import (
     adaptive_voxels,
     mean_by_voxel,
 )
-from lidarpainter_models.gaussians.initialisation.scene import initialise_scene, pixel_footprint
+from lidarpainter_models.gaussians.initialisation.scene import (
+    _spread_cameras,
+    initialise_scene,
+    pixel_footprint,
+)
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.gaussians.initialisation.surfels import (
     fill_colours,
@@ -157,3 +161,72 @@ def test_map_out_of_sight_is_one_clear_error(world):
     blind = replace(world.observations, lidar_map=LidarMap(street=nothing, actors={}), tracks=())
     with pytest.raises(ConfigError, match="no LiDAR point"):
         initialise_scene(blind, InitialisationConfig(num_gaussians=100))
+
+
+def walker(category="Pedestrian", ahead_m=6.0, actor_id="ann"):
+    """Somebody of 1.8 m before the cameras of the world, who walks to the left."""
+    track = car_track(4)
+    poses = track.world_from_box.clone()
+    poses[:, 0, 3], poses[:, 1, 3] = ahead_m, 0.1 * poses[:, 1, 3]
+    return replace(
+        track,
+        actor_id=actor_id,
+        category=category,
+        size_m=torch.tensor([0.7, 0.6, 1.8]),
+        world_from_box=poses,
+    )
+
+
+def with_walkers(world, tracks, *, frame_ns=FRAME_NS):
+    """The observations with walkers of the car's points, and images twice as fine."""
+    seen = world.observations
+    views = [
+        replace(
+            view,
+            camera=camera_at(0.3 * row, width_px=2 * WIDTH_PX, height_px=2 * HEIGHT_PX),
+            timestamp_ns=row * frame_ns,
+            rgb_u8=view.rgb_u8.repeat_interleave(2, 0).repeat_interleave(2, 1),
+            sky_mask=view.sky_mask.repeat_interleave(2, 0).repeat_interleave(2, 1),
+            lidar_depth_m=view.lidar_depth_m.repeat_interleave(2, 0).repeat_interleave(2, 1),
+        )
+        for row, view in enumerate(seen.views)
+    ]
+    points = {track.actor_id: seen.lidar_map.actors["car"] for track in tracks}
+    lidar_map = LidarMap(street=seen.lidar_map.street, actors=points)
+    return replace(seen, views=tuple(views), tracks=tuple(tracks), lidar_map=lidar_map)
+
+
+def bent_bodies(observations):
+    config = InitialisationConfig(num_gaussians=600, street_voxel_m=0.2)
+    return initialise_scene(observations, config).actors.bending.bodies.tolist()
+
+
+def test_people_who_are_seen_well_may_bend(world):
+    tracks = [
+        walker("Car", actor_id="car"),
+        walker(),
+        walker(ahead_m=20.0, actor_id="far"),
+        walker("human.pedestrian.adult", actor_id="bob"),
+    ]
+    assert bent_bodies(with_walkers(world, tracks)) == [2, 4]
+
+
+def test_frames_too_far_apart_show_no_steps(world):
+    assert bent_bodies(with_walkers(world, [walker()], frame_ns=2 * FRAME_NS)) == [1]
+    assert bent_bodies(with_walkers(world, [walker()], frame_ns=5 * FRAME_NS)) == []
+
+
+def test_a_camera_that_stands_is_asked_once_and_counts_for_all_its_images(world):
+    points = world.observations.lidar_map.street.xyz_m
+    camera = camera_at(0.3)
+    footprint, density = pixel_footprint(points, [camera, camera_at(2.0)], [3, 1])
+    again, of_all = pixel_footprint(points, [*3 * [camera], camera_at(2.0)])
+    assert torch.equal(footprint, again)
+    assert torch.allclose(density, of_all)
+    views = world.observations.views
+    stood = [replace(views[0], key=(row, "front")) for row in range(5)] + [views[3]]
+    cameras, images = _spread_cameras(stood)
+    assert [one.centre_world.tolist() for one in cameras] == [
+        one.camera.centre_world.tolist() for one in (views[0], views[3])
+    ]
+    assert images == [5, 1]

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import torch
 from gaussian_world import (
     CAR_SIZE_M,
@@ -9,6 +11,7 @@ from gaussian_world import (
     scene_of,
 )
 
+from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.stored_scene import (
     copy_scene,
@@ -112,3 +115,27 @@ def test_stored_scene_is_the_same_bit_for_bit(world):
     first, second = world.scene.render(camera, 2 * FRAME_NS), again.render(camera, 2 * FRAME_NS)
     assert torch.equal(first.rgb, second.rgb)
     assert torch.equal(again.actors.recorded_tracks[0].size_m, CAR_SIZE_M)
+
+
+def test_who_walks_is_drawn_and_stored_as_they_stand_then(world):
+    scene = copy_scene(world.scene)
+    tracks, knots_ns = scene.actors.recorded_tracks, scene.actors.knots_ns
+    scene = replace(scene, actors=Actors.uncorrected(tracks, knots_ns, bent=[0]))
+    camera = world.observations.views[1].camera
+    at_rest = scene.render(camera, FRAME_NS)
+    assert torch.equal(at_rest.rgb, world.scene.render(camera, FRAME_NS).rgb)
+    scene.actors.bending.offset_m[1, :, :, 2] = 0.3
+    bent = scene.render(camera, FRAME_NS)
+    lifted = [image.actor_alpha.nonzero()[:, 0].min() for image in (bent, at_rest)]
+    assert lifted[0] < lifted[1]
+    again = scene_from_arrays(*scene_to_arrays(scene))
+    assert torch.equal(again.render(camera, FRAME_NS).rgb, bent.rgb)
+    assert torch.equal(
+        scene.render(camera, 3 * FRAME_NS).rgb, again.render(camera, 3 * FRAME_NS).rgb
+    )
+
+
+def test_scenes_stored_before_people_walked_are_read(world):
+    arrays, metadata = scene_to_arrays(world.scene)
+    older = {name: value for name, value in arrays.items() if not name.startswith("bending.")}
+    assert not len(scene_from_arrays(older, metadata).actors.bending.bodies)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from lidarpainter_models.assets.categories import category_of
+from lidarpainter_models.scenes.categories import category_of
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,173 @@
+"""How people and animals move within their boxes: a lattice of offsets over time.
+
+A box is filled with a coarse lattice; its nodes are moved by offsets that a fit finds for each of
+its times, cubic in between (Catmull and Rom, 1974; knots need not be even). A Gaussian goes where
+the eight nodes around its centre take it (free-form deformation, Sederberg and Parry, 1986); axes
+and colours stay. Box frame: x along the length, y left, z up, metres.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import TypeVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, ShownGaussians
+from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
+
+NODES = (3, 3, 5)
+"""Along a box's length, width and height: legs part, arms swing, the head follows."""
+REACH_M = 0.5
+"""No limb is taken further from where it rests."""
+REST = 0.1
+"""How much a node's own way counts beside what parts it from a neighbour."""
+NUM_NODES = NODES[0] * NODES[1] * NODES[2]
+
+AnyGaussians = TypeVar("AnyGaussians", GaussianSet, SeenGaussians, ShownGaussians)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Bending:
+    """The lattices of those actors that bend; all else is rigid."""
+
+    bodies: Int[Tensor, " bent"]
+    """Their body indices, ascending."""
+    size_m: Float[Tensor, "bent 3"]
+    """Of their boxes."""
+    knots_ns: Int[Tensor, " knots"]
+    """Ascending; on the CPU."""
+    offset_m: Float[Tensor, "knots bent nodes 3"]
+    """Where each node is taken; changed in place by a fit."""
+
+    @classmethod
+    def none(
+        cls,
+        bodies: Sequence[int] = (),
+        sizes_m: Sequence[Float[Tensor, "3"]] = (),
+        knots_ns: Int[Tensor, " knots"] | None = None,
+    ) -> "Bending":
+        """Lattices at rest, in boxes of these sizes; by default none."""
+        times_ns = torch.zeros(0, dtype=torch.int64) if knots_ns is None else knots_ns
+        return cls(
+            bodies=torch.tensor(bodies, dtype=torch.int64),
+            size_m=torch.stack([torch.zeros(3), *sizes_m]).float()[1:],
+            knots_ns=times_ns,
+            offset_m=torch.zeros(len(times_ns), len(bodies), NUM_NODES, 3),
+        )
+
+    def to(self, device: torch.device) -> "Bending":
+        """The same on another device, but for the times."""
+        return replace(
+            self,
+            bodies=self.bodies.to(device),
+            size_m=self.size_m.to(device),
+            offset_m=self.offset_m.to(device),
+        )
+
+    def strain(self, timestamp_ns: int) -> Float[Tensor, ""]:
+        """How far nodes are taken at a time, and how differently their neighbours; square metres.
+
+        Sums over nodes, differentiable.
+        """
+        offset_m = self.offset_at(timestamp_ns)
+        lattice = offset_m.unflatten(1, NODES)
+        bends = [torch.diff(lattice, dim=axis).square().sum() for axis in (1, 2, 3)]
+        return torch.stack([REST * offset_m.square().sum(), *bends]).sum()
+
+    def rigid(self, body: int) -> "Bending":
+        """The same, but one body does not bend."""
+        kept = self.bodies != body
+        return replace(
+            self,
+            bodies=self.bodies[kept],
+            size_m=self.size_m[kept],
+            offset_m=self.offset_m[:, kept],
+        )
+
+    def without(self, body: int) -> "Bending":
+        """The same once a body has gone; those after it move up."""
+        rest = self.rigid(body)
+        return replace(rest, bodies=rest.bodies - (rest.bodies > body).long())
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything to be stored."""
+        return dict(vars(self))
+
+    def weights_at(self, timestamp_ns: int) -> tuple[slice, list[float]]:
+        """Which knots say how the nodes stand at a time, and how much each of them counts."""
+        last = self.knots_ns.numel() - 1
+        after = int(torch.searchsorted(self.knots_ns, timestamp_ns))
+        if after == 0 or after > last:
+            end = min(after, last)
+            return slice(end, end + 1), [1.0]
+        first, past = max(after - 2, 0), min(after + 2, last + 1)
+        times_s = (self.knots_ns[first:past] - self.knots_ns[after]).double() * 1e-9
+        now_s = (timestamp_ns - int(self.knots_ns[after])) * 1e-9
+        return slice(first, past), _cubic_weights(times_s.tolist(), after - first, now_s)
+
+    def offset_at(self, timestamp_ns: int) -> Float[Tensor, "bent nodes 3"]:
+        """Where the nodes are taken at a time; differentiable."""
+        near, weights = self.weights_at(timestamp_ns)
+        known = zip(weights, self.offset_m[near], strict=True)
+        return torch.stack([weight * offset_m for weight, offset_m in known]).sum(dim=0)
+
+    def bent(self, gaussians: AnyGaussians, timestamp_ns: int) -> AnyGaussians:
+        """The Gaussians where they are at a time; differentiable in centres and offsets."""
+        if not len(self.bodies):
+            return gaussians
+        body = gaussians.body_index.long()
+        rows = torch.isin(body, self.bodies).nonzero()[:, 0]
+        if not len(rows):
+            return gaussians
+        lattice = torch.searchsorted(self.bodies, body[rows])
+        moved = self._moved(self.offset_at(timestamp_ns), gaussians.means[rows], lattice)
+        return replace(gaussians, means=gaussians.means.index_add(0, rows, moved))
+
+    def _moved(
+        self,
+        offset_m: Float[Tensor, "bent nodes 3"],
+        means: Float[Tensor, "rows 3"],
+        lattice: Int[Tensor, " rows"],
+    ) -> Float[Tensor, "rows 3"]:
+        """By how much the nodes around each centre take it along."""
+        (x, at_x), (y, at_y), (z, at_z) = (
+            _between(place, count)
+            for place, count in zip(
+                (means / self.size_m[lattice] + 0.5).unbind(1), NODES, strict=True
+            )
+        )
+        moved = torch.zeros_like(means)
+        for right, left, up in product((0, 1), repeat=3):
+            node = ((x + right) * NODES[1] + y + left) * NODES[2] + z + up
+            weight = at_x[right] * at_y[left] * at_z[up]
+            moved = moved + weight[:, None] * offset_m[lattice, node]
+        return moved
+
+
+def _between(
+    place: Float[Tensor, " rows"], count: int
+) -> tuple[Int[Tensor, " rows"], tuple[Float[Tensor, " rows"], Float[Tensor, " rows"]]]:
+    """The lower of two nodes around each place (0 to 1 along the box), and what both count."""
+    along = (place * (count - 1)).clamp(0, count - 1)
+    low = along.detach().floor().long().clamp(max=count - 2)
+    share = along - low
+    return low, (1 - share, share)
+
+
+def _cubic_weights(times_s: Sequence[float], after: int, now_s: float) -> list[float]:
+    """Of the knots around an interval, for its cubic with the slopes of their neighbours."""
+    before, last = after - 1, len(times_s) - 1
+    span_s = times_s[after] - times_s[before]
+    u = (now_s - times_s[before]) / span_s
+    weights = [0.0] * len(times_s)
+    weights[before] += 1 - u * u * (3 - 2 * u)
+    weights[after] += u * u * (3 - 2 * u)
+    for knot, slope in ((before, u * (1 - u) ** 2), (after, u * u * (u - 1))):
+        left, right = max(knot - 1, 0), min(knot + 1, last)
+        per_knot = slope * span_s / (times_s[right] - times_s[left])
+        weights[right] += per_knot
+        weights[left] -= per_knot
+    return weights
