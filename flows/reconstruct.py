@@ -23,6 +23,8 @@ from lidarpainter_models.painter.selection import NO_PAINTER
 from tasks.evaluation.views import evaluate, load_scores
 from tasks.opened import opened
 from tasks.progress import working_on
+from tasks.reconstruction.examine import STAGE as EXAMINE
+from tasks.reconstruction.examine import examine, suspicions
 from tasks.reconstruction.fit import fit
 from tasks.reconstruction.paint import paint
 from tasks.reconstruction.prepare import prepare
@@ -113,6 +115,8 @@ def _run(course: Course) -> dict[str, Any]:
     fitted = FittedRef(seen.ref, first.ref)
     final = _rounds(course, fitted)
     store = open_store(run.store_path)
+    if parameters.report:
+        course.add(EXAMINE, examine(run))
     scores = _judged(course, store, fitted, final) if parameters.judge else {}
     result = _result(course, scores, final)
     if parameters.report:
@@ -223,6 +227,7 @@ def _result(course: Course, scores: dict[str, Scores], final: FittedRef) -> dict
             for name, stage in stages.items()
             if stage.ref.kind == "guidance"
         },
+        "suspicions": suspicions(stages[EXAMINE]) if EXAMINE in stages else None,
         "artefacts": {name: stage.ref.artefact_id for name, stage in stages.items()},
         "report": None,
     }

@@ -20,9 +20,11 @@ from lidarpainter_models.checks.actors import (
     check_box_points,
     check_duplicate_tracks,
 )
+from lidarpainter_models.checks.box_places import check_box_places
 from lidarpainter_models.checks.calibration import check_calibration
 from lidarpainter_models.checks.lidar_reach import reaches_of
 from lidarpainter_models.checks.overlay import draw_overlay
+from lidarpainter_models.checks.swapped_images import check_swapped_images
 from lidarpainter_models.checks.sweep_agreement import NEIGHBOURHOOD_M, points_near, sweep_offset_m
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.transforms import (
@@ -83,7 +85,9 @@ def check_scene(scene: DrivingScene) -> list[Check]:
         ("sweeps agree", check_sweeps_agree),
         ("points in images", check_coverage),
         ("camera calibration", check_calibration),
+        ("cameras in their place", check_swapped_images),
         ("boxes hold points", check_box_points),
+        ("boxes around points", check_box_places),
         ("boxes point ahead", check_box_axes),
         ("duplicate tracks", check_duplicate_tracks),
     )
@@ -332,5 +336,7 @@ _BY_POINTS = {
     check_sweeps_agree,
     check_coverage,
     check_calibration,
+    check_swapped_images,
     check_box_points,
+    check_box_places,
 }

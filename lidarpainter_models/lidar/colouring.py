@@ -13,7 +13,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
@@ -119,18 +119,19 @@ class MapColouring:
         number = self._view_numbers[view.key]
         insert_samples(self._samples, seen.rows.numpy(), weight.numpy(), rgb.numpy(), number)
 
+    def gains(self) -> Float[np.ndarray, "views 3"]:
+        """What brings each view, in their order, to the exposure of the first view's camera."""
+        cameras = [camera_name for _, camera_name in self._view_numbers]
+        order = list(dict.fromkeys(cameras))
+        return match_exposure(self._samples, np.array([order.index(name) for name in cameras]))
+
     def coloured(self) -> LidarMap:
         """The map with the colours that the images added gave it.
 
         Colours have the exposure of the first view's camera. Points that no image showed keep
         `has_colour` false.
         """
-        cameras = [camera_name for _, camera_name in self._view_numbers]
-        order = list(dict.fromkeys(cameras))
-        gains = np.ones((1, 3), np.float32)
-        if cameras:
-            view_camera = np.array([order.index(name) for name in cameras])
-            gains = match_exposure(self._samples, view_camera)
+        gains = self.gains() if self._view_numbers else np.ones((1, 3), np.float32)
         rgb, has_colour = map(torch.from_numpy, combine_samples(self._samples, gains))
         sizes = [len(body.points) for body in self._bodies]
         street, *actors = (

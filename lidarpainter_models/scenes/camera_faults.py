@@ -53,7 +53,7 @@ class CameraFault:
         if self.readout_s:
             way = "down" if self.readout_s > 0 else "up"
             said.append(f"reads its rows {way} in {1e3 * abs(self.readout_s):.0f} ms")
-        return f"{', '.join(said)}; corrected"
+        return ", ".join(said)
 
 
 def faults_from_records(records: Mapping[str, Mapping[str, Any]]) -> dict[str, CameraFault]:

@@ -2,14 +2,16 @@
 
 import json
 import tempfile
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
 from catalog.errors import CatalogError
 from catalog.store import Store
 from lidarpainter_models.checks.doctor import check_scene, draw_overlay
-from lidarpainter_models.errors import LidarPainterError
+from lidarpainter_models.errors import LidarPainterError, SceneError
 from lidarpainter_models.export.images import write_png
+from lidarpainter_models.lidar.exposure_differences import exposure_differences
 from lidarpainter_models.lidar.recording_faults import find_faults
 from lidarpainter_models.observations.own_body import in_words, own_bodies
 from lidarpainter_models.readers import ingest_scene
@@ -18,6 +20,8 @@ from tasks.health import Finding
 from tasks.ingest.sequences import find_sequences
 from tasks.opened import open_scene
 
+CAMERA_FAULTS = "camera faults"
+CORRECTS = "--set observation.corrects_cameras=true"
 TRIAL_FRAMES = slice(0, 6)
 """A dataset is tried on this much of each sequence: enough to tell how its cameras are turned."""
 
@@ -32,7 +36,19 @@ def check_stored_scene(store: Store, scene_id: str, out: Path | None) -> list[Fi
     path = out or store.root / "doctor" / scene.dataset / f"{scene.sequence}.png"
     if path.suffix != ".png":
         path = path / "overlay.png"
-    return _examined(scene, path, [*_findings(scene), _camera_faults(scene), _own_bodies(scene)])
+    return _examined(scene, path, findings_about(scene))
+
+
+def findings_about(
+    scene: DrivingScene, progress: Callable[[int, int], None] = lambda _done, _total: None
+) -> list[Finding]:
+    """Everything that is looked for in a whole scene; a trial of a few frames says too little."""
+    looks = [_findings, _camera_faults, *([_exposure] if scene.lidar_names else []), _own_bodies]
+    found = []
+    for done, look in enumerate(looks, start=1):
+        found += look(scene)
+        progress(done, len(looks))
+    return found
 
 
 def check_dataset(store: Store, dataset: str, root: Path, out: Path | None) -> list[Finding]:
@@ -72,20 +88,31 @@ def _findings(scene: DrivingScene) -> list[Finding]:
     return [Finding(check.name, check.verdict, check.detail) for check in check_scene(scene)]
 
 
-def _camera_faults(scene: DrivingScene) -> Finding:
-    """What a fit would correct about the cameras; a trial of a few frames says too little."""
+def _camera_faults(scene: DrivingScene) -> list[Finding]:
+    """What a fit can correct about the cameras."""
     faults = find_faults(scene, scene.views)
     said = [f"{name} {fault}" for name, fault in faults.items()]
     if not said:
-        return Finding("camera faults", "ok", "clocks, angles and readouts are as stored")
-    return Finding("camera faults", "warn", f"{'; '.join(said)} in a fit")
+        return [Finding(CAMERA_FAULTS, "ok", "clocks, angles and readouts are as stored")]
+    return [Finding(CAMERA_FAULTS, "warn", f"{'; '.join(said)} ({CORRECTS} corrects it in a fit)")]
 
 
-def _own_bodies(scene: DrivingScene) -> Finding:
+def _exposure(scene: DrivingScene) -> list[Finding]:
+    """How images differ in brightness."""
+    try:
+        said = exposure_differences(scene)
+    except SceneError as error:
+        return [Finding("exposure", "fail", str(error))]
+    if not said:
+        return [Finding("exposure", "ok", "images are exposed alike")]
+    return [Finding("exposure", "warn", f"{'; '.join(said)} (a fit brings cameras together)")]
+
+
+def _own_bodies(scene: DrivingScene) -> list[Finding]:
     """Which cameras show the recording car, which a fit leaves out."""
     found = own_bodies(scene, scene.views)
     said = [in_words(name, body) for name, body in found.items()]
-    return Finding("own body", "ok", " ".join(said) or "no camera shows the recording car")
+    return [Finding("own body", "ok", " ".join(said) or "no camera shows the recording car")]
 
 
 def _write_overlay(scene: DrivingScene, path: Path) -> Path:

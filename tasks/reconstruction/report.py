@@ -26,6 +26,8 @@ from tasks.evaluation.shown import view_time_painting
 from tasks.machine import machine
 from tasks.opened import OpenedRun, opened
 from tasks.progress import Progress
+from tasks.reconstruction.examine import STAGE as EXAMINE
+from tasks.reconstruction.examine import suspicions
 from tasks.specs import FittedRef, RunSpec
 from tasks.stages import StageResult, run_stage, stage_task
 from tasks.stored import History, load_history, load_scene
@@ -74,6 +76,7 @@ def write_report(run: RunSpec, inputs: ReportInputs, config: JudgeConfig) -> Sta
             histories=partial(_histories, this.store, fits),
             held_out=this.held_out(config.observation, or_train=True),
             shifts=config.scoring.shifts,
+            said=suspicions(stages[EXAMINE]) if EXAMINE in stages else (),
             unpainted=partial(load_scene, this.store, inputs.unpainted.gaussians),
             painting=partial(
                 view_time_painting,
@@ -95,11 +98,12 @@ def _build(  # noqa: PLR0913 - all that the page is made from
     histories: Callable[[], dict[str, History]],
     held_out: HeldOut,
     shifts: Sequence[Shift],
+    said: Sequence[str],
     unpainted: Callable[[], GaussianScene],
     painting: Callable[[], ViewTimePainting],
 ) -> dict[str, Any]:
     subject = Subject(held_out=held_out, unpainted=unpainted(), painting=painting())
-    pictures = _pictures(subject, shifts, progress)
+    pictures = _pictures(subject, shifts, said, progress)
     report = page.report(
         held_out.scene,
         pictures,
@@ -112,7 +116,9 @@ def _build(  # noqa: PLR0913 - all that the page is made from
     return {}
 
 
-def _pictures(subject: Subject, shifts: Sequence[Shift], progress: Progress) -> Pictures:
+def _pictures(
+    subject: Subject, shifts: Sequence[Shift], said: Sequence[str], progress: Progress
+) -> Pictures:
     fitted, held_out = subject.painting.conditions.scene, subject.held_out
     beside = shifts[0] if shifts else Shift(lateral_m=2.0)
     bodies = fitted.gaussians.body_index.long().cpu()
@@ -124,7 +130,8 @@ def _pictures(subject: Subject, shifts: Sequence[Shift], progress: Progress) -> 
         worst=worst_views(held_out, fitted),
         actor_gaussians=dict(zip(names, counts, strict=True)),
         faults=[
-            *(f"{name} {fault}." for name, fault in fitted.cameras.faults.items()),
+            *said,
+            *(f"{name} {fault}; corrected." for name, fault in fitted.cameras.faults.items()),
             *(in_words(name, body) for name, body in fitted.cameras.own_bodies.items()),
         ],
     )

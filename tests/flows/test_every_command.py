@@ -18,7 +18,10 @@ from lidarpainter_models.painter.styles import STYLE_PROMPTS
 from tasks.reconstruction.report import WORST_FILE
 
 ROOT = Path(__file__).resolve().parents[2]
-STAGES = ("prepare", "fit", "paint-1", "refine-1", "evaluate-unpainted", "evaluate", "report")
+STAGES = (
+    *("prepare", "fit", "paint-1", "refine-1"),
+    *("examine", "evaluate-unpainted", "evaluate", "report"),
+)
 SHIFTS = {"left-2m", "up-1.5m"}
 TINY = ("--preset", "brief", *settings(*SETTINGS))
 
@@ -123,6 +126,7 @@ def test_every_stage_tells_how_far_it_is_from_its_start_to_its_end(tiny_run, mon
     told = {
         stage: [line for line in said.splitlines() if line.startswith(f"{stage}: ")]
         for stage in STAGES
+        if stage != "examine"  # as another run of the scene has left it
     }
     for stage, lines in told.items():
         assert len(lines) > 1, stage

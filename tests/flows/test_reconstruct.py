@@ -76,6 +76,7 @@ def test_the_command_gives_numbers_a_report_and_a_catalog(store):
         "refine-1",
         "paint-2",
         "refine-2",
+        "examine",
         "evaluate-unpainted",
         "evaluate",
         "report",

@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("flows", "tasks", "catalog", "lidarpainter_models")
 SETTINGS = (*SMALL, "rounds=1")
 FIT_AND_AFTER = {"fit", "paint-1", "refine-1", "evaluate-unpainted", "evaluate", "report"}
-STAGES = {"prepare", *FIT_AND_AFTER}
+STAGES = {"prepare", "examine", *FIT_AND_AFTER}
 
 pytestmark = pytest.mark.slow
 

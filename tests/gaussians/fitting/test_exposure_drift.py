@@ -1,0 +1,85 @@
+"""A camera that is a third brighter than its neighbour, and grows brighter still during the log."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from lidarpainter_models.evaluation.held_out import HeldOut
+from lidarpainter_models.gaussians.fitting.config import FitConfig
+from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
+from lidarpainter_models.gaussians.fitting.refinement import Refinement
+from lidarpainter_models.observations.preparation import prepare_observations
+from lidarpainter_models.observations.settings import ObservationConfig
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.splits import split_views
+from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street
+from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
+
+FRONT, _, SIDE = DEFAULT_CAMERAS
+STREET = SyntheticStreetConfig(
+    seed=7, num_frames=24, width_px=240, height_px=136, cameras=(FRONT, replace(SIDE, gain=1.0))
+)
+BRIGHTER = replace(STREET, cameras=(FRONT, replace(SIDE, gain=1.3, gain_drift=0.1)))
+SIZE = ObservationConfig(width_px=STREET.width_px)
+
+
+class Fitted:
+    """A fit of a street, and the held-out images it is judged on."""
+
+    def __init__(self, street, folder):
+        recording = DrivingScene.open(write_street(street, folder))
+        split = split_views(recording, "alternate", None)
+        seen = prepare_observations(recording, split, SIZE)
+        self.scene = fit_gaussians(seen, FitConfig()).scene
+        self.held_out = HeldOut(scene=recording, test_views=split.test, observation=SIZE)
+
+    def shown(self):
+        """Camera, truth and render of every held-out view."""
+        for view in self.held_out.recorded_views(self.scene, "interpolated"):
+            name = view.name.partition("/")[0]
+            image = self.scene.render(view.camera, view.timestamp_ns, camera_name=name).rgb
+            yield name, view, image.clamp(0, 1)
+
+    def psnr(self, camera_name):
+        """Mean over a camera's views."""
+        errors = [
+            (image - view.truth_rgb).square().mean()
+            for name, view, image in self.shown()
+            if name == camera_name
+        ]
+        return float(torch.stack([-10 * error.log10() for error in errors]).mean())
+
+    def colour_difference(self):
+        """Of the side camera's images, brought to the scene's colours, from what both show."""
+        front = {v.timestamp_ns: v.camera for n, v, _ in self.shown() if n == FRONT.name}
+        differences = []
+        for name, view, _ in self.shown():
+            if name == FRONT.name:
+                continue
+            plain = self.scene.render(view.camera, view.timestamp_ns)
+            points = view.camera.unproject(plain.depth_m)
+            there = front[view.timestamp_ns]
+            both = there.contains(*there.project(points.flatten(0, 1))).view(points.shape[:2])
+            both &= (plain.depth_m > 0) & (view.truth_rgb < 0.98).all(dim=-1)
+            undone = self.scene.exposure.undone(view.truth_rgb, name, view.timestamp_ns)
+            differences.append((undone - plain.rgb)[both])
+        return 255 * torch.cat(differences).mean(dim=0)
+
+
+@pytest.mark.slow
+def test_a_brighter_camera_that_drifts_is_brought_back(tmp_path, monkeypatch, capsys):
+    alike, corrected = Fitted(STREET, tmp_path / "alike"), Fitted(BRIGHTER, tmp_path / "brighter")
+    monkeypatch.setattr(Refinement, "refines_exposure", False)
+    left = Fitted(BRIGHTER, tmp_path / "left")
+    difference = corrected.colour_difference()
+    with capsys.disabled():
+        for name, one in (("alike", alike), ("corrected", corrected), ("left", left)):
+            psnr = {camera.name: round(one.psnr(camera.name), 2) for camera in STREET.cameras}
+            print(f"\n{name}: {psnr}")  # noqa: T201
+        print(f"colours in the overlap, of 255: {difference.tolist()}")  # noqa: T201
+    for camera in STREET.cameras:
+        lost = alike.psnr(camera.name) - left.psnr(camera.name)
+        gained = corrected.psnr(camera.name) - left.psnr(camera.name)
+        assert gained > 0.8 * lost, camera.name
+    assert float(difference.abs().max()) < 2
