@@ -64,7 +64,7 @@ class NovelPainting:
     """Its weight is 0 everywhere if the gate refused the painting."""
     gate: GuidanceGate
     images: dict[str, UInt8[Tensor, "height width 3"]]
-    """By name: render, lidar, warp, painted, confidence."""
+    """Of one view of each shift, by name: render, lidar, warp, painted, confidence."""
 
     @property
     def mean_weight(self) -> float:
@@ -147,22 +147,31 @@ def paint_novel_views(
     config = config or NovelGuidanceConfig()
     paintings = []
     paths: dict[tuple[Shift, str], SequencePainter] = {}
-    for done, novel in enumerate(cameras, start=1):
-        if has_room(novel, builder.lidar_map, builder.boxes):
-            path = paths.setdefault(
-                (novel.shift, novel.key[1]),
-                SequencePainter(builder, painter, config=config.sequence),
+    standing = [one for one in cameras if has_room(one, builder.lidar_map, builder.boxes)]
+    shown = _one_per_shift(standing)
+    for done, novel in enumerate(standing, start=len(cameras) - len(standing) + 1):
+        path = paths.setdefault(
+            (novel.shift, novel.key[1]),
+            SequencePainter(builder, painter, config=config.sequence),
+        )
+        paintings.append(
+            within_memory(
+                partial(_paint, builder, path, novel, novel in shown),
+                builder.scene.device,
+                "painting: a narrower observation.width_px takes less",
             )
-            paintings.append(
-                within_memory(
-                    partial(_paint, builder, path, novel),
-                    builder.scene.device,
-                    "painting: a narrower observation.width_px takes less",
-                )
-            )
+        )
         if progress is not None:
             progress(done, len(cameras))
     return paintings
+
+
+def _one_per_shift(cameras: Sequence[NovelCamera]) -> list[NovelCamera]:
+    """The middle one of each shift."""
+    by_shift: dict[Shift, list[NovelCamera]] = {}
+    for novel in cameras:
+        by_shift.setdefault(novel.shift, []).append(novel)
+    return [group[len(group) // 2] for group in by_shift.values()]
 
 
 def guidance_views(paintings: Sequence[NovelPainting]) -> list[GuidanceView]:
@@ -174,6 +183,7 @@ def _paint(
     builder: ConditionBuilder,
     path: SequencePainter,
     novel: NovelCamera,
+    is_shown: bool,
     spares: bool,
 ) -> NovelPainting:
     if spares:
@@ -186,15 +196,16 @@ def _paint(
     seen = is_seen(novel.camera, depth_m, builder.recorded_cameras)
     geometric = geometric_confidence(conditions, novel.camera, seen)
     weight = (painting.confidence * geometric * gate.weight).clamp(0, 1)
-    guidance = GuidanceView(
-        camera=novel.camera,
-        timestamp_ns=novel.timestamp_ns,
+    guidance = GuidanceView.of(
+        novel.camera,
+        novel.timestamp_ns,
         rgb=painting.rgb,
         weight=weight,
         lidar_depth_m=conditions.lidar_depth_m,
     )
     home = torch.device("cpu")  # where paintings of a whole log have room
-    images = {name: rgb.to(home) for name, rgb in _images(conditions, painting, weight).items()}
+    images = _images(conditions, painting, weight) if is_shown else {}
+    images = {name: rgb.to(home) for name, rgb in images.items()}
     return NovelPainting(novel=novel, guidance=guidance.to(home), gate=gate, images=images)
 
 

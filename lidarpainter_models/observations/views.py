@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float16, UInt8
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
@@ -46,27 +46,63 @@ class TrainingView:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GuidanceView:
-    """One painted image of a view nobody recorded."""
+    """One painted image of a view nobody recorded, kept no finer than it is exact."""
 
     camera: Camera
     """Where the image was painted; it is never corrected."""
     timestamp_ns: int
-    rgb: Float[Tensor, "height width 3"]
-    weight: Float[Tensor, "height width"]
-    """Confidence per pixel, 0 to 1."""
-    lidar_depth_m: Float[Tensor, "height width"]
-    """Sparse LiDAR depth in this view, 0 where there is none."""
+    rgb_u8: UInt8[Tensor, "height width 3"]
+    weight_u8: UInt8[Tensor, "height width"]
+    lidar_depth_f16: Float16[Tensor, "height width"]
+
+    @classmethod
+    def of(
+        cls,
+        camera: Camera,
+        timestamp_ns: int,
+        *,
+        rgb: Float[Tensor, "height width 3"],
+        weight: Float[Tensor, "height width"],
+        lidar_depth_m: Float[Tensor, "height width"],
+    ) -> "GuidanceView":
+        """A view of floats; see the properties."""
+        return cls(
+            camera=camera,
+            timestamp_ns=timestamp_ns,
+            rgb_u8=_bytes(rgb),
+            weight_u8=_bytes(weight),
+            lidar_depth_f16=lidar_depth_m.half(),
+        )
+
+    @property
+    def rgb(self) -> Float[Tensor, "height width 3"]:
+        """The image as floats."""
+        return self.rgb_u8.float() / 255
+
+    @property
+    def weight(self) -> Float[Tensor, "height width"]:
+        """Confidence per pixel, 0 to 1."""
+        return self.weight_u8.float() / 255
+
+    @property
+    def lidar_depth_m(self) -> Float[Tensor, "height width"]:
+        """Sparse LiDAR depth in this view, 0 where there is none."""
+        return self.lidar_depth_f16.float()
 
     def to(self, device: torch.device) -> "GuidanceView":
         """The same view on another device, as far as it is not there."""
-        if self.rgb.device == device:
+        if self.rgb_u8.device == device:
             return self
         return replace(
             self,
-            rgb=self.rgb.to(device, non_blocking=True),
-            weight=self.weight.to(device, non_blocking=True),
-            lidar_depth_m=self.lidar_depth_m.to(device, non_blocking=True),
+            rgb_u8=self.rgb_u8.to(device, non_blocking=True),
+            weight_u8=self.weight_u8.to(device, non_blocking=True),
+            lidar_depth_f16=self.lidar_depth_f16.to(device, non_blocking=True),
         )
+
+
+def _bytes(values: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
+    return (values.clamp(0, 1) * 255).round().to(torch.uint8)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

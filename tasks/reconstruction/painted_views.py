@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from catalog.artefacts import ArtefactRef
@@ -29,14 +28,14 @@ def save_guidance(folder: Path, paintings: Sequence[NovelPainting]) -> None:
     arrays: dict[str, Tensor] = {}
     records: list[dict[str, Any]] = []
     for index, view in enumerate(guidance_views(paintings)):
-        arrays[f"{index}.rgb_u8"] = _bytes(view.rgb)
-        arrays[f"{index}.weight_u8"] = _bytes(view.weight)
-        arrays[f"{index}.lidar_depth_m"] = view.lidar_depth_m.to(torch.float16)
+        arrays[f"{index}.rgb_u8"] = view.rgb_u8
+        arrays[f"{index}.weight_u8"] = view.weight_u8
+        arrays[f"{index}.lidar_depth_m"] = view.lidar_depth_f16
         arrays[f"{index}.world_from_camera"] = view.camera.world_from_camera
         lens = {name: getattr(view.camera, name) for name in LENS}
         records.append({"timestamp_ns": view.timestamp_ns, "lens": lens})
     write_tensors(folder / GUIDANCE_FILE, arrays, {"views": records})
-    for painting in _one_per_shift(paintings):
+    for painting in paintings:
         for name, rgb_u8 in painting.images.items():
             path = folder / IMAGE_FOLDER / painting.novel.shift.name / f"{name}.png"
             write_png(rgb_u8.float() / FULL_BYTE, path)
@@ -50,20 +49,9 @@ def load_guidance(store: Store, ref: ArtefactRef) -> tuple[GuidanceView, ...]:
         GuidanceView(
             camera=Camera(world_from_camera=arrays[f"{index}.world_from_camera"], **row["lens"]),
             timestamp_ns=row["timestamp_ns"],
-            rgb=arrays[f"{index}.rgb_u8"].float() / FULL_BYTE,
-            weight=arrays[f"{index}.weight_u8"].float() / FULL_BYTE,
-            lidar_depth_m=arrays[f"{index}.lidar_depth_m"].float(),
+            rgb_u8=arrays[f"{index}.rgb_u8"],
+            weight_u8=arrays[f"{index}.weight_u8"],
+            lidar_depth_f16=arrays[f"{index}.lidar_depth_m"],
         )
         for index, row in enumerate(metadata["views"])
     )
-
-
-def _bytes(values: Tensor) -> Tensor:
-    return (values.clamp(0, 1) * FULL_BYTE).round().to(torch.uint8)
-
-
-def _one_per_shift(paintings: Sequence[NovelPainting]) -> list[NovelPainting]:
-    by_shift: dict[str, list[NovelPainting]] = {}
-    for painting in paintings:
-        by_shift.setdefault(painting.novel.shift.name, []).append(painting)
-    return [group[len(group) // 2] for group in by_shift.values()]

@@ -34,7 +34,7 @@ def finding(scene, name):
 def test_sound_scene_passes_every_check(small_scene):
     checks = check_scene(small_scene)
     assert [check for check in checks if check.verdict != "ok"] == []
-    assert len({check.name for check in checks}) == 13
+    assert len({check.name for check in checks}) == 15
 
 
 @pytest.fixture

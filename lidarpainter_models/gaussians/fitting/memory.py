@@ -18,7 +18,7 @@ from lidarpainter_models.observations.views import GuidanceView, SceneObservatio
 
 FLOAT = 4
 """Bytes of a number."""
-IMAGE_BYTES, GUIDANCE_BYTES = 8, 20
+IMAGE_BYTES, GUIDANCE_BYTES = 8, 6
 """Of a pixel: colour, depth and kind of a recorded image; colour, weight and depth of a painted."""
 PROGRAM_BYTES = 700_000_000
 """Of the process before it holds anything: the interpreter, torch, numba's kernels, arrow."""

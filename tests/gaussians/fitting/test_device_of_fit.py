@@ -43,9 +43,9 @@ def device(monkeypatch):
 
 def painted_view(world):
     view = world.observations.views[1]
-    return GuidanceView(
-        camera=view.camera,
-        timestamp_ns=FRAME_NS,
+    return GuidanceView.of(
+        view.camera,
+        FRAME_NS,
         rgb=torch.full_like(view.rgb, 0.2),
         weight=torch.full(view.sky_mask.shape, 0.7),
         lidar_depth_m=view.lidar_depth_m,

@@ -40,9 +40,9 @@ def short_fit(**changes):
 
 def painted_view(world, *, weight=1.0):
     camera = world.observations.views[1].camera
-    return GuidanceView(
-        camera=camera,
-        timestamp_ns=FRAME_NS,
+    return GuidanceView.of(
+        camera,
+        FRAME_NS,
         rgb=torch.full((HEIGHT_PX, WIDTH_PX, 3), 0.2),
         weight=torch.full((HEIGHT_PX, WIDTH_PX), weight),
         lidar_depth_m=torch.zeros(HEIGHT_PX, WIDTH_PX),
