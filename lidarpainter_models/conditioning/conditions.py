@@ -28,10 +28,10 @@ from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT, PaintingConditions
 from lidarpainter_models.scenes.records import ViewKey
 
-MOST_SOURCE_BYTES = 1_000_000_000
+MOST_SOURCE_BYTES = 2_000_000_000
 """Of training views that are kept as sources: all of a short log, the last ones of a long one."""
-SOURCE_PIXEL_BYTES = 20
-"""Of a source: colour, depth and opacity."""
+SOURCE_PIXEL_BYTES = 41
+"""Of a source: colour, depth and opacity, and the layers that are sampled."""
 
 
 class ConditionBuilder:

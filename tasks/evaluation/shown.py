@@ -65,7 +65,7 @@ def condition_builder(
 
 
 def forget_shown() -> None:
-    """Let go of what was gathered for a painter: views of up to 1 GB."""
+    """Let go of what was gathered for a painter: views of up to 2 GB."""
     _builder.cache_clear()
 
 
