@@ -20,7 +20,8 @@ FRONT, _, SIDE = DEFAULT_CAMERAS
 STREET = SyntheticStreetConfig(
     seed=7, num_frames=24, width_px=240, height_px=136, cameras=(FRONT, replace(SIDE, gain=1.0))
 )
-BRIGHTER = replace(STREET, cameras=(FRONT, replace(SIDE, gain=1.3, gain_drift=0.1)))
+GAIN, DRIFT_PER_S = 1.3, 0.1
+BRIGHTER = replace(STREET, cameras=(FRONT, replace(SIDE, gain=GAIN, gain_drift=DRIFT_PER_S)))
 SIZE = ObservationConfig(width_px=STREET.width_px)
 
 
@@ -28,6 +29,7 @@ class Fitted:
     """A fit of a street, and the held-out images it is judged on."""
 
     def __init__(self, street, folder):
+        self.cameras = {camera.name: camera for camera in street.cameras}
         recording = DrivingScene.open(write_street(street, folder))
         split = split_views(recording, "alternate", None)
         seen = prepare_observations(recording, split, SIZE)
@@ -41,14 +43,25 @@ class Fitted:
             image = self.scene.render(view.camera, view.timestamp_ns, camera_name=name).rgb
             yield name, view, image.clamp(0, 1)
 
+    def gain(self, camera_name, timestamp_ns):
+        """How much brighter a camera was at a time."""
+        camera, log = self.cameras[camera_name], self.held_out.scene
+        since_s = (timestamp_ns - int(log.frame_timestamps_ns[0])) * 1e-9
+        return camera.gain * (1 + camera.gain_drift * since_s)
+
     def psnr(self, camera_name):
-        """Mean over a camera's views."""
-        errors = [
-            (image - view.truth_rgb).square().mean()
-            for name, view, image in self.shown()
-            if name == camera_name
-        ]
-        return float(torch.stack([-10 * error.log10() for error in errors]).mean())
+        """Mean over a camera's views, errors in the light of a camera of gain 1.
+
+        Pixels that are white in the brighter camera are left out.
+        """
+        found = []
+        for name, view, image in self.shown():
+            if name == camera_name:
+                gain = self.gain(name, view.timestamp_ns)
+                is_told = (view.truth_rgb < 0.98 * gain / GAIN / (1 + 3 * DRIFT_PER_S)).all(dim=-1)
+                error = ((image - view.truth_rgb) / gain)[is_told].square().mean()
+                found.append(-10 * error.log10())
+        return float(torch.stack(found).mean())
 
     def colour_difference(self):
         """Of the side camera's images, brought to the scene's colours, from what both show."""
