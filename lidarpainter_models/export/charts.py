@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK, SOFT, NAMED, FRONT = "#1f2430", "#7b8494", "#c2410c", "#94a3b8"
+NAME_PT = 7.5
+NAME_OFFSETS = ((0, 6, "center"), (0, -13, "center"), (7, -3, "left"), (-7, -3, "right"))
+"""Where a name may stand beside its point: points across and up, and the side that is held."""
 PANEL_INCHES = (4.6, 3.4)
 SALT = "lidarpainter"
 """Makes the ids in an SVG the same every time."""
@@ -61,6 +64,10 @@ def draw_chart(chart: Chart, cost: str, qualities: Sequence[str], stem: Path) ->
                 _draw_panel(axes[row, column], marks, cost, quality)
                 axes[row, column].set_title(scene if row == 0 else "", loc="left", color=INK)
             axes[row, 0].set_ylabel(chart.labels[quality], color=SOFT)
+        figure.draw_without_rendering()  # now it is known where points come to lie
+        for row, quality in enumerate(qualities):
+            for column, marks in enumerate(chart.panels.values()):
+                _name_points(axes[row, column], marks, cost, quality)
         for panel in axes[-1]:
             panel.set_xlabel(chart.labels[cost], color=SOFT)
         figure.suptitle(chart.title, x=0.01, ha="left", color=INK, fontsize=11)
@@ -99,15 +106,51 @@ def _draw_panel(axes: "Axes", marks: Sequence[Mark], cost: str, quality: str) ->
     for mark, x, y in zip(known, xs, ys, strict=True):
         colour = NAMED if mark.is_named else INK
         axes.errorbar(x.mean, y.mean, _bar(y), _bar(x), fmt="o", ms=5, color=colour, elinewidth=1)
+    axes.margins(0.1)
+
+
+def _name_points(axes: "Axes", marks: Sequence[Mark], cost: str, quality: str) -> None:
+    """A name beside each point, the named one's first, each where it covers fewest others."""
+    taken: list[tuple[float, float, float, float]] = []
+    known = [mark for mark in marks if cost in mark.figures and quality in mark.figures]
+    for mark in sorted(known, key=lambda mark: not mark.is_named):
+        place = mark.figures[cost].mean, mark.figures[quality].mean
+        x_px, y_px = axes.transData.transform(place)
+        scale = 72 / axes.get_figure(root=True).dpi
+        boxes = {
+            offset: _name_box(mark.name, x_px * scale, y_px * scale, *offset)
+            for offset in NAME_OFFSETS
+        }
+        best = min(boxes, key=lambda offset: sum(_overlap(boxes[offset], one) for one in taken))
+        taken.append(boxes[best])
+        across, up, side = best
         axes.annotate(
             mark.name,
-            (x.mean, y.mean),
-            xytext=(0, 6),
+            place,
+            xytext=(across, up),
             textcoords="offset points",
-            ha="center",
-            fontsize=7.5,
-            color=colour,
+            ha=side,
+            fontsize=NAME_PT,
+            color=NAMED if mark.is_named else INK,
         )
+
+
+def _name_box(
+    name: str, x_pt: float, y_pt: float, across_pt: float, up_pt: float, side: str
+) -> tuple[float, float, float, float]:
+    """About where a name lies: left, bottom, right, top."""
+    width_pt = 0.55 * NAME_PT * len(name)
+    left = x_pt + across_pt - {"center": 0.5, "left": 0.0, "right": 1.0}[side] * width_pt
+    return left, y_pt + up_pt, left + width_pt, y_pt + up_pt + NAME_PT
+
+
+def _overlap(
+    one: tuple[float, float, float, float], other: tuple[float, float, float, float]
+) -> float:
+    """Area that both boxes cover."""
+    width = min(one[2], other[2]) - max(one[0], other[0])
+    height = min(one[3], other[3]) - max(one[1], other[1])
+    return max(width, 0.0) * max(height, 0.0)
 
 
 def _bar(spread: Spread) -> float:
