@@ -67,7 +67,7 @@ def draw_chart(chart: Chart, cost: str, qualities: Sequence[str], stem: Path) ->
         figure.draw_without_rendering()  # now it is known where points come to lie
         for row, quality in enumerate(qualities):
             for column, marks in enumerate(chart.panels.values()):
-                _name_points(axes[row, column], marks, cost, quality)
+                _name_points(axes[row, column], marks, (cost, quality), 72 / figure.dpi)
         for panel in axes[-1]:
             panel.set_xlabel(chart.labels[cost], color=SOFT)
         figure.suptitle(chart.title, x=0.01, ha="left", color=INK, fontsize=11)
@@ -109,16 +109,18 @@ def _draw_panel(axes: "Axes", marks: Sequence[Mark], cost: str, quality: str) ->
     axes.margins(0.1)
 
 
-def _name_points(axes: "Axes", marks: Sequence[Mark], cost: str, quality: str) -> None:
+def _name_points(
+    axes: "Axes", marks: Sequence[Mark], names: tuple[str, str], points_per_px: float
+) -> None:
     """A name beside each point, the named one's first, each where it covers fewest others."""
+    cost, quality = names
     taken: list[tuple[float, float, float, float]] = []
     known = [mark for mark in marks if cost in mark.figures and quality in mark.figures]
     for mark in sorted(known, key=lambda mark: not mark.is_named):
         place = mark.figures[cost].mean, mark.figures[quality].mean
         x_px, y_px = axes.transData.transform(place)
-        scale = 72 / axes.get_figure(root=True).dpi
         boxes = {
-            offset: _name_box(mark.name, x_px * scale, y_px * scale, *offset)
+            offset: _name_box(mark.name, x_px * points_per_px, y_px * points_per_px, *offset)
             for offset in NAME_OFFSETS
         }
         best = min(boxes, key=lambda offset: sum(_overlap(boxes[offset], one) for one in taken))
