@@ -100,9 +100,8 @@ class ReconstructParameters(ViewParameters):
             stages[f"refine-{number}"] = self.refine.steps or None
         judged = ["evaluate-unpainted", "evaluate"]
         judged += ["evaluate-view-time"] if self.judge_view_time and paints else []
-        about = {"examine": None} if self.report else {}
-        last = [*(judged if self.judge else ()), *(["report"] if self.report else ())]
-        return stages | about | dict.fromkeys(last)
+        first, last = (["examine"], ["report"]) if self.report else ([], [])
+        return stages | dict.fromkeys([*first, *(judged if self.judge else ()), *last])
 
 
 def view_parameters(run: FinishedRun) -> ViewParameters:

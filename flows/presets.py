@@ -48,8 +48,7 @@ def brief(scene: str) -> ReconstructParameters:
 def balanced(scene: str) -> ReconstructParameters:
     """The best trade for a whole log: twice as fine, in under an hour on two CPU cores.
 
-    Fewer Gaussians for each pixel, and one painted round of fewer views: a step takes four times as
-    long as in `preview`.
+    Fewer Gaussians for each pixel, and one painted round of fewer views.
     """
     fit = FitConfig(effort=EffortConfig(looks=400.0, gaussians_per_pixel=0.125))
     changes = {

@@ -19,14 +19,10 @@ import numpy as np
 
 from lidarpainter_models.checks.depth_edges import (
     EdgeImage,
-    EdgePoints,
-    depth_edges,
-    edge_images,
+    SceneEdges,
     edge_score,
     reduced,
-    slow_frames,
 )
-from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 
 Verdict = Literal["ok", "warn", "fail"]
@@ -86,12 +82,13 @@ def _trust(peak: float) -> str:
     return f"not trusted (stands out by {peak:.1f} deviations from other turns, not {MIN_PEAK})"
 
 
-def check_calibration(scene: DrivingScene) -> tuple[Verdict, str]:
+def check_calibration(edges: SceneEdges) -> tuple[Verdict, str]:
     """Whether depth edges lie on image edges without turning any camera."""
-    edges: dict[int, dict[str, EdgePoints]] = {}
-    if any(_is_fine_enough(reduced(view.camera)) for view in scene.views):
-        edges = {frame_index: depth_edges(scene, frame_index) for frame_index in slow_frames(scene)}
-    found = {name: best_turn(scene, name, edges) for name in scene.camera_names}
+    scene = edges.scene
+    found = {
+        name: best_turn(edges.images[name]) if _is_fine_enough(scene, name) else None
+        for name in scene.camera_names
+    }
     wrong, unsure, details = [], [], []
     for name, turn in found.items():
         if turn is None:
@@ -110,13 +107,10 @@ def check_calibration(scene: DrivingScene) -> tuple[Verdict, str]:
     return "ok", detail
 
 
-def best_turn(
-    scene: DrivingScene, camera_name: str, edges: dict[int, dict[str, EdgePoints]]
-) -> CameraTurn | None:
+def best_turn(images: Sequence[EdgeImage]) -> CameraTurn | None:
     """The turn of a camera that puts depth edges on image edges; None where none can be told."""
-    images = edge_images(scene, camera_name, edges)
     num_points = sum(len(points) for image in images for points, _ in image.points.values())
-    if num_points < MIN_EDGE_POINTS or not all(_is_fine_enough(image.camera) for image in images):
+    if num_points < MIN_EDGE_POINTS:
         return None
     plane = np.array([[edge_score(images, (p, yaw, 0)) for yaw in _TURNS_DEG] for p in _TURNS_DEG])
     row, column = np.unravel_index(plane.argmax(), plane.shape)
@@ -134,17 +128,19 @@ def best_turn(
     )
 
 
-def _is_fine_enough(camera: Camera) -> bool:
-    return _px_per_deg(camera) >= _MIN_PX_PER_DEG
+def _is_fine_enough(scene: DrivingScene, camera_name: str) -> bool:
+    return _px_per_deg(scene, camera_name) >= _MIN_PX_PER_DEG
 
 
-def _px_per_deg(camera: Camera) -> float:
-    return camera.fx_px * math.radians(1.0)
+def _px_per_deg(scene: DrivingScene, camera_name: str) -> float:
+    """Of the coarsest image that is looked at."""
+    cameras = [reduced(view.camera) for view in scene.views_of(camera_name)]
+    return min(camera.fx_px for camera in cameras) * math.radians(1.0)
 
 
 def _why_untold(scene: DrivingScene, camera_name: str) -> str:
-    px_per_deg = min(_px_per_deg(reduced(view.camera)) for view in scene.views_of(camera_name))
-    if px_per_deg < _MIN_PX_PER_DEG:
+    if not _is_fine_enough(scene, camera_name):
+        px_per_deg = _px_per_deg(scene, camera_name)
         return f"images of {px_per_deg:.1f} pixels a degree, {_MIN_PX_PER_DEG} are needed"
     return f"fewer than {MIN_EDGE_POINTS} points at depth edges in its images"
 

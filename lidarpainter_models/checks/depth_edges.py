@@ -12,6 +12,7 @@ Camera frame: x right, y down, z forward.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -57,7 +58,21 @@ class EdgeImage:
     """In the camera's frame, with their weights."""
 
 
-def slow_frames(scene: DrivingScene) -> list[int]:
+class SceneEdges:
+    """The edge images of each camera of a scene, found once for all who look at them."""
+
+    def __init__(self, scene: DrivingScene) -> None:
+        self.scene = scene
+
+    @cached_property
+    def images(self) -> dict[str, list[EdgeImage]]:
+        """By camera."""
+        frames = _slow_frames(self.scene)
+        edges = {frame_index: _depth_edges(self.scene, frame_index) for frame_index in frames}
+        return {name: _edge_images(self.scene, name, edges) for name in self.scene.camera_names}
+
+
+def _slow_frames(scene: DrivingScene) -> list[int]:
     """A few frames with sweeps, spread over the slower half of a log; all of a short one."""
     swept = sorted({sweep.frame_index for sweep in scene.sweeps})
     if len(swept) > 2:
@@ -71,7 +86,7 @@ def slow_frames(scene: DrivingScene) -> list[int]:
     return [swept[place] for place in np.unique(places)]
 
 
-def edge_images(
+def _edge_images(
     scene: DrivingScene, camera_name: str, edges: dict[int, dict[str, EdgePoints]]
 ) -> list[EdgeImage]:
     """The images of a camera in the frames whose depth edges are given."""
@@ -100,7 +115,7 @@ def reduced(camera: Camera) -> Camera:
     )
 
 
-def depth_edges(scene: DrivingScene, frame_index: int) -> dict[str, EdgePoints]:
+def _depth_edges(scene: DrivingScene, frame_index: int) -> dict[str, EdgePoints]:
     """Points where a near surface ends: `across` neighbouring azimuths, or `along` elevations."""
     found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {"across": [], "along": []}
     for sweep in scene.sweeps_of(frame_index):

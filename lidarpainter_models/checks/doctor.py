@@ -22,6 +22,7 @@ from lidarpainter_models.checks.actors import (
 )
 from lidarpainter_models.checks.box_places import check_box_places
 from lidarpainter_models.checks.calibration import check_calibration
+from lidarpainter_models.checks.depth_edges import SceneEdges
 from lidarpainter_models.checks.lidar_reach import reaches_of
 from lidarpainter_models.checks.overlay import draw_overlay
 from lidarpainter_models.checks.swapped_images import check_swapped_images
@@ -74,6 +75,7 @@ class Check:
 
 def check_scene(scene: DrivingScene) -> list[Check]:
     """Run every check; the order is that in which a reader would debug a new dataset."""
+    edges = SceneEdges(scene)
     checks: tuple[tuple[str, Callable[[DrivingScene], tuple[Verdict, str]]], ...] = (
         ("stored content", check_content),
         ("licence", check_licence),
@@ -84,8 +86,8 @@ def check_scene(scene: DrivingScene) -> list[Check]:
         ("ground", check_ground),
         ("sweeps agree", check_sweeps_agree),
         ("points in images", check_coverage),
-        ("camera calibration", check_calibration),
-        ("cameras in their place", check_swapped_images),
+        ("camera calibration", lambda _: check_calibration(edges)),
+        ("cameras in their place", lambda _: check_swapped_images(edges)),
         ("boxes hold points", check_box_points),
         ("boxes around points", check_box_places),
         ("boxes point ahead", check_box_axes),
@@ -95,7 +97,7 @@ def check_scene(scene: DrivingScene) -> list[Check]:
         return [_run(name, check, scene) for name, check in checks]
     without = "none: a fit takes its points from images, and what needs points is not checked"
     return [
-        *(_run(name, check, scene) for name, check in checks if check not in _BY_POINTS),
+        *(_run(name, check, scene) for name, check in checks if name not in _BY_POINTS),
         Check(name="LiDAR", verdict="warn", detail=without),
     ]
 
@@ -332,11 +334,11 @@ def sampled_positions(count: int) -> list[int]:
 
 
 _BY_POINTS = {
-    check_ground,
-    check_sweeps_agree,
-    check_coverage,
-    check_calibration,
-    check_swapped_images,
-    check_box_points,
-    check_box_places,
+    "ground",
+    "sweeps agree",
+    "points in images",
+    "camera calibration",
+    "cameras in their place",
+    "boxes hold points",
+    "boxes around points",
 }

@@ -11,12 +11,9 @@ from typing import Literal
 
 from lidarpainter_models.checks.depth_edges import (
     EdgeImage,
-    depth_edges,
-    edge_images,
+    SceneEdges,
     edge_score,
-    slow_frames,
 )
-from lidarpainter_models.scenes.driving_scene import DrivingScene
 
 Verdict = Literal["ok", "warn", "fail"]
 
@@ -27,13 +24,12 @@ Of the cameras of PandaSet 002 own images lead by 0.17 to 0.66.
 """
 
 
-def check_swapped_images(scene: DrivingScene) -> tuple[Verdict, str]:
+def check_swapped_images(edges: SceneEdges) -> tuple[Verdict, str]:
     """Whether the images of two cameras of one size fit each other's place better."""
-    edges = {frame_index: depth_edges(scene, frame_index) for frame_index in slow_frames(scene)}
-    images = {name: edge_images(scene, name, edges) for name in scene.camera_names}
+    images = edges.images
     pairs = [
         (first, second)
-        for first, second in combinations(scene.camera_names, 2)
+        for first, second in combinations(images, 2)
         if _size(images[first]) == _size(images[second])
     ]
     if not pairs:

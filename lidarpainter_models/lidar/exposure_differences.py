@@ -1,7 +1,8 @@
 """Whether images are exposed alike: between cameras, and from one image of a camera to the next.
 
 LiDAR points that several images show are compared (see `exposure_matching`), in a few short runs of
-frames. A fit corrects what cameras differ by; jumps from image to image it takes for the scene.
+frames. A fit of several cameras corrects what changes slowly; jumps of one camera from image to
+image it takes for the scene.
 """
 
 from collections.abc import Sequence

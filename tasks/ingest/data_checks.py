@@ -105,7 +105,7 @@ def _exposure(scene: DrivingScene) -> list[Finding]:
         return [Finding("exposure", "fail", str(error))]
     if not said:
         return [Finding("exposure", "ok", "images are exposed alike")]
-    return [Finding("exposure", "warn", f"{'; '.join(said)} (a fit brings cameras together)")]
+    return [Finding("exposure", "warn", "; ".join(said))]
 
 
 def _own_bodies(scene: DrivingScene) -> list[Finding]:

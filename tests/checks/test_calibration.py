@@ -8,6 +8,7 @@ import torch
 from drawn_streets import drawn_street
 
 from lidarpainter_models.checks.calibration import CameraTurn, check_calibration
+from lidarpainter_models.checks.depth_edges import SceneEdges
 from lidarpainter_models.checks.doctor import check_licence
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.readers import ingest_scene
@@ -47,7 +48,7 @@ def turned(path, camera_name, axis, angle_deg):
 
 def test_sound_cameras_of_a_street_pass_and_each_figure_says_whether_it_is_trusted(street):
     scene = DrivingScene.open(street)
-    verdict, detail = check_calibration(scene)
+    verdict, detail = check_calibration(SceneEdges(scene))
     assert verdict == "ok", detail
     figures = re.findall(r"(?:roll|pitch) [+-]\d\.\d\d (trusted|not trusted)", detail)
     assert len(figures) == 2 * len(scene.camera_names), detail
@@ -67,25 +68,27 @@ def test_roll_that_does_not_stand_out_is_said_to_be_not_trusted():
 @pytest.mark.parametrize("axis", [PITCH, YAW, ROLL])
 @pytest.mark.parametrize("angle_deg", [-1.0, 1.0])
 def test_camera_of_a_street_turned_by_a_degree_is_found(street, axis, angle_deg):
-    verdict, detail = check_calibration(turned(street, "front_left_camera", axis, angle_deg))
+    verdict, detail = check_calibration(
+        SceneEdges(turned(street, "front_left_camera", axis, angle_deg))
+    )
     assert verdict == "fail"
     assert detail.startswith("front_left_camera turned on its mount")
 
 
 def test_camera_turned_beyond_the_search_is_not_called_sound(street):
-    verdict, _ = check_calibration(turned(street, "front_camera", YAW, 8.0))
+    verdict, _ = check_calibration(SceneEdges(turned(street, "front_camera", YAW, 8.0)))
     assert verdict != "ok"
 
 
 def test_small_images_cannot_tell(small_scene):
-    verdict, detail = check_calibration(small_scene)
+    verdict, detail = check_calibration(SceneEdges(small_scene))
     assert verdict == "ok"
     assert "front_camera cannot be told (images of 0.7 pixels a degree" in detail
 
 
 @pytest.mark.slow
 def test_sound_cameras_of_the_real_log_pass(real_log):
-    verdict, detail = check_calibration(DrivingScene.open(real_log))
+    verdict, detail = check_calibration(SceneEdges(DrivingScene.open(real_log)))
     assert verdict == "ok", detail
 
 
@@ -95,7 +98,7 @@ def test_sound_cameras_of_the_real_log_pass(real_log):
     ("axis", "angle_deg"), [(PITCH, 1.0), (YAW, -1.0), (YAW, 1.0), (ROLL, 1.0)]
 )
 def test_camera_of_the_real_log_turned_by_a_degree_is_found(real_log, camera, axis, angle_deg):
-    verdict, detail = check_calibration(turned(real_log, camera, axis, angle_deg))
+    verdict, detail = check_calibration(SceneEdges(turned(real_log, camera, axis, angle_deg)))
     assert verdict == "fail"
     assert detail.startswith(f"{camera} turned on its mount")
 

@@ -21,7 +21,7 @@ from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
 NODES = (3, 3, 5)
 """Along a box's length, width and height: legs part, arms swing, the head follows."""
 REACH_M = 0.5
-"""No limb is taken further from where it rests."""
+"""A fit that asks which bodies are in view takes limbs to reach so far from where they rest."""
 REST = 0.1
 """How much a node's own way counts beside what parts it from a neighbour."""
 NUM_NODES = NODES[0] * NODES[1] * NODES[2]
