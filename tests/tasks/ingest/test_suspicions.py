@@ -13,8 +13,8 @@ from tasks.ingest.data_checks import findings_about
 STREET = SyntheticStreetConfig(
     seed=7,
     num_frames=16,
-    width_px=320,
-    height_px=180,
+    width_px=480,
+    height_px=270,
     speed_mps=(15.0, 15.0),
 )
 FRONT, *SIDES = DEFAULT_CAMERAS
@@ -27,7 +27,7 @@ def with_front(**changes):
 
 
 FAULTS = {
-    "50 ms": (with_front(delay_s=0.05), r"front_camera is (3|4|5)\d ms late"),
+    "50 ms": (with_front(delay_s=0.05), r"front_camera is (4|5)\d ms late"),
     "0.5 degrees": (
         with_front(yaw_error_rad=HALF_A_DEGREE),
         r"front_camera looks 0\.(4|5)\d degrees left of its calibration",
