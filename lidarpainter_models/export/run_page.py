@@ -61,6 +61,8 @@ class RunPage:
     """Every setting of the run by its dotted name, as `--set` takes it."""
     has_lidar: bool
     """Whether a LiDAR swept in training frames."""
+    is_estimated: bool = False
+    """Whether points were estimated from images."""
 
     def report(
         self,
@@ -73,7 +75,7 @@ class RunPage:
         return Report(
             title=f"LidarPainter: {self.result['scene']}",
             summary=[_scene_in_words(scene), _summary(self.result)],
-            verdict=[*verdict(self.result), *self._without_lidar(), *pictures.faults],
+            verdict=[*verdict(self.result), *self._estimated(), *pictures.faults],
             moving=pictures.moving,
             worst=pictures.worst,
             repeat=_repeat(self.result, json.loads(self.settings.get("train_cameras", "null"))),
@@ -90,9 +92,14 @@ class RunPage:
             },
         )
 
-    def _without_lidar(self) -> list[str]:
-        if self.has_lidar:
+    def _estimated(self) -> list[str]:
+        if not self.is_estimated:
             return []
+        if self.has_lidar:
+            return [
+                "The LiDAR tells too little of the street: points estimated from images complete "
+                "it, and what guided the painter there is as uncertain as they are."
+            ]
         return [
             "No LiDAR swept in the training frames: points are estimated from their images, and "
             "what guided the painter is as uncertain as they are."

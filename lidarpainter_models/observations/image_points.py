@@ -1,4 +1,4 @@
-"""Points from training images alone, for a log without LiDAR.
+"""Points from training images alone, for a log without LiDAR or with few beams.
 
 Each image is compared with neighbours of the same camera over a sweep of depths (`plane_sweep`);
 of all pixels those are kept whose depth is clearly better than any other and which a neighbour
@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.colouring import BEAM_SPACING_RAD
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
@@ -72,13 +71,12 @@ def points_from_images(
 ) -> LidarMap:
     """Points of the street where images show it, and of moving actors on their boxes.
 
+    None of the street where the images show no parallax that could be measured.
+
     Args:
         scene: where images and tracks are read from.
         views: images that may be used: those of the training set, no others.
         own_bodies: what of a camera's images is the recording car, on any grid.
-
-    Raises:
-        SceneError: the images show no parallax that could be measured.
     """
     tracks = [track for track in scene.tracks if track.is_moving]
     boxes = MovingBoxes(tracks)
@@ -93,11 +91,6 @@ def points_from_images(
         )
     ]
     street = MapPoints.concatenate(parts)
-    if len(street) == 0:
-        raise SceneError(
-            f"{scene.dataset}/{scene.sequence}: no LiDAR, and no depth in the images either: they "
-            "show nothing that stands still from two places"
-        )
     return LidarMap(street=street, actors={track.actor_id: _on_box(track) for track in tracks})
 
 

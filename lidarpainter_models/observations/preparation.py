@@ -1,7 +1,7 @@
 """Read everything that a fit needs of a scene, each image once.
 
-Only training views and the sweeps of training frames enter; without any sweep, points come from
-the images.
+Only training views and the sweeps of training frames enter; where these tell too little of the
+street, points come from the images.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.lidar.colouring import MapColouring
-from lidarpainter_models.lidar.lidar_map import MapPoints
+from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.lidar.map_building import gather_points, showing_more
 from lidarpainter_models.lidar.recording_faults import find_faults
 from lidarpainter_models.lidar.sky_masks import sky_mask
@@ -22,6 +22,7 @@ from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
 from lidarpainter_models.observations.image_points import points_from_images
 from lidarpainter_models.observations.own_body import on_grid, own_bodies
 from lidarpainter_models.observations.settings import ObservationConfig
+from lidarpainter_models.observations.sparse_lidar import LEAST_TOLD, completed, share_told
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
 from lidarpainter_models.scenes.camera_faults import CameraFault
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -46,7 +47,7 @@ def prepare_observations(
     views, and the colours of the map.
 
     Raises:
-        SceneError: the split has no training views.
+        SceneError: the split has no training views, or nothing tells the shape of the street.
     """
     if not split.train:
         raise SceneError(f"the split of {scene.dataset}/{scene.sequence} has no training views")
@@ -54,16 +55,13 @@ def prepare_observations(
     taken = [_as_taken(view, faults) for view in split.train]
     bodies = own_bodies(scene, taken)
     hidden = {name: _at_fit_size(body, taken, name, config) for name, body in bodies.items()}
-    if scene.has_lidar(split.train_frames):
-        points = gather_points(scene, split.train_frames)
-    else:
-        points = points_from_images(scene, taken, bodies)
+    points, is_estimated = _points(scene, split, taken, bodies)
     colouring, colours = MapColouring(points, scene.tracks, taken), _keys_showing_more(taken)
     lidar, views = FramePoints(scene), []
     for done, (recorded, view) in enumerate(zip(split.train, taken, strict=True), start=1):
         image = scene.read_image(recorded)
         near = lidar.measured(view.frame_index)
-        if len(near) == 0:
+        if is_estimated or len(near) == 0:
             near = _nearest_in_time(points.street, view.timestamp_ns)
         made = _training_view(view, image, config, near=near, exposed=lidar.at_exposure(view))
         if view.camera_name in hidden:
@@ -81,7 +79,31 @@ def prepare_observations(
         tracks=tuple(track for track in scene.tracks if track.is_moving),
         faults=faults,
         own_bodies=hidden,
+        is_estimated=is_estimated,
     )
+
+
+def _points(
+    scene: DrivingScene,
+    split: ViewSplit,
+    taken: Sequence[RecordedView],
+    bodies: Mapping[str, Bool[np.ndarray, "rows columns"]],
+) -> tuple[LidarMap, bool]:
+    """Points without colours, and whether images gave some of them."""
+    measured = None
+    if scene.has_lidar(split.train_frames):
+        measured = gather_points(scene, split.train_frames)
+        if share_told(measured.street, taken, bodies) >= LEAST_TOLD:
+            return measured, False
+    estimated = points_from_images(scene, taken, bodies)
+    if len(estimated.street) > 0:
+        return (completed(measured, estimated) if measured else estimated), True
+    if measured is None:
+        raise SceneError(
+            f"{scene.dataset}/{scene.sequence}: no LiDAR, and no depth in the images either: they "
+            "show nothing that stands still from two places"
+        )
+    return measured, False
 
 
 def _keys_showing_more(views: Sequence[RecordedView]) -> set[ViewKey]:

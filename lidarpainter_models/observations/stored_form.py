@@ -51,6 +51,7 @@ def observations_to_arrays(
         "views": records,
         "tracks": track_records,
         "map_actors": actor_ids,
+        "is_estimated": observations.is_estimated,
         "faults": {name: asdict(fault) for name, fault in observations.faults.items()},
     }
     return arrays, metadata
@@ -94,6 +95,7 @@ def observations_from_arrays(
         tracks=tracks,
         faults=faults_from_records(metadata.get("faults", {})),
         own_bodies=bodies,
+        is_estimated=metadata.get("is_estimated", False),
     )
 
 

@@ -117,6 +117,8 @@ class SceneObservations:
     """What was wrong about the cameras' recordings; the views are corrected already."""
     own_bodies: Mapping[str, Bool[Tensor, "height width"]] = field(default_factory=dict)
     """Where cameras show the recording car itself, at fit size."""
+    is_estimated: bool = False
+    """Whether points of the map were estimated from images, as the LiDAR tells too little."""
 
     @property
     def camera_names(self) -> tuple[str, ...]:

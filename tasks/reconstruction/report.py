@@ -72,6 +72,7 @@ def write_report(run: RunSpec, inputs: ReportInputs, config: JudgeConfig) -> Sta
                 provenance=_provenance(this, inputs),
                 settings=_settings(this.store, inputs.result["run_id"]),
                 has_lidar=this.scene.has_lidar(this.views.train_frames),
+                is_estimated=stages["prepare"].summary["is_estimated"],
             ),
             histories=partial(_histories, this.store, fits),
             held_out=this.held_out(config.observation, or_train=True),

@@ -137,6 +137,27 @@ def test_page_begins_with_what_the_scene_is(tmp_path):
     assert "fit.steps" in text
 
 
+@pytest.mark.parametrize(
+    ("has_lidar", "words"),
+    [(True, "The LiDAR tells too little of the street"), (False, "No LiDAR swept")],
+)
+def test_a_page_says_that_points_were_estimated(has_lidar, words):
+    street = ToyStreet()
+    street.manifest = {"counts": {"frames": 4, "images": 4, "points": 1000}}
+    street.lidar_names, street.frame_timestamps_ns = ("top",), [0, 300_000_000]
+    for is_estimated in (True, False):
+        page = RunPage(
+            result=RESULT | {"recorded": None},
+            costs=[],
+            provenance={},
+            settings={},
+            has_lidar=has_lidar,
+            is_estimated=is_estimated,
+        )
+        said = page.report(street, Pictures(), {}, {}).verdict
+        assert any(sentence.startswith(words) for sentence in said) == is_estimated
+
+
 def test_actors_have_their_psnr_and_results_without_it_a_dash():
     street = ToyStreet()
     street.manifest = {"counts": {"frames": 4, "images": 4, "points": 1000}}

@@ -115,7 +115,8 @@ def fit_gaussians(  # noqa: PLR0913 - what was recorded, and one option each
     """
     _check(observations, config, start, perceptual)
     device = device or (start.device if start is not None else torch.device("cpu"))
-    surface = seen_surface(observations.views)
+    street = observations.lidar_map.street.xyz_m if observations.is_estimated else None
+    surface = seen_surface(observations.views, street)
     config = planned_fit(config, surface)
     if device.type == "cpu":
         config = within_limit(

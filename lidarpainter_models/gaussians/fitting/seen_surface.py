@@ -2,7 +2,8 @@
 
 A surface counts at the finest it was seen: A square metres at a pixel's footprint of f metres are
 A / f^2 pixels. A view that sees it after others at footprint g adds (1 - (f / g)^2) of its own
-pixels, or none where g <= f. So views from one place count once, views of a moving car add up to
+pixels, or none where g <= f. Depth is the LiDAR's, that of all points of the street where it tells
+too little. So views from one place count once, views of a moving car add up to
 the finest of them, and cameras that overlap share. Occlusion is not looked at: what traffic
 uncovers before a standing car counts as seen. Metres; the world frame.
 """
@@ -18,6 +19,7 @@ from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.images import shrink_depth
 from lidarpainter_models.gaussians.initialisation.unreached import FARTHEST_M, depth_from_below
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.lidar.sparse_depth import sparse_lidar_depth
 from lidarpainter_models.observations.views import TrainingView
 
 CELL_PX = 12
@@ -43,15 +45,22 @@ class SeenSurface:
     add nothing to it."""
 
 
-def seen_surface(views: Sequence[TrainingView]) -> SeenSurface:
-    """Measure what the views show, in the order in which they were taken."""
+def seen_surface(
+    views: Sequence[TrainingView], street: Float[Tensor, "points 3"] | None = None
+) -> SeenSurface:
+    """Measure what the views show, in the order in which they were taken.
+
+    Args:
+        views: with LiDAR depth.
+        street: points that tell more of the street than that, in the world.
+    """
     order = sorted(range(len(views)), key=lambda index: views[index].timestamp_ns)
     num_pixels = whole_views = 0.0
     groups: dict[str, list[list[int]]] = {}
     kept: list[Camera] = []
     for index in order:
         view = views[index]
-        new = _new_shares(view, _nearest(kept, view.camera))
+        new = _new_shares(view, street, _nearest(kept, view.camera))
         share = float(new.mean()) if len(new) else 0.0
         of_camera = groups.setdefault(view.key[1], [])
         if of_camera and share < LEAST_NEW:
@@ -68,9 +77,11 @@ def seen_surface(views: Sequence[TrainingView]) -> SeenSurface:
     )
 
 
-def _new_shares(view: TrainingView, earlier: Sequence[Camera]) -> Float[Tensor, " cells"]:
+def _new_shares(
+    view: TrainingView, street: Float[Tensor, "points 3"] | None, earlier: Sequence[Camera]
+) -> Float[Tensor, " cells"]:
     """Of each cell that is not sky: which part of its pixels no earlier camera saw as finely."""
-    points_world, footprint_m = _cells(view)
+    points_world, footprint_m = _cells(view, street)
     known = torch.zeros_like(footprint_m)
     for camera in earlier:
         pixels_uv, depth_m = camera.project(points_world)
@@ -79,18 +90,23 @@ def _new_shares(view: TrainingView, earlier: Sequence[Camera]) -> Float[Tensor, 
     return (1 - known).clamp(min=0)
 
 
-def _cells(view: TrainingView) -> tuple[Float[Tensor, "cells 3"], Float[Tensor, " cells"]]:
+def _cells(
+    view: TrainingView, street: Float[Tensor, "points 3"] | None
+) -> tuple[Float[Tensor, "cells 3"], Float[Tensor, " cells"]]:
     """A point for each cell of pixels that shows surface, and the footprint of a pixel there."""
     grid = {
         "width_px": max(view.camera.width_px // CELL_PX, 1),
         "height_px": max(view.camera.height_px // CELL_PX, 1),
     }
+    small = view.camera.resized(**grid)
     depth_m = shrink_depth(view.lidar_depth_m, **grid)
+    if street is not None:
+        depth_m = sparse_lidar_depth(street, small)
     depth_m = depth_from_below(depth_m, fallback_m=FARTHEST_M)
     size = (grid["height_px"], grid["width_px"])
     shown = torch.nn.functional.adaptive_avg_pool2d(view.shows_surface.float()[None], size)[0]
     is_solid = shown > 0.5
-    points_world = view.camera.resized(**grid).unproject(depth_m)[is_solid]
+    points_world = small.unproject(depth_m)[is_solid]
     return points_world, depth_m[is_solid] / view.camera.fx_px
 
 

@@ -44,6 +44,19 @@ def test_one_view_shows_all_its_pixels():
     assert surface.groups == ((0,),)
 
 
+def test_points_of_the_street_tell_how_near_it_is_where_the_lidar_does_not():
+    """Else all would be far away, and views from one end to the other show the same."""
+    views = [
+        replace(view, lidar_depth_m=torch.zeros_like(view.lidar_depth_m))
+        for view in (view_at(0.0), view_at(10.0), view_at(20.0))
+    ]
+    steps = torch.linspace(-40, 40, 400)
+    wall = torch.cartesian_prod(torch.tensor([WALL_M]), steps, steps)
+    swept = seen_surface([view_at(0.0), view_at(10.0), view_at(20.0)])
+    assert seen_surface(views, wall).num_pixels == pytest.approx(swept.num_pixels, rel=0.01)
+    assert seen_surface(views).num_pixels < 0.7 * swept.num_pixels
+
+
 def test_a_standing_car_shows_one_view_however_long_it_stands():
     generator = torch.Generator().manual_seed(0)
     views = [view_at(0.0, frame) for frame in range(50)]

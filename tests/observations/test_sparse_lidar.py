@@ -1,0 +1,124 @@
+"""Where a LiDAR tells too little of the street, images complete it; where it tells enough, not."""
+
+import numpy as np
+import pytest
+import torch
+from toy_street import ToyStreet
+from wall_drive import WALL_X_M, WallDrive
+
+from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
+from lidarpainter_models.lidar.map_building import gather_points
+from lidarpainter_models.observations.preparation import prepare_observations
+from lidarpainter_models.observations.settings import ObservationConfig
+from lidarpainter_models.observations.sparse_lidar import (
+    CELL_RAD,
+    LEAST_TOLD,
+    completed,
+    share_told,
+)
+from lidarpainter_models.scenes.records import SweepPoints
+from lidarpainter_models.scenes.splits import split_views
+
+SIZE = ObservationConfig(width_px=160)
+RING_Z_M = 0.3
+
+
+class OneBeam(WallDrive):
+    """The wall, swept by a single beam along a line."""
+
+    def __init__(self):
+        super().__init__()
+        self.sweeps = ToyStreet().sweeps
+
+    def read_sweep(self, _sweep):
+        y_m = torch.linspace(-8, 10, 400)
+        line = torch.stack([torch.full_like(y_m, WALL_X_M), y_m, torch.full_like(y_m, RING_Z_M)], 1)
+        zeros = torch.zeros(len(y_m), dtype=torch.int32)
+        return SweepPoints(
+            xyz_m=line,
+            intensity=zeros.float(),
+            time_offset_ns=zeros.long(),
+            ring=zeros,
+            return_index=zeros,
+            lidar=zeros,
+        )
+
+
+def points(xyz_m, range_m=10.0):
+    count = len(xyz_m)
+    return MapPoints.uncoloured(
+        xyz_m=torch.tensor(xyz_m),
+        frame_index=torch.zeros(count, dtype=torch.int64),
+        timestamp_ns=torch.zeros(count, dtype=torch.int64),
+        range_m=torch.full((count,), range_m),
+    )
+
+
+@pytest.fixture(scope="module")
+def prepared():
+    street = OneBeam()
+    return prepare_observations(street, split_views(street, "all"), SIZE)
+
+
+def test_images_tell_the_wall_around_the_line_that_one_beam_drew(prepared):
+    street = prepared.lidar_map.street
+    assert prepared.is_estimated
+    on_line = (street.xyz_m[:, 2] - RING_Z_M).abs() < 1e-4
+    assert (
+        int(on_line.sum()) >= 390
+    )  # of 400, one sweep of a LiDAR that stands; all but those in the car's way
+    beside = street.xyz_m[~on_line]
+    assert len(beside) > 10_000
+    assert float((beside[:, 0] - WALL_X_M).abs().median()) < 0.1
+
+
+def test_what_images_tell_is_no_measured_depth(prepared):
+    for view in prepared.views:
+        row = (view.lidar_depth_m > 0).any(dim=1).nonzero()[:, 0]
+        assert 1 <= len(row) <= 2  # where the beam's line is
+
+
+def test_an_actor_that_a_beam_missed_has_its_box(prepared):
+    (actor,) = prepared.lidar_map.actors.values()
+    assert len(actor) > 100
+
+
+def test_a_street_that_was_swept_well_is_left_to_the_lidar():
+    street = ToyStreet()
+    views = split_views(street, "all")
+    measured = gather_points(street, views.train_frames)
+    assert share_told(measured.street, views.train, {}) > LEAST_TOLD
+    prepared = prepare_observations(street, views, SIZE)
+    assert not prepared.is_estimated
+    assert torch.equal(prepared.lidar_map.street.xyz_m, measured.street.xyz_m)
+
+
+def test_cells_of_the_recording_car_are_not_asked():
+    street = OneBeam()
+    views = split_views(street, "all")
+    line = gather_points(street, views.train_frames).street
+    alone = share_told(line, views.train, {})
+    body = np.zeros((10, 10), bool)
+    body[6:] = True  # all that looks down but the uppermost rows
+    assert alone < share_told(line, views.train, {"front": body})
+    assert share_told(line, views.train, {"front": np.ones((10, 10), bool)}) == 1.0
+
+
+def test_estimates_beside_a_measured_point_are_dropped_and_all_else_is_kept():
+    within = 0.5 * CELL_RAD * 10.0
+    measured = LidarMap(street=points([[10.0, 0.0, 0.0]]), actors={"few": points([[0.0, 0, 0]])})
+    estimated = LidarMap(
+        street=points([[10.0, within, 0.0], [10.0, 4 * within, 0.0]]),
+        actors={"few": points([[1.0, 0, 0]]), "unseen": points([[1.0, 0, 0]])},
+    )
+    both = completed(measured, estimated)
+    assert both.street.xyz_m[:, 1].tolist() == pytest.approx([0.0, 4 * within])
+    assert both.actors["few"].xyz_m[0, 0] == 1.0  # a single return tells no shape
+    assert set(both.actors) == {"few", "unseen"}
+
+
+def test_many_returns_from_an_actor_are_kept():
+    many = points(torch.zeros(200, 3).tolist())
+    measured = LidarMap(street=points([[10.0, 0, 0]]), actors={"car": many})
+    estimated = LidarMap(street=points([[10.0, 5, 0]]), actors={"car": points([[1.0, 0, 0]])})
+    assert completed(measured, estimated).actors["car"] is many
