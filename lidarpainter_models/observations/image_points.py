@@ -101,10 +101,13 @@ def _of_camera(
     own_body: Bool[np.ndarray, "rows columns"] | None,
 ) -> list[MapPoints]:
     """The points that each image of a camera gives."""
-    images: list[_Image] = []
+    apart: list[RecordedView] = []
     for view in views[:: max(1, -(-len(views) // MOST_VIEWS_PER_CAMERA))]:
-        if not images or _baseline_m(images[-1].view, view) >= LEAST_BASELINE_M:
-            images.append(_made_ready(view, scene.read_image(view), boxes, own_body))
+        if not apart or _baseline_m(apart[-1], view) >= LEAST_BASELINE_M:
+            apart.append(view)
+    if len(apart) < 2:
+        return []
+    images = [_made_ready(view, scene.read_image(view), boxes, own_body) for view in apart]
     depths = [_swept_depth(images, place) for place in range(len(images))]
     confirmed = [torch.zeros_like(depth_m, dtype=torch.bool) for depth_m in depths]
     for first, second in pairwise(range(len(images))):

@@ -23,19 +23,19 @@ SIZE = ObservationConfig(width_px=160)
 RING_Z_M = 0.3
 
 
-class OneBeam(WallDrive):
-    """The wall, swept by a single beam along a line."""
+class SweptWall(WallDrive):
+    """The wall, swept along lines at some heights."""
 
-    def __init__(self):
+    def __init__(self, *heights_m):
         super().__init__()
-        self.sweeps = ToyStreet().sweeps
+        self.sweeps, self._heights_m = ToyStreet().sweeps, torch.tensor(heights_m)
 
     def read_sweep(self, _sweep):
-        y_m = torch.linspace(-8, 10, 400)
-        line = torch.stack([torch.full_like(y_m, WALL_X_M), y_m, torch.full_like(y_m, RING_Z_M)], 1)
-        zeros = torch.zeros(len(y_m), dtype=torch.int32)
+        x_m, y_m = torch.tensor([WALL_X_M]), torch.linspace(-8, 10, 400)
+        points = torch.cartesian_prod(x_m, y_m, self._heights_m)
+        zeros = torch.zeros(len(points), dtype=torch.int32)
         return SweepPoints(
-            xyz_m=line,
+            xyz_m=points,
             intensity=zeros.float(),
             time_offset_ns=zeros.long(),
             ring=zeros,
@@ -54,9 +54,13 @@ def points(xyz_m, range_m=10.0):
     )
 
 
+def every_tenth(sweep):
+    return SweepPoints(**{name: values[::10] for name, values in vars(sweep).items()})
+
+
 @pytest.fixture(scope="module")
 def prepared():
-    street = OneBeam()
+    street = SweptWall(RING_Z_M)
     return prepare_observations(street, split_views(street, "all"), SIZE)
 
 
@@ -84,7 +88,7 @@ def test_an_actor_that_a_beam_missed_has_its_box(prepared):
 
 
 def test_a_street_that_was_swept_well_is_left_to_the_lidar():
-    street = ToyStreet()
+    street = SweptWall(*torch.arange(-5, 5, 0.1).tolist())
     views = split_views(street, "all")
     measured = gather_points(street, views.train_frames)
     assert share_told(measured.street, views.train, {}) > LEAST_TOLD
@@ -93,8 +97,19 @@ def test_a_street_that_was_swept_well_is_left_to_the_lidar():
     assert torch.equal(prepared.lidar_map.street.xyz_m, measured.street.xyz_m)
 
 
+def test_a_car_that_stands_has_the_little_that_was_measured():
+    street = ToyStreet()
+    street.read_sweep = lambda sweep: every_tenth(ToyStreet.read_sweep(street, sweep))
+    views = split_views(street, "all")
+    measured = gather_points(street, views.train_frames)
+    assert share_told(measured.street, views.train, {}) < LEAST_TOLD
+    prepared = prepare_observations(street, views, SIZE)
+    assert not prepared.is_estimated
+    assert torch.equal(prepared.lidar_map.street.xyz_m, measured.street.xyz_m)
+
+
 def test_cells_of_the_recording_car_are_not_asked():
-    street = OneBeam()
+    street = SweptWall(RING_Z_M)
     views = split_views(street, "all")
     line = gather_points(street, views.train_frames).street
     alone = share_told(line, views.train, {})
