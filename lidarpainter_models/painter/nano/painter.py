@@ -7,12 +7,15 @@ Runs on the device its network lies on. The U-Net runs in the type that this dev
 from typing import Any
 
 import torch
+import torch.nn.functional as F  # noqa: N812
+from jaxtyping import Float
+from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.batches import in_planes, stack_conditions
 from lidarpainter_models.painter.examples import Window
 from lidarpainter_models.painter.input_hull import input_hull
-from lidarpainter_models.painter.nano.network import NanoNetwork
+from lidarpainter_models.painter.nano.network import CELL_PX, NanoNetwork
 from lidarpainter_models.painter.nano.tiles import (
     doubt,
     doubtful_tiles,
@@ -30,9 +33,9 @@ class NanoPainter:
     (`input_hull`): the network's residual may sharpen, not invent. Only a painter that sees the
     render is held to that; the LiDAR alone shows nothing in most places.
 
-    Confidence: exp(-e / 0.05) with e the mean absolute error the network expects in the pixel
-    (its scale is `NanoConfig.confidence_error`); for e, a tile that was not painted takes what is
-    known beside the render.
+    Confidence: exp(-e / 0.05) with e the mean absolute error the network expects around the pixel
+    (its scale is `NanoConfig.confidence_error`), without the steps between the cells it sees by;
+    for e, a tile that was not painted takes what is known beside the render.
     """
 
     name = "nano"
@@ -117,10 +120,24 @@ class NanoPainter:
         conditions = in_planes(conditions)
         batch = stack_conditions([conditions], num_sources=config.num_sources).to(device)
         output = self._network(batch, [conditions.prompt])
-        confidence = torch.exp(-output.log_error[0].exp() / config.confidence_error)
+        log_error = without_cells(output.log_error[0])
+        confidence = torch.exp(-log_error.exp() / config.confidence_error)
         home = conditions.render_rgb.device
         rgb = output.rgb[0].permute(1, 2, 0).to(home)
         if conditions.prompt == DEFAULT_PROMPT and "render" in config.inputs:
             hull = input_hull(conditions, inputs=config.inputs)
             rgb = torch.minimum(torch.maximum(rgb, hull.lower), hull.upper)
         return Painting(rgb=rgb.clamp(0, 1).contiguous(), confidence=confidence.to(home))
+
+
+def without_cells(image: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+    """An image without steps between the network's cells, nor a pattern that repeats in them.
+
+    Each pixel becomes the mean over the cell's width around it, half of the two pixels at its ends:
+    a step between two cells becomes an even slope, and what repeats every cell becomes its mean.
+    """
+    weights = image.new_tensor([0.5, *[1.0] * (CELL_PX - 1), 0.5]) / CELL_PX
+    reach = CELL_PX // 2
+    padded = F.pad(image[None, None], (reach,) * 4, mode="replicate")
+    down = F.conv2d(padded, weights.view(1, 1, -1, 1))
+    return F.conv2d(down, weights.view(1, 1, 1, -1))[0, 0]

@@ -14,7 +14,7 @@ from lidarpainter_models.painter.input_hull import HULL_MARGIN, input_hull
 from lidarpainter_models.painter.nano.candidates import build_candidates, candidate_names
 from lidarpainter_models.painter.nano.features import painting_features
 from lidarpainter_models.painter.nano.network import CELL_PX, NanoConfig, NanoNetwork, PixelNorm
-from lidarpainter_models.painter.nano.painter import NanoPainter
+from lidarpainter_models.painter.nano.painter import NanoPainter, without_cells
 
 SMALL = {"widths": (8, 8, 8), "blocks": (1, 1, 1)}
 
@@ -364,3 +364,38 @@ def test_candidates_follow_the_inputs():
     assert candidate_names(frozenset({"render"}), 2) == ("render", "render_blurred")
     assert candidate_names(frozenset({"lidar"}), 2) == ("lidar_filled", "lidar_blurred")
     assert len(candidate_names(frozenset({"render", "lidar", "warp"}), 2)) == 8
+
+
+def border_steps(confidence):
+    """How much larger the steps between cells of 4 pixels are than those inside: across, down."""
+    ratios = []
+    for axis in (1, 0):
+        steps = confidence.diff(dim=axis).abs().movedim(axis, 0)
+        is_border = torch.arange(len(steps)) % CELL_PX == CELL_PX - 1
+        ratios.append(float(steps[is_border].mean() / steps[~is_border].mean()))
+    return ratios
+
+
+def test_cells_leave_no_grid_in_the_confidence(make_conditions):
+    conditions = make_conditions(96, 96)
+    network = scrambled(NanoConfig(**SMALL))
+    painter = NanoPainter(network, precision=torch.float32)
+    raw = network(stack_conditions([conditions], num_sources=2), ["clear"]).log_error[0]
+    assert min(border_steps(raw)) > 1.3  # what it is about
+    log_error = (-painter.paint(conditions).confidence.log() * 0.05).log()
+    assert max(border_steps(log_error)) < 1.1
+
+
+def test_what_repeats_in_every_cell_becomes_its_mean():
+    cell = torch.arange(16.0).view(4, 4)
+    smooth = without_cells(cell.repeat(6, 6))
+    assert torch.allclose(smooth[4:-4, 4:-4], torch.tensor(7.5))
+
+
+def test_a_step_between_cells_becomes_an_even_slope():
+    image = torch.zeros(16, 16)
+    image[:, 8:] = 1.0
+    row = without_cells(image)[8]
+    assert torch.allclose(row[6:10], torch.tensor([0.125, 0.375, 0.625, 0.875]))
+    assert row[5] == 0
+    assert row[10] == 1
