@@ -93,7 +93,7 @@ class MetricRecord:
     name: str
     value: float | None
     reason: str | None = None
-    by_view: Mapping[str, float] | None = None
+    by_view: Mapping[str, float | None] | None = None
 
     def row(self) -> dict[str, Any]:
         """The row."""

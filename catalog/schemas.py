@@ -156,13 +156,22 @@ METRICS = TableSchema(
         Column("metric_id", "text", "digest of the run and the four columns that name the number"),
         Column("run_id", "text", "the run"),
         Column("scene_id", "text", "dataset/sequence"),
-        Column("protocol", "text", "recorded, recorded-poses, truth, depth or cross-camera"),
-        Column("trajectory", "text", "where the camera was: recorded, left-2m, up-1.5m, ..."),
+        Column(
+            "protocol",
+            "text",
+            "recorded, recorded-poses, truth, depth, cross-camera, flicker or envelope",
+        ),
+        Column("trajectory", "text", "where the camera was: recorded, left-2m, up, ..."),
         Column("variant", "text", "unpainted, painted, refined (no painter), or view-time"),
         Column("name", "text", "what was measured: psnr, ssim, ..."),
         Column("value", "number", "the number, or null with a reason", "see name"),
         Column("reason", "text", "why there is no number"),
-        Column("by_view", "text", "PSNR of each view, where the number is their mean, JSON", "dB"),
+        Column(
+            "by_view",
+            "text",
+            "of what the number is the mean (PSNR of each view) or the least (stretches), JSON",
+            "see name",
+        ),
     ),
 )
 

@@ -100,6 +100,7 @@ class ReconstructParameters(ViewParameters):
             stages[f"refine-{number}"] = self.refine.steps or None
         judged = ["evaluate-unpainted", "evaluate"]
         judged += ["evaluate-view-time"] if self.judge_view_time and paints else []
+        judged += ["envelope"]
         first, last = (["examine"], ["report"]) if self.report else ([], [])
         return stages | dict.fromkeys([*first, *(judged if self.judge else ()), *last])
 

@@ -20,6 +20,8 @@ from lidarpainter_models.export.run_page import GUIDANCE_COLUMNS
 from lidarpainter_models.metrics.perceptual import load_distances
 from lidarpainter_models.observations.fit_size import require_recorded_width
 from lidarpainter_models.painter.selection import NO_PAINTER
+from tasks.evaluation.envelope import STAGE as ENVELOPE
+from tasks.evaluation.envelope import find_envelope, load_envelope
 from tasks.evaluation.views import evaluate, load_scores
 from tasks.opened import opened
 from tasks.progress import working_on
@@ -34,7 +36,12 @@ from tasks.source import code_behind
 from tasks.specs import FittedRef, RunSpec
 from tasks.stages import StageResult
 
-UNJUDGED: Scores = {"recorded": None, "novel": None, "recorded_by_camera": None}
+UNJUDGED: Scores = {
+    "recorded": None,
+    "novel": None,
+    "recorded_by_camera": None,
+    ENVELOPE: None,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,6 +203,8 @@ def _judged(
             view_time=variant == "view-time",
         )
         scores[variant] = load_scores(store, course.add(stage, found).ref)
+    walked = find_envelope(course.run, final, course.parameters.judge_config)
+    scores["painted"][ENVELOPE] = load_envelope(store, course.add(ENVELOPE, walked).ref)
     return scores
 
 

@@ -68,6 +68,11 @@ class ConditionBuilder:
         return tuple(self._cameras.values())
 
     @property
+    def training_views(self) -> tuple[TrainingView, ...]:
+        """What was recorded, with cameras as recorded."""
+        return tuple(self._views.values())
+
+    @property
     def refined_views(self) -> list[TrainingView]:
         """The training views with their cameras where the fit found them to be."""
         return [replace(view, camera=self._cameras[key]) for key, view in self._views.items()]

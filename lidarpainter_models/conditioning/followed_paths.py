@@ -11,6 +11,7 @@ from torch import Tensor
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.moved_cameras import MovedCameras
 from lidarpainter_models.conditioning.sequences import SequencePainter
+from lidarpainter_models.conditioning.view_evidence import EvidenceGatherer
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
@@ -50,6 +51,9 @@ class FollowedPath:
 
     as_rig: bool = False
     """Move the car and its cameras on it, not this camera alone: then a turn is the car's."""
+
+    evidence: EvidenceGatherer | None = None
+    """Measures what speaks for each view; None where nobody says how far it can be trusted."""
 
     @property
     def camera_name(self) -> str:

@@ -6,6 +6,11 @@ from typing import Any, Literal
 DEPTH = "depth_within_5_percent"
 FLICKER = "flicker"
 """Entry of an evaluation that compared neighbouring frames."""
+ENVELOPE = "envelope"
+"""Entry of the scores of a run: how far beside the path the scene can be trusted."""
+TRUSTED = ("left_m", "right_m", "up_m", "ahead_m", "yaw_left_deg", "yaw_right_deg")
+"""What an envelope says of a stretch, in metres and degrees."""
+UNTRUSTED = "a stretch is not trusted even on the recorded path"
 FIGURES = ("PSNR", "SSIM", "depth")
 SCORE_NOTE = "PSNR in dB; depth: part of unseen LiDAR pixels that the rendered depth meets in 5 %."
 
@@ -44,20 +49,65 @@ def metric_values(
         for name, value in _numbers(values):
             protocol = "depth" if name.startswith("depth") else "truth"
             found.append((protocol, trajectory, name, value, _reason(values, name, value)))
-    return found
+    return [*found, *_trusted(scores.get(ENVELOPE))]
 
 
-def values_by_view(scores: Mapping[str, Any]) -> dict[tuple[str, str, str], dict[str, float]]:
-    """What means over views are the mean of: by protocol, trajectory and name, then by view."""
+def _trusted(
+    envelope: Mapping[str, Any] | None,
+) -> list[tuple[str, str, str, float | None, str | None]]:
+    """The least over all stretches, direction by direction."""
+    return [
+        (ENVELOPE, *_trusted_name(name), value, UNTRUSTED if value is None else None)
+        for name, value in (least_of(envelope) if envelope else {}).items()
+    ]
+
+
+def least_of(envelope: Mapping[str, Any]) -> dict[str, float | None]:
+    """The least over all stretches of an envelope, by direction; None where one is not trusted."""
+    rows = envelope["stretches"]
+    return {
+        name: None if any(row[name] is None for row in rows) else min(row[name] for row in rows)
+        for name in TRUSTED
+    }
+
+
+def values_by_view(
+    scores: Mapping[str, Any],
+) -> dict[tuple[str, str, str], dict[str, float | None]]:
+    """What means over views are the mean of: by protocol, trajectory and name, then by view.
+
+    Of an envelope what the least over stretches is the least of, by stretch.
+    """
     recorded = scores.get("recorded") or {}
     found = {("recorded", "recorded"): recorded}
     found |= {("recorded-poses", "recorded"): recorded.get("recorded_poses", {})}
     found |= {("truth", name): values for name, values in (scores.get("novel") or {}).items()}
-    return {
+    by_view = {
         (*place, "psnr"): values["psnr_by_view"]
         for place, values in found.items()
         if "psnr_by_view" in values
     }
+    return by_view | _by_stretch(scores.get(ENVELOPE))
+
+
+def _by_stretch(
+    envelope: Mapping[str, Any] | None,
+) -> dict[tuple[str, str, str], dict[str, float | None]]:
+    """What the least of an envelope is the least of, by stretch: `0-19m`."""
+    if not envelope:
+        return {}
+    return {
+        (ENVELOPE, *_trusted_name(name)): {
+            f"{row['from_m']:.0f}-{row['to_m']:.0f}m": row[name] for row in envelope["stretches"]
+        }
+        for name in TRUSTED
+    }
+
+
+def _trusted_name(name: str) -> tuple[str, str]:
+    """Trajectory and name of a figure of the envelope: `yaw-left`, `trusted_deg`."""
+    direction, _, unit = name.rpartition("_")
+    return direction.replace("_", "-"), f"trusted_{unit}"
 
 
 def _reason(values: Mapping[str, Any], name: str, value: float | None) -> str | None:

@@ -6,7 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from lidarpainter_models.evaluation.score_tables import SCORE_NOTE, score_columns, score_rows
+from lidarpainter_models.evaluation.score_tables import (
+    ENVELOPE,
+    SCORE_NOTE,
+    TRUSTED,
+    score_columns,
+    score_rows,
+)
 from lidarpainter_models.export.moving_picture import MovingPicture
 from lidarpainter_models.export.report import DRIVE_PAGE, Cell, Comparison, Plot, Report, Table
 from lidarpainter_models.export.verdict import verdict
@@ -165,6 +171,8 @@ def _tables(result: Mapping[str, Any], costs: Sequence[StageCost]) -> list[Table
         ]
         columns = ["camera", "PSNR", "SSIM", "PSNR inside actor boxes", "views"]
         tables.insert(-1, Table(title="Held-out views by camera", columns=columns, rows=rows))
+    if envelope := result.get(ENVELOPE):
+        tables.insert(-1, _envelope(envelope))
     if guidance:
         tables.append(
             Table(
@@ -175,6 +183,40 @@ def _tables(result: Mapping[str, Any], costs: Sequence[StageCost]) -> list[Table
             )
         )
     return tables
+
+
+def _envelope(envelope: Mapping[str, Any]) -> Table:
+    """How far each stretch of road can be trusted."""
+    rows: list[list[Cell]] = [
+        [
+            f"{row['from_m']:.0f} to {row['to_m']:.0f}",
+            f"{row['first_frame']} to {row['last_frame']}",
+            row["recorded_db"],
+            row["recorded_confidence"],
+            *(row[name] for name in TRUSTED),
+        ]
+        for row in envelope["stretches"]
+    ]
+    heads = [f"{words}, {unit}" for words, unit in map(_direction, TRUSTED)]
+    return Table(
+        title="Where it can be trusted",
+        columns=["stretch, m", "frames", "predicted on the path, dB", "confidence there", *heads],
+        rows=rows,
+        note=(
+            "So far off the recorded path, one way at a time, a frame has "
+            f"{envelope['good_db']:g} dB or more with a confidence of at least "
+            f"{envelope['promised']:.0%}: the least over {', '.join(envelope['cameras'])} and the "
+            "ends of the stretch, predicted from what recorded images and LiDAR say of "
+            f"{envelope['num_frames']} frames, without their true images. "
+            f"Calibrated on {envelope['calibration']}."
+        ),
+    )
+
+
+def _direction(name: str) -> tuple[str, str]:
+    """`yaw_left_deg` as words and unit."""
+    words, _, unit = name.rpartition("_")
+    return words.replace("_", " "), {"deg": "degrees"}.get(unit, unit)
 
 
 def _in_words(name: str) -> str:

@@ -3,7 +3,13 @@
 from collections.abc import Mapping
 from typing import Any
 
-from lidarpainter_models.evaluation.score_tables import DEPTH, fitted_on
+from lidarpainter_models.evaluation.score_tables import (
+    DEPTH,
+    ENVELOPE,
+    TRUSTED,
+    fitted_on,
+    least_of,
+)
 
 CLOSE_DB, FAIR_DB = 30.0, 26.0
 """From here on a view is close to its photograph, or good but soft; measured streets lie between
@@ -25,6 +31,7 @@ def verdict(result: Mapping[str, Any]) -> list[str]:
         for sentence in (
             _recorded(result["recorded"]),
             _aside(result),
+            _trusted(result.get(ENVELOPE)),
             _actors(result["recorded"]),
             _early(result),
         )
@@ -73,6 +80,23 @@ def _aside(result: Mapping[str, Any]) -> str:
         return f"{sentence}; painting changed nothing there."
     did = "helped" if gain > 0 else "made it worse"
     return f"{sentence}; painting {did} there ({before:.0%} before)."
+
+
+def _trusted(envelope: Mapping[str, Any] | None) -> str:
+    """How far all of it can be trusted; the page has a table of the stretches."""
+    if not envelope or not envelope["stretches"]:
+        return ""
+    rows, good_db = envelope["stretches"], envelope["good_db"]
+    num_untrusted = sum(row["left_m"] is None for row in rows)
+    least = {name: far for name, far in least_of(envelope).items() if far is not None}
+    if num_untrusted or not least:
+        return (
+            f"Weak: on {num_untrusted} of {len(rows)} stretches nobody can promise {good_db:g} dB, "
+            "not even on the recorded path."
+        )
+    metres = ", ".join(f"{least[name]:g} m {name.removesuffix('_m')}" for name in TRUSTED[:4])
+    turns = min(least["yaw_left_deg"], least["yaw_right_deg"])
+    return f"To be trusted ({good_db:g} dB or more) all along: {metres}, {turns:g} degrees of yaw."
 
 
 def _actors(scores: Mapping[str, Any]) -> str:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,6 +15,7 @@ from lidarpainter_models.conditioning.followed_paths import (
     ShownMoment,
     image_record,
 )
+from lidarpainter_models.evaluation.view_confidence import BUNDLED
 from lidarpainter_models.export.images import write_depth_png, write_index_png, write_png
 from lidarpainter_models.export.rig_images import rig_rows, tiled
 from lidarpainter_models.export.videos import images_per_second, video_file
@@ -184,12 +185,20 @@ def _write_view(
         who = instance_image(path.builder.scene, camera, view.timestamp_ns)
         wanted.append(("semantics", write_index_png, who))
     name = f"{view.frame_index:04d}.png"
-    row = {**image_record(name, camera, view), "file": None}
+    row = {**image_record(name, camera, view), **_confidence(path, camera, view), "file": None}
     for kind, write, pixels in wanted:
         if pixels is not None:
             row[kind] = name if kind == "file" else f"{kind}/{name}"
             write(pixels, folder / row[kind])
     return row, seen
+
+
+def _confidence(path: FollowedPath, camera: Camera, view: RecordedView) -> dict[str, Any]:
+    """How far the scene can be trusted there, before anybody paints it; None in a style."""
+    if path.evidence is None:
+        return {"confidence": None, "predicted_db": None}
+    found = path.evidence.of(camera, view.timestamp_ns, view.camera_name)
+    return asdict(BUNDLED.of(found))
 
 
 def legend(scene: GaussianScene) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.followed_paths import (
     FollowedPath,
     followed_cameras,
@@ -12,6 +13,7 @@ from lidarpainter_models.conditioning.followed_paths import (
 )
 from lidarpainter_models.conditioning.sequences import SequencePainter
 from lidarpainter_models.conditioning.settings import ConditionConfig, SequenceConfig
+from lidarpainter_models.conditioning.view_evidence import EvidenceGatherer
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
 from lidarpainter_models.observations.settings import ObservationConfig
@@ -145,7 +147,7 @@ def followed_paths(run: RunSpec, fitted: FittedRef, request: RenderRequest) -> l
             f"the run is in the style {style.mix.text}, and painters know clear days: paint the "
             "run that it was derived from"
         )
-    paths = []
+    paths, evidence = [], _evidence(builder, request)
     for views in views_of:
         painter = None
         if request.is_painted:
@@ -165,12 +167,20 @@ def followed_paths(run: RunSpec, fitted: FittedRef, request: RenderRequest) -> l
                 observation=request.observation,
                 painter=painter,
                 as_rig=len(views_of) > 1,
+                evidence=evidence,
             )
         )
     if not request.allows_collisions:
         for path in paths:
             path.refuse_walls()
     return paths
+
+
+def _evidence(builder: ConditionBuilder, request: RenderRequest) -> EvidenceGatherer | None:
+    """Of images that are written; true images of a style were never recorded."""
+    if builder.scene.style is not None or request.prompt != DEFAULT_PROMPT:
+        return None
+    return EvidenceGatherer(builder.scene, builder.lidar_map, builder.training_views)
 
 
 def followed_path(run: RunSpec, fitted: FittedRef, request: RenderRequest) -> FollowedPath:

@@ -106,6 +106,33 @@ def test_confidence_is_as_large_as_the_images_beside_it():
     assert [row.count("<figure>") for row in rows] == [len(INPUTS) + 1, len(INPUTS)]  # one truth
 
 
+def test_a_page_says_how_far_each_stretch_can_be_trusted():
+    figures = dict.fromkeys(("left_m", "right_m", "up_m", "ahead_m"), 1.5)
+    stretch = figures | {"yaw_left_deg": 20.0, "yaw_right_deg": None, "from_m": 0.0, "to_m": 19.4}
+    stretch |= {"first_frame": 0, "last_frame": 13, "recorded_db": 31.0, "recorded_confidence": 1.0}
+    envelope = {
+        "good_db": 25.0,
+        "promised": 0.9,
+        "cameras": ["front_camera"],
+        "num_frames": 40,
+        "calibration": "numbers made up",
+        "stretches": [stretch],
+    }
+    result = RESULT | {"recorded": None, "envelope": envelope}
+    page = RunPage(result=result, costs=[], provenance={}, settings={}, has_lidar=True)
+    street = ToyStreet(4)
+    street.manifest = {"counts": {"frames": 4, "images": 4, "points": 0}}
+    street.frame_timestamps_ns = torch.arange(4)
+    street.lidar_names = ()
+    tables = page.report(street, Pictures(), {}, {}).tables
+    (table,) = [one for one in tables if one.title == "Where it can be trusted"]
+    assert table.columns[-2:] == ["yaw left, degrees", "yaw right, degrees"]
+    assert table.rows[0][0] == "0 to 19"
+    assert table.rows[0][-2:] == [20.0, None]
+    assert "40 frames" in table.note
+    assert "numbers made up" in table.note
+
+
 def test_view_that_nobody_recorded_says_that_it_has_no_truth():
     page = render_report(sample_report())
     assert page.count("Nobody took an image here") == 1

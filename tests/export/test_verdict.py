@@ -37,6 +37,24 @@ def test_sentence_follows_from_its_figure(figures, position, expected):
     assert expected in sentences[position]
 
 
+def envelope(**changes):
+    """One stretch that is good to 3 m aside and another that is as said."""
+    sides = dict.fromkeys(("left_m", "right_m", "up_m", "ahead_m"), 3.0)
+    good = sides | {"yaw_left_deg": 20.0, "yaw_right_deg": 15.0}
+    return {"good_db": 25.0, "stretches": [good, good | changes]}
+
+
+def test_the_worst_stretch_says_how_far_all_of_it_can_be_trusted():
+    sentence = verdict(run(envelope=envelope(right_m=1.5)))[2]
+    assert "25 dB or more) all along: 3 m left, 1.5 m right, 3 m up" in sentence
+    assert "15 degrees" in sentence
+
+
+def test_a_stretch_that_nobody_can_promise_is_no_number():
+    sentence = verdict(run(envelope=envelope(left_m=None)))[2]
+    assert sentence.startswith("Weak: on 1 of 2 stretches nobody can promise 25 dB")
+
+
 def test_worst_of_several_ways_is_named():
     novel = {
         "left-2m": {"depth_within_5_percent": 0.96},

@@ -20,7 +20,7 @@ from tasks.reconstruction.report import WORST_FILE
 ROOT = Path(__file__).resolve().parents[2]
 STAGES = (
     *("prepare", "fit", "paint-1", "refine-1"),
-    *("examine", "evaluate-unpainted", "evaluate", "report"),
+    *("examine", "evaluate-unpainted", "evaluate", "envelope", "report"),
 )
 SHIFTS = {"left-2m", "up-1.5m"}
 TINY = ("--preset", "brief", *settings(*SETTINGS))
@@ -80,6 +80,28 @@ def test_demo_ends_with_a_page_and_progress_for_every_stage(tiny_run):
     assert worst.shape == (HEIGHT_PX, 2 * WIDTH_PX, 3)
 
 
+def test_demo_says_how_far_each_stretch_can_be_trusted(tiny_run):
+    found = tiny_run.result["envelope"]
+    assert found["cameras"] == [FRONT]
+    assert (found["good_db"], found["promised"]) == (25.0, 0.9)
+    (stretch,) = found["stretches"]
+    assert (stretch["first_frame"], stretch["last_frame"]) == (0, NUM_FRAMES - 1)
+    assert 0 <= stretch["recorded_confidence"] <= 1
+    rows = [row for row in tiny_run.rows["metrics"] if row["protocol"] == "envelope"]
+    told = {row["trajectory"]: row["value"] for row in rows}
+    assert told == {
+        "left": stretch["left_m"],
+        "right": stretch["right_m"],
+        "up": stretch["up_m"],
+        "ahead": stretch["ahead_m"],
+        "yaw-left": stretch["yaw_left_deg"],
+        "yaw-right": stretch["yaw_right_deg"],
+    }
+    assert all((row["value"] is None) == bool(row["reason"]) for row in rows)
+    page = Path(tiny_run.result["report"]).read_text("utf-8")
+    assert "Where it can be trusted" in page
+
+
 def test_catalog_holds_what_the_demo_made_and_nothing_else(tiny_run):
     rows = tiny_run.rows
     (scene,), (run,) = rows["scenes"], rows["runs"]
@@ -108,8 +130,11 @@ def test_the_same_again_computes_nothing(tiny_run):
 def test_a_run_may_go_unjudged_and_be_judged_later(tiny_run):
     answer = reconstructed(tiny_run, "--no-evaluate", "--no-report", "--seed", "3", "--json")
     result = answer.json
-    assert not {"evaluate", "evaluate-unpainted", "report"} & result["seconds"].keys()
-    for name in ("recorded", "novel", "recorded_by_camera", "unpainted", "view_time", "report"):
+    assert not {"evaluate", "evaluate-unpainted", "envelope", "report"} & result["seconds"].keys()
+    for name in (
+        *("recorded", "novel", "recorded_by_camera", "unpainted", "view_time"),
+        *("envelope", "report"),
+    ):
         assert result[name] is None, name
     assert result["computed_now"]["fit"]  # another order of views
     assert not result["computed_now"]["prepare"]
@@ -243,6 +268,7 @@ def test_render_writes_images_along_the_path(tiny_run, tmp_path, trajectory, wor
     assert not np.array_equal(images[0], images[2])
     for row, image in zip(described, images, strict=True):
         assert ("unpainted" in row) == (painter is not None)
+        assert 0 <= row["confidence"] <= 1
         if painter:
             render = seen_image(tmp_path / row["unpainted"], WIDTH_PX, HEIGHT_PX)
             assert not np.array_equal(render, image)

@@ -79,6 +79,7 @@ def test_the_command_gives_numbers_a_report_and_a_catalog(store):
         "examine",
         "evaluate-unpainted",
         "evaluate",
+        "envelope",
         "report",
         "total",
     }

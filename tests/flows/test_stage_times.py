@@ -23,8 +23,9 @@ RECORDED_S = {
     "examine": 5.0,
     "evaluate-unpainted": 9.0,
     "evaluate": 9.5,
+    "envelope": 4.0,
     "report": 3.0,
-    "total": 245.0,
+    "total": 249.0,
 }
 """Wall times of a street of 14 training views, the preview preset, two cores."""
 

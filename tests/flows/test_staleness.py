@@ -19,7 +19,8 @@ from toy_store import SMALL, TOY_SCENE, write_toy_scene
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("flows", "tasks", "catalog", "lidarpainter_models")
 SETTINGS = (*SMALL, "rounds=1")
-FIT_AND_AFTER = {"fit", "paint-1", "refine-1", "evaluate-unpainted", "evaluate", "report"}
+JUDGED = {"evaluate-unpainted", "evaluate", "envelope"}
+FIT_AND_AFTER = {"fit", "paint-1", "refine-1", *JUDGED, "report"}
 STAGES = {"prepare", "examine", *FIT_AND_AFTER}
 
 pytestmark = pytest.mark.slow

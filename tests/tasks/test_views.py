@@ -29,6 +29,9 @@ def test_a_run_is_rendered_where_nobody_drove(store, run, parameters, tmp_path, 
     assert [row["file"] for row in described["images"]] == ["0001.png", "0002.png"]
     first, last = (row["world_from_camera"] for row in described["images"])
     assert last[7] - first[7] == pytest.approx(2.0, abs=0.2)  # y is to the left
+    at_home, aside = (row["predicted_db"] for row in described["images"])
+    assert at_home > aside
+    assert all(0 <= row["confidence"] <= 1 for row in described["images"])
 
 
 @pytest.mark.parametrize("images", ["rendered", "recorded"])

@@ -1,0 +1,156 @@
+"""What speaks for a view of a fitted scene, measured without the view's true image.
+
+Recorded images are carried into the view by depth and compared with the render; what they, the
+LiDAR and the surface vouch for is counted pixel by pixel (`confidence`). That is done on a small
+copy of the view, `EVIDENCE_WIDTH_PX` wide, so that it costs little whatever the size of the images;
+how closely a fit shows at its own size what it saw is measured once for each camera.
+World: x forward, y left, z up; metres.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.conditioning.conditions import ConditionBuilder
+from lidarpainter_models.conditioning.confidence import geometric_confidence, is_seen
+from lidarpainter_models.conditioning.settings import ConditionConfig
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.lidar.lidar_map import LidarMap
+from lidarpainter_models.observations.fit_size import shrink_image
+from lidarpainter_models.observations.views import TrainingView
+from lidarpainter_models.painter.protocol import PaintingConditions
+
+EVIDENCE_WIDTH_PX = 160
+MOST_CHECKED = 6
+"""Training views of a camera whose own images say how closely the fit shows what it saw."""
+GATHERED = ConditionConfig(num_references=2, num_sources=3)
+"""What is carried into a view to be compared: fewer images than a painter is shown, and the same
+whatever a run's painter is shown, since confidences are calibrated with it."""
+LEAST_ERROR = 1e-5
+"""Squared differences below it are noise of the sensor: 50 dB."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewEvidence:
+    """What was measured of one view; decibels are those of a mean squared difference, peak 1.
+
+    More of each speaks for a better frame.
+    """
+
+    recorded_db: float
+    """PSNR of the fit on training views of the camera, at the size of the fit."""
+    expected_db: float
+    """Render against recorded images carried here; where none reaches, the render's own contrast
+    counts as the difference."""
+    detail_db: float
+    """Neighbouring pixels of the render against one another: fine textures forgive less."""
+    support: float
+    """Mean geometric confidence, 0 to 1: what warped images, LiDAR and surface vouch for."""
+
+
+class EvidenceGatherer:
+    """Measures what speaks for views of one scene."""
+
+    def __init__(
+        self,
+        scene: GaussianScene,
+        lidar_map: LidarMap,
+        training_views: Sequence[TrainingView],
+    ) -> None:
+        """Take the scene as it is now, and what the fit saw."""
+        self.scene = scene
+        self._views = tuple(training_views)
+        small = [_small_view(view) for view in self._views]
+        self.builder = ConditionBuilder(scene, lidar_map, small, config=GATHERED)
+        self._recorded_db = lru_cache(maxsize=None)(self._measured_db)
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """Cameras that the fit saw, sorted."""
+        return tuple(sorted({view.key[1] for view in self._views}))
+
+    def of(self, camera: Camera, timestamp_ns: int, camera_name: str | None = None) -> ViewEvidence:
+        """What speaks for the image of a camera, taken as it stands, at a time."""
+        camera = _small_camera(camera)
+        conditions = self.builder.conditions(camera, timestamp_ns, camera_name=camera_name)
+        depth_m = torch.where(
+            conditions.render_depth_m > 0, conditions.render_depth_m, conditions.lidar_depth_m
+        )
+        seen = is_seen(camera, depth_m, self.builder.recorded_cameras)
+        support = geometric_confidence(conditions, camera, seen)
+        return ViewEvidence(
+            recorded_db=self._recorded_db(camera_name),
+            expected_db=_decibels(_difference(conditions).mean()),
+            detail_db=_decibels(_detail(conditions.render_rgb)),
+            support=float(support.mean()),
+        )
+
+    def _measured_db(self, camera_name: str | None) -> float:
+        """Mean PSNR of training views of a camera, evenly over time; of all for a strange one."""
+        own = [view for view in self._views if view.key[1] == camera_name] or list(self._views)
+        count = min(MOST_CHECKED, len(own))
+        chosen = [own[(2 * place + 1) * len(own) // (2 * count)] for place in range(count)]
+        return sum(self._training_db(view) for view in chosen) / count
+
+    def _training_db(self, view: TrainingView) -> float:
+        frame_index, name = view.key
+        render = self.scene.render(
+            view.camera, view.timestamp_ns, camera_name=name, view_key=(frame_index, name)
+        )
+        truth = view.rgb.to(render.rgb)
+        error = (render.rgb.clamp(0, 1) - truth).square().mean(dim=-1)
+        return _decibels(error.mean() if view.hidden is None else error[~view.hidden].mean())
+
+
+def _difference(conditions: PaintingConditions) -> Float[Tensor, "height width"]:
+    """Squared difference of the render from what was carried here; else the render's contrast."""
+    valid = conditions.warp_valid
+    count = valid.sum(dim=0)
+    mean = (conditions.warp_rgb * valid[..., None]).sum(dim=0) / count.clamp(min=1)[..., None]
+    error = (conditions.render_rgb - mean).square().mean(dim=-1)
+    contrast = conditions.render_rgb.flatten(0, 1).var(dim=0).mean()
+    return torch.where(count > 0, error, contrast)
+
+
+def _detail(rgb: Float[Tensor, "height width 3"]) -> Tensor:
+    """Mean squared difference of neighbouring pixels."""
+    across, down = rgb.diff(dim=1).square().mean(), rgb.diff(dim=0).square().mean()
+    return (across + down) / 2
+
+
+def _decibels(mean_square: Tensor) -> float:
+    return -10 * math.log10(max(float(mean_square), LEAST_ERROR))
+
+
+def _small_camera(camera: Camera) -> Camera:
+    width_px = min(EVIDENCE_WIDTH_PX, camera.width_px)
+    height_px = max(round(camera.height_px * width_px / camera.width_px), 1)
+    return camera.resized(width_px=width_px, height_px=height_px)
+
+
+def _small_view(view: TrainingView) -> TrainingView:
+    """A training view as wide as the evidence is gathered; masks and depth of the nearest pixel."""
+    camera = _small_camera(view.camera)
+    if camera.width_px == view.camera.width_px:
+        return view
+    rows = _nearest(camera.height_px, view.camera.height_px)[:, None]
+    columns = _nearest(camera.width_px, view.camera.width_px)
+    size = {"width_px": camera.width_px, "height_px": camera.height_px}
+    return replace(
+        view,
+        camera=camera,
+        rgb_u8=shrink_image(view.rgb_u8, **size),
+        sky_mask=view.sky_mask[rows, columns],
+        lidar_depth_m=view.lidar_depth_m[rows, columns],
+        hidden=None if view.hidden is None else view.hidden[rows, columns],
+    )
+
+
+def _nearest(count: int, of: int) -> Tensor:
+    return ((torch.arange(count) + 0.5) * of / count).long()

@@ -1,0 +1,161 @@
+"""How good a frame is likely to be, from what was measured of it without its true image.
+
+    predicted PSNR = intercept + sum of weight * evidence          (all weights >= 0)
+    confidence     = 1 / (1 + exp(-(predicted - 25 dB - offset) / spread))
+
+The confidence is the probability that the frame has 25 dB or more against its true image, at the
+size of the fit. The weights are those of a least-squares fit on synthetic streets, whose true
+images are known from anywhere; offset and spread those of a logistic regression on streets that
+the weights did not see (Platt scaling). `scripts/calibrate_confidence.py` makes both.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from lidarpainter_models.conditioning.view_evidence import ViewEvidence
+
+GOOD_DB = 25.0
+"""A frame as good as this against its true image can be trusted."""
+PROMISED = 0.9
+"""A frame is said to be good from this confidence on."""
+NEAR_DB = 4.0
+"""Frames so far from `GOOD_DB` count half in the fit of the weights: the border matters."""
+NUM_BINS = 10
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameConfidence:
+    """What is said about a frame."""
+
+    predicted_db: float
+    confidence: float
+    """Probability of `GOOD_DB` or better."""
+
+    @property
+    def is_promised(self) -> bool:
+        """Whether the frame is said to be good."""
+        return self.confidence >= PROMISED
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibration:
+    """Numbers that turn evidence into a confidence, and how they came about."""
+
+    intercept_db: float
+    weights: Mapping[str, float]
+    """By the names of `ViewEvidence`; none is negative, so more evidence never lowers it."""
+    offset_db: float
+    spread_db: float
+    record: str
+
+    def of(self, evidence: ViewEvidence) -> FrameConfidence:
+        """What is said about the frame that the evidence was measured for."""
+        found = (weight * getattr(evidence, name) for name, weight in self.weights.items())
+        predicted_db = self.intercept_db + sum(found)
+        beyond = (predicted_db - GOOD_DB - self.offset_db) / self.spread_db
+        return FrameConfidence(predicted_db=predicted_db, confidence=_logistic(beyond))
+
+
+EVIDENCE = tuple(field.name for field in fields(ViewEvidence))
+"""The parts of the evidence that count."""
+BUNDLED = Calibration(
+    intercept_db=-17.80,
+    weights={
+        "recorded_db": 0.304,
+        "expected_db": 0.492,
+        "detail_db": 0.256,
+        "support": 19.94,
+    },
+    offset_db=0.09,
+    spread_db=0.764,
+    record=(
+        "420 frames of the synthetic streets 101 to 107, 2026-11-23, by "
+        "scripts/calibrate_confidence.py"
+    ),
+)
+"""Streets of one front camera, 160 to 320 pixels wide, 8 to 64 beams, first and last fits of
+preset `brief` with all and with a quarter of its first steps, as they are: unpainted."""
+
+
+def calibrated(
+    evidence: Sequence[ViewEvidence],
+    psnr_db: Sequence[float],
+    streets: Sequence[str],
+    *,
+    names: Sequence[str],
+    record: str,
+) -> Calibration:
+    """Fit the numbers to frames whose truth is known.
+
+    Args:
+        evidence: of every frame.
+        psnr_db: of every frame against its true image.
+        streets: which street each frame is of; no street is predicted by weights that saw it.
+        names: the parts of the evidence that count.
+        record: what the frames were.
+    """
+    measured = np.array([[getattr(one, name) for name in names] for one in evidence])
+    truth, groups = np.asarray(psnr_db, float), np.asarray(streets)
+    unseen = np.empty_like(truth)
+    for street in np.unique(groups):
+        own = groups == street
+        intercept, weights = _least_squares(measured[~own], truth[~own])
+        unseen[own] = intercept + measured[own] @ weights
+    offset_db, spread_db = _platt(unseen - GOOD_DB, truth >= GOOD_DB)
+    intercept, weights = _least_squares(measured, truth)
+    return Calibration(
+        intercept_db=float(intercept),
+        weights=dict(zip(names, weights.tolist(), strict=True)),
+        offset_db=offset_db,
+        spread_db=spread_db,
+        record=record,
+    )
+
+
+def expected_calibration_error(
+    confidences: Sequence[float], is_good: Sequence[bool], *, num_bins: int = NUM_BINS
+) -> float:
+    """Mean distance of confidence from the share of good frames, over bins of equal width.
+
+    Guo et al., "On calibration of modern neural networks" (2017); each bin counts by its frames.
+    """
+    said, true = np.asarray(confidences, float), np.asarray(is_good, float)
+    place = np.minimum((said * num_bins).astype(int), num_bins - 1)
+    gaps = [abs(said[place == one].sum() - true[place == one].sum()) for one in range(num_bins)]
+    return float(sum(gaps) / len(said))
+
+
+def _least_squares(
+    measured: Float[np.ndarray, "frames parts"], psnr_db: Float[np.ndarray, " frames"]
+) -> tuple[float, Float[np.ndarray, " parts"]]:
+    """Intercept and weights, none of them negative."""
+    from scipy.optimize import lsq_linear
+
+    near = 1 / np.sqrt(1 + np.square((psnr_db - GOOD_DB) / NEAR_DB))
+    ones = np.ones((len(measured), 1))
+    low = np.array([-np.inf, *([0.0] * measured.shape[1])])
+    design = np.concatenate([ones, measured], axis=1) * near[:, None]
+    found = lsq_linear(design, psnr_db * near, bounds=(low, np.inf)).x
+    return found[0], found[1:]
+
+
+def _platt(
+    beyond_db: Float[np.ndarray, " frames"], is_good: Bool[np.ndarray, " frames"]
+) -> tuple[float, float]:
+    """Offset and spread of the likeliest logistic curve."""
+    from scipy.optimize import minimize
+
+    def loss(values: Float[np.ndarray, "2"]) -> float:
+        scaled = (beyond_db - values[0]) / math.exp(values[1])
+        return float(np.logaddexp(0, np.where(is_good, -scaled, scaled)).sum())
+
+    offset, log_spread = minimize(loss, np.zeros(2), method="Nelder-Mead").x
+    return float(offset), math.exp(log_spread)
+
+
+def _logistic(value: float) -> float:
+    return 1 / (1 + math.exp(-value)) if value > -700 else 0.0
