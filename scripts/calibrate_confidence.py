@@ -1,10 +1,11 @@
 """Make the numbers behind the confidence of frames, and judge them on other streets.
 
     python scripts/calibrate_confidence.py measure STORE 101:108 > tuned.jsonl
+    python scripts/calibrate_confidence.py measure STORE 201:206 80 >> tuned.jsonl
     python scripts/calibrate_confidence.py fit tuned.jsonl
-    python scripts/calibrate_confidence.py measure STORE 201:206 80 > unseen.jsonl
+    python scripts/calibrate_confidence.py measure STORE 301:305 40 > unseen.jsonl
     python scripts/calibrate_confidence.py judge unseen.jsonl
-    python scripts/calibrate_confidence.py envelope STORE 201:206
+    python scripts/calibrate_confidence.py envelope STORE 301:305
     python scripts/calibrate_confidence.py recorded STORE RUN... > logs.jsonl
 
 `measure` records synthetic streets of these seeds (cameras, beams and effort follow from the seed,

@@ -48,8 +48,6 @@ class ViewEvidence:
     expected_db: float
     """Render against recorded images carried here; where none reaches, the render's own contrast
     counts as the difference."""
-    detail_db: float
-    """Neighbouring pixels of the render against one another: fine textures forgive less."""
     support: float
     """Mean geometric confidence, 0 to 1: what warped images, LiDAR and surface vouch for."""
 
@@ -87,7 +85,6 @@ class EvidenceGatherer:
         return ViewEvidence(
             recorded_db=self._recorded_db(camera_name),
             expected_db=_decibels(_difference(conditions).mean()),
-            detail_db=_decibels(_detail(conditions.render_rgb)),
             support=float(support.mean()),
         )
 
@@ -116,12 +113,6 @@ def _difference(conditions: PaintingConditions) -> Float[Tensor, "height width"]
     error = (conditions.render_rgb - mean).square().mean(dim=-1)
     contrast = conditions.render_rgb.flatten(0, 1).var(dim=0).mean()
     return torch.where(count > 0, error, contrast)
-
-
-def _detail(rgb: Float[Tensor, "height width 3"]) -> Tensor:
-    """Mean squared difference of neighbouring pixels."""
-    across, down = rgb.diff(dim=1).square().mean(), rgb.diff(dim=0).square().mean()
-    return (across + down) / 2
 
 
 def _decibels(mean_square: Tensor) -> float:
