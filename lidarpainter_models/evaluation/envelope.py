@@ -41,7 +41,7 @@ from lidarpainter_models.scenes.records import RecordedView
 STRETCH_M = 20.0
 LEVELS_M = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 """Up to what `render` goes to."""
-LEVELS_DEG = (5.0, 10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0)
+LEVELS_DEG = (2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0)
 DIRECTIONS: dict[str, tuple[tuple[float, ...], Callable[[float], ConstantStep]]] = {
     "left_m": (LEVELS_M, lambda level: ConstantStep(lateral_m=level)),
     "right_m": (LEVELS_M, lambda level: ConstantStep(lateral_m=-level)),

@@ -111,7 +111,7 @@ def test_a_walk_ends_at_the_last_good_step():
     assert first == first | aside | {"ahead_m": 8.0}
     assert last == last | aside | {"ahead_m": 6.0}
     assert json.loads(json.dumps(found)) == found
-    assert found["num_frames"] < 2 * 2 * (1 + 8 * len(DIRECTIONS))
+    assert found["num_frames"] < 2 * 2 * (1 + 9 * len(DIRECTIONS))
 
 
 def test_a_place_in_a_wall_ends_a_walk_as_a_bad_frame_does():
