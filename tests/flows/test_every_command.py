@@ -80,28 +80,6 @@ def test_demo_ends_with_a_page_and_progress_for_every_stage(tiny_run):
     assert worst.shape == (HEIGHT_PX, 2 * WIDTH_PX, 3)
 
 
-def test_demo_says_how_far_each_stretch_can_be_trusted(tiny_run):
-    found = tiny_run.result["envelope"]
-    assert found["cameras"] == [FRONT]
-    assert (found["good_db"], found["promised"]) == (25.0, 0.9)
-    (stretch,) = found["stretches"]
-    assert (stretch["first_frame"], stretch["last_frame"]) == (0, NUM_FRAMES - 1)
-    assert 0 <= stretch["recorded_confidence"] <= 1
-    rows = [row for row in tiny_run.rows["metrics"] if row["protocol"] == "envelope"]
-    told = {row["trajectory"]: row["value"] for row in rows}
-    assert told == {
-        "left": stretch["left_m"],
-        "right": stretch["right_m"],
-        "up": stretch["up_m"],
-        "ahead": stretch["ahead_m"],
-        "yaw-left": stretch["yaw_left_deg"],
-        "yaw-right": stretch["yaw_right_deg"],
-    }
-    assert all((row["value"] is None) == bool(row["reason"]) for row in rows)
-    page = Path(tiny_run.result["report"]).read_text("utf-8")
-    assert "Where it can be trusted" in page
-
-
 def test_catalog_holds_what_the_demo_made_and_nothing_else(tiny_run):
     rows = tiny_run.rows
     (scene,), (run,) = rows["scenes"], rows["runs"]
