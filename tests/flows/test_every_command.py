@@ -109,10 +109,8 @@ def test_a_run_may_go_unjudged_and_be_judged_later(tiny_run):
     answer = reconstructed(tiny_run, "--no-evaluate", "--no-report", "--seed", "3", "--json")
     result = answer.json
     assert not {"evaluate", "evaluate-unpainted", "envelope", "report"} & result["seconds"].keys()
-    for name in (
-        *("recorded", "novel", "recorded_by_camera", "unpainted", "view_time"),
-        *("envelope", "report"),
-    ):
+    judged = ("recorded", "novel", "recorded_by_camera", "unpainted", "view_time", "envelope")
+    for name in (*judged, "report"):
         assert result[name] is None, name
     assert result["computed_now"]["fit"]  # another order of views
     assert not result["computed_now"]["prepare"]
