@@ -148,7 +148,8 @@ def _candidates(known: pa.Table, new: Sequence[Row]) -> list[Row]:
         mask |= is_in.to_numpy(zero_copy_only=False).astype(bool)
     x_m, y_m = (known[name].to_numpy() for name in ("x_m", "y_m"))
     standing = [row for row in new if row["is_moving"] is False]
-    frames = pc.is_in(known["frame"], value_set=pa.array({row["frame"] for row in standing}))
+    places = pa.array({row["frame"] for row in standing}, pa.string())
+    frames = pc.is_in(known["frame"], value_set=places)
     here = np.flatnonzero(frames.to_numpy(zero_copy_only=False))
     for row in standing:
         near = (abs(x_m[here] - row["x_m"]) < NEAR_M) & (abs(y_m[here] - row["y_m"]) < NEAR_M)

@@ -51,7 +51,6 @@ def _build(
         "num_test_views": len(views.test),
         "num_tracks": len(observations.tracks),
         "num_street_points": len(observations.lidar_map.street.xyz_m),
-        "is_estimated": observations.is_estimated,
         "camera_faults": [
             f"{name} {fault}; corrected" for name, fault in observations.faults.items()
         ],

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -22,6 +22,7 @@ from lidarpainter_models.export.worst_views import worst_views, write_beside
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.observations.own_body import in_words
+from lidarpainter_models.observations.views import SceneObservations
 from tasks.evaluation.shown import view_time_painting
 from tasks.machine import machine
 from tasks.opened import OpenedRun, opened
@@ -30,7 +31,7 @@ from tasks.reconstruction.examine import STAGE as EXAMINE
 from tasks.reconstruction.examine import suspicions
 from tasks.specs import FittedRef, RunSpec
 from tasks.stages import StageResult, run_stage, stage_task
-from tasks.stored import History, load_history, load_scene
+from tasks.stored import History, load_history, load_observations, load_scene
 
 REPORT_FILE = "report.html"
 WORST_FILE = "worst.jpg"
@@ -72,11 +73,11 @@ def write_report(run: RunSpec, inputs: ReportInputs, config: JudgeConfig) -> Sta
                 provenance=_provenance(this, inputs),
                 settings=_settings(this.store, inputs.result["run_id"]),
                 has_lidar=this.scene.has_lidar(this.views.train_frames),
-                is_estimated=stages["prepare"].summary["is_estimated"],
             ),
             histories=partial(_histories, this.store, fits),
             held_out=this.held_out(config.observation, or_train=True),
             shifts=config.scoring.shifts,
+            observations=partial(load_observations, this.store, inputs.final.observations),
             said=suspicions(stages[EXAMINE]) if EXAMINE in stages else (),
             unpainted=partial(load_scene, this.store, inputs.unpainted.gaussians),
             painting=partial(
@@ -99,13 +100,14 @@ def _build(  # noqa: PLR0913 - all that the page is made from
     histories: Callable[[], dict[str, History]],
     held_out: HeldOut,
     shifts: Sequence[Shift],
+    observations: Callable[[], SceneObservations],
     said: Sequence[str],
     unpainted: Callable[[], GaussianScene],
     painting: Callable[[], ViewTimePainting],
 ) -> dict[str, Any]:
     subject = Subject(held_out=held_out, unpainted=unpainted(), painting=painting())
     pictures = _pictures(subject, shifts, said, progress)
-    report = page.report(
+    report = replace(page, is_estimated=observations().is_estimated).report(
         held_out.scene,
         pictures,
         histories(),

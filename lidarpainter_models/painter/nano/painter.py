@@ -136,8 +136,11 @@ def without_cells(image: Float[Tensor, "height width"]) -> Float[Tensor, "height
     Each pixel becomes the mean over the cell's width around it, half of the two pixels at its ends:
     a step between two cells becomes an even slope, and what repeats every cell becomes its mean.
     """
-    weights = image.new_tensor([0.5, *[1.0] * (CELL_PX - 1), 0.5]) / CELL_PX
+    weights = torch.tensor([0.5, *[1.0] * (CELL_PX - 1), 0.5], device=image.device) / CELL_PX
     reach = CELL_PX // 2
-    padded = F.pad(image[None, None], (reach,) * 4, mode="replicate")
+    height_px, width_px = image.shape
+    rows = torch.arange(-reach, height_px + reach, device=image.device).clamp(0, height_px - 1)
+    columns = torch.arange(-reach, width_px + reach, device=image.device).clamp(0, width_px - 1)
+    padded = image[rows[:, None], columns][None, None]
     down = F.conv2d(padded, weights.view(1, 1, -1, 1))
     return F.conv2d(down, weights.view(1, 1, 1, -1))[0, 0]
