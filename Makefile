@@ -5,12 +5,13 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 SYSTEM := $(VENV)/.system-libraries
+FIGURES := $(BIN)/lidarpainter --store figures-store
 
 # spinning OpenMP threads turn shared cores into many times the CPU time
 export OMP_WAIT_POLICY := passive
 export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba-cache
 
-.PHONY: demo test lint nightly bench gpu-check clean
+.PHONY: demo test lint nightly bench figures gpu-check clean
 
 demo: $(INSTALLED) $(SYSTEM)
 	$(BIN)/lidarpainter demo --out demo
@@ -31,6 +32,12 @@ lint: $(INSTALLED) $(SYSTEM)
 
 bench: $(INSTALLED)
 	PYTHONPATH=tests/support $(BIN)/python tests/benchmarks/suite.py
+
+# the tables of README and docs from runs of this code, hours where there are none yet. PANDASET is
+# the data set as downloaded, WEIGHTS SqueezeNet's; without them their tables stay as they are
+figures: $(INSTALLED) $(SYSTEM)
+	$(if $(PANDASET),$(FIGURES) ingest pandaset $(PANDASET) 002 --frames 0:28)
+	$(FIGURES) figures docs/figures.toml $(if $(WEIGHTS),--feature-weights $(WEIGHTS))
 
 # five minutes on a machine with a GPU: agreement with the CPU, speed, memory; gpu-check.md
 gpu-check: $(INSTALLED) $(SYSTEM)

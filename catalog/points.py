@@ -1,7 +1,7 @@
 """What the sequences of a fleet came to: their cost and every number of their runs."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import pyarrow as pa
@@ -35,6 +35,8 @@ class Point:
     cpu_seconds, peak_memory_bytes; num_gaussians and scene_bytes of what they made."""
     metrics: dict[MetricName, float]
     """Of the scene at the end."""
+    by_variant: dict[str, dict[MetricName, float]] = field(default_factory=dict)
+    """Of every variant that was judged, by its name in the catalog."""
 
 
 def points_of(store: Store, fleet: str) -> tuple[list[Point], list[Row]]:
@@ -50,11 +52,11 @@ def points_of(store: Store, fleet: str) -> tuple[list[Point], list[Row]]:
     scenes = {run_id: _last_scene(run) for run_id, run in runs.items()}
     made = _chosen(store, "artefacts", artefact_id=scenes.values())
     sizes = {row["artefact_id"]: row["num_bytes"] for row in made}
-    metrics: dict[str, dict[MetricName, float]] = {run_id: {} for run_id in runs}
-    for row in _chosen(store, "metrics", run_id=runs, variant=FINAL):
+    judged: dict[str, dict[str, dict[MetricName, float]]] = {run_id: {} for run_id in runs}
+    for row in _chosen(store, "metrics", run_id=runs):
         if row["value"] is not None:
             name = row["protocol"], row["trajectory"], row["name"]
-            metrics[row["run_id"]][name] = row["value"]
+            judged[row["run_id"]].setdefault(row["variant"], {})[name] = row["value"]
     ended = [row for row in sequences if row["run_id"] in runs and row["state"] == "done"]
     points = [
         Point(
@@ -63,7 +65,12 @@ def points_of(store: Store, fleet: str) -> tuple[list[Point], list[Row]]:
             seed=row["fit_seed"] or 0,
             run_id=row["run_id"],
             cost=_cost(runs[row["run_id"]], sizes[scenes[row["run_id"]]]),
-            metrics=metrics[row["run_id"]],
+            metrics={
+                name: value
+                for variant in FINAL
+                for name, value in judged[row["run_id"]].get(variant, {}).items()
+            },
+            by_variant=judged[row["run_id"]],
         )
         for row in ended
     ]

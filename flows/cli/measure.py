@@ -1,4 +1,4 @@
-"""`lidarpainter chart`, `size` and `stress`: what the user asked to see, measured and drawn."""
+"""`lidarpainter chart`, `size`, `stress`, `figures`: measured, drawn and put into pages."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flows.cli.output import complain, loudness, print_json, print_table
+from flows.cli.output import complain, loudness, print_json, print_table, say_status
 from flows.cli.shared_options import AsJson, Settings, parse_names
 from lidarpainter_models.errors import ConfigError
 
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from flows.fleet.manifest import Configuration
     from flows.measure.sweep import Sweep
 
+NOT_OVER = 2
+"""How the command ends where a table was left."""
 COLUMNS = ("scene", "configuration", "seed", "cpu_seconds", "num_gaussians")
 SHOWN = ("recorded_psnr", "aside_psnr", "aside_depth")
 """Qualities in the table."""
@@ -124,6 +126,50 @@ def stress(  # noqa: PLR0913 - the options of a command
     sweep = _sweep("stress", names, WAYS, preset, train_cameras, seeds, settings)
     points = _made(sweep, workers=workers, accept_stale=accept_stale)
     _show(stress_of(points, trials, out), as_json=as_json)
+
+
+def figures(
+    manifest: Annotated[Path, typer.Argument(help="TOML file, see docs/measuring.md.")],
+    only: Annotated[
+        str | None, typer.Option(help="Names of tables, with commas between; all if absent.")
+    ] = None,
+    workers: Workers = 1,
+    feature_weights: Annotated[
+        Path | None, typer.Option(help="SqueezeNet 1.1 weights for the feature distance.")
+    ] = None,
+    accept_stale: Stale = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write the tables of pages: make the runs that they lack, enter their figures into a record.
+
+    A table that lacks a run stays as it is and is named; the command then ends with 2. Whatever
+    ends it, the same command goes on.
+
+    Example: lidarpainter figures docs/figures.toml --only results
+    """
+    chosen = parse_names(only)
+    say = complain if loudness() != "quiet" else _silent
+    say_status("reading the tables")
+    from catalog.store import open_store
+    from flows.cli.progress import shown_progress
+    from flows.measure.publication import LEFT, Publisher
+
+    store = open_store()
+    store.make()
+    weights = {} if feature_weights is None else {"feature_weights": feature_weights}
+    publisher = Publisher(
+        store=store, workers=workers, accept_stale=accept_stale, say=say, weights=weights
+    )
+    with shown_progress():
+        result = publisher.publish(manifest, chosen)
+    if as_json:
+        print_json(result)
+    else:
+        cells = [[name, one["state"], one["reason"]] for name, one in result["tables"].items()]
+        written = "\n".join([result["record"], *result["pages"]])
+        print_table("tables", ["table", "state", "reason"], cells, written, num_text_columns=3)
+    if any(one["state"] == LEFT for one in result["tables"].values()):
+        raise typer.Exit(NOT_OVER)
 
 
 def _known(only: str | None, names: Sequence[str]) -> tuple[str, ...]:

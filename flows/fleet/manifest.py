@@ -200,6 +200,19 @@ def read_manifest(path: Path) -> Manifest:
     Raises:
         ConfigError: it cannot be read, or holds something that a manifest does not.
     """
+    values = read_toml(path)
+    try:
+        return Manifest.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {_fault(error, values)}") from None
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The values of a TOML file from outside.
+
+    Raises:
+        ConfigError: it cannot be read, is too large, or is no TOML.
+    """
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -207,13 +220,9 @@ def read_manifest(path: Path) -> Manifest:
     if len(content) > MAX_BYTES:
         raise ConfigError(f"{path}: expected a manifest of at most {MAX_BYTES} bytes")
     try:
-        values = tomllib.loads(content.decode("utf-8"))
+        return tomllib.loads(content.decode("utf-8"))
     except (ValueError, RecursionError) as error:  # of TOML, of UTF-8, or too deep
         raise ConfigError(f"{path}: expected TOML: {error}") from None
-    try:
-        return Manifest.model_validate(values)
-    except ValidationError as error:
-        raise ConfigError(f"{path}: {_fault(error, values)}") from None
 
 
 def _fault(error: ValidationError, values: dict[str, Any]) -> str:

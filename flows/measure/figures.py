@@ -3,8 +3,10 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
+from typing import Literal
 
 from catalog.points import MetricName, Point
+from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.fronts import Spread
 from lidarpainter_models.evaluation.score_tables import DEPTH
 
@@ -36,7 +38,89 @@ LABELS = {
     "num_gaussians": "Gaussians",
     "scene_bytes": "stored scene, bytes",
 }
+AT_END: Literal["final"] = "final"
+"""The variant, painted or not, that is of the scene at the end."""
 COSTS = ("cpu_seconds", "seconds", "peak_memory_bytes", "num_gaussians", "scene_bytes")
+
+DERIVED: dict[str, tuple[str, float]] = {
+    "cpu_minutes": ("cpu_seconds", 60.0),
+    "memory_gb": ("peak_memory_bytes", 1e9),
+}
+"""What a cost is called in other units, and how many of its own units one of these is."""
+SHARE = ".3f"
+FORMATS = {
+    "psnr": ".2f",
+    "ssim": SHARE,
+    "depth": SHARE,
+    "depth_within_5_percent": SHARE,
+    "lpips": SHARE,
+    "feature_distance": ".2f",
+    "cpu_seconds": ".0f",
+    "seconds": ".0f",
+    "num_gaussians": ",.0f",
+    "cpu_minutes": ".1f",
+    "memory_gb": ".1f",
+}
+"""By a figure's name or what it ends with behind / or _."""
+
+
+def metric_names(figure: str) -> tuple[MetricName, ...]:
+    """The numbers that a figure is the mean of; a cost is none.
+
+    A figure is one of `QUALITIES`, or `protocol/trajectory/name` as the catalog has it, where
+    several trajectories may stand with + between: `truth/left-2m+right-2m/psnr`.
+
+    Raises:
+        ConfigError: it is neither that nor one of `COSTS`.
+    """
+    if figure in COSTS:
+        return ()
+    if figure in QUALITIES:
+        return QUALITIES[figure]
+    protocol, *rest = figure.split("/")
+    if len(rest) != 2 or not all((protocol, *rest)):
+        raise ConfigError(
+            f"no figure {figure!r}, expected protocol/trajectory/name or one of "
+            f"{', '.join((*COSTS, *QUALITIES))}"
+        )
+    return tuple((protocol, trajectory, rest[1]) for trajectory in rest[0].split("+"))
+
+
+def figure_of(point: Point, figure: str, variant: str) -> float | None:
+    """A figure of one variant of a point, `final` being what it has at its end; None: not known."""
+    if figure in COSTS:
+        return point.cost[figure]
+    known = point.metrics if variant == AT_END else point.by_variant.get(variant, {})
+    names = metric_names(figure)
+    return fmean(known[one] for one in names) if all(one in known for one in names) else None
+
+
+def check_figure(figure: str) -> None:
+    """Refuse what is no figure of a point, or cannot be written.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    metric_names(measured_as(figure))
+    if _format(figure) is None:
+        raise ConfigError(f"how figure {figure!r} is written is not known")
+
+
+def measured_as(figure: str) -> str:
+    """The cost that a figure in other units is derived of, or the figure itself."""
+    return DERIVED.get(figure, (figure, 1.0))[0]
+
+
+def written(figure: str, value: float) -> str:
+    """A figure as tables show it, from a value in the unit that it is measured in."""
+    form = _format(figure) or ""
+    text = f"{value / DERIVED.get(figure, (figure, 1.0))[1]:{form}}"
+    return text.removeprefix("0") if form == SHARE else text
+
+
+def _format(figure: str) -> str | None:
+    last = figure.rpartition("/")[2]
+    return FORMATS.get(last) or FORMATS.get(last.rpartition("_")[2])
 
 
 def qualities(metrics: Mapping[MetricName, float]) -> dict[str, float]:

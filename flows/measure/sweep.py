@@ -4,7 +4,7 @@ So it has what a fleet has: what two points share is computed once, workers may 
 command goes on, and further points join those that are done. Figures come from the catalog alone.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,9 +12,11 @@ from catalog.errors import CatalogError
 from catalog.fleets import FleetLedger
 from catalog.points import Point, points_of
 from catalog.store import Store
-from flows.fleet.asked import wishes
+from catalog.tables import Row
+from flows.fleet.asked import Asked, wishes
 from flows.fleet.local_workers import run_workers, starter
 from flows.fleet.manifest import STORED, Configuration, Manifest, Source
+from flows.fleet.planner import Planner
 from flows.fleet.status import counts_of
 
 
@@ -56,19 +58,57 @@ def run_sweep(
     Raises:
         CatalogError: a point could not be made; the others are done.
     """
+    points, missing = make_points(
+        sweep.manifest, store, workers=workers, accept_stale=accept_stale, say=say
+    )
+    if missing:
+        raise CatalogError(undone(points, missing))
+    return points
+
+
+def make_points(
+    manifest: Manifest,
+    store: Store,
+    *,
+    workers: int,
+    accept_stale: bool,
+    say: Callable[[str], None],
+) -> tuple[list[Point], list[Row]]:
+    """Make the points of a fleet that are not there yet, one thread each, and say what is to come.
+
+    Its sources name no folder. Returns the points that are done, and the sequences that are not.
+    """
     ledger = FleetLedger(store)
     for line in ledger.reconcile():
         say(line)
-    ledger.ask(wishes(sweep.manifest, Path()), accept_stale=accept_stale)
-    counts = counts_of(ledger.rows(sweep.name))
+    ledger.ask(wishes(manifest, Path()), accept_stale=accept_stale)
+    rows = ledger.rows(manifest.name)
+    counts = counts_of(rows)
     if still := counts["waiting"] + counts["running"]:
-        start = starter(store.address, sweep.name, threads=1)
-        run_workers(ledger, sweep.name, start, min(workers, still), say)
-    points, missing = points_of(store, sweep.name)
-    if missing:
-        first = missing[0]
-        raise CatalogError(
-            f"{len(missing)} of {len(points) + len(missing)} points are not done, such as "
-            f"{first['configuration']} on {first['scene_id']}: {first['reason'] or first['state']}"
-        )
-    return points
+        say(f"{manifest.name}: {_cost(store, rows)}")
+        start = starter(store.address, manifest.name, threads=1)
+        run_workers(ledger, manifest.name, start, min(workers, still), say)
+    return points_of(store, manifest.name)
+
+
+def undone(points: Sequence[Point], missing: Sequence[Row]) -> str:
+    """In one line, which points of a fleet are not done, and why."""
+    first = missing[0]
+    made = first["configuration"] or first["fleet"]
+    return (
+        f"{len(missing)} of {len(points) + len(missing)} points are not done, such as "
+        f"{made} on {first['scene_id']}: {first['reason'] or first['state']}"
+    )
+
+
+def _cost(store: Store, rows: Sequence[Row]) -> str:
+    """What is to be made, and what that will take by what sequences of the store have taken."""
+    planner = Planner.of(store)
+    waiting = [Asked.model_validate_json(row["asked"]) for row in rows if row["state"] == "waiting"]
+    costs = [planner.predict(asked).cpu_seconds for asked in waiting]
+    known = [cost for cost in costs if cost is not None]
+    took = (
+        f"about {sum(known) / 60:.0f} CPU minutes" if known else "at a cost that nothing tells yet"
+    )
+    some = "" if len(known) in (0, len(costs)) else f" for {len(known)} of them"
+    return f"{len(waiting)} of {len(rows)} points are to be made, {took}{some}"
