@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
 
@@ -107,9 +107,9 @@ def _build(  # noqa: PLR0913 - all that a fit is made from
         elif "initialised" in entry:
             note = f"placing Gaussians, {100 * entry['initialised']:.0f} %"
         else:
-            note = f"{entry['psnr']:.2f} dB, {entry['num_gaussians'] / 1000:.0f}k Gaussians; {plan}"
-            note += shown
-        progress(step, steps, note)
+            note = f"{_told_step(entry)}; {plan}{shown}"
+        planned = replace(config, steps=steps)
+        progress(planned.work(step) / planned.work(steps), 1.0, note)
 
     result = fit_gaussians(
         seen,
@@ -133,6 +133,14 @@ def _build(  # noqa: PLR0913 - all that a fit is made from
         "steps": int(last["step"]),
         "stopped_early": result.stopped_early,
     }
+
+
+def _told_step(entry: dict[str, float]) -> str:
+    """Such as `step 2,400, 28.61 dB, 210k Gaussians`."""
+    return (
+        f"step {entry['step']:,.0f}, {entry['psnr']:.2f} dB, "
+        f"{entry['num_gaussians'] / 1000:.0f}k Gaussians"
+    )
 
 
 def _told_plan(steps: int, entry: dict[str, float], device: torch.device) -> str:

@@ -11,6 +11,9 @@ from lidarpainter_models.gaussians.fitting.settings import (
 )
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 
+HALF_STEP = 0.45
+"""What a step at half the image size costs of one at full size (docs/benchmarks.md)."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RefinementConfig:
@@ -93,6 +96,21 @@ class FitConfig:
     def most_steps(self, num_views: float) -> float:
         """Steps that are set, or those that follow if every view is new all over."""
         return self.steps or self.effort.looks * num_views
+
+    def work(self, step: int) -> float:
+        """What the first steps cost, in steps at full image size."""
+        return step - (1 - HALF_STEP) * min(step, self.half_resolution * self.steps)
+
+    def steps_within(self, work: float, step: int) -> int:
+        """How many steps there may be in all, so that those after `step` cost so much `work`.
+
+        `steps` at most; of fewer steps, the part at half size is shorter too.
+        """
+        half = self.half_resolution
+        steps = (work + HALF_STEP * step) / (HALF_STEP * half + 1 - half)
+        if steps * half < step:
+            steps = step + max(work, 0.0)
+        return min(self.steps, int(steps))
 
     @property
     def weighs_perceptual(self) -> bool:

@@ -77,8 +77,9 @@ class _Clock:
         if config.time_limit_s is None or step <= self._first:
             return config
         gone_s = time.monotonic() - self._began_s
-        rest = (config.time_limit_s - gone_s) * (step - self._first) / gone_s
-        return replace(config, steps=min(config.steps, step + max(int(rest), 0)))
+        done = config.work(step) - config.work(self._first)
+        rest = (config.time_limit_s - gone_s) * done / gone_s
+        return replace(config, steps=config.steps_within(rest, step))
 
 
 def fit_gaussians(  # noqa: PLR0913 - what was recorded, and one option each

@@ -3,7 +3,12 @@ from dataclasses import replace
 import pytest
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.gaussians.fitting.config import EffortConfig, FitConfig, continuation
+from lidarpainter_models.gaussians.fitting.config import (
+    HALF_STEP,
+    EffortConfig,
+    FitConfig,
+    continuation,
+)
 from lidarpainter_models.gaussians.fitting.seen_surface import START_SHARE, SeenSurface, planned_fit
 from lidarpainter_models.gaussians.fitting.settings import DensificationConfig
 
@@ -44,3 +49,25 @@ def test_going_on_has_its_own_looks_and_the_same_size():
 def test_no_effort_is_refused(name):
     with pytest.raises(ConfigError, match="must be positive"):
         EffortConfig(**{name: 0.0})
+
+
+@pytest.mark.parametrize("half", [0.0, 0.3, 1.0])
+def test_steps_at_half_size_count_for_what_they_cost(half):
+    config = FitConfig(steps=1000, half_resolution=half)
+    smaller = round(1000 * half)
+    assert config.work(smaller) == pytest.approx(HALF_STEP * smaller)
+    assert config.work(1000) - config.work(smaller) == 1000 - smaller
+
+
+@pytest.mark.parametrize("step", [100, 250, 600])
+@pytest.mark.parametrize("share", [0.1, 0.5, 1.0])
+def test_as_many_steps_follow_as_there_is_work_for(step, share):
+    config = FitConfig(steps=1000, half_resolution=0.5)
+    work = share * (config.work(1000) - config.work(step))
+    fewer = replace(config, steps=config.steps_within(work, step))
+    assert fewer.work(fewer.steps) - fewer.work(step) == pytest.approx(work, abs=1.0)
+
+
+def test_without_work_to_be_done_the_steps_end_where_they_are():
+    config = FitConfig(steps=1000, half_resolution=0.5)
+    assert [config.steps_within(-9.0, step) for step in (100, 600)] == [100, 600]
