@@ -1,7 +1,7 @@
 """Make the numbers behind the confidence of frames, and judge them on other streets.
 
     python scripts/calibrate_confidence.py measure STORE 101:108 > tuned.jsonl
-    python scripts/calibrate_confidence.py measure STORE 201:206 80 >> tuned.jsonl
+    python scripts/calibrate_confidence.py measure STORE 201:206 60 >> tuned.jsonl
     python scripts/calibrate_confidence.py fit tuned.jsonl
     python scripts/calibrate_confidence.py measure STORE 301:305 40 > unseen.jsonl
     python scripts/calibrate_confidence.py judge unseen.jsonl
@@ -39,6 +39,7 @@ from lidarpainter_models.evaluation.view_confidence import (
     BUNDLED,
     EVIDENCE,
     GOOD_DB,
+    NUM_BINS,
     PROMISED,
     calibrated,
     expected_calibration_error,
@@ -93,17 +94,20 @@ def fits_of(store: Store, seed: int) -> Iterator[tuple[str, MovedViews]]:
     result = reconstruct.fn(parameters_of(seed), store.address)
     run = open_run(store, result["run_id"])
     for name, fitted in (("first", run.unpainted), ("last", run.final)):
-        yield name, moved_views(store, street_id(seed), fitted)
+        observation = view_parameters(run).observation
+        yield name, moved_views(store, street_id(seed), fitted, observation)
 
 
-def moved_views(store: Store, scene_id: str, fitted: FittedRef) -> MovedViews:
-    """A fitted scene to be looked at from anywhere."""
+def moved_views(
+    store: Store, scene_id: str, fitted: FittedRef, observation: ObservationConfig
+) -> MovedViews:
+    """A scene fitted to images of that size, to be looked at from anywhere."""
     seen = load_observations(store, fitted.observations)
     scene = load_scene(store, fitted.gaussians)
     return MovedViews(
         scene=open_scene(store, scene_id),
         gatherer=EvidenceGatherer(scene, seen.lidar_map, seen.views),
-        observation=ObservationConfig(width_px=seen.views[0].camera.width_px),
+        observation=observation,
     )
 
 
@@ -126,9 +130,10 @@ def recorded(store_path: str, *run_ids: str) -> None:
     store = open_store(Path(store_path))
     for run_id in run_ids:
         run = open_run(store, run_id)
-        _scene, split = open_split(store, view_parameters(run).split_spec)
+        parameters = view_parameters(run)
+        _scene, split = open_split(store, parameters.split_spec)
         for fit, fitted in (("first", run.unpainted), ("last", run.final)):
-            views = moved_views(store, run.scene_id, fitted)
+            views = moved_views(store, run.scene_id, fitted, parameters.observation)
             scene, gatherer = views.gatherer.scene, views.gatherer
             held_out = HeldOut(
                 scene=views.scene, test_views=split.test, observation=views.observation
@@ -178,15 +183,14 @@ def told(rows: list[dict], confidences: list[float]) -> None:
     error = expected_calibration_error(confidences, good)
     sys.stdout.write(
         f"{len(rows)} frames of {len({row['street'] for row in rows})} streets, "
-        f"{fmean(good):.3f} of them good; promised {len(kept)}, "
-        f"kept {fmean(kept) if kept else float('nan'):.3f}; "
+        f"{share(good):.3f} of them good; promised {len(kept)}, kept {share(kept):.3f}; "
         f"expected calibration error {error:.3f}\n"
     )
-    for low in range(10):
+    for low in range(NUM_BINS):
         inside = [
             (said, one)
             for said, one in zip(confidences, good, strict=True)
-            if min(int(said * 10), 9) == low
+            if min(int(said * NUM_BINS), NUM_BINS - 1) == low
         ]
         if inside:
             said_mean, true_share = (fmean(column) for column in zip(*inside, strict=True))
@@ -204,7 +208,7 @@ def envelope(store_path: str, seeds: str) -> None:
         seconds = time.process_time() - began_s
         psnr_db = [db for row in found["stretches"] for db in inside(views, row, generator)]
         everything += psnr_db
-        kept = fmean(db >= GOOD_DB for db in psnr_db) if psnr_db else float("nan")
+        kept = share([db >= GOOD_DB for db in psnr_db])
         sys.stdout.write(
             f"{street_id(seed)}: {found['num_frames']} frames in {seconds:.1f} CPU s; of "
             f"{len(psnr_db)} drawn inside {kept:.3f} good\n"
@@ -213,7 +217,7 @@ def envelope(store_path: str, seeds: str) -> None:
             said = {name: row[name] for name in DIRECTIONS}
             sys.stdout.write(f"  {row['from_m']:.0f}-{row['to_m']:.0f} m: {json.dumps(said)}\n")
     good = [db >= GOOD_DB for db in everything]
-    sys.stdout.write(f"all: {len(good)} frames inside, {fmean(good):.3f} good\n")
+    sys.stdout.write(f"all: {len(good)} frames inside, {share(good):.3f} good\n")
 
 
 def inside(views: MovedViews, row: dict, generator: torch.Generator) -> list[float]:
@@ -226,12 +230,17 @@ def inside(views: MovedViews, row: dict, generator: torch.Generator) -> list[flo
     found = []
     for name, (_levels, step_of) in DIRECTIONS.items():
         for _ in range(INSIDE_EACH if row[name] else 0):
-            share, place = torch.rand(2, generator=generator).tolist()
+            part, place = torch.rand(2, generator=generator).tolist()
             view = recorded[min(int(place * len(recorded)), len(recorded) - 1)]
-            camera = views.camera(view, step_of(row[name] * share))
+            camera = views.camera(view, step_of(row[name] * part))
             if camera is not None:
                 found.append(true_psnr_db(views, camera, view))
     return found
+
+
+def share(good: list[bool]) -> float:
+    """How many of them are; not a number where there is none."""
+    return fmean(good) if good else float("nan")
 
 
 def read(files: tuple[str, ...]) -> list[dict]:

@@ -15,7 +15,7 @@ from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.lidar.collisions import Collision, MovingBody, find_collisions
 from lidarpainter_models.lidar.lidar_map import MapPoints
 from lidarpainter_models.scenes.actor_names import named_actor, path_of_track
-from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.driving_scene import DrivingScene, driven_road
 from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.scenes.tracks import ActorTrack
 
@@ -34,10 +34,7 @@ class MovedCameras:
     @cached_property
     def road(self) -> DrivenPath:
         """The way the car drove."""
-        return DrivenPath(
-            timestamps_ns=self.recorded.frame_timestamps_ns,
-            world_from_body=self.recorded.world_from_ego,
-        )
+        return driven_road(self.recorded)
 
     def moved(self, views: Sequence[RecordedView], cameras: Sequence[Camera]) -> tuple[Camera, ...]:
         """The cameras of some moments of one camera, moved.

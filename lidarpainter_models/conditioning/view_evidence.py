@@ -10,10 +10,10 @@ World: x forward, y left, z up; metres.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
@@ -27,6 +27,7 @@ from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.painter.protocol import PaintingConditions
 
 EVIDENCE_WIDTH_PX = 160
+"""Confidences are calibrated with it."""
 MOST_CHECKED = 6
 """Training views of a camera whose own images say how closely the fit shows what it saw."""
 GATHERED = ConditionConfig(num_references=2, num_sources=3)
@@ -63,10 +64,14 @@ class EvidenceGatherer:
     ) -> None:
         """Take the scene as it is now, and what the fit saw."""
         self.scene = scene
-        self._views = tuple(training_views)
-        small = [_small_view(view) for view in self._views]
-        self.builder = ConditionBuilder(scene, lidar_map, small, config=GATHERED)
+        self._lidar_map, self._views = lidar_map, tuple(training_views)
         self._recorded_db = lru_cache(maxsize=None)(self._measured_db)
+
+    @cached_property
+    def builder(self) -> ConditionBuilder:
+        """Carries what is known into views, at their small size."""
+        small = [_small_view(view) for view in self._views]
+        return ConditionBuilder(self.scene, self._lidar_map, small, config=GATHERED)
 
     @property
     def camera_names(self) -> tuple[str, ...]:
@@ -90,7 +95,8 @@ class EvidenceGatherer:
 
     def _measured_db(self, camera_name: str | None) -> float:
         """Mean PSNR of training views of a camera, evenly over time; of all for a strange one."""
-        own = [view for view in self._views if view.key[1] == camera_name] or list(self._views)
+        showing = [view for view in self._views if view.hidden is None or not view.hidden.all()]
+        own = [view for view in showing if view.key[1] == camera_name] or showing
         count = min(MOST_CHECKED, len(own))
         chosen = [own[(2 * place + 1) * len(own) // (2 * count)] for place in range(count)]
         return sum(self._training_db(view) for view in chosen) / count
@@ -115,7 +121,7 @@ def _difference(conditions: PaintingConditions) -> Float[Tensor, "height width"]
     return torch.where(count > 0, error, contrast)
 
 
-def _decibels(mean_square: Tensor) -> float:
+def _decibels(mean_square: Float[Tensor, ""]) -> float:
     return -10 * math.log10(max(float(mean_square), LEAST_ERROR))
 
 
@@ -143,5 +149,6 @@ def _small_view(view: TrainingView) -> TrainingView:
     )
 
 
-def _nearest(count: int, of: int) -> Tensor:
+def _nearest(count: int, of: int) -> Int[Tensor, " count"]:
+    """Of so many pixels, those under the centres of `count` cells."""
     return ((torch.arange(count) + 0.5) * of / count).long()

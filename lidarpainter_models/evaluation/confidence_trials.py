@@ -20,8 +20,9 @@ from lidarpainter_models.geometry.trajectory_words import ConstantStep
 from lidarpainter_models.metrics.images import psnr_from_error, squared_error
 from lidarpainter_models.scenes.records import RecordedView
 
-FARTHEST = {"left": 6.0, "right": 6.0, "up": 5.0, "ahead": 8.0, "yaw": 60.0}
-"""Metres and degrees; small steps are drawn as often as large ones are rare: by their square."""
+FARTHEST = {"aside": 6.0, "up": 5.0, "ahead": 8.0, "yaw": 60.0}
+"""Metres and degrees, to both sides. Of a uniform number the square is drawn: half of all steps are
+within a quarter of the way."""
 RECORDED_SHARE = 0.1
 """Of frames that are drawn on the path itself."""
 MIXED_SHARE = 0.2
@@ -46,7 +47,7 @@ def drawn_step(generator: Generator) -> ConstantStep:
         return ConstantStep()
     sizes = [amount**2 for amount in amounts]
     steps = {
-        "lateral_m": FARTHEST["left"] * sizes[0],
+        "lateral_m": FARTHEST["aside"] * sizes[0],
         "up_m": FARTHEST["up"] * sizes[1],
         "along_m": FARTHEST["ahead"] * sizes[2],
         "yaw_rad": math.radians(FARTHEST["yaw"]) * sizes[3],

@@ -12,13 +12,9 @@ straight on past the end of the log. One step at a time: no step says anything a
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
+from lidarpainter_models.conditioning.moved_cameras import MovedCameras
 from lidarpainter_models.conditioning.novel_guidance import NovelCamera, has_room
 from lidarpainter_models.conditioning.view_evidence import EvidenceGatherer
 from lidarpainter_models.evaluation.view_confidence import (
@@ -28,25 +24,25 @@ from lidarpainter_models.evaluation.view_confidence import (
     FrameConfidence,
 )
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.geometry.shifts import Shift
-from lidarpainter_models.geometry.trajectory_parts import Moments
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
 from lidarpainter_models.geometry.trajectory_words import ConstantStep
 from lidarpainter_models.observations.fit_size import fit_camera
 from lidarpainter_models.observations.settings import ObservationConfig
-from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.driving_scene import DrivingScene, driven_road
 from lidarpainter_models.scenes.records import RecordedView
 
 STRETCH_M = 20.0
-LEVELS_M = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
-"""Up to what `render` goes to."""
-LEVELS_DEG = (2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0)
+UP_M = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
+ASIDE_M = (*UP_M, 6.0)
+AHEAD_M = (*ASIDE_M, 8.0)
+LEVELS_DEG = (2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 45.0, 60.0)
+"""No farther than frames were drawn to calibrate what is promised (`confidence_trials`)."""
 DIRECTIONS: dict[str, tuple[tuple[float, ...], Callable[[float], ConstantStep]]] = {
-    "left_m": (LEVELS_M, lambda level: ConstantStep(lateral_m=level)),
-    "right_m": (LEVELS_M, lambda level: ConstantStep(lateral_m=-level)),
-    "up_m": (LEVELS_M, lambda level: ConstantStep(up_m=level)),
-    "ahead_m": (LEVELS_M, lambda level: ConstantStep(along_m=level)),
+    "left_m": (ASIDE_M, lambda level: ConstantStep(lateral_m=level)),
+    "right_m": (ASIDE_M, lambda level: ConstantStep(lateral_m=-level)),
+    "up_m": (UP_M, lambda level: ConstantStep(up_m=level)),
+    "ahead_m": (AHEAD_M, lambda level: ConstantStep(along_m=level)),
     "yaw_left_deg": (LEVELS_DEG, lambda level: ConstantStep(yaw_rad=math.radians(level))),
     "yaw_right_deg": (LEVELS_DEG, lambda level: ConstantStep(yaw_rad=-math.radians(level))),
 }
@@ -103,33 +99,16 @@ class MovedViews:
         found = fitted.found_camera(view, fit_camera(view, self.observation))
         if step == ConstantStep():
             return found
-        moved = found.at(self._moved_pose(view, step, found.world_from_camera))
+        # as `render --trajectory` moves it, past the end of the path as far as asked
+        trajectory = Trajectory("a step", (step,), max_shift_m=None)
+        (moved,) = MovedCameras(recorded=self.scene, tracks=(), trajectory=trajectory).moved(
+            [view], [found]
+        )
         builder = self.gatherer.builder
         novel = NovelCamera(
             camera=moved, timestamp_ns=view.timestamp_ns, shift=Shift(), key=view.key
         )
         return moved if has_room(novel, builder.lidar_map, builder.boxes) else None
-
-    @cached_property
-    def _road(self) -> DrivenPath:
-        return driven_road(self.scene)
-
-    def _moved_pose(
-        self, view: RecordedView, step: ConstantStep, world_from_camera: Float[Tensor, "4 4"]
-    ) -> Float[Tensor, "4 4"]:
-        """As `render --trajectory` moves a camera, past the end of the path as far as asked."""
-        row = self.scene.frame_position(view.frame_index)
-        seconds = float(self._road.timestamps_ns[row] - self._road.timestamps_ns[0]) * 1e-9
-        moment = Moments(
-            rows=torch.tensor([row]),
-            seconds=torch.tensor([seconds], dtype=torch.float64),
-            progress=torch.zeros(1, dtype=torch.float64),
-            log_s=seconds,
-        )
-        placed = Trajectory("a step", (step,), max_shift_m=None).placed
-        return placed(
-            world_from_camera.double()[None], self._road, moment, _no_actor, is_camera=True
-        )[0]
 
     def said(
         self, view: RecordedView, step: ConstantStep, calibration: Calibration
@@ -194,7 +173,7 @@ class _Walk:
     ) -> None:
         self._views, self._moments, self._calibration = views, moments, calibration
         self.num_frames = 0
-        """That were looked at."""
+        """Where something was said."""
 
     def recorded(self) -> tuple[float, float]:
         """Least confidence and least predicted PSNR on the path itself."""
@@ -228,8 +207,9 @@ class _Walk:
         return said is not None and said.is_promised
 
     def _said(self, view: RecordedView, step: ConstantStep) -> FrameConfidence | None:
-        self.num_frames += 1
-        return self._views.said(view, step, self._calibration)
+        found = self._views.said(view, step, self._calibration)
+        self.num_frames += found is not None
+        return found
 
 
 def _moments(
@@ -245,12 +225,3 @@ def _moments(
         ]
         found += [own[-1], *own[:1]] if len(own) > 1 else own
     return found
-
-
-def driven_road(scene: DrivingScene) -> DrivenPath:
-    """The way the car drove."""
-    return DrivenPath(timestamps_ns=scene.frame_timestamps_ns, world_from_body=scene.world_from_ego)
-
-
-def _no_actor(name: str) -> DrivenPath:
-    raise AssertionError(f"a step follows nobody, asked for {name}")

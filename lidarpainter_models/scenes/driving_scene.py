@@ -17,6 +17,7 @@ from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.cameras import Camera, Shutter
+from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.scenes.records import (
     Distortion,
     ImageRecord,
@@ -252,3 +253,8 @@ def _shutter(row: dict[str, Any]) -> RollingShutter | None:
         return None
     direction = row["rolling_shutter_direction"]
     return RollingShutter(duration_s=row["rolling_shutter_s"], direction=direction)
+
+
+def driven_road(scene: DrivingScene) -> DrivenPath:
+    """The way the car drove."""
+    return DrivenPath(timestamps_ns=scene.frame_timestamps_ns, world_from_body=scene.world_from_ego)

@@ -35,10 +35,10 @@ from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene, describe
 from lidarpainter_models.gaussians.model.ply_files import read_ply
 from lidarpainter_models.gaussians.model.styling.scene_style import LampChange
-from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.painter.selection import NO_PAINTER, PainterChoice
+from lidarpainter_models.scenes.driving_scene import driven_road
 from lidarpainter_models.storage.tensor_files import write_tensors
 from tasks.opened import global_frame_of, open_scene
 from tasks.progress import Progress
@@ -190,7 +190,6 @@ def opened_world(store: Store, run: FinishedRun) -> EditedWorld:
     # what is mended is mended by day
     fitted = replace(load_scene(store, run.final.gaussians), style=None)
     bodies = {track.actor_id for track in fitted.actors.recorded_tracks}
-    ego = DrivenPath(timestamps_ns=scene.frame_timestamps_ns, world_from_body=scene.world_from_ego)
     return EditedWorld(
         scene=fitted,
         fitted=fitted,
@@ -199,7 +198,7 @@ def opened_world(store: Store, run: FinishedRun) -> EditedWorld:
         parked=tuple(
             track for track in scene.tracks if not track.is_moving and track.actor_id not in bodies
         ),
-        log=LogTimes(ego=ego),
+        log=LogTimes(ego=driven_road(scene)),
     )
 
 

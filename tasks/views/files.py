@@ -48,6 +48,11 @@ class ViewKinds:
     fps: float | None = None
     """Images a second of the film; None takes those of the recording."""
 
+    @property
+    def has_poses(self) -> bool:
+        """Whether files are written that say where each was taken from."""
+        return self.images or self.depth or self.semantics
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Companion:
@@ -157,7 +162,7 @@ def _described(
     collisions = [found.to_dict() for found in path.collisions()]
     if kinds.semantics:
         write_json(folder / LEGEND_FILE, legend(path.builder.scene))
-    if kinds.images or kinds.depth or kinds.semantics:
+    if kinds.has_poses:
         about = {"trajectory": path.trajectory.spec, "collisions": collisions}
         write_json(folder / POSES_FILE, {**about, "images": rows})
     return {"camera": path.camera_name, "num_images": len(rows), "collisions": collisions}
@@ -185,7 +190,9 @@ def _write_view(
         who = instance_image(path.builder.scene, camera, view.timestamp_ns)
         wanted.append(("semantics", write_index_png, who))
     name = f"{view.frame_index:04d}.png"
-    row = {**image_record(name, camera, view), **_confidence(path, camera, view), "file": None}
+    row = image_record(name, camera, view)
+    if kinds.has_poses:
+        row |= {**_confidence(path, camera, view), "file": None}
     for kind, write, pixels in wanted:
         if pixels is not None:
             row[kind] = name if kind == "file" else f"{kind}/{name}"

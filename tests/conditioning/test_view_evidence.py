@@ -59,6 +59,15 @@ def test_a_small_copy_of_a_view_says_much_the_same(world, monkeypatch):
     assert small.support == pytest.approx(whole.support, abs=0.15)
 
 
+def test_a_training_view_that_shows_the_own_car_alone_says_nothing_of_the_fit(world):
+    first, *others = world.observations.views
+    nothing = replace(first, hidden=torch.ones_like(first.sky_mask))
+    views = [nothing, *others, replace(nothing, key=(first.key[0], "covered"))]
+    found = EvidenceGatherer(world.scene, world.observations.lidar_map, views)
+    for name in ("front", "covered"):
+        assert found.of(camera_at(0.15), FRAME_NS, name).recorded_db > 20
+
+
 def test_what_hides_behind_the_own_car_vouches_for_nothing(world):
     hidden = torch.ones_like(world.observations.views[0].sky_mask)
     hidden[:4] = False

@@ -11,6 +11,7 @@ from gaussian_world import map_points
 from toy_street import ToyStreet
 
 from lidarpainter_models.conditioning.view_evidence import EvidenceGatherer, ViewEvidence
+from lidarpainter_models.evaluation.confidence_trials import FARTHEST
 from lidarpainter_models.evaluation.envelope import (
     DIRECTIONS,
     MovedViews,
@@ -111,7 +112,16 @@ def test_a_walk_ends_at_the_last_good_step():
     assert first == first | aside | {"ahead_m": 8.0}
     assert last == last | aside | {"ahead_m": 6.0}
     assert json.loads(json.dumps(found)) == found
-    assert found["num_frames"] < 2 * 2 * (1 + 9 * len(DIRECTIONS))
+    every_step = sum(len(levels) for levels, _step_of in DIRECTIONS.values())
+    assert 0 < found["num_frames"] < 2 * 2 * (1 + every_step)  # both ends of both stretches
+
+
+def test_nothing_is_promised_farther_out_than_it_was_calibrated():
+    names = {"lateral_m": "aside", "up_m": "up", "along_m": "ahead", "yaw_rad": "yaw"}
+    for levels, step_of in DIRECTIONS.values():
+        step = step_of(levels[-1])
+        (name,) = (name for name in names if getattr(step, name))
+        assert levels[-1] <= FARTHEST[names[name]]
 
 
 def test_a_place_in_a_wall_ends_a_walk_as_a_bad_frame_does():

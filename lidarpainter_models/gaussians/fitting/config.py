@@ -36,6 +36,9 @@ class GuidanceConfig:
     probability: float = 1.0
     """Of adding one painted view to a step (the paper's p_novel, 0.4). Against 0.5 the neighbouring
     lanes of streets gain 0.1 dB, recorded views lose 0.05 to 0.1 (docs/benchmarks.md)."""
+    until: float = 0.7
+    """Part of the steps that painted views take part in. The last ones fit recorded views alone,
+    which halves what painting costs these (docs/benchmarks.md)."""
     weight: float = 1.0
     """Of its loss (the paper's lambda_novel, 0.2, changed nothing on short schedules)."""
     ssim: float = 0.1
@@ -130,10 +133,9 @@ class FitConfig:
                 raise ConfigError(f"{name} must be positive, got {value}")
         if not 0 <= self.half_resolution <= 1:
             raise ConfigError(f"half_resolution must be in [0, 1], got {self.half_resolution}")
-        if not 0 <= self.guidance.probability <= 1:
-            raise ConfigError(
-                f"guidance.probability must be in [0, 1], got {self.guidance.probability}"
-            )
+        for name in ("probability", "until"):
+            if not 0 <= (value := getattr(self.guidance, name)) <= 1:
+                raise ConfigError(f"guidance.{name} must be in [0, 1], got {value}")
 
 
 def continuation(

@@ -229,7 +229,8 @@ def _advance(
 ) -> None:
     """One step: gradients, optimisers, and at their times the rounds that change the set."""
     painted = None
-    if guidance and state.random() < config.guidance.probability:
+    takes_part = state.step < config.guidance.until * config.steps
+    if guidance and takes_part and state.random() < config.guidance.probability:
         painted = guidance[int(torch.randint(len(guidance), (), generator=state.generator))]
         painted = painted.to(state.scene.device)
     image = images[row].to(state.scene.device)

@@ -187,6 +187,21 @@ def test_painted_views_pull_the_scene_towards_them(world):
     assert errors[0] < errors[1] - 0.02
 
 
+def test_the_last_steps_fit_recorded_views_alone(world):
+    def fitted(until):
+        guidance = GuidanceConfig(until=until, weight=3.0)
+        config = continuation(short_fit(), steps=20, guidance=guidance)
+        views = [painted_view(world)]
+        return fit_gaussians(world.observations, config, start=world.scene, guidance=views).scene
+
+    unguided = continuation(short_fit(), steps=20)
+    alone = fit_gaussians(world.observations, unguided, start=world.scene).scene
+    assert_same_scene(fitted(0.0), alone)
+    some, all_along = fitted(0.5).gaussians.means, fitted(1.0).gaussians.means
+    assert not torch.equal(some, alone.gaussians.means)
+    assert not torch.equal(some, all_along)
+
+
 def test_untrusted_painted_view_changes_nothing(world):
     config = short_fit(guidance=GuidanceConfig(depth=0.0))
     _, seen = with_guidance_gradients(world, painted_view(world, weight=0.0), config)
