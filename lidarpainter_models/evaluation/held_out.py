@@ -23,6 +23,7 @@ from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene, RecordedView
 from lidarpainter_models.scenes.records import ViewKey
+from lidarpainter_models.scenes.splits import sampled_views
 from lidarpainter_models.synthetic.street import SyntheticStreet
 
 Poses = Literal["interpolated", "recorded"]
@@ -45,16 +46,9 @@ class HeldOut:
 
     def sampled(self, most_views: int) -> "HeldOut":
         """With so many of the views at most, each camera's evenly over time; 0 keeps all."""
-        views = self.test_views
-        if most_views == 0 or len(views) <= most_views:
+        if most_views == 0 or len(self.test_views) <= most_views:
             return self
-        names = dict.fromkeys(view.camera_name for view in views)
-        share, kept = max(most_views // len(names), 1), set()
-        for name in names:
-            own = [view.key for view in views if view.camera_name == name]
-            count = min(share, len(own))
-            kept |= {own[(2 * place + 1) * len(own) // (2 * count)] for place in range(count)}
-        return replace(self, test_views=tuple(view for view in views if view.key in kept))
+        return replace(self, test_views=sampled_views(self.test_views, most_views))
 
     def image_of(self, view: RecordedView) -> Float[Tensor, "height width 3"]:
         """The recorded image at fit size, decoded at the first call."""

@@ -17,6 +17,7 @@ from torch import Tensor
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.observations.own_body import on_grid
 from lidarpainter_models.scenes.records import RecordedView
+from lidarpainter_models.scenes.splits import sampled_views
 
 LEAST_TOLD = 0.5
 """Below it images complete the LiDAR.
@@ -40,11 +41,16 @@ def share_told(
     """Of the cells of the images below the horizon, the part that holds a point of the street.
 
     Cells of the recording car itself are left out; 1 where no image looks below the horizon.
+
+    Args:
+        street: in the world; of many points an even part is looked at.
+        views: each camera's in order of time; of many some of each camera are looked at.
+        own_bodies: what of a camera's images is the recording car, by its name, on any grid.
     """
-    step = max(1, len(street) // _MOST_POINTS)
+    step = max(1, -(-len(street) // _MOST_POINTS))
     points_world = street.xyz_m[::step]
     told = of_all = 0
-    for view in views[:: max(1, -(-len(views) // _MOST_VIEWS))]:
+    for view in sampled_views(views, _MOST_VIEWS):
         asked, hit = _cells(view, points_world, own_bodies.get(view.camera_name))
         told += int((asked & hit).sum())
         of_all += int(asked.sum())
@@ -74,7 +80,16 @@ def _cells(
 
 
 def completed(measured: LidarMap, estimated: LidarMap) -> LidarMap:
-    """What was measured, and of what was estimated from images that which lies not beside it."""
+    """What was measured, and of what was estimated from images that which lies not beside it.
+
+    Beside means within `CELL_RAD` of a measured point, at the range of the estimate. An actor has
+    its returns alone from `LEAST_ON_ACTOR` of them on, else its estimated points alone.
+
+    Args:
+        measured: what the LiDAR told; its street may be empty.
+        estimated: what images tell, with points of every moving actor; its street must not be
+            empty.
+    """
     street = estimated.street
     nearest_m, _ = cKDTree(measured.street.xyz_m.numpy()).query(
         street.xyz_m.numpy(), distance_upper_bound=float(street.range_m.max()) * CELL_RAD

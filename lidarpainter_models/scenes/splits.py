@@ -54,6 +54,24 @@ def split_views(
     )
 
 
+def sampled_views(views: Sequence[RecordedView], most_views: int) -> tuple[RecordedView, ...]:
+    """So many of some views at most, each camera's evenly over time, in the order they came in.
+
+    Args:
+        views: each camera's in order of time, however the cameras take turns.
+        most_views: at least 1; where there are more cameras than that, one view of each is taken.
+    """
+    if len(views) <= most_views:
+        return tuple(views)
+    names = dict.fromkeys(view.camera_name for view in views)
+    share, kept = max(most_views // len(names), 1), set()
+    for name in names:
+        own = [view.key for view in views if view.camera_name == name]
+        count = min(share, len(own))
+        kept |= {own[(2 * place + 1) * len(own) // (2 * count)] for place in range(count)}
+    return tuple(view for view in views if view.key in kept)
+
+
 def split_frames(
     frame_indices: Sequence[int], spec: str
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:

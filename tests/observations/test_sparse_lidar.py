@@ -1,5 +1,7 @@
 """Where a LiDAR tells too little of the street, images complete it; where it tells enough, not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -8,10 +10,12 @@ from wall_drive import WALL_X_M, WallDrive
 
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.lidar.map_building import gather_points
+from lidarpainter_models.observations import sparse_lidar
 from lidarpainter_models.observations.preparation import prepare_observations
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.observations.sparse_lidar import (
     CELL_RAD,
+    LEAST_ON_ACTOR,
     LEAST_TOLD,
     completed,
     share_told,
@@ -32,16 +36,7 @@ class SweptWall(WallDrive):
 
     def read_sweep(self, _sweep):
         x_m, y_m = torch.tensor([WALL_X_M]), torch.linspace(-8, 10, 400)
-        points = torch.cartesian_prod(x_m, y_m, self._heights_m)
-        zeros = torch.zeros(len(points), dtype=torch.int32)
-        return SweepPoints(
-            xyz_m=points,
-            intensity=zeros.float(),
-            time_offset_ns=zeros.long(),
-            ring=zeros,
-            return_index=zeros,
-            lidar=zeros,
-        )
+        return SweepPoints.of(torch.cartesian_prod(x_m, y_m, self._heights_m))
 
 
 def points(xyz_m, range_m=10.0):
@@ -108,6 +103,29 @@ def test_a_car_that_stands_has_the_little_that_was_measured():
     assert torch.equal(prepared.lidar_map.street.xyz_m, measured.street.xyz_m)
 
 
+def test_of_many_images_every_camera_is_asked():
+    cameras = [f"camera {place}" for place in range(6)]
+    street = ToyStreet(40, tuple((name, 1.0) for name in cameras))  # all look the same way
+    line = gather_points(SweptWall(RING_Z_M), [0]).street
+    told = share_told(line, street.views, {})
+    assert 0 < told < 1
+    hides_all = np.ones((10, 10), bool)
+    for own in cameras:
+        others = {name: hides_all for name in cameras if name != own}
+        assert share_told(line, street.views, others) == told
+
+
+def test_of_many_points_no_more_are_looked_at_than_allowed(monkeypatch):
+    views = SweptWall(RING_Z_M).views
+    line = gather_points(SweptWall(RING_Z_M), [0]).street
+    behind = replace(line, xyz_m=-line.xyz_m)
+    by_turns = torch.arange(2 * len(line)).view(2, -1).T.flatten()
+    street = MapPoints.concatenate([behind, line]).keep(by_turns)
+    assert share_told(street, views, {}) > 0
+    monkeypatch.setattr(sparse_lidar, "_MOST_POINTS", len(street) - 1)
+    assert share_told(street, views, {}) == 0  # of each two the first, which is behind
+
+
 def test_cells_of_the_recording_car_are_not_asked():
     street = SweptWall(RING_Z_M)
     views = split_views(street, "all")
@@ -132,8 +150,11 @@ def test_estimates_beside_a_measured_point_are_dropped_and_all_else_is_kept():
     assert set(both.actors) == {"few", "unseen"}
 
 
-def test_many_returns_from_an_actor_are_kept():
-    many = points(torch.zeros(200, 3).tolist())
-    measured = LidarMap(street=points([[10.0, 0, 0]]), actors={"car": many})
-    estimated = LidarMap(street=points([[10.0, 5, 0]]), actors={"car": points([[1.0, 0, 0]])})
-    assert completed(measured, estimated).actors["car"] is many
+@pytest.mark.parametrize(
+    ("num_returns", "is_told"), [(LEAST_ON_ACTOR - 1, False), (LEAST_ON_ACTOR, True)]
+)
+def test_an_actor_keeps_its_returns_from_the_least_number_on(num_returns, is_told):
+    returns, on_box = points(torch.zeros(num_returns, 3).tolist()), points([[1.0, 0, 0]])
+    measured = LidarMap(street=points([[10.0, 0, 0]]), actors={"car": returns})
+    estimated = LidarMap(street=points([[10.0, 5, 0]]), actors={"car": on_box})
+    assert completed(measured, estimated).actors["car"] is (returns if is_told else on_box)
