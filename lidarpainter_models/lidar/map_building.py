@@ -57,13 +57,20 @@ def build_lidar_map(
     return colouring.coloured()
 
 
-def gather_points(scene: DrivingScene, split_frames: Collection[int]) -> LidarMap:
+def gather_points(
+    scene: DrivingScene, split_frames: Collection[int], *, may_be_empty: bool = False
+) -> LidarMap:
     """The sweeps of some frames in one map that has no colours yet.
 
     Of a LiDAR that stands a sweep each half second is enough for the street, not for who moves.
 
+    Args:
+        scene: where sweeps and tracks are read from.
+        split_frames: frames whose sweeps may be used.
+        may_be_empty: whether a street without points is an answer and no error.
+
     Raises:
-        SceneError: the frames hold no point in range.
+        SceneError: the frames hold no point of the street in range, unless that is an answer.
     """
     tracks = [track for track in scene.tracks if track.is_moving]
     taken = [sweep for sweep in scene.sweeps if sweep.frame_index in set(split_frames)]
@@ -78,7 +85,7 @@ def gather_points(scene: DrivingScene, split_frames: Collection[int]) -> LidarMa
         for placed, is_new in zip(sweeps, are_new, strict=True)
         if is_new
     ]
-    if sum(len(part) for part in street_parts) == 0:
+    if not may_be_empty and sum(len(part) for part in street_parts) == 0:
         raise SceneError(
             f"{scene.dataset}/{scene.sequence}: no LiDAR point within {MAX_RANGE_M:g} m in "
             f"frames {sorted(split_frames)}"
@@ -154,7 +161,8 @@ def _ground(street_parts: Sequence[MapPoints]) -> GroundHeights:
     """The ground, from an even sample of the street."""
     total = sum(len(part) for part in street_parts)
     step = max(1, total // _GROUND_SAMPLE)
-    return GroundHeights(torch.cat([part.xyz_m[::step] for part in street_parts]))
+    sample = [part.xyz_m[::step] for part in street_parts]
+    return GroundHeights(torch.cat([torch.zeros(0, 3), *sample]))  # of no sweeps, no points
 
 
 def _sort_near_points(

@@ -14,7 +14,7 @@ from torch import Tensor
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.lidar.colouring import MapColouring
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
-from lidarpainter_models.lidar.map_building import gather_points, showing_more
+from lidarpainter_models.lidar.map_building import MAX_RANGE_M, gather_points, showing_more
 from lidarpainter_models.lidar.recording_faults import find_faults
 from lidarpainter_models.lidar.sky_masks import sky_mask
 from lidarpainter_models.lidar.sparse_depth import FramePoints, sparse_lidar_depth
@@ -89,19 +89,22 @@ def _points(
     taken: Sequence[RecordedView],
     bodies: Mapping[str, Bool[np.ndarray, "rows columns"]],
 ) -> tuple[LidarMap, bool]:
-    """Points without colours, and whether images gave some of them."""
-    measured = None
-    if scene.has_lidar(split.train_frames):
-        measured = gather_points(scene, split.train_frames)
-        if share_told(measured.street, taken, bodies) >= LEAST_TOLD:
-            return measured, False
+    """Points without colours, and whether images gave some of them.
+
+    Raises:
+        SceneError: neither sweeps nor images tell anything of the street.
+    """
+    measured = gather_points(scene, split.train_frames, may_be_empty=True)
+    is_swept = len(measured.street) > 0
+    if is_swept and share_told(measured.street, taken, bodies) >= LEAST_TOLD:
+        return measured, False
     estimated = points_from_images(scene, taken, bodies)
     if len(estimated.street) > 0:
-        return (completed(measured, estimated) if measured else estimated), True
-    if measured is None:
+        return completed(measured, estimated), True
+    if not is_swept:
         raise SceneError(
-            f"{scene.dataset}/{scene.sequence}: no LiDAR, and no depth in the images either: they "
-            "show nothing that stands still from two places"
+            f"{scene.dataset}/{scene.sequence}: no LiDAR point within {MAX_RANGE_M:g} m, and no "
+            "depth in the images either: they show nothing that stands still from two places"
         )
     return measured, False
 

@@ -9,7 +9,8 @@ from lidarpainter_models.lidar import map_building
 from lidarpainter_models.lidar.actor_separation import CLEARANCE_M, ROAD_HEIGHT_M, poses_at
 from lidarpainter_models.lidar.ground_heights import GroundHeights
 from lidarpainter_models.lidar.lidar_map import MapPoints
-from lidarpainter_models.lidar.map_building import build_lidar_map
+from lidarpainter_models.lidar.map_building import build_lidar_map, gather_points
+from lidarpainter_models.scenes.records import SweepPoints
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +87,16 @@ def test_the_ego_vehicle_itself_leaves_no_points():
 def test_no_points_is_an_error(street):
     with pytest.raises(SceneError, match="no LiDAR point"):
         build_lidar_map(street, split_frames=(), colour_views=())
+
+
+@pytest.mark.parametrize("frames", [(), (0,)])
+def test_no_points_are_an_empty_street_for_who_asks_so(frames):
+    street = ToyStreet()
+    street.read_sweep = lambda _: SweepPoints.of(torch.zeros(0, 3))
+    with pytest.raises(SceneError, match="no LiDAR point"):
+        gather_points(street, frames)
+    nothing = gather_points(street, frames, may_be_empty=True)
+    assert (len(nothing.street), nothing.actors) == (0, {})
 
 
 def test_no_parts_make_no_points():

@@ -44,7 +44,7 @@ def test_no_pixel_pretends_to_have_been_measured(prepared):
 def test_images_from_one_place_are_one_clear_error():
     street = ToyStreet()
     street.sweeps = ()
-    with pytest.raises(SceneError, match="toy/street: no LiDAR, and no depth in the images either"):
+    with pytest.raises(SceneError, match="toy/street: no LiDAR point within 300 m, and no depth"):
         prepare_observations(street, split_views(street, "all"), ObservationConfig(width_px=120))
 
 

@@ -8,6 +8,7 @@ import torch
 from toy_street import ToyStreet
 from wall_drive import WALL_X_M, WallDrive
 
+from lidarpainter_models.errors import SceneError
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.lidar.map_building import gather_points
 from lidarpainter_models.observations import sparse_lidar
@@ -103,6 +104,25 @@ def test_a_car_that_stands_has_the_little_that_was_measured():
     assert torch.equal(prepared.lidar_map.street.xyz_m, measured.street.xyz_m)
 
 
+def test_a_lidar_that_met_nothing_leaves_the_street_to_the_images():
+    street = WallDrive()
+    views = split_views(street, "all")
+    unswept = prepare_observations(street, views, SIZE)
+    street.sweeps = ToyStreet().sweeps
+    street.read_sweep = lambda _: SweepPoints.of(torch.zeros(0, 3))
+    blocked = prepare_observations(street, views, SIZE)
+    assert blocked.is_estimated
+    assert torch.equal(blocked.lidar_map.street.xyz_m, unswept.lidar_map.street.xyz_m)
+    assert set(blocked.lidar_map.actors) == set(unswept.lidar_map.actors)
+
+
+def test_a_lidar_that_met_nothing_and_images_from_one_place_are_one_clear_error():
+    street = ToyStreet()
+    street.read_sweep = lambda _: SweepPoints.of(torch.zeros(0, 3))
+    with pytest.raises(SceneError, match="no LiDAR point within 300 m, and no depth in the images"):
+        prepare_observations(street, split_views(street, "all"), SIZE)
+
+
 def test_of_many_images_every_camera_is_asked():
     cameras = [f"camera {place}" for place in range(6)]
     street = ToyStreet(40, tuple((name, 1.0) for name in cameras))  # all look the same way
@@ -158,3 +178,12 @@ def test_an_actor_keeps_its_returns_from_the_least_number_on(num_returns, is_tol
     measured = LidarMap(street=points([[10.0, 0, 0]]), actors={"car": returns})
     estimated = LidarMap(street=points([[10.0, 5, 0]]), actors={"car": on_box})
     assert completed(measured, estimated).actors["car"] is (returns if is_told else on_box)
+
+
+def test_returns_from_an_actor_are_kept_where_the_street_gave_none():
+    returns = points(torch.zeros(LEAST_ON_ACTOR, 3).tolist())
+    measured = LidarMap(street=MapPoints.concatenate([]), actors={"car": returns})
+    estimated = LidarMap(street=points([[10.0, 5, 0]]), actors={"car": points([[1.0, 0, 0]])})
+    both = completed(measured, estimated)
+    assert torch.equal(both.street.xyz_m, estimated.street.xyz_m)
+    assert both.actors["car"] is returns
