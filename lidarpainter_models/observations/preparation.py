@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
@@ -62,7 +63,7 @@ def prepare_observations(
         image = scene.read_image(recorded)
         near = lidar.measured(view.frame_index)
         if is_estimated or len(near) == 0:
-            near = _nearest_in_time(points.street, view.timestamp_ns)
+            near = torch.cat([near, _nearest_in_time(points.street, view.timestamp_ns)])
         made = _training_view(view, image, config, near=near, exposed=lidar.at_exposure(view))
         if view.camera_name in hidden:
             body = hidden[view.camera_name]
@@ -159,7 +160,7 @@ def _training_view(
         recorded: which image.
         image: as it was recorded.
         config: see there.
-        near: points measured about then, in the world: no sky is where they are.
+        near: points measured or estimated about then, in the world: no sky is where they are.
         exposed: its frame's LiDAR points, moving actors where they are in the image.
     """
     camera = fit_camera(recorded, config)

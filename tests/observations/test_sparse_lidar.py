@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from toy_street import ToyStreet
+from toy_street import CAR_X_M, SKY, ToyStreet, car_y_m
 from wall_drive import WALL_X_M, WallDrive
 
 from lidarpainter_models.errors import SceneError
@@ -38,6 +38,33 @@ class SweptWall(WallDrive):
     def read_sweep(self, _sweep):
         x_m, y_m = torch.tensor([WALL_X_M]), torch.linspace(-8, 10, 400)
         return SweepPoints.of(torch.cartesian_prod(x_m, y_m, self._heights_m))
+
+
+class LorryBeforeSky(SweptWall):
+    """A tall lorry as pale as the sky, above a low wall; sweeps meet both."""
+
+    def __init__(self):
+        super().__init__(RING_Z_M)
+        self.tracks = tuple(
+            replace(track, size_m=torch.tensor([4.0, 1.8, 4.0])) for track in self.tracks
+        )
+
+    def read_image(self, view):
+        image = super().read_image(view)
+        sky = image[: int(view.camera.cy_px) - 10]
+        noise = torch.Generator().manual_seed(view.frame_index)
+        sky[:] = torch.tensor(SKY) + torch.randint(-3, 4, sky.shape, generator=noise)
+        return image
+
+    def read_sweep(self, sweep):
+        wall = super().read_sweep(sweep).xyz_m
+        return SweepPoints.of(torch.cat([wall, self.lorry_side(sweep.timestamp_ns)]))
+
+    def lorry_side(self, timestamp_ns):
+        """Returns from its side, 2 m above the ground: above the wall, as the camera sees it."""
+        along_m = car_y_m(timestamp_ns * 1e-9) + torch.linspace(-0.5, 0.5, 10)
+        x_m, z_m = torch.tensor([CAR_X_M - 0.9]), torch.tensor([2.0, 2.1, 2.2])
+        return torch.cartesian_prod(x_m, along_m, z_m)
 
 
 def points(xyz_m, range_m=10.0):
@@ -121,6 +148,18 @@ def test_a_lidar_that_met_nothing_and_images_from_one_place_are_one_clear_error(
     street.read_sweep = lambda _: SweepPoints.of(torch.zeros(0, 3))
     with pytest.raises(SceneError, match="no LiDAR point within 300 m, and no depth in the images"):
         prepare_observations(street, split_views(street, "all"), SIZE)
+
+
+def test_returns_from_an_actor_are_no_sky_where_images_complete_the_lidar():
+    street = LorryBeforeSky()
+    prepared = prepare_observations(street, split_views(street, "all"), SIZE)
+    assert prepared.is_estimated
+    for view in prepared.views:
+        assert float(view.sky_mask.float().mean()) > 0.2
+        pixels_uv, depth_m = view.camera.project(street.lorry_side(view.timestamp_ns))
+        column, row = pixels_uv[view.camera.contains(pixels_uv, depth_m)].long().unbind(-1)
+        assert len(row) == 30
+        assert not bool(view.sky_mask[row, column].any())
 
 
 def test_of_many_images_every_camera_is_asked():
