@@ -10,9 +10,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from lidarpainter_models.errors import SceneError
 from lidarpainter_models.lidar.colouring import MapColouring
 from lidarpainter_models.lidar.lidar_map import LidarMap
-from lidarpainter_models.lidar.map_building import gather_points
+from lidarpainter_models.lidar.map_building import MAX_RANGE_M, gather_points
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 
 LEAST_BETWEEN, LEAST_JUMP = 0.2, 0.08
@@ -30,6 +31,11 @@ def exposure_differences(scene: DrivingScene) -> list[str]:
     frames = set(_runs(sorted({sweep.frame_index for sweep in scene.sweeps})))
     views = [view for view in scene.views if view.frame_index in frames]
     street = gather_points(scene, frames).street
+    if len(street) == 0:
+        raise SceneError(
+            f"{scene.dataset}/{scene.sequence}: no LiDAR point within {MAX_RANGE_M:g} m by which "
+            "images could be compared"
+        )
     some = street.keep(torch.arange(0, len(street), -(-len(street) // _MOST_POINTS)))
     colouring = MapColouring(LidarMap(street=some, actors={}), scene.tracks, views)
     for view in views:

@@ -51,26 +51,21 @@ def build_lidar_map(
         SceneError: the frames hold no point in range.
     """
     points = gather_points(scene, split_frames)
+    if len(points.street) == 0:
+        raise SceneError(
+            f"{scene.dataset}/{scene.sequence}: no LiDAR point within {MAX_RANGE_M:g} m in "
+            f"frames {sorted(split_frames)}"
+        )
     colouring = MapColouring(points, scene.tracks, colour_views)
     for view in colour_views:
         colouring.add(view, scene.read_image(view))
     return colouring.coloured()
 
 
-def gather_points(
-    scene: DrivingScene, split_frames: Collection[int], *, may_be_empty: bool = False
-) -> LidarMap:
-    """The sweeps of some frames in one map that has no colours yet.
+def gather_points(scene: DrivingScene, split_frames: Collection[int]) -> LidarMap:
+    """The sweeps of some frames in a map without colours yet; empty where they met nothing.
 
     Of a LiDAR that stands a sweep each half second is enough for the street, not for who moves.
-
-    Args:
-        scene: where sweeps and tracks are read from.
-        split_frames: frames whose sweeps may be used.
-        may_be_empty: whether a street without points is an answer and no error.
-
-    Raises:
-        SceneError: the frames hold no point of the street in range, unless that is an answer.
     """
     tracks = [track for track in scene.tracks if track.is_moving]
     taken = [sweep for sweep in scene.sweeps if sweep.frame_index in set(split_frames)]
@@ -85,11 +80,6 @@ def gather_points(
         for placed, is_new in zip(sweeps, are_new, strict=True)
         if is_new
     ]
-    if not may_be_empty and sum(len(part) for part in street_parts) == 0:
-        raise SceneError(
-            f"{scene.dataset}/{scene.sequence}: no LiDAR point within {MAX_RANGE_M:g} m in "
-            f"frames {sorted(split_frames)}"
-        )
     ground = _ground(street_parts)
     actor_parts: dict[str, list[MapPoints]] = {}
     for placed, is_new in zip(sweeps, are_new, strict=True):

@@ -95,7 +95,7 @@ def _points(
     Raises:
         SceneError: neither sweeps nor images tell anything of the street.
     """
-    measured = gather_points(scene, split.train_frames, may_be_empty=True)
+    measured = gather_points(scene, split.train_frames)
     is_swept = len(measured.street) > 0
     if is_swept and share_told(measured.street, taken, bodies) >= LEAST_TOLD:
         return measured, False
