@@ -42,6 +42,8 @@ FARTHEST_M = 120.0
 """Further points have no depth to speak of: they are left to what lies behind everything."""
 MOST_COST_RATIO = 0.8
 """Cost of the best depth over that of the best one elsewhere: more tells nothing."""
+LEAST_COST = 0.01
+"""Standard deviations of contrast: what costs less everywhere, as a blown sky, tells nothing."""
 SAME_DEPTH = 0.06
 """Two images find the same place if they differ by at most this part of its depth."""
 BOX_SPACING_M = 0.1
@@ -163,7 +165,8 @@ def _swept_depth(images: list[_Image], place: int) -> Float[Tensor, "height widt
     offset = (before - after) / (2 * (before - 2 * least + after).clamp(min=1e-6))
     inverse = 1 / DEPTHS_M
     depth_m = 1 / (inverse[middle] + offset.clamp(-0.5, 0.5) * (inverse[1] - inverse[0]))
-    is_clear = (best < MOST_COST_RATIO * elsewhere) & (depth_m < FARTHEST_M) & ~image.moves
+    is_clear = best.clamp(min=LEAST_COST) < MOST_COST_RATIO * elsewhere
+    is_clear &= (depth_m < FARTHEST_M) & ~image.moves
     return torch.where(is_clear, depth_m, 0.0)
 
 

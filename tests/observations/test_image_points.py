@@ -41,6 +41,20 @@ def test_no_pixel_pretends_to_have_been_measured(prepared):
     assert all(float(view.sky_mask.float().mean()) < 0.05 for view in prepared.views)
 
 
+def test_a_blown_sky_has_no_depth():
+    class BlownSky(WallDrive):
+        def read_image(self, view):
+            image = super().read_image(view)
+            image[:60] = 255
+            return image
+
+    street, config = BlownSky(), ObservationConfig(width_px=160)
+    found = prepare_observations(street, split_views(street, "all"), config)
+    assert all(float(view.sky_mask[:25].float().mean()) > 0.9 for view in found.views)
+    off_m = (found.lidar_map.street.xyz_m[:, 0] - WALL_X_M).abs()
+    assert float((off_m < 0.05 * WALL_X_M).float().mean()) > 0.9
+
+
 def test_images_from_one_place_are_one_clear_error():
     street = ToyStreet()
     street.sweeps = ()
