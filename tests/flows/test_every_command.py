@@ -135,7 +135,7 @@ def test_every_stage_tells_how_far_it_is_from_its_start_to_its_end(tiny_run, mon
         assert lines[-1].endswith(" s"), stage
         assert all("; run " in line for line in lines[:-2]), stage
     assert [line.rpartition(", ")[2] for line in told["fit"][:2]] == ["25 %", "50 %"]
-    assert told["fit"][0].startswith("fit: 0/40 0 %")
+    assert told["fit"][0].startswith("fit: 0 %, ")
     assert "0:00" not in said
 
 
