@@ -11,8 +11,9 @@ from lidarpainter_models.gaussians.fitting.settings import (
 )
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 
-HALF_STEP = 0.45
-"""What a step at half the image size costs of one at full size (docs/benchmarks.md)."""
+HALF_STEP = 0.6
+"""What a step at half the image size costs of one at full size: 0.46 in images 960 pixels wide, in
+smaller ones 0.72, as Gaussians cost more than pixels there (docs/benchmarks.md)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
