@@ -28,7 +28,7 @@ from flows.measure.figure_manifest import (
     read_figure_manifest,
 )
 from flows.measure.figures import COSTS, figure_of, measured_as, metric_names
-from flows.measure.sweep import make_points, undone
+from flows.measure.sweep import THREADS, make_points, undone
 from flows.measure.tables import (
     Figures,
     MissingFigureError,
@@ -44,8 +44,6 @@ from lidarpainter_models.storage.whole_files import write_whole
 from tasks.machine import machine
 from tasks.opened import open_scene
 
-THREADS = 1
-"""Of the workers that make points."""
 PAPER = "paper"
 """The protocol of what is under no other."""
 VIEW_TIME = "view-time"

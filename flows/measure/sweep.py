@@ -19,6 +19,9 @@ from flows.fleet.manifest import STORED, Configuration, Manifest, Source
 from flows.fleet.planner import Planner
 from flows.fleet.status import counts_of
 
+THREADS = 1
+"""Of the workers that make points."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
@@ -86,7 +89,7 @@ def make_points(
     counts = counts_of(rows)
     if still := counts["waiting"] + counts["running"]:
         say(f"{manifest.name}: {_cost(store, rows)}")
-        start = starter(store.address, manifest.name, threads=1)
+        start = starter(store.address, manifest.name, threads=THREADS)
         run_workers(ledger, manifest.name, start, min(workers, still), say)
     return points_of(store, manifest.name)
 

@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from statistics import fmean
 
 import torch
 from jaxtyping import Float, Int
@@ -25,6 +26,7 @@ from lidarpainter_models.lidar.lidar_map import LidarMap
 from lidarpainter_models.observations.fit_size import shrink_image
 from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.painter.protocol import PaintingConditions
+from lidarpainter_models.scenes.splits import evenly_taken
 
 EVIDENCE_WIDTH_PX = 160
 """Confidences are calibrated with it."""
@@ -80,7 +82,7 @@ class EvidenceGatherer:
 
     def of(self, camera: Camera, timestamp_ns: int, camera_name: str | None = None) -> ViewEvidence:
         """What speaks for the image of a camera, taken as it stands, at a time."""
-        camera = _small_camera(camera)
+        camera = camera.no_wider(EVIDENCE_WIDTH_PX)
         conditions = self.builder.conditions(camera, timestamp_ns, camera_name=camera_name)
         depth_m = torch.where(
             conditions.render_depth_m > 0, conditions.render_depth_m, conditions.lidar_depth_m
@@ -97,9 +99,7 @@ class EvidenceGatherer:
         """Mean PSNR of training views of a camera, evenly over time; of all for a strange one."""
         showing = [view for view in self._views if view.hidden is None or not view.hidden.all()]
         own = [view for view in showing if view.key[1] == camera_name] or showing
-        count = min(MOST_CHECKED, len(own))
-        chosen = [own[(2 * place + 1) * len(own) // (2 * count)] for place in range(count)]
-        return sum(self._training_db(view) for view in chosen) / count
+        return fmean(self._training_db(view) for view in evenly_taken(own, MOST_CHECKED))
 
     def _training_db(self, view: TrainingView) -> float:
         frame_index, name = view.key
@@ -125,15 +125,9 @@ def _decibels(mean_square: Float[Tensor, ""]) -> float:
     return -10 * math.log10(max(float(mean_square), LEAST_ERROR))
 
 
-def _small_camera(camera: Camera) -> Camera:
-    width_px = min(EVIDENCE_WIDTH_PX, camera.width_px)
-    height_px = max(round(camera.height_px * width_px / camera.width_px), 1)
-    return camera.resized(width_px=width_px, height_px=height_px)
-
-
 def _small_view(view: TrainingView) -> TrainingView:
     """A training view as wide as the evidence is gathered; masks and depth of the nearest pixel."""
-    camera = _small_camera(view.camera)
+    camera = view.camera.no_wider(EVIDENCE_WIDTH_PX)
     if camera.width_px == view.camera.width_px:
         return view
     rows = _nearest(camera.height_px, view.camera.height_px)[:, None]

@@ -108,6 +108,12 @@ class Camera:
             height_px=height_px,
         )
 
+    def no_wider(self, width_px: int) -> "Camera":
+        """The same view so many pixels wide at most, in its own proportions; never enlarged."""
+        width_px = min(width_px, self.width_px)
+        height_px = max(round(self.height_px * width_px / self.width_px), 1)
+        return self.resized(width_px=width_px, height_px=height_px)
+
     def project(
         self, points_world: Float[Tensor, "points 3"]
     ) -> tuple[Float[Tensor, "points 2"], Float[Tensor, " points"]]:

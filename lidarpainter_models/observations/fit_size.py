@@ -39,6 +39,4 @@ def shrink_image(
 
 def fit_camera(view: RecordedView, config: ObservationConfig) -> Camera:
     """The view's camera at fit size; images are never enlarged."""
-    width_px = min(config.width_px, view.camera.width_px)
-    height_px = max(round(view.camera.height_px * width_px / view.camera.width_px), 1)
-    return view.camera.resized(width_px=width_px, height_px=height_px)
+    return view.camera.no_wider(config.width_px)

@@ -61,7 +61,7 @@ def own_bodies(
         chosen = _far_apart([view for view in views if view.camera_name == name])
         if len(chosen) < LEAST_IMAGES:
             continue
-        cameras = [_small(view.camera) for view in chosen]
+        cameras = [view.camera.no_wider(WIDTH_PX) for view in chosen]
         seen = [
             _seen_change(scene.read_image(view), camera, _way(cameras, place), moving, view)
             for place, (view, camera) in enumerate(zip(chosen, cameras, strict=True))
@@ -100,13 +100,6 @@ def _far_apart(views: Sequence[RecordedView]) -> list[RecordedView]:
 
 def _baseline_m(first: Camera, second: Camera) -> float:
     return float((first.centre_world - second.centre_world).norm())
-
-
-def _small(camera: Camera) -> Camera:
-    width_px = min(WIDTH_PX, camera.width_px)
-    return camera.resized(
-        width_px=width_px, height_px=max(round(camera.height_px * width_px / camera.width_px), 1)
-    )
 
 
 def _way(cameras: Sequence[Camera], place: int) -> Float[np.ndarray, "3"]:

@@ -11,10 +11,13 @@ camera at the same moment, and the LiDAR sweeps of test frames stay out as well.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
+
+Item = TypeVar("Item")
 
 SPECS = "alternate, forward:N:M or all"
 
@@ -67,9 +70,14 @@ def sampled_views(views: Sequence[RecordedView], most_views: int) -> tuple[Recor
     share, kept = max(most_views // len(names), 1), set()
     for name in names:
         own = [view.key for view in views if view.camera_name == name]
-        count = min(share, len(own))
-        kept |= {own[(2 * place + 1) * len(own) // (2 * count)] for place in range(count)}
+        kept |= set(evenly_taken(own, share))
     return tuple(view for view in views if view.key in kept)
+
+
+def evenly_taken(items: Sequence[Item], most: int) -> list[Item]:
+    """So many of some items at most, from the middles of as many equal parts, in order."""
+    count = min(most, len(items))
+    return [items[(2 * place + 1) * len(items) // (2 * count)] for place in range(count)]
 
 
 def split_frames(

@@ -9,6 +9,35 @@ from tiny_street import SCENE
 from catalog.store import open_store
 
 
+@pytest.mark.parametrize("table", ["scenes", "runs", "artefacts", "metrics", "painters"])
+def test_catalog_lists_every_table(tiny_run, table):
+    found = succeed("catalog", "list", table, "--json", store=tiny_run.store).json
+    assert found["table"] == table
+    known = [row for row in tiny_run.rows[table] if row.get("value", 0) is not None]
+    assert len(found["rows"]) >= len(known) > 0 or table == "painters"
+    assert bool(found.get("absent")) == (len(known) < len(tiny_run.rows[table]))
+    reasons = [one["reason"] for one in found.get("absent", [])]
+    assert len(set(reasons)) == len(reasons)
+    assert f"{table} in " in succeed("catalog", "list", table, store=tiny_run.store).out
+
+
+def test_catalog_shows_a_scene_a_run_and_an_artefact_by_prefix(tiny_run):
+    artefact = tiny_run.rows["artefacts"][0]["artefact_id"]
+    names = {"scenes": SCENE, "runs": tiny_run.run_id[:10], "artefacts": artefact}
+    for table, name in names.items():
+        found = succeed("catalog", "show", name, "--json", store=tiny_run.store).json
+        assert found["table"] == table
+        assert name in succeed("catalog", "show", name, store=tiny_run.store).out
+
+
+@pytest.mark.parametrize("command", ["list", "show", "explain", "delete"])
+def test_every_command_of_the_catalog_answers_about_the_run(tiny_run, command):
+    names = {"list": ("runs",), "delete": (tiny_run.run_id, "--dry-run")}
+    words = ("catalog", command, *names.get(command, (tiny_run.run_id,)))
+    assert tiny_run.run_id in succeed(*words, store=tiny_run.store).out
+    assert tiny_run.run_id in json.dumps(succeed(*words, "--json", store=tiny_run.store).json)
+
+
 def test_a_whole_store_is_verified_and_a_flipped_bit_ends_with_1(tiny_run, own_run):
     found = succeed("catalog", "verify", "--json", store=tiny_run.store).json
     assert found["damaged"] == []

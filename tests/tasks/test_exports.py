@@ -8,6 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from lidarpainter_models.conditioning.view_evidence import EvidenceGatherer
 from lidarpainter_models.errors import ConfigError, SceneError, WriteError
 from lidarpainter_models.gaussians.model.instance_images import SKY
 from lidarpainter_models.gaussians.model.ply_files import read_ply
@@ -162,3 +163,19 @@ def test_renders_come_with_film_depth_semantics_and_a_companion(asked, view, tmp
     assert (tmp_path / "video.mp4").is_file()
     with pytest.raises(ConfigError, match="--beside unpainted needs a painter"):
         replace(view, beside="unpainted")
+
+
+def test_images_say_how_far_they_can_be_trusted_and_films_do_not_ask(
+    asked, view, tmp_path, monkeypatch
+):
+    asks = []
+    gathered = EvidenceGatherer.of
+    monkeypatch.setattr(
+        EvidenceGatherer, "of", lambda *words, **named: asks.append(1) or gathered(*words, **named)
+    )
+    render.fn(*asked, view, tmp_path / "images")
+    rows = json.loads((tmp_path / "images" / "trajectory.json").read_text())["images"]
+    assert len(asks) == len(rows)
+    assert all(0 <= row["confidence"] <= 1 for row in rows)
+    export_video.fn(*asked, view, tmp_path / "drive.mp4")
+    assert len(asks) == len(rows)
