@@ -254,12 +254,27 @@ def _change_set(state: FitState, config: FitConfig) -> None:
     if fraction > settings.stop:
         state.apply(prune(gaussians, sizes))
         return
-    first = min(len(gaussians), settings.budget)
+    state.apply(
+        densify(
+            gaussians,
+            state.tally,
+            sizes,
+            target=_target(len(gaussians), fraction, config),
+            threshold=settings.threshold,
+        )
+    )
+
+
+def _target(num_gaussians: int, fraction: float, config: FitConfig) -> int:
+    """How many Gaussians there may be after a round: even steps up to the budget, or all of it."""
+    settings = config.densification
+    if settings.threshold > 0:
+        return settings.budget
+    first = min(num_gaussians, settings.budget)
     progress = (fraction - settings.start) / max(settings.stop - settings.start, 1e-9)
     rounds_left = max((1 - progress) * (settings.stop - settings.start), 0) * config.steps
     rounds_left = 1 + rounds_left // settings.every
-    target = first + math.ceil((settings.budget - first) / rounds_left)
-    state.apply(densify(gaussians, state.tally, sizes, target=target))
+    return first + math.ceil((settings.budget - first) / rounds_left)
 
 
 def _log(state: FitState, config: FitConfig, progress: Progress | None) -> None:

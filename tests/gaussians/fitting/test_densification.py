@@ -39,6 +39,14 @@ def test_nothing_is_split_without_gradient():
     assert change.num_added == 0
 
 
+def test_a_threshold_leaves_what_pulls_less():
+    tally = tally_of(*[float(score) for score in range(10)])
+    change = densify(ten(), tally, [], target=100, threshold=6.0)
+    assert change.kept.tolist() == [0, 1, 2, 3, 4, 5, 6]
+    assert change.num_added == 6
+    assert len(densify(ten(), tally, [], target=11, threshold=6.0).gaussians) == 11
+
+
 def test_gradients_count_only_where_visible():
     tally = GradientTally.zeros(2)
     tally.add(torch.tensor([0, 1]), torch.tensor([2.0, 3.0]), torch.tensor([True, False]))
