@@ -83,10 +83,12 @@ def check_inputs(parameters: ReconstructParameters, store_path: Path) -> None:
     Raises:
         SceneError: the scene is not there, or lacks a camera.
         ConfigError: the split leaves nothing to train on, images are wanted wider than recorded,
-            the device is not there, or a fit weighs a distance without weights.
+            the device is not there, a fit weighs a distance without weights, or a round paints
+            too far away.
         WeightsError: the painter or the weights of a perceptual distance cannot be used.
     """
     run = opened(parameters.run_spec(store_path))
+    parameters.novel.in_round(parameters.rounds)
     width_px = parameters.observation.width_px
     if width_px != preset_named(parameters.preset, parameters.scene).observation.width_px:
         require_recorded_width(width_px, run.views.train, "observation.width_px")
@@ -167,7 +169,7 @@ def _rounds(course: Course, fitted: FittedRef) -> FittedRef:
                 run,
                 stage,
                 fitted,
-                parameters.novel,
+                parameters.novel.in_round(number),
                 parameters.conditions,
                 start_frame=number - 1,
             )
@@ -235,6 +237,9 @@ def _result(course: Course, scores: dict[str, Scores], final: FittedRef) -> dict
             name: {key: stage.summary[key] for key in GUIDANCE_COLUMNS}
             for name, stage in stages.items()
             if stage.ref.kind == "guidance"
+        },
+        "gains": {
+            name: gain for name, stage in stages.items() if (gain := stage.summary.get("gain"))
         },
         "suspicions": suspicions(stages[EXAMINE]) if EXAMINE in stages else None,
         "artefacts": {name: stage.ref.artefact_id for name, stage in stages.items()},

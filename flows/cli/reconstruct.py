@@ -150,6 +150,11 @@ def show(result: dict[str, Any]) -> None:
         "run": result["run_id"],
         "Gaussians": result["num_gaussians"],
         **({"stopped early": "at its time limit"} if result.get("stopped_early") else {}),
+        **{
+            name: "taken back: worse beside the path than before it"
+            for name, gain in (result.get("gains") or {}).items()
+            if gain["is_taken_back"]
+        },
         "peak memory": format_bytes(result["peak_memory_bytes"]),
         **{f"{name}, s": seconds for name, seconds in result["seconds"].items()},
         "report": result["report"],

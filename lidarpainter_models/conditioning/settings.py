@@ -1,6 +1,7 @@
 """What decides which views are painted and what a painter is shown; read without tensors."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from math import copysign
 from typing import Literal
 
 from lidarpainter_models.errors import ConfigError
@@ -52,6 +53,8 @@ class NovelGuidanceConfig:
 
     shifts: tuple[Shift, ...] = DEFAULT_SHIFTS
     """Where the recorded cameras are moved to; the paper's 2 and 3 m to both sides and 1.5 m up."""
+    outwards_m: float = 0.0
+    """How much farther to the side each round paints than the one before."""
     every_nth: int = 2
     """Of the training frames, every n-th is painted at every shift."""
     camera_names: tuple[str, ...] | None = None
@@ -65,3 +68,20 @@ class NovelGuidanceConfig:
             raise ConfigError("novel guidance needs at least one shift")
         if self.every_nth < 1:
             raise ConfigError(f"every_nth must be at least 1, got {self.every_nth}")
+        if self.outwards_m < 0:
+            raise ConfigError(f"outwards_m must not be negative, got {self.outwards_m}")
+
+    def in_round(self, number: int) -> "NovelGuidanceConfig":
+        """What is painted in a round, of which the first is 1.
+
+        Raises:
+            ConfigError: that is farther away than a scene shows anything.
+        """
+        farther_m = self.outwards_m * (number - 1)
+        shifts = tuple(
+            replace(one, lateral_m=one.lateral_m + copysign(farther_m, one.lateral_m))
+            if one.lateral_m
+            else one
+            for one in self.shifts
+        )
+        return replace(self, shifts=shifts, outwards_m=0.0)

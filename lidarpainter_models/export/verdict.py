@@ -34,6 +34,7 @@ def verdict(result: Mapping[str, Any]) -> list[str]:
             _trusted(result.get(ENVELOPE)),
             _actors(result["recorded"]),
             _early(result),
+            _taken_back(result.get("gains") or {}),
         )
         if sentence
     ]
@@ -56,6 +57,16 @@ def _recorded(scores: Mapping[str, Any]) -> str:
 
 def _early(result: Mapping[str, Any]) -> str:
     return "The fit ended early, at its time limit." if result.get("stopped_early") else ""
+
+
+def _taken_back(gains: Mapping[str, Mapping[str, Any]]) -> str:
+    """Which painted rounds were taken back, and why."""
+    return " ".join(
+        f"Round {stage.rpartition('-')[2]} was taken back: by what vouches for views beside the "
+        f"path it made them worse ({gain['before_db']:.1f} to {gain['after_db']:.1f} dB)."
+        for stage, gain in gains.items()
+        if gain["is_taken_back"]
+    )
 
 
 def _aside(result: Mapping[str, Any]) -> str:

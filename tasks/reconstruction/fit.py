@@ -10,9 +10,10 @@ import cv2
 import torch
 
 from catalog.artefacts import ArtefactRef, Workplace
+from lidarpainter_models.evaluation.round_gain import round_gain
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import FitConfig
-from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
+from lidarpainter_models.gaussians.fitting.fit import FitResult, fit_gaussians
 from lidarpainter_models.gaussians.fitting.step import Perceptual
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene, describe
 from lidarpainter_models.gaussians.model.stored_scene import copy_scene
@@ -85,6 +86,7 @@ def _build(  # noqa: PLR0913 - all that a fit is made from
     device: torch.device,
 ) -> dict[str, Any]:
     seen, plan, shown = observations(), "", ""
+    before, painted = start() if start else None, guidance() if guidance else ()
 
     def look(scene: GaussianScene) -> None:
         nonlocal shown
@@ -114,8 +116,8 @@ def _build(  # noqa: PLR0913 - all that a fit is made from
     result = fit_gaussians(
         seen,
         config,
-        start=copy_scene(start()) if start else None,  # the fit moves what it is given
-        guidance=guidance() if guidance else (),
+        start=copy_scene(before) if before else None,  # the fit moves what it is given
+        guidance=painted,
         checkpoints=CheckpointFolder(
             path=place.scratch, identity=place.scratch.name, every_seconds=CHECKPOINT_EVERY_S
         ),
@@ -124,10 +126,31 @@ def _build(  # noqa: PLR0913 - all that a fit is made from
         perceptual=perceptual() if perceptual else None,
         device=device,
     )
-    save_scene(place.output, result.scene, result.history)
+    scene, gain = _better(before, result.scene, seen, painted)
+    save_scene(place.output, scene, result.history)
+    return _summary(scene, result, gain)
+
+
+def _better(
+    before: GaussianScene | None,
+    after: GaussianScene,
+    seen: SceneObservations,
+    painted: tuple[GuidanceView, ...],
+) -> tuple[GaussianScene, dict[str, Any] | None]:
+    """The scene to go on with, and what a painted round gained; one that cost is taken back."""
+    if before is None or not painted:
+        return after, None
+    gain = round_gain(before, after, seen, painted)
+    return before if gain.is_worse else after, {**asdict(gain), "is_taken_back": gain.is_worse}
+
+
+def _summary(
+    scene: GaussianScene, result: FitResult, gain: dict[str, Any] | None
+) -> dict[str, Any]:
     last = result.history[-1]
     return {
-        **describe(result.scene),
+        **describe(scene),
+        "gain": gain,
         "train_psnr": last["psnr"],
         "cpu_s": last["cpu_s"],
         "steps": int(last["step"]),

@@ -83,3 +83,12 @@ def test_a_sample_of_the_held_out_views_is_called_one():
 def test_a_fit_that_ended_at_its_time_limit_is_called_early():
     assert verdict(run(stopped_early=True))[-1] == "The fit ended early, at its time limit."
     assert "early" not in " ".join(verdict(run(stopped_early=False)))
+
+
+def test_a_round_that_was_taken_back_is_named():
+    kept = {"before_db": 24.0, "after_db": 25.0, "is_taken_back": False}
+    lost = {"before_db": 25.0, "after_db": 23.96, "is_taken_back": True}
+    sentences = verdict(run(gains={"refine-1": kept, "refine-2": lost}))
+    assert sentences[-1].startswith("Round 2 was taken back")
+    assert "25.0 to 24.0 dB" in sentences[-1]
+    assert len(verdict(run(gains={"refine-1": kept}))) == len(verdict(run()))

@@ -25,6 +25,7 @@ from lidarpainter_models.export.moving_picture import PANEL_WIDTH_PX
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.metrics import lpips
 from lidarpainter_models.metrics.backbones import SQUEEZENET
+from lidarpainter_models.storage.tensor_files import read_tensors
 from tasks.evaluation.flicker import evaluate_flicker
 from tasks.evaluation.views import evaluate, load_scores
 from tasks.opened import open_scene
@@ -91,6 +92,33 @@ def test_painted_views_come_back_as_guidance(store, stages):
         assert 0 <= float(view.weight.min()) <= float(view.weight.max()) <= 1
     images = store.artefacts.folder(stages["paint-1"].ref) / "images" / "left-2m"
     assert {path.stem for path in images.iterdir()} >= {"render", "painted", "confidence"}
+
+
+def negatives(path):
+    """Painted views in the colours that nobody painted, sure of every pixel."""
+    arrays, metadata = read_tensors(path)
+    for name, array in arrays.items():
+        if name.endswith("rgb_u8"):
+            arrays[name] = 255 - array
+        elif name.endswith("weight_u8"):
+            arrays[name] = torch.full_like(array, 255)
+    return arrays, metadata
+
+
+def test_a_round_that_makes_views_worse_is_taken_back(store, parameters, stages, monkeypatch):
+    run, seen, first = parameters.run_spec(store.root), stages["prepare"].ref, stages["fit"].ref
+    painted = stages["paint-1"].ref
+    monkeypatch.setattr("tasks.reconstruction.painted_views.read_tensors", negatives)
+    guidance = replace(parameters.refine.guidance, probability=1.0, until=1.0, weight=20.0)
+    config = replace(parameters.refine, steps=60, guidance=guidance)
+    spoilt = fit.fn(run, "refine-1", seen, config, start=first, guidance=painted)
+    gain = spoilt.summary["gain"]
+    assert gain["is_taken_back"]
+    assert gain["after_db"] < gain["before_db"] - 1
+    kept, before = (load_scene(store, ref).gaussians for ref in (spoilt.ref, first))
+    torch.testing.assert_close(kept.means, before.means, rtol=0, atol=0)
+    assert stages["fit"].summary["gain"] is None
+    assert stages["refine-1"].summary["gain"].keys() == gain.keys()
 
 
 def test_scores_say_why_a_number_is_missing(store, stages):
