@@ -31,6 +31,7 @@ from tasks.reconstruction.fit import fit
 from tasks.reconstruction.paint import paint
 from tasks.reconstruction.prepare import prepare
 from tasks.reconstruction.publish import begin_run, complete_run
+from tasks.reconstruction.refine import refine
 from tasks.reconstruction.report import REPORT_FILE, ReportInputs, write_report
 from tasks.source import code_behind
 from tasks.specs import FittedRef, RunSpec
@@ -160,32 +161,46 @@ def _report(course: Course, result: dict[str, Any], unpainted: FittedRef, final:
 
 def _rounds(course: Course, fitted: FittedRef) -> FittedRef:
     """Paint and go on fitting; without a painter the fit goes on alone, just as long."""
-    parameters, run = course.parameters, course.run
+    parameters = course.parameters
+    go_on = _unpainted if parameters.painter == NO_PAINTER else _painted
     for number in range(1, parameters.rounds + 1):
-        guidance = None
-        if parameters.painter != NO_PAINTER:
-            stage = f"paint-{number}"
-            painted = paint(
-                run,
-                stage,
-                fitted,
-                parameters.novel.in_round(number),
-                parameters.conditions,
-                start_frame=number - 1,
-            )
-            guidance = course.add(stage, painted).ref
-        stage = f"refine-{number}"
-        refined = fit(
-            run,
-            stage,
-            fitted.observations,
-            parameters.refine,
-            start=fitted.gaussians,
-            guidance=guidance,
-            lpips=parameters.lpips,
-        )
-        fitted = FittedRef(fitted.observations, course.add(stage, refined).ref)
+        refined = course.add(f"refine-{number}", go_on(course, fitted, number))
+        fitted = FittedRef(fitted.observations, refined.ref)
     return fitted
+
+
+def _unpainted(course: Course, fitted: FittedRef, number: int) -> StageResult:
+    """The control of a painted round."""
+    parameters = course.parameters
+    return fit(
+        course.run,
+        f"refine-{number}",
+        fitted.observations,
+        parameters.refine,
+        start=fitted.gaussians,
+        lpips=parameters.lpips,
+    )
+
+
+def _painted(course: Course, fitted: FittedRef, number: int) -> StageResult:
+    """Paint views of a fitted scene, and go on fitting with them."""
+    parameters, stage = course.parameters, f"paint-{number}"
+    painted = paint(
+        course.run,
+        stage,
+        fitted,
+        parameters.novel.in_round(number),
+        parameters.conditions,
+        start_frame=number - 1,
+    )
+    return refine(
+        course.run,
+        f"refine-{number}",
+        fitted,
+        parameters.refine,
+        guidance=course.add(stage, painted).ref,
+        lpips=parameters.lpips,
+    )
 
 
 def _judged(

@@ -1,7 +1,7 @@
-"""Fit Gaussians to observations, from scratch or on from a fitted scene with painted views."""
+"""Fit Gaussians to observations, from scratch or on from a fitted scene."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
@@ -10,7 +10,6 @@ import cv2
 import torch
 
 from catalog.artefacts import ArtefactRef, Workplace
-from lidarpainter_models.evaluation.round_gain import round_gain
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.fit import FitResult, fit_gaussians
@@ -22,7 +21,6 @@ from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.observations.views import GuidanceView, SceneObservations
 from tasks.opened import opened
 from tasks.progress import Progress
-from tasks.reconstruction.painted_views import load_guidance
 from tasks.specs import RunSpec
 from tasks.stages import StageResult, run_stage, stage_task
 from tasks.stored import load_observations, load_scene, save_scene
@@ -43,17 +41,16 @@ def fit(
     config: FitConfig,
     *,
     start: ArtefactRef | None = None,
-    guidance: ArtefactRef | None = None,
     lpips: LpipsFiles | None = None,
 ) -> StageResult:
     """Fit a scene to what was recorded.
 
-    Without a `start` it begins with the LiDAR map; one that goes on without guidance is the
-    control of one with it.
+    Without a `start` it begins with the LiDAR map; one that goes on is the control of one that does
+    so with painted views (`refine`).
     """
     this = opened(run)
     weighed = lpips if config.weighs_perceptual else None
-    inputs = {"observations": observations, "start": start, "guidance": guidance}
+    inputs = {"observations": observations, "start": start}
     return run_stage(
         this.store,
         kernels=run.kernels,
@@ -66,7 +63,6 @@ def fit(
             _build,
             observations=partial(load_observations, this.store, observations),
             start=partial(load_scene, this.store, start) if start is not None else None,
-            guidance=partial(load_guidance, this.store, guidance) if guidance is not None else None,
             perceptual=partial(load_lpips, weighed, this.device) if weighed is not None else None,
             config=config,
             device=this.device,
@@ -80,13 +76,39 @@ def _build(  # noqa: PLR0913 - all that a fit is made from
     *,
     observations: Callable[[], SceneObservations],
     start: Callable[[], GaussianScene] | None,
-    guidance: Callable[[], tuple[GuidanceView, ...]] | None,
     perceptual: Callable[[], Perceptual | None] | None,
     config: FitConfig,
     device: torch.device,
 ) -> dict[str, Any]:
-    seen, plan, shown = observations(), "", ""
-    before, painted = start() if start else None, guidance() if guidance else ()
+    result = run_fit(
+        place,
+        progress,
+        observations(),
+        config,
+        start=start() if start else None,
+        perceptual=perceptual() if perceptual else None,
+        device=device,
+    )
+    save_scene(place.output, result.scene, result.history)
+    return fit_summary(result)
+
+
+def run_fit(  # noqa: PLR0913 - as `fit_gaussians`
+    place: Workplace,
+    progress: Progress,
+    seen: SceneObservations,
+    config: FitConfig,
+    *,
+    start: GaussianScene | None,
+    guidance: Sequence[GuidanceView] = (),
+    perceptual: Perceptual | None,
+    device: torch.device,
+) -> FitResult:
+    """Fit where a stage is built: resumed from what a killed one left, and telling how far it is.
+
+    A `start` stays as it is.
+    """
+    plan, shown = "", ""
 
     def look(scene: GaussianScene) -> None:
         nonlocal shown
@@ -113,44 +135,26 @@ def _build(  # noqa: PLR0913 - all that a fit is made from
         planned = replace(config, steps=steps)
         progress(planned.work(step) / planned.work(steps), 1.0, note)
 
-    result = fit_gaussians(
+    return fit_gaussians(
         seen,
         config,
-        start=copy_scene(before) if before else None,  # the fit moves what it is given
-        guidance=painted,
+        start=copy_scene(start) if start else None,
+        guidance=guidance,
         checkpoints=CheckpointFolder(
             path=place.scratch, identity=place.scratch.name, every_seconds=CHECKPOINT_EVERY_S
         ),
         progress=told,
         first_look=None if start else look,
-        perceptual=perceptual() if perceptual else None,
+        perceptual=perceptual,
         device=device,
     )
-    scene, gain = _better(before, result.scene, seen, painted)
-    save_scene(place.output, scene, result.history)
-    return _summary(scene, result, gain)
 
 
-def _better(
-    before: GaussianScene | None,
-    after: GaussianScene,
-    seen: SceneObservations,
-    painted: tuple[GuidanceView, ...],
-) -> tuple[GaussianScene, dict[str, Any] | None]:
-    """The scene to go on with, and what a painted round gained; one that cost is taken back."""
-    if before is None or not painted:
-        return after, None
-    gain = round_gain(before, after, seen, painted)
-    return before if gain.is_worse else after, {**asdict(gain), "is_taken_back": gain.is_worse}
-
-
-def _summary(
-    scene: GaussianScene, result: FitResult, gain: dict[str, Any] | None
-) -> dict[str, Any]:
+def fit_summary(result: FitResult) -> dict[str, Any]:
+    """What a manifest says of a fit."""
     last = result.history[-1]
     return {
-        **describe(scene),
-        "gain": gain,
+        **describe(result.scene),
         "train_psnr": last["psnr"],
         "cpu_s": last["cpu_s"],
         "steps": int(last["step"]),

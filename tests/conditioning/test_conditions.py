@@ -121,6 +121,18 @@ def test_novel_cameras_stand_beside_and_above_the_path(views):
     assert [camera.key[0] for camera in later] == [2, 6, 2, 6]
 
 
+def test_rounds_paint_ever_farther_out():
+    shifts = (Shift(lateral_m=2), Shift(lateral_m=-3), Shift(up_m=1.5))
+    config = NovelGuidanceConfig(shifts=shifts, outwards_m=1)
+    assert config.in_round(1).shifts == shifts
+    names = [shift.name for shift in config.in_round(3).shifts]
+    assert names == ["left-4m", "right-5m", "up-1.5m"]
+    with pytest.raises(ConfigError, match="at most 8 metres"):
+        config.in_round(7)
+    with pytest.raises(ConfigError, match="outwards_m must not be negative"):
+        NovelGuidanceConfig(outwards_m=-1)
+
+
 def test_a_standing_car_still_has_a_left_side(views):
     config = NovelGuidanceConfig(shifts=(Shift(lateral_m=3),))
     novel = novel_cameras(views, range(10), ego_path(step_m=0.0), config=config)

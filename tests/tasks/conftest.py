@@ -13,6 +13,7 @@ from tasks.reconstruction.fit import fit
 from tasks.reconstruction.paint import paint
 from tasks.reconstruction.prepare import prepare
 from tasks.reconstruction.publish import begin_run, complete_run
+from tasks.reconstruction.refine import refine
 from tasks.reconstruction.report import REPORT_FILE, ReportInputs, write_report
 from tasks.runs import open_run
 from tasks.specs import FittedRef
@@ -65,9 +66,7 @@ def stages(store, parameters, ran):  # noqa: ARG001 - it watches them being buil
     fitted = FittedRef(seen.ref, first.ref)
     novel, conditions = parameters.novel, parameters.conditions
     painted = paint.fn(run, "paint-1", fitted, novel, conditions, start_frame=0)
-    refined = fit.fn(
-        run, "refine-1", seen.ref, parameters.refine, start=first.ref, guidance=painted.ref
-    )
+    refined = refine.fn(run, "refine-1", fitted, parameters.refine, guidance=painted.ref)
     final, config = FittedRef(seen.ref, refined.ref), parameters.judge_config
     return {
         "prepare": seen,

@@ -15,6 +15,7 @@ from tasks.reconstruction.fit import fit
 from tasks.reconstruction.paint import paint
 from tasks.reconstruction.prepare import prepare
 from tasks.reconstruction.publish import begin_run
+from tasks.reconstruction.refine import refine
 from tasks.reconstruction.report import ReportInputs, write_report
 from tasks.specs import FittedRef
 
@@ -68,14 +69,9 @@ def counted(tmp_path, monkeypatch):
     first = FittedRef(seen, made["fit"].ref)
     novel, conditions = parameters.novel, parameters.conditions
     made["paint-1"] = stage("paint", paint, "paint-1", first, novel, conditions, start_frame=0)
+    guidance = made["paint-1"].ref
     made["refine-1"] = stage(
-        "refine",
-        fit,
-        "refine-1",
-        seen,
-        parameters.refine,
-        start=first.gaussians,
-        guidance=made["paint-1"].ref,
+        "refine", refine, "refine-1", first, parameters.refine, guidance=guidance
     )
     final = FittedRef(seen, made["refine-1"].ref)
     before = stage("before", evaluate, "evaluate-unpainted", first, config)

@@ -65,6 +65,12 @@ def test_a_fit_follows_the_rasteriser_and_nothing_that_comes_after_it():
     assert holds(modules, *(f"{LIBRARY}.{other}." for other in others)) == []
 
 
+def test_a_painted_round_follows_what_takes_it_back_and_no_painter():
+    modules = modules_of(*builds_in("reconstruction.refine"))
+    assert {f"{LIBRARY}.evaluation.round_gain", f"{LIBRARY}.gaussians.fitting.fit"} <= modules.keys()
+    assert holds(modules, f"{LIBRARY}.readers.", f"{LIBRARY}.painter.nano.") == []
+
+
 def test_preparing_follows_the_colouring_and_no_reader_and_no_fit():
     modules = modules_of(*builds_in("reconstruction.prepare"))
     assert {f"{LIBRARY}.lidar.colouring", f"{LIBRARY}.kernels.point_splat.cpu"} <= modules.keys()
@@ -135,7 +141,7 @@ def test_scoring_code_changes_what_scores_and_nothing_else(copied):
 def test_the_rasteriser_changes_the_fit_and_all_after_it_but_not_what_it_is_fitted_to(copied):
     module = f"{LIBRARY}.kernels.gaussian_raster.cpu"
     changed = changed_by(copied, module, "return ", "return None or ")
-    after = ("reconstruction.fit", "reconstruction.paint", "reconstruction.report")
+    after = ("reconstruction.fit", "reconstruction.refine", "reconstruction.paint", "reconstruction.report")
     assert changed >= {f"tasks.{name}" for name in (*after, "evaluation.views")}
     assert "tasks.reconstruction.prepare" not in changed
 

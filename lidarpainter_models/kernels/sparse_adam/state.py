@@ -16,9 +16,9 @@ MOST_UNITS = MOST_STEP / (math.sqrt(BETA2) / BETA1 - 1)
 BETA1 / sqrt(BETA2) each."""
 MISSED_RUN_ENDS = (2, 4, 6, 8, 12, 20, 36, 68, 132, 260)
 """Last step of each run of missed steps that are taken at once; later ones are dropped."""
-VECTOR = 16
-"""Rows of moments are this many float32, a cache line, or several times as long: no vector loop
-ends in single numbers."""
+VECTOR = 8
+"""Rows of moments are this many float32, half a cache line, or several times as long: no vector
+loop ends in single numbers."""
 
 
 class Parameters(NamedTuple):
