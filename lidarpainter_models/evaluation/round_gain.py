@@ -16,7 +16,7 @@ from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.observations.views import GuidanceView, SceneObservations, TrainingView
 from lidarpainter_models.scenes.splits import evenly_taken
 
-MOST_VIEWS = 8
+MOST_VIEWS = 4
 """Painted views that are asked for, each at two places."""
 MOST_LOST_DB = 0.1
 """What the likely PSNR of two equally good scenes may differ by."""

@@ -70,7 +70,7 @@ def fit(
     )
 
 
-def _build(  # noqa: PLR0913 - all that a fit is made from
+def _build(
     place: Workplace,
     progress: Progress,
     *,

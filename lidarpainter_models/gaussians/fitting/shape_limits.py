@@ -56,11 +56,11 @@ def viewing_rays(scene: GaussianScene, camera_rows: Sequence[int] | None = None)
             body_from_camera = invert_rigid(
                 camera_from_body(scene.cameras.world_from_camera(row), *actors)
             ).to(means.device, non_blocking=True)
-            offset = means - body_from_camera[body, :3, 3]
-            forward = body_from_camera[body, :3, 2]
+            forward = body_from_camera[:, :3, 2].contiguous().index_select(0, body)
+            offset = means - body_from_camera[:, :3, 3].contiguous().index_select(0, body)
             length = offset.norm(dim=1).clamp(min=1e-3)
             is_ahead = (offset * forward).sum(dim=1) > 0.5
-            total += torch.where(is_ahead[:, None], offset / length[:, None], 0.0)
+            total.addcmul_(offset, (is_ahead / length)[:, None])
             count += is_ahead
             distance_m = torch.where(is_ahead, torch.minimum(distance_m, length), distance_m)
     return ViewingRays(
