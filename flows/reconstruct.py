@@ -89,7 +89,8 @@ def check_inputs(parameters: ReconstructParameters, store_path: Path) -> None:
         WeightsError: the painter or the weights of a perceptual distance cannot be used.
     """
     run = opened(parameters.run_spec(store_path))
-    parameters.novel.in_round(parameters.rounds)
+    if parameters.rounds and parameters.painter != NO_PAINTER:
+        parameters.novel.in_round(parameters.rounds)
     width_px = parameters.observation.width_px
     if width_px != preset_named(parameters.preset, parameters.scene).observation.width_px:
         require_recorded_width(width_px, run.views.train, "observation.width_px")

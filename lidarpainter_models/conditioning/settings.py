@@ -5,7 +5,7 @@ from math import copysign
 from typing import Literal
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.geometry.shifts import Shift
+from lidarpainter_models.geometry.shifts import MAX_SHIFT_M, Shift
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,8 +68,11 @@ class NovelGuidanceConfig:
             raise ConfigError("novel guidance needs at least one shift")
         if self.every_nth < 1:
             raise ConfigError(f"every_nth must be at least 1, got {self.every_nth}")
-        if self.outwards_m < 0:
-            raise ConfigError(f"outwards_m must not be negative, got {self.outwards_m}")
+        if not 0 <= self.outwards_m <= MAX_SHIFT_M:
+            raise ConfigError(
+                f"novel.outwards_m must lie between 0 and {MAX_SHIFT_M:g} metres, got "
+                f"{self.outwards_m}"
+            )
 
     def in_round(self, number: int) -> "NovelGuidanceConfig":
         """What is painted in a round, of which the first is 1.
@@ -78,10 +81,13 @@ class NovelGuidanceConfig:
             ConfigError: that is farther away than a scene shows anything.
         """
         farther_m = self.outwards_m * (number - 1)
-        shifts = tuple(
-            replace(one, lateral_m=one.lateral_m + copysign(farther_m, one.lateral_m))
-            if one.lateral_m
-            else one
-            for one in self.shifts
-        )
+        try:
+            shifts = tuple(
+                replace(one, lateral_m=one.lateral_m + copysign(farther_m, one.lateral_m))
+                if one.lateral_m
+                else one
+                for one in self.shifts
+            )
+        except ConfigError as error:
+            raise ConfigError(f"novel.outwards_m in round {number}: {error}") from None
         return replace(self, shifts=shifts, outwards_m=0.0)

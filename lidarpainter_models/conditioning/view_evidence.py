@@ -10,7 +10,7 @@ World: x forward, y left, z up; metres.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from statistics import fmean
 
 import torch
@@ -67,7 +67,7 @@ class EvidenceGatherer:
         """Take the scene as it is now, and what the fit saw."""
         self.scene = scene
         self._lidar_map, self._views = lidar_map, tuple(training_views)
-        self._recorded_db = lru_cache(maxsize=None)(self._measured_db)
+        self._recorded_db: dict[str | None, float] = {}
 
     @cached_property
     def builder(self) -> ConditionBuilder:
@@ -90,16 +90,22 @@ class EvidenceGatherer:
         seen = is_seen(camera, depth_m, self.builder.recorded_cameras)
         support = geometric_confidence(conditions, camera, seen)
         return ViewEvidence(
-            recorded_db=self._recorded_db(camera_name),
+            recorded_db=self._measured_db(camera_name),
             expected_db=_decibels(_difference(conditions).mean()),
             support=float(support.mean()),
         )
 
     def _measured_db(self, camera_name: str | None) -> float:
         """Mean PSNR of training views of a camera, evenly over time; of all for a strange one."""
+        if camera_name not in self._recorded_db:
+            chosen = evenly_taken(self._showing(camera_name), MOST_CHECKED)
+            self._recorded_db[camera_name] = fmean(self._training_db(view) for view in chosen)
+        return self._recorded_db[camera_name]
+
+    def _showing(self, camera_name: str | None) -> list[TrainingView]:
+        """Training views of a camera that show more than the own car; all for a strange one."""
         showing = [view for view in self._views if view.hidden is None or not view.hidden.all()]
-        own = [view for view in showing if view.key[1] == camera_name] or showing
-        return fmean(self._training_db(view) for view in evenly_taken(own, MOST_CHECKED))
+        return [view for view in showing if view.key[1] == camera_name] or showing
 
     def _training_db(self, view: TrainingView) -> float:
         frame_index, name = view.key

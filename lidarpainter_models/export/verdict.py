@@ -24,20 +24,17 @@ TELLING = 0.005
 
 def verdict(result: Mapping[str, Any]) -> list[str]:
     """Sentences about recorded views, views aside, and actors; `result` is that of a run."""
-    if result.get("recorded") is None:
-        return ["Nobody judged this scene: `lidarpainter evaluate` does."]
-    return [
-        sentence
-        for sentence in (
-            _recorded(result["recorded"]),
+    if (recorded := result.get("recorded")) is None:
+        judged = ["Nobody judged this scene: `lidarpainter evaluate` does."]
+    else:
+        judged = [
+            _recorded(recorded),
             _aside(result),
             _trusted(result.get(ENVELOPE)),
-            _actors(result["recorded"]),
-            _early(result),
-            _taken_back(result.get("gains") or {}),
-        )
-        if sentence
-    ]
+            _actors(recorded),
+        ]
+    sentences = (*judged, _early(result), _taken_back(result.get("gains") or {}))
+    return [sentence for sentence in sentences if sentence]
 
 
 def _recorded(scores: Mapping[str, Any]) -> str:

@@ -88,6 +88,7 @@ def _build(  # noqa: PLR0913 - all that a fit is made from
     told = None
     if painted:
         gain = round_gain(before.to(device), result.scene, seen, painted)
+        # history and costs stay those of what was fitted
         result = replace(result, scene=before) if gain.is_worse else result
         told = {**asdict(gain), "is_taken_back": gain.is_worse}
     save_scene(place.output, result.scene, result.history)

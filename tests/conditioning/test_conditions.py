@@ -127,10 +127,11 @@ def test_rounds_paint_ever_farther_out():
     assert config.in_round(1).shifts == shifts
     names = [shift.name for shift in config.in_round(3).shifts]
     assert names == ["left-4m", "right-5m", "up-1.5m"]
-    with pytest.raises(ConfigError, match="at most 8 metres"):
+    with pytest.raises(ConfigError, match="outwards_m in round 7: -9 m"):
         config.in_round(7)
-    with pytest.raises(ConfigError, match="outwards_m must not be negative"):
-        NovelGuidanceConfig(outwards_m=-1)
+    for metres in (-1.0, float("nan"), 9.0):
+        with pytest.raises(ConfigError, match="outwards_m must lie between 0 and 8"):
+            NovelGuidanceConfig(outwards_m=metres)
 
 
 def test_a_standing_car_still_has_a_left_side(views):

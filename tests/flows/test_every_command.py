@@ -13,6 +13,7 @@ from commands import call, seen_image, settings, succeed
 from tiny_street import FRONT, HEIGHT_PX, NUM_FRAMES, SCENE, SETTINGS, SIDE, WIDTH_PX
 
 from flows.cli.evaluate import PROTOCOLS
+from flows.cli.reconstruct import show
 from lidarpainter_models.export.images import read_image
 from lidarpainter_models.painter.styles import STYLE_PROMPTS
 from tasks.reconstruction.report import WORST_FILE
@@ -204,6 +205,7 @@ def test_another_painter_goes_on_from_the_fit_that_is_there(tiny_run, words, pai
     assert sum(stage.startswith("paint") for stage in result["seconds"]) == painted
     assert result["recorded"]["psnr"] > 15
     assert set(result["guidance"]) == ({"paint-1"} if painted else set())
+    assert set(result["gains"]) == ({"refine-1"} if painted else set())
     is_refined = "refine-1" in result["seconds"]
     assert (result["novel"] != result["unpainted"]["novel"]) == is_refined
     assert tiny_run.store.tables.row("runs", result["run_id"])["status"] == "complete"
@@ -214,6 +216,26 @@ def test_another_painter_goes_on_from_the_fit_that_is_there(tiny_run, words, pai
     rows = tiny_run.store.tables.rows("metrics")
     variants = {row["variant"] for row in rows if row["run_id"] == result["run_id"]}
     assert variants == {"unpainted", last}
+
+
+def test_a_later_round_paints_farther_out(tiny_run):
+    changes = settings("rounds=2", "novel.outwards_m=1")
+    words = ("--painter", "warp", "--shift", "2", *changes, "--no-evaluate", "--no-report")
+    result = reconstructed(tiny_run, *words, "--json").json
+    for stage, names in (
+        ("paint-1", ("left-2m", "right-2m")),
+        ("paint-2", ("left-3m", "right-3m")),
+    ):
+        shown = Path(result["artefacts"][stage]) / "images"
+        assert sorted(path.name for path in shown.iterdir()) == list(names)
+
+
+def test_a_round_that_was_taken_back_is_shown(tiny_run, capsys):
+    gains = {"refine-1": {"before_db": 25.0, "after_db": 24.0, "is_taken_back": True}}
+    show(tiny_run.result)
+    assert "taken back" not in capsys.readouterr().out
+    show({**tiny_run.result, "gains": gains})
+    assert "taken back" in capsys.readouterr().out
 
 
 def test_a_person_is_shown_tables(tiny_run):

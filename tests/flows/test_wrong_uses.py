@@ -130,7 +130,7 @@ def refused(words, expected, place):
         ((*TOY, "--set", "fit=3"), "fit=3: Input should be"),
         ((*TOY, "--set", "painter.name=x"), "no setting 'painter.name'"),
         ((*TOY, "--set", "observation.width_px=100000"), "expected at most the 240 px"),
-        ((*TOY, "--set", "novel.outwards_m=9"), "expected at most 8 metres"),
+        ((*TOY, "--set", "novel.outwards_m=7"), "novel.outwards_m in round 2"),
         ((*TOY, "--set", 'novel.shifts=[{{"lateral_m": 90}}]'), "at most 8 metres from"),
         ((*TOY, "--set", "feature_weights={file}"), "{file} is no readable weights file"),
         ((*TOY, "--set", "feature_weights={tmp}"), "{tmp}"),

@@ -119,6 +119,7 @@ def test_a_round_that_makes_views_worse_is_taken_back(store, parameters, stages,
     assert gain["after_db"] < gain["before_db"] - 1
     kept, before = (load_scene(store, ref).gaussians for ref in (spoilt.ref, first.gaussians))
     torch.testing.assert_close(kept.means, before.means, rtol=0, atol=0)
+    assert spoilt.summary["num_gaussians"] == stages["fit"].summary["num_gaussians"]
     assert stages["refine-1"].summary["gain"].keys() == gain.keys()
 
 
