@@ -9,6 +9,7 @@ import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 from lidarpainter_models.errors import ConfigError, ShapeError
 from lidarpainter_models.painter import load_painter
 from lidarpainter_models.painter.batches import in_planes, stack_conditions
+from lidarpainter_models.painter.filters import fill_push_pull
 from lidarpainter_models.painter.input_hull import HULL_MARGIN, input_hull
 from lidarpainter_models.painter.nano.candidates import build_candidates, candidate_names
 from lidarpainter_models.painter.nano.features import painting_features
