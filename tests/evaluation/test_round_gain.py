@@ -30,7 +30,8 @@ def in_other_colours(scene):
 
 
 def test_what_spoils_a_scene_lowers_it_and_what_mends_it_does_not(world):
-    wrong, views = in_other_colours(world.scene), [painted(camera_at(0.4))]
+    wrong = in_other_colours(world.scene)
+    views = [painted(camera_at(0.4)), painted(camera_at(-0.4))]  # one of them is asked halfway
     lost = round_gain(world.scene, wrong, world.observations, views)
     won = round_gain(wrong, world.scene, world.observations, views)
     assert lost.after_db < lost.before_db - 1
