@@ -36,11 +36,12 @@ def sweep_cost(
     Averaged over a small window (detail) and a large one (where there is little texture).
     """
     target = image.permute(2, 0, 1)[None]
+    carried = [(_places(camera, other), other_image) for other, other_image in others]
     rows = []
     for depth_m in depths_m:
         total = torch.zeros(image.shape[:2])
-        for other_camera, other_image in others:
-            warped, inside = warp_plane(camera, other_camera, other_image, float(depth_m))
+        for places, other_image in carried:
+            warped, inside = _warped(other_image, *places, float(depth_m))
             difference = (warped - target)[0].abs().mean(dim=0).clamp(max=_HIDDEN_DIFFERENCE)
             total += torch.where(inside, difference, _HIDDEN_DIFFERENCE)
         total = (total / max(len(others), 1))[None, None]
@@ -48,22 +49,40 @@ def sweep_cost(
     return torch.stack(rows)
 
 
-def warp_plane(
-    camera: Camera,
-    other: Camera,
-    other_image: Float[Tensor, "rows columns channels"],
-    depth_m: float,
-) -> tuple[Float[Tensor, "1 channels height width"], Bool[Tensor, "height width"]]:
-    """The other image on the camera's plane at a depth, and where it lies inside the other."""
+def _places(
+    camera: Camera, other: Camera
+) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "3 1 1"]]:
+    """What a metre of depth adds to each pixel's place in another image, and the place at none.
+
+    Places are homogeneous, the other image reaches from -1 to 1.
+    """
     other_from_camera = (
         invert_rigid(other.world_from_camera.double()) @ camera.world_from_camera.double()
     ).float()
-    points = camera.pixel_directions() * depth_m
-    points = points @ other_from_camera[:3, :3].T + other_from_camera[:3, 3]
-    z = points[..., 2].clamp(min=1e-3)
-    u = (points[..., 0] / z * other.fx_px + other.cx_px) / other.width_px * 2 - 1
-    v = (points[..., 1] / z * other.fy_px + other.cy_px) / other.height_px * 2 - 1
-    inside = (u.abs() < 1) & (v.abs() < 1) & (points[..., 2] > 0.5)
+    x, y = 2 / other.width_px, 2 / other.height_px
+    lens = torch.tensor(
+        [
+            [x * other.fx_px, 0.0, x * other.cx_px - 1],
+            [0.0, y * other.fy_px, y * other.cy_px - 1],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    along = camera.pixel_directions() @ (lens @ other_from_camera[:3, :3]).T
+    offset = lens @ other_from_camera[:3, 3]
+    return along.permute(2, 0, 1).contiguous(), offset[:, None, None]
+
+
+def _warped(
+    other_image: Float[Tensor, "rows columns channels"],
+    along: Float[Tensor, "3 height width"],
+    offset: Float[Tensor, "3 1 1"],
+    depth_m: float,
+) -> tuple[Float[Tensor, "1 channels height width"], Bool[Tensor, "height width"]]:
+    """Another image on the camera's plane at a depth, and where it lies inside the other."""
+    u, v, z_m = (depth_m * along + offset).unbind(0)
+    is_before = z_m > 0.5
+    z_m = z_m.clamp(min=1e-3)
+    u, v = u / z_m, v / z_m
     warped = torch.nn.functional.grid_sample(
         other_image.permute(2, 0, 1)[None],
         torch.stack([u, v], dim=-1)[None],
@@ -71,7 +90,7 @@ def warp_plane(
         padding_mode="border",
         align_corners=False,
     )
-    return warped, inside
+    return warped, (u.abs() < 1) & (v.abs() < 1) & is_before
 
 
 def choose_depth(
@@ -94,6 +113,12 @@ def choose_depth(
 
 
 def _box(image: Float[Tensor, "1 1 height width"], size: int) -> Float[Tensor, "1 1 height width"]:
-    return torch.nn.functional.avg_pool2d(
-        image, size, stride=1, padding=size // 2, count_include_pad=False
-    )
+    for window in ((size, 1), (1, size)):  # one after the other: a mean of means, and faster
+        image = torch.nn.functional.avg_pool2d(
+            image,
+            window,
+            stride=1,
+            padding=(window[0] // 2, window[1] // 2),
+            count_include_pad=False,
+        )
+    return image

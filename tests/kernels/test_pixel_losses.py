@@ -23,6 +23,7 @@ HEIGHT_PX, WIDTH_PX = 13, 17
 RULES = PixelRules(sky_tolerance=0.3, depth_tolerance=0.05, min_transmittance=0.2)
 LEAVES = ("rgb", "depth_m", "alpha", "sky_rgb")
 EPS = torch.finfo(torch.float32).eps
+EXPOSURE = torch.tensor([[1.3, 0.1, -0.1, 0.02], [0.05, 1.2, 0.0, -0.03], [0.0, -0.2, 0.8, 0.1]])
 
 
 def random_case(seed=0):
@@ -58,11 +59,14 @@ def terms_and_gradients(backend, dtype):
     leaves = [leaf.detach().to(dtype).requires_grad_(True) for leaf in leaves]
     facts = replace(facts, rgb=facts.rgb.to(dtype), lidar_depth_m=facts.lidar_depth_m.to(dtype))
     rgb, depth_m, alpha, sky_rgb = leaves
-    terms = pixel_terms(image_of(rgb, depth_m, alpha), sky_rgb, facts, RULES, backend=backend)
+    exposure = EXPOSURE.to(dtype, copy=True).requires_grad_(True)
+    image = image_of(rgb, depth_m, alpha)
+    terms = pixel_terms(image, sky_rgb, facts, RULES, exposure=exposure, backend=backend)
     weight = torch.linspace(-1, 1, terms.shown.numel(), dtype=dtype).view_as(terms.shown)
     ((terms.shown * weight).sum() + 3 * terms.sky + 5 * terms.depth).backward()
     found = {"shown": terms.shown, "sky": terms.sky, "depth": terms.depth}
     found |= {name: leaf.grad for name, leaf in zip(LEAVES, leaves, strict=True)}
+    found["exposure"] = exposure.grad
     return {name: value.detach().double() for name, value in found.items()}
 
 
@@ -75,6 +79,12 @@ def test_fast_terms_and_gradients_are_those_of_plain_torch_in_double():
         # a dozen operations a pixel, on numbers as large as the largest beside it
         most = 16 * EPS * torch.maximum(expected.abs(), expected.abs().mean())
         assert bool(((fast[name] - expected).abs() <= most).all()), name
+
+
+def test_without_an_exposure_colours_are_shown_as_they_are():
+    (rgb, depth_m, alpha, sky_rgb), facts = random_case()
+    shown = pixel_terms(image_of(rgb, depth_m, alpha), sky_rgb, facts, RULES).shown
+    assert torch.equal(shown, rgb + (1 - alpha)[..., None] * sky_rgb)
 
 
 def test_sky_term_by_hand():

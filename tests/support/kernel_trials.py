@@ -136,7 +136,8 @@ def _image_loss(backend: str, device: torch.device) -> list[Tensor]:
 def _pixel_terms(backend: str, device: torch.device) -> list[Tensor]:
     draw = Draw(device)
     leaves = [draw.uniform(*SIZE_PX, 3), 20 * draw.uniform(*SIZE_PX), draw.uniform(*SIZE_PX)]
-    leaves = [leaf.requires_grad_() for leaf in (*leaves, draw.uniform(*SIZE_PX, 3))]
+    leaves = [*leaves, draw.uniform(*SIZE_PX, 3), draw.uniform(3, 4)]
+    leaves = [leaf.requires_grad_() for leaf in leaves]
     image = SplatImage(
         rgb=leaves[0],
         depth_m=leaves[1],
@@ -151,7 +152,7 @@ def _pixel_terms(backend: str, device: torch.device) -> list[Tensor]:
         lidar_depth_m=20 * draw.uniform(*SIZE_PX) * (draw.uniform(*SIZE_PX) > 0.5),
     )
     rules = PixelRules(sky_tolerance=0.3, depth_tolerance=0.05, min_transmittance=0.2)
-    terms = pixel_terms(image, leaves[3], facts, rules, backend=backend)
+    terms = pixel_terms(image, leaves[3], facts, rules, exposure=leaves[4], backend=backend)
     (terms.shown.sum() + terms.sky + terms.depth).backward()
     found = [terms.shown.detach(), terms.sky.detach(), terms.depth.detach()]
     return [*found, *(leaf.grad for leaf in leaves)]

@@ -128,13 +128,11 @@ class Refinement:
         pose = self.scene.cameras.world_from_camera(row)
         return pose if self.refines_cameras(step) else pose.detach()
 
-    def exposed(
-        self, rgb: Float[Tensor, "height width 3"], image: FitImage
-    ) -> Float[Tensor, "height width 3"]:
-        """The image as its camera exposes it."""
+    def exposure(self, image: FitImage) -> Float[Tensor, "3 4"] | None:
+        """How the camera of an image exposes it; None leaves colours as they are."""
         if not self.refines_exposure:
-            return rgb
-        return self.scene.exposure.apply(rgb, image.camera_name, image.timestamp_ns)
+            return None
+        return self.scene.exposure.map_at(image.camera_name, image.timestamp_ns)
 
     def prior(self, row: int, timestamp_ns: int, step: int) -> Float[Tensor, ""]:
         """Corrections are small, and an actor's change little from one knot to the next."""

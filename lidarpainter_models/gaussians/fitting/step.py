@@ -99,8 +99,9 @@ def _recorded_step(
     )
     rays = sky.rays(camera, (splat.alpha.detach() < OPAQUE) | image.is_open)
     sky_rgb = sky.sample(rays).requires_grad_(True)
-    terms = pixel_terms(splat, sky_rgb, facts, _pixel_rules(config))
-    shown = state.refinement.exposed(terms.shown, image)
+    exposure = state.refinement.exposure(image)
+    terms = pixel_terms(splat, sky_rgb, facts, _pixel_rules(config), exposure=exposure)
+    shown = terms.shown
     if image.hidden is not None:
         shown = torch.where(image.hidden[..., None], facts.rgb, shown)
     loss = l1_ssim_loss(shown, facts.rgb, ssim_weight=weights.ssim)

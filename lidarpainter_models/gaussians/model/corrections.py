@@ -173,25 +173,25 @@ class ExposureCorrections:
         self, rgb: Float[Tensor, "height width 3"], camera_name: str | None, timestamp_ns: int
     ) -> Float[Tensor, "height width 3"]:
         """The image as this camera exposes it then; unchanged for a camera never trained on."""
-        if camera_name is None or camera_name not in self.camera_names:
-            return rgb
-        matrix, offset = self._map_at(camera_name, timestamp_ns)
-        return rgb @ matrix.T + offset
+        exposure = self.map_at(camera_name, timestamp_ns)
+        return rgb if exposure is None else rgb @ exposure[:, :3].T + exposure[:, 3]
 
     def undone(
         self, rgb: Float[Tensor, "height width 3"], camera_name: str, timestamp_ns: int
     ) -> Float[Tensor, "height width 3"]:
         """A recorded image in the colours of the scene itself; no gradient."""
-        if camera_name not in self.camera_names:
-            return rgb
         with torch.no_grad():
-            matrix, offset = self._map_at(camera_name, timestamp_ns)
-            return (rgb - offset) @ torch.linalg.inv(matrix).T
+            exposure = self.map_at(camera_name, timestamp_ns)
+            if exposure is None:
+                return rgb
+            return (rgb - exposure[:, 3]) @ torch.linalg.inv(exposure[:, :3]).T
 
-    def _map_at(
-        self, camera_name: str, timestamp_ns: int
-    ) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
+    def map_at(self, camera_name: str | None, timestamp_ns: int) -> Float[Tensor, "3 4"] | None:
+        """How this camera exposes colours then, what is added last; None for a strange camera."""
+        if camera_name is None or camera_name not in self.camera_names:
+            return None
         row = self.camera_names.index(camera_name)
         before, after, weight = self.neighbours(timestamp_ns)
         log_gain = (1 - weight) * self.log_gain[row, before] + weight * self.log_gain[row, after]
-        return log_gain.exp() * self.matrix[row, :, :3], self.matrix[row, :, 3]
+        matrix, offset = self.matrix[row, :, :3], self.matrix[row, :, 3:]
+        return torch.cat([log_gain.exp() * matrix, offset], dim=1)

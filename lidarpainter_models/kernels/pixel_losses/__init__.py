@@ -4,6 +4,7 @@ The regularisers are those that StreetCrafter (Yan et al., 2025) calls L_g: the 
 LiDAR says how far things are. Depth is camera z in metres, alpha the opacity of the Gaussians.
 """
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -40,9 +41,13 @@ def pixel_terms(
     facts: PixelFacts,
     rules: PixelRules,
     *,
+    exposure: Float[Tensor, "3 4"] | None = None,
     backend: Backend = "auto",
 ) -> PixelTerms:
     """Put a drawn image over its sky and judge its alpha and depth; differentiable.
+
+    `exposure` maps the colours of the scene to those that the camera shows, the last column being
+    added; without it they are shown as they are.
 
     Raises:
         ShapeError: the images differ in size.
@@ -57,4 +62,6 @@ def pixel_terms(
         float32_backend("pixel_losses", backend, image.rgb),
         image.rgb.device,
     )
-    return terms(image, sky_rgb, facts, rules)
+    if exposure is None:
+        exposure = torch.eye(3, 4).to(image.rgb)
+    return terms(image, sky_rgb, facts, rules, exposure)

@@ -38,7 +38,7 @@ class PixelTerms:
     """The image as shown, and two means over it."""
 
     shown: Float[Tensor, "height width 3"]
-    """Gaussians over sky."""
+    """Gaussians over sky, exposed."""
     sky: Float[Tensor, ""]
     """See `reference.clear_sky_loss`."""
     depth: Float[Tensor, ""]

@@ -22,12 +22,14 @@ def pixel_terms(
     sky_rgb: Float[Tensor, "height width 3"],
     facts: PixelFacts,
     rules: PixelRules,
+    exposure: Float[Tensor, "3 4"],
 ) -> PixelTerms:
     """See `pixel_losses.pixel_terms`."""
+    composed_rgb = composed(image, sky_rgb, rules.min_transmittance)
     is_open = facts.kind == OPEN
     like_sky = looks_like_sky(facts.rgb, sky_rgb.detach(), is_open, tolerance=rules.sky_tolerance)
     return PixelTerms(
-        shown=composed(image, sky_rgb, rules.min_transmittance),
+        shown=composed_rgb @ exposure[:, :3].T + exposure[:, 3],
         sky=clear_sky_loss(image.alpha, (facts.kind == SKY) | like_sky, facts.kind == SOLID),
         depth=depth_loss(
             image.depth_m, image.alpha, facts.lidar_depth_m, tolerance=rules.depth_tolerance

@@ -184,7 +184,8 @@ def _missed_nodes(last, rows, rates, kind_of_column, now):
                         weight[start, place, c], depth[start, place, c] = pair[0], pair[1]
                         weight[start, place + 1, c], depth[start, place + 1, c] = pair[2], pair[3]
             lead[start, place : place + 2] = 0.5 - min(steps, 2) / (2.0 * steps)
-            begin, place = end + 1, place + 2
+            # the second node of a run of one step weighs nothing
+            begin, place = end + 1, place + min(steps, 2)
         length[start] = place
     return _Nodes(weight, depth, lead, length)
 
@@ -234,17 +235,21 @@ def _drift(values, first, second, nodes, start, eps, work):
     for c in range(len(values)):
         root[c] = math.sqrt(second[c])
     a, b, c2 = LOG_SCALE, LOG_SCALE + 1, LOG_SCALE + 2
+    x, y, z = values[MEANS], values[MEANS + 1], values[MEANS + 2]
     for k in range(nodes.length[start]):
-        weight, depth, lead = nodes.weight[start, k], nodes.depth[start, k], nodes.lead[start, k]
+        weight, depth = nodes.weight[start, k], nodes.depth[start, k]
+        rest = np.float32(1.0) - nodes.lead[start, k]
         for c in range(len(values)):
-            moved[c] = first[c] * weight[c] / (root[c] * depth[c] + eps[c])
+            step = first[c] * weight[c] / (root[c] * depth[c] + eps[c])
+            moved[c] = step
+            values[c] -= step
         size_m = _sigma_m(
-            values[a] - lead * moved[a], values[b] - lead * moved[b], values[c2] - lead * moved[c2]
+            values[a] + rest * moved[a], values[b] + rest * moved[b], values[c2] + rest * moved[c2]
         )
-        for c in range(MEANS, MEANS + 3):
-            moved[c] *= size_m
-        for c in range(len(values)):
-            values[c] -= moved[c]
+        x -= moved[MEANS] * size_m
+        y -= moved[MEANS + 1] * size_m
+        z -= moved[MEANS + 2] * size_m
+    values[MEANS], values[MEANS + 1], values[MEANS + 2] = x, y, z
 
 
 @numba.njit(cache=True, parallel=True)
