@@ -46,7 +46,7 @@ class StageResult:
     seconds: float
     """Wall time of the computation, whenever it took place."""
     cpu_seconds: float
-    """CPU time of the same, over all threads."""
+    """CPU time of the same over all threads, without compiling kernels."""
     peak_memory_bytes: int
     is_new: bool
     """Whether it was computed in this run."""
