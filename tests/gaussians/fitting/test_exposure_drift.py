@@ -1,6 +1,7 @@
 """A camera that is a third brighter than its neighbour, and grows brighter still during the log."""
 
 from dataclasses import replace
+from statistics import fmean
 
 import pytest
 import torch
@@ -25,15 +26,19 @@ BRIGHTER = replace(STREET, cameras=(FRONT, replace(SIDE, gain=GAIN, gain_drift=D
 SIZE = ObservationConfig(width_px=STREET.width_px)
 
 
+SEEDS = (0, 1, 2, 3)
+"""Fits of one street part by 0.1 to 0.2 dB, as much as is judged: their means count."""
+
+
 class Fitted:
     """A fit of a street, and the held-out images it is judged on."""
 
-    def __init__(self, street, folder):
+    def __init__(self, street, folder, seed):
         self.cameras = {camera.name: camera for camera in street.cameras}
-        recording = DrivingScene.open(write_street(street, folder))
+        recording = DrivingScene.open(write_street(street, folder / f"seed-{seed}"))
         split = split_views(recording, "alternate", None)
         seen = prepare_observations(recording, split, SIZE)
-        self.scene = fit_gaussians(seen, FitConfig()).scene
+        self.scene = fit_gaussians(seen, FitConfig(seed=seed)).scene
         self.held_out = HeldOut(scene=recording, test_views=split.test, observation=SIZE)
 
     def shown(self):
@@ -80,19 +85,31 @@ class Fitted:
         return 255 * torch.cat(differences).mean(dim=0)
 
 
+def fits_of(street, folder):
+    """A fit for every seed."""
+    return [Fitted(street, folder, seed) for seed in SEEDS]
+
+
 @pytest.mark.slow
 def test_a_brighter_camera_that_drifts_is_brought_back(tmp_path, monkeypatch, capsys):
-    alike, corrected = Fitted(STREET, tmp_path / "alike"), Fitted(BRIGHTER, tmp_path / "brighter")
+    fits = {
+        "alike": fits_of(STREET, tmp_path / "alike"),
+        "corrected": fits_of(BRIGHTER, tmp_path / "brighter"),
+    }
     monkeypatch.setattr(Refinement, "refines_exposure", False)
-    left = Fitted(BRIGHTER, tmp_path / "left")
-    difference = corrected.colour_difference()
+    fits["left"] = fits_of(BRIGHTER, tmp_path / "left")
+    psnr = {
+        name: {camera.name: [one.psnr(camera.name) for one in those] for camera in STREET.cameras}
+        for name, those in fits.items()
+    }
+    difference = torch.stack([one.colour_difference() for one in fits["corrected"]])
     with capsys.disabled():
-        for name, one in (("alike", alike), ("corrected", corrected), ("left", left)):
-            psnr = {camera.name: round(one.psnr(camera.name), 2) for camera in STREET.cameras}
-            print(f"\n{name}: {psnr}")  # noqa: T201
+        for name, by_camera in psnr.items():
+            print(f"\n{name}: {by_camera}")  # noqa: T201
         print(f"colours in the overlap, of 255: {difference.tolist()}")  # noqa: T201
     for camera in STREET.cameras:
-        lost = alike.psnr(camera.name) - left.psnr(camera.name)
-        gained = corrected.psnr(camera.name) - left.psnr(camera.name)
-        assert gained > 0.8 * lost, camera.name
+        alike, corrected, left = (
+            fmean(psnr[name][camera.name]) for name in ("alike", "corrected", "left")
+        )
+        assert corrected - left > 0.8 * (alike - left), camera.name
     assert float(difference.abs().max()) < 2
