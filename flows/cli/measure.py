@@ -117,14 +117,23 @@ def stress(  # noqa: PLR0913 - the options of a command
     Example: lidarpainter stress synthetic/street-0001 --only beams,clock --out stress
     """
     from catalog.store import existing_store
-    from flows.measure.stress import WAYS, stress_of, trials_of
+    from flows.measure.stress import WAYS, spoil_scenes, stress_of, trials_of
+    from flows.measure.sweep import foretold, was_asked
     from lidarpainter_models.stress.causes import CAUSES
+
+    def sweep(names: Sequence[str]) -> "Sweep":
+        return _sweep("stress", names, WAYS, preset, train_cameras, seeds, settings)
 
     store, causes = existing_store(), _known(only, list(CAUSES))
     trials = trials_of(store, scenes, causes, levels)
-    names = [*scenes, *(trial.spoilt for trial in trials)]
-    sweep = _sweep("stress", names, WAYS, preset, train_cameras, seeds, settings)
-    points = _made(sweep, workers=workers, accept_stale=accept_stale)
+    if not was_asked("stress", store):  # they tell what all others will take
+        _made(sweep(scenes), workers=workers, accept_stale=accept_stale)
+    times = {scene: sum(trial.scene == scene for trial in trials) for scene in scenes}
+    cost = foretold(sweep(scenes), store, times)
+    _told(f"{len(trials)} recordings are spoilt and made with painting and without, {cost} in all")
+    spoil_scenes(store, trials)
+    everything = sweep([*scenes, *(trial.spoilt for trial in trials)])
+    points = _made(everything, workers=workers, accept_stale=accept_stale)
     _show(stress_of(points, trials, out), as_json=as_json)
 
 
@@ -148,7 +157,6 @@ def figures(
     Example: lidarpainter figures docs/figures.toml --only results
     """
     chosen = parse_names(only)
-    say = complain if loudness() != "quiet" else _silent
     say_status("reading the tables")
     from catalog.store import open_store
     from flows.cli.progress import shown_progress
@@ -158,7 +166,7 @@ def figures(
     store.make()
     weights = {} if feature_weights is None else {"feature_weights": feature_weights}
     publisher = Publisher(
-        store=store, workers=workers, accept_stale=accept_stale, say=say, weights=weights
+        store=store, workers=workers, accept_stale=accept_stale, say=_told, weights=weights
     )
     with shown_progress():
         result = publisher.publish(manifest, chosen)
@@ -208,14 +216,15 @@ def _made(sweep: "Sweep", *, workers: int, accept_stale: bool) -> list["Point"]:
     from catalog.store import existing_store
     from flows.measure.sweep import run_sweep
 
-    say = complain if loudness() != "quiet" else _silent
     ways = len(sweep.configurations) * len(sweep.seeds)
-    say(f"{len(sweep.scenes) * ways} points: {len(sweep.scenes)} scenes in {ways} ways")
-    return run_sweep(sweep, existing_store(), workers=workers, accept_stale=accept_stale, say=say)
+    _told(f"{len(sweep.scenes) * ways} points: {len(sweep.scenes)} scenes in {ways} ways")
+    return run_sweep(sweep, existing_store(), workers=workers, accept_stale=accept_stale, say=_told)
 
 
-def _silent(_line: str) -> None:
-    """In place of progress."""
+def _told(line: str) -> None:
+    """A line of progress, unless silence is asked for."""
+    if loudness() != "quiet":
+        complain(line)
 
 
 def _show(result: dict[str, Any], *, as_json: bool) -> None:

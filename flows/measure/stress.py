@@ -13,7 +13,8 @@ from flows.measure.figures import LABELS, groups_of
 from lidarpainter_models.evaluation.fronts import Spread
 from lidarpainter_models.export.charts import Line, draw_lines
 from lidarpainter_models.stress.causes import CAUSES, cause_of
-from tasks.ingest.spoil import ingest_spoilt
+from tasks.ingest.spoil import ingest_spoilt, spoilt_id
+from tasks.opened import open_scene
 
 PAINTED, UNPAINTED = "painted", "unpainted"
 WAYS = (
@@ -41,22 +42,29 @@ class Trial:
 def trials_of(
     store: Store, scenes: Sequence[str], causes: Sequence[str], num_levels: int
 ) -> list[Trial]:
-    """Spoil scenes by causes, each at so many levels from mild on, unless they are there.
+    """Every cause at so many levels, from mild on, of those that a scene has.
 
     Raises:
         ConfigError: there is no such cause.
     """
+    opened = {scene: open_scene(store, scene) for scene in scenes}
     return [
         Trial(
             scene=scene,
             cause=name,
             level=level,
-            spoilt=ingest_spoilt.fn(store.address, scene, name, level),
+            spoilt=spoilt_id(opened[scene], name, level),
         )
         for name in causes
-        for level in cause_of(name).levels[:num_levels]
         for scene in scenes
+        for level in cause_of(name).levels_of(len(opened[scene].camera_names))[:num_levels]
     ]
+
+
+def spoil_scenes(store: Store, trials: Sequence[Trial]) -> None:
+    """Write the recordings of all trials, unless they are there."""
+    for trial in trials:
+        ingest_spoilt.fn(store.address, trial.scene, trial.cause, trial.level)
 
 
 def stress_of(points: Sequence[Point], trials: Sequence[Trial], out: Path) -> dict[str, Any]:
@@ -70,40 +78,49 @@ def stress_of(points: Sequence[Point], trials: Sequence[Trial], out: Path) -> di
     figures = {(group.scene, group.configuration): group.figures for group in groups_of(points)}
     pictures, says = [], []
     for quality in QUALITIES:
-        panels: dict[str, list[Line]] = {}
-        for scene in dict.fromkeys(trial.scene for trial in trials):
-            found = _curves([t for t in trials if t.scene == scene], scene, figures, quality)
-            panels |= {f"{cause}, {scene}": lines for cause, lines in found.items()}
+        scenes = [
+            scene
+            for scene in dict.fromkeys(trial.scene for trial in trials)
+            if quality in figures.get((scene, PAINTED), {})
+        ]
+        panels = {
+            f"{cause}, {scene}": lines
+            for cause in dict.fromkeys(trial.cause for trial in trials)
+            for scene in scenes
+            if (lines := _lines(trials, cause, scene, figures, quality))
+        }
         if panels:
             stem = out / f"stress-{quality}"
-            pictures += draw_lines(panels, LABELS[quality], stem)
+            pictures += draw_lines(panels, LABELS[quality], stem, columns=_columns(len(scenes)))
             says += _told(panels, quality)
     return {"points": rows_of(points), "pictures": list(map(str, pictures)), "says": says}
 
 
-def _curves(
+def _columns(num_scenes: int) -> int:
+    """So many that those of a scene stand below each other, about four."""
+    return num_scenes * max(4 // num_scenes, 1)
+
+
+def _lines(
     trials: Sequence[Trial],
+    cause: str,
     scene: str,
     figures: Mapping[tuple[str, str], Mapping[str, Spread]],
     quality: str,
-) -> dict[str, list[Line]]:
-    """By cause: a line for each way, from the scene as recorded on."""
-    curves = {}
-    for cause in dict.fromkeys(trial.cause for trial in trials):
-        steps = [("none", scene)]
-        steps += [(f"{t.level:g}", t.spoilt) for t in trials if t.cause == cause]
-        lines = []
-        for way in (PAINTED, UNPAINTED):
-            known = [
-                (level, figures[name, way][quality])
-                for level, name in steps
-                if quality in figures.get((name, way), {})
-            ]
-            levels, values = [level for level, _ in known], [value for _, value in known]
-            lines.append(Line(name=way, levels=levels, values=values))
-        if lines[0].values:
-            curves[cause] = lines
-    return curves
+) -> list[Line]:
+    """A line for each way, from the scene as recorded on; none where the cause has no level."""
+    spoilt = [t for t in trials if (t.cause, t.scene) == (cause, scene)]
+    steps = [("none", scene), *((f"{t.level:g}", t.spoilt) for t in spoilt)]
+    lines = []
+    for way in (PAINTED, UNPAINTED):
+        known = [
+            (level, figures[name, way][quality])
+            for level, name in steps
+            if quality in figures.get((name, way), {})
+        ]
+        levels, values = [level for level, _ in known], [value for _, value in known]
+        lines.append(Line(name=way, levels=levels, values=values))
+    return lines if spoilt else []
 
 
 def _told(panels: Mapping[str, Sequence[Line]], quality: str) -> list[str]:

@@ -4,11 +4,12 @@ So it has what a fleet has: what two points share is computed once, workers may 
 command goes on, and further points join those that are done. Figures come from the catalog alone.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from catalog.errors import CatalogError
+from catalog.fleets import TABLE as SEQUENCES
 from catalog.fleets import FleetLedger
 from catalog.points import Point, points_of
 from catalog.store import Store
@@ -104,14 +105,32 @@ def undone(points: Sequence[Point], missing: Sequence[Row]) -> str:
     )
 
 
+def was_asked(name: str, store: Store) -> bool:
+    """Whether a store knows a sweep of that name."""
+    return any(row["fleet"] == name for row in store.tables.rows(SEQUENCES))
+
+
+def foretold(sweep: Sweep, store: Store, times: Mapping[str, int]) -> str:
+    """What the points of each scene take so many times over, in words."""
+    wanted = wishes(sweep.manifest, Path())
+    return _took(store, [(wish.asked, times[wish.scene_id]) for wish in wanted])
+
+
 def _cost(store: Store, rows: Sequence[Row]) -> str:
-    """What is to be made, and what that will take by what sequences of the store have taken."""
+    """What is to be made, and what that will take."""
+    waiting = [(row["asked"], 1) for row in rows if row["state"] == "waiting"]
+    return f"{len(waiting)} of {len(rows)} points are to be made, {_took(store, waiting)}"
+
+
+def _took(store: Store, asked: Sequence[tuple[str, int]]) -> str:
+    """What sequences will take, each so many times, by what those of the store have taken."""
     planner = Planner.of(store)
-    waiting = [Asked.model_validate_json(row["asked"]) for row in rows if row["state"] == "waiting"]
-    costs = [planner.predict(asked).cpu_seconds for asked in waiting]
-    known = [cost for cost in costs if cost is not None]
-    took = (
-        f"about {sum(known) / 60:.0f} CPU minutes" if known else "at a cost that nothing tells yet"
-    )
-    some = "" if len(known) in (0, len(costs)) else f" for {len(known)} of them"
-    return f"{len(waiting)} of {len(rows)} points are to be made, {took}{some}"
+    costs = [
+        (planner.predict(Asked.model_validate_json(one)).cpu_seconds, times) for one, times in asked
+    ]
+    known = [(cost, times) for cost, times in costs if cost is not None]
+    if not known:
+        return "at a cost that nothing tells yet"
+    minutes = sum(cost * times for cost, times in known) / 60
+    some = "" if len(known) == len(costs) else f" for {sum(times for _, times in known)} of them"
+    return f"about {minutes:.0f} CPU minutes{some}"

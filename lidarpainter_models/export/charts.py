@@ -169,12 +169,12 @@ class Line:
 
 
 def draw_lines(
-    panels: Mapping[str, Sequence[Line]], label: str, stem: Path, *, columns: int = 4
+    panels: Mapping[str, Sequence[Line]], label: str, stem: Path, *, columns: int
 ) -> list[Path]:
     """Draw small multiples, a panel for each title, as SVG and PNG; returns both files.
 
-    The first line of each panel is set off; all share the label of the y axis. `stem` has no
-    suffix.
+    The first line of each panel is set off; all share the label of the y axis, those of a column
+    the axis. `stem` has no suffix.
 
     Raises:
         WriteError: a file cannot be written.
@@ -186,7 +186,7 @@ def draw_lines(
     size = 0.7 * PANEL_INCHES[0] * columns, 0.7 * PANEL_INCHES[1] * rows
     with mpl.rc_context({"svg.hashsalt": SALT, "font.size": 7.5, "axes.edgecolor": FRONT}):
         figure = Figure(figsize=size, layout="constrained")
-        axes = list(figure.subplots(rows, columns, squeeze=False, sharey=True).flat)
+        axes = list(figure.subplots(rows, columns, squeeze=False, sharey="col").flat)
         for panel, (title, lines) in zip(axes, panels.items(), strict=False):
             panel.set_title(title, loc="left", color=INK, fontsize=8)
             panel.spines[["top", "right"]].set_visible(False)

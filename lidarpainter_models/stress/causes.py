@@ -24,6 +24,14 @@ class Cause:
     """A frame at a level."""
     is_of_actors: bool = False
     """Then it spoils all frames: what an actor is, its boxes say together."""
+    most_of: Callable[[int], int] | None = None
+    """The gravest level that there is with so many cameras; None knows no end."""
+
+    def levels_of(self, num_cameras: int) -> tuple[float, ...]:
+        """The levels that a recording has; graver ones would spoil nothing more."""
+        if self.most_of is None:
+            return self.levels
+        return tuple(level for level in self.levels if level <= self.most_of(num_cameras))
 
 
 def _lost_pictures(frame: Frame, level: float, _dice: np.random.Generator) -> Frame:
@@ -51,8 +59,16 @@ CAUSES = {
         Cause("motion-blur", "1/1000", (2, 5, 10, 20), images.motion_blur),
         Cause("darkness", "share", (0.5, 0.8, 0.9, 0.97), images.darkness),
         Cause("dirt", "share", (0.01, 0.03, 0.06, 0.12), images.dirt),
-        Cause("swapped", "pairs", (1, 2, 3, 4), images.swapped_cameras),
-        Cause("missing-cameras", "cameras", (1, 2, 3, 4), images.missing_cameras),
+        Cause(
+            "swapped", "pairs", (1, 2, 3, 4), images.swapped_cameras, most_of=lambda num: num // 2
+        ),
+        Cause(
+            "missing-cameras",
+            "cameras",
+            (1, 2, 3, 4),
+            images.missing_cameras,
+            most_of=lambda num: num - 1,
+        ),
         Cause("frame-rate", "one of", (2, 3, 4, 6), _lost_pictures),
     )
 }

@@ -17,25 +17,28 @@ def ingest_spoilt(store_path: Path, scene_id: str, cause: str, level: float) -> 
     """Write a stored scene anew with a fault, unless that is there; returns its scene id."""
     store = open_store(store_path)
     scene = open_scene(store, scene_id)
-    spoilt_id = f"{DATASET}/{spoilt_name(scene, cause, level)}"
-    if not _is_of(store, spoilt_id, scene):
-        with writing(store, spoilt_id):
+    name = spoilt_id(scene, cause, level)
+    if not _is_of(store, name, scene):
+        with writing(store, name):
             path = write_spoilt(
                 scene,
                 cause,
                 level,
                 store.root,
-                progress=lambda done, total: listener().advanced(STAGE, done, total, spoilt_id),
+                progress=lambda done, total: listener().advanced(STAGE, done, total, name),
             )
         record_scene(store, path)
-    return spoilt_id
+    return name
 
 
-def _is_of(store: Store, spoilt_id: str, scene: DrivingScene) -> bool:
+def spoilt_id(scene: DrivingScene, cause: str, level: float) -> str:
+    """Scene id of what a fault makes of a scene."""
+    return f"{DATASET}/{spoilt_name(scene, cause, level)}"
+
+
+def _is_of(store: Store, scene_id: str, scene: DrivingScene) -> bool:
     """Whether the store holds a spoilt scene of this one as it is now."""
     try:
-        return bool(
-            open_scene(store, spoilt_id).manifest["stress"]["scene"] == scene.content_digest
-        )
+        return bool(open_scene(store, scene_id).manifest["stress"]["scene"] == scene.content_digest)
     except (SceneError, KeyError):
         return False

@@ -146,3 +146,10 @@ def test_pictures_grow_dark_and_blurred(clean, spoilt):
     blurred = pixels(spoilt("motion-blur", 20))
     across = [np.abs(np.diff(image, axis=1)).max() for image in (before, blurred)]
     assert across[1] < 0.7 * across[0]
+
+
+def test_a_level_that_so_few_cameras_do_not_have_is_left_out():
+    assert CAUSES["swapped"].levels_of(6) == (1, 2, 3)
+    assert CAUSES["missing-cameras"].levels_of(3) == (1, 2)
+    assert CAUSES["missing-cameras"].levels_of(1) == ()
+    assert CAUSES["beams"].levels_of(1) == CAUSES["beams"].levels
