@@ -1,5 +1,6 @@
 """Stability where methods fail: one cause at a time, with and without painting."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,60 +77,106 @@ def stress_of(points: Sequence[Point], trials: Sequence[Trial], out: Path) -> di
         What `stress --json` prints: `points`, `pictures`, and what they say.
     """
     figures = {(group.scene, group.configuration): group.figures for group in groups_of(points)}
+    causes = dict.fromkeys(trial.cause for trial in trials)
     pictures, says = [], []
     for quality in QUALITIES:
-        scenes = [
-            scene
-            for scene in dict.fromkeys(trial.scene for trial in trials)
-            if quality in figures.get((scene, PAINTED), {})
-        ]
-        panels = {
-            f"{cause}, {scene}": lines
-            for cause in dict.fromkeys(trial.cause for trial in trials)
-            for scene in scenes
-            if (lines := _lines(trials, cause, scene, figures, quality))
-        }
-        if panels:
-            stem = out / f"stress-{quality}"
-            pictures += draw_lines(panels, LABELS[quality], stem, columns=_columns(len(scenes)))
-            says += _told(panels, quality)
+        curves = [one for cause in causes for one in _curves(trials, cause, figures, quality)]
+        if not curves:
+            continue
+        for what, label, lines_of in (
+            (quality, LABELS[quality], _as_it_falls),
+            (f"gain-{quality}", f"{LABELS[quality]}: what painting gains", _as_it_gains),
+        ):
+            panels = {
+                f"{cause}, {CAUSES[cause].unit}": [
+                    line for curve in curves if curve.cause == cause for line in lines_of(curve)
+                ]
+                for cause in causes
+            }
+            pictures += draw_lines(panels, label, out / f"stress-{what}")
+        says += _told(curves, quality)
     return {"points": rows_of(points), "pictures": list(map(str, pictures)), "says": says}
 
 
-def _columns(num_scenes: int) -> int:
-    """So many that those of a scene stand below each other, about four."""
-    return num_scenes * max(4 // num_scenes, 1)
+@dataclass(frozen=True, kw_only=True)
+class _Curve:
+    """A figure of a scene over the levels of a cause, from the scene as recorded on."""
+
+    cause: str
+    scene: str
+    number: int
+    """Of the scene."""
+    levels: list[str]
+    painted: list[Spread]
+    unpainted: list[Spread]
+
+    @property
+    def gains(self) -> list[float]:
+        return [a.mean - b.mean for a, b in zip(self.painted, self.unpainted, strict=True)]
 
 
-def _lines(
+def _curves(
     trials: Sequence[Trial],
     cause: str,
-    scene: str,
     figures: Mapping[tuple[str, str], Mapping[str, Spread]],
     quality: str,
-) -> list[Line]:
-    """A line for each way, from the scene as recorded on; none where the cause has no level."""
-    spoilt = [t for t in trials if (t.cause, t.scene) == (cause, scene)]
-    steps = [("none", scene), *((f"{t.level:g}", t.spoilt) for t in spoilt)]
-    lines = []
-    for way in (PAINTED, UNPAINTED):
+) -> list[_Curve]:
+    """Of all scenes that have the cause and the figure."""
+    curves = []
+    for number, scene in enumerate(dict.fromkeys(trial.scene for trial in trials)):
+        spoilt = [t for t in trials if (t.cause, t.scene) == (cause, scene)]
+        steps = [("none", scene), *((f"{t.level:g}", t.spoilt) for t in spoilt)]
         known = [
-            (level, figures[name, way][quality])
+            (level, painted[quality], unpainted[quality])
             for level, name in steps
-            if quality in figures.get((name, way), {})
+            if quality in (painted := figures.get((name, PAINTED), {}))
+            and quality in (unpainted := figures.get((name, UNPAINTED), {}))
         ]
-        levels, values = [level for level, _ in known], [value for _, value in known]
-        lines.append(Line(name=way, levels=levels, values=values))
-    return lines if spoilt else []
+        if spoilt and known:
+            levels, painted_values, unpainted_values = map(list, zip(*known, strict=True))
+            curves.append(
+                _Curve(
+                    cause=cause,
+                    scene=scene,
+                    number=number,
+                    levels=levels,
+                    painted=painted_values,
+                    unpainted=unpainted_values,
+                )
+            )
+    return curves
 
 
-def _told(panels: Mapping[str, Sequence[Line]], quality: str) -> list[str]:
+def _as_it_falls(curve: _Curve) -> list[Line]:
+    ways = ((PAINTED, curve.painted), (UNPAINTED, curve.unpainted))
+    return [
+        Line(
+            name=f"{curve.scene}, {name}",
+            levels=curve.levels,
+            values=values,
+            colour=curve.number,
+            is_dashed=name == UNPAINTED,
+        )
+        for name, values in ways
+    ]
+
+
+def _as_it_gains(curve: _Curve) -> list[Line]:
+    """Bars as wide as if both ways were tried with seeds of their own."""
+    bars = [
+        math.hypot(a.half_width, b.half_width)
+        for a, b in zip(curve.painted, curve.unpainted, strict=True)
+    ]
+    values = [Spread(gain, bar) for gain, bar in zip(curve.gains, bars, strict=True)]
+    return [Line(name=curve.scene, levels=curve.levels, values=values, colour=curve.number)]
+
+
+def _told(curves: Sequence[_Curve], quality: str) -> list[str]:
     """By cause: where the lead of painting is halved, where it hurts; the worst case last."""
     says, worst = [], (0.0, "")
-    for title, (painted, unpainted) in panels.items():
-        gains = [a.mean - b.mean for a, b in zip(painted.values, unpainted.values, strict=True)]
-        levels = painted.levels
-        unit = CAUSES[title.split(",")[0]].unit
+    for curve in curves:
+        gains, levels = curve.gains, curve.levels
+        title, unit = f"{curve.cause}, {curve.scene}", CAUSES[curve.cause].unit
         halved = next((lv for lv, g in zip(levels, gains, strict=True) if g < gains[0] / 2), None)
         hurts = next((lv for lv, g in zip(levels, gains, strict=True) if g < -HARM_DB), None)
         says.append(

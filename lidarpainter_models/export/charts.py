@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK, SOFT, NAMED, FRONT = "#1f2430", "#7b8494", "#c2410c", "#94a3b8"
+COLOURS = (NAMED, "#1d4ed8", "#15803d", "#7e22ce", INK)
+COLUMNS = 4
+"""Of small multiples."""
 NAME_PT = 7.5
 NAME_OFFSETS = ((0, 6, "center"), (0, -13, "center"), (7, -3, "left"), (-7, -3, "right"))
 """Where a name may stand beside its point: points across and up, and the side that is held."""
@@ -166,15 +169,15 @@ class Line:
     name: str
     levels: Sequence[str]
     values: Sequence[Spread]
+    colour: int = 0
+    """Lines of one colour belong together."""
+    is_dashed: bool = False
 
 
-def draw_lines(
-    panels: Mapping[str, Sequence[Line]], label: str, stem: Path, *, columns: int
-) -> list[Path]:
+def draw_lines(panels: Mapping[str, Sequence[Line]], label: str, stem: Path) -> list[Path]:
     """Draw small multiples, a panel for each title, as SVG and PNG; returns both files.
 
-    The first line of each panel is set off; all share the label of the y axis, those of a column
-    the axis. `stem` has no suffix.
+    All panels share the label of the y axis. `stem` has no suffix.
 
     Raises:
         WriteError: a file cannot be written.
@@ -182,27 +185,35 @@ def draw_lines(
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    rows = math.ceil(len(panels) / columns)
-    size = 0.7 * PANEL_INCHES[0] * columns, 0.7 * PANEL_INCHES[1] * rows
+    means = [value.mean for lines in panels.values() for line in lines for value in line.values]
+    has_zero = min(means, default=0.0) < 0 < max(means, default=0.0)
+    rows = math.ceil(len(panels) / COLUMNS)
+    size = 0.7 * PANEL_INCHES[0] * COLUMNS, 0.7 * PANEL_INCHES[1] * rows
     with mpl.rc_context({"svg.hashsalt": SALT, "font.size": 7.5, "axes.edgecolor": FRONT}):
         figure = Figure(figsize=size, layout="constrained")
-        axes = list(figure.subplots(rows, columns, squeeze=False, sharey="col").flat)
+        axes = list(figure.subplots(rows, COLUMNS, squeeze=False, sharey=True).flat)
         for panel, (title, lines) in zip(axes, panels.items(), strict=False):
             panel.set_title(title, loc="left", color=INK, fontsize=8)
             panel.spines[["top", "right"]].set_visible(False)
             panel.tick_params(colors=SOFT)
             panel.grid(alpha=0.25)
-            for number, line in enumerate(lines):
-                colour = INK if number else NAMED
-                means = [value.mean for value in line.values]
-                bars = [_bar(value) for value in line.values]
+            if has_zero:
+                panel.axhline(0.0, color=FRONT)
+            for line in lines:
                 panel.errorbar(
-                    line.levels, means, bars, fmt="o-", ms=3, color=colour, label=line.name
+                    line.levels,
+                    [value.mean for value in line.values],
+                    [_bar(value) for value in line.values],
+                    fmt="o--" if line.is_dashed else "o-",
+                    ms=3,
+                    color=COLOURS[line.colour % len(COLOURS)],
+                    label=line.name,
                 )
         for panel in axes[len(panels) :]:
             panel.axis("off")
         figure.suptitle(label, x=0.01, ha="left", color=INK)
-        figure.legend(*axes[0].get_legend_handles_labels(), loc="upper right", ncols=len(lines))
+        names = dict(zip(*reversed(axes[0].get_legend_handles_labels()), strict=True))
+        figure.legend(names.values(), names, loc="outside upper right", ncols=len(names))
         return _saved(figure, stem)
 
 
