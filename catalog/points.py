@@ -13,7 +13,7 @@ from catalog.records import json_of
 from catalog.store import Store
 from catalog.tables import Row
 
-JUDGING = ("evaluate", "report")
+JUDGING = ("evaluate", "envelope", "examine", "report")
 """Stages that look at a scene and make nothing of it."""
 FINAL = ("painted", "refined")
 """Variants of numbers that are of the scene at the end of its run."""
@@ -37,6 +37,8 @@ class Point:
     """Of the scene at the end."""
     by_variant: dict[str, dict[MetricName, float]] = field(default_factory=dict)
     """Of every variant that was judged, by its name in the catalog."""
+    suspicions: tuple[str, ...] | None = None
+    """What is wrong about the recording, in sentences; None where nobody looked."""
 
 
 def points_of(store: Store, fleet: str) -> tuple[list[Point], list[Row]]:
@@ -58,19 +60,21 @@ def points_of(store: Store, fleet: str) -> tuple[list[Point], list[Row]]:
             name = row["protocol"], row["trajectory"], row["name"]
             judged[row["run_id"]].setdefault(row["variant"], {})[name] = row["value"]
     ended = [row for row in sequences if row["run_id"] in runs and row["state"] == "done"]
+    results = {run_id: json_of(run, "result") for run_id, run in runs.items()}
     points = [
         Point(
             scene=row["scene_id"],
             configuration=row["configuration"] or fleet,
             seed=row["fit_seed"] or 0,
             run_id=row["run_id"],
-            cost=_cost(runs[row["run_id"]], sizes[scenes[row["run_id"]]]),
+            cost=_cost(results[row["run_id"]], sizes[scenes[row["run_id"]]]),
             metrics={
                 name: value
                 for variant in FINAL
                 for name, value in judged[row["run_id"]].get(variant, {}).items()
             },
             by_variant=judged[row["run_id"]],
+            suspicions=_suspicions(results[row["run_id"]]),
         )
         for row in ended
     ]
@@ -90,8 +94,12 @@ def _last_scene(run: Row) -> str:
     return str(fitted[-1])
 
 
-def _cost(run: Row, scene_bytes: int) -> dict[str, float]:
-    result: dict[str, Any] = json_of(run, "result")
+def _suspicions(result: Mapping[str, Any]) -> tuple[str, ...] | None:
+    said = result.get("suspicions")
+    return None if said is None else tuple(said)
+
+
+def _cost(result: Mapping[str, Any], scene_bytes: int) -> dict[str, float]:
     return {
         "seconds": _made(result["seconds"]),
         "cpu_seconds": _made(result["cpu_seconds"]),

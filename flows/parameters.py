@@ -85,6 +85,8 @@ class ReconstructParameters(ViewParameters):
     """The fit of one round."""
     judge: bool = True
     """Judge the scene; one that is not judged has no scores, and `evaluate` can judge it later."""
+    examine: bool = False
+    """Look for what is wrong about the recording, even if no page is to say it."""
     report: bool = True
     """Write the page about the run."""
     judge_view_time: bool = False
@@ -101,8 +103,14 @@ class ReconstructParameters(ViewParameters):
         judged = ["evaluate-unpainted", "evaluate"]
         judged += ["evaluate-view-time"] if self.judge_view_time and paints else []
         judged += ["envelope"]
-        first, last = (["examine"], ["report"]) if self.report else ([], [])
+        first = ["examine"] if self.examines else []
+        last = ["report"] if self.report else []
         return stages | dict.fromkeys([*first, *(judged if self.judge else ()), *last])
+
+    @property
+    def examines(self) -> bool:
+        """Whether a run looks for what is wrong about its recording."""
+        return self.examine or self.report
 
 
 def view_parameters(run: FinishedRun) -> ViewParameters:

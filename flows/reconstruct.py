@@ -126,7 +126,7 @@ def _run(course: Course) -> dict[str, Any]:
     fitted = FittedRef(seen.ref, first.ref)
     final = _rounds(course, fitted)
     store = open_store(run.store_path)
-    if parameters.report:
+    if parameters.examines:
         course.add(EXAMINE, examine(run))
     scores = _judged(course, store, fitted, final) if parameters.judge else {}
     result = _result(course, scores, final)

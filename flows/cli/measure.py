@@ -1,6 +1,7 @@
 """`lidarpainter chart`, `size`, `stress`, `figures`: measured, drawn and put into pages."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -117,12 +118,13 @@ def stress(  # noqa: PLR0913 - the options of a command
     Example: lidarpainter stress synthetic/street-0001 --only beams,clock --out stress
     """
     from catalog.store import existing_store
-    from flows.measure.stress import WAYS, spoil_scenes, stress_of, trials_of
+    from flows.measure.stress import PUBLISHED, WAYS, spoil_scenes, stress_of, trials_of
     from flows.measure.sweep import foretold, was_asked
     from lidarpainter_models.stress.causes import CAUSES
 
     def sweep(names: Sequence[str]) -> "Sweep":
-        return _sweep("stress", names, WAYS, preset, train_cameras, seeds, settings)
+        asked = _sweep("stress", names, WAYS, preset, train_cameras, seeds, settings)
+        return replace(asked, publish=PUBLISHED)
 
     store, causes = existing_store(), _known(only, list(CAUSES))
     trials = trials_of(store, scenes, causes, levels)

@@ -64,6 +64,7 @@ class Asked(BaseModel):
     """Name of the way that it is made in, where there are several."""
     fit_seed: int = 0
     scores: bool = True
+    examination: bool = False
     report: bool = True
     assets: bool = False
     variants: tuple[str, ...] = ()
@@ -81,7 +82,11 @@ class Asked(BaseModel):
         Raises:
             ConfigError: there is no such preset or setting.
         """
-        changes: dict[str, Any] = {"judge": self.scores, "report": self.report}
+        changes: dict[str, Any] = {
+            "judge": self.scores,
+            "examine": self.examination,
+            "report": self.report,
+        }
         changes |= {"train_cameras": self.cameras} if self.cameras else {}
         changes |= {"painter": self.painter} if self.painter else {}
         chosen = with_changes(preset_named(self.preset, self.scene_id), changes)
@@ -191,6 +196,7 @@ def _of_source(manifest: Manifest, source: Source, folder: Path, table: str) -> 
         "painter": manifest.painter,
         "settings": manifest.settings,
         "scores": "scores" in manifest.publish,
+        "examination": "examination" in manifest.publish,
         "report": "report" in manifest.publish,
         "assets": "assets" in manifest.publish,
         "variants": manifest.variants,

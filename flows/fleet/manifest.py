@@ -44,6 +44,7 @@ _KEYS: dict[str, tuple[str, set[str]]] = {
     STORED: ("scenes", set()),
 }
 """What a source that is no dataset needs, and what else it may have of these."""
+Publication = Literal["scores", "examination", "report", "assets"]
 _MODEL = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
@@ -172,7 +173,7 @@ class Manifest(BaseModel):
     """Each way is tried with each of these, which decide in which order a fit sees its views."""
     variants: tuple[Name, ...] = ()
     """Names of styles; of every scene a run in each of them is made too."""
-    publish: tuple[Literal["scores", "report", "assets"], ...] = ("scores", "report")
+    publish: tuple[Publication, ...] = ("scores", "report")
     """What is made of every fitted scene; assets of its variants too."""
     budget: Budget = Budget()
 

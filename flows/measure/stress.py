@@ -1,6 +1,7 @@
 """Stability where methods fail: one cause at a time, with and without painting."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any
 
 from catalog.points import Point
 from catalog.store import Store
-from flows.fleet.manifest import Configuration
+from flows.fleet.manifest import Configuration, Publication
 from flows.measure.chart import rows_of
 from flows.measure.figures import LABELS, groups_of
 from lidarpainter_models.evaluation.fronts import Spread
@@ -23,7 +24,9 @@ WAYS = (
     Configuration(name=UNPAINTED, painter="none"),
 )
 """The unpainted scene is fitted as long."""
+PUBLISHED: tuple[Publication, ...] = ("scores", "examination")
 QUALITIES = ("aside_psnr", "recorded_psnr")
+_NUMBER = re.compile(r"[-+]?\d+(\.\d+)?")
 HARM_DB = 0.1
 """Painting that costs more hurts."""
 
@@ -95,7 +98,43 @@ def stress_of(points: Sequence[Point], trials: Sequence[Trial], out: Path) -> di
             }
             pictures += draw_lines(panels, label, out / f"stress-{what}")
         says += _told(curves, quality)
-    return {"points": rows_of(points), "pictures": list(map(str, pictures)), "says": says}
+    return {
+        "points": rows_of(points),
+        "pictures": list(map(str, pictures)),
+        "says": _noticed(points, trials) + says,
+    }
+
+
+def _noticed(points: Sequence[Point], trials: Sequence[Trial]) -> list[str]:
+    """By cause: from which level on the system says of a recording what it does not as recorded."""
+    said = {point.scene: point.suspicions for point in points if point.suspicions is not None}
+    lines = []
+    for cause, scene in dict.fromkeys((t.cause, t.scene) for t in trials if t.spoilt in said):
+        levels = [t for t in trials if (t.cause, t.scene) == (cause, scene) and t.spoilt in said]
+        news = {t.level: new_suspicions(said[t.spoilt], said.get(scene, ())) for t in levels}
+        first = next((level for level, new in news.items() if new), None)
+        told = (
+            "not noticed"
+            if first is None
+            else f"noticed from {first:g} {CAUSES[cause].unit} on: {news[first][0]}"
+        )
+        lines.append(f"{cause}, {scene}: {told}")
+    return lines
+
+
+def new_suspicions(said: Sequence[str], as_recorded: Sequence[str]) -> list[str]:
+    """The statements of suspicions that are not there as recorded, whatever their numbers."""
+    known = {_NUMBER.sub("#", part) for part in _statements(as_recorded)}
+    return [part for part in _statements(said) if _NUMBER.sub("#", part) not in known]
+
+
+def _statements(suspicions: Sequence[str]) -> list[str]:
+    """Each with the name of what found it."""
+    found = []
+    for one in suspicions:
+        name, _, detail = one.rstrip(".").partition(": ")
+        found += [f"{name}: {part}" for part in detail.split("; ")]
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from catalog.store import Store
 from catalog.tables import Row
 from flows.fleet.asked import Asked, wishes
 from flows.fleet.local_workers import run_workers, starter
-from flows.fleet.manifest import STORED, Configuration, Manifest, Source
+from flows.fleet.manifest import STORED, Configuration, Manifest, Publication, Source
 from flows.fleet.planner import Planner
 from flows.fleet.status import counts_of
 
@@ -37,6 +37,7 @@ class Sweep:
     """Of all configurations."""
     configurations: tuple[Configuration, ...]
     seeds: tuple[int, ...]
+    publish: tuple[Publication, ...] = ("scores",)
 
     @property
     def manifest(self) -> Manifest:
@@ -48,7 +49,7 @@ class Sweep:
             source=(Source(dataset=STORED, scenes=self.scenes, cameras=self.cameras),),
             configuration=self.configurations,
             fit_seeds=self.seeds,
-            publish=("scores",),
+            publish=self.publish,
         )
 
 

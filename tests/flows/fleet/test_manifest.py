@@ -31,7 +31,7 @@ FAULTS = {
     "[budget]: unknown key 'hous', expected one of hours": f"{GOOD}[budget]\nhous = 3\n",
     "[budget]: hours: input should be greater than 0, got -1": f"{GOOD}[budget]\nhours = -1\n",
     "budget: input should be a table, got 3": f"budget = 3\n{GOOD}",
-    "publish.0: input should be 'scores', 'report' or 'assets', got 'all'": (
+    "publish.0: input should be 'scores', 'examination', 'report' or 'assets', got 'all'": (
         f'publish = ["all"]\n{GOOD}'
     ),
     "[[source]] 1: scenes.0: '002': expected dataset/sequence": (

@@ -1,6 +1,7 @@
 """What a chart draws and says of points that are known."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -143,3 +144,27 @@ def test_stress_says_where_painting_hurts(tmp_path):
         "painting costs most -0.40 (beams, " + scene + " at 8 beams)"
     )
     assert all(Path(path).stat().st_size > 5_000 for path in result["pictures"])
+
+
+def test_stress_says_from_which_level_on_a_cause_is_noticed(tmp_path):
+    from flows.measure.stress import Trial, stress_of
+
+    scene = SCENES[0]
+    said = {
+        "none": ("camera faults: left looks 0.3 degrees up.",),
+        "10": ("camera faults: left looks 0.4 degrees up.",),
+        "50": ("camera faults: left looks 0.3 degrees up; front is 48 ms late.",),
+    }
+    trials = [
+        Trial(scene=scene, cause="clock", level=float(level), spoilt=f"stress/clock-{level}")
+        for level in ("10", "50")
+    ]
+    names = [scene, *(trial.spoilt for trial in trials)]
+    points = [
+        replace(point(name, way, 0, 25.0, 100), suspicions=suspicions)
+        for name, suspicions in zip(names, said.values(), strict=True)
+        for way in ("painted", "unpainted")
+    ]
+    told = f"clock, {scene}: noticed from 50 ms on: camera faults: front is 48 ms late"
+    assert told in stress_of(points, trials, tmp_path)["says"]
+    assert f"clock, {scene}: not noticed" in stress_of(points[:4], trials, tmp_path)["says"]
