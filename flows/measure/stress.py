@@ -86,9 +86,9 @@ def stress_of(points: Sequence[Point], trials: Sequence[Trial], out: Path) -> di
         curves = [one for cause in causes for one in _curves(trials, cause, figures, quality)]
         if not curves:
             continue
-        for what, label, lines_of in (
-            (quality, LABELS[quality], _as_it_falls),
-            (f"gain-{quality}", f"{LABELS[quality]}: what painting gains", _as_it_gains),
+        for what, label, lines_of, are_gains in (
+            (quality, LABELS[quality], _as_it_falls, False),
+            (f"gain-{quality}", f"{LABELS[quality]}: what painting gains", _as_it_gains, True),
         ):
             panels = {
                 f"{cause}, {CAUSES[cause].unit}": [
@@ -96,7 +96,7 @@ def stress_of(points: Sequence[Point], trials: Sequence[Trial], out: Path) -> di
                 ]
                 for cause in causes
             }
-            pictures += draw_lines(panels, label, out / f"stress-{what}")
+            pictures += draw_lines(panels, label, out / f"stress-{what}", are_gains=are_gains)
         says += _told(curves, quality)
     return {
         "points": rows_of(points),

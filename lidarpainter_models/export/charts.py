@@ -174,10 +174,13 @@ class Line:
     is_dashed: bool = False
 
 
-def draw_lines(panels: Mapping[str, Sequence[Line]], label: str, stem: Path) -> list[Path]:
+def draw_lines(
+    panels: Mapping[str, Sequence[Line]], label: str, stem: Path, *, are_gains: bool = False
+) -> list[Path]:
     """Draw small multiples, a panel for each title, as SVG and PNG; returns both files.
 
-    All panels share the label of the y axis. `stem` has no suffix.
+    All panels share the y axis and its label; where they show gains, with a line at none. `stem`
+    has no suffix.
 
     Raises:
         WriteError: a file cannot be written.
@@ -185,8 +188,6 @@ def draw_lines(panels: Mapping[str, Sequence[Line]], label: str, stem: Path) -> 
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    means = [value.mean for lines in panels.values() for line in lines for value in line.values]
-    has_zero = min(means, default=0.0) < 0 < max(means, default=0.0)
     rows = math.ceil(len(panels) / COLUMNS)
     size = 0.7 * PANEL_INCHES[0] * COLUMNS, 0.7 * PANEL_INCHES[1] * rows
     with mpl.rc_context({"svg.hashsalt": SALT, "font.size": 7.5, "axes.edgecolor": FRONT}):
@@ -197,7 +198,7 @@ def draw_lines(panels: Mapping[str, Sequence[Line]], label: str, stem: Path) -> 
             panel.spines[["top", "right"]].set_visible(False)
             panel.tick_params(colors=SOFT)
             panel.grid(alpha=0.25)
-            if has_zero:
+            if are_gains:
                 panel.axhline(0.0, color=FRONT)
             for line in lines:
                 panel.errorbar(
