@@ -77,11 +77,11 @@ def stress_of(points: Sequence[Point], trials: Sequence[Trial], out: Path) -> di
     The points are of all trials, and of the scenes as recorded.
 
     Returns:
-        What `stress --json` prints: `points`, `pictures`, and what they say.
+        What `stress --json` prints: `points`, `pictures`, the `curves` in them, and what they say.
     """
     figures = {(group.scene, group.configuration): group.figures for group in groups_of(points)}
     causes = dict.fromkeys(trial.cause for trial in trials)
-    pictures, says = [], []
+    pictures, drawn, says = [], [], []
     for quality in QUALITIES:
         curves = [one for cause in causes for one in _curves(trials, cause, figures, quality)]
         if not curves:
@@ -97,10 +97,12 @@ def stress_of(points: Sequence[Point], trials: Sequence[Trial], out: Path) -> di
                 for cause in causes
             }
             pictures += draw_lines(panels, label, out / f"stress-{what}", are_gains=are_gains)
+        drawn += [_row(curve, quality) for curve in curves]
         says += _told(curves, quality)
     return {
         "points": rows_of(points),
         "pictures": list(map(str, pictures)),
+        "curves": drawn,
         "says": _noticed(points, trials) + says,
     }
 
@@ -186,6 +188,17 @@ def _curves(
     return curves
 
 
+def _row(curve: _Curve, quality: str) -> dict[str, Any]:
+    return {
+        "cause": curve.cause,
+        "scene": curve.scene,
+        "quality": quality,
+        "levels": curve.levels,
+        PAINTED: [value.mean for value in curve.painted],
+        UNPAINTED: [value.mean for value in curve.unpainted],
+    }
+
+
 def _as_it_falls(curve: _Curve) -> list[Line]:
     ways = ((PAINTED, curve.painted), (UNPAINTED, curve.unpainted))
     return [
@@ -223,7 +236,11 @@ def _told(curves: Sequence[_Curve], quality: str) -> list[str]:
             f"{levels[-1]} {unit}; halved at {halved or 'none'}, hurts at {hurts or 'none'}"
         )
         worst = min(worst, (min(gains), f"{title} at {levels[gains.index(min(gains))]} {unit}"))
+    spoilt = [gain for curve in curves for gain in curve.gains[1:]]
+    harmed = sum(gain < -HARM_DB for gain in spoilt)
     return [
         *says,
+        f"{LABELS[quality]}: painting costs more than {HARM_DB} dB at {harmed} of {len(spoilt)} "
+        "levels",
         f"{LABELS[quality]}: painting costs most {worst[0]:+.2f} ({worst[1] or 'never'})",
     ]

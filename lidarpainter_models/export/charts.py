@@ -213,7 +213,8 @@ def draw_lines(
         for panel in axes[len(panels) :]:
             panel.axis("off")
         figure.suptitle(label, x=0.01, ha="left", color=INK)
-        names = dict(zip(*reversed(axes[0].get_legend_handles_labels()), strict=True))
+        shown = [axis.get_legend_handles_labels() for axis in axes]
+        names = {name: handle for pair in shown for handle, name in zip(*pair, strict=True)}
         figure.legend(names.values(), names, loc="outside upper right", ncols=len(names))
         return _saved(figure, stem)
 

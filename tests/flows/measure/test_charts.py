@@ -143,6 +143,11 @@ def test_stress_says_where_painting_hurts(tmp_path):
     assert result["says"][-1].endswith(
         "painting costs most -0.40 (beams, " + scene + " at 8 beams)"
     )
+    assert result["says"][-2].endswith("painting costs more than 0.1 dB at 1 of 3 levels")
+    curve = next(one for one in result["curves"] if one["quality"] == "recorded_psnr")
+    assert curve["levels"] == ["none", "32", "16", "8"]
+    assert curve["unpainted"] == pytest.approx([25, 25, 25, 25], abs=1)
+    assert curve["painted"][-1] - curve["unpainted"][-1] == pytest.approx(-0.4)
     assert all(Path(path).stat().st_size > 5_000 for path in result["pictures"])
 
 
