@@ -18,9 +18,6 @@ warped images on, they are no better than the render.
 The gate compares: where recorded pixels are known (warped images first, LiDAR colours
 elsewhere), a painting that departs from them by more than the plain render did is weighed down,
 locally and, if it does so on the whole, as a view; far beyond that it is refused.
-
-However well it is painted, a surface that recorded images show from about there is theirs to tell:
-`parallax_weight`.
 """
 
 import math
@@ -56,10 +53,6 @@ GATE_WINDOW_PX = 11  # side of the square over which painting and evidence are c
 GATE_SLACK = 0.01  # mean difference by which a painting may exceed the render unpunished
 GATE_SCALE = 0.03  # further difference at which the weight has fallen to 1/e
 REFUSE_EXCESS = 0.05  # a view that exceeds the render by this mean difference is refused
-FULL_PARALLAX_RAD = math.radians(15)
-"""Angle from which on a painting counts fully: 2 m aside that is a surface nearer than 7.5 m. Half
-of what painting costs held-out views is saved, for 0.05 dB of the lanes beside streets
-(docs/benchmarks.md)."""
 MIN_EVIDENCE = 0.02  # share of pixels with evidence under which no view is gated as a whole
 
 
@@ -129,23 +122,6 @@ def _in_any(
         is_in = (u >= 0) & (u < size[:, :1] * depth_m) & (v >= 0) & (v < size[:, 1:] * depth_m)
         found |= (is_in & (depth_m > NEAREST_M)).any(dim=0)
     return found
-
-
-def parallax_weight(
-    camera: Camera, depth_m: Float[Tensor, "height width"], recorded_cameras: Iterable[Camera]
-) -> Float[Tensor, "height width"]:
-    """How much a pixel tells that recorded images do not, in [0, 1].
-
-    That is the angle at its surface between this camera and the nearest recorded one, in units of
-    `FULL_PARALLAX_RAD`. Of pixels without depth (0) those below the horizon count fully, as nothing
-    was seen there, and those above it not at all: the sky looks the same from everywhere.
-    """
-    centres = torch.stack([recorded.centre_world for recorded in recorded_cameras])
-    nearest_m = (centres - camera.centre_world).norm(dim=-1).min().to(depth_m)
-    weight = (torch.atan2(nearest_m, depth_m) / FULL_PARALLAX_RAD).clamp(max=1)
-    up = camera.world_from_camera[2, :3].to(depth_m)
-    is_below = (camera.pixel_directions(depth_m.device) @ up < 0).to(weight)
-    return torch.where(depth_m > 0, weight, is_below)
 
 
 def geometric_confidence(

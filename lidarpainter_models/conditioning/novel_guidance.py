@@ -1,10 +1,9 @@
 """Painted images of views that nobody recorded, to guide the fit on.
 
 The recorded cameras are moved sideways and up relative to the road, what the scene shows there is
-painted, and every pixel gets a confidence: the painter's, times that of geometry, times the gate of
-`confidence`. It guides by that, the less the better recorded cameras show it already. Views from
-inside a car or a wall are left out; refused paintings stay in the result, for the report, but give
-no guidance. World: x forward, y left, z up; metres.
+painted, and every pixel gets a weight: painter confidence times geometric confidence times the
+gate of `confidence`. Views from inside a car or a wall are left out; refused paintings stay in the
+result, for the report, but give no guidance. World: x forward, y left, z up; metres.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,7 +20,6 @@ from lidarpainter_models.conditioning.confidence import (
     geometric_confidence,
     guidance_gate,
     is_seen,
-    parallax_weight,
 )
 from lidarpainter_models.conditioning.sequences import SequencePainter
 from lidarpainter_models.conditioning.settings import NovelGuidanceConfig
@@ -197,23 +195,22 @@ def _paint(
     )
     seen = is_seen(novel.camera, depth_m, builder.recorded_cameras)
     geometric = geometric_confidence(conditions, novel.camera, seen)
-    confidence = (painting.confidence * geometric * gate.weight).clamp(0, 1)
-    parallax = parallax_weight(novel.camera, depth_m, builder.recorded_cameras)
+    weight = (painting.confidence * geometric * gate.weight).clamp(0, 1)
     guidance = GuidanceView.of(
         novel.camera,
         novel.timestamp_ns,
         rgb=painting.rgb,
-        weight=confidence * parallax,
+        weight=weight,
         lidar_depth_m=conditions.lidar_depth_m,
     )
     home = torch.device("cpu")  # where paintings of a whole log have room
-    images = _images(conditions, painting, confidence) if is_shown else {}
+    images = _images(conditions, painting, weight) if is_shown else {}
     images = {name: rgb.to(home) for name, rgb in images.items()}
     return NovelPainting(novel=novel, guidance=guidance.to(home), gate=gate, images=images)
 
 
 def _images(
-    conditions: PaintingConditions, painting: Painting, confidence: Float[Tensor, "height width"]
+    conditions: PaintingConditions, painting: Painting, weight: Float[Tensor, "height width"]
 ) -> dict[str, UInt8[Tensor, "height width 3"]]:
     """What a report shows of one view."""
     floats = {
@@ -221,6 +218,6 @@ def _images(
         "lidar": conditions.lidar_rgb,
         "warp": conditions.warp_rgb[0],
         "painted": painting.rgb,
-        "confidence": confidence[..., None].expand(-1, -1, 3),
+        "confidence": weight[..., None].expand(-1, -1, 3),
     }
     return {name: (rgb.clamp(0, 1) * 255).round().to(torch.uint8) for name, rgb in floats.items()}

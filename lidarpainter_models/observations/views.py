@@ -81,7 +81,7 @@ class GuidanceView:
 
     @property
     def weight(self) -> Float[Tensor, "height width"]:
-        """How much each pixel counts, 0 to 1."""
+        """Confidence per pixel, 0 to 1."""
         return self.weight_u8.float() / 255
 
     @property

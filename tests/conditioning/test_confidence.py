@@ -1,5 +1,4 @@
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -9,7 +8,6 @@ from lidarpainter_models.conditioning.confidence import (
     geometric_confidence,
     guidance_gate,
     is_seen,
-    parallax_weight,
 )
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.painter.protocol import Painting, PaintingConditions
@@ -135,20 +133,3 @@ def test_without_evidence_nothing_is_gated():
     gate = guidance_gate(painting(torch.zeros(HEIGHT, WIDTH, 3)), conditions(warp_valid=nothing))
     assert (gate.weight == 1).all()
     assert math.isnan(gate.painted_difference)
-
-
-def test_a_painted_pixel_counts_by_the_angle_from_which_recorded_images_miss_it():
-    depth_m = torch.tensor([1.0, 7.4, 20.0, 200.0]).expand(HEIGHT, 4)
-    recorded = [camera(-8.0), camera(1.0)]  # the nearest one is 2 m aside
-    weight = parallax_weight(replace(camera(3.0), width_px=4), depth_m, recorded)
-    expected = [1, 1, math.degrees(math.atan(0.1)) / 15, math.degrees(math.atan(0.01)) / 15]
-    assert torch.allclose(weight, torch.tensor(expected).expand(HEIGHT, 4))
-
-
-def test_where_nothing_was_seen_a_painting_counts_on_the_ground_and_not_in_the_sky():
-    looking_ahead = torch.tensor([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], dtype=torch.float64)
-    painted = camera(3.0)
-    painted.world_from_camera[:3, :3] = looking_ahead
-    weight = parallax_weight(painted, torch.zeros(HEIGHT, WIDTH), [camera()])
-    assert (weight[: HEIGHT // 2] == 0).all()
-    assert (weight[HEIGHT // 2 :] == 1).all()
