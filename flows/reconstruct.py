@@ -162,46 +162,55 @@ def _report(course: Course, result: dict[str, Any], unpainted: FittedRef, final:
 
 def _rounds(course: Course, fitted: FittedRef) -> FittedRef:
     """Paint and go on fitting; without a painter the fit goes on alone, just as long."""
-    parameters = course.parameters
-    go_on = _unpainted if parameters.painter == NO_PAINTER else _painted
-    for number in range(1, parameters.rounds + 1):
-        refined = course.add(f"refine-{number}", go_on(course, fitted, number))
+    go_on = _unpainted if course.parameters.painter == NO_PAINTER else _painted
+    for number in range(1, course.parameters.rounds + 1):
+        refined = go_on(course, fitted, f"refine-{number}", number)
         fitted = FittedRef(fitted.observations, refined.ref)
     return fitted
 
 
-def _unpainted(course: Course, fitted: FittedRef, number: int) -> StageResult:
+def _unpainted(course: Course, fitted: FittedRef, stage: str, _number: int) -> StageResult:
     """The control of a painted round."""
     parameters = course.parameters
-    return fit(
+    found = fit(
         course.run,
-        f"refine-{number}",
+        stage,
         fitted.observations,
         parameters.refine,
         start=fitted.gaussians,
         lpips=parameters.lpips,
     )
+    return course.add(stage, found)
 
 
-def _painted(course: Course, fitted: FittedRef, number: int) -> StageResult:
-    """Paint views of a fitted scene, and go on fitting with them."""
-    parameters, stage = course.parameters, f"paint-{number}"
+def _painted(course: Course, fitted: FittedRef, stage: str, number: int) -> StageResult:
+    """Paint views of a fitted scene, and go on fitting with them.
+
+    A round that made views worse is taken back and made again as its control is, so that painting
+    costs time there and nothing else.
+    """
+    parameters = course.parameters
     painted = paint(
         course.run,
-        stage,
+        f"paint-{number}",
         fitted,
         parameters.novel.in_round(number),
         parameters.conditions,
         start_frame=number - 1,
     )
-    return refine(
+    found = refine(
         course.run,
-        f"refine-{number}",
+        stage,
         fitted,
         parameters.refine,
-        guidance=course.add(stage, painted).ref,
+        guidance=course.add(f"paint-{number}", painted).ref,
         lpips=parameters.lpips,
     )
+    refined = course.add(stage, found)
+    gain = refined.summary["gain"]
+    if gain is not None and gain["is_taken_back"]:
+        return _unpainted(course, fitted, f"{stage}-unpainted", number)
+    return refined
 
 
 def _judged(

@@ -151,7 +151,7 @@ def show(result: dict[str, Any]) -> None:
         "Gaussians": result["num_gaussians"],
         **({"stopped early": "at its time limit"} if result.get("stopped_early") else {}),
         **{
-            name: "taken back: worse beside the path than before it"
+            name: "taken back: worse beside the path than before it, made again without paintings"
             for name, gain in (result.get("gains") or {}).items()
             if gain["is_taken_back"]
         },

@@ -59,8 +59,9 @@ def _early(result: Mapping[str, Any]) -> str:
 def _taken_back(gains: Mapping[str, Mapping[str, Any]]) -> str:
     """Which painted rounds were taken back, and why."""
     return " ".join(
-        f"Round {stage.rpartition('-')[2]} was taken back: by what vouches for views beside the "
-        f"path it made them worse ({gain['before_db']:.1f} to {gain['after_db']:.1f} dB)."
+        f"Round {stage.rpartition('-')[2]} was taken back and made again without paintings: by "
+        f"what vouches for views beside the path it made them worse ({gain['before_db']:.1f} to "
+        f"{gain['after_db']:.1f} dB)."
         for stage, gain in gains.items()
         if gain["is_taken_back"]
     )

@@ -1,7 +1,7 @@
-"""Go on fitting a scene with painted views, and take that back where it made things worse."""
+"""Go on fitting a scene with painted views, and tell whether that made things worse."""
 
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -35,7 +35,10 @@ def refine(
     guidance: ArtefactRef,
     lpips: LpipsFiles | None = None,
 ) -> StageResult:
-    """Go on fitting a scene with views that were painted of it."""
+    """Go on fitting a scene with views that were painted of it.
+
+    The summary's `gain` says whether the round is to be taken back; it is kept here all the same.
+    """
     this = opened(run)
     weighed = lpips if config.weighs_perceptual else None
     inputs = {
@@ -88,8 +91,6 @@ def _build(  # noqa: PLR0913 - all that a fit is made from
     told = None
     if painted:
         gain = round_gain(before.to(device), result.scene, seen, painted)
-        # history and costs stay those of what was fitted
-        result = replace(result, scene=before) if gain.is_worse else result
         told = {**asdict(gain), "is_taken_back": gain.is_worse}
     save_scene(place.output, result.scene, result.history)
     return {**fit_summary(result), "gain": told}

@@ -230,6 +230,19 @@ def test_a_later_round_paints_farther_out(tiny_run):
         assert sorted(path.name for path in shown.iterdir()) == list(names)
 
 
+def test_a_round_that_is_taken_back_is_made_again_as_its_control(tiny_run, monkeypatch):
+    monkeypatch.setattr("lidarpainter_models.evaluation.round_gain.MOST_LOST_DB", -100.0)
+    words = (*settings("refine.steps=8"), "--no-evaluate", "--no-report", "--json")
+    painted, control = (
+        reconstructed(tiny_run, "--painter", painter, *words).json for painter in ("warp", "none")
+    )
+    assert painted["gains"]["refine-1"]["is_taken_back"]
+    again = painted["artefacts"]["refine-1-unpainted"]
+    assert again == control["artefacts"]["refine-1"]
+    assert again != painted["artefacts"]["refine-1"]
+    assert not control["computed_now"]["refine-1"]
+
+
 def test_a_round_that_was_taken_back_is_shown(tiny_run, capsys):
     gains = {"refine-1": {"before_db": 25.0, "after_db": 24.0, "is_taken_back": True}}
     show(tiny_run.result)
