@@ -162,14 +162,18 @@ def _report(course: Course, result: dict[str, Any], unpainted: FittedRef, final:
 
 def _rounds(course: Course, fitted: FittedRef) -> FittedRef:
     """Paint and go on fitting; without a painter the fit goes on alone, just as long."""
-    go_on = _unpainted if course.parameters.painter == NO_PAINTER else _painted
+    is_unpainted = course.parameters.painter == NO_PAINTER
     for number in range(1, course.parameters.rounds + 1):
-        refined = go_on(course, fitted, f"refine-{number}", number)
+        stage = f"refine-{number}"
+        if is_unpainted:
+            refined = _unpainted(course, fitted, stage)
+        else:
+            refined = _painted(course, fitted, stage, number)
         fitted = FittedRef(fitted.observations, refined.ref)
     return fitted
 
 
-def _unpainted(course: Course, fitted: FittedRef, stage: str, _number: int) -> StageResult:
+def _unpainted(course: Course, fitted: FittedRef, stage: str) -> StageResult:
     """The control of a painted round."""
     parameters = course.parameters
     found = fit(
@@ -209,7 +213,7 @@ def _painted(course: Course, fitted: FittedRef, stage: str, number: int) -> Stag
     refined = course.add(stage, found)
     gain = refined.summary["gain"]
     if gain is not None and gain["is_taken_back"]:
-        return _unpainted(course, fitted, f"{stage}-unpainted", number)
+        return _unpainted(course, fitted, f"{stage}-unpainted")
     return refined
 
 

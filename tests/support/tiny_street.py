@@ -1,5 +1,7 @@
 """A street so small that every command gets through it in seconds: two cameras that overlap."""
 
+from commands import settings, succeed
+
 from lidarpainter_models.synthetic import RigCamera, RigLidar, SyntheticStreetConfig
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
 
@@ -22,6 +24,7 @@ SETTINGS = (
     "refine.densification.budget=2000",
 )
 """The preview preset, shrunk; the side camera is kept to judge by."""
+TINY = ("--preset", "brief", *settings(*SETTINGS))
 
 
 def tiny_street(seed=SEED, **changes):
@@ -37,3 +40,8 @@ def tiny_street(seed=SEED, **changes):
         "lidar": RigLidar(beams=32, columns=720),
     }
     return SyntheticStreetConfig(**(chosen | changes))
+
+
+def reconstructed(tiny_run, *words):
+    """`reconstruct` of the tiny street, with other words behind."""
+    return succeed("reconstruct", SCENE, *TINY, *words, store=tiny_run.store)
