@@ -18,6 +18,9 @@ warped images on, they are no better than the render.
 The gate compares: where recorded pixels are known (warped images first, LiDAR colours
 elsewhere), a painting that departs from them by more than the plain render did is weighed down,
 locally and, if it does so on the whole, as a view; far beyond that it is refused.
+
+Where a painter left the render as it was, `departure_weight`, a painting has nothing to tell: it
+would hold the scene to what it was when it was painted, while recorded views still sharpen it.
 """
 
 import math
@@ -53,6 +56,10 @@ GATE_WINDOW_PX = 11  # side of the square over which painting and evidence are c
 GATE_SLACK = 0.01  # mean difference by which a painting may exceed the render unpunished
 GATE_SCALE = 0.03  # further difference at which the weight has fallen to 1/e
 REFUSE_EXCESS = 0.05  # a view that exceeds the render by this mean difference is refused
+DEPARTURE_WINDOW_PX = 5  # side of the square over which painting and render are compared; odd
+DEPARTURE_RANGE = (0.01, 0.04)
+"""Mean differences from which on a painted pixel counts, and at which it counts fully. A tenth of
+the weight is left, which does what all of it did beside the path (docs/benchmarks.md)."""
 MIN_EVIDENCE = 0.02  # share of pixels with evidence under which no view is gated as a whole
 
 
@@ -196,6 +203,19 @@ def guidance_gate(painting: Painting, conditions: PaintingConditions) -> Guidanc
     ).clamp(min=1.0)
     fall = torch.exp(-(local - GATE_SLACK).clamp(min=0) / GATE_SCALE)
     return GuidanceGate(view_weight * fall, painted_mean, render_mean)
+
+
+def departure_weight(
+    painting: Painting, conditions: PaintingConditions
+) -> Float[Tensor, "height width"]:
+    """How far a painting departs from its render: 0 where not at all, 1 where much."""
+    low, high = DEPARTURE_RANGE
+    difference = (painting.rgb - conditions.render_rgb).abs().mean(dim=-1)
+    side_px = DEPARTURE_WINDOW_PX
+    mean = torch.nn.functional.avg_pool2d(
+        difference[None, None], side_px, stride=1, padding=side_px // 2, count_include_pad=False
+    )[0, 0]
+    return ((mean - low) / (high - low)).clamp(0, 1)
 
 
 def _evidence(

@@ -2,8 +2,9 @@
 
 The recorded cameras are moved sideways and up relative to the road, what the scene shows there is
 painted, and every pixel gets a weight: painter confidence times geometric confidence times the
-gate of `confidence`. Views from inside a car or a wall are left out; refused paintings stay in the
-result, for the report, but give no guidance. World: x forward, y left, z up; metres.
+gate of `confidence`, where the painting departs from the render. Views from inside a car or a wall
+are left out; refused paintings stay in the result, for the report, but give no guidance. World: x
+forward, y left, z up; metres.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,6 +18,7 @@ from torch import Tensor
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.confidence import (
     GuidanceGate,
+    departure_weight,
     geometric_confidence,
     guidance_gate,
     is_seen,
@@ -195,22 +197,22 @@ def _paint(
     )
     seen = is_seen(novel.camera, depth_m, builder.recorded_cameras)
     geometric = geometric_confidence(conditions, novel.camera, seen)
-    weight = (painting.confidence * geometric * gate.weight).clamp(0, 1)
+    trust = (painting.confidence * geometric * gate.weight).clamp(0, 1)
     guidance = GuidanceView.of(
         novel.camera,
         novel.timestamp_ns,
         rgb=painting.rgb,
-        weight=weight,
+        weight=trust * departure_weight(painting, conditions),
         lidar_depth_m=conditions.lidar_depth_m,
     )
     home = torch.device("cpu")  # where paintings of a whole log have room
-    images = _images(conditions, painting, weight) if is_shown else {}
+    images = _images(conditions, painting, trust) if is_shown else {}
     images = {name: rgb.to(home) for name, rgb in images.items()}
     return NovelPainting(novel=novel, guidance=guidance.to(home), gate=gate, images=images)
 
 
 def _images(
-    conditions: PaintingConditions, painting: Painting, weight: Float[Tensor, "height width"]
+    conditions: PaintingConditions, painting: Painting, trust: Float[Tensor, "height width"]
 ) -> dict[str, UInt8[Tensor, "height width 3"]]:
     """What a report shows of one view."""
     floats = {
@@ -218,6 +220,6 @@ def _images(
         "lidar": conditions.lidar_rgb,
         "warp": conditions.warp_rgb[0],
         "painted": painting.rgb,
-        "confidence": weight[..., None].expand(-1, -1, 3),
+        "confidence": trust[..., None].expand(-1, -1, 3),
     }
     return {name: (rgb.clamp(0, 1) * 255).round().to(torch.uint8) for name, rgb in floats.items()}

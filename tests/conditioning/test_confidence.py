@@ -5,6 +5,7 @@ import torch
 
 from lidarpainter_models.conditioning import confidence as confidences
 from lidarpainter_models.conditioning.confidence import (
+    departure_weight,
     geometric_confidence,
     guidance_gate,
     is_seen,
@@ -133,3 +134,20 @@ def test_without_evidence_nothing_is_gated():
     gate = guidance_gate(painting(torch.zeros(HEIGHT, WIDTH, 3)), conditions(warp_valid=nothing))
     assert (gate.weight == 1).all()
     assert math.isnan(gate.painted_difference)
+
+
+def test_a_painting_counts_where_it_departs_from_the_render():
+    given = conditions()
+    painted = given.render_rgb.clone()
+    painted[:, WIDTH // 2 :] += 0.1
+    weight = departure_weight(painting(painted), given)
+    window = confidences.DEPARTURE_WINDOW_PX
+    assert (weight[:, : WIDTH // 2 - window] == 0).all()
+    assert (weight[:, WIDTH // 2 + window :] == 1).all()
+
+
+def test_a_small_departure_counts_in_part():
+    low, high = confidences.DEPARTURE_RANGE
+    given = conditions()
+    weight = departure_weight(painting(given.render_rgb + (low + high) / 2), given)
+    assert torch.allclose(weight, torch.tensor(0.5), atol=1e-4)  # roundings of the window's mean
