@@ -12,6 +12,7 @@ from rich.text import Text
 
 from flows.cli.output import clear_status, loudness
 from flows.cli.stage_times import Clock, as_clock
+from lidarpainter_models.kernels.compile_clock import CompileClock
 from tasks.progress import ProgressListener, Silence, listening
 
 LINE_EVERY_S = 30.0
@@ -132,10 +133,14 @@ def shown_progress(expected: Mapping[str, float] | None = None) -> Iterator[Prog
     if loudness() == "verbose":
         log.setLevel(logging.INFO)
         log.addHandler(lines)
+    compiling = CompileClock()
+    compiling.start()
+    clock = Clock(expected=expected or {}, compiled=lambda: compiling.cpu_seconds)
     try:
-        with _listener(Clock(expected=expected or {})) as listener, listening(listener):
+        with _listener(clock) as listener, listening(listener):
             yield listener
     finally:
+        compiling.stop()
         log.removeHandler(lines)
 
 

@@ -76,11 +76,13 @@ class Clock:
     expected: Mapping[str, float] = field(default_factory=dict)
     """By stage, in order; empty where no past run tells."""
     now: Callable[[], float] = time.monotonic
+    compiled: Callable[[], float] = lambda: 0.0
+    """How long kernels have been compiled so far: what is left of a stage needs no more of it."""
     _began: dict[str, float] = field(default_factory=dict)
     _first: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Of a stage: how much was done when its parts began, and when that was."""
+    """Of a stage: how much was done when its parts began, and after how much work that was."""
     _last: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """How much is done, and when that was so."""
+    """How much is done, and after how much work that was so."""
     _took: dict[str, float] = field(default_factory=dict)
     """Of stages that were computed."""
     _over: set[str] = field(default_factory=set)
@@ -91,7 +93,7 @@ class Clock:
 
     def advanced(self, stage: str, share: float) -> None:
         """So much of a stage is done, 0 to 1; told again, it has only made ready for its parts."""
-        self._last[stage] = (share, self.elapsed(stage))
+        self._last[stage] = (share, self.elapsed(stage) - self.compiled())
         if self._first.setdefault(stage, self._last[stage])[0] == share:
             self._first[stage] = self._last[stage]
 
@@ -142,10 +144,11 @@ class Clock:
         """What a stage takes in all, by the parts it has done; None before it has done any."""
         if stage not in self._last:
             return None
-        (first, began), (share, gone) = self._first[stage], self._last[stage]
+        (first, began), (share, done) = self._first[stage], self._last[stage]
         if share - first < LEAST_SHARE:
             return None
-        return gone + (gone - began) / (share - first) * (1 - share)
+        gone = done + self.compiled()
+        return gone + (done - began) / (share - first) * (1 - share)
 
 
 def as_clock(seconds: float) -> str:

@@ -145,6 +145,18 @@ def test_making_ready_says_nothing_about_the_speed():
     assert clock.left("fit") == pytest.approx(10)
 
 
+def test_what_kernels_took_to_compile_is_not_expected_again():
+    compiled_s = 0.0
+    clock = Clock(now=Time(), compiled=lambda: compiled_s)
+    clock.started("fit")
+    clock.advanced("fit", 0.0)
+    clock.now.s += 30
+    compiled_s = 20.0
+    clock.advanced("fit", 0.25)
+    assert clock.elapsed("fit") == 30
+    assert clock.left("fit") == pytest.approx(30)
+
+
 def test_no_stage_is_over_before_it_is():
     clock = Clock(expected={"fit": 10.0, "report": 5.0}, now=Time())
     clock.started("fit")
