@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, TextColumn
@@ -12,8 +13,10 @@ from rich.text import Text
 
 from flows.cli.output import clear_status, loudness
 from flows.cli.stage_times import Clock, as_clock
-from lidarpainter_models.kernels.compile_clock import CompileClock
 from tasks.progress import ProgressListener, Silence, listening
+
+if TYPE_CHECKING:
+    from lidarpainter_models.kernels.compile_clock import CompileClock
 
 LINE_EVERY_S = 30.0
 """How often a stage says how far it is where no bar can be drawn."""
@@ -118,6 +121,26 @@ class SaidLines(logging.Handler):
         sys.stderr.write(f"{record.getMessage()}\n")
 
 
+class _Compiling:
+    """Seconds of compiling kernels since it was first asked, as the first stage began."""
+
+    def __init__(self) -> None:
+        self._clock: CompileClock | None = None
+
+    def __call__(self) -> float:
+        if self._clock is None:
+            # brings numba along, which a mistyped command must not wait for
+            from lidarpainter_models.kernels.compile_clock import CompileClock
+
+            self._clock = CompileClock()
+            self._clock.start()
+        return self._clock.cpu_seconds
+
+    def stop(self) -> None:
+        if self._clock is not None:
+            self._clock.stop()
+
+
 @contextmanager
 def shown_progress(expected: Mapping[str, float] | None = None) -> Iterator[ProgressListener]:
     """Show the progress of every stage that runs inside the block, as loud as was chosen.
@@ -133,9 +156,8 @@ def shown_progress(expected: Mapping[str, float] | None = None) -> Iterator[Prog
     if loudness() == "verbose":
         log.setLevel(logging.INFO)
         log.addHandler(lines)
-    compiling = CompileClock()
-    compiling.start()
-    clock = Clock(expected=expected or {}, compiled=lambda: compiling.cpu_seconds)
+    compiling = _Compiling()
+    clock = Clock(expected=expected or {}, compiled=compiling)
     try:
         with _listener(clock) as listener, listening(listener):
             yield listener

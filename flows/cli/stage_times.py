@@ -79,6 +79,7 @@ class Clock:
     compiled: Callable[[], float] = lambda: 0.0
     """How long kernels have been compiled so far: what is left of a stage needs no more of it."""
     _began: dict[str, float] = field(default_factory=dict)
+    _compiled_before: dict[str, float] = field(default_factory=dict)
     _first: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Of a stage: how much was done when its parts began, and after how much work that was."""
     _last: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -89,11 +90,11 @@ class Clock:
 
     def started(self, stage: str) -> None:
         """A stage begins."""
-        self._began[stage] = self.now()
+        self._compiled_before[stage], self._began[stage] = self.compiled(), self.now()
 
     def advanced(self, stage: str, share: float) -> None:
         """So much of a stage is done, 0 to 1; told again, it has only made ready for its parts."""
-        self._last[stage] = (share, self.elapsed(stage) - self.compiled())
+        self._last[stage] = (share, self.elapsed(stage) - self._compiled(stage))
         if self._first.setdefault(stage, self._last[stage])[0] == share:
             self._first[stage] = self._last[stage]
 
@@ -147,8 +148,12 @@ class Clock:
         (first, began), (share, done) = self._first[stage], self._last[stage]
         if share - first < LEAST_SHARE:
             return None
-        gone = done + self.compiled()
+        gone = done + self._compiled(stage)
         return gone + (done - began) / (share - first) * (1 - share)
+
+    def _compiled(self, stage: str) -> float:
+        """How long kernels have been compiled since a stage began."""
+        return self.compiled() - self._compiled_before[stage]
 
 
 def as_clock(seconds: float) -> str:
