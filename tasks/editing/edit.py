@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -78,8 +78,9 @@ class Edits:
         """The last one that is asked for."""
         return next((one for one in reversed(self.operations) if isinstance(one, Style)), None)
 
+    @cached_property
     def world(self) -> EditedWorld:
-        """The run as it is after them.
+        """The run as it is after them; checked, masked and filled it is the same.
 
         Raises:
             ConfigError: an operation cannot be done.
@@ -208,7 +209,7 @@ def checked_encounters(edits: Edits) -> list[Encounter]:
     Raises:
         ConfigError: an operation cannot be done.
     """
-    return encounters(edits.world())
+    return encounters(edits.world)
 
 
 def edit_build(
@@ -232,7 +233,7 @@ def _build(
     painter: PainterChoice,
     device: torch.device,
 ) -> dict[str, Any]:
-    world = edits.world()
+    world = edits.world
     paints = painter.name != NO_PAINTER
     found = filled(world, conditions, painter.load(device) if paints else None)
     scene = _styled(found.scene, edits, world.lamps)
@@ -263,7 +264,7 @@ def _styled(scene: GaussianScene, edits: Edits, lamps: tuple[LampChange, ...]) -
 
 
 def _build_observations(place: Workplace, _progress: Progress, *, edits: Edits) -> dict[str, Any]:
-    world = edits.world()
+    world = edits.world
     seen = masked_observations(world)
     save_observations(place.output, seen)
     hidden = [float(view.hidden.float().mean()) for view in seen.views if view.hidden is not None]

@@ -6,6 +6,7 @@ import pytest
 from commands import call, seen_image, succeed
 from tiny_street import HEIGHT_PX, WIDTH_PX
 
+from lidarpainter_models.editing.edits import edited
 from tasks.runs import open_run
 from tasks.stored import load_observations, load_scene
 
@@ -60,6 +61,15 @@ def test_edits_of_an_edited_run_are_added_to_its_list(own_run, ahead):
     assert second["derived_from"] == own_run.run_id
     told = second["change"]["parameters"]["operations"]
     assert [one["op"] for one in told] == ["scale", "freeze"]
+
+
+def test_edits_are_done_once_for_check_images_and_scene(own_run, ahead, monkeypatch):
+    done = []
+    monkeypatch.setattr(
+        "tasks.editing.edit.edited", lambda *args: done.append(args) or edited(*args)
+    )
+    succeed("edit", own_run.run_id, "scale", ahead, "factor=1.2", store=own_run.store)
+    assert len(done) == 1
 
 
 @pytest.mark.parametrize(
