@@ -166,7 +166,7 @@ def _told_step(entry: dict[str, float]) -> str:
     """Such as `step 2,400, 28.61 dB, 210k Gaussians`."""
     return (
         f"step {entry['step']:,.0f}, {entry['psnr']:.2f} dB, "
-        f"{entry['num_gaussians'] / 1000:.0f}k Gaussians"
+        f"{in_thousands(entry['num_gaussians'])} Gaussians"
     )
 
 
@@ -174,6 +174,13 @@ def _told_plan(steps: int, entry: dict[str, float], device: torch.device) -> str
     """Such as `84 views, 0.9 Mpx of surface, at most 210k Gaussians, 4,800 steps, 1 GB on cpu`."""
     return (
         f"{entry['num_views']:.0f} views, {entry['surface_pixels'] / 1e6:.2g} Mpx of surface, "
-        f"at most {entry['most_gaussians'] / 1000:.3g}k Gaussians, {steps:,} steps, "
+        f"at most {in_thousands(entry['most_gaussians'])} Gaussians, {steps:,} steps, "
         f"{entry['planned_bytes'] / 1e9:.2g} GB on {device}"
     )
+
+
+def in_thousands(count: float) -> str:
+    """Such as `850`, `9.8k`, `210k` or `3,050k`."""
+    if count < 1000:
+        return f"{count:.0f}"
+    return f"{count / 1000:,.{1 if count < 10_000 else 0}f}k"

@@ -31,7 +31,7 @@ from tasks.evaluation.views import evaluate, load_scores
 from tasks.opened import open_scene
 from tasks.painter.judge import judge_painters
 from tasks.painter.judged_fits import JudgedFit
-from tasks.reconstruction.fit import fit
+from tasks.reconstruction.fit import fit, in_thousands
 from tasks.reconstruction.painted_views import load_guidance
 from tasks.reconstruction.prepare import prepare
 from tasks.reconstruction.publish import begin_run, end_run
@@ -311,3 +311,8 @@ def test_a_store_that_was_moved_is_read_and_nothing_is_written(store, run, param
     before = content_of(moved.root)
     assert looked_at(moved, parameters).run_id == run.run_id
     assert content_of(moved.root) == before
+
+
+def test_a_fit_tells_its_gaussians_in_plain_numbers():
+    told = [in_thousands(count) for count in (850, 9_800, 210_400, 3_050_000)]
+    assert told == ["850", "9.8k", "210k", "3,050k"]
