@@ -14,19 +14,14 @@ neither clock nor readout. Camera frame: x right, y down, z forward.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
 
-from lidarpainter_models.geometry.cameras import Camera, Shutter
-from lidarpainter_models.lidar.contrast_images import LEVELS_PER_OCTAVE, ContrastImage
-from lidarpainter_models.lidar.moving_boxes import BACKGROUND, MovingBoxes
-from lidarpainter_models.lidar.sparse_depth import sparse_lidar_depth
+from lidarpainter_models.lidar.contrast_images import LEVELS_PER_OCTAVE
+from lidarpainter_models.lidar.hub_images import NEAR_M, WIDTH_PX, Hub, HubImage, hubs_of
 from lidarpainter_models.scenes.camera_faults import CameraFault
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
@@ -39,9 +34,6 @@ MIN_STANDS_OUT = 4.0  # standard errors
 MIN_SPEED_MPS = 2.0  # a slower car's images look alike whenever they were taken
 MIN_PX_PER_DEG = 2.2  # as in the doctor's check of calibration
 _TURN, _LATE, _READOUT = slice(0, 3), 3, 4
-_WIDTH_PX = 480
-_HUBS, _NEIGHBOURS, _POINTS = 8, 2, 1000
-"""Images whose points are followed, into how many before and after, and of how many points."""
 _SEARCHED_S = np.linspace(-0.06, 0.06, 7)
 _SEARCH_LEVEL, _SEARCH_ROUNDS, _SEARCH_STRIDE = 3, 3, 3
 _SCHEDULE = ((3, 5), (2, 14))  # level and rounds of Gauss-Newton
@@ -49,9 +41,8 @@ _STEP = 1.5  # derivatives of images that do not fit yet are too small
 _OUTLIER = 5.0  # medians from which on a difference counts little
 _EXPECTED = np.array([0.01, 0.01, 0.01, 0.05, 0.03])
 _SAMPLES_OF_PRIOR = 500.0  # neighbouring points look alike
-_NEAR_M, _FAR_M, _BORDER_PX = 1.0, 80.0, 3
+_BORDER_PX = 3
 _HIDDEN, _HIDDEN_M = 1.15, 0.5  # a point farther behind a return than this is hidden
-_EDGE_PX, _LEAST_SHARE, _MOST_SHARE = 11, 0.7, 1.4  # of its own depth, all around a point
 
 
 class Found(NamedTuple):
@@ -59,30 +50,6 @@ class Found(NamedTuple):
 
     values: Float[np.ndarray, "5"]
     errors: Float[np.ndarray, "5"]
-
-
-@dataclass(frozen=True, eq=False)
-class _Image:
-    """One image, what it moved like, and the returns of its frame's sweeps in it."""
-
-    camera: Camera
-    twist_per_s: Float[np.ndarray, "6"]
-    contrast: ContrastImage
-    standing: Float[Tensor, "points 3"]
-    """Points of the frame outside moving boxes, in the world."""
-    depth_m: Float[np.ndarray, "height width"]
-    """0 where there is no return."""
-    nearest_m: Float[np.ndarray, "height width"]
-    """Nearest return around, very far where there is none."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Hub:
-    """Points of one image and the images that show them, it among them."""
-
-    points: Float[np.ndarray, "points 3"]
-    images: Sequence[_Image]
-    own: int
 
 
 def find_faults(scene: DrivingScene, views: Sequence[RecordedView]) -> dict[str, CameraFault]:
@@ -121,23 +88,16 @@ def measured_faults(scene: DrivingScene, views: Sequence[RecordedView]) -> Found
     Returns:
         None where too little is seen: three images or fewer, coarse ones, or a car that stands.
     """
-    shutters = [view.camera.shutter for view in views if view.camera.shutter is not None]
+    moved = [(view, shutter) for view in views if (shutter := view.camera.shutter) is not None]
+    shutters = [shutter for _, shutter in moved]
     speeds_mps = [float(shutter.twist_per_s[3:].norm()) for shutter in shutters]
-    if len(shutters) <= 3 or np.median(speeds_mps) < MIN_SPEED_MPS:
+    if len(moved) <= 3 or np.median(speeds_mps) < MIN_SPEED_MPS:
         return None
     camera = views[0].camera
-    share = min(1.0, _WIDTH_PX / camera.width_px)
+    share = min(1.0, WIDTH_PX / camera.width_px)
     if camera.fx_px * share * np.radians(1) < MIN_PX_PER_DEG:
         return None
-    boxes = MovingBoxes([track for track in scene.tracks if track.is_moving])
-    images = [_image(scene, *pair, boxes) for pair in zip(views, shutters, strict=True)]
-    hubs = []
-    for place in np.unique(np.linspace(0, len(images) - 1, min(_HUBS, len(images))).round()):
-        first = max(int(place) - _NEIGHBOURS, 0)
-        shown_by = images[first : int(place) + _NEIGHBOURS + 1]
-        points = _hub_points(images[int(place)])
-        if len(points):
-            hubs.append(_Hub(points, shown_by, int(place) - first))
+    hubs = hubs_of(scene, moved)
     if not hubs:
         return None
     is_told = any(shutter.is_rolling for shutter in shutters)
@@ -145,50 +105,8 @@ def measured_faults(scene: DrivingScene, views: Sequence[RecordedView]) -> Found
     return _refined(hubs, _searched(hubs, free), free)
 
 
-def _image(scene: DrivingScene, view: RecordedView, shutter: Shutter, boxes: MovingBoxes) -> _Image:
-    share = min(1.0, _WIDTH_PX / view.camera.width_px)
-    camera = view.camera.resized(
-        width_px=round(view.camera.width_px * share),
-        height_px=round(view.camera.height_px * share),
-    )
-    size = (camera.width_px, camera.height_px)
-    rgb = cv2.resize(scene.read_image(view).numpy(), size, interpolation=cv2.INTER_AREA)
-    clouds = [(scene.read_sweep(s).xyz_m, s) for s in scene.sweeps_of(view.frame_index)]
-    standing = [
-        xyz_m[boxes.owners(xyz_m, sweep.timestamp_ns, floor_m=-torch.inf) == BACKGROUND]
-        for xyz_m, sweep in clouds
-    ]
-    everything = torch.cat([xyz_m for xyz_m, _ in clouds]) if clouds else torch.zeros(0, 3)
-    depth_m = sparse_lidar_depth(everything, camera).numpy()
-    far_m = np.where(depth_m > 0, depth_m, np.float32(1e6))
-    return _Image(
-        camera=camera,
-        twist_per_s=shutter.twist_per_s.numpy(),
-        contrast=ContrastImage.of(rgb),
-        standing=torch.cat(standing) if standing else everything,
-        depth_m=depth_m,
-        nearest_m=cv2.erode(far_m, np.ones((5, 5), np.uint8)),
-    )
-
-
-def _hub_points(image: _Image) -> Float[np.ndarray, "points 3"]:
-    """Visible points of what stands, away from depth edges; a random choice, always the same."""
-    pixels_uv, depth_m = image.camera.project(image.standing)
-    inside = image.camera.contains(pixels_uv, depth_m, near_m=_NEAR_M).nonzero()[:, 0]
-    column, row = pixels_uv[inside].long().numpy().T
-    depth = depth_m[inside].numpy()
-    window = np.ones((_EDGE_PX, _EDGE_PX), np.uint8)
-    known = np.where(image.depth_m > 0, image.depth_m, np.float32(1e6))
-    nearest, furthest = cv2.erode(known, window), cv2.dilate(image.depth_m, window)
-    is_good = np.abs(depth - image.depth_m[row, column]) < 0.02 * depth
-    is_good &= (nearest[row, column] > _LEAST_SHARE * depth) & (depth < _FAR_M)
-    is_good &= furthest[row, column] < _MOST_SHARE * depth
-    chosen = np.random.default_rng(0).permutation(np.flatnonzero(is_good))[:_POINTS]
-    return image.standing[inside[torch.from_numpy(chosen)]].double().numpy()
-
-
 def _projected(
-    points: Float[np.ndarray, "points 3"], image: _Image, values: Float[np.ndarray, "5"]
+    points: Float[np.ndarray, "points 3"], image: HubImage, values: Float[np.ndarray, "5"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixels (points, 2), depth, and derivatives of the pixels (points, 2, 5)."""
     camera, across_s = image.camera, np.array([0.0, values[_READOUT]])
@@ -232,7 +150,7 @@ class _Compared(NamedTuple):
     """The same with the mean gradient of a point, which has less noise."""
 
 
-def _compared(hub: _Hub, values: Float[np.ndarray, "5"], level: int, stride: int) -> _Compared:
+def _compared(hub: Hub, values: Float[np.ndarray, "5"], level: int, stride: int) -> _Compared:
     points = hub.points[::stride]
     placed = [_projected(points, image, values) for image in hub.images]
     hub_depth = np.maximum(placed[hub.own][1], 0.5)
@@ -240,7 +158,7 @@ def _compared(hub: _Hub, values: Float[np.ndarray, "5"], level: int, stride: int
     for image, (pixels_uv, depth, change) in zip(hub.images, placed, strict=True):
         size = np.array([image.camera.width_px, image.camera.height_px])
         octaves = np.log2(hub_depth / np.maximum(depth, 0.5))
-        seen = (depth > _NEAR_M) & (np.abs(octaves) < 1)
+        seen = (depth > NEAR_M) & (np.abs(octaves) < 1)
         seen &= ((pixels_uv > _BORDER_PX) & (pixels_uv < size - _BORDER_PX)).all(1)
         column, row = np.clip(pixels_uv.astype(int), 0, size - 1).T
         seen &= depth <= image.nearest_m[row, column] * _HIDDEN + _HIDDEN_M
@@ -268,7 +186,7 @@ class _Equations(NamedTuple):
 
 
 def _equations(
-    hubs: Sequence[_Hub],
+    hubs: Sequence[Hub],
     values: Float[np.ndarray, "5"],
     level: int,
     outlier: float | None,
@@ -316,7 +234,7 @@ def _stepped(
     return stepped, inverse
 
 
-def _searched(hubs: Sequence[_Hub], free: np.ndarray) -> Float[np.ndarray, "5"]:
+def _searched(hubs: Sequence[Hub], free: np.ndarray) -> Float[np.ndarray, "5"]:
     """Of several latenesses the best one, each with its own turn."""
     tried: list[tuple[float, int, np.ndarray]] = []
     outlier = None
@@ -331,7 +249,7 @@ def _searched(hubs: Sequence[_Hub], free: np.ndarray) -> Float[np.ndarray, "5"]:
     return min(tried)[2]
 
 
-def _refined(hubs: Sequence[_Hub], values: Float[np.ndarray, "5"], free: np.ndarray) -> Found:
+def _refined(hubs: Sequence[Hub], values: Float[np.ndarray, "5"], free: np.ndarray) -> Found:
     """All free parameters, and how much they scatter between hubs."""
     for level, rounds in _SCHEDULE:
         outlier = None

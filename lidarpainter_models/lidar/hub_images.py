@@ -1,0 +1,122 @@
+"""Some images of a camera, and points of what stands that its other images show as well.
+
+Hubs lie evenly over a recording; the points of each are followed into the images before and after
+it. Camera frame: x right, y down, z forward; lengths are metres.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lidarpainter_models.geometry.cameras import Camera, Shutter
+from lidarpainter_models.lidar.contrast_images import ContrastImage
+from lidarpainter_models.lidar.moving_boxes import BACKGROUND, MovingBoxes
+from lidarpainter_models.lidar.sparse_depth import sparse_lidar_depth
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.records import RecordedView
+
+WIDTH_PX = 480
+"""Images that are wider are made as small as this."""
+NEAR_M = 1.0
+"""Nothing nearer is compared."""
+_HUBS, _NEIGHBOURS, _POINTS = 8, 2, 1000
+"""Images whose points are followed, into how many before and after, and of how many points."""
+_FAR_M = 80.0
+_EDGE_PX, _LEAST_SHARE, _MOST_SHARE = 11, 0.7, 1.4  # of its own depth, all around a point
+
+
+@dataclass(frozen=True, eq=False)
+class HubImage:
+    """One image, what it moved like, and the returns of its frame's sweeps in it."""
+
+    camera: Camera
+    twist_per_s: Float[np.ndarray, "6"]
+    contrast: ContrastImage
+    standing: Float[Tensor, "points 3"]
+    """Points of the frame outside moving boxes, in the world."""
+    depth_m: Float[np.ndarray, "height width"]
+    """0 where there is no return."""
+    nearest_m: Float[np.ndarray, "height width"]
+    """Nearest return around, very far where there is none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hub:
+    """Points of one image and the images that show them, it among them."""
+
+    points: Float[np.ndarray, "points 3"]
+    images: Sequence[HubImage]
+    own: int
+
+
+def hubs_of(scene: DrivingScene, moved: Sequence[tuple[RecordedView, Shutter]]) -> list[Hub]:
+    """What is compared of one camera's images; those that are nobody's neighbours are not read."""
+    boxes = MovingBoxes([track for track in scene.tracks if track.is_moving])
+    images: dict[int, HubImage] = {}
+    hubs = []
+    for own, around in hub_neighbours(len(moved)):
+        for index in around:
+            if index not in images:
+                images[index] = _image(scene, *moved[index], boxes)
+        points = _hub_points(images[own])
+        if len(points):
+            hubs.append(Hub(points, [images[index] for index in around], around.index(own)))
+    return hubs
+
+
+def hub_neighbours(num_images: int) -> list[tuple[int, range]]:
+    """Positions of the hubs, evenly over a camera's images, each with those of its neighbours."""
+    hubs = np.unique(np.linspace(0, num_images - 1, min(_HUBS, num_images)).round()).astype(int)
+    return [
+        (own, range(max(own - _NEIGHBOURS, 0), min(own + _NEIGHBOURS + 1, num_images)))
+        for own in hubs.tolist()
+    ]
+
+
+def _image(
+    scene: DrivingScene, view: RecordedView, shutter: Shutter, boxes: MovingBoxes
+) -> HubImage:
+    share = min(1.0, WIDTH_PX / view.camera.width_px)
+    camera = view.camera.resized(
+        width_px=round(view.camera.width_px * share),
+        height_px=round(view.camera.height_px * share),
+    )
+    size = (camera.width_px, camera.height_px)
+    rgb = cv2.resize(scene.read_image(view).numpy(), size, interpolation=cv2.INTER_AREA)
+    clouds = [(scene.read_sweep(s).xyz_m, s) for s in scene.sweeps_of(view.frame_index)]
+    standing = [
+        xyz_m[boxes.owners(xyz_m, sweep.timestamp_ns, floor_m=-torch.inf) == BACKGROUND]
+        for xyz_m, sweep in clouds
+    ]
+    everything = torch.cat([xyz_m for xyz_m, _ in clouds]) if clouds else torch.zeros(0, 3)
+    depth_m = sparse_lidar_depth(everything, camera).numpy()
+    far_m = np.where(depth_m > 0, depth_m, np.float32(1e6))
+    return HubImage(
+        camera=camera,
+        twist_per_s=shutter.twist_per_s.numpy(),
+        contrast=ContrastImage.of(rgb),
+        standing=torch.cat(standing) if standing else everything,
+        depth_m=depth_m,
+        nearest_m=cv2.erode(far_m, np.ones((5, 5), np.uint8)),
+    )
+
+
+def _hub_points(image: HubImage) -> Float[np.ndarray, "points 3"]:
+    """Visible points of what stands, away from depth edges; a random choice, always the same."""
+    pixels_uv, depth_m = image.camera.project(image.standing)
+    inside = image.camera.contains(pixels_uv, depth_m, near_m=NEAR_M).nonzero()[:, 0]
+    column, row = pixels_uv[inside].long().numpy().T
+    depth = depth_m[inside].numpy()
+    window = np.ones((_EDGE_PX, _EDGE_PX), np.uint8)
+    known = np.where(image.depth_m > 0, image.depth_m, np.float32(1e6))
+    nearest, furthest = cv2.erode(known, window), cv2.dilate(image.depth_m, window)
+    is_good = np.abs(depth - image.depth_m[row, column]) < 0.02 * depth
+    is_good &= (nearest[row, column] > _LEAST_SHARE * depth) & (depth < _FAR_M)
+    is_good &= furthest[row, column] < _MOST_SHARE * depth
+    chosen = np.random.default_rng(0).permutation(np.flatnonzero(is_good))[:_POINTS]
+    return image.standing[inside[torch.from_numpy(chosen)]].double().numpy()
