@@ -47,12 +47,12 @@ class Judgement:
         )
         cameras = tuple(dict.fromkeys(view.camera_name for view in held_out.test_views))
         num_views, is_known = len(held_out.test_views), known_street(held_out.scene)
-        # every view is rendered at both poses, where truth is known at every shift, and for depth
-        total = num_views * (3 + (len(shifts) if is_known else 0))
-        done = itertools.count(1)
+        # each view at both poses, where truth is known at every shift, and everywhere for depth
+        times = 2 + (len(shifts) if is_known else 0) + 1 + len(shifts)
+        renders = itertools.count(1)
 
-        def told(_done: int = 0, _total: int = 0) -> None:
-            progress(next(done), total)
+        def told() -> None:
+            progress(next(renders), num_views * times)
 
         parts = {name: self._of_camera(shown, held_out, name, distances, told) for name in cameras}
         recorded = _mean([recorded for recorded, _novel in parts.values()])
@@ -60,7 +60,7 @@ class Judgement:
             shift.name: _mean([novel[shift.name] for _recorded, novel in parts.values()])
             for shift in shifts
         }
-        fractions = score_geometry(held_out, shown.scene, shifts, progress=told)
+        fractions = score_geometry(held_out, shown.scene, shifts, told=told)
         for name, fraction in fractions.items():
             novel.get(name, recorded)[DEPTH] = fraction
         recorded["num_held_out"] = len(self.held_out.test_views)

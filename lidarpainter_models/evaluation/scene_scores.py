@@ -68,17 +68,19 @@ def score_geometry(
     fitted: GaussianScene,
     shifts: Sequence[Shift],
     *,
-    progress: Callable[[int, int], None] | None = None,
+    told: Callable[[], None] = lambda: None,
 ) -> dict[str, float | None]:
-    """Part of held-out LiDAR pixels that the rendered depth meets within 5 %, per trajectory."""
+    """Part of held-out LiDAR pixels that the rendered depth meets within 5 %, per trajectory.
+
+    `told` is called after every render.
+    """
     scores: dict[str, list[DepthScores]] = {shift.name: [] for shift in (Shift(), *shifts)}
     lidar = FramePoints(held_out.scene)
-    for done, view in enumerate(held_out.test_views, start=1):
+    for view in held_out.test_views:
         points = lidar.at_exposure(view)
         for shift in (Shift(), *shifts):
             camera = held_out.shifted_camera(fitted, view, shift)
             depth_m = fitted.render(camera, view.timestamp_ns).depth_m.cpu()
             scores[shift.name].append(score_depth(depth_m, camera, points))
-        if progress is not None:
-            progress(done, len(held_out.test_views))
+            told()
     return {name: pooled_inlier_fraction(found) for name, found in scores.items()}

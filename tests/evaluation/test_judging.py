@@ -19,6 +19,7 @@ from lidarpainter_models.evaluation.judged_views import (
 from lidarpainter_models.evaluation.judging import Judgement
 from lidarpainter_models.evaluation.settings import JudgeConfig, ScoringConfig
 from lidarpainter_models.evaluation.shown import ShownScene
+from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.metrics.perceptual import PerceptualDistances
 from lidarpainter_models.observations.settings import ObservationConfig
@@ -28,19 +29,32 @@ JUDGED_FRAMES = (1, 2)
 
 
 @pytest.fixture(scope="module")
-def scores():
-    """Of a scene that holds nothing of the street, by a bright and a dark camera."""
+def judged():
+    """Of a scene that holds nothing of the street, by a bright and a dark camera; with progress."""
     street = ToyStreet(4, ((FRONT, 1.0), (SIDE, 0.5)))
     street.manifest = {}
     tests = tuple(view for view in street.views if view.frame_index in JUDGED_FRAMES)
     observation = ObservationConfig(width_px=60)
     config = JudgeConfig(
-        observation=observation, scoring=ScoringConfig(shifts=()), conditions=ConditionConfig()
+        observation=observation,
+        scoring=ScoringConfig(shifts=(Shift(lateral_m=1.0),)),
+        conditions=ConditionConfig(),
     )
     held_out = HeldOut(scene=street, test_views=tests, observation=observation)
     fitted = scene_trained_on([view for view in street.views_of(FRONT) if view not in tests])
     judgement = Judgement(held_out=held_out, config=config)
-    return judgement.scores(ShownScene(scene=fitted), lambda *_done: None)
+    told = []
+    return judgement.scores(ShownScene(scene=fitted), lambda *step: told.append(step)), told
+
+
+@pytest.fixture(scope="module")
+def scores(judged):
+    return judged[0]
+
+
+def test_every_render_is_told(judged):
+    # four views, at both poses and, for depth, there and beside the path
+    assert judged[1] == [(done, 4 * 4) for done in range(1, 4 * 4 + 1)]
 
 
 def test_views_of_all_cameras_have_their_score(scores):
