@@ -68,7 +68,7 @@ def score_geometry(
     fitted: GaussianScene,
     shifts: Sequence[Shift],
     *,
-    told: Callable[[], None] = lambda: None,
+    told: Callable[[], None],
 ) -> dict[str, float | None]:
     """Part of held-out LiDAR pixels that the rendered depth meets within 5 %, per trajectory.
 

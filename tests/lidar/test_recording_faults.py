@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from lidarpainter_models.lidar.contrast_images import ContrastImage
-from lidarpainter_models.lidar.hub_images import hub_neighbours
 from lidarpainter_models.lidar.recording_faults import Found, believed, find_faults
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import split_views
@@ -54,16 +53,6 @@ def test_samples_of_contrast_are_linear_between_pixels_and_levels():
     at = np.array([[2.5, 1.5], [2.0, 1.5], [2.5, 1.0], [2.5, 1.5]])
     found = image.sample(at, np.array([0.999, 0.999, 0.999, 0.5]))[:, 0]
     assert found == pytest.approx([8.0, 4.0, 4.0, 4.0], abs=0.02)
-
-
-@pytest.mark.parametrize(("num_images", "most_read"), [(1, 1), (5, 5), (28, 28), (1000, 40)])
-def test_of_a_long_log_few_images_are_read(num_images, most_read):
-    hubs = hub_neighbours(num_images)
-    assert [hubs[0][0], hubs[-1][0]] == [0, num_images - 1]
-    assert all(own in around for own, around in hubs)
-    read = {index for _, around in hubs for index in around}
-    assert len(read) <= most_read
-    assert read <= set(range(num_images))
 
 
 @pytest.mark.slow
