@@ -26,7 +26,8 @@ GUIDANCE_COLUMNS = ("num_cameras", "num_without_room", "num_refused", "num_views
 
 GUIDANCE_NOTE = (
     "Cameras beside the path; of them those that would stand in a car or a wall, and those whose "
-    "painting was refused; views that the fit went on with, and how much a pixel of them counts."
+    "painting was refused; views that the fit went on with, and how much a pixel of them counts: "
+    "nothing where the painting leaves the render as it is."
 )
 
 
