@@ -89,7 +89,10 @@ class Clock:
     _over: set[str] = field(default_factory=set)
 
     def started(self, stage: str) -> None:
-        """A stage begins."""
+        """A stage begins; `refine-1-unpainted`, which no plan knows, is like its round."""
+        like = stage.rpartition("-")[0]
+        if stage not in self.expected and like in self.expected:
+            self.expected = {**self.expected, stage: self.expected[like]}
         self._compiled_before[stage], self._began[stage] = self.compiled(), self.now()
 
     def advanced(self, stage: str, share: float) -> None:

@@ -203,3 +203,17 @@ def test_a_last_stage_that_takes_longer_than_was_thought_still_tells_of_the_run(
     Now.s = 5.0
     assert clock.run_left("report") is None
     assert how_far(clock, "report", 1, 1) == "100 %, 0:05 gone; run 0:05 gone"
+
+
+def test_a_round_that_is_made_again_is_foretold_by_what_it_took():
+    now = Time()
+    clock = Clock(expected={"refine-1": 40.0, "paint-2": 20.0, "refine-2": 40.0}, now=now)
+    clock.started("refine-1")
+    now.s += 80
+    clock.finished("refine-1", is_new=True)
+    clock.started("refine-1-unpainted")
+    told = how_far(clock, "refine-1-unpainted", 0, 500)
+    left_s = clock.left("refine-1-unpainted")
+    assert left_s == pytest.approx(80, rel=0.05)
+    assert clock.run_left("refine-1-unpainted") == pytest.approx(left_s * 100 / 40)
+    assert "run 1:20 gone" in told
