@@ -5,16 +5,11 @@ from statistics import fmean
 
 import pytest
 import torch
+from fitted_street import FittedStreet
 
-from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.gaussians.fitting.config import FitConfig
-from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.gaussians.fitting.refinement import Refinement
-from lidarpainter_models.observations.preparation import prepare_observations
-from lidarpainter_models.observations.settings import ObservationConfig
-from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.splits import split_views
-from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street
+from lidarpainter_models.synthetic import SyntheticStreetConfig
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
 
 FRONT, _, SIDE = DEFAULT_CAMERAS
@@ -23,30 +18,17 @@ STREET = SyntheticStreetConfig(
 )
 GAIN, DRIFT_PER_S = 1.3, 0.1
 BRIGHTER = replace(STREET, cameras=(FRONT, replace(SIDE, gain=GAIN, gain_drift=DRIFT_PER_S)))
-SIZE = ObservationConfig(width_px=STREET.width_px)
-
 
 SEEDS = (0, 1, 2, 3)
 """Fits of one street part by 0.1 to 0.2 dB, as much as is judged: their means count."""
 
 
-class Fitted:
-    """A fit of a street, and the held-out images it is judged on."""
+class Exposed(FittedStreet):
+    """A fit of a street whose cameras are exposed differently."""
 
     def __init__(self, street, folder, seed):
+        super().__init__(street, folder, FitConfig(seed=seed))
         self.cameras = {camera.name: camera for camera in street.cameras}
-        recording = DrivingScene.open(write_street(street, folder / f"seed-{seed}"))
-        split = split_views(recording, "alternate", None)
-        seen = prepare_observations(recording, split, SIZE)
-        self.scene = fit_gaussians(seen, FitConfig(seed=seed)).scene
-        self.held_out = HeldOut(scene=recording, test_views=split.test, observation=SIZE)
-
-    def shown(self):
-        """Camera, truth and render of every held-out view."""
-        for view in self.held_out.recorded_views(self.scene, "interpolated"):
-            name = view.name.partition("/")[0]
-            image = self.scene.render(view.camera, view.timestamp_ns, camera_name=name).rgb
-            yield name, view, image.clamp(0, 1)
 
     def gain(self, camera_name, timestamp_ns):
         """How much brighter a camera was at a time."""
@@ -87,7 +69,7 @@ class Fitted:
 
 def fits_of(street, folder):
     """A fit for every seed."""
-    return [Fitted(street, folder, seed) for seed in SEEDS]
+    return [Exposed(street, folder, seed) for seed in SEEDS]
 
 
 @pytest.mark.slow
