@@ -126,9 +126,7 @@ class Camera:
         points = transform_points(camera_from_world, points_world)
         pixels_uv = self._pixels_of(points)
         if self.shutter is not None and self.shutter.is_rolling:
-            turn, speed = self.shutter.twist_per_s.to(points).split(3)
-            velocity = -torch.linalg.cross(turn.expand_as(points), points) - speed
-            standing = points
+            standing, velocity = points, _velocity(self.shutter, points)
             for _ in range(_READ_ROUNDS):
                 points = standing + self.read_s(pixels_uv)[:, None] * velocity
                 pixels_uv = self._pixels_of(points)
@@ -169,8 +167,24 @@ class Camera:
         return torch.stack([grid_u, grid_v, torch.ones_like(grid_u)], dim=-1)
 
     def unproject(self, depth_m: Float[Tensor, "height width"]) -> Float[Tensor, "height width 3"]:
-        """World points (float32) seen at each pixel centre at the given camera z."""
+        """World points (float32) seen at each pixel centre at the given camera z.
+
+        What `project` takes back to the pixel and its depth: points stand still while it is read.
+        """
         points_camera = self.pixel_directions(depth_m.device) * depth_m[..., None]
+        if self.shutter is not None and self.shutter.is_rolling:
+            read = points_camera.reshape(-1, 3)
+            centres_uv = self._pixels_of(self.pixel_directions(depth_m.device).reshape(-1, 3))
+            after_s, standing = self.read_s(centres_uv)[:, None], read
+            for _ in range(_READ_ROUNDS):
+                standing = read - after_s * _velocity(self.shutter, standing)
+            points_camera = standing.reshape(points_camera.shape)
         world_from_camera = self.world_from_camera.to(torch.float32)
         world_from_camera = world_from_camera.to(depth_m.device, non_blocking=True)
         return points_camera @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
+
+
+def _velocity(shutter: Shutter, points: Float[Tensor, "points 3"]) -> Float[Tensor, "points 3"]:
+    """How points that stand move before the camera, in its frame, metres a second."""
+    turn, speed = shutter.twist_per_s.to(points).split(3)
+    return -torch.linalg.cross(turn.expand_as(points), points) - speed

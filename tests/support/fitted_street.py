@@ -12,12 +12,12 @@ from lidarpainter_models.synthetic import write_street
 class FittedStreet:
     """A fit of a street, and the held-out images it is judged on."""
 
-    def __init__(self, street, folder, config, **observation):
-        size = ObservationConfig(width_px=street.width_px, **observation)
+    def __init__(self, street, folder, config):
+        size = ObservationConfig(width_px=street.width_px)
         recording = DrivingScene.open(write_street(street, folder / f"seed-{config.seed}"))
         split = split_views(recording, "alternate", None)
-        self.seen = prepare_observations(recording, split, size)
-        self.scene = fit_gaussians(self.seen, config).scene
+        seen = prepare_observations(recording, split, size)
+        self.scene = fit_gaussians(seen, config).scene
         self.held_out = HeldOut(scene=recording, test_views=split.test, observation=size)
 
     def shown(self):

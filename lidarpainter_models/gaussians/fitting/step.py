@@ -14,7 +14,7 @@ from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.images import FitImage
 from lidarpainter_models.gaussians.fitting.spatial_blocks import View
 from lidarpainter_models.gaussians.fitting.state import FitState
-from lidarpainter_models.gaussians.model.rolling_shutter import as_read
+from lidarpainter_models.gaussians.model.rolling_shutter import as_read, bodies_while_read
 from lidarpainter_models.gaussians.model.scene_rendering import (
     OPAQUE,
     camera_from_body,
@@ -66,7 +66,8 @@ def fit_step(
     views = [(recorded, camera_from_body(pose, *actors))]
     if guidance is not None:
         views.append((guidance.camera, _guidance_bodies(state, guidance)))
-    seen = state.seen(views)
+    read = bodies_while_read(recorded, state.scene.actors, image.timestamp_ns)
+    seen = state.seen([*views, *((recorded, bodies) for bodies in read)])
     told = _recorded_step(state, seen, image, row, views[0], config, perceptual)
     if guidance is not None:
         add_guidance_gradients(state, seen, guidance, config, perceptual)

@@ -1,23 +1,29 @@
 """A camera that reads its rows one after another, at 15 m/s among traffic: what a fit loses by it.
 
 The same street is recorded at once (`global`), in 30 ms that are told, and in 30 ms that nobody
-tells: fitted as if at once (`left`), and with the readout looked for (`looked for`).
+tells and that are fitted as if at once (`left`).
 """
 
 from dataclasses import replace
+from statistics import fmean
 
 import pytest
 import torch
 from fitted_street import FittedStreet
 
 from lidarpainter_models.gaussians.fitting.config import EffortConfig, FitConfig
-from lidarpainter_models.synthetic import SyntheticStreetConfig
+from lidarpainter_models.lidar.recording_faults import find_faults
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.splits import split_views
+from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
 
 READOUT_S = 0.03
 LENSES = {"front": 1.026, "wide": 0.6}
 """Focal lengths in image widths; through a wide lens what is near moves much."""
-CONFIG = FitConfig(effort=EffortConfig(looks=300))
+EFFORT = EffortConfig(looks=300)
+SEEDS = (0, 1, 2)
+"""Fits of one street part by about 0.1 dB, nearly as much as is judged: their means count."""
 
 
 def psnr(fitted):
@@ -39,26 +45,46 @@ def street(lens, **shutter):
     )
 
 
+def mean_psnr(recorded, folder):
+    """Over fits with every seed."""
+    configs = [FitConfig(effort=EFFORT, seed=seed) for seed in SEEDS]
+    return fmean(psnr(FittedStreet(recorded, folder, config)) for config in configs)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(("lens", "least_recovered"), [("front", 0.5), ("wide", 0.0)])
-def test_what_a_rolling_shutter_costs_is_recovered(lens, least_recovered, tmp_path, capsys):
-    at_once, told = street(lens), street(lens, readout_s=READOUT_S)
-    untold, looked_for = replace(told, is_readout_told=False), {"corrects_cameras": True}
-    ways = {
-        "global": (at_once, {}),
-        "global, looked for": (at_once, looked_for),
-        "told": (told, {}),
-        "looked for": (untold, looked_for),
-        "left": (untold, {}),
-    }
-    found = {}
-    for name, (recorded, observation) in ways.items():
-        fitted = FittedStreet(recorded, tmp_path / name, CONFIG, **observation)
-        found[name] = psnr(fitted)
-        faults = [f"{camera} {fault}" for camera, fault in fitted.seen.faults.items()]
-        with capsys.disabled():
-            print(f"\n{lens}, {name}: {found[name]:.3f} dB, {faults or 'no fault'}")  # noqa: T201
+@pytest.mark.parametrize(
+    "lens",
+    [
+        "front",
+        pytest.param(
+            "wide",
+            marks=pytest.mark.xfail(
+                reason="a Gaussian is moved as a whole: the near road is not stretched", strict=True
+            ),
+        ),
+    ],
+)
+def test_what_a_rolling_shutter_costs_is_recovered_where_it_is_told(lens, tmp_path, capsys):
+    told = street(lens, readout_s=READOUT_S)
+    ways = {"global": street(lens), "told": told, "left": replace(told, is_readout_told=False)}
+    found = {name: mean_psnr(recorded, tmp_path / name) for name, recorded in ways.items()}
     lost = found["global"] - found["left"]
-    assert found["told"] - found["left"] > least_recovered * lost
-    assert found["global"] - found["global, looked for"] < 0.02
-    assert found["looked for"] > found["left"] - 0.02
+    recovered = (found["told"] - found["left"]) / lost
+    with capsys.disabled():
+        print(f"\n{lens}: {found}, recovered {recovered:.2f} of {lost:.3f} dB")  # noqa: T201
+    assert lost > 0
+    assert recovered > 0.8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_camera_that_reads_at_once_is_left_as_it_is(lens, tmp_path, capsys):
+    untold = replace(street(lens, readout_s=READOUT_S), is_readout_told=False)
+    found = {}
+    for name, recorded in {"global": street(lens), "untold": untold}.items():
+        scene = DrivingScene.open(write_street(recorded, tmp_path / name))
+        faults = find_faults(scene, split_views(scene, "alternate").train)
+        found[name] = [f"{camera} {fault}" for camera, fault in faults.items()]
+    with capsys.disabled():
+        print(f"\n{lens}: {found}")  # noqa: T201
+    assert not found["global"]

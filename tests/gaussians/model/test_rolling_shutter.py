@@ -7,7 +7,7 @@ import torch
 from gaussian_world import FRAME_NS, camera_at, car_track, round_gaussians
 
 from lidarpainter_models.gaussians.model.actors import Actors
-from lidarpainter_models.gaussians.model.rolling_shutter import as_read
+from lidarpainter_models.gaussians.model.rolling_shutter import as_read, bodies_while_read
 from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
 from lidarpainter_models.geometry.cameras import Shutter
 
@@ -47,6 +47,25 @@ def test_what_stands_is_drawn_where_the_camera_projects_it(across_s):
     assert float((before - expected).abs().max()) > 0.3
 
 
+@pytest.mark.parametrize("across_s", [(0.0, 0.03), (0.0, -0.03)])
+def test_the_near_road_is_stretched_as_its_rows_are_read(across_s):
+    camera = rolling(across_s, velocity=(0.0, 0.0, 15.0))
+    at_once = replace(camera, shutter=None)
+    road = round_gaussians(torch.tensor([[3.5, 0.5, -0.4]]), torch.rand(1, 3), sigma_m=0.2)
+    read = read_by(camera, road)
+
+    def length_px(seen_by, gaussians):
+        along = gaussians.scale_m[:, :1] * torch.tensor([[1.0, 0.0, 0.0]])
+        (far, _), (near, _) = (
+            seen_by.project((gaussians.means + end).double()) for end in (along, -along)
+        )
+        return float((near - far).norm())
+
+    whole = replace(read, log_scale=road.log_scale)
+    assert length_px(at_once, read) == pytest.approx(length_px(camera, road), rel=0.01)
+    assert length_px(at_once, whole) != pytest.approx(length_px(camera, road), rel=0.03)
+
+
 def test_an_actor_is_where_it_drove_until_its_row_was_read():
     camera = rolling((0.0, 0.03))
     in_box = torch.tensor([[0.3, 0.2, -0.4]])
@@ -59,7 +78,18 @@ def test_an_actor_is_where_it_drove_until_its_row_was_read():
     assert float(moved[0, 1:].abs().max()) < 1e-5
 
 
-def test_gradients_reach_the_centres():
+def test_bodies_are_known_from_the_first_pixel_to_the_last():
+    camera = rolling((0.0, -0.03), velocity=(0.0, 0.0, 15.0))
+    first, last = bodies_while_read(camera, ACTORS, MIDDLE_NS)
+    assert float(first[0, 2, 3] - last[0, 2, 3]) == pytest.approx(15.0 * 0.03)
+    car = torch.stack([first[1], last[1]])[:, :3, 3]
+    assert float(car[0, 0] - car[1, 0]) == pytest.approx(0.3, abs=0.01)  # 10 m/s to the left
+    assert bodies_while_read(camera.at(camera.world_from_camera), ACTORS, MIDDLE_NS) == []
+
+
+def test_gradients_reach_centres_and_sizes():
     gaussians = wall().as_leaves()
-    read_by(rolling((0.0, 0.03), velocity=(0.0, 0.0, 15.0)), gaussians).means.sum().backward()
+    read = read_by(rolling((0.0, 0.03), velocity=(0.0, 0.0, 15.0)), gaussians)
+    (read.means.sum() + read.log_scale.sum()).backward()
     assert float(gaussians.means.grad.abs().min()) > 0.5
+    assert float(gaussians.log_scale.grad.abs().min()) > 0.5
