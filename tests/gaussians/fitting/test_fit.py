@@ -13,13 +13,16 @@ from lidarpainter_models.gaussians.fitting.config import (
     continuation,
 )
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
+from lidarpainter_models.gaussians.fitting.images import full_image
 from lidarpainter_models.gaussians.fitting.settings import DensificationConfig, LearningRates
 from lidarpainter_models.gaussians.fitting.state import FitState
-from lidarpainter_models.gaussians.fitting.step import add_guidance_gradients
+from lidarpainter_models.gaussians.fitting.step import add_guidance_gradients, fit_step
 from lidarpainter_models.gaussians.initialisation.scene import initialise_scene
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
-from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
+from lidarpainter_models.gaussians.model.rolling_shutter import as_read
+from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body, draw_gaussians
 from lidarpainter_models.gaussians.model.stored_scene import scene_to_arrays
+from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.observations.views import GuidanceView
 
@@ -81,6 +84,26 @@ def image_error(world, scene):
         for view in world.observations.views
     ]
     return float(torch.stack(errors).mean())
+
+
+def test_a_step_sees_what_only_the_first_row_shows(world):
+    actors, view = world.scene.actors, world.observations.views[0]
+    aside = torch.tensor([0.0, 0.0, 0.0, 100.0, 0.0, 0.0]).double()
+    camera = replace(
+        view.camera,
+        fx_px=4 * view.camera.fx_px,
+        fy_px=4 * view.camera.fy_px,
+        shutter=Shutter(across_s=(0.0, 0.06), twist_per_s=aside),
+    )
+    view = replace(view, camera=camera)
+    bodies = camera_from_body(
+        view.camera.world_from_camera, *actors.corrected_poses(view.timestamp_ns)
+    )
+    read = as_read(world.scene.gaussians, bodies, view.camera, actors, view.timestamp_ns)
+    shown = draw_gaussians(read, bodies, view.camera).visible
+    state = FitState.begin(world.scene, short_fit())
+    fit_step(state, full_image(view), 0, None, short_fit(), None)
+    assert torch.equal(state.tally.visits > 0, shown)
 
 
 def test_fit_gets_closer_to_the_images(world, undisturbed):
