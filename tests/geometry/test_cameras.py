@@ -32,18 +32,28 @@ def test_right_and_down_are_positive():
     assert pixels[0].tolist() == pytest.approx([42.0, 35.0])
 
 
-@pytest.mark.parametrize("across_s", [(0.0, 0.0), (0.0, 0.03), (-0.02, 0.0)])
-def test_unprojected_pixels_project_back_to_their_centres(across_s):
-    twist = torch.tensor([0.02, 0.1, -0.05, 0.5, 0.0, 15.0], dtype=torch.float64)
+def test_unprojected_pixels_project_back_to_their_centres():
     view = camera(
-        world_from_camera=rigid_from_tangent(torch.tensor([0.1, 0.2, 0.3, 4, 5, 6.0]).double()),
-        shutter=Shutter(across_s=across_s, twist_per_s=twist),
+        world_from_camera=rigid_from_tangent(torch.tensor([0.1, 0.2, 0.3, 4, 5, 6.0]).double())
     )
+    depth_m = torch.rand(48, 64, generator=torch.Generator().manual_seed(0)) * 20 + 1
+    pixels, depth_again_m = view.project(view.unproject(depth_m).reshape(-1, 3))
+    assert torch.allclose(depth_again_m, depth_m.reshape(-1), atol=1e-4)
+    assert torch.allclose(pixels[0], torch.tensor([0.5, 0.5]), atol=1e-3)
+    assert torch.allclose(pixels[-1], torch.tensor([63.5, 47.5]), atol=1e-3)
+
+
+@pytest.mark.parametrize("across_s", [(0.0, 0.03), (-0.02, 0.0)])
+def test_pixels_that_are_read_one_after_another_project_back_too(across_s):
+    twist = torch.tensor([0.02, 0.1, -0.05, 0.5, 0.0, 15.0], dtype=torch.float64)
+    view = camera(shutter=Shutter(across_s=across_s, twist_per_s=twist))
     depth_m = torch.rand(48, 64, generator=torch.Generator().manual_seed(0)) * 20 + 5
     pixels, depth_again_m = view.project(view.unproject(depth_m).reshape(-1, 3))
     assert torch.allclose(depth_again_m, depth_m.reshape(-1), atol=1e-3)
     assert torch.allclose(pixels[0], torch.tensor([0.5, 0.5]), atol=5e-3)
     assert torch.allclose(pixels[-1], torch.tensor([63.5, 47.5]), atol=5e-3)
+    standing = camera().unproject(depth_m)
+    assert float((view.unproject(depth_m) - standing).norm(dim=-1).max()) > 0.1
 
 
 def test_resized_camera_sees_the_same_relative_position():
