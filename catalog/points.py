@@ -15,6 +15,8 @@ from catalog.tables import Row
 
 JUDGING = ("evaluate", "envelope", "examine", "report")
 """Stages that look at a scene and make nothing of it."""
+UNPAINTED = "unpainted"
+"""The variant of numbers that are of the first fit."""
 FINAL = ("painted", "refined")
 """Variants of numbers that are of the scene at the end of its run."""
 
@@ -70,7 +72,7 @@ def points_of(store: Store, fleet: str) -> tuple[list[Point], list[Row]]:
             cost=_cost(results[row["run_id"]], sizes[scenes[row["run_id"]]]),
             metrics={
                 name: value
-                for variant in FINAL
+                for variant in _at_end(runs[row["run_id"]])
                 for name, value in judged[row["run_id"]].get(variant, {}).items()
             },
             by_variant=judged[row["run_id"]],
@@ -89,9 +91,17 @@ def _chosen(store: Store, table: str, **wanted: Iterable[str]) -> list[Row]:
     return found.to_pylist()
 
 
+def _scenes(run: Row) -> list[str]:
+    return [one for one in run["artefacts"] if ArtefactRef.of_id(one).kind == "gaussians"]
+
+
 def _last_scene(run: Row) -> str:
-    fitted = [one for one in run["artefacts"] if ArtefactRef.of_id(one).kind == "gaussians"]
-    return str(fitted[-1])
+    return _scenes(run)[-1]
+
+
+def _at_end(run: Row) -> tuple[str, ...]:
+    """Variants of numbers that are of its last scene; without a round that is the first fit."""
+    return (UNPAINTED, *FINAL) if len(_scenes(run)) == 1 else FINAL
 
 
 def _suspicions(result: Mapping[str, Any]) -> tuple[str, ...] | None:

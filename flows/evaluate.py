@@ -46,8 +46,8 @@ def evaluate_run(store: Store, request: EvaluationRequest) -> dict[str, Any]:
 
     Returns:
         `run_id`, `scene`, `protocol`, and the scores by variant (for flicker by shift):
-        `unpainted` after the first fit; at the end, which without a round is the same scene,
-        `painted`, or `refined` where the run had no painter; `view-time` if asked for.
+        `unpainted` after the first fit; after the last round `painted`, or `refined` where the
+        run had no painter; `view-time` if asked for.
 
     Raises:
         UnknownRecordError: there is no such run, or it did not complete.
@@ -78,7 +78,8 @@ def _variants(
     judged: dict[str, FittedRef] = {}
     if finished.derived_from is None:
         judged["unpainted"] = finished.unpainted
-    judged[fitted_on(parameters.painter)] = finished.final
+    if finished.derived_from is not None or finished.final != finished.unpainted:
+        judged[fitted_on(parameters.painter)] = finished.final
     if request.is_painted or request.painter:
         judged["view-time"] = finished.final
     judge = evaluate_strips if request.protocol == CROSS_CAMERA else evaluate

@@ -83,10 +83,3 @@ def test_gain_of_painting_is_that_of_the_delivered_files(stereo_run, tmp_path):
         gain_db, abs=0.05
     )
     assert painted["psnr"] - plain["psnr"] == pytest.approx(gain_db, abs=0.3)  # calibrated
-
-
-def test_without_a_round_the_scene_at_the_end_is_judged_as_the_first_fit(stereo_run):
-    store, run_id = stereo_run
-    words = ("evaluate", run_id, "--protocol", "cross-camera", "--json")
-    judged = succeed(*words, store=store).json
-    assert judged["painted"] == judged["unpainted"]
