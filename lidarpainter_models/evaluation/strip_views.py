@@ -9,15 +9,22 @@ from torch import Tensor
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.judged_views import Renderer
 from lidarpainter_models.evaluation.shown import ShownScene
-from lidarpainter_models.evaluation.strips import StripView, calibrate_strip, score_strips
+from lidarpainter_models.evaluation.strips import (
+    StripView,
+    calibrate_strip,
+    score_strips,
+    strip_mask,
+)
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.lidar.sparse_depth import FramePoints
 from lidarpainter_models.observations.fit_size import fit_camera
-from lidarpainter_models.scenes.splits import ViewSplit
+from lidarpainter_models.scenes.splits import ViewSplit, evenly_taken
+
+COMPARED_FRAMES = 3
+"""Frames in which a judging camera looks for its neighbour: the rig does not change."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -28,43 +35,62 @@ class StripJudgement:
     views: ViewSplit
 
     @property
-    def fitted_camera(self) -> str:
-        """The camera that the others are held against."""
-        return self.views.train[0].camera_name
+    def fitted_cameras(self) -> tuple[str, ...]:
+        """The scene's cameras that the fit has seen."""
+        fitted = {view.camera_name for view in self.views.train}
+        return tuple(name for name in self.held_out.scene.camera_names if name in fitted)
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """The scene's cameras that no fit has seen."""
-        fitted = {view.camera_name for view in self.views.train}
+        fitted = self.fitted_cameras
         return tuple(name for name in self.held_out.scene.camera_names if name not in fitted)
 
     def scores(self, shown: ShownScene, progress: Callable[[int, int], None]) -> dict[str, Any]:
-        """Every camera's scores in the colours of the fitted one, or why there are none."""
-        scores, shows = {}, shown.renderer(self.fitted_camera)
+        """Every camera's scores in the colours of its neighbour, or why there are none."""
+        scores = {}
+        for done, name in enumerate(self.cameras, start=1):
+            scores[name] = self._score(shown, name)
+            progress(done, len(self.cameras))
+        return scores
+
+    def neighbour(self, fitted: GaussianScene, camera: str) -> str:
+        """The fitted camera that sees most of what a judging camera sees, in a few frames."""
+        frames = tuple(evenly_taken(self.views.train_frames, COMPARED_FRAMES))
+
+        def num_shared(name: str) -> int:
+            views = self._strip(fitted, camera, name, frames)
+            return sum(int(strip_mask(view).sum()) for view in views)
+
+        return max(self.fitted_cameras, key=num_shared)
+
+    def _score(self, shown: ShownScene, camera: str) -> dict[str, Any]:
+        neighbour = self.neighbour(shown.scene, camera)
+        shows = shown.renderer(neighbour)
 
         def render(camera: Camera, timestamp_ns: int) -> Float[Tensor, "height width 3"]:
             return shows(camera, timestamp_ns).cpu()  # strips are cut and turned there
 
-        for done, name in enumerate(self.cameras, start=1):
-            scores[name] = self._score(shown.scene, render, name)
-            progress(done, len(self.cameras))
-        return scores
-
-    def _score(self, fitted: GaussianScene, render: Renderer, camera: str) -> dict[str, Any]:
         def views_of(frames: tuple[int, ...]) -> list[StripView]:
-            return strip_views(
-                self.held_out,
-                fitted,
-                judging_camera=camera,
-                fitted_camera=self.fitted_camera,
-                frames=frames,
-            )
+            return self._strip(shown.scene, camera, neighbour, frames)
 
         try:
             calibration = calibrate_strip(render, views_of(self.views.train_frames))
-            return asdict(score_strips(render, views_of(self.views.test_frames), calibration))
+            scores = score_strips(render, views_of(self.views.test_frames), calibration)
         except DataError as error:
-            return {"psnr": None, "psnr_reason": str(error)}
+            return {"psnr": None, "psnr_reason": str(error), "fitted_camera": neighbour}
+        return asdict(scores) | {"fitted_camera": neighbour}
+
+    def _strip(
+        self, fitted: GaussianScene, camera: str, neighbour: str, frames: tuple[int, ...]
+    ) -> list[StripView]:
+        return strip_views(
+            self.held_out,
+            fitted,
+            judging_camera=camera,
+            fitted_camera=neighbour,
+            frames=frames,
+        )
 
 
 def strip_views(

@@ -3,6 +3,7 @@
 The scene that is judged is the street itself: whatever error is left is the judging's own.
 """
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -12,12 +13,14 @@ from gaussian_world import scene_trained_on
 from tiny_street import FRONT, NUM_FRAMES, SIDE, SIDE_GAIN, tiny_street
 
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.strip_views import strip_views
+from lidarpainter_models.evaluation.strip_views import StripJudgement, strip_views
 from lidarpainter_models.evaluation.strips import calibrate_strip, score_strips, strip_mask
 from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_tangent
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.synthetic import record_street
+from lidarpainter_models.scenes.splits import split_views
+from lidarpainter_models.synthetic import RigCamera, record_street
+from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
 
 WIDTH_PX = 160
 MOUNT_RAD = (0.012, -0.018, 0.009)
@@ -95,3 +98,18 @@ def test_a_strip_is_what_both_cameras_see(street, views):
     pixels_uv, other_m = view.fitted_camera.project(points_world.reshape(-1, 3))
     seen = view.fitted_camera.contains(pixels_uv, other_m)
     assert float(seen.float().mean()) > 0.9
+
+
+def test_a_camera_judges_beside_the_fitted_one_that_sees_most_of_what_it_does(tmp_path):
+    back = RigCamera(name="back_camera", focal_per_width=0.8, yaw_rad=math.pi)
+    left = RigCamera(name="left_camera", focal_per_width=0.8, yaw_rad=1.0)
+    right = RigCamera(name=SIDE, focal_per_width=0.8, yaw_rad=-0.35)
+    rig = tiny_street(cameras=(back, left, DEFAULT_CAMERAS[0], right))
+    scene = DrivingScene.open(record_street(drawn_street(rig), tmp_path))
+    seen = split_views(scene, "alternate", ("back_camera", "left_camera", FRONT))
+    held_out = HeldOut(
+        scene=scene, test_views=seen.test, observation=ObservationConfig(width_px=96)
+    )
+    judgement = StripJudgement(held_out=held_out, views=seen)
+    assert judgement.fitted_cameras == ("back_camera", "left_camera", FRONT)
+    assert judgement.neighbour(scene_trained_on(list(seen.train)), SIDE) == FRONT
