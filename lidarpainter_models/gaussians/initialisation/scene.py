@@ -22,6 +22,7 @@ from lidarpainter_models.gaussians.initialisation.surfels import (
     SPACING_SIGMA,
     fill_colours,
     surfels_from_points,
+    within_outlines,
 )
 from lidarpainter_models.gaussians.initialisation.unreached import MOST_SHARE, unreached_gaussians
 from lidarpainter_models.gaussians.model.actors import Actors
@@ -36,6 +37,7 @@ from lidarpainter_models.lidar.map_building import LEAST_WAY_M
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
 from lidarpainter_models.scenes.categories import category_of
 from lidarpainter_models.scenes.driving_scene import ActorTrack
+from lidarpainter_models.scenes.splits import evenly_taken
 
 LEAST_UNSEEN_POINTS = 3
 """Voxels with fewer points that only a camera moved aside would see are dropped."""
@@ -56,6 +58,8 @@ ASIDE_M = 3.5
 MOST_VIEWS_PER_CAMERA = 60
 """Views that tell where the street is seen and how finely; those between see the same, and asking
 every point for every view would take the square of a log's length."""
+OUTLINE_VIEWS_PER_CAMERA = 8
+"""Views that tell what stands against the sky."""
 MOST_STREET_POINTS = 5_000_000
 """Of the street's points so many are looked at, evenly: dozens for each Gaussian."""
 _MOST_VIEWS_PER_ACTOR = 24
@@ -198,6 +202,16 @@ def _spread_cameras(views: Sequence[TrainingView]) -> tuple[list[Camera], list[i
     return [camera for camera, _ in chosen], [images for _, images in chosen]
 
 
+def _some_of_each_camera(views: Sequence[TrainingView]) -> list[TrainingView]:
+    """A few views of each camera, evenly over the log."""
+    by_camera: dict[str, list[TrainingView]] = {}
+    for view in views:
+        by_camera.setdefault(view.key[1], []).append(view)
+    return [
+        view for own in by_camera.values() for view in evenly_taken(own, OUTLINE_VIEWS_PER_CAMERA)
+    ]
+
+
 def _on_surfaces(
     observations: SceneObservations,
     config: InitialisationConfig,
@@ -228,7 +242,10 @@ def _on_surfaces(
         if int(in_sight.sum()) >= LEAST_ACTOR_POINTS:
             clouds[index] = _cloud(points, spacing_m, in_sight, ACTOR_VOXEL_M)
     seen = adaptive_voxels(list(clouds.values()), budget=max(budget - for_aside, 1))
-    gaussians = _surfels([seen[0], aside], [2.0, SPACING_SIGMA], config)
+    gaussians = within_outlines(
+        _surfels([seen[0], aside], [2.0, SPACING_SIGMA], config),
+        _some_of_each_camera(observations.views),
+    )
     for body, voxels in zip(list(clouds)[1:], seen[1:], strict=True):
         gaussians = gaussians.append(_surfels([voxels], [2.0], config, body=body))
     return gaussians

@@ -2,7 +2,15 @@ from dataclasses import replace
 
 import pytest
 import torch
-from gaussian_world import FRAME_NS, HEIGHT_PX, WIDTH_PX, camera_at, car_track, map_points
+from gaussian_world import (
+    FRAME_NS,
+    HEIGHT_PX,
+    WIDTH_PX,
+    camera_at,
+    car_track,
+    map_points,
+    scene_of,
+)
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.initialisation.adaptive_voxels import (
@@ -19,9 +27,11 @@ from lidarpainter_models.gaussians.initialisation.settings import Initialisation
 from lidarpainter_models.gaussians.initialisation.surfels import (
     fill_colours,
     surfels_from_points,
+    within_outlines,
 )
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 from lidarpainter_models.lidar.lidar_map import LidarMap
+from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.scenes.camera_faults import CameraFault
 
 
@@ -97,6 +107,42 @@ def test_surfel_shows_its_colour():
     rgb = torch.rand(50, 3)
     gaussians = surfels_from_points(plane(50), rgb)
     assert torch.allclose(gaussians.base_rgb, rgb, atol=1e-6)
+
+
+def test_a_wire_hides_no_tower_behind_it():
+    """Its points lie 3 m apart, 20 m ahead, in an image of sky but for a tower and the wire."""
+    camera = camera_at(0.0, width_px=96, height_px=64)
+    y_m = torch.arange(-9.0, 9.1, 3.0)
+    wire_m = torch.stack([torch.full_like(y_m, 20.0), y_m, torch.full_like(y_m, 5.0)], dim=1)
+    row = int(camera.project(wire_m)[0][0, 1])
+    surface = torch.zeros(64, 96, dtype=torch.bool)
+    surface[row] = True
+    surface[row - 15 :, 40:56] = True
+    view = TrainingView(
+        key=(0, "front"),
+        camera=camera,
+        timestamp_ns=0,
+        rgb_u8=torch.zeros(64, 96, 3, dtype=torch.uint8),
+        sky_mask=~surface,
+        lidar_depth_m=torch.zeros(64, 96),
+    )
+    discs = surfels_from_points(wire_m, torch.full((7, 3), 0.3))
+    within = within_outlines(discs, [view])
+    tower = surface.clone()
+    tower[row - 2 : row + 3] = False
+    share_hidden = {
+        name: float((scene_of(one, [camera]).render(camera, 0).alpha > 0.1)[tower].float().mean())
+        for name, one in (("discs", discs), ("within", within))
+    }
+    assert share_hidden["discs"] > 0.5
+    assert share_hidden["within"] < 0.2
+    depth_m = camera.project(within.means)[1]
+    sigma_px = within.scale_m[:, 2] / depth_m * camera.fx_px
+    on_tower = y_m.abs() < 2
+    assert float(sigma_px[~on_tower].max()) == pytest.approx(0.7, abs=1e-3)
+    assert 1 < float(sigma_px[on_tower]) < 5
+    free = replace(view, sky_mask=torch.zeros_like(surface))
+    assert torch.equal(within_outlines(discs, [free]).log_scale, discs.log_scale)
 
 
 def test_points_without_colour_take_that_of_their_neighbours():
