@@ -2,14 +2,14 @@
 
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from fleet_wishes import wish
 
 from catalog.attempts import MAX_TRIES, Ending
 from catalog.errors import UnknownRecordError
-from catalog.fleets import FleetLedger, Wish
+from catalog.fleets import FleetLedger
 from catalog.leases import FolderObjects, Leases
 from catalog.store import open_store
 
@@ -28,22 +28,6 @@ while waiting := [row for row in ledger.rows("night") if row["state"] == "waitin
             break
     time.sleep(0.01)
 """
-
-
-def wish(scene="x/one", **changes):
-    usual = Wish(
-        fleet="night",
-        scene_id=scene,
-        cameras=None,
-        position=0,
-        priority=0,
-        variants=(),
-        asked="{}",
-        asked_digest="as asked",
-        code_digest="the code",
-        budget="{}",
-    )
-    return replace(usual, **changes)
 
 
 class Clock:

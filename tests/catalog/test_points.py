@@ -3,9 +3,10 @@
 import json
 
 import pytest
+from fleet_wishes import wish
 
 from catalog.attempts import Ending
-from catalog.fleets import FleetLedger, Wish
+from catalog.fleets import FleetLedger
 from catalog.points import points_of
 from catalog.store import open_store
 
@@ -30,19 +31,7 @@ def point_of(store, *, fitted, judged):
     ]
     store.tables.merge("metrics", scores)
     ledger = FleetLedger(store)
-    wish = Wish(
-        fleet="night",
-        scene_id="x/one",
-        cameras=None,
-        position=0,
-        priority=0,
-        variants=(),
-        asked="{}",
-        asked_digest="as asked",
-        code_digest="the code",
-        budget="{}",
-    )
-    ledger.ask([wish])
+    ledger.ask([wish()])
     lease = ledger.take(ledger.rows("night")[0], {})
     assert ledger.end(lease, Ending(cause="done", run_id="run", seconds=2.0))
     (point,), missing = points_of(store, "night")
