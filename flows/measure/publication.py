@@ -46,6 +46,8 @@ from tasks.opened import open_scene
 
 PAPER = "paper"
 """The protocol of what is under no other."""
+ON_REQUEST = {CROSS_CAMERA, FLICKER}
+"""Protocols that no run is judged by as it ends."""
 VIEW_TIME = "view-time"
 DIGITS = 8
 """Of a figure in the record."""
@@ -119,7 +121,7 @@ class Publisher:
             if why is not None:
                 reasons[fleet.name] = why
                 self.say(f"{fleet.name}: {why}")
-            if self._judge(made, own):
+            if judge(self.store, made, own, weights=self.weights, say=self.say):
                 made = _by_name(fleet, points_of(self.store, fleet.name)[0])
             points |= made
         found, left = {}, {}
@@ -147,28 +149,6 @@ class Publisher:
             say=self.say,
         )
         return _by_name(fleet, points), undone(points, missing) if missing else None
-
-    def _judge(self, points: Mapping[str, Point], cells: Iterable[Cell]) -> bool:
-        """Judge runs by what cells ask of them and they have not; whether there was any."""
-        lacking: dict[tuple[str, str], bool] = {}
-        for cell in cells:
-            for name in cell.points:
-                for protocol in _lacking(points.get(name), cell):
-                    at_view_time = lacking.get((name, protocol), False)
-                    lacking[name, protocol] = at_view_time or cell.variant == VIEW_TIME
-        for (name, protocol), is_painted in lacking.items():
-            self.say(f"{name}: judged by {protocol}{', painted at view time' * is_painted}")
-            request = EvaluationRequest(
-                run=points[name].run_id,
-                protocol=protocol,
-                is_painted=is_painted,
-                changes=self.weights,
-            )
-            try:
-                evaluate_run(self.store, request)
-            except (LidarPainterError, CatalogError) as error:
-                self.say(f"{name}: {error}")
-        return bool(lacking)
 
     def _figures(
         self,
@@ -213,6 +193,38 @@ class Publisher:
         }
 
 
+def judge(
+    store: Store,
+    points: Mapping[str, Point],
+    cells: Iterable[Cell],
+    *,
+    weights: Mapping[str, Any],
+    say: Callable[[str], None],
+) -> bool:
+    """Judge points by what cells ask of them; whether there was anything to ask.
+
+    Runs judge themselves by what they are judged by as they end. The rest is asked each time:
+    what the judging code of now has judged before is taken as it is, what older code said is
+    replaced.
+    """
+    asked: dict[tuple[str, str], bool] = {}
+    for cell in cells:
+        for name in cell.points:
+            for protocol in _asked(points.get(name), cell):
+                at_view_time = asked.get((name, protocol), False)
+                asked[name, protocol] = at_view_time or cell.variant == VIEW_TIME
+    for (name, protocol), is_painted in asked.items():
+        say(f"{name}: judged by {protocol}{', painted at view time' * is_painted}")
+        request = EvaluationRequest(
+            run=points[name].run_id, protocol=protocol, is_painted=is_painted, changes=weights
+        )
+        try:
+            evaluate_run(store, request)
+        except (LidarPainterError, CatalogError) as error:
+            say(f"{name}: {error}")
+    return bool(asked)
+
+
 def _by_name(fleet: Fleet, points: Iterable[Point]) -> dict[str, Point]:
     return {
         point_name(fleet.name, point.configuration, point.scene, point.seed): point
@@ -220,16 +232,18 @@ def _by_name(fleet: Fleet, points: Iterable[Point]) -> dict[str, Point]:
     }
 
 
-def _lacking(point: Point | None, cell: Cell) -> set[str]:
-    """The protocols under which a point has not all figures of a cell."""
+def _asked(point: Point | None, cell: Cell) -> set[str]:
+    """The protocols that a point is to be judged under for a cell."""
     if point is None:
         return set()
-    names = [measured_as(figure) for figure in cell.figures]
-    unknown = [
-        name for name in names if name not in COSTS and figure_of(point, name, cell.variant) is None
-    ]
-    protocols = {protocol for name in unknown for protocol, _, _ in metric_names(name)}
-    return {one if one in (CROSS_CAMERA, FLICKER) else PAPER for one in protocols}
+    asked = set()
+    for figure in map(measured_as, cell.figures):
+        protocols = {protocol for protocol, _, _ in metric_names(figure)}
+        is_known = figure in COSTS or figure_of(point, figure, cell.variant) is not None
+        asked |= protocols & ON_REQUEST
+        if not is_known and protocols - ON_REQUEST:
+            asked.add(PAPER)
+    return asked
 
 
 def _runs_in(record: Mapping[str, Figures]) -> dict[str, Mapping[str, Any]]:

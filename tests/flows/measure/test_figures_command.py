@@ -1,13 +1,16 @@
 """`lidarpainter figures` makes what a table lacks, once, and leaves what it cannot fill."""
 
 import json
+from dataclasses import replace
 
 import pytest
 from commands import call, succeed
 from toy_store import SMALL, TOY_SCENE, write_toy_scene
 
+from catalog.points import Point
 from catalog.store import open_store
-from flows.measure.figure_manifest import read_figure_manifest
+from flows.measure.figure_manifest import Cell, read_figure_manifest
+from flows.measure.publication import judge
 from flows.measure.tables import marked_tables, read_record, rendered
 
 MANIFEST = f"""
@@ -131,3 +134,32 @@ def test_runs_are_made_judged_and_shown_once(tmp_path):
     assert len(store.tables.rows("runs")) == 2
     assert "to be made" not in again.err
     assert "judged" not in again.err
+
+
+def test_strips_that_other_code_judged_are_judged_again(own_run):
+    store, name, figure = own_run.store, "one", "cross-camera/side/psnr"
+    point = Point(
+        scene=own_run.result["scene"],
+        configuration="way",
+        seed=0,
+        run_id=own_run.run_id,
+        cost={},
+        metrics={},
+    )
+    cell = Cell(table="table", fleet="fleet", points=(name,), variant="final", figures=(figure,))
+    said = []
+
+    def strips():
+        rows = store.tables.rows("metrics")
+        return {row["metric_id"]: row for row in rows if row["protocol"] == "cross-camera"}
+
+    def judged(metrics):
+        known = replace(point, metrics=metrics)
+        assert judge(store, {name: known}, [cell], weights={}, say=said.append)
+        return strips()
+
+    first = judged({})
+    assert any(row["value"] for row in first.values())
+    store.tables.merge("metrics", [{**row, "value": 1.0} for row in first.values()])
+    assert judged({("cross-camera", "side", "psnr"): 1.0}) == first
+    assert said == [f"{name}: judged by cross-camera"] * 2
