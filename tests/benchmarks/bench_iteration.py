@@ -114,7 +114,8 @@ class Fit:
     def __init__(self, count, width_px, height_px, *, blocks=1, start_step=100):
         scene, cameras = street_scene(count, width_px, height_px, blocks=blocks)
         self.config = FitConfig(steps=10_000, refinement=RefinementConfig(start_step=start_step))
-        self.state = FitState.begin(scene, self.config)
+        self.pixels = width_px * height_px
+        self.state = FitState.begin(scene, self.config, self.pixels)
         self.images = training_images(cameras)
         self.view = 0
 

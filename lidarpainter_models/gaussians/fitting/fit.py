@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from statistics import fmean
 
 import torch
 
@@ -118,6 +119,7 @@ def fit_gaussians(  # noqa: PLR0913 - what was recorded, and one option each
     device = device or (start.device if start is not None else torch.device("cpu"))
     street = observations.lidar_map.street.xyz_m if observations.is_estimated else None
     surface = seen_surface(observations.views, street)
+    pixels = fmean(view.camera.width_px * view.camera.height_px for view in observations.views)
     config = planned_fit(config, surface)
     if device.type == "cpu":
         config = within_limit(
@@ -133,9 +135,9 @@ def fit_gaussians(  # noqa: PLR0913 - what was recorded, and one option each
     def attempt(spares: bool) -> FitResult:
         kept = checkpoints.load() if checkpoints is not None else None
         if kept is not None:
-            return steps(FitState.resume(*kept, config, device), keeps_images=not spares)
+            return steps(FitState.resume(*kept, config, pixels, device), keeps_images=not spares)
         first = start or _first_scene(observations, config, progress)
-        return steps(FitState.begin(first.to(device), config), keeps_images=not spares)
+        return steps(FitState.begin(first.to(device), config, pixels), keeps_images=not spares)
 
     what = "the fit: a lower densification.budget or a narrower observation.width_px takes less"
     return within_memory(attempt, device, what)

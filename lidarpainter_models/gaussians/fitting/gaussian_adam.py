@@ -11,7 +11,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from lidarpainter_models.gaussians.fitting.settings import LearningRates
-from lidarpainter_models.gaussians.model.gaussian_set import PARAMETERS, GaussianSet
+from lidarpainter_models.gaussians.model.gaussian_set import PARAMETERS, SH_CONSTANT, GaussianSet
 from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
 from lidarpainter_models.kernels.sparse_adam import (
     AdamState,
@@ -21,11 +21,10 @@ from lidarpainter_models.kernels.sparse_adam import (
     step_rows,
 )
 
-LEAST_COLOUR_GRADIENT = 1e-7
-"""Adam's epsilon for colours. The loss is a mean over the image, so a colour's gradient is the
-share of the image that its Gaussian fills. One that the recorded views barely show gets less than
-a whole step: Adam's normalisation would drive its colour by noise, and from the next lane it is in
-full view. Shapes do not need it; there it costs sharpness.
+COLOUR_PIXELS = 0.5
+"""A colour takes about half a step where its Gaussian fills this much of a pixel of a view. Adam's
+normalisation would drive one that the recorded views barely show as fast as all others, by noise,
+and from the next lane it is in full view. Shapes do not need it; there it costs sharpness.
 """
 LEAST_SHAPE_GRADIENT = 1e-15
 COLOURS = ("sh_dc", "sh_rest")
@@ -34,14 +33,17 @@ COLOURS = ("sh_dc", "sh_rest")
 class GaussianAdam:
     """Adam (Kingma and Ba, 2015) over the parameters of a Gaussian set."""
 
-    def __init__(self, gaussians: GaussianSet, rates: LearningRates) -> None:
-        """Start with empty moments."""
+    def __init__(
+        self, gaussians: GaussianSet, rates: LearningRates, pixels_per_view: float
+    ) -> None:
+        """Start with empty moments; views have so many pixels on average."""
+        least_colour_gradient = COLOUR_PIXELS * SH_CONSTANT / (3 * pixels_per_view)
         self.rates = rates
         self.state = AdamState.empty(
             len(gaussians),
             [value.shape[1:].numel() for value in gaussians.parameters().values()],
             [
-                LEAST_COLOUR_GRADIENT if name in COLOURS else LEAST_SHAPE_GRADIENT
+                least_colour_gradient if name in COLOURS else LEAST_SHAPE_GRADIENT
                 for name in PARAMETERS
             ],
             gaussians.means.device,

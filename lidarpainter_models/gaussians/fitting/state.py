@@ -56,7 +56,7 @@ class FitState:
     the host waits for the device whenever it reads."""
 
     @classmethod
-    def begin(cls, scene: GaussianScene, config: FitConfig) -> "FitState":
+    def begin(cls, scene: GaussianScene, config: FitConfig, pixels_per_view: float) -> "FitState":
         """A fit before its first step; takes its own copy of the scene."""
         scene = copy_scene(scene)
         scene = scene.with_gaussians(scene.gaussians.as_leaves())
@@ -64,7 +64,7 @@ class FitState:
         generator.manual_seed(config.seed)
         return cls(
             scene=scene,
-            gaussian_adam=GaussianAdam(scene.gaussians, config.learning_rates),
+            gaussian_adam=GaussianAdam(scene.gaussians, config.learning_rates, pixels_per_view),
             blocks=SpatialBlocks.of(scene.gaussians, config.learning_rates),
             refinement=Refinement.begin(scene, config),
             tally=GradientTally.zeros(scene.num_gaussians, scene.device),
@@ -150,11 +150,12 @@ class FitState:
         tensors: dict[str, Tensor],
         numbers: dict[str, Any],
         config: FitConfig,
+        pixels_per_view: float,
         device: torch.device | None = None,
     ) -> "FitState":
         """The state that `keep` described; where it was kept from does not matter."""
         scene = scene_from_arrays(ungroup_tensors(tensors, "scene"), numbers["scene"])
-        state = cls.begin(scene if device is None else scene.to(device), config)
+        state = cls.begin(scene if device is None else scene.to(device), config, pixels_per_view)
         state.gaussian_adam.load(ungroup_tensors(tensors, "gaussian_adam"))
         for name, adam in state.refinement.adams.items():
             adam.load(ungroup_tensors(tensors, name))

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from gaussian_world import FRAME_NS
+from gaussian_world import FRAME_NS, HEIGHT_PX, WIDTH_PX
 from strict_device import NAME, StrictTensor, most_held, strict_runs, waits
 
 from lidarpainter_models.errors import DeviceMemoryError
@@ -81,7 +81,9 @@ def test_a_fit_is_taken_up_on_another_device_than_it_was_left_on(world, device, 
 def test_a_step_makes_the_host_wait_no_oftener_than_it_says(world, device, bent):
     actors = world.scene.actors
     actors = Actors.uncorrected(actors.recorded_tracks, actors.knots_ns, bent)
-    state = FitState.begin(replace(world.scene, actors=actors).to(device), CONFIG)
+    state = FitState.begin(
+        replace(world.scene, actors=actors).to(device), CONFIG, WIDTH_PX * HEIGHT_PX
+    )
     image = full_image(world.observations.views[0]).to(device)
     painted = painted_view(world).to(device)
     state.step = 3  # corrections are refined by now, and actors are not looked at

@@ -101,7 +101,7 @@ def test_a_step_sees_what_only_the_first_row_shows(world):
     )
     read = as_read(world.scene.gaussians, bodies, view.camera, actors, view.timestamp_ns)
     shown = draw_gaussians(read, bodies, view.camera).visible
-    state = FitState.begin(world.scene, short_fit())
+    state = FitState.begin(world.scene, short_fit(), WIDTH_PX * HEIGHT_PX)
     fit_step(state, full_image(view), 0, None, short_fit(), None)
     assert torch.equal(state.tally.visits > 0, shown)
 
@@ -181,7 +181,7 @@ def test_pose_refinement_recovers_a_known_rotation(world):
 
 def with_guidance_gradients(world, view, config, perceptual=None):
     """A state and its leaves after the gradients of one painted view."""
-    state = FitState.begin(world.scene, config)
+    state = FitState.begin(world.scene, config, WIDTH_PX * HEIGHT_PX)
     poses = state.scene.actors.corrected_poses(view.timestamp_ns)
     bodies = camera_from_body(view.camera.world_from_camera, *poses)
     seen = state.seen([(view.camera, bodies)])

@@ -6,18 +6,20 @@ import torch
 from gaussian_world import round_gaussians
 
 from lidarpainter_models.gaussians.fitting.gaussian_adam import (
-    LEAST_COLOUR_GRADIENT,
+    COLOUR_PIXELS,
     LEAST_SHAPE_GRADIENT,
     GaussianAdam,
 )
 from lidarpainter_models.gaussians.fitting.settings import LearningRates
-from lidarpainter_models.gaussians.model.gaussian_set import PARAMETERS, GaussianSet
+from lidarpainter_models.gaussians.model.gaussian_set import PARAMETERS, SH_CONSTANT, GaussianSet
 from lidarpainter_models.gaussians.model.seen_gaussians import LEAVES
 
 BETAS = (0.9, 0.99)
 COLOURS = ("sh_dc", "sh_rest")
 EPS = dict.fromkeys(PARAMETERS, LEAST_SHAPE_GRADIENT)
-EPS |= dict.fromkeys(COLOURS, LEAST_COLOUR_GRADIENT)
+PIXELS = 160 * 90
+HALF_A_STEP = COLOUR_PIXELS * SH_CONSTANT / (3 * PIXELS)
+EPS |= dict.fromkeys(COLOURS, HALF_A_STEP)
 RATES = LearningRates()
 
 
@@ -103,7 +105,7 @@ def test_rows_out_of_view_move_as_a_dense_adam_moves_them(share):
     generator = torch.Generator().manual_seed(int(100 * share))
     start = some_gaussians(300, generator)
     gaussians, dense = start.as_leaves(), DenseAdam(start)
-    adam, steps = GaussianAdam(gaussians, RATES), 150
+    adam, steps = GaussianAdam(gaussians, RATES, PIXELS), 150
     for step in range(steps):
         is_seen = torch.rand(300, generator=generator) < share
         gradients = sparse_gradients(gaussians, is_seen, generator)
@@ -121,7 +123,7 @@ def test_a_row_left_alone_is_where_its_momentum_takes_it(missed, before):
     generator = torch.Generator().manual_seed(missed)
     start = some_gaussians(60, generator)
     gaussians, dense = start.as_leaves(), DenseAdam(start)
-    adam, steps = GaussianAdam(gaussians, RATES), before + missed
+    adam, steps = GaussianAdam(gaussians, RATES, PIXELS), before + missed
     everyone, nobody = torch.ones(60), torch.zeros(60)
     for step in range(steps):
         gradients = sparse_gradients(gaussians, everyone if step < before else nobody, generator)
@@ -144,7 +146,7 @@ def test_threads_change_no_bit():
             numba.set_num_threads(threads)
             generator = torch.Generator().manual_seed(5)
             gaussians = some_gaussians(500, generator).as_leaves()
-            adam = GaussianAdam(gaussians, RATES)
+            adam = GaussianAdam(gaussians, RATES, PIXELS)
             for step in range(12):
                 rows = (torch.rand(500, generator=generator) < 0.4).nonzero()[:, 0]
                 gradients = sparse_gradients(gaussians, torch.ones(500), generator)
@@ -159,7 +161,7 @@ def test_threads_change_no_bit():
 def test_looking_changes_nothing():
     generator = torch.Generator().manual_seed(0)
     gaussians = some_gaussians(20, generator).as_leaves()
-    adam, everyone = GaussianAdam(gaussians, RATES), torch.arange(20)
+    adam, everyone = GaussianAdam(gaussians, RATES, PIXELS), torch.arange(20)
     gradients = sparse_gradients(gaussians, torch.ones(20), generator)
     lazy_step(adam, gaussians, everyone, gradients, 0.0)
     for _ in range(5):
@@ -174,13 +176,13 @@ def test_looking_changes_nothing():
 def test_kept_state_goes_on_bit_for_bit():
     generator = torch.Generator().manual_seed(1)
     gaussians = some_gaussians(40, generator).as_leaves()
-    adam = GaussianAdam(gaussians, RATES)
+    adam = GaussianAdam(gaussians, RATES, PIXELS)
     for step in range(20):
         rows = (torch.rand(40, generator=generator) < 0.3).nonzero()[:, 0]
         gradients = sparse_gradients(gaussians, torch.ones(40), generator)
         lazy_step(adam, gaussians, rows, gradients, step / 20)
     copy = gaussians.select(torch.arange(40)).as_leaves()
-    resumed = GaussianAdam(copy, RATES)
+    resumed = GaussianAdam(copy, RATES, PIXELS)
     resumed.load({name: value.clone() for name, value in adam.tensors().items()})
     adam.catch_up(gaussians)
     resumed.catch_up(copy)
@@ -193,7 +195,7 @@ def test_centres_move_in_units_of_their_size():
     gaussians = round_gaussians(torch.zeros(2, 3), torch.rand(2, 3), sigma_m=0.1)
     gaussians.log_scale[1] = 0.0
     gaussians = gaussians.as_leaves()
-    adam = GaussianAdam(gaussians, LearningRates(means=(0.1, 0.01)))
+    adam = GaussianAdam(gaussians, LearningRates(means=(0.1, 0.01)), PIXELS)
     seen = adam.seen(gaussians, torch.arange(2))
     seen.means.grad = torch.ones(2, 3)
     adam.step(gaussians, seen, 0.0)
@@ -204,7 +206,7 @@ def test_centres_move_in_units_of_their_size():
 def test_parameters_without_gradient_stay():
     gaussians = some_gaussians(2, torch.Generator().manual_seed(2)).as_leaves()
     before = {name: value.clone() for name, value in gaussians.columns().items()}
-    adam = GaussianAdam(gaussians, RATES)
+    adam = GaussianAdam(gaussians, RATES, PIXELS)
     seen = adam.seen(gaussians, torch.arange(2))
     seen.sh.grad = torch.zeros_like(seen.sh)
     seen.sh.grad[:, 0] = 1.0
@@ -217,9 +219,9 @@ def test_parameters_without_gradient_stay():
 def test_colour_that_is_hardly_seen_moves_less_than_one_that_is():
     gaussians = some_gaussians(2, torch.Generator().manual_seed(3)).as_leaves()
     before = gaussians.sh_dc.detach().clone()
-    adam = GaussianAdam(gaussians, LearningRates(sh_dc=(0.01, 0.01)))
+    adam = GaussianAdam(gaussians, LearningRates(sh_dc=(0.01, 0.01)), PIXELS)
     seen = adam.seen(gaussians, torch.arange(2))
-    gradient = torch.tensor([LEAST_COLOUR_GRADIENT / 10, LEAST_COLOUR_GRADIENT * 100])
+    gradient = HALF_A_STEP * torch.tensor([0.1, 100.0])
     seen.sh.grad = torch.zeros_like(seen.sh)
     seen.sh.grad[:, 0] = gradient[:, None]
     adam.step(gaussians, seen, 0.0)
@@ -229,7 +231,7 @@ def test_colour_that_is_hardly_seen_moves_less_than_one_that_is():
 
 def test_moments_follow_their_rows():
     gaussians = some_gaussians(2, torch.Generator().manual_seed(4)).as_leaves()
-    adam = GaussianAdam(gaussians, RATES)
+    adam = GaussianAdam(gaussians, RATES, PIXELS)
     seen = adam.seen(gaussians, torch.arange(2))
     seen.means.grad = torch.tensor([[1.0] * 3, [2.0] * 3])
     adam.step(gaussians, seen, 0.0)
@@ -242,7 +244,7 @@ def test_moments_follow_their_rows():
 
 def test_empty_set_takes_steps():
     gaussians = GaussianSet.empty().as_leaves()
-    adam = GaussianAdam(gaussians, RATES)
+    adam = GaussianAdam(gaussians, RATES, PIXELS)
     adam.step(gaussians, adam.seen(gaussians, torch.arange(0)), 0.0)
     adam.catch_up(gaussians)
     assert len(gaussians) == 0

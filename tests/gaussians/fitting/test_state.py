@@ -75,7 +75,8 @@ def test_kept_state_goes_on_bit_for_bit(kept_at):
     tensors, numbers = copy.deepcopy(fit.state.keep())
     assert int(tensors["gaussian_adam/last"].min()) < kept_at  # some lag behind
     resumed = street_fit()
-    resumed.state, resumed.view = FitState.resume(tensors, numbers, fit.config), fit.view
+    resumed.state = FitState.resume(tensors, numbers, fit.config, fit.pixels)
+    resumed.view = fit.view
     steps_of(fit, 9), steps_of(resumed, 9)
     expected = parameters_of(fit)
     for name, value in parameters_of(resumed).items():
