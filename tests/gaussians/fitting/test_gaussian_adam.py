@@ -18,7 +18,18 @@ BETAS = (0.9, 0.99)
 COLOURS = ("sh_dc", "sh_rest")
 EPS = dict.fromkeys(PARAMETERS, LEAST_SHAPE_GRADIENT)
 PIXELS = 160 * 90
-HALF_A_STEP = COLOUR_PIXELS * SH_CONSTANT / (3 * PIXELS)
+
+
+def gradient_of_colour(filled_px):
+    """Of a mean absolute difference, by a colour that fills so much of a pixel of an image."""
+    colour = torch.ones(3, requires_grad=True)
+    shown = torch.zeros(PIXELS, 3).index_add(
+        0, torch.tensor([7]), filled_px * SH_CONSTANT * colour[None]
+    )
+    return float(torch.autograd.grad(shown.abs().mean(), colour)[0][0])
+
+
+HALF_A_STEP = gradient_of_colour(COLOUR_PIXELS)
 EPS |= dict.fromkeys(COLOURS, HALF_A_STEP)
 RATES = LearningRates()
 
