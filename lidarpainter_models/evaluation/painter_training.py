@@ -48,7 +48,7 @@ class TrainingRequest:
     lpips: LpipsFiles = NO_FILES
     """Weights for the loss of the one-step painter."""
     device: str = "cpu"
-    """Where the one-step painter is trained in one process."""
+    """Where a painter is trained in one process."""
     num_processes: int = 1
     """In which the one-step painter is trained, each on a GPU."""
 

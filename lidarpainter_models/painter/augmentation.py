@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.painter.batches import ConditionBatch, stack_conditions
+from lidarpainter_models.painter.batches import ConditionBatch, moved, stack_conditions
 from lidarpainter_models.painter.examples import PaintingPair, PairSource, Window
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT, PaintingConditions
 from lidarpainter_models.painter.render_damage import damage_render
@@ -71,11 +71,11 @@ class TrainingBatch(NamedTuple):
         return torch.tensor(styled, device=self.target.device)
 
     def to(self, device: torch.device) -> "TrainingBatch":
-        """The same batch on another device."""
+        """The same batch on another device; see `ConditionBatch.to`."""
         return self._replace(
             conditions=self.conditions.to(device),
-            target=self.target.to(device),
-            target_valid=self.target_valid.to(device),
+            target=moved(self.target, device),
+            target_valid=moved(self.target_valid, device),
         )
 
 

@@ -6,6 +6,7 @@ where there is none; masks are float, 1 where true. Warps beyond those a view ha
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -39,8 +40,20 @@ class ConditionBatch:
         return type(self)(**changed)
 
     def to(self, device: torch.device) -> "ConditionBatch":
-        """The same batch on another device."""
-        return self.map(lambda values: values.to(device))
+        """The same batch on another device; the host waits for it only on the CPU."""
+        return self.map(partial(moved, device=device))
+
+    def pin_memory(self) -> "ConditionBatch":
+        """The same batch in pinned memory; a loader of batches asks for it by this name."""
+        return self.map(lambda values: values.pin_memory())
+
+
+def moved(values: Tensor, device: torch.device) -> Tensor:
+    """The same numbers on another device; from pinned memory to a GPU the host goes on meanwhile.
+
+    On the way back it waits, or it would read what has not arrived.
+    """
+    return values.to(device, non_blocking=device.type != "cpu")
 
 
 def in_planes(conditions: PaintingConditions) -> PaintingConditions:

@@ -33,7 +33,7 @@ def job_for(
     """The job of a recipe; what it needs is checked, and not yet read whole.
 
     The start is weights to go on from, or for the one-step painter its model. The device is that of
-    a one-step painter in one process; the small one takes the CPU.
+    a training in one process.
 
     Raises:
         ConfigError: the one-step painter has no model, its loss lacks what it weighs, several
@@ -45,7 +45,7 @@ def job_for(
     if isinstance(config, NanoTrainingConfig):
         if num_processes > 1:
             raise ConfigError("the small painter is trained in one process")
-        return NanoJob(config, None if start is None else _first_nano(Path(start)))
+        return NanoJob(config, None if start is None else _first_nano(Path(start)), device)
     if start is None:
         raise ConfigError("the one-step painter is trained on a model: give --base")
     recipe = OneStepRecipe(start=str(start), config=config, lpips=lpips)

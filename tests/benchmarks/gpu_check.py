@@ -19,8 +19,8 @@ for _folder in ("support", "benchmarks"):
     sys.path.insert(0, str(Path(__file__).resolve().parents[1] / _folder))
 
 
-def check(model: str | None):
-    """Everything; takes minutes on a GPU."""
+def check(model: str | None, out: Path | None):
+    """Everything; takes minutes on a GPU. What is found is written part by part."""
     import torch
 
     has_gpu = torch.cuda.is_available()
@@ -46,10 +46,16 @@ def check(model: str | None):
         lambda *given: measure_painters(*given, model),
     ):
         part(findings, device)
+        findings.machine["took"] = f"{time.perf_counter() - started:.0f} s"
+        _write(findings, out)
     if not has_gpu:
         findings.unchecked.append("every figure of a GPU: none is here")
-    findings.machine["took"] = f"{time.perf_counter() - started:.0f} s"
     return findings
+
+
+def _write(findings, out: Path | None) -> None:
+    if out is not None:
+        out.write_text(findings.page(), "utf-8")
 
 
 def main() -> int:
@@ -57,11 +63,9 @@ def main() -> int:
     parser.add_argument("--out", type=Path, help="where the page goes as well")
     parser.add_argument("--model", help="a model in diffusers' layout; random weights without it")
     options = parser.parse_args()
-    findings = check(options.model)
-    page = findings.page()
-    sys.stdout.write(page)
-    if options.out is not None:
-        options.out.write_text(page, "utf-8")
+    findings = check(options.model, options.out)
+    sys.stdout.write(findings.page())
+    _write(findings, options.out)
     return 0 if findings.is_fit else 1
 
 

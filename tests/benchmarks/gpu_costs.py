@@ -16,10 +16,13 @@ import kernel_trials
 import torch
 from gpu_findings import Cost, Findings
 from random_conditions import random_conditions
+from smooth_pairs import MemoryPairs, smooth_pair
 
 import lidarpainter_models as lp
 from lidarpainter_models.errors import WeightsError
 from lidarpainter_models.kernels.backends import available_backends
+from lidarpainter_models.painter.augmentation import AugmentationConfig
+from lidarpainter_models.painter.nano.training import NanoTrainingConfig, train_nano
 from lidarpainter_models.painter.selection import PainterChoice
 from tasks.measuring import measured
 
@@ -86,18 +89,12 @@ def measure_stages(findings: Findings, device: torch.device) -> None:
         fitted = lp.fit_gaussians(seen, config, device=device).scene
         name = f"{size['width_px']}x{size['height_px']}"
 
-        def add(what: str, run: Callable[[], object], repeats: int, share: float = 1.0) -> None:
+        def add(what: str, run: Callable[[], object], repeats: int, of: int = 1) -> None:
             cost = cost_of(f"{what}, {name}", run, device, repeats)
-            scaled = Cost(
-                what=cost.what,
-                first_ms=share * cost.first_ms,
-                ms=share * cost.ms,
-                peak_bytes=cost.peak_bytes,
-            )
-            findings.costs.append(scaled)
+            findings.costs.append(cost.of_one(of))
 
         again = partial(lp.fit_gaussians, seen, config, start=fitted, device=device)
-        add(f"a step of a fit, {len(fitted.gaussians)} Gaussians", again, 1, 1 / steps)
+        add(f"a step of a fit, {len(fitted.gaussians)} Gaussians", again, 1, steps)
         view = seen.views[1]
         add("render", partial(fitted.render, view.camera, view.timestamp_ns), 5)
         aside = lp.camera_beside(fitted, scene, view, lp.Shift(lateral_m=2.0))
@@ -122,6 +119,7 @@ def measure_painters(findings: Findings, device: torch.device, model: str | None
         painter = PainterChoice.of("nano").load(device)
         run = partial(painter.paint, known)
         findings.painters.append(cost_of(f"nano, {size}", run, device, 5))
+    measure_training(findings, device)
     for preset in PRESETS:
         if find_spec("diffusers") is None:
             findings.unchecked.append(f"painter {preset}: diffusers is not installed")
@@ -132,6 +130,20 @@ def measure_painters(findings: Findings, device: torch.device, model: str | None
             what = f"{preset} ({weights}), {size}"
             findings.painters.append(cost_of(what, run, device, 5))
             del painter, run
+
+
+def measure_training(findings: Findings, device: torch.device) -> None:
+    """A step of training the small painter, batches drawn as in a real training."""
+    side_px, batch, steps = (192, 32, 40) if device.type == "cuda" else (32, 2, 4)
+    source = MemoryPairs([smooth_pair(side_px, seed) for seed in range(4)])
+    recipe = NanoTrainingConfig(
+        augmentation=AugmentationConfig(crop_px=side_px), batch_size=batch, steps=steps
+    )
+    with findings.part("training of nano"):
+        train = partial(train_nano, [source], recipe, device=device)
+        what = f"a training step of nano, {batch} windows of {side_px} px"
+        cost = cost_of(what, train, device, 2)
+        findings.painters.append(cost.of_one(steps))
 
 
 def one_step_painter(preset, device, model):

@@ -1,8 +1,9 @@
 """What a check of the GPU found, and the page that it makes of it."""
 
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 PAPER_MS, PAPER_GB = 870, 10.5
 """Of the paper's painter at 1024x576, as its authors measured it."""
@@ -34,6 +35,10 @@ class Cost:
     peak_bytes: int
     """Largest allocation of torch on the GPU; on the CPU the resident set of the process."""
 
+    def of_one(self, steps: int) -> "Cost":
+        """What one of some equal steps takes."""
+        return replace(self, first_ms=self.first_ms / steps, ms=self.ms / steps)
+
 
 @dataclass(kw_only=True)
 class Findings:
@@ -53,6 +58,7 @@ class Findings:
         try:
             yield
         except Exception as error:  # noqa: BLE001 - it must come to its end on any machine
+            traceback.print_exc()
             lines = str(error).splitlines() or [""]
             self.failed.append(f"{what}: {type(error).__name__}: {lines[0]}")
 

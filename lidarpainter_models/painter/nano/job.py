@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from lidarpainter_models.painter.examples import PairSource
 from lidarpainter_models.painter.nano.painter import NanoPainter
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig, train_nano
@@ -19,9 +21,11 @@ class NanoJob:
 
     name = "nano"
 
-    def __init__(self, config: NanoTrainingConfig, first: NanoPainter | None) -> None:
-        """Take the recipe and the painter to go on from."""
-        self._config = config
+    def __init__(
+        self, config: NanoTrainingConfig, first: NanoPainter | None, device: torch.device
+    ) -> None:
+        """Take the recipe, the painter to go on from, and where to train."""
+        self._config, self._device = config, device
         self._start = None if first is None else first.network
         self._trained = self._start
         self.first_provenance: Mapping[str, Any] | None = None
@@ -44,7 +48,12 @@ class NanoJob:
     def train(self, sources: Sequence[PairSource], folder: Path, told: Told) -> dict[str, Any]:
         """See `TrainingJob`."""
         result = train_nano(
-            sources, self._config, start=self._start, checkpoint_folder=folder, progress=told
+            sources,
+            self._config,
+            start=self._start,
+            checkpoint_folder=folder,
+            progress=told,
+            device=self._device,
         )
         self._trained = result.network
         return result.record

@@ -10,8 +10,10 @@ step that one process takes with two accumulated batches, up to the order of a s
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ from torch import Tensor
 from lidarpainter_models.errors import ConfigError, DataError, TrainingError
 from lidarpainter_models.painter.augmentation import TrainingBatch, draw_batch
 from lidarpainter_models.painter.examples import PairSource
+from lidarpainter_models.painter.training.batch_stream import batches_in_order
 from lidarpainter_models.painter.training.checkpoints import (
     CHECKPOINT_NAME,
     TrainingState,
@@ -83,9 +86,15 @@ def run_training(
         read_checkpoint(path, state, digest)
     processes.meet()  # all have read before the first one writes
     writes = path if processes.index == 0 else None
+    batches = batches_in_order(
+        partial(_draw, sources, shares, trainee.num_warps, trainee.prompts, config),
+        state.device,
+        first=state.step * config.accumulated_batches * processes.count + processes.index,
+        every=processes.count,
+    )
     clock = _Clock(state.cpu_s)
     while config.share_done(state.step, state.cpu_s) < 1:
-        losses = _step(trainee, state, sources, shares, config, processes)
+        losses = _step(trainee, state, batches, config, processes)
         state.step += 1
         state.cpu_s = clock.cpu_s()
         _log(trainee, state, losses, config, progress)
@@ -137,19 +146,20 @@ def source_shares(sources: Sequence[PairSource], config: TrainingConfig) -> list
 
 
 def _draw(
-    trainee: Trainee,
     sources: Sequence[PairSource],
     shares: list[float],
-    number: int,
+    num_warps: int,
+    prompts: Sequence[str],
     config: TrainingConfig,
+    number: int,
 ) -> TrainingBatch:
     generator = torch.Generator().manual_seed((config.seed << 32) + number)
     return draw_batch(
         sources,
         shares,
         batch_size=config.batch_size,
-        num_warps=trainee.num_warps,
-        prompts=trainee.prompts,
+        num_warps=num_warps,
+        prompts=prompts,
         config=config.augmentation,
         generator=generator,
     )
@@ -158,8 +168,7 @@ def _draw(
 def _step(
     trainee: Trainee,
     state: TrainingState,
-    sources: Sequence[PairSource],
-    shares: list[float],
+    batches: Iterator[TrainingBatch],
     config: TrainingConfig,
     processes: Processes,
 ) -> dict[str, float]:
@@ -169,9 +178,7 @@ def _step(
         optimiser.zero_grad(set_to_none=True)
     parts = config.accumulated_batches
     losses: dict[str, float] = {}
-    for part in range(parts):
-        number = (state.step * parts + part) * processes.count + processes.index
-        batch = _draw(trainee, sources, shares, number, config).to(state.device)
+    for batch in islice(batches, parts):
         found = trainee.learn(batch, step=state.step, share=1 / parts)
         for name, value in found.items():
             losses[name] = losses.get(name, 0.0) + value / parts
@@ -254,5 +261,6 @@ def _record(
         "cpu_s": round(state.cpu_s, 1),
         "processes": processes.count,
         "torch": torch.__version__,
+        "device": state.device.type,
         "history": state.history,
     }
