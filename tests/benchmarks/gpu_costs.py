@@ -5,7 +5,7 @@ Without a GPU everything is small and the networks tiny: a rehearsal of the code
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,6 +23,7 @@ from lidarpainter_models.errors import WeightsError
 from lidarpainter_models.kernels.backends import available_backends
 from lidarpainter_models.painter.augmentation import AugmentationConfig
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig, train_nano
+from lidarpainter_models.painter.protocol import PaintingConditions
 from lidarpainter_models.painter.selection import PainterChoice
 from tasks.measuring import measured
 
@@ -69,7 +70,8 @@ def measure_rasterisers(findings: Findings, device: torch.device) -> None:
             count, width_px, height_px = size
             what = f"draw and go back, {count} Gaussians, {width_px}x{height_px}, {backend}"
             with findings.part(what):
-                run = partial(kernel_trials.raster, size, backend, device)
+                scene = kernel_trials.raster_scene(size, device)
+                run = partial(kernel_trials.draw_and_go_back, scene, backend)
                 findings.costs.append(cost_of(what, run, device))
 
 
@@ -113,7 +115,7 @@ def _with_gaussians(config: lp.FitConfig, count: int) -> lp.FitConfig:
 def measure_painters(findings: Findings, device: torch.device, model: str | None) -> None:
     """One view by the small painter and by presets of the one-step painter."""
     height_px, width_px = PAINTED_PX if device.type == "cuda" else REHEARSED_PAINTED_PX
-    known = random_conditions(height_px, width_px)
+    known = _on(device, random_conditions(height_px, width_px))
     size = f"{width_px}x{height_px}"
     with findings.part("painter nano"), torch.inference_mode():
         painter = PainterChoice.of("nano").load(device)
@@ -132,9 +134,16 @@ def measure_painters(findings: Findings, device: torch.device, model: str | None
             del painter, run
 
 
+def _on(device: torch.device, conditions: PaintingConditions) -> PaintingConditions:
+    """What is known of a view, where a fit has it."""
+    known = {field.name: getattr(conditions, field.name) for field in fields(conditions)}
+    tensors = {name: value.to(device) for name, value in known.items() if torch.is_tensor(value)}
+    return replace(conditions, **tensors)
+
+
 def measure_training(findings: Findings, device: torch.device) -> None:
     """A step of training the small painter, batches drawn as in a real training."""
-    side_px, batch, steps = (192, 32, 40) if device.type == "cuda" else (32, 2, 4)
+    side_px, batch, steps = (192, 32, 100) if device.type == "cuda" else (32, 2, 4)
     source = MemoryPairs([smooth_pair(side_px, seed) for seed in range(4)])
     recipe = NanoTrainingConfig(
         augmentation=AugmentationConfig(crop_px=side_px), batch_size=batch, steps=steps
@@ -142,7 +151,7 @@ def measure_training(findings: Findings, device: torch.device) -> None:
     with findings.part("training of nano"):
         train = partial(train_nano, [source], recipe, device=device)
         what = f"a training step of nano, {batch} windows of {side_px} px"
-        cost = cost_of(what, train, device, 2)
+        cost = cost_of(what, train, device, 1)
         findings.painters.append(cost.of_one(steps))
 
 

@@ -38,6 +38,20 @@ def test_the_same_points_fall_into_the_image(count):
     assert np.abs(fast[2] - plain[2]).max(initial=0) <= 4 * EPS * 10.5
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_point_that_rounds_up_to_the_far_edge_is_outside(backend, axis):
+    pixels_from_points = torch.zeros(3, 4, dtype=torch.float64)
+    pixels_from_points[:, 3] = torch.tensor([2.0, 2.0, 1.0])
+    pixels_from_points[axis, 3] = 64 - 1e-9
+    points, sizes = torch.zeros(1, 3), [64, 64]
+    rows, _, _ = project_inside(points, pixels_from_points, *sizes, 0.5, backend=backend)
+    assert rows.tolist() == []
+    pixels_from_points[axis, 3] = 64 - 1e-5
+    _, pixels_uv, _ = project_inside(points, pixels_from_points, *sizes, 0.5, backend=backend)
+    assert int(pixels_uv[0, axis]) == 63
+
+
 def test_the_same_samples_are_kept():
     slots = []
     for backend in BACKENDS:

@@ -7,6 +7,7 @@ number that a threshold on which a pixel sits does not spoil.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from bench_scenes import LEARNED, street_like_splats
@@ -226,11 +227,21 @@ def _adam(backend: str, device: torch.device) -> list[Tensor]:
 
 def raster(size: tuple[int, int, int], backend: str, device: torch.device) -> list[Tensor]:
     """Images of a street-like scene, and the gradients of a loss on them."""
+    return draw_and_go_back(raster_scene(size, device), backend)
+
+
+def raster_scene(size: tuple[int, int, int], device: torch.device) -> dict[str, Any]:
+    """A street-like scene of so many Gaussians for images so wide and high."""
     scene = street_like_splats(*size)
     leaves = {name: scene[name].detach().to(device).requires_grad_() for name in LEARNED}
-    moved = leaves | {"body_index": scene["body_index"].to(device)}
-    splats = Splats(**{name: moved[name] for name in SPLATS})
-    image = render_gaussians(splats, moved["camera_from_body"], scene["camera"], backend=backend)
+    return scene | leaves | {"body_index": scene["body_index"].to(device)}
+
+
+def draw_and_go_back(scene: dict[str, Any], backend: str) -> list[Tensor]:
+    """The images of such a scene, and the gradients of a loss on them."""
+    leaves = {name: scene[name] for name in LEARNED}
+    splats = Splats(**{name: scene[name] for name in SPLATS})
+    image = render_gaussians(splats, scene["camera_from_body"], scene["camera"], backend=backend)
     loss = image.rgb.square().sum() + 0.01 * image.depth_m.sum() + image.alpha.sum()
     gradients = torch.autograd.grad(loss, list(leaves.values()))
     return [image.rgb.detach(), image.depth_m.detach(), image.alpha.detach(), *gradients]

@@ -13,10 +13,11 @@ def project_inside(
     """See `colour_sampling.project_inside`."""
     matrix = pixels_from_points.double().to(xyz_m.device, non_blocking=True)
     u, v, depth_m = (xyz_m.double() @ matrix[:, :3].T + matrix[:, 3]).T
-    u, v = u / depth_m, v / depth_m
+    # as they are given on: what rounds up to the edge is outside
+    u, v = (u / depth_m).float(), (v / depth_m).float()
     inside = (depth_m >= near_m) & (u >= 0) & (v >= 0) & (u < width_px) & (v < height_px)
     rows = inside.nonzero()[:, 0]
-    pixels_uv = torch.stack([u, v], dim=1).index_select(0, rows).float()
+    pixels_uv = torch.stack([u, v], dim=1).index_select(0, rows)
     return rows, pixels_uv, depth_m.index_select(0, rows).float()
 
 
