@@ -112,8 +112,8 @@ def stress(  # noqa: PLR0913 - the options of a command
 ) -> None:
     """Spoil recordings by one cause at a time, and hold painted scenes against unpainted ones.
 
-    Faults are in the frames that train; those that judge stay as recorded. Whatever ends it, the
-    same command goes on.
+    Faults are in the frames that train; those that judge stay as recorded, but for what is said of
+    cameras and actors. Whatever ends it, the same command goes on.
 
     Example: lidarpainter stress synthetic/street-0001 --only beams,clock --out stress
     """

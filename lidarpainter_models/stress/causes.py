@@ -14,7 +14,7 @@ SHARES = (0.25, 0.5, 0.75, 1)
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """One thing that goes wrong in the frames that a fit sees."""
+    """One thing that goes wrong."""
 
     name: str
     unit: str
@@ -22,8 +22,10 @@ class Cause:
     """From mild to grave."""
     spoil: Callable[[Frame, float, np.random.Generator], Frame]
     """A frame at a level."""
-    is_of_actors: bool = False
-    """Then it spoils all frames: what an actor is, its boxes say together."""
+    is_of_log: bool = False
+    """Then it spoils all frames. What an actor is, its boxes say together; and a mount, a lens or a
+    clock that is off in every second frame only would have views judged away from where the fit
+    could learn that cameras are."""
     most_of: Callable[[int], int] | None = None
     """The gravest level that there is with so many cameras; None knows no end."""
 
@@ -46,14 +48,16 @@ CAUSES = {
         Cause("reach", "m", (60, 40, 20, 10), sweeps.reach),
         Cause("dropout", "share", (0.25, 0.5, 0.75, 0.9), sweeps.dropout),
         Cause("clutter", "share", (0.02, 0.05, 0.1, 0.2), sweeps.clutter),
-        Cause("clock", "ms", (10, 25, 50, 100), labels.clock_offset),
+        Cause("clock", "ms", (10, 25, 50, 100), labels.clock_offset, is_of_log=True),
         Cause("pose-noise", "m", (0.02, 0.05, 0.1, 0.3), labels.pose_noise),
-        Cause("camera-yaw", "degrees", (0.2, 0.5, 1, 2), labels.camera_yaw),
-        Cause("focal-length", "share", (0.005, 0.01, 0.02, 0.05), labels.focal_length),
-        Cause("box-noise", "m", (0.1, 0.25, 0.5, 1), labels.box_noise, is_of_actors=True),
-        Cause("missing-boxes", "share", SHARES, labels.missing_boxes, is_of_actors=True),
-        Cause("false-boxes", "boxes", (1, 2, 4, 8), labels.false_boxes, is_of_actors=True),
-        Cause("wrong-classes", "share", SHARES, labels.wrong_classes, is_of_actors=True),
+        Cause("camera-yaw", "degrees", (0.2, 0.5, 1, 2), labels.camera_yaw, is_of_log=True),
+        Cause(
+            "focal-length", "share", (0.005, 0.01, 0.02, 0.05), labels.focal_length, is_of_log=True
+        ),
+        Cause("box-noise", "m", (0.1, 0.25, 0.5, 1), labels.box_noise, is_of_log=True),
+        Cause("missing-boxes", "share", SHARES, labels.missing_boxes, is_of_log=True),
+        Cause("false-boxes", "boxes", (1, 2, 4, 8), labels.false_boxes, is_of_log=True),
+        Cause("wrong-classes", "share", SHARES, labels.wrong_classes, is_of_log=True),
         Cause("exposure", "share", (0.1, 0.2, 0.3, 0.5), images.exposure),
         Cause("white-balance", "share", (0.05, 0.1, 0.2, 0.3), images.white_balance),
         Cause("motion-blur", "1/1000", (2, 5, 10, 20), images.motion_blur),

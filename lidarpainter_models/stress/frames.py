@@ -65,7 +65,8 @@ class Frame:
     timestamp_ns: int
     world_from_ego: Float[Tensor, "4 4"]
     pose_at: Callable[[int], Float[Tensor, "4 4"]]
-    """`world_from_ego` at any time (ns) of the log."""
+    """`world_from_ego` at any time (ns) of the log; beyond its ends the end pose holds."""
+    log_end_ns: int
     shots: tuple[Shot, ...]
     turns: tuple[Turn, ...]
     boxes: tuple[BoxRecord, ...]
@@ -110,6 +111,7 @@ def read_frame(scene: DrivingScene, frame_index: int) -> Frame:
         timestamp_ns=int(scene.frame_timestamps_ns[position]),
         world_from_ego=scene.world_from_ego[position],
         pose_at=partial(interpolate_rigid_track, scene.frame_timestamps_ns, scene.world_from_ego),
+        log_end_ns=int(scene.frame_timestamps_ns[-1]),
         shots=tuple(
             Shot(record=scene.image_record(view), jpeg=scene.read_jpeg(view)) for view in views
         ),

@@ -5,6 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_tangent
 from lidarpainter_models.scenes.records import BoxRecord
@@ -33,10 +35,16 @@ def clock_offset(frame: Frame, level: float, _dice: np.random.Generator) -> Fram
     shots = []
     for shot in frame.shots:
         then = shot.record.timestamp_ns
-        motion = frame.pose_at(then + late_ns) @ invert_rigid(frame.pose_at(then))
+        motion = _driven(frame, then, late_ns)
         late = shot.seen_from(motion @ shot.record.camera.world_from_camera)
         shots.append(replace(late, record=replace(late.record, timestamp_ns=then + late_ns)))
     return replace(frame, shots=tuple(shots))
+
+
+def _driven(frame: Frame, start_ns: int, for_ns: int) -> Float[Tensor, "4 4"]:
+    """How the car moved (in the world) in some time; past the end of the log as just before it."""
+    start_ns = min(start_ns, frame.log_end_ns - for_ns)
+    return frame.pose_at(start_ns + for_ns) @ invert_rigid(frame.pose_at(start_ns))
 
 
 def camera_yaw(frame: Frame, level: float, _dice: np.random.Generator) -> Frame:

@@ -1,8 +1,9 @@
-"""A stored scene with a fault in every frame that trains; what judges stays as recorded."""
+"""A stored scene with a fault, in all frames or in those that train; the others are as recorded."""
 
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,23 @@ from lidarpainter_models.stress.frames import Frame, read_frame
 DATASET = "stress"
 GENERATOR = "generator"
 """Entry of a street's manifest by which its exact truth is drawn."""
+STRESS = "stress"
+"""Entry of a spoilt scene's manifest: see `spoilt_from`."""
 SPLIT = "alternate"
+
+
+def spoilt_from(scene: DrivingScene, cause: str, level: float) -> dict[str, Any]:
+    """What the manifest of a spoilt scene says of it: another fault of this one says another thing.
+
+    Raises:
+        ConfigError: there is no such cause.
+    """
+    return {
+        "scene": scene.content_digest,
+        "cause": cause,
+        "level": level,
+        "frames": "all" if cause_of(cause).is_of_log else "training",
+    }
 
 
 def spoilt_name(scene: DrivingScene, cause: str, level: float) -> str:
@@ -45,14 +62,14 @@ def write_spoilt(
         licence=scene.manifest["licence"],
         global_from_world=scene.global_from_world,
         semantic_classes=scene.semantic_classes,
-        more={**more, "stress": {"scene": scene.content_digest, "cause": cause, "level": level}},
+        more={**more, STRESS: spoilt_from(scene, cause, level)},
     )
     train, _ = split_frames(scene.frame_indices, SPLIT)
     name = spoilt_name(scene, cause, level)
     with SceneWriter(store, DATASET, name, header) as writer:
         for done, frame_index in enumerate(scene.frame_indices, start=1):
             frame = read_frame(scene, frame_index)
-            if frame_index in train or fault.is_of_actors:
+            if frame_index in train or fault.is_of_log:
                 seed = zlib.crc32(f"{cause} {frame_index}".encode())
                 frame = fault.spoil(frame, level, np.random.default_rng(seed))
             _write(writer, frame)

@@ -1,11 +1,18 @@
 """Bring a recording with a fault into the store and the catalog."""
 
 from pathlib import Path
+from typing import Any
 
 from catalog.store import Store, open_store
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.stress.spoiling import DATASET, spoilt_name, write_spoilt
+from lidarpainter_models.stress.spoiling import (
+    DATASET,
+    STRESS,
+    spoilt_from,
+    spoilt_name,
+    write_spoilt,
+)
 from tasks.ingest.ingest import STAGE, record_scene, writing
 from tasks.opened import open_scene
 from tasks.progress import listener
@@ -18,7 +25,7 @@ def ingest_spoilt(store_path: Path, scene_id: str, cause: str, level: float) -> 
     store = open_store(store_path)
     scene = open_scene(store, scene_id)
     name = spoilt_id(scene, cause, level)
-    if not _is_of(store, name, scene):
+    if not _is_stored(store, name, spoilt_from(scene, cause, level)):
         with writing(store, name):
             path = write_spoilt(
                 scene,
@@ -36,9 +43,9 @@ def spoilt_id(scene: DrivingScene, cause: str, level: float) -> str:
     return f"{DATASET}/{spoilt_name(scene, cause, level)}"
 
 
-def _is_of(store: Store, scene_id: str, scene: DrivingScene) -> bool:
-    """Whether the store holds a spoilt scene of this one as it is now."""
+def _is_stored(store: Store, scene_id: str, told: dict[str, Any]) -> bool:
+    """Whether the store holds a spoilt scene that says this of itself."""
     try:
-        return bool(open_scene(store, scene_id).manifest["stress"]["scene"] == scene.content_digest)
+        return bool(open_scene(store, scene_id).manifest[STRESS] == told)
     except (SceneError, KeyError):
         return False

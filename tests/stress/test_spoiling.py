@@ -1,4 +1,4 @@
-"""Every fault changes what it says in frames that train, and nothing in those that judge."""
+"""Every fault changes what it says in frames that train, and no image or sweep that judges."""
 
 from dataclasses import replace
 
@@ -8,9 +8,11 @@ import torch
 from toy_store import write_toy_scene
 
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.gaussians.model.corrections import CameraCorrections
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.stress.causes import CAUSES
 from lidarpainter_models.stress.frames import read_frame
+from lidarpainter_models.stress.labels import clock_offset
 from lidarpainter_models.stress.spoiling import write_spoilt
 
 TRAINS, JUDGES = 2, 1
@@ -57,12 +59,14 @@ def same(one, other):
 
 
 @pytest.mark.parametrize("cause", sorted(CAUSES))
-def test_a_fault_touches_frames_that_train_alone(clean, spoilt, cause):
+def test_a_fault_touches_no_image_or_sweep_that_judges(clean, spoilt, cause):
     level = CAUSES[cause].levels[-1]
     scene = spoilt(cause, level)
     judging, recorded = frame_of(scene, JUDGES), frame_of(clean, JUDGES)
-    if CAUSES[cause].is_of_actors:
+    if CAUSES[cause].is_of_log:
         judging, recorded = (replace(frame, boxes=()) for frame in (judging, recorded))
+        assert [shot.jpeg for shot in judging.shots] == [shot.jpeg for shot in recorded.shots]
+        judging = replace(judging, shots=recorded.shots)
     assert same(judging, recorded)
     if cause not in ("swapped", "missing-cameras"):  # of one camera nothing can be
         assert not same(frame_of(scene, TRAINS), frame_of(clean, TRAINS))
@@ -70,6 +74,7 @@ def test_a_fault_touches_frames_that_train_alone(clean, spoilt, cause):
         "scene": clean.content_digest,
         "cause": cause,
         "level": level,
+        "frames": "all" if CAUSES[cause].is_of_log else "training",
     }
 
 
@@ -134,6 +139,42 @@ def test_yaw_and_focal_length_are_as_stated(clean, spoilt):
     assert float(ahead[1] @ right) > 0
     longer = frame_of(spoilt("focal-length", 0.05), TRAINS).shots[0].record.camera
     assert longer.fx_px == pytest.approx(1.05 * before.fx_px)
+
+
+def test_a_camera_is_turned_in_frames_that_judge_as_in_those_that_train(clean, spoilt):
+    """A fit that finds no turn, but for its noise, has judged cameras look where the others do."""
+    scene = spoilt("camera-yaw", 1.0)
+    views, held_out = scene.views[::2], scene.views[1::2]
+    corrections = CameraCorrections.none(
+        [view.key for view in views],
+        torch.tensor([view.timestamp_ns for view in views]),
+        torch.stack([view.camera.world_from_camera for view in views]),
+    )
+    noise = torch.randn(len(views), 6, generator=torch.Generator().manual_seed(0))
+    corrections.view_tangent.copy_(1e-4 * noise)
+    for view, before in zip(held_out, clean.views[1::2], strict=True):
+        judged = corrections.corrected(
+            view.camera, key=None, timestamp_ns=view.timestamp_ns, camera_name=view.camera_name
+        )
+        apart = before.camera.world_from_camera[:3, 2] @ judged.world_from_camera[:3, 2]
+        assert float(torch.rad2deg(torch.arccos(apart))) == pytest.approx(1.0, abs=0.03)
+
+
+@pytest.mark.parametrize("position", [TRAINS, 3])
+def test_a_late_clock_has_every_camera_stand_further_on(clean, position):
+    frame = frame_of(clean, position)
+    first, end_ns = frame_of(clean, 0), frame.log_end_ns
+
+    def driven(time_ns):
+        away = torch.eye(4).double()
+        away[0, 3] = 3.0 * (min(time_ns, end_ns) - first.timestamp_ns) * 1e-9
+        return away
+
+    late = clock_offset(replace(frame, pose_at=driven), 100.0, np.random.default_rng(0))
+    for shot, before in zip(late.shots, frame.shots, strict=True):
+        way = shot.record.camera.world_from_camera - before.record.camera.world_from_camera
+        assert float(way[0, 3]) == pytest.approx(0.3)
+        assert shot.record.timestamp_ns == before.record.timestamp_ns + 100_000_000
 
 
 def test_pictures_grow_dark_and_blurred(clean, spoilt):
