@@ -190,6 +190,7 @@ def check_camera_sync(scene: DrivingScene) -> tuple[Verdict, str]:
 def check_camera_rig(scene: DrivingScene) -> tuple[Verdict, str]:
     """Whether every camera stays where it is on the car."""
     worst_m, worst_rad, worst_name = 0.0, 0.0, ""
+    first_ns, last_ns = (int(scene.frame_timestamps_ns[row]) for row in (0, -1))
     for name in scene.camera_names:
         ego_from_camera = torch.stack(
             [
@@ -200,7 +201,7 @@ def check_camera_rig(scene: DrivingScene) -> tuple[Verdict, str]:
                 )
                 @ view.camera.world_from_camera
                 for view in scene.views_of(name)
-                if int(scene.frame_timestamps_ns[0]) <= view.timestamp_ns
+                if first_ns <= view.timestamp_ns <= last_ns
             ]
             or [torch.eye(4, dtype=torch.float64)]
         )

@@ -93,6 +93,20 @@ def test_camera_that_leaves_its_mount_is_found(pandaset, tmp_path):
     assert verdicts(ingested(pandaset, tmp_path))["camera rig"] == "warn"
 
 
+def test_images_after_the_last_pose_of_the_car_say_nothing_of_the_mount(scene):
+    last_ns = int(scene.frame_timestamps_ns[-1])
+
+    def late(view, row):
+        if row < len(scene.frame_indices) - 1:
+            return view
+        further = view.camera.world_from_camera.clone()
+        further[0, 3] += 1.0
+        return replace(view, timestamp_ns=last_ns + 100_000_000, camera=view.camera.at(further))
+
+    change_views(scene, "right_camera", late)
+    assert finding(scene, "camera rig").verdict == "ok"
+
+
 def test_camera_that_looks_into_the_sky_is_found(scene):
     def look_up(view, _row):
         pose = view.camera.world_from_camera.clone()
