@@ -14,9 +14,11 @@ from tempfile import TemporaryDirectory
 
 import kernel_trials
 import torch
-from gpu_findings import Cost, Findings
+from gpu_findings import Cost, Findings, StepPart
 from random_conditions import random_conditions
 from smooth_pairs import MemoryPairs, smooth_pair
+from torch.autograd import DeviceType
+from torch.profiler import profile, supported_activities
 
 import lidarpainter_models as lp
 from lidarpainter_models.errors import WeightsError
@@ -97,11 +99,32 @@ def measure_stages(findings: Findings, device: torch.device) -> None:
 
         again = partial(lp.fit_gaussians, seen, config, start=fitted, device=device)
         add(f"a step of a fit, {len(fitted.gaussians)} Gaussians", again, 1, steps)
+        findings.step = parts_of_a_step(again, steps, device)
         view = seen.views[1]
         add("render", partial(fitted.render, view.camera, view.timestamp_ns), 5)
         aside = lp.camera_beside(fitted, scene, view, lp.Shift(lateral_m=2.0))
         known = lp.ConditionBuilder(fitted, seen.lidar_map, seen.views)
         add("what is known of a view", partial(known.conditions, aside, view.timestamp_ns), 3)
+
+
+def parts_of_a_step(run: Callable[[], object], steps: int, device: torch.device) -> list[StepPart]:
+    """What some steps launch on a device (operations of torch on the CPU), the longest first."""
+    is_gpu = device.type == "cuda"
+    with profile(activities=list(supported_activities())) as trace:
+        run()
+    wanted = DeviceType.CUDA if is_gpu else DeviceType.CPU
+    found = [event for event in trace.key_averages() if event.device_type == wanted]
+    parts = [
+        StepPart(
+            kernel=event.key,
+            launches=event.count / steps,
+            ms=(event.self_device_time_total if is_gpu else event.self_cpu_time_total)
+            / 1e3
+            / steps,
+        )
+        for event in found
+    ]
+    return sorted(parts, key=lambda part: part.ms, reverse=True)
 
 
 def _with_gaussians(config: lp.FitConfig, count: int) -> lp.FitConfig:

@@ -9,6 +9,10 @@ PAPER_MS, PAPER_GB = 870, 10.5
 """Of the paper's painter at 1024x576, as its authors measured it."""
 
 
+MOST_KERNELS = 12
+"""Named of a step."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
     """A part of the program run on two devices or backends."""
@@ -40,6 +44,15 @@ class Cost:
         return replace(self, first_ms=self.first_ms / steps, ms=self.ms / steps)
 
 
+@dataclass(frozen=True, kw_only=True)
+class StepPart:
+    """A kernel's part in a step of a fit."""
+
+    kernel: str
+    launches: float
+    ms: float
+
+
 @dataclass(kw_only=True)
 class Findings:
     """Everything that was found, in order."""
@@ -49,6 +62,8 @@ class Findings:
     agreements: list[Agreement] = field(default_factory=list)
     costs: list[Cost] = field(default_factory=list)
     painters: list[Cost] = field(default_factory=list)
+    step: list[StepPart] = field(default_factory=list)
+    """What a step of a fit launches, the longest first."""
     failed: list[str] = field(default_factory=list)
     unchecked: list[str] = field(default_factory=list)
 
@@ -96,6 +111,9 @@ class Findings:
             rows = [*map(_cost_row, self.painters)]
             rows.append(("the paper, at 1024x576", "", str(PAPER_MS), str(PAPER_GB)))
             parts += ["", *_table(header, rows)]
+        if self.step:
+            header = ("kernel of a step", "launches", "ms")
+            parts += ["", *_table(header, self._step_rows())]
         for title, lines in (("Failed", self.failed), ("Not checked", self.unchecked)):
             parts += ["", f"{title}:", "", *(f"- {line}" for line in lines or ["nothing"])]
         return "\n".join(parts) + "\n"
@@ -104,6 +122,16 @@ class Findings:
         for found in self.agreements:
             verdict = "agrees" if found.holds else "**differs**"
             yield found.what, found.compared, f"{found.error:.1e}", f"{found.allowed:.0e}", verdict
+
+    def _step_rows(self) -> Iterator[tuple[str, ...]]:
+        rest = self.step[MOST_KERNELS:]
+        others = StepPart(
+            kernel=f"{len(rest)} others",
+            launches=sum(part.launches for part in rest),
+            ms=sum(part.ms for part in rest),
+        )
+        for part in (*self.step[:MOST_KERNELS], others):
+            yield f"`{part.kernel[:60]}`", f"{part.launches:.1f}", f"{part.ms:.3f}"
 
 
 def _cost_row(cost: Cost) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ import kernel_trials
 import pytest
 import torch
 from gpu_agreement import compare_kernels
-from gpu_findings import Agreement, Cost, Findings
+from gpu_findings import Agreement, Cost, Findings, StepPart
 from strict_device import strict_runs
 
 CPU = torch.device("cpu")
@@ -49,6 +49,17 @@ def test_the_page_sets_a_painter_beside_the_papers():
     page = findings.page()
     assert "| paper | 9000 | 123.4 | 2.00 |" in page
     assert "| the paper, at 1024x576 |  | 870 | 10.5 |" in page
+
+
+def test_the_page_names_what_a_step_spends_most_on_and_sums_up_the_rest():
+    findings = findings_of()
+    findings.step = [
+        StepPart(kernel=f"kernel {number}", launches=2.0, ms=0.25) for number in range(15)
+    ]
+    page = findings.page()
+    assert "| `kernel 11` | 2.0 | 0.250 |" in page
+    assert "| `kernel 12` |" not in page
+    assert "| `3 others` | 6.0 | 0.750 |" in page
 
 
 INTERPRETED_LONG = ("sparse_adam", "ssim")
