@@ -41,14 +41,15 @@ def mark_seen(
     lever = torch.maximum(blocks.low.abs(), blocks.high.abs()).sum(dim=1)
     slack = frustum.actor_slack[0] + frustum.actor_slack[1] * lever
     reach = blocks.reach + torch.where(blocks.body > 0, slack, 0.0)
-    is_in_view = (blocks.low[:, 0] <= blocks.high[:, 0]) & (
-        _farthest(transform[:, 2], blocks) + reach >= frustum.near_m
-    )
-    for axis in range(2):
-        for tangent, sign in ((frustum.lowest[axis], -1.0), (frustum.highest[axis], 1.0)):
-            # a plane through the camera: outside it is sign (x - tangent z) > 0
-            plane = sign * (transform[:, axis] - tangent * transform[:, 2])
-            is_in_view &= ~(-_farthest(-plane, blocks) > reach * frustum.stretch[axis])
+    view = _planes(frustum).to(reach.device, non_blocking=True)
+    facing, stretch, begin = view[:, :3], view[:, 3], view[:, 4]
+    planes = facing @ transform[:, :3]
+    middle, half = (blocks.low + blocks.high)[:, None] / 2, (blocks.high - blocks.low)[:, None] / 2
+    slope = planes[..., :3]
+    # of the corner of the box that is least outside
+    outside = planes[..., 3] + (slope * middle - slope.abs() * half).sum(dim=2)
+    reaches_in = outside + begin <= reach[:, None] * stretch
+    is_in_view = (blocks.low[:, 0] <= blocks.high[:, 0]) & reaches_in.all(dim=1)
     is_seen |= torch.zeros_like(is_seen).index_copy(
         0, blocks.order, is_in_view.index_select(0, blocks.of_ordered)
     )
@@ -66,8 +67,19 @@ def _of_each(
     return out.scatter_reduce(0, block[:, None].expand_as(values), values, which)
 
 
-def _farthest(plane: Float[Tensor, "blocks 4"], blocks: Blocks) -> Float[Tensor, " blocks"]:
-    """Largest value of a linear function on each block's box of centres."""
-    middle, half = (blocks.low + blocks.high) / 2, (blocks.high - blocks.low) / 2
-    slope = plane[:, :3]
-    return plane[:, 3] + (slope * middle).sum(dim=1) + (slope.abs() * half).sum(dim=1)
+def _planes(frustum: Frustum) -> Float[Tensor, "planes 5"]:
+    """The planes of a view, float64 on the CPU: left, right, top, bottom, near.
+
+    How far outside a point is, by its x, y and z; how far the plane's own stretch lets a Gaussian
+    reach; and where the plane begins.
+    """
+    (left, top), (right, bottom) = frustum.lowest, frustum.highest
+    across, down = frustum.stretch
+    rows = [
+        [-1, 0, left, across, 0],
+        [1, 0, -right, across, 0],
+        [0, -1, top, down, 0],
+        [0, 1, -bottom, down, 0],
+        [0, 0, -1, 1, frustum.near_m],
+    ]
+    return torch.tensor(rows, dtype=torch.float64)
