@@ -1,7 +1,5 @@
 """Wall time, CPU time and peak memory of a stage."""
 
-import ctypes
-import os
 import resource
 import time
 from collections.abc import Iterator
@@ -30,12 +28,11 @@ class Measurement:
 
 @contextmanager
 def measured() -> Iterator[Measurement]:
-    """Measure a block, which begins without the memory that work before it has freed.
+    """Measure a block.
 
     Where the kernel does not let the peak be reset, it is that of the whole process so far.
     """
     measurement = Measurement()
-    _give_back_freed_memory()
     can_reset = _reset_peak()
     compiling = CompileClock()
     compiling.start()
@@ -47,16 +44,6 @@ def measured() -> Iterator[Measurement]:
         compiling.stop()
         measurement.cpu_seconds = time.process_time() - cpu_started - compiling.cpu_seconds
         measurement.peak_memory_bytes = _peak_bytes() if can_reset else _process_peak_bytes()
-
-
-def _give_back_freed_memory() -> None:
-    """Have glibc return free pages between blocks that are still held (malloc_trim(3)).
-
-    It returns by itself what is free at the end of its heap. Other C libraries have no such call.
-    """
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
-    if trim is not None:
-        trim(0)
 
 
 def _reset_peak() -> bool:
