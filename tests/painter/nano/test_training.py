@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from quiet_augmentation import QUIET
+from strict_device import NAME, strict_runs
 
 from lidarpainter_models.errors import ConfigError, DataError, TrainingError
 from lidarpainter_models.painter.augmentation import (
@@ -254,3 +255,15 @@ def test_blobs_cover_about_the_share_asked_for():
     assert float(random_blobs(64, 64, 0.25, generator_of(0)).float().mean()) == pytest.approx(
         0.25, abs=0.01
     )
+
+
+def test_a_device_learns_what_the_cpu_learns(make_pair, memory_pairs, monkeypatch):
+    source = memory_pairs([make_pair(48, seed) for seed in (0, 1)])
+    config = replace(SHORT, half_precision=False, steps=3, log_every_steps=1)
+    here = train_nano([source], config).record
+    with strict_runs(monkeypatch) as device:
+        there = train_nano([source], config, device=device).record
+    assert (here["device"], there["device"]) == ("cpu", NAME)
+    losses, expected = ([entry["total"] for entry in one["history"]] for one in (there, here))
+    # Adam makes steps of full length of gradients that are roundings alone
+    assert losses == pytest.approx(expected, rel=1e-3)
