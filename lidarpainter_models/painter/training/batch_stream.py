@@ -22,7 +22,7 @@ def batches_in_order(
 ) -> Iterator[TrainingBatch]:
     """The batches `first`, `first + every` and so on without end, on a device.
 
-    `draw` makes the batch of a number on the CPU; it is pickled where processes are not forked.
+    `draw` makes the batch of a number on the CPU; it is pickled for processes that draw ahead.
 
     Raises:
         DataError: a batch could not be drawn; raised when its turn comes.
@@ -39,6 +39,7 @@ def _drawn_ahead(
         batch_size=None,
         sampler=numbers,
         num_workers=max(1, torch.get_num_threads() - 1),  # one core is left to whoever learns
+        multiprocessing_context="spawn",  # numba ends forks of a process that ran its threads
         pin_memory=device.type == "cuda",
         generator=torch.Generator(),  # the global one is left alone
     )
