@@ -2,32 +2,12 @@
 
 import pytest
 import torch
+from smooth_pairs import MemoryPairs
 
 from lidarpainter_models.painter.examples import PaintingPair
 from lidarpainter_models.painter.protocol import PaintingConditions
 
 SIDE_PX = 20
-
-
-class ListedPairs:
-    """Pairs held in memory."""
-
-    def __init__(self, *pairs):
-        self.pairs = pairs
-        self.digest = "listed"
-
-    def __len__(self):
-        return len(self.pairs)
-
-    def size_px(self, index):
-        return self.pairs[index].conditions.height_width_px
-
-    def read(self, index, window=None):
-        pair = self.pairs[index]
-        return pair if window is None else pair.cropped(window)
-
-    def describe(self):
-        return {"digest": self.digest}
 
 
 def flat_pair(render_rgb, *, truth=0.5, warp=None, lidar=None):
@@ -54,4 +34,4 @@ def make_flat_pair():
 
 @pytest.fixture
 def listed_pairs():
-    return ListedPairs
+    return lambda *pairs: MemoryPairs(pairs)

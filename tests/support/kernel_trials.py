@@ -17,6 +17,7 @@ from torch import Tensor
 
 from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_tangent
 from lidarpainter_models.kernels.box_owners import box_owners
+from lidarpainter_models.kernels.colour_sampling import project_inside
 from lidarpainter_models.kernels.frustum_culling import Blocks, mark_seen, refresh_bounds
 from lidarpainter_models.kernels.gaussian_raster import SplatImage, Splats, render_gaussians
 from lidarpainter_models.kernels.pixel_losses import PixelFacts, PixelRules, pixel_terms
@@ -124,6 +125,21 @@ def _blend(backend: str, device: torch.device) -> list[Tensor]:
         backend=backend,
     )
     return list(found)
+
+
+def _projection(backend: str, device: torch.device) -> list[Tensor]:
+    """Which points fall into an image, and where: all of the colouring that runs on a GPU."""
+    draw, (height_px, width_px) = Draw(device), SIZE_PX
+    points = 20 * draw.uniform(5000, 3) - 10
+    lens = torch.tensor([[80.0, 0, width_px / 2, 0], [0, 80, height_px / 2, 0], [0, 0, 1, 0.5]])
+    rows, pixels_uv, depth_m = project_inside(
+        points, lens.double(), width_px, height_px, 0.5, backend=backend
+    )
+    inside = torch.zeros(len(points), dtype=torch.bool, device=device)
+    inside[rows] = True
+    seen = torch.zeros_like(points)
+    seen[rows] = torch.cat([pixels_uv, depth_m[:, None]], dim=1)
+    return [inside, seen]
 
 
 def _image_loss(backend: str, device: torch.device) -> list[Tensor]:
@@ -249,6 +265,7 @@ def draw_and_go_back(scene: dict[str, Any], backend: str) -> list[Tensor]:
 
 TRIALS = {
     "box_owners": Trial(_boxes, 2e-3),
+    "colour_sampling": Trial(_projection, 2e-3),
     "frustum_culling": Trial(_culling, 1e-6),
     "pixel_losses": Trial(_pixel_terms, 1e-4),
     "point_blend": Trial(_blend, 1e-3),
@@ -257,8 +274,7 @@ TRIALS = {
     "sparse_adam": Trial(_adam, 1e-4),
     "ssim": Trial(_image_loss, 1e-4),
 }
-"""All but the rasteriser, which has several fast backends, and the colour sampling, which is done
-by the CPU alone."""
+"""All but the rasteriser, which has several fast backends."""
 RASTER_TOLERANCE = {"triton": 2e-3, "cuda": 1e-2}
 """A pixel on the alpha cut may fall on either side; gsplat clamps alpha at 0.999 and takes the fast
 exponential of the GPU."""
