@@ -45,7 +45,7 @@ class FitLossWeights:
     perceptual: float = 0.0
     """Of the perceptual distance, where one is given to the fit."""
     sky: float = 0.05
-    """Of the clear-sky term."""
+    """Of the clear-sky term, on painted views of its part where LiDAR hit something."""
     sky_tolerance: float = 0.06
     """A pixel without LiDAR return this close to the sky's colour counts as sky: between wires
     the fit would otherwise hang sky-coloured needles at any depth."""

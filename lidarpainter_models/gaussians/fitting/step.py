@@ -29,7 +29,13 @@ from lidarpainter_models.gaussians.model.sky import (
 from lidarpainter_models.geometry.box_masks import project_boxes
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
-from lidarpainter_models.kernels.pixel_losses import SKY, PixelRules, depth_loss, pixel_terms
+from lidarpainter_models.kernels.pixel_losses import (
+    SKY,
+    PixelRules,
+    clear_sky_loss,
+    depth_loss,
+    pixel_terms,
+)
 from lidarpainter_models.kernels.sky_texture import SkyRays
 from lidarpainter_models.kernels.ssim import l1_ssim_loss
 from lidarpainter_models.observations.views import GuidanceView
@@ -136,7 +142,11 @@ def add_guidance_gradients(
     config: FitConfig,
     perceptual: Perceptual | None = None,
 ) -> None:
-    """Add one painted view's gradients to the Gaussians; nothing else is changed by it."""
+    """Add one painted view's gradients to the Gaussians; nothing else is changed by it.
+
+    What LiDAR hit is opaque there as on recorded views. The depth term alone is content with ever
+    less of what is there, and wears away what recorded views do not hold.
+    """
     sky, settings = state.scene.sky, config.guidance
     bent = state.scene.actors.bending.bent(seen, view.timestamp_ns)
     splat = draw_gaussians(bent, _guidance_bodies(state, view), view.camera)
@@ -153,6 +163,8 @@ def add_guidance_gradients(
         loss = loss + settings.depth * depth_loss(
             splat.depth_m, splat.alpha, view.lidar_depth_m, tolerance=config.losses.depth_tolerance
         )
+    is_hit = view.lidar_depth_m > 0
+    loss = loss + config.losses.sky * clear_sky_loss(splat.alpha, torch.zeros_like(is_hit), is_hit)
     loss.backward()
 
 

@@ -20,7 +20,7 @@ from lidarpainter_models.kernels.pixel_losses.pixel_facts import (
     PixelRules,
     PixelTerms,
 )
-from lidarpainter_models.kernels.pixel_losses.reference import depth_loss
+from lidarpainter_models.kernels.pixel_losses.reference import clear_sky_loss, depth_loss
 
 __all__ = [
     "NOTHING",
@@ -30,6 +30,7 @@ __all__ = [
     "PixelFacts",
     "PixelRules",
     "PixelTerms",
+    "clear_sky_loss",
     "depth_loss",
     "pixel_terms",
 ]

@@ -41,14 +41,14 @@ def short_fit(**changes):
     return replace(config, **changes)
 
 
-def painted_view(world, *, weight=1.0):
+def painted_view(world, *, weight=1.0, lidar_m=0.0):
     camera = world.observations.views[1].camera
     return GuidanceView.of(
         camera,
         FRAME_NS,
         rgb=torch.full((HEIGHT_PX, WIDTH_PX, 3), 0.2),
         weight=torch.full((HEIGHT_PX, WIDTH_PX), weight),
-        lidar_depth_m=torch.zeros(HEIGHT_PX, WIDTH_PX),
+        lidar_depth_m=torch.full((HEIGHT_PX, WIDTH_PX), lidar_m),
     )
 
 
@@ -228,6 +228,15 @@ def test_the_last_steps_fit_recorded_views_alone(world):
 def test_untrusted_painted_view_changes_nothing(world):
     config = short_fit(guidance=GuidanceConfig(depth=0.0))
     _, seen = with_guidance_gradients(world, painted_view(world, weight=0.0), config)
+    assert float(seen.sh.grad.abs().sum()) == 0
+
+
+def test_what_lidar_hit_on_painted_views_becomes_more_opaque_alone(world):
+    config = short_fit(guidance=GuidanceConfig(depth=0.0))
+    view = painted_view(world, weight=0.0, lidar_m=7.0)
+    _, seen = with_guidance_gradients(world, view, config)
+    assert (seen.opacity_logit.grad <= 0).all()  # a step goes against it
+    assert (seen.opacity_logit.grad < 0).any()
     assert float(seen.sh.grad.abs().sum()) == 0
 
 
