@@ -244,8 +244,8 @@ ATTEMPTS = TableSchema(
         Column(
             "cause",
             "text",
-            "why it ended: done, bad-input, disk-full, api-lost, killed, memory, timeout, system, "
-            "error, interrupted, cancelled or superseded",
+            "why it ended: done, bad-input, disk-full, store-lost, api-lost, killed, memory, "
+            "timeout, system, error, interrupted, cancelled or superseded",
         ),
         Column("reason", "text", "one line about the cause"),
         Column("effort", "text", "what its cost grows with, JSON; null unless it made all stages"),

@@ -1,8 +1,8 @@
 """Delta Lake tables with deterministic ids: merging the same row twice changes nothing.
 
-Writers take no lock: Delta Lake commits are optimistic, the loser of a race reloads and tries
-again, a bounded number of times with growing, jittered pauses. The root is a folder or a URI such
-as `s3://bucket/store`.
+Writers take turns by a lock where one reaches all of them. Delta Lake commits are optimistic: the
+loser of a race reloads and tries again, a bounded number of times with growing, jittered pauses.
+The root is a folder or a URI such as `s3://bucket/store`.
 """
 
 import errno

@@ -51,7 +51,7 @@ class TrainPainterParameters(HarvestParameters):
     lpips: LpipsFiles = LpipsFiles()
     """Weights for the loss of the one-step painter."""
     device: str = "auto"
-    """Where the one-step painter is trained, and what is trained is judged."""
+    """Where a painter is trained and judged."""
     processes: int = 1
     """In which the one-step painter is trained, each on a GPU of its own."""
     held_back: float = Field(default=0.1, ge=0, lt=1)

@@ -62,7 +62,7 @@ def cost(
 ) -> None:
     """Show what a scene has cost: attempts of fleets by cause, and stages as computed.
 
-    Money follows from money_per_hour in the [budget] of the fleet's manifest.
+    Money follows from money_per_hour in the table `budget` of the fleet's manifest.
 
     Example: lidarpainter catalog cost pandaset/002
     """

@@ -59,7 +59,7 @@ class EffortConfig:
     """Steps for every view's worth of new surface. More of them sharpen the recorded views and cost
     the neighbouring lanes (docs/benchmarks.md)."""
     gaussians_per_pixel: float = 0.3
-    """Most Gaussians for a pixel of surface, at the knee of their curve (docs/benchmarks.md)."""
+    """Most Gaussians for a pixel of surface, at the knee of their curve (docs/measuring.md)."""
 
     def __post_init__(self) -> None:
         """Refuse an effort that comes to nothing."""
