@@ -5,6 +5,7 @@ and images lie on the device of the scene; poses (float64, a few 4x4 a step) on 
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -148,8 +149,11 @@ def add_guidance_gradients(
     less of what is there, and wears away what recorded views do not hold.
     """
     sky, settings = state.scene.sky, config.guidance
-    bent = state.scene.actors.bending.bent(seen, view.timestamp_ns)
-    splat = draw_gaussians(bent, _guidance_bodies(state, view), view.camera)
+    bending = state.scene.actors.bending
+    held = replace(bending, offset_m=bending.offset_m.detach())
+    splat = draw_gaussians(
+        held.bent(seen, view.timestamp_ns), _guidance_bodies(state, view), view.camera
+    )
     sky_rgb = sky.sample(sky.rays(view.camera, splat.alpha.detach() < OPAQUE))
     shown = splat.rgb + (1 - splat.alpha)[..., None] * sky_rgb
     loss = settings.weight * l1_ssim_loss(

@@ -10,11 +10,15 @@ from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.gaussians.fitting.config import FitConfig, RefinementConfig
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.gaussians.fitting.settings import DensificationConfig
+from lidarpainter_models.gaussians.fitting.state import FitState
+from lidarpainter_models.gaussians.fitting.step import add_guidance_gradients
 from lidarpainter_models.gaussians.initialisation import scene as first_scene
 from lidarpainter_models.gaussians.model.actors import Actors
+from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
 from lidarpainter_models.gaussians.model.stored_scene import copy_scene
 from lidarpainter_models.observations.preparation import prepare_observations
 from lidarpainter_models.observations.settings import ObservationConfig
+from lidarpainter_models.observations.views import GuidanceView
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import split_views
 from lidarpainter_models.synthetic import RigCamera, SyntheticStreetConfig, write_street
@@ -37,6 +41,23 @@ def with_lattice(scene):
     scene = copy_scene(scene)
     actors = Actors.uncorrected(scene.actors.recorded_tracks, scene.actors.knots_ns, bent=[0])
     return replace(scene, actors=actors)
+
+
+def test_painted_views_leave_no_gradient_to_how_somebody_moves(world):
+    view = world.observations.views[1]
+    painted = GuidanceView.of(
+        view.camera,
+        FRAME_NS,
+        rgb=torch.full_like(view.rgb, 0.2),
+        weight=torch.ones(view.sky_mask.shape),
+        lidar_depth_m=view.lidar_depth_m,
+    )
+    config = FitConfig(steps=4)
+    state = FitState.begin(with_lattice(world.scene), config, painted.weight_u8.numel())
+    poses = state.scene.actors.corrected_poses(FRAME_NS)
+    bodies = camera_from_body(view.camera.world_from_camera, *poses)
+    add_guidance_gradients(state, state.seen([(view.camera, bodies)]), painted, config)
+    assert state.scene.actors.bending.offset_m.grad is None
 
 
 def seen_of(world, scene):
