@@ -22,6 +22,7 @@ from lidarpainter_models.painter.styles.lamps import Lamp, LampKind, find_lamps
 from lidarpainter_models.painter.styles.night import POWER, RADIANCE, place_of, sunlit_white
 from lidarpainter_models.painter.styles.view import fit_ground
 from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.splits import sampled_rows
 from lidarpainter_models.weather.darkness import HEADLAMP_AHEAD_M, HEADLAMP_HEIGHT_M
 from lidarpainter_models.weather.mix import StyleMix
 
@@ -77,8 +78,8 @@ def styled_scene(
     """
     clear = replace(scene, style=None)
     builder = ConditionBuilder(clear, seen.lidar_map, seen.views)
-    step = max(1, len(seen.views) // MOST_VIEWS)
-    looked_at = seen.views[::step][:MOST_VIEWS]
+    rows = sampled_rows([view.key[1] for view in seen.views], MOST_VIEWS)
+    looked_at = [seen.views[row] for row in rows]
     looks = []
     for number, view in enumerate(looked_at):
         looks.append(_look(builder, view))

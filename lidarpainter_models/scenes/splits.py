@@ -64,14 +64,26 @@ def sampled_views(views: Sequence[RecordedView], most_views: int) -> tuple[Recor
         views: each camera's in order of time, however the cameras take turns.
         most_views: at least 1; where there are more cameras than that, one view of each is taken.
     """
-    if len(views) <= most_views:
-        return tuple(views)
-    names = dict.fromkeys(view.camera_name for view in views)
-    share, kept = max(most_views // len(names), 1), set()
-    for name in names:
-        own = [view.key for view in views if view.camera_name == name]
-        kept |= set(evenly_taken(own, share))
-    return tuple(view for view in views if view.key in kept)
+    return tuple(views[row] for row in sampled_rows([one.camera_name for one in views], most_views))
+
+
+def sampled_rows(cameras: Sequence[str], most: int) -> list[int]:
+    """The same for views of which only the cameras are named: which of them to take."""
+    if len(cameras) <= most:
+        return list(range(len(cameras)))
+    return rows_of_each(cameras, max(most // len(set(cameras)), 1))
+
+
+def rows_of_each(cameras: Sequence[str], most: int) -> list[int]:
+    """Which of some views to take: so many of each camera at most, evenly over time, in order.
+
+    Every n-th view would not do: cameras take turns, and a step that has a factor in common with
+    their number passes over some of them.
+    """
+    by_camera: dict[str, list[int]] = {}
+    for row, name in enumerate(cameras):
+        by_camera.setdefault(name, []).append(row)
+    return sorted(row for own in by_camera.values() for row in evenly_taken(own, most))
 
 
 def evenly_taken(items: Sequence[Item], most: int) -> list[Item]:

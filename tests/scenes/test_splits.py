@@ -3,7 +3,7 @@
 import pytest
 
 from lidarpainter_models.errors import ConfigError, SceneError
-from lidarpainter_models.scenes.splits import split_frames, split_views
+from lidarpainter_models.scenes.splits import rows_of_each, sampled_rows, split_frames, split_views
 
 
 def test_alternate_frames_train_and_test():
@@ -61,3 +61,18 @@ def test_all_cameras_are_split_unless_named(small_scene):
 def test_unknown_camera_is_refused(small_scene):
     with pytest.raises(SceneError, match="no camera 'roof'; it has front_camera"):
         split_views(small_scene, "all", ("roof",))
+
+
+@pytest.mark.parametrize("num_cameras", [1, 2, 4, 6])
+def test_cameras_that_take_turns_are_all_among_some_views(num_cameras):
+    cameras = [str(camera) for _frame in range(14) for camera in range(num_cameras)]
+    for most in (num_cameras, 16, 24):
+        rows = sampled_rows(cameras, most)
+        assert len(rows) <= max(most, num_cameras)
+        assert {cameras[row] for row in rows} == set(cameras)
+        assert rows == sorted(set(rows))
+    assert sampled_rows(cameras, len(cameras)) == list(range(len(cameras)))
+
+
+def test_of_each_camera_rows_are_taken_evenly():
+    assert rows_of_each(list("ababababac"), 2) == [2, 3, 6, 7, 9]

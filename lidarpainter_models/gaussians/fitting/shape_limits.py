@@ -5,7 +5,6 @@ needles, which show as fans of streaks from anywhere else. Lengths are metres, i
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -17,9 +16,10 @@ from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
 from lidarpainter_models.geometry.transforms import invert_rigid, rotation_from_quaternion
+from lidarpainter_models.scenes.splits import sampled_rows
 
 _ALONG = math.cos(math.radians(45))
-_MOST_CAMERAS = 16
+_MOST_VIEWS = 32
 LIMITS_EVERY = 50
 """Steps between two checks."""
 STEADY_RAY = 0.985
@@ -39,13 +39,11 @@ class ViewingRays:
     """To the nearest camera."""
 
 
-def viewing_rays(scene: GaussianScene, camera_rows: Sequence[int] | None = None) -> ViewingRays:
+def viewing_rays(scene: GaussianScene) -> ViewingRays:
     """Directions and distances from the training cameras in whose front a Gaussian lies."""
     means = scene.gaussians.means.detach()
     body = scene.gaussians.body_index.long()
-    num_views = len(scene.cameras.keys)
-    stride = math.ceil(num_views / _MOST_CAMERAS)
-    rows = range(0, num_views, stride) if camera_rows is None else camera_rows
+    rows = sampled_rows([camera_name for _, camera_name in scene.cameras.keys], _MOST_VIEWS)
     total = torch.zeros_like(means)
     count = means.new_zeros(len(means))
     distance_m = means.new_full((len(means),), torch.inf)

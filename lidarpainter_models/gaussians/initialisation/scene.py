@@ -37,7 +37,7 @@ from lidarpainter_models.lidar.map_building import LEAST_WAY_M
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
 from lidarpainter_models.scenes.categories import category_of
 from lidarpainter_models.scenes.driving_scene import ActorTrack
-from lidarpainter_models.scenes.splits import evenly_taken
+from lidarpainter_models.scenes.splits import rows_of_each, sampled_rows
 
 LEAST_UNSEEN_POINTS = 3
 """Voxels with fewer points that only a camera moved aside would see are dropped."""
@@ -204,12 +204,8 @@ def _spread_cameras(views: Sequence[TrainingView]) -> tuple[list[Camera], list[i
 
 def _some_of_each_camera(views: Sequence[TrainingView]) -> list[TrainingView]:
     """A few views of each camera, evenly over the log."""
-    by_camera: dict[str, list[TrainingView]] = {}
-    for view in views:
-        by_camera.setdefault(view.key[1], []).append(view)
-    return [
-        view for own in by_camera.values() for view in evenly_taken(own, OUTLINE_VIEWS_PER_CAMERA)
-    ]
+    cameras = [view.key[1] for view in views]
+    return [views[row] for row in rows_of_each(cameras, OUTLINE_VIEWS_PER_CAMERA)]
 
 
 def _on_surfaces(
@@ -299,13 +295,13 @@ def _actor_spacing(
     """
     footprint = torch.full((len(points),), torch.inf)
     total = torch.zeros(len(points))
-    stride = math.ceil(len(views) / _MOST_VIEWS_PER_ACTOR)
-    for view in views[::stride]:
+    rows = sampled_rows([view.key[1] for view in views], _MOST_VIEWS_PER_ACTOR)
+    for view in (views[row] for row in rows):
         if not track.is_present(view.timestamp_ns):
             continue
         world_from_box = track.pose_at(view.timestamp_ns).float()
         xyz_world_m = transform_points(world_from_box, points.xyz_m)
         at_time, density = pixel_footprint(xyz_world_m, [view.camera])
         footprint = torch.minimum(footprint, at_time)
-        total += stride * density.square()
+        total += len(views) / len(rows) * density.square()
     return torch.maximum(total.sqrt(), footprint**-2) ** -0.5

@@ -56,3 +56,15 @@ def test_rays_of_an_actor_are_taken_in_its_box_frame():
     direction = rays.mean_direction[0] / rays.mean_direction[0].norm()
     assert float(direction[1]) < -0.9
     assert abs(float(rays.distance_m[0]) - 6.0) < 0.5
+
+
+def test_every_camera_of_a_rig_is_asked_what_it_saw():
+    # five look ahead and one back, in turn; the Gaussian lies six metres behind
+    ahead = camera_at(0.0)
+    turned = ahead.world_from_camera.clone()
+    turned[:2, :3] *= -1  # half a turn about z
+    rig = [*5 * [ahead], ahead.at(turned)]
+    behind = round_gaussians(torch.tensor([[-6.0, 0.0, 1.0]]), torch.rand(1, 3), sigma_m=1.0)
+    rays = viewing_rays(scene_of(behind, 14 * rig))
+    assert abs(float(rays.distance_m) - 6.0) < 0.3
+    assert float(rays.mean_direction[0, 0]) < -0.9

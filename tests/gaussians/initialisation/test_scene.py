@@ -188,6 +188,17 @@ def test_actor_never_near_a_image_is_not_modelled(world):
     assert int((scene.gaussians.body_index > 0).sum()) == 0
 
 
+def test_an_actor_that_one_camera_of_six_sees_is_modelled(world):
+    config = InitialisationConfig(num_gaussians=500, street_voxel_m=0.1)
+    views = []
+    for frame in range(14):
+        for camera, x_m in enumerate((50.0, 0.0, 50.0, 50.0, 50.0, 50.0)):
+            view = world.observations.views[0]
+            views.append(replace(view, key=(frame, f"camera-{camera}"), camera=camera_at(x_m)))
+    scene = initialise_scene(replace(world.observations, views=tuple(views)), config)
+    assert int((scene.gaussians.body_index > 0).sum()) > 0
+
+
 def test_first_scene_holds_what_was_found_of_the_cameras(world):
     late = CameraFault(late_s=0.012)
     views = tuple(
