@@ -143,9 +143,7 @@ class Refinement:
         if self.refines_actors(step):
             now = actors.tangent_at(timestamp_ns)
             total = total + ACTOR_PRIOR * pose_prior(now, **ACTOR_NOISE)
-            before, after, _ = actors.neighbours(timestamp_ns)
-            last = actors.knots_ns.numel() - 1
-            for neighbour in {max(before - 1, 0), min(after + 1, last)}:
+            for neighbour in actors.knots_beside(timestamp_ns):
                 jump = now - actors.tangent[:, neighbour].detach()
                 total = total + ACTOR_SMOOTHNESS * pose_prior(jump, **ACTOR_NOISE)
         return total

@@ -101,6 +101,13 @@ class Actors:
         start_ns, end_ns = int(self.knots_ns[after - 1]), int(self.knots_ns[after])
         return after - 1, after, (timestamp_ns - start_ns) / (end_ns - start_ns)
 
+    def knots_beside(self, timestamp_ns: int) -> set[int]:
+        """The knots that a correction at a time is not made of and stands next to."""
+        before, after, weight = self.neighbours(timestamp_ns)
+        first = after if weight == 1 else before
+        last = before if weight == 0 else after
+        return {max(first - 1, 0), min(last + 1, self.knots_ns.numel() - 1)}
+
     def tangent_at(self, timestamp_ns: int) -> Float[Tensor, "actors 6"]:
         """Every actor's correction at a time; differentiable."""
         before, after, weight = self.neighbours(timestamp_ns)

@@ -53,6 +53,12 @@ def test_actor_corrections_are_linear_between_knots_and_constant_beyond():
     assert found == [1.0, 1.0, 1.5, 3.0, 4.0, 4.0]
 
 
+def test_a_correction_is_held_against_the_knots_beside_it():
+    actors = Actors.uncorrected([car_track(4)], torch.tensor([100, 200, 300, 400]))
+    found = [actors.knots_beside(time) for time in (100, 200, 250, 300, 400, 999)]
+    assert found == [{0, 1}, {0, 2}, {0, 3}, {1, 3}, {2, 3}, {2, 3}]
+
+
 def test_exposure_of_an_unknown_camera_is_neutral():
     exposure = ExposureCorrections.none(["front"], [0])
     exposure.matrix[0, :, 3] = 0.1
