@@ -1,6 +1,7 @@
 import math
 from dataclasses import replace
 
+import pytest
 import torch
 
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
@@ -10,14 +11,11 @@ from lidarpainter_models.kernels.pixel_losses import (
     SOLID,
     PixelFacts,
     PixelRules,
+    clear_sky_loss,
     depth_loss,
     pixel_terms,
 )
-from lidarpainter_models.kernels.pixel_losses.reference import (
-    clear_sky_loss,
-    composed,
-    looks_like_sky,
-)
+from lidarpainter_models.kernels.pixel_losses.reference import composed, looks_like_sky
 
 HEIGHT_PX, WIDTH_PX = 13, 17
 RULES = PixelRules(sky_tolerance=0.3, depth_tolerance=0.05, min_transmittance=0.2)
@@ -109,6 +107,23 @@ def test_only_open_pixels_can_look_like_sky():
     kind = torch.tensor([[OPEN, SOLID, OPEN]])
     found = looks_like_sky(rgb, sky_rgb, kind == OPEN, tolerance=0.05)
     assert found.tolist() == [[True, False, False]]
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_open_pixels_are_held_against_the_sky_as_the_camera_shows_it(backend):
+    clear, black = torch.zeros(HEIGHT_PX, WIDTH_PX), torch.zeros(HEIGHT_PX, WIDTH_PX, 3)
+    sky_rgb = black + 0.4
+    facts = PixelFacts(
+        rgb=black + 0.8,  # twice the sky: a camera that is twice as bright
+        kind=torch.full_like(clear, OPEN, dtype=torch.uint8),
+        lidar_depth_m=clear,
+    )
+    image = image_of(black, clear, clear + 0.5)
+    exposures = {1.0: 0.0, 2.0: math.log(2)}
+    for gain, expected in exposures.items():
+        exposure = torch.cat([gain * torch.eye(3), torch.zeros(3, 1)], dim=1)
+        terms = pixel_terms(image, sky_rgb, facts, RULES, exposure=exposure, backend=backend)
+        assert float(terms.sky) == pytest.approx(expected)
 
 
 def test_image_without_returns_has_no_depth_term():

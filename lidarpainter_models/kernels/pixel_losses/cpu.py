@@ -34,11 +34,12 @@ def _forward(rgb, depth, alpha, sky, target, kind, lidar, exposure, tolerances):
             clear = np.float32(1.0) - a
             most = np.float32(0.0)
             for k in range(3):
-                most = max(most, abs(target[v, u, k] - sky[v, u, k]))
-                light = exposure[k, 3]
+                light, open_sky = exposure[k, 3], exposure[k, 3]
                 for j in range(3):
                     light += exposure[k, j] * (rgb[v, u, j] + clear * sky[v, u, j])
+                    open_sky += exposure[k, j] * sky[v, u, j]
                 shown[v, u, k] = light
+                most = max(most, abs(target[v, u, k] - open_sky))
             by_alpha[v, u, 0], by_alpha[v, u, 1], by_depth[v, u] = 0.0, 0.0, 0.0
             is_sky = kind[v, u] == 1 or (kind[v, u] == 3 and most < sky_tolerance)
             if is_sky or kind[v, u] == 2:

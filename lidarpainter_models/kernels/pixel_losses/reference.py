@@ -27,14 +27,22 @@ def pixel_terms(
     """See `pixel_losses.pixel_terms`."""
     composed_rgb = composed(image, sky_rgb, rules.min_transmittance)
     is_open = facts.kind == OPEN
-    like_sky = looks_like_sky(facts.rgb, sky_rgb.detach(), is_open, tolerance=rules.sky_tolerance)
+    shown_sky = exposed(sky_rgb, exposure).detach()
+    like_sky = looks_like_sky(facts.rgb, shown_sky, is_open, tolerance=rules.sky_tolerance)
     return PixelTerms(
-        shown=composed_rgb @ exposure[:, :3].T + exposure[:, 3],
+        shown=exposed(composed_rgb, exposure),
         sky=clear_sky_loss(image.alpha, (facts.kind == SKY) | like_sky, facts.kind == SOLID),
         depth=depth_loss(
             image.depth_m, image.alpha, facts.lidar_depth_m, tolerance=rules.depth_tolerance
         ),
     )
+
+
+def exposed(
+    rgb: Float[Tensor, "height width 3"], exposure: Float[Tensor, "3 4"]
+) -> Float[Tensor, "height width 3"]:
+    """Colours as a camera shows them."""
+    return rgb @ exposure[:, :3].T + exposure[:, 3]
 
 
 def composed(
@@ -69,7 +77,7 @@ def looks_like_sky(
     *,
     tolerance: float,
 ) -> Bool[Tensor, "height width"]:
-    """Open pixels that show the colour which the sky has in their direction.
+    """Open pixels that show the colour which the sky has in their direction, exposed like them.
 
     Where no view has sky its colour is a continuation of what lies around, far towers included;
     such pixels must not be OPEN, or the towers would be given to the sky.
