@@ -126,7 +126,18 @@ def _mean(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             merged[name] = total / sum(weights)
         else:
             merged[name] = first if isinstance(first, str) else None
+    if "psnr_by_actor" in merged:
+        merged["actors_psnr"] = _of_all(merged["psnr_by_actor"])
     return merged
+
+
+def _of_all(actors: Mapping[str, Mapping[str, Any]]) -> float | None:
+    """PSNR over the pixels of all actors; None without any."""
+    num = sum(found["num_pixels"] for found in actors.values())
+    if not num:
+        return None
+    errors = (found["num_pixels"] * 10 ** (-found["psnr"] / 10) for found in actors.values())
+    return psnr_from_error(sum(errors) / num)
 
 
 def _pooled(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from lidarpainter_models.evaluation.judged_views import (
     actors_in_view,
     score_views,
 )
-from lidarpainter_models.evaluation.judging import Judgement
+from lidarpainter_models.evaluation.judging import Judgement, _mean
 from lidarpainter_models.evaluation.settings import JudgeConfig, ScoringConfig
 from lidarpainter_models.evaluation.shown import ShownScene
 from lidarpainter_models.geometry.shifts import Shift
@@ -73,6 +73,13 @@ def test_an_actor_is_scored_over_the_pixels_of_all_cameras(scores):
     error = sum(part["num_pixels"] * 10 ** (-part["psnr"] / 10) for part in parts)
     assert whole["psnr"] == pytest.approx(-10 * math.log10(error / whole["num_pixels"]), abs=1e-9)
     assert parts[0]["psnr"] != pytest.approx(parts[1]["psnr"], abs=0.1)
+    assert scores["recorded"]["actors_psnr"] == pytest.approx(whole["psnr"], abs=1e-4)
+
+
+def test_a_camera_that_saw_no_actor_takes_none_from_the_others(scores):
+    seen = scores["recorded_by_camera"][FRONT]
+    blind = {**scores["recorded_by_camera"][SIDE], "actors_psnr": None, "psnr_by_actor": {}}
+    assert _mean([seen, blind])["actors_psnr"] == pytest.approx(seen["actors_psnr"], abs=1e-4)
 
 
 @pytest.fixture
