@@ -8,7 +8,7 @@ forward, y left, z up; metres.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -208,6 +208,7 @@ def _paint(
     home = torch.device("cpu")  # where paintings of a whole log have room
     images = _images(conditions, painting, trust) if is_shown else {}
     images = {name: rgb.to(home) for name, rgb in images.items()}
+    gate = replace(gate, weight=gate.weight.to(home))
     return NovelPainting(novel=novel, guidance=guidance.to(home), gate=gate, images=images)
 
 

@@ -44,6 +44,10 @@ class HeldOut:
     def _moving(self) -> MovingBoxes:
         return MovingBoxes([track for track in self.scene.tracks if track.is_moving])
 
+    @cached_property
+    def _directions(self) -> Float[Tensor, "frames 3"]:
+        return road_directions(self.scene.world_from_ego)
+
     def sampled(self, most_views: int) -> "HeldOut":
         """With so many of the views at most, each camera's evenly over time; 0 keeps all."""
         if most_views == 0 or len(self.test_views) <= most_views:
@@ -71,8 +75,7 @@ class HeldOut:
     def shifted_camera(self, fitted: GaussianScene, view: RecordedView, shift: Shift) -> Camera:
         """The interpolated camera moved beside the path."""
         camera = self.camera_of(fitted, view, "interpolated")
-        directions = road_directions(self.scene.world_from_ego)
-        direction = directions[self.scene.frame_position(view.frame_index)]
+        direction = self._directions[self.scene.frame_position(view.frame_index)]
         return camera.at(shift_pose(camera.world_from_camera, direction, shift))
 
     def recorded_views(self, fitted: GaussianScene, poses: Poses) -> list[JudgedView]:

@@ -87,8 +87,7 @@ def actors_in_view(
         sizes_m = torch.stack([track.size_m for track in tracks])
         outlines = box_outlines(camera, torch.stack(poses), sizes_m)
         for outline in sorted(outlines, key=lambda outline: -outline.far_m):
-            hull = cv2.convexHull(outline.pixels_uv.astype(np.float32))
-            cv2.fillConvexPoly(index, np.round(hull - 0.5).astype(np.int32), outline.box)
+            cv2.fillConvexPoly(index, outline.hull, outline.box)
     return tuple(track.actor_id for track, _pose in placed), torch.from_numpy(index)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.geometry.boxes import BOX_EDGES, box_corners
@@ -31,6 +31,11 @@ class BoxOutline:
     """Their convex hull is the box; clamped to `FARTHEST_PX`."""
     far_m: float
     """Depth of the furthest corner."""
+
+    @property
+    def hull(self) -> Int[np.ndarray, "hull 1 2"]:
+        """The outline in whole pixels, whose centres lie half a pixel in, as OpenCV fills it."""
+        return cv2.convexHull(np.round(self.pixels_uv - 0.5).astype(np.int32))
 
 
 def box_outlines(
@@ -73,8 +78,7 @@ def project_boxes(
     if bool(present.any()):
         sizes = torch.stack(list(sizes_m))[present].double() * margin
         for outline in box_outlines(camera, world_from_boxes[present], sizes):
-            rounded = outline.pixels_uv.round().astype(np.int32)
-            cv2.fillConvexPoly(mask, cv2.convexHull(rounded), 1)
+            cv2.fillConvexPoly(mask, outline.hull, 1)
     return torch.from_numpy(mask.astype(bool))
 
 

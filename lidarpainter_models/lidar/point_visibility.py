@@ -109,8 +109,7 @@ def box_far_ends(
         outlines = box_outlines(camera, poses, sizes_m)
         # the nearest is drawn last, over all that end behind it
         for outline in sorted(outlines, key=lambda outline: outline.far_m, reverse=True):
-            hull = cv2.convexHull(np.floor(outline.pixels_uv).astype(np.int32))
-            cv2.fillConvexPoly(far_ends, hull, outline.far_m)
+            cv2.fillConvexPoly(far_ends, outline.hull, outline.far_m)
     return torch.from_numpy(far_ends)
 
 

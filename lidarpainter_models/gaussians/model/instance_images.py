@@ -5,6 +5,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.gaussians.model.rolling_shutter import as_read
 from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.backends import Backend
@@ -21,18 +22,22 @@ def instance_image(
 ) -> Int[Tensor, "height width"]:
     """The body that gives most of each pixel: 0 street, i + 1 the i-th track, `SKY` if clear.
 
-    Only actors that the view shows are drawn, a few at a time, each as a channel of its own.
+    Drawn as `GaussianScene.render` does, of the actors only those that the view shows, a few at a
+    time, each as a channel of its own.
     """
-    gaussians = scene.actors.bending.bent(scene.gaussians, timestamp_ns)
+    timestamp_ns = camera.taken_ns(timestamp_ns)
     with torch.no_grad():
         poses = scene.actors.likely_poses(timestamp_ns)
-        bodies = camera_from_body(camera.world_from_camera, *poses).to(scene.device)
+        bodies = camera_from_body(camera.world_from_camera, *poses)
+        bent = scene.actors.bending.bent(scene.gaussians, timestamp_ns)
+        gaussians = as_read(bent, bodies, camera, scene.actors, timestamp_ns)
+        bodies = bodies.to(scene.device)
         splats = Splats(
             means=gaussians.means,
             rotation_wxyz=gaussians.rotation_wxyz,
             scale_m=gaussians.scale_m,
             opacity=gaussians.opacity,
-            sh=gaussians.sh_dc,
+            sh=scene.gaussians.sh_dc,
             body_index=gaussians.body_index,
         )
         own = gaussians.body_index

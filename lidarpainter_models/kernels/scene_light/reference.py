@@ -100,7 +100,8 @@ def _lamp_light(
 ) -> Float[Tensor, "gaussians 3"]:
     """Irradiance by the lamps that count for each surface."""
     found = torch.zeros_like(points)
-    for lamp in range(len(lamps.reach_m)):
+    is_beam = (lamps.heading_world != 0).any(dim=1).tolist()
+    for lamp in counts.any(dim=1).nonzero()[:, 0].tolist():
         to_point = points - lamps.position_world[lamp].to(points)
         squared = to_point.square().sum(dim=-1)
         away_m = squared.sqrt().clamp_min(1e-3)
@@ -110,9 +111,8 @@ def _lamp_light(
         span = surfaces.facing - surfaces.least_facing
         back = surfaces.least_facing + span * cosine.clamp(0, 1)
         strength = fade * back / (squared + NEAREST_M2) * counts[lamp]
-        heading = lamps.heading_world[lamp].to(points)
-        if bool((heading != 0).any()):
-            strength = strength * _beam(to_point, heading)
+        if is_beam[lamp]:
+            strength = strength * _beam(to_point, lamps.heading_world[lamp].to(points))
         found = found + strength[:, None] * lamps.power_rgb[lamp].to(points)
     return found
 
