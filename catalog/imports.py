@@ -13,7 +13,7 @@ import tarfile
 import uuid
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path, PurePosixPath
@@ -32,7 +32,7 @@ from catalog.digests import canonical_json, digest_text
 from catalog.errors import CatalogError, DamagedArtefactError, UnknownRecordError, storage_errors
 from catalog.locks import held_lock
 from catalog.schemas import TABLES
-from catalog.store import Store, split_scene_id
+from catalog.store import Store, digest_in, split_scene_id
 from catalog.tables import Row
 
 MAX_FILES = 1_000_000
@@ -259,7 +259,7 @@ def _has_scene(staged: Store, store: Store, scene_id: str, path: Path) -> bool:
     Raises:
         ArchiveError: it has one of the same name with another content.
     """
-    ours, theirs = (_content_digest(one, scene_id) for one in (store, staged))
+    ours, theirs = (one.scene_digest(scene_id) for one in (store, staged))
     if theirs is None:
         raise ArchiveError(f"{path}: the scene {scene_id} has no manifest")
     if ours not in (None, theirs):
@@ -270,31 +270,16 @@ def _has_scene(staged: Store, store: Store, scene_id: str, path: Path) -> bool:
     return ours == theirs
 
 
-def _content_digest(store: Store, scene_id: str) -> str | None:
-    """What a scene holds, by its manifest; None where there is no scene."""
-    with suppress(UnknownRecordError):
-        if (files := store.scene_files(scene_id)) is not None:
-            files([MANIFEST_NAME])
-    return _digest_in(store.scene_folder(scene_id))
-
-
-def _digest_in(folder: Path) -> str | None:
-    try:
-        return str(json.loads((folder / MANIFEST_NAME).read_text("utf-8"))["content_digest"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-
-
 def _place(store: Store, folder: Path, name: str) -> None:
     """Give a checked folder its name, under the lock of whoever makes such."""
     root, _, what = name.partition("/")
     if root == "artefacts":
         store.artefacts.adopt(ArtefactRef.of_id(what), folder)
         return
-    if _content_digest(store, what) is not None:  # it came meanwhile
+    if store.scene_digest(what) is not None:  # it came meanwhile
         return
     final = store.scene_folder(what)
     with store.scene_lock(what):
-        if _digest_in(final) is None:
+        if digest_in(final) is None:
             final.parent.mkdir(parents=True, exist_ok=True)
             folder.rename(final)

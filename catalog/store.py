@@ -6,19 +6,20 @@ between machines nothing needs to be locked, since artefacts and scenes are publ
 condition. That a run is going on is told by a lock in a folder, by a lease in a bucket.
 """
 
+import json
 import os
 import re
 import secrets
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from catalog.artefacts import ArtefactStore
+from catalog.artefacts import MANIFEST_NAME, ArtefactStore
 from catalog.errors import CatalogError, StorageError, UnknownRecordError
 from catalog.leases import ConditionalObjects, FolderObjects, Leases
 from catalog.locks import held_lock, is_held, shared_lock
@@ -106,6 +107,13 @@ class Store:
             UnknownRecordError: there is no such scene in the bucket.
         """
         return None if self.mirror is None else self.mirror.opened(scene_entry(scene_id))
+
+    def scene_digest(self, scene_id: str) -> str | None:
+        """What a scene holds, by its manifest; None where there is no scene."""
+        with suppress(UnknownRecordError):
+            if (files := self.scene_files(scene_id)) is not None:
+                files([MANIFEST_NAME])
+        return digest_in(self.scene_folder(scene_id))
 
     def whole_scene(self, scene_id: str) -> Path:
         """Folder of a scene with all its files; from a bucket they are fetched.
@@ -284,6 +292,15 @@ def existing_store() -> Store:
     if not is_there:
         raise CatalogError(f"no store at {store.name}: `ingest` or `demo` makes one, see --store")
     return store
+
+
+def digest_in(scene_folder: Path) -> str | None:
+    """The content digest in a scene's manifest; None where it cannot be read."""
+    try:
+        manifest = json.loads((scene_folder / MANIFEST_NAME).read_text("utf-8"))
+        return str(manifest["content_digest"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def changed_at(path: Path) -> datetime:

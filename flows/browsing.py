@@ -8,7 +8,7 @@ from catalog.store import Store
 from flows.parameters import view_parameters
 from flows.views import PathRequest, render_request
 from lidarpainter_models.errors import ConfigError
-from tasks.runs import FinishedRun, open_run
+from tasks.runs import FinishedRun, is_of_its_scene, open_run
 from tasks.specs import FittedRef
 from tasks.views.drive import DriveRequest, view_live
 from tasks.views.files import ViewKinds
@@ -55,7 +55,8 @@ def _other_scenes(store: Store, finished: FinishedRun) -> dict[str, FittedRef]:
     if finished.unpainted != finished.final:
         scenes[UNPAINTED] = finished.unpainted
     for row in store.rows("runs"):
-        if row["derived_from"] == finished.run_id and row["status"] == "complete":
+        is_derived = row["derived_from"] == finished.run_id and row["status"] == "complete"
+        if is_derived and is_of_its_scene(store, row):
             derived = open_run(store, row["run_id"])
             kind = derived.change["kind"] if derived.change else "derived"
             scenes[f"{kind} {derived.run_id[:8]}"] = derived.final

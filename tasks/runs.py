@@ -35,7 +35,7 @@ def open_run(store: Store, run_id: str) -> FinishedRun:
 
     Raises:
         UnknownRecordError: there is no such run, or it did not complete.
-        CatalogError: its row is damaged.
+        CatalogError: its row is damaged, or its scene has another content by now.
     """
     row = store.run(run_id)
     if row["status"] != "complete":
@@ -46,6 +46,11 @@ def open_run(store: Store, run_id: str) -> FinishedRun:
     fits = [ref for ref in refs if ref.kind == "gaussians"]
     if not seen or not fits:
         raise CatalogError(f"run {row['run_id']} lists no fit: reconstruct the scene again")
+    if not is_of_its_scene(store, row):
+        raise CatalogError(
+            f"run {row['run_id']} was made of another content of {row['scene_id']}: "
+            "reconstruct the scene again"
+        )
     return FinishedRun(
         run_id=row["run_id"],
         scene_id=row["scene_id"],
@@ -57,3 +62,9 @@ def open_run(store: Store, run_id: str) -> FinishedRun:
         derived_from=row["derived_from"],
         change=json_of(row, "change") if row["change"] else None,
     )
+
+
+def is_of_its_scene(store: Store, row: dict[str, Any]) -> bool:
+    """Whether the scene of a run's row still is what it was made of; True where one is unknown."""
+    made_of = row["scene_digest"]
+    return not made_of or store.scene_digest(row["scene_id"]) in (None, made_of)

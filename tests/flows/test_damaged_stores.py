@@ -8,6 +8,7 @@ from toy_store import TOY_SCENE, write_toy_scene
 
 from catalog.store import open_store
 from tasks.ingest.ingest import record_scene
+from tasks.runs import open_run
 
 RUN = {
     "run_id": "r1",
@@ -84,6 +85,16 @@ def test_a_table_whose_rows_are_gone(store):
 def test_a_damaged_row(store, changes, words, expected):
     store.tables.merge("runs", [RUN | changes])
     refused(store, words, expected)
+
+
+def test_a_run_is_not_opened_on_another_content_of_its_scene(store):
+    store.tables.merge("runs", [RUN | {"scene_digest": store.scene_digest(TOY_SCENE)}])
+    record_scene(store, write_toy_scene(store.root))  # read again, the same
+    assert open_run(store, "r1").scene_id == TOY_SCENE
+    record_scene(store, write_toy_scene(store.root, num_frames=3))
+    for words in EVERY[2:]:
+        refused(store, words, "run r1 was made of another content of toy/street: reconstruct the")
+    assert call("catalog", "delete", "r1", "--yes", store=store).code == 0
 
 
 @pytest.mark.parametrize(
