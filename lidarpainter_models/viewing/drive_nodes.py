@@ -60,11 +60,10 @@ class DriveNodes:
         """Send everything but scenes; those are sent when they are first shown."""
         self._api, self._drive = server.scene, drive
         self._cameras = drive.recorded_cameras()
-        self._scenes: dict[str, SceneNodes] = {}
+        self._scenes: dict[str, _SentScene] = {}
         self._api.configure_default_lights(False)
         self._api.configure_environment_map(None)
         self._world = self._api.add_frame(ROOT, show_axes=False)
-        self.tracks = TrackNodes(self._api, ROOT, drive.path.builder.scene.tracks)
         self.with_actors = True
         self.show_scene(next(iter(drive.scenes)))
         look_forward(server.initial_camera, self._cameras[0][0])
@@ -72,23 +71,40 @@ class DriveNodes:
     def show_scene(self, name: str) -> None:
         """Show another of the drive's scenes; it is sent when it is first asked for."""
         if name not in self._scenes:
-            self._scenes[name] = SceneNodes(
-                self._api,
-                f"{ROOT}/{name}",
-                self._drive.scenes[name](),
-                self._cameras,
-                self._drive.camera_name,
-            )
+            self._scenes[name] = self._sent(f"{ROOT}/{name}", self._drive.scenes[name]())
         self._shown = self._scenes[name]
-        for nodes in self._scenes.values():
-            nodes.visible = nodes is self._shown
+        for sent in self._scenes.values():
+            sent.nodes.visible = sent is self._shown
+
+    def _sent(self, root: str, scene: GaussianScene) -> "_SentScene":
+        camera_name = self._drive.camera_name
+        nodes = SceneNodes(self._api, root, scene, self._cameras, camera_name)
+        return _SentScene(scene, nodes, TrackNodes(self._api, root, scene.tracks))
+
+    @property
+    def scene(self) -> GaussianScene:
+        """The scene that is shown."""
+        return self._shown.scene
+
+    @property
+    def tracks(self) -> TrackNodes:
+        """Boxes and ways of its actors."""
+        return self._shown.tracks
 
     def place(self, timestamp_ns: int, seat: Camera) -> None:
         """Show a moment from a seat."""
-        self._shown.with_actors = self.with_actors
-        self._shown.place(timestamp_ns, seat.centre_world)
-        self.tracks.place(self._drive.path.builder.scene.actors.likely_poses(timestamp_ns))
+        nodes = self._shown.nodes
+        nodes.with_actors = self.with_actors
+        nodes.place(timestamp_ns, seat.centre_world)
+        self.tracks.place(self.scene.actors.likely_poses(timestamp_ns))
         place_node(self._world, seat_from_world(seat))
+
+
+@dataclass(frozen=True, eq=False)
+class _SentScene:
+    scene: GaussianScene
+    nodes: SceneNodes
+    tracks: TrackNodes
 
 
 def seat_from_world(seat: Camera) -> Float[Tensor, "4 4"]:

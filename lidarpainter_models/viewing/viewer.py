@@ -58,7 +58,7 @@ class LiveViewer:
     ) -> None:
         """Send the drive's first moment, and answer the panel from now on.
 
-        Without `painting` the own renderer's images are never painted.
+        `painting` is of the first scene; without it the own renderer's images are never painted.
         """
         self._server, self._drive, self._painting = server, drive, painting
         self._lock = threading.RLock()
@@ -70,7 +70,6 @@ class LiveViewer:
         self.controls = add_controls(
             server.gui, num_moments=len(drive.path.views), scenes=list(drive.scenes)
         )
-        self.controls.painted.disabled = painting is None
         self.controls.on_change(self.show)
         self.controls.straighten.on_click(lambda event: self._straighten(event.client))
         self.controls.render.on_click(lambda event: self._render(event.client))
@@ -85,6 +84,7 @@ class LiveViewer:
             if wanted.seat.value != FREE:
                 self._seat = self._camera_aside()
             self._nodes.show_scene(wanted.scene.value)
+            wanted.painted.disabled = not self._is_paintable
             self._nodes.with_actors = wanted.actors.value
             self._nodes.tracks.boxes.visible = wanted.boxes.value
             self._nodes.tracks.tracks.visible = wanted.tracks.value
@@ -118,10 +118,16 @@ class LiveViewer:
         with self._lock:
             camera = self._camera_of(view)
             moment = self._drive.path.views[self._moment]
-            scene = self._drive.scenes[self.controls.scene.value]()
-            shown = ShownScene(scene=scene, painting=self._painting if painted else None)
+            painting = self._painting if painted and self._is_paintable else None
+            shown = ShownScene(scene=self._nodes.scene, painting=painting)
             render = shown.renderer(self._drive.camera_name)
             return render(camera, moment.timestamp_ns).clamp(0, 1)
+
+    @property
+    def _is_paintable(self) -> bool:
+        """What is known of views is of the drive's own scene, and painters know clear days."""
+        is_own = self.controls.scene.value == next(iter(self._drive.scenes))
+        return self._painting is not None and is_own and self._nodes.scene.style is None
 
     @property
     def _moment(self) -> int:
@@ -138,6 +144,8 @@ class LiveViewer:
     def _place_rig(self, frame_index: int) -> None:
         path, scene = self._drive.path, self._drive.path.builder.scene
         size = replace(path.observation, width_px=FRUSTUM_PX)
+        in_the_way = self._drive.camera_name if self.controls.seat.value == "recorded" else None
+        there = []
         for view in path.recorded.views:
             if view.frame_index != frame_index:
                 continue
@@ -148,9 +156,9 @@ class LiveViewer:
                 height_px=camera.height_px,
             )
             self._rig.place(view.camera_name, camera, rgb_u8)
-        in_the_way = self._drive.camera_name if self.controls.seat.value == "recorded" else None
-        names = path.recorded.camera_names
-        self._rig.show_only([name for name in names if name != in_the_way])
+            if view.camera_name != in_the_way:
+                there.append(view.camera_name)
+        self._rig.show_only(there)
 
     def _camera_of(self, view: viser.CameraHandle) -> Camera:
         """Where a browser looks from, in the world, as wide as the images of the fit."""
@@ -194,7 +202,7 @@ class LiveViewer:
         self, origin_seat: Sequence[float], direction_seat: Sequence[float]
     ) -> ActorTrack | None:
         """The actor whose box a ray of the seat's frame meets first."""
-        actors = self._drive.path.builder.scene.actors
+        actors = self._nodes.scene.actors
         moment = self._drive.path.views[self._moment]
         world_from_actors, present = actors.likely_poses(moment.timestamp_ns)
         there = [actors.recorded_tracks[row] for row in present.nonzero()[:, 0].tolist()]

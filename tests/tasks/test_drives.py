@@ -3,7 +3,7 @@
 import threading
 from contextlib import contextmanager
 from dataclasses import replace
-from unittest.mock import Mock
+from unittest.mock import Mock, patch
 
 import pytest
 import torch
@@ -11,6 +11,8 @@ import viser
 from viser import transforms
 
 from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.evaluation.shown import ViewTimePainting
+from lidarpainter_models.gaussians.model.styling.scene_style import SceneStyle
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.geometry.transforms import invert_rigid, quaternion_from_rotation
 from lidarpainter_models.viewing.annotations import vertical_fov_rad
@@ -73,6 +75,15 @@ def seat_camera(server):
     return invert_rigid(pose(world)) @ SEAT_FROM_CAMERA
 
 
+def from_the_seat(camera):
+    """A browser's view straight ahead, as wide as the camera's."""
+    view = Mock(viser.CameraHandle)
+    view.wxyz = quaternion_from_rotation(SEAT_FROM_CAMERA[:3, :3]).numpy()
+    view.position = torch.zeros(3).numpy()
+    view.fov, view.aspect = vertical_fov_rad(camera), camera.width_px / camera.height_px
+    return view
+
+
 def shown(server, name):
     return server.scene.get_handle_by_name(f"/drive/{name}").visible
 
@@ -92,7 +103,7 @@ def test_seat_aside_is_as_far_to_the_left_as_was_chosen(server, viewer, drive):
 
 
 def test_free_seat_stays_while_actors_go_on(server, viewer, drive):
-    car = server.scene.get_handle_by_name("/drive/boxes/000 Car")
+    car = server.scene.get_handle_by_name("/drive/painted/boxes/000 Car")
     with chosen(viewer, seat="aside"), chosen(viewer, seat="free"):
         before, stood = seat_camera(server), pose(car)
         with chosen(viewer, moment=3):
@@ -108,8 +119,8 @@ def test_free_seat_stays_while_actors_go_on(server, viewer, drive):
     ("control", "name"),
     [
         ("actors", "painted/actors"),
-        ("boxes", "boxes"),
-        ("tracks", "tracks"),
+        ("boxes", "painted/boxes"),
+        ("tracks", "painted/tracks"),
         ("cameras", "cameras"),
         ("lidar", "lidar"),
     ],
@@ -132,12 +143,56 @@ def test_camera_shows_its_image_and_lidar_its_points(server, viewer, drive):
             assert frustum.visible
 
 
+def test_camera_without_an_image_at_the_moment_is_hidden(server, viewer, drive):
+    recorded = drive.path.recorded
+    last = drive.path.views[-1].frame_index
+    others = [view for view in recorded.views if view.frame_index != last]
+    with patch.object(recorded, "views", others), chosen(viewer, cameras=True, seat="aside"):
+        assert shown(server, "cameras/front")
+        with chosen(viewer, moment=len(drive.path.views) - 1):
+            assert not shown(server, "cameras/front")
+
+
 def test_scene_before_painting_takes_the_place_of_the_painted_one(server, viewer):
     with chosen(viewer, scene="before painting"):
         assert shown(server, "before painting")
         assert not shown(server, "painted")
     assert shown(server, "painted")
     assert not shown(server, "before painting")
+
+
+def without_car(scene):
+    street = (scene.gaussians.body_index == 0).nonzero()[:, 0]
+    return replace(scene, gaussians=scene.gaussians.select(street), actors=scene.actors.without(1))
+
+
+def test_boxes_and_clicks_are_those_of_the_scene_that_is_shown(drive):
+    emptied = without_car(drive.path.builder.scene)
+    scenes = {**drive.scenes, "edit": lambda: emptied}
+    with local_server(port=0) as server:
+        viewer = LiveViewer(server, replace(drive, scenes=scenes))
+        with chosen(viewer, boxes=True, scene="edit"):
+            assert shown(server, "edit/boxes")
+            assert not shown(server, "painted")
+            assert server.scene.get_handle_by_name("/drive/edit/boxes/000 Car") is None
+            assert viewer._track_hit((0.0, 0.0, 0.0), (10.0, -4.0, -0.9)) is None
+        assert viewer._track_hit((0.0, 0.0, 0.0), (10.0, -4.0, -0.9)).actor_id == "car"
+
+
+def test_only_the_drives_own_scene_can_be_painted(drive):
+    painting = Mock(ViewTimePainting)  # nobody paints
+    foggy = replace(drive.path.builder.scene, style=Mock(SceneStyle))
+    with local_server(port=0) as server:
+        viewer = LiveViewer(server, drive, painting)
+        assert not viewer.controls.painted.disabled
+        with chosen(viewer, scene="before painting"):
+            assert viewer.controls.painted.disabled
+            view = from_the_seat(drive.path.camera(0))
+            plain = viewer.own_image(view, painted=False)
+            assert torch.equal(viewer.own_image(view, painted=True), plain)
+    with local_server(port=0) as server:
+        viewer = LiveViewer(server, replace(drive, scenes={"painted": lambda: foggy}), painting)
+        assert viewer.controls.painted.disabled
 
 
 def test_click_names_the_actor_under_it_and_nothing_else(viewer):
@@ -166,11 +221,8 @@ def test_time_goes_on_while_playing_and_begins_again(viewer, drive):
 
 
 def test_own_image_is_what_the_scene_shows_from_the_browsers_camera(viewer, drive):
-    camera, view = drive.path.camera(0), Mock(viser.CameraHandle)
-    view.wxyz = quaternion_from_rotation(SEAT_FROM_CAMERA[:3, :3]).numpy()
-    view.position = torch.zeros(3).numpy()
-    view.fov, view.aspect = vertical_fov_rad(camera), camera.width_px / camera.height_px
-    found = viewer.own_image(view, painted=False)
+    camera = drive.path.camera(0)
+    found = viewer.own_image(from_the_seat(camera), painted=False)
     scene, moment = drive.path.builder.scene, drive.path.views[0]
     expected = scene.render(camera, moment.timestamp_ns, camera_name="front").rgb.clamp(0, 1)
     lower = round(camera.height_px / 2 - camera.cy_px)  # a browser looks through the middle
