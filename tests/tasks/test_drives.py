@@ -9,12 +9,16 @@ import pytest
 import torch
 import viser
 from viser import transforms
+from websockets import Subprotocol
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.evaluation.shown import ViewTimePainting
 from lidarpainter_models.gaussians.model.styling.scene_style import SceneStyle
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.geometry.transforms import invert_rigid, quaternion_from_rotation
+from lidarpainter_models.viewing import servers
 from lidarpainter_models.viewing.annotations import vertical_fov_rad
 from lidarpainter_models.viewing.controls import CLICK_HINT
 from lidarpainter_models.viewing.drive_nodes import SEAT_FROM_CAMERA
@@ -234,6 +238,34 @@ def test_own_image_is_what_the_scene_shows_from_the_browsers_camera(viewer, driv
 def test_port_that_is_taken_is_refused(server):
     with pytest.raises(ConfigError, match="cannot be had"), local_server(port=server.get_port()):
         pass
+
+
+def connects(server, origin):
+    address = f"ws://127.0.0.1:{server.get_port()}"
+    protocol = Subprotocol(f"viser-v{viser.__version__}")
+    try:
+        with connect(address, origin=origin, subprotocols=[protocol]) as connection:
+            return bool(connection.recv(timeout=10))
+    except InvalidStatus:
+        return False
+
+
+def test_only_the_servers_own_page_and_programs_may_connect(server):
+    port = server.get_port()
+    assert connects(server, f"http://127.0.0.1:{port}")
+    assert connects(server, f"http://localhost:{port}")
+    assert connects(server, None)
+    assert not connects(server, "https://elsewhere.example")
+    assert not connects(server, f"http://127.0.0.1:{port + 1}")
+    assert not connects(server, "null")
+
+
+def test_viser_that_would_let_other_pages_in_is_refused(monkeypatch):
+    another = Mock(viser.ViserServer)  # it serves nothing by way of websockets
+    monkeypatch.setattr(servers, "LocalServer", lambda *_, **__: another)
+    with pytest.raises(ConfigError, match="lets other pages in"), local_server():
+        pass
+    another.stop.assert_called_once()
 
 
 def test_page_drives_the_recorded_path_and_one_beside_it(
