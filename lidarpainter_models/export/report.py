@@ -7,6 +7,7 @@ escaped by the template, since names come from datasets.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
+from itertools import cycle
 
 import jinja2
 from jaxtyping import Float
@@ -21,7 +22,10 @@ PLOT_MARGIN = 46
 MOST_SHOWN_FACTS = 20
 DRIVE_PAGE = "drive.html"
 """Where `demo` puts the page that plays the drive, beside the report."""
-SERIES_COLOURS = ("#0b6e99", "#d1495b", "#5c8001", "#8f5db7")
+SERIES_COLOURS = (
+    *("#0b6e99", "#d1495b", "#5c8001", "#8f5db7"),
+    *("#c77700", "#555555", "#009e8e", "#7a4b2a"),
+)
 
 Cell = str | float | int | None
 
@@ -98,6 +102,7 @@ def plot_geometry(plot: Plot) -> dict[str, object]:
     xs = [point[0] for point in points] or [0.0]
     ys = [point[1] for point in points] or [0.0]
     low_x, high_x, low_y, high_y = min(xs), max(xs), min(ys), max(ys)
+    colours = cycle(SERIES_COLOURS)
     span_x, span_y = (high_x - low_x) or 1.0, (high_y - low_y) or 1.0
 
     def place(x: float, y: float) -> str:
@@ -113,7 +118,7 @@ def plot_geometry(plot: Plot) -> dict[str, object]:
         "y_range": (_mark(low_y), _mark(high_y)),
         "lines": [
             {"label": label, "colour": colour, "points": " ".join(place(*p) for p in line)}
-            for (label, line), colour in zip(plot.series.items(), SERIES_COLOURS, strict=False)
+            for (label, line), colour in zip(plot.series.items(), colours, strict=False)
         ],
         "width": PLOT_WIDTH,
         "height": PLOT_HEIGHT,

@@ -21,6 +21,7 @@ from lidarpainter_models.export.report import (
     Report,
     Table,
     format_cell,
+    plot_geometry,
     render_report,
 )
 from lidarpainter_models.export.run_page import Pictures, RunPage
@@ -253,6 +254,14 @@ def test_hostile_names_are_escaped():
     page = render_report(sample_report(title="<script>alert(1)</script>"))
     assert "<script>alert" not in page
     assert "&lt;script&gt;alert" in page
+
+
+def test_a_plot_shows_every_line():
+    series = {f"refine-{number}": [(0, 1), (5, number)] for number in range(9)}
+    plot = Plot(title="fit", x_label="step", y_label="dB", series=series)
+    lines = plot_geometry(plot)["lines"]
+    assert [line["label"] for line in lines] == list(series)
+    assert len({line["colour"] for line in lines}) == 8
 
 
 def test_missing_numbers_print_as_a_dash_and_numbers_shortly():
