@@ -7,12 +7,14 @@ of its box. Needs usd-core (extra `export`).
 
 import re
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from lidarpainter_models.errors import ConfigError, DataError, MissingPackageError
+from lidarpainter_models.errors import ConfigError, DataError, MissingPackageError, WriteError
 from lidarpainter_models.export.contents import ExportedActor, SceneContents
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation
@@ -21,6 +23,7 @@ from lidarpainter_models.storage.whole_files import whole_file
 USD_ENDINGS = (".usdz", ".usdc", ".usda")
 MAX_PACKED_BYTES = 2**32 - 1
 """Of a layer inside a .usdz, which is a zip file without its 64-bit extension."""
+_REASON = re.compile(r"Error occurred writing file: ([^'\n]+)")
 TIME_CODES_PER_SECOND = 1000.0
 """Time codes are milliseconds since the first frame."""
 
@@ -41,7 +44,11 @@ def write_usd(path: Path, contents: SceneContents) -> None:
     except ImportError:
         hint = "USD needs usd-core: pip install 'lidarpainter[export]'"
         raise MissingPackageError(hint) from None
-    with whole_file(path) as aside, tempfile.TemporaryDirectory(dir=path.parent) as folder:
+    with (
+        whole_file(path) as aside,
+        tempfile.TemporaryDirectory(dir=path.parent) as folder,
+        _usd_errors(path),
+    ):
         layer = Path(folder) / f"scene{'.usdc' if path.suffix == '.usdz' else path.suffix}"
         stage = Usd.Stage.CreateNew(str(layer))
         _fill(stage, contents)
@@ -53,8 +60,22 @@ def write_usd(path: Path, contents: SceneContents) -> None:
         if layer.stat().st_size > MAX_PACKED_BYTES:
             raise DataError(f"{path}: larger than the 4 GiB of a .usdz, expected .usdc")
         packed = Path(folder) / "scene.usdz"
-        UsdUtils.CreateNewUsdzPackage(str(layer), str(packed))
+        if not UsdUtils.CreateNewUsdzPackage(str(layer), str(packed)):
+            raise WriteError(f"{path}: cannot be written: USD could not pack it")
         packed.replace(aside)
+
+
+@contextmanager
+def _usd_errors(path: Path) -> Iterator[None]:
+    """Turn what USD says of its insides into one line."""
+    from pxr import Tf
+
+    try:
+        yield
+    except Tf.ErrorException as error:
+        found = _REASON.search(str(error))
+        reason = found[1] if found else "USD failed"
+        raise WriteError(f"{path}: cannot be written: {reason}") from None
 
 
 def _fill(stage: Any, contents: SceneContents) -> None:  # noqa: ANN401 - pxr has no types

@@ -1,5 +1,6 @@
 """A scene as a file of other programs, opened by readers that are not ours."""
 
+import resource
 import struct
 import sys
 from dataclasses import replace
@@ -298,6 +299,27 @@ def test_a_street_without_actors_stands_still(tmp_path):
     write_usd(tmp_path / "a.usdz", contents)
     stage = Usd.Stage.Open(str(tmp_path / "a.usdz"))
     assert len(usd_gaussians(stage.GetPrimAtPath("/World/Street"))) == 150
+
+
+@pytest.mark.parametrize("ending", ["usda", "usdz"])
+def test_usd_on_a_full_disk_is_one_line(world, tmp_path, ending):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2_000, before[1]))  # the kernel refuses more
+    try:
+        with pytest.raises(WriteError, match=r"cannot be written: File too large$"):
+            write_usd(tmp_path / f"a.{ending}", world[3])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_usd_that_cannot_be_packed_leaves_nothing(world, tmp_path, monkeypatch):
+    from pxr import UsdUtils
+
+    monkeypatch.setattr(UsdUtils, "CreateNewUsdzPackage", lambda *_: False)
+    with pytest.raises(WriteError, match="USD could not pack it"):
+        write_usd(tmp_path / "a.usdz", world[3])
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("write", [write_gltf, write_usd])
