@@ -19,6 +19,7 @@ from tasks.specs import FittedRef
 
 CROSS_CAMERA = "cross-camera"
 TRUTH = "truth"
+VIEW_TIME = "view-time"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +33,7 @@ class EvaluationRequest:
     is_painted: bool = False
     """Judge what is painted at view time as well."""
     painter: str | None = None
-    """Who paints then; None takes the run's own."""
+    """Who paints then; None takes the run's own. What another paints is judged, not entered."""
     changes: Mapping[str, Any]
     """Fields of the run's parameters that are replaced, such as weights of distances."""
     judges_all: bool = False
@@ -42,7 +43,7 @@ class EvaluationRequest:
 
 
 def evaluate_run(store: Store, request: EvaluationRequest) -> dict[str, Any]:
-    """Judge a finished run on views it never saw, and enter the scores into the catalog.
+    """Judge a finished run on views it never saw, and enter its own scores into the catalog.
 
     Returns:
         `run_id`, `scene`, `protocol`, and the scores by variant (for flicker by shift):
@@ -66,7 +67,12 @@ def evaluate_run(store: Store, request: EvaluationRequest) -> dict[str, Any]:
     if request.protocol == FLICKER:
         return about | _flicker(store, finished, parameters, request)
     scores = _variants(store, finished, parameters, request)
-    record_scores(store, finished.run_id, finished.scene_id, scores)
+    own = {
+        name: found
+        for name, found in scores.items()
+        if name != VIEW_TIME or _is_own_painter(request, parameters)
+    }
+    record_scores(store, finished.run_id, finished.scene_id, own)
     if request.protocol == TRUTH:
         scores = {name: _with_truth(found, finished.scene_id) for name, found in scores.items()}
     return about | scores
@@ -81,7 +87,7 @@ def _variants(
     if finished.derived_from is not None or finished.final != finished.unpainted:
         judged[fitted_on(parameters.painter)] = finished.final
     if request.is_painted or request.painter:
-        judged["view-time"] = finished.final
+        judged[VIEW_TIME] = finished.final
     judge = evaluate_strips if request.protocol == CROSS_CAMERA else evaluate
     run = parameters.run_spec(store.address, painter=request.painter)
     scores = {}
@@ -91,7 +97,7 @@ def _variants(
             f"{request.protocol}-{name}",
             fitted,
             parameters.judge_config,
-            view_time=name == "view-time",
+            view_time=name == VIEW_TIME,
         )
         scores[name] = load_scores(store, made.ref)
     return scores
@@ -105,8 +111,14 @@ def _flicker(
         run, FLICKER, finished.final, parameters.judge_config, request.previous
     )
     found = load_scores(store, made.ref)[FLICKER]
-    record_scores(store, finished.run_id, finished.scene_id, flicker_by_image(found))
+    if _is_own_painter(request, parameters):
+        record_scores(store, finished.run_id, finished.scene_id, flicker_by_image(found))
     return {"painter": run.painter, FLICKER: found}
+
+
+def _is_own_painter(request: EvaluationRequest, parameters: ViewParameters) -> bool:
+    """A number of the catalog does not say who painted: it is the run's own painter."""
+    return request.painter in (None, parameters.painter)
 
 
 def _with_truth(scores: Scores, scene_id: str) -> Scores:

@@ -28,7 +28,11 @@ def evaluate(  # noqa: PLR0913 - the options of a command
         bool, typer.Option("--postpaint", help="Judge what is painted at view time as well.")
     ] = False,
     painter: Annotated[
-        str | None, typer.Option(help="Painter for --postpaint; the run's own if absent.")
+        str | None,
+        typer.Option(
+            help="Painter for --postpaint; the run's own if absent. What another paints is judged, "
+            "but not entered into the catalog."
+        ),
     ] = None,
     feature_weights: Annotated[
         Path | None, typer.Option(help="SqueezeNet 1.1 weights for the feature distance.")

@@ -272,18 +272,22 @@ def test_cross_camera_judges_by_the_camera_that_was_left_out(tiny_run):
 
 
 def test_flicker_compares_what_was_rendered_painted_and_true(tiny_run):
+    before = tiny_run.store.tables.rows("metrics")
     words = ("evaluate", tiny_run.run_id, "--protocol", "flicker", "--painter", "overlay")
     result = succeed(*words, "--previous", "mixed", "--json", store=tiny_run.store).json
     for images in result["flicker"].values():
         assert {"render", "painted", "truth", "painted, previous mixed"} <= set(images)
         assert 0 < images["render"]["flicker"] < images["painted"]["flicker"]
+    assert tiny_run.store.tables.rows("metrics") == before  # the run's own painter is another
 
 
 def test_view_time_painting_is_judged_beside_the_run(tiny_run):
+    before = tiny_run.store.tables.rows("metrics")
     words = ("evaluate", tiny_run.run_id, "--painter", "overlay", "--json")
     result = succeed(*words, store=tiny_run.store).json
     assert result["view-time"]["novel"] != result["painted"]["novel"]
     assert set(result["view-time"]["novel"]) == SHIFTS
+    assert tiny_run.store.tables.rows("metrics") == before  # the run's own painter is another
 
 
 @pytest.mark.parametrize("prompt", STYLE_PROMPTS)
