@@ -6,7 +6,13 @@ from typing import Annotated, Any
 import typer
 
 from flows.cli.output import print_json, print_table, say_status
-from flows.cli.shared_options import AsJson, RunName, check_painter, parse_previous
+from flows.cli.shared_options import (
+    AsJson,
+    RunName,
+    check_painter,
+    parse_previous,
+    refuse_unused,
+)
 from lidarpainter_models.errors import ConfigError
 
 FLICKER = "flicker"
@@ -17,8 +23,16 @@ STRIP_FIGURES = {
     "whole_image_psnr": "all, as delivered",
 }
 PROTOCOLS = ("paper", "truth", CROSS_CAMERA, FLICKER)
+WEIGHTS = ("--feature-weights", "--lpips-backbone", "--lpips-heads")
 VARIANTS = ("unpainted", "painted", "refined", "view-time")
 FLICKER_COLUMNS = ("flicker", "moving_flicker", "valid_share", "psnr", "num_pairs")
+ViewTimePainter = Annotated[
+    str | None,
+    typer.Option(
+        help="Painter for --postpaint; the run's own if absent. Scores of another one are printed, "
+        "not entered into the catalog."
+    ),
+]
 
 
 def evaluate(  # noqa: PLR0913 - the options of a command
@@ -27,13 +41,7 @@ def evaluate(  # noqa: PLR0913 - the options of a command
     postpaint: Annotated[
         bool, typer.Option("--postpaint", help="Judge what is painted at view time as well.")
     ] = False,
-    painter: Annotated[
-        str | None,
-        typer.Option(
-            help="Painter for --postpaint; the run's own if absent. What another paints is judged, "
-            "but not entered into the catalog."
-        ),
-    ] = None,
+    painter: ViewTimePainter = None,
     feature_weights: Annotated[
         Path | None, typer.Option(help="SqueezeNet 1.1 weights for the feature distance.")
     ] = None,
@@ -56,7 +64,8 @@ def evaluate(  # noqa: PLR0913 - the options of a command
 
     Example: lidarpainter evaluate latest --protocol flicker --previous mixed
     """
-    _check(protocol, previous)
+    weights = (feature_weights, lpips_backbone, lpips_heads)
+    _check(protocol, previous, weights, all_views=all_views)
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
     from tasks.runs import open_run
@@ -72,7 +81,7 @@ def evaluate(  # noqa: PLR0913 - the options of a command
         protocol=protocol,
         is_painted=postpaint,
         painter=painter,
-        changes=_weights(feature_weights, lpips_backbone, lpips_heads),
+        changes=_weights(*weights),
         judges_all=all_views,
         previous=previously,
     )
@@ -84,12 +93,17 @@ def evaluate(  # noqa: PLR0913 - the options of a command
         {FLICKER: _show_flicker, CROSS_CAMERA: _show_strips}.get(protocol, _show)(result)
 
 
-def _check(protocol: str, previous: str | None) -> None:
+def _check(
+    protocol: str, previous: str | None, weights: tuple[Path | None, ...], *, all_views: bool
+) -> None:
     """Refuse what cannot be judged before anything is loaded."""
     if protocol not in PROTOCOLS:
         raise ConfigError(f"no protocol {protocol!r}, expected {', '.join(PROTOCOLS)}")
     if previous is not None and protocol != FLICKER:
         raise ConfigError(f"--previous is judged by --protocol {FLICKER}, not by {protocol}")
+    if protocol in (CROSS_CAMERA, FLICKER):
+        given = {name: path is not None for name, path in zip(WEIGHTS, weights, strict=True)}
+        refuse_unused(f"--protocol {protocol}", {"--all-views": all_views, **given})
 
 
 def _weights(features: Path | None, backbone: Path | None, heads: Path | None) -> dict[str, Any]:

@@ -63,7 +63,7 @@ def run(  # noqa: PLR0913 - the options of a command
             "workers": workers,
             "accept_stale": accept_stale,
         }
-        _deploy(asked.name, parameters, cron=cron, pool=pool, as_json=as_json)
+        _deploy(asked.name, parameters, threads, cron=cron, pool=pool, as_json=as_json)
         return
     if cron is not None or pool is not None:
         raise typer.BadParameter("--cron and --pool go with --deploy")
@@ -213,14 +213,21 @@ def _run_here(
 
 
 def _deploy(
-    name: str, parameters: dict[str, Any], *, cron: str | None, pool: str | None, as_json: bool
+    name: str,
+    parameters: dict[str, Any],
+    threads: int,
+    *,
+    cron: str | None,
+    pool: str | None,
+    as_json: bool,
 ) -> None:
     say_status(f"deploying {name}")
     from catalog.store import open_store
     from flows.fleet.deployment import POOL, deploy
 
     store = open_store().name
-    made = deploy(name, {**parameters, "store": store}, pool=pool or POOL, cron=cron)
+    asked = {**parameters, "store": store}
+    made = deploy(name, asked, pool=pool or POOL, cron=cron, threads=threads)
     if as_json:
         print_json(made)
     else:

@@ -21,6 +21,7 @@ from flows.cli.shared_options import (
     parse_previous,
     with_told_collisions,
 )
+from lidarpainter_models.errors import ConfigError
 
 Postpaint = Annotated[
     bool, typer.Option("--postpaint", help="Paint every image; renders go to `unpainted/`.")
@@ -73,7 +74,11 @@ def render(  # noqa: PLR0913 - the options of a command
     from flows.cli.progress import shown_progress
     from lidarpainter_models.conditioning.settings import SequenceConfig
 
-    sequence = SequenceConfig() if previous is None else parse_previous(previous)[0]
+    if fps is not None and not video:
+        raise ConfigError("--fps needs --video")
+    sequence, *others = parse_previous(previous) or (SequenceConfig(),)
+    if others:
+        raise ConfigError(f"--previous {previous!r}: expected one of them here")
     path = followed_path(
         run,
         trajectory,

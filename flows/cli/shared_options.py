@@ -1,6 +1,7 @@
 """Options that several commands have, with the same meaning in each, and how they are read."""
 
 import re
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
@@ -110,6 +111,16 @@ def with_told_collisions(result: dict[str, Any]) -> dict[str, Any]:
 
     told = "; ".join(str(Collision(**found)) for found in result["collisions"])
     return {**result, "collisions": told or "none"}
+
+
+def refuse_unused(by: str, given: Mapping[str, bool]) -> None:
+    """Refuse an option that is given and would change nothing.
+
+    Raises:
+        ConfigError: there is one.
+    """
+    if unused := [name for name, is_given in given.items() if is_given]:
+        raise ConfigError(f"{by} has no use for {unused[0]}")
 
 
 def parse_frames(text: str | None) -> slice | None:

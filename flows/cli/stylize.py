@@ -14,8 +14,10 @@ from flows.cli.shared_options import (
     RunName,
     TrajectorySpec,
     followed_path,
+    refuse_unused,
 )
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.geometry.trajectory_words import RECORDED
 from lidarpainter_models.weather.mix import StyleMix
 
 Prompt = Annotated[
@@ -52,7 +54,7 @@ def stylize(  # noqa: PLR0913 - the options of a command
     in_scene: InScene = False,
     strength: Strength = 1.0,
     visibility: Visibility = None,
-    trajectory: TrajectorySpec = "recorded",
+    trajectory: TrajectorySpec = RECORDED,
     images: ImageKind = "rendered",
     camera: FollowedCamera = None,
     frames: FollowedFrames = None,
@@ -69,6 +71,17 @@ def stylize(  # noqa: PLR0913 - the options of a command
     mix = StyleMix.parse(prompt, strength=strength, visibility_m=visibility)
     if in_scene == (out is not None):
         raise ConfigError("stylize needs --out FOLDER for images, or --in-scene for a new run")
+    if in_scene:
+        given = {
+            "--trajectory": trajectory != RECORDED,
+            "--images": images != "rendered",
+            "--camera": camera is not None,
+            "--frames": frames is not None,
+            "--width": width is not None,
+            "--painter": painter is not None,
+            "--allow-collisions": allow_collisions,
+        }
+        refuse_unused("--in-scene", given)
     path = followed_path(
         run,
         trajectory,

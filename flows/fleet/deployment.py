@@ -13,7 +13,7 @@ from catalog.errors import CatalogError
 from flows.environment import THREADS
 from flows.fleet.deployed import fleet, fleet_tag, fleet_work
 from flows.fleet.flow_runs import api_lost, store_tag
-from flows.fleet.local_workers import ONE_THREAD
+from flows.fleet.local_workers import THREAD_COUNTS
 from lidarpainter_models.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -24,11 +24,13 @@ POOL = "lidarpainter"
 MODULE = "flows.fleet.deployed"
 
 
-def deploy(name: str, parameters: dict[str, Any], *, pool: str, cron: str | None) -> dict[str, Any]:
+def deploy(
+    name: str, parameters: dict[str, Any], *, pool: str, cron: str | None, threads: int = 1
+) -> dict[str, Any]:
     """Make or update the pool and the deployments of a fleet; without a schedule, fire once.
 
     `parameters` are those of `deployed.fleet`; the pool is of type process, made if it is not
-    there; `cron` is in UTC.
+    there; `cron` is in UTC; `threads` are those of each worker.
 
     Returns:
         What `fleet run --deploy --json` prints.
@@ -51,7 +53,7 @@ def deploy(name: str, parameters: dict[str, Any], *, pool: str, cron: str | None
         _require_own_store(client, name, store)
         _make_pool(client, pool)
         common: dict[str, Any] = {"name": name, "work_pool_name": pool, "tags": named}
-        env = {**THREADS, **dict.fromkeys(ONE_THREAD, "1")}
+        env = {**THREADS, **dict.fromkeys(THREAD_COUNTS, str(threads))}
         client.create_deployment(
             flow_id=client.create_flow_from_name(fleet_work.name),
             entrypoint=f"{MODULE}.{fleet_work.fn.__name__}",

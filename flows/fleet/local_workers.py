@@ -26,7 +26,7 @@ STOP_S = 0.3
 """How long workers may take to end, of what an interrupted command has in all."""
 MAX_EARLY_DEATHS = 3
 """Workers that may end one after the other before any of them has entered an attempt."""
-ONE_THREAD = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+THREAD_COUNTS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 Start = Callable[[int], subprocess.Popen[bytes]]
 """Starts the worker of a number."""
@@ -34,7 +34,7 @@ Start = Callable[[int], subprocess.Popen[bytes]]
 
 def starter(store: Path, fleet: str, threads: int) -> Start:
     """Workers as the command starts them: `lidarpainter fleet work NAME`."""
-    counts = dict.fromkeys(ONE_THREAD, str(threads))
+    counts = dict.fromkeys(THREAD_COUNTS, str(threads))
     environment: Mapping[str, str] = {**os.environ, **counts}
     words = ["-m", "flows.cli", "--store", str(store), "--quiet", "fleet", "work", fleet]
 

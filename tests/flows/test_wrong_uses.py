@@ -20,6 +20,7 @@ from catalog.store import Store, open_store
 from flows.cli.main import main
 from tasks.ingest.ingest import record_scene
 
+IN_SCENE = ("stylize", "latest", "--prompt", "rain", "--in-scene")
 RENDER = ("render", "latest", "--out", "{tmp}/x", "--trajectory")
 TOY = ("reconstruct", TOY_SCENE)
 
@@ -138,6 +139,8 @@ def refused(words, expected, place):
         ((*RENDER, "recorded"), "no complete run in {store}"),
         ((*RENDER, "lateral:200"), "'lateral:200': 200 m sideways: expected at most 8 metres"),
         ((*RENDER, "sideways"), "expected one of recorded, lateral:METRES"),
+        ((*RENDER, "recorded", "--fps", "5"), "--fps needs --video"),
+        ((*RENDER, "recorded", "--previous", "mixed,shown"), "expected one of them here"),
         ((*RENDER, "recorded", "--previous", "next"), "--previous 'next': expected unused, mixed"),
         (("render", "ffff", "--trajectory", "recorded", "--out", "x"), "no run_id 'ffff' among 0"),
         (("stylize", "latest", "--prompt", "rain", "--out", "x"), "no complete run in {store}"),
@@ -149,9 +152,24 @@ def refused(words, expected, place):
             "from 0 to 1",
         ),
         (("stylize", "latest", "--prompt", "rain"), "--out FOLDER"),
+        ((*IN_SCENE, "--trajectory", "up:1"), "--in-scene has no use for --trajectory"),
+        ((*IN_SCENE, "--images", "recorded"), "--in-scene has no use for --images"),
+        ((*IN_SCENE, "--camera", "front"), "--in-scene has no use for --camera"),
+        ((*IN_SCENE, "--frames", "0:2"), "--in-scene has no use for --frames"),
+        ((*IN_SCENE, "--width", "90"), "--in-scene has no use for --width"),
+        ((*IN_SCENE, "--painter", "warp"), "--in-scene has no use for --painter"),
+        ((*IN_SCENE, "--allow-collisions"), "--in-scene has no use for --allow-collisions"),
         (("evaluate", "latest"), "no complete run in {store}"),
         (("evaluate", "latest", "--protocol", "guess"), "expected paper, truth, cross-camera"),
         (("evaluate", "latest", "--previous", "mixed"), "is judged by --protocol flicker"),
+        (
+            ("evaluate", "latest", "--protocol", "flicker", "--all-views"),
+            "--protocol flicker has no use for --all-views",
+        ),
+        (
+            ("evaluate", "latest", "--protocol", "cross-camera", "--feature-weights", "x"),
+            "--protocol cross-camera has no use for --feature-weights",
+        ),
         # painters
         (("painter", "info", "--painter", "miro"), "expected one of none, overlay, warp"),
         (("painter", "info", "--painter", "{garbage}"), "{garbage}"),

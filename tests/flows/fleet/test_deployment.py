@@ -34,14 +34,15 @@ def test_a_fleet_is_deployed_once_and_changed_by_doing_it_again(client, tmp_path
     told = deploy("night", parameters(tmp_path), pool="nights", cron="*/15 * * * *")
     assert told["worker"] == "prefect worker start --pool nights --limit 3"
     assert client.read_work_pool("nights").type == "process"
-    deploy("night", parameters(tmp_path, workers=5), pool="nights", cron="0 3 * * *")
+    again = parameters(tmp_path, workers=5)
+    deploy("night", again, pool="nights", cron="0 3 * * *", threads=2)
     firing = client.read_deployment_by_name("fleet/night")
     assert [one.schedule.cron for one in firing.schedules] == ["0 3 * * *"]
     assert firing.parameters["workers"] == 5
     assert firing.entrypoint == "flows.fleet.deployed.fleet"
     worker = client.read_deployment_by_name("fleet-work/night")
     assert worker.parameters == {"fleet": "night", "store": str(tmp_path)}
-    assert worker.job_variables["env"]["OMP_NUM_THREADS"] == "1"
+    assert worker.job_variables["env"]["OMP_NUM_THREADS"] == "2"
     assert worker.global_concurrency_limit is None
     with pytest.raises(ConfigError, match=f"night is deployed for the store {tmp_path}"):
         deploy("night", parameters(tmp_path / "other"), pool="nights", cron=None)
