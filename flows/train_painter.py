@@ -22,6 +22,7 @@ from lidarpainter_models.painter.selection import WEIGHTS_SUFFIX
 from lidarpainter_models.painter.training_jobs import job_for
 from lidarpainter_models.storage.whole_files import write_whole
 from lidarpainter_models.training_data.pair_sets import PairSet, named_sets
+from tasks.ingest.ingest import has_street
 from tasks.opened import open_split
 from tasks.painter.harvest import harvest_recorded, harvest_street, keep_street, pair_set
 from tasks.painter.judge import (
@@ -91,7 +92,8 @@ def check_harvest(parameters: HarvestParameters, store_path: Path) -> None:
     """Refuse to harvest nothing, or scenes that are not there or cannot be split.
 
     Raises:
-        ConfigError: there are neither streets nor scenes, or the split leaves nothing to train on.
+        ConfigError: there are neither streets nor scenes, the split leaves nothing to train on, or
+            a street is in the store with other frames, width or cameras.
         SceneError: a scene is not there, or lacks a camera.
     """
     if not parameters.street_seeds and not parameters.scenes:
@@ -100,6 +102,8 @@ def check_harvest(parameters: HarvestParameters, store_path: Path) -> None:
 
 
 def _check_scenes(parameters: HarvestParameters, store_path: Path) -> None:
+    for seed in parameters.street_seeds:
+        has_street(open_store(store_path), replace(parameters.street, seed=seed))
     streets = {street_id(seed) for seed in parameters.street_seeds}  # these are drawn
     for scene_id in parameters.scenes:
         if scene_id not in streets:

@@ -11,6 +11,7 @@ from lidarpainter_models.errors import ConfigError
 
 _SIZE = re.compile(r"([1-9]\d{0,4})x([1-9]\d{0,4})")
 _SEEDS = re.compile(r"(\d+)(?::(\d+))?")
+MOST_STREETS = 10_000
 
 Settings = Annotated[
     list[str] | None,
@@ -79,7 +80,7 @@ def parse_seeds(text: str | None) -> tuple[int, ...]:
     """`1000:1004` (the last excluded), `1000,1007`, or both mixed.
 
     Raises:
-        ConfigError: the text says something else, or names a seed twice.
+        ConfigError: the text says something else, names a seed twice, or too many.
     """
     if text is None:
         return ()
@@ -92,6 +93,8 @@ def parse_seeds(text: str | None) -> tuple[int, ...]:
             chosen = range(first, int(match[2]) if match[2] else first + 1)
         if not chosen:
             raise ConfigError(f"seeds {text!r}: expected such as 1000:1004 or 1000,1007")
+        if len(seeds) + chosen.stop - chosen.start > MOST_STREETS:
+            raise ConfigError(f"seeds {text!r}: expected at most {MOST_STREETS} streets")
         seeds += chosen
     if len(set(seeds)) != len(seeds):
         raise ConfigError(f"seeds {text!r}: a seed is named twice")

@@ -5,7 +5,6 @@ runs. Else they are plain functions, and no server is started: who works on what
 stands in the store either way. What Prefect cannot be told of changes nothing about it.
 """
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,12 +19,10 @@ from flows.dress import dress_run
 from flows.fleet.asked import Asked
 from flows.fleet.flow_runs import SEQUENCE, store_tag
 from flows.reconstruct import reconstruct
-from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.evaluation.judging import known_street
-from lidarpainter_models.synthetic.street import WORLD_VERSION
 from lidarpainter_models.weather.mix import StyleMix
 from tasks.evaluation.shown import forget_shown
-from tasks.ingest.ingest import ingest_street
+from tasks.ingest.ingest import has_street, ingest_street
 from tasks.ingest.jobs import IngestRequest, ingest_or_recall
 from tasks.opened import forget_opened, open_scene
 from tasks.stored import forget_stored
@@ -119,14 +116,5 @@ def _bring_in(asked: Asked, store: Store) -> None:
         request = IngestRequest(store.address, asked.dataset, root, frames, asked.read_cameras)
         ingest_or_recall(request, asked.sequence, again=False)
         return
-    try:
-        drawn = open_scene(store, asked.scene_id).manifest.get("generator", {})
-    except SceneError:
-        drawn = {}
-    if drawn.get("world_version") != WORLD_VERSION:
+    if not has_street(store, asked.street):
         ingest_street(store.address, asked.street)
-    elif drawn.get("config") != json.loads(json.dumps(asked.street.to_dict())):
-        raise ConfigError(
-            f"scene {asked.scene_id} is in the store with other frames, width or cameras; it was "
-            f"kept, `catalog delete {asked.scene_id}` makes room for another"
-        )

@@ -1,5 +1,6 @@
 """Bring a sequence of a dataset, or the synthetic street, into the store and the catalog."""
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -9,8 +10,10 @@ from typing import Any
 import lidarpainter_models
 from catalog.records import SceneRecord
 from catalog.store import Store, open_store
+from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.readers import ingest_scene, scene_id_of
 from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street
+from lidarpainter_models.synthetic.street import WORLD_VERSION
 from tasks.ingest.bucket_roots import root_at_hand
 from tasks.measuring import measured
 from tasks.opened import open_scene
@@ -62,6 +65,27 @@ def ingest_street(store_path: Path, config: SyntheticStreetConfig) -> dict[str, 
             progress=lambda done, total: listener().advanced(STAGE, done, total, ""),
         )
     return record_scene(store, path)
+
+
+def has_street(store: Store, config: SyntheticStreetConfig) -> bool:
+    """Whether the store has exactly this street; one of an older world does not count.
+
+    Raises:
+        ConfigError: the street of this seed is there otherwise; runs may have been made of it.
+    """
+    scene_id = street_id(config.seed)
+    try:
+        drawn = open_scene(store, scene_id).manifest.get("generator", {})
+    except SceneError:
+        return False
+    if drawn.get("world_version") != WORLD_VERSION:
+        return False
+    if drawn.get("config") != json.loads(json.dumps(config.to_dict())):
+        raise ConfigError(
+            f"scene {scene_id} is in the store with other frames, width or cameras; it was "
+            f"kept, `catalog delete {scene_id}` makes room for another"
+        )
+    return True
 
 
 @contextmanager

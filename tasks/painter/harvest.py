@@ -4,7 +4,6 @@ A harvest that was killed goes on with the pairs it had stored. The pairs lie in
 own inside the artefact, which any command that takes pairs can be given.
 """
 
-import json
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -12,18 +11,18 @@ from typing import Any
 
 from catalog.artefacts import ArtefactRef, Workplace
 from catalog.store import Store, open_store
-from lidarpainter_models.errors import DataError, SceneError
+from lidarpainter_models.errors import DataError
 from lidarpainter_models.evaluation.held_back import target_of
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import ViewSplit
 from lidarpainter_models.synthetic.config import SyntheticStreetConfig
-from lidarpainter_models.synthetic.street import WORLD_VERSION, SyntheticStreet
+from lidarpainter_models.synthetic.street import SyntheticStreet
 from lidarpainter_models.training_data.harvest import default_plans, harvest_left_out
 from lidarpainter_models.training_data.pair_sets import PairSet
 from lidarpainter_models.training_data.pairs import PairFolder, PairWriter
 from lidarpainter_models.training_data.settings import HarvestConfig, StreetPlan
 from lidarpainter_models.training_data.street_harvest import harvest_shifted_street
-from tasks.ingest.ingest import ingest_street
+from tasks.ingest.ingest import has_street, ingest_street
 from tasks.opened import open_scene, open_split
 from tasks.progress import Progress
 from tasks.specs import SplitSpec, street_id
@@ -34,12 +33,14 @@ PAIRS_FOLDER = "pairs"
 
 @stage_task
 def keep_street(store_path: Path, config: SyntheticStreetConfig) -> str:
-    """Write a synthetic street unless the store has exactly this one; returns its scene id."""
-    store = open_store(store_path)
-    scene_id = street_id(config.seed)
-    if not _has_street(store, scene_id, config):
+    """Write a synthetic street unless the store has exactly this one; returns its scene id.
+
+    Raises:
+        ConfigError: the store has the street of this seed with other frames, width or cameras.
+    """
+    if not has_street(open_store(store_path), config):
         ingest_street.fn(store_path, config)
-    return scene_id
+    return street_id(config.seed)
 
 
 @stage_task
@@ -83,15 +84,6 @@ def harvest_street(
 def pair_set(store: Store, name: str, ref: ArtefactRef) -> PairSet:
     """The pairs of an artefact."""
     return PairSet(name=name, folder=store.artefacts.files(ref) / PAIRS_FOLDER)
-
-
-def _has_street(store: Store, scene_id: str, config: SyntheticStreetConfig) -> bool:
-    try:
-        generator = open_scene(store, scene_id).manifest.get("generator", {})
-    except SceneError:
-        return False
-    wanted = json.loads(json.dumps(config.to_dict()))
-    return generator.get("config") == wanted and generator.get("world_version") == WORLD_VERSION
 
 
 def _build_recorded(

@@ -183,6 +183,7 @@ def refused(words, expected, place):
         (("painter", "evaluate", "--painter", "nano", "--run", "ffff"), "no run_id 'ffff'"),
         (("painter", "harvest"), "expected --seeds or --scene"),
         (("painter", "harvest", "--seeds", "x"), "expected such as 1000:1004 or 1000,1007"),
+        (("painter", "harvest", "--seeds", "0:3000000000"), "expected at most 10000 streets"),
         (("painter", "harvest", "--scene", "toy/other"), "ingest it first"),
         (("painter", "harvest", "--scene", TOY_SCENE, "--split", "x"), "expected alternate"),
         (("painter", "train"), "nothing to train on: expected"),

@@ -7,9 +7,10 @@ from random_pairs import random_pair
 from toy_store import TOY_SCENE, write_toy_scene
 
 from catalog.store import open_store
-from lidarpainter_models.errors import DataError
+from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.synthetic import SyntheticStreetConfig
 from lidarpainter_models.training_data.settings import HarvestConfig
+from tasks.ingest import ingest
 from tasks.painter import harvest
 from tasks.specs import SplitSpec
 
@@ -67,17 +68,20 @@ def test_a_harvest_without_a_pair_is_one_clear_line(store, monkeypatch):
     assert store.tables.rows("artefacts") == []
 
 
-def test_a_street_is_drawn_only_if_the_store_has_another(store, monkeypatch):
+def test_a_street_is_drawn_only_if_the_store_has_none_of_its_seed(store, monkeypatch):
     drawn = []
     monkeypatch.setattr(harvest.ingest_street, "fn", lambda _store, config: drawn.append(config))
     config = SyntheticStreetConfig(seed=1000)
     assert harvest.keep_street.fn(store.root, config) == "synthetic/street-1000"
     assert drawn == [config]
 
-    generator = {"config": config.to_dict(), "world_version": harvest.WORLD_VERSION}
+    generator = {"config": config.to_dict(), "world_version": ingest.WORLD_VERSION}
     stored = SimpleNamespace(manifest={"generator": generator})
-    monkeypatch.setattr(harvest, "open_scene", lambda _store, _scene_id: stored)
+    monkeypatch.setattr(ingest, "open_scene", lambda _store, _scene_id: stored)
     harvest.keep_street.fn(store.root, config)
     assert drawn == [config]
-    harvest.keep_street.fn(store.root, SyntheticStreetConfig(seed=1000, num_frames=5))
-    assert len(drawn) == 2
+    with pytest.raises(ConfigError, match="street-1000 is in the store with other frames"):
+        harvest.keep_street.fn(store.root, SyntheticStreetConfig(seed=1000, num_frames=5))
+    generator["world_version"] -= 1
+    harvest.keep_street.fn(store.root, config)
+    assert drawn == [config, config]
