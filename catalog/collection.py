@@ -61,13 +61,13 @@ def plan_collection(store: Store, since: datetime) -> list[Doomed]:
         *doomed_rows(store, "runs", runs),
         *doomed_rows(store, "artefacts", free),
         *doomed_rows(store, "scenes", (one for one in scenes if scene_entry(one) not in young)),
-        *_leftovers(store, known, since),
+        *_leftovers(store, known | kept.artefacts, since),
         *([] if store.mirror is None else _abandoned(store.mirror, since)),
     ]
 
 
 def _leftovers(store: Store, known: set[str], since: datetime) -> Iterator[Doomed]:
-    """Artefacts without a row, scratch of nobody, folders that were being written or removed."""
+    """Unknown artefacts, scratch of nobody, folders that were being written or removed."""
     settled = datetime.now(UTC) - SETTLED_AFTER
     made = store.changed("artefacts")
     unknown = made.keys() - {ArtefactRef.of_id(name).entry for name in known}

@@ -93,7 +93,8 @@ def run_stage(
         recipe, measured_build, on_wait=lambda process_id: listener().waiting(stage, process_id)
     )
     manifest = store.artefacts.manifest(ref)
-    if is_new:
+    # who made it may have been killed before its row was written
+    if is_new or store.tables.find("artefacts", ref.artefact_id) is None:
         store.tables.merge("artefacts", [artefact_row(ref, manifest)])
     listener().finished(stage, manifest.seconds, is_new=is_new)
     _log(stage, recipe, store.place_of(ref.entry), is_new=is_new)

@@ -73,6 +73,13 @@ def test_a_recent_run_keeps_what_it_was_made_from(shop):
     assert going(shop) == OF_R1
 
 
+def test_an_artefact_without_a_row_stays_with_a_run_that_lists_it(shop):
+    shop.change("runs", "r2", finished_at=NOW)
+    shop.store.tables.delete("artefacts", "artefact_id", [shop.second.artefact_id])
+    age(shop.store.artefacts.folder(shop.second), days=90)
+    assert going(shop) == OF_R1
+
+
 def test_a_wanted_sequence_keeps_its_run(shop):
     wanted = {"sequence_id": "s1", "scene_id": "toy/street", "run_id": "r2", "state": "done"}
     shop.store.tables.merge("sequences", [wanted])

@@ -65,6 +65,21 @@ def test_a_stage_is_computed_once_and_entered_into_the_catalog(tmp_path):
     assert row["config"] == '{"steps":1}'
 
 
+def test_a_row_that_was_not_written_is_written_by_who_comes_next(tmp_path, monkeypatch):
+    store = open_store(tmp_path)
+    with monkeypatch.context() as patched:
+        patched.setattr(store.tables, "merge", lambda *_: fail_to_write())
+        with pytest.raises(StorageError, match="full"):
+            run(store)
+    again = run(store)
+    assert not again.is_new
+    assert store.tables.find("artefacts", again.ref.artefact_id) is not None
+
+
+def fail_to_write():
+    raise StorageError("full")
+
+
 def test_changed_code_is_never_served_a_stale_result(tmp_path, monkeypatch):
     source = tmp_path / "stage_code.py"
     source.write_text("def build(place, progress):\n    return {'version': 1}\n")
