@@ -25,12 +25,15 @@ ARTEFACT_COLUMNS = (
     *("artefact_id", "inputs", "source_digest", "starts"),
     *("seconds", "num_bytes", "summary"),
 )
-RUN_COLUMNS = ("run_id", "scene_id", "parameters", "status", "finished_at", "artefacts")
+RUN_COLUMNS = (
+    *("run_id", "scene_id", "parameters", "change"),
+    *("status", "finished_at", "artefacts"),
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StaleRun:
-    """The newest run of a scene with some parameters, if today's code would make it otherwise."""
+    """The newest run of a scene, parameters and change, if today's code would make it otherwise."""
 
     scene_id: str
     run_id: str
@@ -148,10 +151,10 @@ def _with_heirs(
 
 
 def _newest(runs: Iterable[Row]) -> Iterable[Row]:
-    """Of the complete runs of one scene with the same parameters, the newest."""
-    newest: dict[tuple[str, str], Row] = {}
+    """Of the complete runs of one scene with the same parameters and change, the newest."""
+    newest: dict[tuple[str, str, str | None], Row] = {}
     for row in runs:
-        key = row["scene_id"], row["parameters"]
+        key = row["scene_id"], row["parameters"], row["change"]
         if row["status"] == "complete" and (
             key not in newest or row["finished_at"] > newest[key]["finished_at"]
         ):

@@ -1,6 +1,7 @@
 """What is stale and what things cost, from a store whose answers are known by hand."""
 
 import json
+from datetime import datetime, timedelta
 
 import pytest
 
@@ -57,8 +58,6 @@ class Books:
             "finished_at": f"2026-11-22T0{hour}:00:00+00:00",
             "artefacts": [ref.artefact_id for ref in (prepared, fitted, judged)],
         }
-        from datetime import datetime
-
         self.rows["runs"].append({**row, "finished_at": datetime.fromisoformat(row["finished_at"])})
 
     def made(self, stage, *, steps, **inputs):
@@ -90,6 +89,16 @@ def test_a_loss_redoes_fits_and_what_follows(books):
     assert {one.changed for one in found} == {("library.loss",)}
     assert {(one.total("seconds"), one.total("cpu_seconds")) for one in found} == {(14.0, 28.0)}
     assert [one.scene_id for one in found] == ["toy/a", "toy/a", "toy/b"]
+
+
+def test_a_run_and_what_it_was_changed_into_are_both_told(tmp_path):
+    books = Books(tmp_path / "store")
+    new = books.store.tables.row("runs", "new")
+    edited = {**new, "run_id": "edited", "derived_from": "new", "change": '{"kind":"edit"}'}
+    later = new["finished_at"] + timedelta(hours=1)
+    books.store.tables.merge("runs", [{**edited, "finished_at": later}])
+    kinds = books.stale(**{"library.loss": "l2"})[1]
+    assert set(kinds) == {"new", "edited", "more", "other"}
 
 
 def test_what_is_prepared_redoes_all_and_a_judge_only_itself(books):
