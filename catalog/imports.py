@@ -184,9 +184,10 @@ def _require_inside(table: str, row: Mapping[str, Any]) -> None:
 
 def _require_room(store: Store, declared: _Declared, path: Path) -> None:
     needed = sum(int(known["num_bytes"]) for known in declared.files.values())
-    free = shutil.disk_usage(store.root).free
-    if needed > free:
-        raise ArchiveError(f"{path} holds {needed} bytes, {free} are free in {store.root}")
+    if needed > store.free_bytes:
+        raise ArchiveError(
+            f"{path} holds {needed} bytes, {store.free_bytes} are free in {store.root}"
+        )
 
 
 def _unpack(tar: tarfile.TarFile, declared: _Declared, aside: Path, path: Path) -> None:

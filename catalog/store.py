@@ -10,6 +10,7 @@ import json
 import os
 import re
 import secrets
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -184,6 +185,11 @@ class Store:
             return 0 if listing is None else sum(listing.sizes.values())
         return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
+    @property
+    def free_bytes(self) -> int:
+        """Room on the disk of `root`, which need not be there yet."""
+        return shutil.disk_usage(nearest_existing(self.root)).free
+
     def release(self) -> None:
         """What this process has fetched is no longer in use, and may be let go."""
         if self.mirror is not None:
@@ -309,6 +315,11 @@ def changed_at(path: Path) -> datetime:
         return datetime.fromtimestamp(path.stat().st_mtime, UTC)
     except FileNotFoundError:
         return datetime.fromtimestamp(0, UTC)
+
+
+def nearest_existing(path: Path) -> Path:
+    """A path, or the first above it that is there."""
+    return next(one for one in (path, *path.parents) if one.exists())
 
 
 def make_writable(folder: Path, what: str) -> None:

@@ -14,6 +14,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal
 
+from catalog.store import nearest_existing
+
 Verdict = Literal["ok", "warn", "fail"]
 PYTHON_RANGE = ((3, 11), (3, 14))
 REQUIRED = ("torch", "numpy", "scipy", "numba", "pyarrow", "zarr", "deltalake", "prefect", "typer")
@@ -140,7 +142,7 @@ def _memory() -> Finding:
 
 
 def _disk(store_path: Path) -> Finding:
-    existing = next(path for path in (store_path, *store_path.parents) if path.exists())
+    existing = nearest_existing(store_path)
     if not os.access(existing, os.W_OK):
         return Finding("store", "fail", f"{existing} cannot be written")
     free = shutil.disk_usage(existing).free

@@ -1,7 +1,6 @@
 """What holds a fleet back: the room on the disk, the memory of the machine, its budget of hours."""
 
 import os
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,7 +18,7 @@ MEMORY_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
 def lacks_disk(ledger: FleetLedger, budget: Budget, num_bytes: float = 0.0) -> str | None:
     """Why a sequence that makes so much may not begin; None if there is room."""
-    free = shutil.disk_usage(ledger.store.root).free
+    free = ledger.store.free_bytes
     needed = budget.free_disk_gb * GIGABYTE + num_bytes
     if free >= needed:
         return None

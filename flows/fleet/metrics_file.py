@@ -4,7 +4,6 @@
 run` of a name, since attempts are never forgotten.
 """
 
-import shutil
 from collections import Counter
 from pathlib import Path
 
@@ -41,7 +40,7 @@ def write_metrics(ledger: FleetLedger, fleet: str, path: Path) -> None:
     for state, count in counts_of(rows).items():
         states.labels(fleet, state).set(count)
     free = Gauge("lidarpainter_store_free_bytes", "Room on its disk.", registry=registry)
-    free.set(shutil.disk_usage(ledger.store.root).free)
+    free.set(ledger.store.free_bytes)
     if attempts:
         last = Gauge(f"{PREFIX}_last_end_seconds", "Since 1970.", ["fleet"], registry=registry)
         last.labels(fleet).set(max(row["ended_at"] for row in attempts).timestamp())

@@ -8,7 +8,9 @@ from catalog import buckets
 from catalog.buckets import Bucket
 from catalog.store import open_store
 from flows.fleet.asked import Asked, wishes
-from flows.fleet.manifest import read_manifest
+from flows.fleet.limits import lacks_disk
+from flows.fleet.manifest import Budget, read_manifest
+from flows.fleet.metrics_file import write_metrics
 from tasks.ingest.jobs import IngestRequest, ingest_or_recall
 
 
@@ -40,6 +42,16 @@ def test_a_log_in_a_bucket_is_fetched_read_and_let_go(address, tmp_path, monkeyp
     assert list((tmp_path / "cache").glob("dataset-*")) == []
     monkeypatch.setattr("tasks.ingest.jobs.ingest_sequence", None)  # it is not read again
     assert ingest_or_recall(request, asked.sequence, again=False) == row
+
+
+@pytest.mark.usefixtures("asked")
+def test_a_machine_without_a_mirror_yet_knows_its_room(address, tmp_path, monkeypatch):
+    monkeypatch.setenv("LIDARPAINTER_CACHE", str(tmp_path / "elsewhere"))
+    there = stub_ledger(address)
+    assert not there.store.root.exists()
+    assert lacks_disk(there, Budget(free_disk_gb=0)) is None
+    write_metrics(there, "stub", tmp_path / "stub.prom")
+    assert "store_free_bytes" in (tmp_path / "stub.prom").read_text()
 
 
 def test_a_bucket_that_is_away_holds_a_fleet_up(asked, address, tmp_path, stand_in, monkeypatch):

@@ -139,7 +139,7 @@ def test_no_work_begins_on_a_disk_without_room(asked, store, monkeypatch):
             return usage._replace(free=-1)
         return usage
 
-    monkeypatch.setattr("flows.fleet.limits.shutil.disk_usage", fuller)
+    monkeypatch.setattr("catalog.store.shutil.disk_usage", fuller)
     worker = stub_worker(store.root, "stub")
     monkeypatch.setattr("flows.fleet.worker.time.sleep", lambda _s: heard.append("slept"))
     lines = []
