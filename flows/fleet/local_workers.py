@@ -2,7 +2,8 @@
 
 Each has one thread unless the user has said otherwise: two that share two cores with threads of
 their own take two and a half times the CPU time. One that dies is replaced; what it had in its
-hands is entered as killed at once, and goes on with whoever is free.
+hands is entered as killed at once, and goes on with whoever is free. Where the store is away, they
+wait for it, and so does the command.
 """
 
 import os
@@ -14,10 +15,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from catalog.attempts import Ending
-from catalog.errors import CatalogError
+from catalog.errors import CatalogError, StorageError
 from catalog.fleets import FleetLedger
 from catalog.store import open_store
 from flows.children import start_child
+from flows.fleet.causes import is_storage_away
 from flows.fleet.status import counts_of
 
 WATCH_S = 0.5
@@ -65,8 +67,7 @@ def run_workers(
     try:
         while crew.workers:
             time.sleep(WATCH_S)
-            crew.replace_dead()
-            crew.tell()
+            crew.look()
     finally:
         if crew.workers:
             _stop(crew.workers.values())
@@ -89,23 +90,35 @@ class _Crew:
     _told_at: float = 0.0
     _told: str = ""
 
-    def replace_dead(self) -> None:
+    def look(self) -> None:
+        """See to the workers, and say how the fleet stands, or that the store is away."""
+        try:
+            self._replace_dead()
+            self._tell()
+        except StorageError as error:
+            if not is_storage_away(error):
+                raise
+            self._say_once(f"paused: {error}")
+
+    def _replace_dead(self) -> None:
         """Let workers go that are through, and put others in place of those that died."""
         for number, process in list(self.workers.items()):
             if process.poll() is None:
                 continue
-            del self.workers[number]
             if process.returncode != 0:
                 self._count_death(number)
                 self.workers[number] = self.start(number)
+            else:
+                del self.workers[number]
 
-    def tell(self) -> None:
-        """Say how the fleet stands, if that is new."""
+    def _tell(self) -> None:
         if time.monotonic() - self._told_at < TELL_S:
             return
         self._told_at = time.monotonic()
         counts = counts_of(self.ledger.rows(self.fleet))
-        line = ", ".join(f"{number} {state}" for state, number in counts.items() if number)
+        self._say_once(", ".join(f"{number} {state}" for state, number in counts.items() if number))
+
+    def _say_once(self, line: str) -> None:
         if line != self._told:
             self.say(line)
         self._told = line

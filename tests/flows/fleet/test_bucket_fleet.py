@@ -9,9 +9,15 @@ from catalog.buckets import Bucket
 from catalog.store import open_store
 from flows.fleet.asked import Asked, wishes
 from flows.fleet.limits import lacks_disk
+from flows.fleet.local_workers import run_workers
 from flows.fleet.manifest import Budget, read_manifest
 from flows.fleet.metrics_file import write_metrics
 from tasks.ingest.jobs import IngestRequest, ingest_or_recall
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    monkeypatch.setattr(buckets, "RETRIES", 0)
 
 
 @pytest.fixture
@@ -54,8 +60,33 @@ def test_a_machine_without_a_mirror_yet_knows_its_room(address, tmp_path, monkey
     assert "store_free_bytes" in (tmp_path / "stub.prom").read_text()
 
 
-def test_a_bucket_that_is_away_holds_a_fleet_up(asked, address, tmp_path, stand_in, monkeypatch):
-    monkeypatch.setattr(buckets, "RETRIES", 0)
+class Ended:
+    """A worker's process that is through, with some exit code."""
+
+    def __init__(self, code):
+        self.returncode = code
+
+    def poll(self):
+        return self.returncode
+
+
+@pytest.mark.usefixtures("impatient")
+def test_a_command_waits_with_its_workers_for_a_bucket_that_is_away(asked, stand_in):
+    codes, heard = [1, 0], []
+
+    def hears(line):
+        heard.append(line)
+        stand_in.fail()
+
+    stand_in.fail(before=10**6)
+    run_workers(asked, "stub", lambda _number: Ended(codes.pop(0)), 1, hears)
+    assert codes == []  # the one that died was replaced
+    assert heard[0].startswith("paused: cannot ")
+    assert heard[1:] == ["2 waiting"]
+
+
+@pytest.mark.usefixtures("impatient")
+def test_a_bucket_that_is_away_holds_a_fleet_up(asked, address, tmp_path, stand_in):
     worker = stub_worker(address, "stub")
     heard = []
 
