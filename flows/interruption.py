@@ -3,8 +3,9 @@
 The first signal raises `Interrupted` in the main thread, and the work cleans up on its way out: it
 is no `Exception`, so nobody takes it for a failure. Where that takes longer than `GRACE_S`, in a
 kernel or in a client that waits for its server, a thread enters what must be entered and ends the
-process. Further signals change nothing: the end is that near. Flows that a worker runs are
-interrupted by Prefect's own exceptions, and enter the same on their way out.
+process, after `LATE_S` also where the store does not answer. Further signals change nothing: the
+end is that near. Flows that a worker runs are interrupted by Prefect's own exceptions, and enter
+the same on their way out.
 """
 
 import os
@@ -21,6 +22,8 @@ from typing import NoReturn
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 GRACE_S = 0.7
 """How long the work may take to clean up."""
+LATE_S = 5.0
+"""How long entering may take then; a bucket that is away is asked for a minute."""
 MESSAGE = "interrupted; the same command goes on where this one stopped"
 CLEAN_LINE = "\r\x1b[K\x1b[?25h"
 """Clears the line of a terminal and brings back its cursor, which progress bars hide."""
@@ -121,8 +124,9 @@ def _end(*, is_late: bool) -> NoReturn:
 
 def _end_now(*, is_late: bool) -> NoReturn:
     if is_late:
-        for action in reversed(_actions):
-            _try(action)
+        entering = threading.Thread(target=_enter, daemon=True)
+        entering.start()
+        entering.join(LATE_S)
     for process in {*_started, *_descendants()}:
         with suppress(OSError):
             signal.pidfd_send_signal(process, signal.SIGKILL)
@@ -130,6 +134,11 @@ def _end_now(*, is_late: bool) -> NoReturn:
         line = f"{CLEAN_LINE if os.isatty(STDERR) else ''}lidarpainter: {MESSAGE}\n"
         os.write(STDERR, line.encode())
     os._exit(128 + _caught[0])
+
+
+def _enter() -> None:
+    for action in reversed(_actions):
+        _try(action)
 
 
 def _try(action: Callable[[], object]) -> None:

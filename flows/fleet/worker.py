@@ -138,7 +138,11 @@ class Worker:
         self._end(beat, ending)
 
     def _end(self, beat: Heartbeat, ending: Ending) -> None:
-        """Enter how an attempt ended; where the store is away, as soon as it is back."""
+        """Enter how an attempt ended; where the store is away, as soon as it is back.
+
+        Raises:
+            StorageError: it is away, and the attempt was interrupted: that cannot wait.
+        """
         with self._entering:
             took = replace(ending, **beat.took())
             peak = max(took.peak_memory_bytes or 0, ending.peak_memory_bytes or 0)
@@ -148,7 +152,7 @@ class Worker:
                     follows = self.ledger.end(beat.lease, took)
                     break
                 except StorageError as error:
-                    if not is_storage_away(error):
+                    if not is_storage_away(error) or ending.cause == "interrupted":
                         raise
                     self._pause(str(error))
         scene = beat.lease.facts["scene_id"]

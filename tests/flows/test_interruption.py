@@ -124,6 +124,24 @@ def test_a_run_that_was_killed_does_not_count_as_running(store):
     assert store.row("runs", row["run_id"])["status"] == "interrupted"
 
 
+ENTERS_FOR_EVER = """
+import sys, time
+from flows import interruption
+interruption.LATE_S = 0.3
+interruption.watch()
+with interruption.at_interruption(lambda: time.sleep(60)):
+    sys.stderr.write("begun")
+    time.sleep(60)
+"""
+
+
+def test_what_cannot_be_entered_does_not_hold_up_the_end():
+    command = TerminalCommand(code=ENTERS_FOR_EVER)
+    command.wait_for("begun")
+    assert command.interrupt(signal.SIGTERM) < LONGEST_S
+    assert command.process.returncode == CODES[signal.SIGTERM]
+
+
 WORKER = """
 import sys
 from pathlib import Path

@@ -12,6 +12,7 @@ from flows.fleet.limits import lacks_disk
 from flows.fleet.local_workers import run_workers
 from flows.fleet.manifest import Budget, read_manifest
 from flows.fleet.metrics_file import write_metrics
+from flows.interruption import Interrupted
 from tasks.ingest.jobs import IngestRequest, ingest_or_recall
 
 
@@ -106,3 +107,24 @@ def test_a_bucket_that_is_away_holds_a_fleet_up(asked, address, tmp_path, stand_
     (paused,) = [line for line in heard if line.startswith("paused")]
     assert address in paused
     assert "503" in paused
+
+
+@pytest.mark.usefixtures("impatient", "asked")
+def test_an_interrupted_worker_does_not_wait_for_a_bucket_that_is_away(address, stand_in):
+    worker = stub_worker(address, "stub")
+    heard = []
+
+    def hears(line):
+        heard.append(line)
+        if line.startswith("paused"):
+            stand_in.fail()
+
+    def work(*_):
+        stand_in.fail(before=10**6)
+        raise Interrupted
+
+    worker.say, worker.work = hears, work
+    with pytest.raises(Interrupted):
+        worker.run()
+    stand_in.fail()
+    assert [line for line in heard if line.startswith("paused")] == []
