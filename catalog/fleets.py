@@ -4,7 +4,8 @@
 sequence is running is not stored: it waits, and a live lease bears its name. So nothing can be left
 running. Every row of `sequences` has a number that only grows, and whoever writes a row needs a
 higher one than it has: a worker that lost its lease to another is refused, two that ask at once
-cannot undo each other.
+cannot undo each other. Where a manifest has moved a sequence, only that is written: whoever works
+on it goes on.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,6 +23,8 @@ from catalog.tables import Row
 
 TABLE, ATTEMPTS = "sequences", "attempts"
 ID_LENGTH = 16
+PLACE = ("position", "priority", "budget")
+"""Columns that say when a sequence is made and what it may take, not what it is."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,20 +110,19 @@ class FleetLedger:
         known = {r["sequence_id"]: r for r in self.store.tables.rows(TABLE) if r["fleet"] == fleet}
         wanted = {wish.sequence_id: wish.row() for wish in wishes}
         standing = _StandingRuns(self.store)
-        changed = []
+        changed, moved = [], []
         for sequence_id in wanted.keys() & known.keys():
             new, old = wanted[sequence_id], known[sequence_id]
             if _is_to_redo(new, old, standing, accept_stale=accept_stale):
-                changed.append({**new, "attempts": old["attempts"], "fence": old["fence"] + 1})
-            elif any(new[name] != old[name] for name in ("position", "priority", "budget")):
-                kept = {name: old[name] for name in ("asked", "asked_digest", "code_digest")}
-                place = {**old, **{name: new[name] for name in ("position", "priority", "budget")}}
-                changed.append({**place, **kept, "fence": old["fence"] + 1})
+                changed.append({**new, **_spent(old), "fence": old["fence"] + 1})
+            elif any(new[name] != old[name] for name in PLACE):
+                moved.append(new)
         dropped = sorted(known.keys() - wanted.keys())
         added = [row for sequence_id, row in wanted.items() if sequence_id not in known]
         tables = self.store.tables
         tables.add_absent(TABLE, added)
         tables.replace_older(TABLE, changed, "fence")
+        tables.replace_columns(TABLE, moved, PLACE)
         if dropped:
             tables.delete(TABLE, "sequence_id", dropped)
 
@@ -177,7 +179,7 @@ class FleetLedger:
             raise UnknownRecordError(f"fleet {fleet} has no scene {', '.join(sorted(unknown))}")
         states = ("failed", "set-aside") if named else ("failed",)
         again = [
-            {**row, **_waiting(fence=row["fence"] + 1)}
+            {**row, **_waiting(fence=row["fence"] + 1), **_spent(row)}
             for row in rows
             if row["state"] in states and (not named or row["scene_id"] in named)
         ]
@@ -214,7 +216,8 @@ class FleetLedger:
             peak_memory_bytes=lease.facts.get("memory_bytes"),
         )
         row = self.store.tables.find(TABLE, lease.name)
-        if row is not None and row["fence"] == lease.fence:  # it died right after it had told
+        if row is not None and row["cause"] is not None and row["fence"] == lease.fence:
+            # it died right after it had told
             told = {name: row[name] for name in ("cause", "reason", "run_id")}
             return replace(took, **told)
         if why is not None:
@@ -249,6 +252,11 @@ def _is_to_redo(new: Row, old: Row, standing: _StandingRuns, *, accept_stale: bo
     if new["code_digest"] != old["code_digest"] and not accept_stale:
         return True
     return old["state"] == "done" and old["run_id"] not in standing
+
+
+def _spent(row: Row) -> dict[str, Any]:
+    """The columns about all attempts, whatever became of them."""
+    return {name: row[name] for name in ("attempts", "seconds")}
 
 
 def _waiting(*, fence: int) -> dict[str, Any]:

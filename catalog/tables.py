@@ -100,13 +100,13 @@ class CatalogTables:
         newer = f"source.{column} > target.{column}"
         return self._merged(table, rows, lambda one: one.when_matched_update_all(predicate=newer))
 
-    def delete(self, table: str, column: str, values: Sequence[str]) -> None:
-        """Remove the rows with one of these values in a column.
+    def replace_columns(self, table: str, rows: Sequence[Row], columns: Sequence[str]) -> int:
+        """Replace some columns of rows that are there, and no others; see `replace_older`."""
+        new = {name: f"source.{name}" for name in columns}
+        return self._merged(table, rows, lambda one: one.when_matched_update(new))
 
-        Raises:
-            ConflictError: other writers won every attempt.
-            StorageError: the table cannot be written.
-        """
+    def delete(self, table: str, column: str, values: Sequence[str]) -> None:
+        """Remove the rows with one of these values in a column; raises what `merge` raises."""
         schema = _schema(table)
         quoted = ", ".join("'{}'".format(value.replace("'", "''")) for value in values)
         if self.arrow(table, columns=[column], where={column: values}).num_rows:

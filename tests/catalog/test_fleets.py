@@ -93,6 +93,36 @@ def test_what_is_asked_otherwise_is_done_again(ledger, change, accept_stale, sta
     assert one(ledger)["priority"] == change.get("priority", 0)
 
 
+def test_who_works_on_a_sequence_goes_on_where_it_is_only_moved(ledger):
+    ledger.ask([wish()])
+    lease = ledger.take(one(ledger), {})
+    ledger.ask([wish(position=4, priority=3, budget='{"hours":1}')])
+    assert ledger.end(lease, DONE)
+    row = one(ledger)
+    assert (row["state"], row["priority"], row["position"]) == ("done", 3, 4)
+    assert row["budget"] == '{"hours":1}'
+
+
+def test_who_is_gone_while_it_was_asked_otherwise_counts_as_killed(ledger, clock):
+    ledger.ask([wish()])
+    ledger.take(one(ledger), {})
+    ledger.ask([wish(asked_digest="otherwise")])
+    clock.now += 61
+    assert ledger.reconcile() != []
+    assert causes(ledger) == ["killed"]
+    assert (one(ledger)["state"], one(ledger)["tries"]) == ("waiting", 0)
+
+
+def test_hours_are_of_all_attempts_whatever_is_tried_again(ledger):
+    ledger.ask([wish()])
+    assert attempted(ledger, Ending(cause="error", seconds=5.0))["state"] == "failed"
+    assert ledger.retry("night") == ["x/one"]
+    assert one(ledger)["seconds"] == 5.0
+    ledger.ask([wish(asked_digest="otherwise")])
+    assert (one(ledger)["seconds"], one(ledger)["attempts"]) == (5.0, 1)
+    assert attempted(ledger, DONE)["seconds"] == 7.0
+
+
 def test_what_was_deleted_from_the_store_is_done_again(ledger):
     ledger.ask([wish()])
     attempted(ledger, DONE)  # its run is not in the catalog
