@@ -14,7 +14,7 @@ import platform
 import shutil
 import time
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -155,8 +155,8 @@ class ArtefactStore:
         """Where the files of an artefact lie on this machine, whether they are there or not."""
         return self.root / ref.entry
 
-    def files(self, ref: ArtefactRef) -> Path:
-        """Its folder, for whoever reads it: in a bucket's mirror its files are fetched first."""
+    def files(self, ref: ArtefactRef, names: Collection[str] | None = None) -> Path:  # noqa: ARG002
+        """Its folder, for whoever reads all its files, or some by name: a mirror fetches them."""
         return self.folder(ref)
 
     def ids(self) -> set[str]:

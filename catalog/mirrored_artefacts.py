@@ -6,6 +6,7 @@ processes of one machine wait for each other, as in a folder. Scratch stays on t
 another one takes over begins anew. Whether an artefact is complete is asked of the bucket.
 """
 
+from collections.abc import Collection
 from pathlib import Path
 
 from catalog.artefacts import (
@@ -27,14 +28,14 @@ class MirroredArtefacts(ArtefactStore):
         super().__init__(mirror.root)
         self._mirror = mirror
 
-    def files(self, ref: ArtefactRef) -> Path:
-        """Its folder, with all its files, checked as they arrived; in use from now on.
+    def files(self, ref: ArtefactRef, names: Collection[str] | None = None) -> Path:
+        """Its folder, with all its files or the named ones, checked as they arrived; in use then.
 
         Raises:
             UnknownRecordError: the bucket has no such artefact.
             DamagedArtefactError: a file in the bucket is not what was published.
         """
-        return self._mirror.fetch(ref.entry)
+        return self._mirror.fetch(ref.entry, names)
 
     def ids(self) -> set[str]:
         """The id of every artefact that is published."""

@@ -43,7 +43,7 @@ def enter_published(
         "created_at": datetime.fromisoformat(manifest.created_at),
         "software_version": manifest.software_version,
     }
-    records = read_json(store.artefacts.folder(published.ref) / SIGHTINGS_FILE)
+    records = read_json(store.artefacts.files(published.ref, [SIGHTINGS_FILE]) / SIGHTINGS_FILE)
     rows = [sighting(same, record) for record in records]
     return enter_sightings(store, rows, is_same)
 

@@ -1,6 +1,7 @@
 """Take assets out of the store: one as a file of other programs, many as a page to leaf through."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -8,7 +9,7 @@ from typing import Any, Literal
 import torch
 
 from catalog.artefacts import ArtefactRef
-from catalog.errors import CatalogError
+from catalog.errors import CatalogError, UnknownRecordError
 from catalog.store import Store
 from catalog.tables import Row
 from lidarpainter_models.assets.asset_files import FRAME, GAUSSIANS_FILE
@@ -37,6 +38,8 @@ def export_asset(store: Store, asset: Row, format_: AssetFormat, out: Path) -> d
     if out.suffix.lower() not in ENDINGS[format_]:
         raise ConfigError(f"{out.name}: expected a name in {', '.join(ENDINGS[format_])}")
     folder = asset_path(store, asset, "folder")
+    if folder is not None:
+        store.artefacts.files(ArtefactRef.of_id(asset["artefact_id"]))
     if folder is None or not folder.is_dir():
         raise CatalogError(f"the files of asset {asset['asset_id']} are gone, expected {folder}")
     if not (folder / GAUSSIANS_FILE).is_file():
@@ -88,6 +91,7 @@ def export_gallery(store: Store, assets: Sequence[Row], out: Path) -> dict[str, 
     folder = AsideFolder(out)
     try:
         with storage_errors(out):
+            _fetch_pictures(store, assets)
             picture_of = partial(asset_path, store, column="thumbnail")
             num_pictures = write_gallery(folder.path, assets, picture_of)
             folder.publish()
@@ -95,6 +99,17 @@ def export_gallery(store: Store, assets: Sequence[Row], out: Path) -> dict[str, 
         folder.discard()
         raise
     return {"path": str(out / PAGE), "num_assets": len(assets), "num_pictures": num_pictures}
+
+
+def _fetch_pictures(store: Store, assets: Sequence[Row]) -> None:
+    """See that the pictures lie here, asking a bucket once for each artefact."""
+    wanted: dict[str, list[str]] = {}
+    for asset in assets:
+        if asset_path(store, asset, "thumbnail") is not None:
+            wanted.setdefault(asset["artefact_id"], []).append(asset["thumbnail"])
+    for name, pictures in wanted.items():
+        with suppress(UnknownRecordError):  # its files are gone
+            store.artefacts.files(ArtefactRef.of_id(name), pictures)
 
 
 def asset_path(store: Store, asset: Mapping[str, Any], column: str) -> Path | None:

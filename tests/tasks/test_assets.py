@@ -1,12 +1,20 @@
 """Which sightings the tasks call one car: in overlapping clips, by track id, by boxes that meet."""
 
+from types import SimpleNamespace
+
 import pytest
 from parked_world import clip
 
+from catalog.artefacts import Recipe
 from catalog.assets import enter_sightings
+from catalog.code_closure import Code
 from catalog.store import open_store
 from lidarpainter_models.assets.extraction import write_assets
-from tasks.assets.enter import ids_of, is_same
+from tasks.assets import enter
+from tasks.assets.enter import enter_published, ids_of, is_same
+from tasks.assets.publish import SIGHTINGS_FILE
+from tasks.exports.asset import export_asset, export_gallery
+from tasks.json_files import write_json
 
 UUID = "0d238564-0ebe-47b3-8067-593b980ce26d"
 
@@ -32,6 +40,28 @@ def test_a_parked_car_in_two_overlapping_clips_is_one_asset_with_two_sightings(t
     assert abs(places[0] - places[1]) == pytest.approx(0.3, abs=0.1)
     others = [row for row in store.tables.rows("assets") if row["kind"] != "actor"]
     assert {row["num_sightings"] for row in others} == {1}
+
+
+def test_what_was_published_into_a_bucket_is_at_hand_on_another_machine(
+    address, tmp_path, monkeypatch
+):
+    def build(place):
+        write_json(place.output / SIGHTINGS_FILE, write_assets(clip(), place.output))
+
+    recipe = Recipe(kind="assets", inputs={}, config={}, code=Code(("a:build",), {"a": "x"}))
+    ref, _ = open_store(address).artefacts.produce(recipe, build)
+    monkeypatch.setenv("LIDARPAINTER_CACHE", str(tmp_path / "elsewhere"))
+    store = open_store(address)
+    scene = SimpleNamespace(manifest={"licence": "none"})
+    monkeypatch.setattr(enter, "open_scene", lambda *_: scene)
+    monkeypatch.setattr(enter, "global_frame_of", lambda _scene: "town")
+    run = SimpleNamespace(run_id="run", scene_id="toy/street")
+    enter_published(store, run, SimpleNamespace(ref=ref), None)
+    assets = store.tables.rows("assets")
+    gallery = export_gallery(store, assets, tmp_path / "gallery")
+    assert gallery["num_pictures"] == sum(row["thumbnail"] is not None for row in assets) > 0
+    (car,) = [row for row in assets if row["kind"] == "actor"]
+    assert export_asset(store, car, "ply", tmp_path / "car.ply")["num_gaussians"] > 0
 
 
 def box(**changes):
