@@ -16,7 +16,8 @@ MOST_LISTED = 200
 app = typer.Typer()
 
 Days = Annotated[
-    float, typer.Option(min=0.0, help="How long ago counts as recent; 0.5 is half a day.")
+    float,
+    typer.Option(min=0.0, max=36500.0, help="How long ago counts as recent; 0.5 is half a day."),
 ]
 ForReal = Annotated[bool, typer.Option("--delete", help="Do it; else only list what would go.")]
 

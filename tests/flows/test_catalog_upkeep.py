@@ -38,6 +38,14 @@ def test_every_command_of_the_catalog_answers_about_the_run(tiny_run, command):
     assert tiny_run.run_id in json.dumps(succeed(*words, "--json", store=tiny_run.store).json)
 
 
+@pytest.mark.parametrize("command", ["gc", "vacuum"])
+@pytest.mark.parametrize("days", ["nan", "inf", "1000000", "-1"])
+def test_days_that_are_no_time_are_refused_in_one_line(command, days, tmp_path):
+    answer = call("catalog", command, "--days", days, store=open_store(tmp_path))
+    assert (answer.code, answer.err.count("\n")) == (2, 1)
+    assert "--days" in answer.err
+
+
 def test_a_whole_store_is_verified_and_a_flipped_bit_ends_with_1(tiny_run, own_run):
     found = succeed("catalog", "verify", "--json", store=tiny_run.store).json
     assert found["damaged"] == []
