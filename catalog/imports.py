@@ -12,7 +12,7 @@ import shutil
 import tarfile
 import uuid
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
@@ -127,10 +127,14 @@ def _parsed(content: Mapping[str, Any]) -> _Declared:
         raise ValueError(f"{len(files)} files, expected at most {MAX_FILES}")
     for name, known in files.items():
         _require_name(name)
-        if known["num_bytes"] < 0 or not _SHA256.fullmatch(known["sha256"]):
+        if not _is_size(known["num_bytes"]) or not _SHA256.fullmatch(known["sha256"]):
             raise ValueError(f"{name} has no size or digest")
     rows = {table: _rows(table, found) for table, found in content["rows"].items()}
     return _Declared(rows=rows, files=files)
+
+
+def _is_size(value: object) -> bool:
+    return isinstance(value, int) and value >= 0
 
 
 def _require_name(name: str) -> None:
@@ -152,7 +156,7 @@ def _rows(table: str, rows: Sequence[Mapping[str, Any]]) -> list[Row]:
         found.append({**row, **parsed})
     if unknown := {name for row in found for name in row} - set(TABLES[table].arrow.names):
         raise ValueError(f"{table} has no column {sorted(unknown)[0]!r}: a newer lidarpainter?")
-    pa.Table.from_pylist(found, schema=TABLES[table].arrow)
+    TABLES[table].rows_as_arrow(found)
     for row in found:
         _require_inside(table, row)
     return found
@@ -183,7 +187,7 @@ def _require_inside(table: str, row: Mapping[str, Any]) -> None:
 
 
 def _require_room(store: Store, declared: _Declared, path: Path) -> None:
-    needed = sum(int(known["num_bytes"]) for known in declared.files.values())
+    needed = sum(known["num_bytes"] for known in declared.files.values())
     if needed > store.free_bytes:
         raise ArchiveError(
             f"{path} holds {needed} bytes, {store.free_bytes} are free in {store.root}"
@@ -234,12 +238,22 @@ def _checked(staged: Store, store: Store, declared: _Declared, path: Path) -> li
         else:
             is_there = _has_scene(staged, store, name, path)
         new += [] if is_there else [folder]
+    _require_folders(store, declared, folders.keys(), path)
+    return new
+
+
+def _require_folders(
+    store: Store, declared: _Declared, folders: Collection[str], path: Path
+) -> None:
+    """See that what rows name came with them, or is in the store where it is an artefact."""
     for row in (*declared.rows.get("runs", ()), *declared.rows.get("artefacts", ())):
-        for artefact_id in row.get("artefacts") or [row.get("artefact_id")]:
+        for artefact_id in row["artefacts"] if "artefacts" in row else [row["artefact_id"]]:
             is_known = f"artefacts/{artefact_id}" in folders
             if not is_known and not store.artefacts.is_complete(ArtefactRef.of_id(artefact_id)):
                 raise ArchiveError(f"{path}: {artefact_id} is neither in it nor in the store")
-    return new
+    for row in declared.rows.get("scenes", ()):
+        if f"scenes/{row['scene_id']}" not in folders:
+            raise ArchiveError(f"{path}: the scene {row['scene_id']} is not in it")
 
 
 def _require_artefact(staged: ArtefactStore, ref: ArtefactRef, names: set[str], path: Path) -> None:

@@ -172,9 +172,19 @@ def of_tomorrow(forged):
     forged.with_manifest(lambda found: found.update(version=2))
 
 
-def too_large(forged):
-    name = forged.name_of("data")
-    forged.with_manifest(lambda found: found["files"][name].update(num_bytes=10**18))
+def of_size(value):
+    def change(forged):
+        name = forged.name_of("data")
+        forged.with_manifest(lambda found: found["files"][name].update(num_bytes=value))
+
+    return change
+
+
+def with_row_again(table, **values):
+    def change(found):
+        found["rows"][table].append({**found["rows"][table][0], **values})
+
+    return lambda forged: forged.with_manifest(change)
 
 
 def with_other_digest(forged):
@@ -197,7 +207,9 @@ FORGERIES = {
     "pipe": (retyped(tarfile.FIFOTYPE), "was not declared as a file"),
     "longer": (with_content(b"-" * 2000), "of another size than was declared"),
     "other bytes": (with_content(b"x" * 1000), "is not what was written"),
-    "bomb": (too_large, "bytes are free|bytes, .* are free"),
+    "bomb": (of_size(10**18), "bytes are free|bytes, .* are free"),
+    "no size": (of_size(float("nan")), "has no size or digest"),
+    "endless": (of_size(float("inf")), "has no size or digest"),
     "missing": (without_last, "is missing"),
     "undeclared": (with_more, "was not declared"),
     "twice": (twice, "was not declared"),
@@ -213,10 +225,19 @@ FORGERIES = {
     "report root": (changed_row("runs", report="/etc/passwd"), "report leads out"),
     "running": (changed_row("runs", status="running"), "a run is not complete"),
     "scene up": (changed_row("scenes", scene_id="../x"), "is no scene id"),
+    "phantom": (with_row_again("scenes", scene_id="toy/other"), "toy/other is not in it"),
+    "row twice": (with_row_again("runs"), "share a run_id"),
     "column": (changed_row("scenes", colour="red"), "scenes has no column 'colour'"),
     "type": (changed_row("scenes", num_frames="many"), "its manifest cannot be used"),
     "time": (changed_row("artefacts", created_at="soon"), "its manifest cannot be used"),
 }
+
+
+def test_a_run_that_lists_no_artefacts_is_taken(archive, tmp_path):
+    forged = Forged(archive)
+    changed_row("runs", artefacts=[])(forged)
+    store = open_store(tmp_path / "store")
+    assert import_archive(store, forged.write(tmp_path / "forged.tar"))["runs"] == 1
 
 
 @pytest.mark.parametrize(("forge", "expected"), FORGERIES.values(), ids=FORGERIES)
