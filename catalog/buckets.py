@@ -250,11 +250,7 @@ def _from_files() -> Any:  # noqa: ANN401 - a typed dictionary of each of its tw
     if "AWS_ACCESS_KEY_ID" in os.environ:
         return {}
     profile, found = os.environ.get("AWS_PROFILE", "default"), configparser.RawConfigParser()
-    places = {
-        "AWS_CONFIG_FILE": "~/.aws/config",
-        "AWS_SHARED_CREDENTIALS_FILE": "~/.aws/credentials",
-    }
-    for variable, place in places.items():
+    for variable, place in _AMAZON_FILES.items():
         found.read(Path(os.environ.get(variable, place)).expanduser(), "utf-8")
     said: dict[str, str] = {}
     for section in (f"profile {profile}", profile):

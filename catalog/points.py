@@ -80,7 +80,8 @@ def points_of(store: Store, fleet: str) -> tuple[list[Point], list[Row]]:
         )
         for row in ended
     ]
-    return points, [row for row in sequences if row not in ended]
+    names = {row["sequence_id"] for row in ended}
+    return points, [row for row in sequences if row["sequence_id"] not in names]
 
 
 def _chosen(store: Store, table: str, **wanted: Iterable[str]) -> list[Row]:

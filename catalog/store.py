@@ -145,21 +145,21 @@ class Store:
     @contextmanager
     def scene_lock(
         self, scene_id: str, *, on_wait: Callable[[str], None] | None = None
-    ) -> Iterator[bool]:
+    ) -> Iterator[None]:
         """What whoever writes this scene must hold; a bucket has the scene when the block ends.
 
         Of two machines that write one scene at once the second takes over what the first wrote.
         """
         dataset, sequence = split_scene_id(scene_id)
         path = self.root / "locks" / f"scene-{dataset}-{sequence}.lock"
-        with held_lock(path, on_wait=on_wait) as waited:
+        with held_lock(path, on_wait=on_wait):
             if self.mirror is None:
-                yield waited
+                yield
                 return
             entry = scene_entry(scene_id)
             before = self.mirror.version(entry)
             self.mirror.forget(entry)
-            yield waited
+            yield
             self.mirror.publish(entry, replacing=before)
 
     def name_of(self, path: Path) -> str:
