@@ -191,7 +191,7 @@ class Mirror:
 
     def tidy(self) -> None:
         """Let go what was not used for longest, until no more is kept than is allowed."""
-        notes = sorted(self.root.glob(f"{LISTINGS}/**/*.json"), key=lambda one: one.stat().st_mtime)
+        notes = sorted(self.root.glob(f"{LISTINGS}/**/*.json"), key=_used_at)
         sizes = {note: self._kept_bytes(self._entry_of(note)) for note in notes}
         excess = sum(sizes.values()) - _limit_bytes()
         for note, num_bytes in sizes.items():
@@ -247,15 +247,15 @@ class Mirror:
     def _fetch(self, entry: str, name: str, listing: Listing) -> None:
         """Bring one file here, whole and checked, or not at all."""
         path = self.root / entry / name
-        aside = self.root / "aside" / f"fetched-{secrets.token_hex(8)}"
+        aside = self.root / "aside" / f"fetched-{secrets.token_hex(8)}"  # a folder: `gc` finds it
         with storage_errors(f"cannot write {path}"):
             path.parent.mkdir(parents=True, exist_ok=True)
-            aside.parent.mkdir(exist_ok=True)
+            aside.mkdir(parents=True)
             try:
-                self._download(entry, name, listing, aside)
-                aside.replace(path)
+                self._download(entry, name, listing, aside / path.name)
+                (aside / path.name).replace(path)
             finally:
-                aside.unlink(missing_ok=True)
+                shutil.rmtree(aside, ignore_errors=True)
 
     def _download(self, entry: str, name: str, listing: Listing, path: Path) -> None:
         where = f"{entry}/{listing.place}/{name}"
@@ -310,6 +310,14 @@ class EntryFiles:
             DamagedArtefactError: a file is not there or is not what was published.
         """
         self.mirror.bring(self.entry, self.listing, names)
+
+
+def _used_at(note: Path) -> float:
+    """When an entry was used last; long ago if another process has let go of it."""
+    try:
+        return note.stat().st_mtime
+    except FileNotFoundError:
+        return 0.0
 
 
 def _listing_name(entry: str) -> str:

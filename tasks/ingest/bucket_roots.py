@@ -72,4 +72,5 @@ def _fetch(bucket: Bucket, name: str, folder: Path) -> None:
     if ".." in Path(name).parts or path == folder:
         raise DataError(f"{bucket.where(name)}: a name that leads elsewhere")
     path.parent.mkdir(parents=True, exist_ok=True)
-    bucket.download(name, path)
+    if bucket.download(name, path) is None:
+        raise DataError(f"{bucket.where(name)}: it is gone, though it was listed a moment ago")

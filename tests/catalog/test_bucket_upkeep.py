@@ -1,6 +1,7 @@
 """Collecting, verifying, exporting and importing where the store is a bucket."""
 
 import json
+import os
 from datetime import UTC, datetime, timedelta
 
 import pytest
@@ -67,6 +68,19 @@ def test_files_that_no_listing_names_and_leases_of_nobody_are_found(shop, monkey
     left = {name for name in bucket.sizes("") if not name.startswith(changing)}
     assert left == {name for name in before if not name.startswith(changing)} - gone
     assert {"leases/s1"} < left
+
+
+def test_what_a_killed_fetch_left_is_found(shop, address, tmp_path, monkeypatch):
+    monkeypatch.setenv("LIDARPAINTER_CACHE", str(tmp_path / "elsewhere"))
+    store = open_store(address)
+    with monkeypatch.context() as patched:
+        patched.setattr("catalog.mirrors.shutil.rmtree", lambda *_, **__: None)
+        store.artefacts.manifest(shop.fit)
+    (left,) = store.root.glob("aside/*")
+    os.utime(left, (0, 0))
+    assert going(store) == {f"aside/{left.name}"}
+    delete(store, plan_collection(store, LATER))
+    assert not left.exists()
 
 
 def test_each_byte_in_the_bucket_is_read_whatever_the_mirror_holds(shop):

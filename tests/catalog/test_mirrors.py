@@ -161,6 +161,16 @@ def test_keys_come_from_amazons_files_where_the_environment_has_none(
     assert store.artefacts.produce(RECIPE, build_of(b"x"))[1]
 
 
+def test_an_entry_that_another_process_lets_go_does_not_stop_tidying(machine):
+    store = machine("a")
+    ref, _ = store.artefacts.produce(RECIPE, build_of(b"x"))
+    store.release()
+    note = store.mirror.root / f"published/{ref.entry}.json"
+    note.with_name("gone.json").symlink_to("nowhere")  # it is listed, and then is not there
+    store.mirror.tidy()
+    assert note.exists()
+
+
 @pytest.mark.parametrize(
     "text", ["s3://", "s3://B/x", "s3://bucket/../x", "s3://bucket/a//b", "s3://bucket/a b"]
 )

@@ -1,5 +1,7 @@
 """A fleet whose store is a bucket: it goes on when the bucket is back."""
 
+from pathlib import Path
+
 import pytest
 from small_pandaset import PandasetFolder
 from stub_fleet import stub_ledger, stub_worker, write_stub_manifest
@@ -13,6 +15,8 @@ from flows.fleet.local_workers import run_workers
 from flows.fleet.manifest import Budget, read_manifest
 from flows.fleet.metrics_file import write_metrics
 from flows.interruption import Interrupted
+from lidarpainter_models.errors import DataError
+from tasks.ingest.bucket_roots import root_at_hand
 from tasks.ingest.jobs import IngestRequest, ingest_or_recall
 
 
@@ -49,6 +53,16 @@ def test_a_log_in_a_bucket_is_fetched_read_and_let_go(address, tmp_path, monkeyp
     assert list((tmp_path / "cache").glob("dataset-*")) == []
     monkeypatch.setattr("tasks.ingest.jobs.ingest_sequence", None)  # it is not read again
     assert ingest_or_recall(request, asked.sequence, again=False) == row
+
+
+def test_a_log_that_goes_while_it_is_fetched_is_one_line(address, tmp_path, monkeypatch):
+    logs = Bucket(f"{address}/logs")
+    (tmp_path / "image").write_bytes(b"x")
+    logs.upload("002/image", tmp_path / "image")
+    monkeypatch.setattr(Bucket, "download", lambda *_: None)
+    root = root_at_hand(Path(logs.address), "002")
+    with pytest.raises(DataError, match="002/image: it is gone"), root:
+        pytest.fail("a file that is not there was read")
 
 
 @pytest.mark.usefixtures("asked")
