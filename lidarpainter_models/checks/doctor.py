@@ -335,6 +335,7 @@ def sampled_positions(count: int) -> list[int]:
 
 
 _BY_POINTS = {
+    "camera sync",
     "ground",
     "sweeps agree",
     "points in images",
