@@ -141,7 +141,8 @@ def check_ego_poses(scene: DrivingScene) -> tuple[Verdict, str]:
     turn = _turn_rad(scene.world_from_ego[:-1], scene.world_from_ego[1:]) / step_s
     detail = f"speed {speed.min():.1f} to {speed.max():.1f} m/s, turn up to {turn.max():.2f} rad/s"
     if speed.max() > MAX_SPEED_MPS or turn.max() > MAX_TURN_RADPS:
-        return "fail", f"{detail}: a jump at frame {_frame_after(scene, int(speed.argmax()))}"
+        worst = speed if speed.max() > MAX_SPEED_MPS else turn
+        return "fail", f"{detail}: a jump at frame {_frame_after(scene, int(worst.argmax()))}"
     if _drives_across(scene.world_from_ego):
         return "fail", f"{detail}; the car drives across its x axis: is ego x forward, y left?"
     if len(speed) > 1:

@@ -58,6 +58,14 @@ def test_jump_of_the_car_is_found(scene):
     assert "a jump at frame 2" in check.detail
 
 
+def test_turn_of_the_car_on_the_spot_is_found_where_it_is(scene):
+    half_turn = torch.diag(torch.tensor([-1.0, -1, 1, 1], dtype=torch.float64))
+    scene.world_from_ego[2] = scene.world_from_ego[1] @ half_turn
+    verdict, detail = check_ego_poses(scene)
+    assert verdict == "fail"
+    assert "a jump at frame 2" in detail
+
+
 def test_ego_whose_x_is_not_forward_is_found(scene):
     across = torch.tensor(
         [[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=torch.float64
