@@ -57,6 +57,7 @@ _NON_COMMERCIAL = ("non-commercial", "noncommercial", "-nc-", " nc ", "-nc ")
 _COVERAGE_CELLS = (9, 16)
 _MIN_STEP_M = 0.2
 """From frame to frame; the poses of a car that stands jitter by less."""
+_GROUND_CELL_M = 2.0
 _GROUND_THICKNESS_M = 0.3
 _NUM_GROUND_TRIES = 1000
 _NUM_SAMPLED_FRAMES = 4
@@ -291,9 +292,9 @@ def _points_near_ego(scene: DrivingScene, frame_index: int) -> np.ndarray:
     return points_near(scene.read_points(frame_index).xyz_m, centre_m)
 
 
-def _lowest_in_cells(points_m: np.ndarray, cell_m: float = 2.0) -> np.ndarray:
+def _lowest_in_cells(points_m: np.ndarray) -> np.ndarray:
     """The lowest point over every square cell of the ground."""
-    cells = np.floor(points_m[:, :2] / cell_m).astype(int)
+    cells = np.floor(points_m[:, :2] / _GROUND_CELL_M).astype(int)
     order = np.lexsort((points_m[:, 2], cells[:, 1], cells[:, 0]))
     first = np.ones(len(order), dtype=bool)
     first[1:] = (np.diff(cells[order], axis=0) != 0).any(axis=1)
