@@ -3,10 +3,12 @@
 Wrong conventions (length along y, yaw from another axis, boxes at another moment) show here first.
 """
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from lidarpainter_models.checks.lidar_reach import LidarReach, could_any_hit, reaches_of
 from lidarpainter_models.geometry.boxes import is_inside_box
@@ -71,12 +73,8 @@ def check_box_axes(scene: DrivingScene) -> tuple[Verdict, str]:
 
 def check_duplicate_tracks(scene: DrivingScene) -> tuple[Verdict, str]:
     """Whether two tracks stand for the same actor."""
-    twins = [
-        f"{first.actor_id} = {second.actor_id}"
-        for index, first in enumerate(scene.tracks)
-        for second in scene.tracks[index + 1 :]
-        if _are_twins(first, second)
-    ]
+    pairs = [(scene.tracks[i], scene.tracks[j]) for i, j in _pairs_that_meet(scene.tracks)]
+    twins = [f"{a.actor_id} = {b.actor_id}" for a, b in pairs if _are_twins(a, b)]
     if twins:
         return "warn", f"{len(twins)} pairs stand in the same place: {', '.join(twins[:3])}"
     return "ok", f"{len(scene.tracks)} tracks, each in a place of its own"
@@ -98,6 +96,25 @@ def _near_moving_boxes(scene: DrivingScene) -> list[tuple[bool, bool]]:
                 could_be_hit = could_any_hit(reaches[frame_index], world_from_box, track.size_m)
                 found.append((could_be_hit, bool(track.num_points[row] > 0)))
     return found
+
+
+def _pairs_that_meet(tracks: Sequence[ActorTrack]) -> list[tuple[int, int]]:
+    """Positions of tracks that stand in the same place in some frame: twins do in half of them."""
+    if len(tracks) < 2:
+        return []
+    frames = torch.cat([track.frame_indices for track in tracks]).numpy()
+    numbers = np.repeat(np.arange(len(tracks)), [len(track.frame_indices) for track in tracks])
+    centres_m = torch.cat([track.world_from_box[:, :3, 3] for track in tracks]).numpy()
+    reaches_m = _DUPLICATE_SHARE * np.array([float(track.size_m[1]) for track in tracks])[numbers]
+    pairs: set[tuple[int, int]] = set()
+    for frame in np.unique(frames):
+        rows = np.flatnonzero(frames == frame)
+        tree = cKDTree(centres_m[rows])
+        near = rows[tree.query_pairs(reaches_m[rows].max(), output_type="ndarray")]
+        apart_m = np.linalg.norm(centres_m[near[:, 0]] - centres_m[near[:, 1]], axis=1)
+        met = near[apart_m < reaches_m[near].min(axis=1)]
+        pairs.update((i, j) for i, j in numbers[met].tolist())
+    return sorted(pairs)
 
 
 def _are_twins(first: ActorTrack, second: ActorTrack) -> bool:

@@ -3,12 +3,14 @@
 import json
 import shutil
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
 import torch
 
-from lidarpainter_models.checks.actors import check_box_axes
+from lidarpainter_models.checks import actors
+from lidarpainter_models.checks.actors import check_box_axes, check_duplicate_tracks
 from lidarpainter_models.checks.doctor import check_ego_poses, check_scene, draw_overlay
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 
@@ -191,6 +193,37 @@ def test_actor_with_two_tracks_is_found(pandaset, tmp_path):
     check = next(check for check in check_scene(scene) if check.name == "duplicate tracks")
     assert check.verdict == "warn"
     assert "moving-1 = moving-0" in check.detail
+
+
+def random_tracks(track, num_tracks):
+    """Cars in one to four of four frames, in places where some pairs meet in none or a few."""
+    random = np.random.default_rng(0)
+    for number in range(num_tracks):
+        frames = torch.tensor(np.sort(random.permutation(4)[: random.integers(1, 5)]))
+        poses = torch.eye(4, dtype=torch.float64).repeat(len(frames), 1, 1)
+        centres_m = random.uniform(0, 20, 2) + random.normal(0, 0.7, (len(frames), 2))
+        poses[:, :2, 3] = torch.from_numpy(centres_m)
+        yield replace(
+            track,
+            actor_id=f"car-{number}",
+            size_m=torch.tensor([4.0, random.uniform(0.5, 4.0), 1.5]),
+            frame_indices=frames,
+            timestamps_ns=frames,
+            world_from_box=poses,
+            num_points=frames,
+        )
+
+
+def test_twins_among_many_tracks_are_found_without_asking_about_each_pair(scene, monkeypatch):
+    scene.tracks = tuple(random_tracks(scene.tracks[0], 80))
+    are_twins, asked = actors._are_twins, []
+    pairs = list(combinations(scene.tracks, 2))
+    twins = [f"{a.actor_id} = {b.actor_id}" for a, b in pairs if are_twins(a, b)]
+    assert len(twins) > 10
+    monkeypatch.setattr(actors, "_are_twins", lambda *pair: asked.append(pair) or are_twins(*pair))
+    detail = check_duplicate_tracks(scene)[1]
+    assert detail == f"{len(twins)} pairs stand in the same place: {', '.join(twins[:3])}"
+    assert len(asked) < len(pairs) / 10
 
 
 def test_damaged_content_is_found(small_scene, tmp_path):
