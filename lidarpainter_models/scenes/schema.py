@@ -22,6 +22,9 @@ MAX_NAME_LENGTH = 128
 NAME_PATTERN = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_NAME_LENGTH - 1}}}")
 """Datasets, sequences, cameras and LiDARs are named so: safe as a folder of their own."""
 
+MAX_LIDARS = 256
+"""`point_lidar` counts them in a byte."""
+
 POSE_TYPE = pa.list_(pa.float64(), 16)
 
 

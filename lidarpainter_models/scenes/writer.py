@@ -203,6 +203,8 @@ class SceneWriter:
         if (semantics is not None) != bool(self._header.semantic_classes):
             raise DataError(f"{where}: point classes and their names must come together")
         if lidar_name not in self._lidar_names:
+            if len(self._lidar_names) == schema.MAX_LIDARS:
+                raise DataError(f"{where}: one LiDAR too many, expected {schema.MAX_LIDARS}")
             self._lidar_names.append(lidar_name)
         columns = {
             "point_xyz_m": points.xyz_m,

@@ -5,9 +5,11 @@ import gzip
 import json
 import pickle
 import shutil
+import struct
 
 import numpy as np
 import pytest
+from pickled_tables import pickled_table
 
 from lidarpainter_models.errors import DataError, LidarPainterError, UnsafePickleError, WriteError
 from lidarpainter_models.readers import ingest_scene
@@ -174,6 +176,14 @@ def test_truncated_pickle(pandaset, store, share):
     kind, message = refusal(pandaset, store)
     assert kind is DataError
     assert "cuboids/00.pkl.gz: the pickle is damaged" in message
+
+
+def test_column_at_no_place(tmp_path):
+    content = pickled_table({"x": np.ones(1)}).replace(b"i8", b"f8")
+    size = struct.pack("<I", 8)
+    content = content.replace(size + bytes(8), size + struct.pack("<d", np.inf))
+    with pytest.raises(DataError, match="the pandas table is damaged"):
+        read_table_bytes(content, tmp_path / "table.pkl")
 
 
 def test_table_that_unpacks_without_end(tmp_path):

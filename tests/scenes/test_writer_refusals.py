@@ -78,6 +78,16 @@ def test_scene_without_frames_or_images_is_refused(tmp_path, missing):
     assert files_below(tmp_path) == []
 
 
+def test_more_lidars_than_a_byte_counts_are_refused(tmp_path):
+    place = {"timestamp_ns": 7, "world_from_lidar": IDENTITY}
+    with SceneWriter(tmp_path, "rig", "a", HEADER) as writer:
+        add_frame(writer)  # has one of its own
+        for number in range(1, 256):
+            writer.add_sweep(f"roof-{number}", some_points(1), **place)
+        with pytest.raises(DataError, match="lidar roof-256: one LiDAR too many, expected 256"):
+            writer.add_sweep("roof-256", some_points(1), **place)
+
+
 def test_scene_without_lidar_is_read_back_and_examined(tmp_path):
     with SceneWriter(tmp_path, "rig", "a", HEADER) as writer:
         for frame in range(2):

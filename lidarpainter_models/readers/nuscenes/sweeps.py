@@ -88,9 +88,9 @@ def _turn_share(x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
 
 
 def _read_rows(source: SourceFolder, name: str, path: Path) -> Float[np.ndarray, "points 5"]:
-    if path.is_file() and path.stat().st_size > _MAX_FILE_BYTES:
-        raise DataError(f"{path}: more than {_MAX_FILE_BYTES} bytes, expected one turn of a LiDAR")
     content = source.read_bytes(name)
+    if len(content) > _MAX_FILE_BYTES:
+        raise DataError(f"{path}: more than {_MAX_FILE_BYTES} bytes, expected one turn of a LiDAR")
     if len(content) % _POINT_BYTES:
         raise DataError(
             f"{path}: {len(content)} bytes, expected whole points of {_POINT_BYTES} bytes"

@@ -121,7 +121,7 @@ def _table(tree: object, max_rows: int) -> Table:
         for values, positions in placed:
             for row, position in enumerate(positions):
                 columns[position] = values[row]
-    except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
+    except (TypeError, ValueError, KeyError, IndexError, AttributeError, OverflowError) as error:
         if isinstance(error, DataError):
             raise
         raise DataError(f"the pandas table is damaged ({shown(str(error))})") from None

@@ -79,17 +79,18 @@ def shaped_matrix(
     Raises:
         DataError: the shape is none of a range image, or the numbers are more or fewer.
     """
-    dims = [int(size) for size in list(shape)[:4]]  # type: ignore[call-overload]
+    sizes = list(shape)[:4]  # type: ignore[call-overload]
     if (
-        len(dims) != 3
-        or dims[2] != channels
-        or not (0 < dims[0] <= MAX_ROWS and 0 < dims[1] <= MAX_COLUMNS)
-        or dims[0] * dims[1] > MAX_PIXELS
+        len(sizes) != 3
+        or sizes[2] != channels
+        or not (0 < sizes[0] <= MAX_ROWS and 0 < sizes[1] <= MAX_COLUMNS)
+        or sizes[0] * sizes[1] > MAX_PIXELS
     ):
         raise DataError(
-            f"{where}: shape {dims}, expected at most {MAX_ROWS} rows, {MAX_COLUMNS} columns, "
+            f"{where}: shape {sizes}, expected at most {MAX_ROWS} rows, {MAX_COLUMNS} columns, "
             f"{MAX_PIXELS} pixels and exactly {channels} channels"
         )
+    dims = [int(size) for size in sizes]
     num_bytes = dims[0] * dims[1] * channels * _FLOAT_BYTES
     if values.nbytes != num_bytes:
         raise DataError(f"{where}: {values.nbytes} bytes, expected {num_bytes} for shape {dims}")

@@ -70,6 +70,7 @@ CASES = [
     ("sample_data", set_in("filename", "a\x00b"), "expected a path below the root"),
     ("sample_data", set_in("filename", "\ud800"), "expected a path below the root"),
     ("sample_data", set_in("filename", "x" * 5000), "cannot be read (File name too long)"),
+    ("sample_data", set_sweep("filename", "x" * 256), "cannot be read (File name too long)"),
     ("sample_data", set_in("filename", "samples"), "/log/samples: "),
     ("sample_data", set_in("filename", "samples/none.jpg"), "none.jpg: the file is missing"),
     ("sample_data", set_in("is_key_frame", "yes"), "is_key_frame is 'yes', expected true or"),
@@ -168,6 +169,12 @@ def test_truncated_sweep(log, store, kept):
     message = refusal(log, store)
     assert f"{file.name}: " in message
     assert "expected whole points of 20 bytes" in message
+
+
+def test_sweep_of_more_than_a_turn(log, store, monkeypatch):
+    monkeypatch.setattr("lidarpainter_models.readers.nuscenes.sweeps._MAX_FILE_BYTES", 100)
+    message = refusal(log, store)
+    assert message.endswith(": more than 100 bytes, expected one turn of a LiDAR")
 
 
 def test_empty_sweep(log, store):

@@ -2,6 +2,7 @@
 
 import re
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -10,6 +11,9 @@ from waymo_edits import (
     with_value,
 )
 from waymo_numbers import SEGMENT
+
+from lidarpainter_models.errors import DataError
+from lidarpainter_models.readers.waymo.range_images import shaped_matrix
 
 
 def component_refusal(components, store, component, change):
@@ -75,6 +79,17 @@ def test_senseless_value(components, tmp_path, component, column, value, complai
     change = with_value(column, 1 if component != "vehicle_pose" else 0, value)
     line = component_refusal(components, tmp_path / "store", component, change)
     assert re.search(complaint, line), line
+
+
+@pytest.mark.parametrize("size", [float("nan"), float("inf")])
+@pytest.mark.parametrize("axis", range(3))
+def test_shape_that_is_no_number(size, axis):
+    shape = [1.0, 1.0, 4.0]
+    values = np.zeros(4, np.float32)
+    assert shaped_matrix(values, shape, 4, "here").shape == (1, 1, 4)
+    shape[axis] = size
+    with pytest.raises(DataError, match=r"here: shape .* expected at most"):
+        shaped_matrix(values, shape, 4, "here")
 
 
 def test_frame_that_stands_twice(components, tmp_path):
