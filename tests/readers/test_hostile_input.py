@@ -193,6 +193,15 @@ def test_table_that_unpacks_without_end(tmp_path):
     assert dataframe_pickle.MAX_TABLE_BYTES < 2**30
 
 
+def test_gzip_file_of_several_members(tmp_path):
+    content = pickled_table({"x": np.arange(3.0)})
+    members = [gzip.compress(part) for part in (content[:100], b"", content[100:])]
+    table = read_table_bytes(b"".join(members), tmp_path / "table.pkl.gz")
+    assert table["x"].tolist() == [0, 1, 2]
+    with pytest.raises(DataError, match="more than 16 gzip members, expected a table"):
+        read_table_bytes(b"".join([members[1]] * 17), tmp_path / "table.pkl.gz")
+
+
 class Runs:
     """Would leave a file behind if it were unpickled."""
 

@@ -22,6 +22,8 @@ MAX_TABLE_BYTES = 64 * 1024 * 1024
 """A table that unpacks to more is refused; the largest of PandaSet has 9 MB."""
 MAX_TABLE_ROWS = 1_000_000
 """A frame of PandaSet has 170,000 points."""
+_MAX_MEMBERS = 16
+"""Of a gzip file; those of PandaSet have one."""
 _GZIP_WINDOW_BITS = 31
 """For zlib: a gzip header, its checksum and the largest window."""
 
@@ -94,7 +96,9 @@ def read_table_bytes(
 def _unzip(content: bytes, max_bytes: int) -> bytes:
     """The content of a gzip file, which may have several members; no more than `max_bytes`."""
     parts, left = [], max_bytes + 1
-    while content:
+    for _ in range(_MAX_MEMBERS):
+        if not content:
+            break
         member = zlib.decompressobj(_GZIP_WINDOW_BITS)
         try:
             parts.append(member.decompress(content, left))
@@ -106,6 +110,8 @@ def _unzip(content: bytes, max_bytes: int) -> bytes:
         if not member.eof:
             raise DataError("the gzip file is cut off or damaged (it has no end)")
         content = member.unused_data.lstrip(b"\x00")
+    if content:
+        raise DataError(f"has more than {_MAX_MEMBERS} gzip members, expected a table")
     return b"".join(parts)
 
 
