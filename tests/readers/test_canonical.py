@@ -1,6 +1,7 @@
 """A scene written elsewhere comes into the store whole, and a damaged or hostile one does not."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -152,6 +153,14 @@ def test_header_of_a_frame_without_a_size_tells_none():
 def test_link_in_a_scene_is_refused(foreign, tmp_path):
     (foreign / "link").symlink_to("/etc")
     assert "is a link" in refusal(foreign, tmp_path)
+
+
+@pytest.mark.parametrize("name", ["frames.parquet", "scene.zarr/point_ring/c/0"])
+def test_pipe_that_the_manifest_does_not_list_is_refused(foreign, tmp_path, name):
+    edit_manifest(foreign, lambda m: m["files"].pop(name))
+    (foreign / name).unlink()
+    os.mkfifo(foreign / name)
+    assert f"{name}: is a link or a pipe" in refusal(foreign, tmp_path)
 
 
 def rewrite_table(folder, name, change):

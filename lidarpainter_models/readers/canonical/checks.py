@@ -94,7 +94,7 @@ def _require_texts(manifest: dict[str, Any], where: str) -> None:
 
 
 def _require_files(files: object, folder: Path) -> None:
-    """Every file listed is a plain one below the folder and has its size; nothing is a link."""
+    """Every file listed is a plain one below the folder and has its size; no links, no pipes."""
     where = folder / schema.MANIFEST_NAME
     if not isinstance(files, dict) or len(files) > MAX_FILES:
         raise DataError(f"{where}: files is no object of sizes by name")
@@ -111,8 +111,8 @@ def _require_files(files: object, folder: Path) -> None:
                 f"{folder / name}: {status.st_size} bytes, expected a file of {num_bytes!r:.20}"
             )
     for current in (folder, *folder.rglob("*")):
-        if current.is_symlink():
-            raise DataError(f"{current}: is a link, expected files and folders alone")
+        if current.is_symlink() or not (current.is_file() or current.is_dir()):
+            raise DataError(f"{current}: is a link or a pipe, expected files and folders alone")
 
 
 def _require_entries(manifest: dict[str, Any], where: str) -> None:

@@ -6,6 +6,7 @@ of the file agree with it, so a hostile length is refused and not allocated.
 """
 
 import hashlib
+import stat
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,7 +93,10 @@ class TfrecordFile:
 
     def _index(self) -> list[_Place]:
         records: list[_Place] = []
-        size = self.path.stat().st_size
+        status = self.path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise DataError(f"{self.path}: not a file")
+        size = status.st_size
         position = 0
         with self.path.open("rb") as file:
             while position < size:

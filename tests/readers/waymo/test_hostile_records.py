@@ -1,5 +1,6 @@
 """A bad record or message of Waymo gets one clear line with file and record."""
 
+import os
 import re
 import struct
 
@@ -7,9 +8,11 @@ import pytest
 from waymo_damage import joined
 from waymo_edits import (
     CONTEXT,
+    FILE,
     POSE,
     TIME,
     edited,
+    refused_line,
     with_frame,
 )
 from waymo_records import tfrecord, whole
@@ -75,6 +78,13 @@ def test_flipped_bit_in_a_frame(refusal, messages):
 
 def test_file_without_a_record(refusal):
     assert refusal(b"").endswith("zero records, expected at least one")
+
+
+def test_pipe_in_place_of_records(records, tmp_path):
+    path = records.root / FILE
+    path.unlink()
+    os.mkfifo(path)
+    assert refused_line(records, tmp_path / "store", FILE).endswith(f"{FILE}: not a file")
 
 
 def test_something_else_entirely(refusal):
