@@ -58,6 +58,13 @@ def test_scene_from_elsewhere_keeps_its_name_and_every_byte_of_content(foreign, 
     assert all((path / file).read_bytes() == (foreign / file).read_bytes() for file in arrays)
 
 
+def test_entries_that_the_format_does_not_know_stay_behind(foreign, tmp_path):
+    known = {"global_frame": "map", "generator": {"name": "a street"}, "stress": {"level": 1}}
+    edit_manifest(foreign, lambda manifest: manifest.update(known, invented=[1]))
+    manifest = DrivingScene.open(ingested(foreign, tmp_path / "store")).manifest
+    assert {key: manifest.get(key) for key in (*known, "invented")} == {**known, "invented": None}
+
+
 def test_scenes_below_a_root_and_a_scene_itself_are_found(foreign):
     assert list_sequences("canonical", foreign.parent) == ("002",)
     assert list_sequences("canonical", foreign) == ("002",)
@@ -188,10 +195,11 @@ def changed_rows(table, **columns):
         ("cameras", {"fx_px": float("nan")}, "finite lens"),
         ("cameras", {"width_px": 65}, "is 64 x 48 px, expected"),
         ("cameras", {"offset": 2**40}, "rows 1099511627776"),
-        ("cameras", {"num_bytes": 2**40}, "an image of"),
+        ("cameras", {"num_bytes": 2**40}, "cameras.parquet: 19791209299968 num_bytes in all"),
+        ("cameras", {"num_bytes": -1}, "an image of -1 bytes"),
         ("cameras", {"distortion_model": "magic"}, "'magic' is not known"),
         ("cameras", {"rolling_shutter_s": 1.0}, "reads in no known direction"),
-        ("sweeps", {"num_points": 2**40}, "a sweep of"),
+        ("sweeps", {"num_points": -1}, "a sweep of -1 points"),
         ("sweeps", {"lidar": "../x"}, "cannot be used"),
         ("boxes", {"actor_id": "../x"}, "cannot be used"),
         ("boxes", {"category": "a\nb"}, "printable"),
@@ -207,6 +215,16 @@ def test_senseless_row_is_refused_though_its_digest_is_right(
 ):
     rewrite_table(foreign, table, lambda found: changed_rows(found, **columns))
     assert expected in refusal(foreign, tmp_path)
+
+
+@pytest.mark.parametrize(("table", "length"), [("cameras", "num_bytes"), ("sweeps", "num_points")])
+def test_rows_that_share_one_stretch_are_refused(foreign, tmp_path, table, length):
+    def share(found):
+        longest = max(found.to_pylist(), key=lambda row: row[length])
+        return changed_rows(found, **{key: longest[key] for key in ("offset", length)})
+
+    rewrite_table(foreign, table, share)
+    assert "no rows share any" in refusal(foreign, tmp_path)
 
 
 def test_column_of_another_type_is_refused(foreign, tmp_path):

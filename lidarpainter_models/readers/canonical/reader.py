@@ -39,13 +39,10 @@ from lidarpainter_models.scenes.writer import SceneHeader
 
 _MAX_JPEG_BYTES = 64_000_000
 _MAX_SWEEP_POINTS = 10_000_000
-_KNOWN_ENTRIES = frozenset(
-    {
-        *("schema_version", "dataset", "sequence", "global_from_world", "camera_names"),
-        *("lidar_names", "semantic_classes", "tables", "arrays", "licence", "provenance"),
-        *("software_version", "counts", "content_digest", "files", "is_complete"),
-    }
-)
+_FURTHER_ENTRIES = (schema.GLOBAL_FRAME, "generator", "stress")
+"""Of a manifest, taken over as they are; by the latter two a drawn or spoilt street is known."""
+_STRETCHES = (("cameras", "num_bytes", "image_bytes"), ("sweeps", "num_points", "point_xyz_m"))
+"""Tables whose rows are stretches of an array, and the column with their lengths."""
 
 
 def list_canonical_scenes(root: Path) -> tuple[str, ...]:
@@ -101,6 +98,7 @@ class ForeignScene:
         self.dataset, self.sequence = self.manifest["dataset"], self.manifest["sequence"]
         self.stored = StoredScene(folder)
         self.stored.verify_content()
+        self._require_own_stretches()
         used = chosen_cameras(cameras, self.manifest["camera_names"], folder)
         all_frames = self.stored.table("frames").to_pylist()
         known = {row["frame_index"] for row in all_frames}
@@ -120,7 +118,7 @@ class ForeignScene:
             semantic_classes={
                 int(number): name for number, name in self.manifest["semantic_classes"].items()
             },
-            more={k: v for k, v in self.manifest.items() if k not in _KNOWN_ENTRIES},
+            more={k: self.manifest[k] for k in _FURTHER_ENTRIES if k in self.manifest},
         )
 
     def provenance(self) -> dict[str, object]:
@@ -140,6 +138,18 @@ class ForeignScene:
             sweeps=[self._sweep(found) for found in self._rows["sweeps"].get(frame_index, [])],
             boxes=[self._box(found) for found in self._rows["boxes"].get(frame_index, [])],
         )
+
+    def _require_own_stretches(self) -> None:
+        """Refuse rows that share bytes or points: a small folder would become a large scene."""
+        for table, column, array in _STRETCHES:
+            lengths = self.stored.table(table)[column].to_pylist()
+            total = sum(max(0, count) for count in lengths)
+            length = self.manifest["arrays"][array]["shape"][0]
+            if total > length:
+                raise DataError(
+                    f"{self.folder / table}.parquet: {total} {column} in all, expected at most "
+                    f"the {length} of {array}: no rows share any"
+                )
 
     def _by_frame(self, table: str, known: set[int]) -> dict[int, list[dict[str, Any]]]:
         rows_of: dict[int, list[dict[str, Any]]] = {}
