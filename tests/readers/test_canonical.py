@@ -5,11 +5,13 @@ import os
 import shutil
 from pathlib import Path
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from lidarpainter_models.errors import DataError, LidarPainterError
 from lidarpainter_models.readers import ingest_scene, list_sequences
+from lidarpainter_models.readers.canonical import checks
 from lidarpainter_models.readers.canonical.checks import zstd_content_size
 from lidarpainter_models.scenes import schema
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -225,6 +227,27 @@ def test_rows_that_share_one_stretch_are_refused(foreign, tmp_path, table, lengt
 
     rewrite_table(foreign, table, share)
     assert "no rows share any" in refusal(foreign, tmp_path)
+
+
+def test_text_that_all_rows_repeat_is_refused_before_it_is_unpacked(foreign, tmp_path, monkeypatch):
+    monkeypatch.setattr(checks, "MAX_TEXT_BYTES", 1 << 20)
+    file = foreign / "boxes.parquet"
+    row = {**pq.read_table(file).to_pylist()[0], "category": "x" * 10_000}
+    pq.write_table(pa.Table.from_pylist([row] * 1000, schema=schema.arrow_schema("boxes")), file)
+    assert file.stat().st_size < 50_000
+    edit_manifest(foreign, lambda m: m["files"].update({file.name: file.stat().st_size}))
+    pool, usual = pa.proxy_memory_pool(pa.default_memory_pool()), pa.default_memory_pool()
+    pa.set_memory_pool(pool)
+    try:
+        assert "category has more than 1048576 bytes of texts" in refusal(foreign, tmp_path)
+    finally:
+        pa.set_memory_pool(usual)
+    assert pool.max_memory() < 2 << 20
+
+
+def test_table_that_states_more_than_it_may_unpack_to_is_refused(foreign, tmp_path, monkeypatch):
+    monkeypatch.setattr(checks, "MAX_TABLE_BYTES", 100)
+    assert "expected 100 at most" in refusal(foreign, tmp_path)
 
 
 def test_column_of_another_type_is_refused(foreign, tmp_path):

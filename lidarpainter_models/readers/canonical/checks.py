@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from lidarpainter_models.errors import DataError
@@ -23,6 +24,10 @@ MAX_FILES = 100_000
 MAX_TABLE_ROWS = 200_000
 """Boxes of 200 frames have at most a few ten thousand rows."""
 MAX_LIST_LENGTH = 16
+MAX_TABLE_BYTES = 256 << 20
+"""When unpacked; 200,000 boxes take 50 MB."""
+MAX_TEXT_BYTES = 64 << 20
+"""Of one column, in all rows; 200,000 names of full length take 26 MB."""
 _CHUNK_OVERHEAD = 1024
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _DIGEST = re.compile(r"[0-9a-f]{64}")
@@ -145,30 +150,47 @@ def _stated_rows(name: str, entry: dict[str, Any], where: str) -> int:
 
 
 def _require_table(file: Path) -> None:
-    """Rows and values as stated by the footer, before anything is unpacked."""
-    try:
-        footer = pq.read_metadata(file)
-        groups = [footer.row_group(index) for index in range(footer.num_row_groups)]
-        values = [
-            group.column(index).num_values for group in groups for index in range(group.num_columns)
-        ]
-    except (OSError, ValueError, IndexError, pa.ArrowException) as error:
-        raise DataError(f"{file}: no Parquet file ({shown(str(error))})") from None
-    if not 0 <= footer.num_rows <= MAX_TABLE_ROWS:
-        raise DataError(f"{file}: {footer.num_rows} rows, expected at most {MAX_TABLE_ROWS}")
-    if any(not 0 <= count <= footer.num_rows * MAX_LIST_LENGTH for count in values):
-        raise DataError(f"{file}: a column has more values than {MAX_LIST_LENGTH} a row")
-    try:
-        table = pq.read_table(file)
-        table.validate(full=True)
-    except (OSError, ValueError, MemoryError, pa.ArrowException) as error:
-        raise DataError(f"{file}: cannot be read ({shown(str(error))})") from None
+    """Types, rows and values as stated by the footer before anything is unpacked, then the rest."""
     name = file.stem
-    if not table.schema.equals(schema.arrow_schema(name)):
-        raise DataError(f"{file}: the columns or their types are not those of the format")
+    try:
+        _require_footer(pq.read_metadata(file), file)
+        if not pq.read_schema(file).equals(schema.arrow_schema(name)):
+            raise DataError(f"{file}: the columns or their types are not those of the format")
+        # as a dictionary, a text that all rows repeat is unpacked once
+        texts = [column.name for column in schema.TABLES[name] if column.type == pa.string()]
+        table = pq.read_table(file, read_dictionary=texts)
+        table.validate(full=True)
+    except (OSError, ValueError, IndexError, MemoryError, pa.ArrowException) as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(f"{file}: no sound Parquet file ({shown(str(error))})") from None
+    for text in texts:
+        if _text_bytes(table[text]) > MAX_TEXT_BYTES:
+            raise DataError(f"{file}: column {text} has more than {MAX_TEXT_BYTES} bytes of texts")
     for column in schema.TABLES[name]:
         if not column.is_optional and table[column.name].null_count:
             raise DataError(f"{file}: column {column.name} has empty cells")
+
+
+def _require_footer(footer: pq.FileMetaData, file: Path) -> None:
+    groups = [footer.row_group(index) for index in range(footer.num_row_groups)]
+    if not 0 <= footer.num_rows <= MAX_TABLE_ROWS:
+        raise DataError(f"{file}: {footer.num_rows} rows, expected at most {MAX_TABLE_ROWS}")
+    for index in range(footer.num_columns):
+        counts = [group.column(index).num_values for group in groups]
+        if any(count < 0 for count in counts) or sum(counts) > footer.num_rows * MAX_LIST_LENGTH:
+            raise DataError(f"{file}: a column has more values than {MAX_LIST_LENGTH} a row")
+    num_bytes = sum(group.total_byte_size for group in groups)
+    if num_bytes > MAX_TABLE_BYTES:
+        raise DataError(f"{file}: unpacks to {num_bytes} bytes, expected {MAX_TABLE_BYTES} at most")
+
+
+def _text_bytes(column: pa.ChunkedArray) -> int:
+    """What the texts of a column take when every row has its own."""
+    return sum(
+        pc.sum(pc.binary_length(chunk.dictionary).take(chunk.indices)).as_py() or 0
+        for chunk in column.chunks
+    )
 
 
 def _require_group(folder: Path) -> None:
