@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from lidarpainter_models.errors import DataError
@@ -23,6 +24,9 @@ MAX_ROW_BYTES = 64 << 20
 """Of one row when unpacked, on the average of its row group; a range image takes 4 MB."""
 MAX_ROWS_PER_FRAME = 64
 """No component that is streamed has more than eight sensors."""
+MAX_TEXT_BYTES = 256
+"""Of one text; the name of a segment has 50."""
+_VALUE_BYTES = 8
 _BATCH_ROWS = 2
 _BUFFER_BYTES = 1 << 20
 """Read from a column at a time, so that a row group is never in memory whole."""
@@ -100,17 +104,23 @@ class ParquetRows:
         if not self.path.is_file():
             raise DataError(f"{self.path}: the file is missing")
         try:
+            footer = pq.read_metadata(self.path)
+            self._types = {field.name: field.type for field in footer.schema.to_arrow_schema()}
             self._file = pq.ParquetFile(
-                self.path, buffer_size=_BUFFER_BYTES, page_checksum_verification=True
+                self.path,
+                metadata=footer,
+                # as a dictionary, a text that all rows repeat is unpacked once
+                read_dictionary=[name for name, kind in self._types.items() if _is_text(kind)],
+                buffer_size=_BUFFER_BYTES,
+                page_checksum_verification=True,
             )
-            names = set(self._file.schema_arrow.names)
         except (pa.ArrowException, OSError, ValueError) as error:
             raise self._damaged(error) from None
-        missing = [column for column in columns if column not in names]
+        missing = [column for column in columns if column not in self._types]
         if missing:
             raise DataError(f"{self.path}: no column {', '.join(missing)}")
-        self._columns = [*columns, *(name for name in optional if name in names)]
-        self._absent = dict.fromkeys(name for name in optional if name not in names)
+        self._columns = [*columns, *(name for name in optional if name in self._types)]
+        self._absent = dict.fromkeys(name for name in optional if name not in self._types)
 
     @property
     def num_rows(self) -> int:
@@ -121,11 +131,17 @@ class ParquetRows:
         """All rows at once.
 
         Raises:
-            DataError: there are more than a small table has, or they cannot be read.
+            DataError: there are more than a small table has, files among them, or they cannot be
+                read.
         """
+        for name in self._columns:
+            if not _is_small(self._types[name]):
+                raise DataError(
+                    f"{self.path}: column {name} is {self._types[name]}, expected numbers or texts"
+                )
         metadata = self._file.metadata
         num_bytes = sum(
-            metadata.row_group(group).total_byte_size for group in range(metadata.num_row_groups)
+            _unpacked_bytes(metadata.row_group(group)) for group in range(metadata.num_row_groups)
         )
         if self.num_rows > MAX_SMALL_ROWS or num_bytes > MAX_SMALL_BYTES:
             raise DataError(
@@ -147,10 +163,11 @@ class ParquetRows:
             raise DataError(f"{self.path}: {self.num_rows} rows, expected {MAX_ROWS} at most")
         for number in range(metadata.num_row_groups):
             group = metadata.row_group(number)
-            if group.total_byte_size > MAX_ROW_BYTES * max(group.num_rows, 1):
+            num_bytes = _unpacked_bytes(group)
+            if num_bytes > MAX_ROW_BYTES * max(group.num_rows, 1):
                 raise DataError(
                     f"{self.path}, row group {number}: {group.num_rows} rows of "
-                    f"{group.total_byte_size} bytes, expected {MAX_ROW_BYTES} a row at most"
+                    f"{num_bytes} bytes, expected {MAX_ROW_BYTES} a row at most"
                 )
         yield from self._rows(batch_rows=_BATCH_ROWS)
 
@@ -219,11 +236,39 @@ class FrameStream:
         return found
 
 
+def _is_text(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind))
+
+
+def _is_small(kind: pa.DataType) -> bool:
+    """Whether values take no more than the footer says: numbers, lists of them, and texts."""
+    number = kind.value_type if _is_list(kind) else kind
+    return bool(_is_text(kind) or pa.types.is_primitive(number) or pa.types.is_null(number))
+
+
+def _unpacked_bytes(group: pq.RowGroupMetaData) -> int:
+    """What a row group takes in memory; a number that is repeated takes next to none in a file."""
+    num_values = sum(group.column(index).num_values for index in range(group.num_columns))
+    return int(max(group.total_byte_size, _VALUE_BYTES * num_values))
+
+
+def _require_short(column: pa.DictionaryArray, name: str) -> None:
+    longest = pc.max(pc.binary_length(column.dictionary)).as_py() or 0
+    if longest > MAX_TEXT_BYTES:
+        raise DataError(f"{name}: a text of {longest} bytes, expected {MAX_TEXT_BYTES} at most")
+
+
 def _values(batch: pa.RecordBatch) -> list[dict[str, Any]]:
     """The rows of a batch; lists stay Arrow arrays, a range image would take seconds as a list."""
     columns = {}
     for name, column in zip(batch.schema.names, batch.columns, strict=True):
-        is_list = pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type)
+        if pa.types.is_dictionary(column.type):
+            _require_short(column, name)
+        is_list = _is_list(column.type)
         columns[name] = [scalar.values for scalar in column] if is_list else column.to_pylist()
     return [
         dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)

@@ -13,6 +13,8 @@ from waymo_edits import (
 from waymo_numbers import SEGMENT
 
 from lidarpainter_models.errors import DataError
+from lidarpainter_models.readers.waymo import parquet_rows
+from lidarpainter_models.readers.waymo.parquet_rows import ParquetRows
 from lidarpainter_models.readers.waymo.range_images import shaped_matrix
 
 
@@ -71,6 +73,7 @@ def test_rows_that_are_not_in_the_order_of_time(components, tmp_path):
         ("vehicle_pose", "key.frame_timestamp_micros", -5, "expected a time since the epoch"),
         ("lidar_box", "[LiDARBoxComponent].box.heading", float("nan"), "is not finite"),
         ("lidar_box", "key.laser_object_id", "../../x", "actor name"),
+        ("lidar_box", "key.laser_object_id", "x" * 257, "object_id: a text of 257 bytes, expected"),
         ("camera_calibration", "[CameraCalibrationComponent].width", None, "width: is empty"),
         ("lidar_calibration", "[LiDARCalibrationComponent].beam_inclination.min", 9.0, "ascend|90"),
     ],
@@ -90,6 +93,31 @@ def test_shape_that_is_no_number(size, axis):
     shape[axis] = size
     with pytest.raises(DataError, match=r"here: shape .* expected at most"):
         shaped_matrix(values, shape, 4, "here")
+
+
+REPEATED = {
+    "text": (pa.string(), "x" * 10_000, "a text of 10000 bytes, expected 256 at most"),
+    "long text": (pa.large_string(), "x" * 10_000, "a text of 10000 bytes, expected 256 at most"),
+    "file": (pa.binary(), b"x" * 10_000, "column x is binary, expected numbers or texts"),
+    "numbers": (pa.list_(pa.float64()), [0.0] * 1000, "1000 rows of 8000000 bytes, expected at"),
+}
+
+
+@pytest.mark.parametrize("kind", REPEATED)
+def test_value_that_all_rows_repeat_is_refused_before_it_is_unpacked(tmp_path, monkeypatch, kind):
+    monkeypatch.setattr(parquet_rows, "MAX_SMALL_BYTES", 1 << 20)
+    column, value, complaint = REPEATED[kind]
+    path = tmp_path / "x.parquet"
+    pq.write_table(pa.table({"x": pa.array([value] * 1000, column)}), path)
+    assert path.stat().st_size < 10_000
+    pool, usual = pa.proxy_memory_pool(pa.default_memory_pool()), pa.default_memory_pool()
+    pa.set_memory_pool(pool)
+    try:
+        with pytest.raises(DataError, match=complaint):
+            ParquetRows(path, ("x",)).small_table()
+    finally:
+        pa.set_memory_pool(usual)
+    assert pool.max_memory() < 2 << 20
 
 
 def test_frame_that_stands_twice(components, tmp_path):
