@@ -1,6 +1,5 @@
 """The held-out views that a scene shows worst, so that nobody has to look for them."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.export.images import read_image, small_image, write_jpeg
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.metrics.images import score_image
-from lidarpainter_models.scenes.records import RecordedView
+from lidarpainter_models.scenes.splits import sampled_views
 
 MOST_LOOKED_AT = 24
 """Views that are rendered for it, spread over all."""
@@ -32,9 +31,8 @@ class WorstView:
 
 def worst_views(held_out: HeldOut, fitted: GaussianScene) -> list[WorstView]:
     """Those of the least PSNR at interpolated poses, worst first."""
-    looked_at = _spread(held_out.test_views, MOST_LOOKED_AT)
     found: list[tuple[float, WorstView]] = []
-    for view in looked_at:
+    for view in sampled_views(held_out.test_views, MOST_LOOKED_AT):
         camera = held_out.camera_of(fitted, view, "interpolated")
         rendered = fitted.render(camera, view.timestamp_ns, camera_name=view.camera_name)
         rgb, truth = rendered.rgb.clamp(0, 1).cpu(), held_out.image_of(view)
@@ -65,7 +63,3 @@ def read_beside(path: Path, title: str) -> WorstView:
     """
     rendered, truth = read_image(path).chunk(2, dim=1)
     return WorstView(title=title, rendered_rgb=rendered, truth_rgb=truth)
-
-
-def _spread(views: Sequence[RecordedView], most: int) -> Sequence[RecordedView]:
-    return views[:: max(-(-len(views) // most), 1)]
