@@ -21,9 +21,10 @@ from typing import TYPE_CHECKING
 from catalog.artefacts import ArtefactRef
 from catalog.deletion import Doomed, doomed_rows
 from catalog.errors import DamagedArtefactError
+from catalog.folders import changed_at
 from catalog.locks import is_held
 from catalog.needs import Needs
-from catalog.store import Store, changed_at, scene_entry
+from catalog.store import Store, scene_entry
 
 if TYPE_CHECKING:
     from obstore import ObjectMeta

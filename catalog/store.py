@@ -11,17 +11,17 @@ import os
 import re
 import secrets
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import datetime
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from catalog.artefacts import MANIFEST_NAME, ArtefactStore
-from catalog.errors import CatalogError, StorageError, UnknownRecordError
+from catalog.errors import CatalogError, UnknownRecordError
+from catalog.folders import changed_at, make_writable, nearest_existing
 from catalog.leases import ConditionalObjects, FolderObjects, Leases
 from catalog.locks import held_lock, is_held, shared_lock
 
@@ -307,35 +307,6 @@ def digest_in(scene_folder: Path) -> str | None:
         return str(manifest["content_digest"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
-
-
-def changed_at(path: Path) -> datetime:
-    """When a file or a folder was last changed; long ago if it is gone."""
-    try:
-        return datetime.fromtimestamp(path.stat().st_mtime, UTC)
-    except FileNotFoundError:
-        return datetime.fromtimestamp(0, UTC)
-
-
-def nearest_existing(path: Path) -> Path:
-    """A path, or the first above it that is there."""
-    return next(one for one in (path, *path.parents) if one.exists())
-
-
-def make_writable(folder: Path, what: str) -> None:
-    """Make a folder where it is not there, and see that it takes a file.
-
-    Raises:
-        StorageError: it cannot be made or written.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder) as probe:
-            probe.write(b"-")
-    except OSError as error:
-        raise StorageError(
-            f"{what} {folder} cannot be written: {error.strerror}; expected a folder with room"
-        ) from None
 
 
 def split_scene_id(scene_id: str) -> tuple[str, str]:

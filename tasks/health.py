@@ -14,7 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal
 
-from catalog.store import nearest_existing
+from catalog.folders import nearest_existing
 
 Verdict = Literal["ok", "warn", "fail"]
 PYTHON_RANGE = ((3, 11), (3, 14))

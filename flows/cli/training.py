@@ -4,7 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from catalog.store import make_writable, open_store
+from catalog.folders import make_writable
+from catalog.store import open_store
 from flows.ablate_painter import AblationParameters, ablate_painter, check_ablation
 from flows.cli.output import say_status
 from flows.cli.progress import shown_progress
