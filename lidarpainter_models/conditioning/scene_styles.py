@@ -22,7 +22,7 @@ from lidarpainter_models.painter.styles.lamps import Lamp, LampKind, find_lamps
 from lidarpainter_models.painter.styles.night import POWER, RADIANCE, place_of, sunlit_white
 from lidarpainter_models.painter.styles.view import fit_ground
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.splits import sampled_rows
+from lidarpainter_models.scenes.splits import sampled_views
 from lidarpainter_models.weather.darkness import HEADLAMP_AHEAD_M, HEADLAMP_HEIGHT_M
 from lidarpainter_models.weather.mix import StyleMix
 
@@ -78,8 +78,7 @@ def styled_scene(
     """
     clear = replace(scene, style=None)
     builder = ConditionBuilder(clear, seen.lidar_map, seen.views)
-    rows = sampled_rows([view.key[1] for view in seen.views], MOST_VIEWS)
-    looked_at = [seen.views[row] for row in rows]
+    looked_at = sampled_views(seen.views, MOST_VIEWS)
     looks = []
     for number, view in enumerate(looked_at):
         looks.append(_look(builder, view))

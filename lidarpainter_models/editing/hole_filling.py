@@ -24,7 +24,7 @@ from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.kernels.box_owners import NO_BOX, box_owners
 from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.painter.protocol import Painter, PaintingConditions
-from lidarpainter_models.scenes.splits import sampled_rows
+from lidarpainter_models.scenes.splits import sampled_views
 from lidarpainter_models.scenes.tracks import ActorTrack
 
 MOST_VIEWS = 6
@@ -136,7 +136,7 @@ def _chosen(views: Sequence[TrainingView], left: Sequence[ActorTrack]) -> list[T
     shown = [
         view for view in views if bool(changed_pixels(left, view.camera, view.timestamp_ns).any())
     ]
-    return [shown[row] for row in sampled_rows([view.key[1] for view in shown], MOST_VIEWS)]
+    return list(sampled_views(shown, MOST_VIEWS))
 
 
 def _holes(

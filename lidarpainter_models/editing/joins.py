@@ -24,7 +24,7 @@ from lidarpainter_models.geometry.transforms import (
     transform_points,
 )
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
-from lidarpainter_models.scenes.splits import sampled_rows
+from lidarpainter_models.scenes.splits import sampled_views
 from lidarpainter_models.scenes.tracks import ActorTrack
 
 FINER = 2.0
@@ -229,8 +229,7 @@ class _SeenTwice:
 def _looks(world: EditedWorld) -> _Looks:
     """Training views where the fit found them, and the surfaces that they show."""
     looks = []
-    rows = sampled_rows([view.key[1] for view in world.views], MOST_VIEWS)
-    for view in (world.views[row] for row in rows):
+    for view in sampled_views(world.views, MOST_VIEWS):
         camera = world.fitted.found_camera(view)
         looks.append((camera, world.fitted.render(camera, view.timestamp_ns).depth_m))
     return looks

@@ -18,7 +18,7 @@ from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_fro
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.lidar.lidar_map import MapPoints
 from lidarpainter_models.observations.views import TrainingView
-from lidarpainter_models.scenes.splits import sampled_rows
+from lidarpainter_models.scenes.splits import sampled_views
 from lidarpainter_models.scenes.tracks import ActorTrack
 
 MOST_VIEWS = 40
@@ -77,8 +77,7 @@ def _shown(
     """Which Gaussians showed outside the actors' outlines, and which lay inside them."""
     was_shown = torch.zeros(len(means), dtype=torch.bool)
     was_covered = torch.zeros_like(was_shown)
-    rows = sampled_rows([view.key[1] for view in views], MOST_VIEWS)
-    for view in (views[row] for row in rows):
+    for view in sampled_views(views, MOST_VIEWS):
         camera = view.camera
         surface = fitted.render(camera, view.timestamp_ns).depth_m
         covered = shown_actors(camera, surface, view.timestamp_ns, left)

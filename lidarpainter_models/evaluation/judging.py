@@ -136,8 +136,11 @@ def _of_all(actors: Mapping[str, Mapping[str, Any]]) -> float | None:
     num = sum(found["num_pixels"] for found in actors.values())
     if not num:
         return None
-    errors = (found["num_pixels"] * 10 ** (-found["psnr"] / 10) for found in actors.values())
-    return psnr_from_error(sum(errors) / num)
+    return psnr_from_error(sum(map(_summed_error, actors.values())) / num)
+
+
+def _summed_error(found: Mapping[str, Any]) -> float:
+    return float(found["num_pixels"] * 10 ** (-found["psnr"] / 10))
 
 
 def _pooled(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -146,8 +149,7 @@ def _pooled(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     for part in parts:
         for actor_id, found in part.items():
             pixels[actor_id] += found["num_pixels"]
-            error = found["num_pixels"] * 10 ** (-found["psnr"] / 10)
-            errors[actor_id] = errors.get(actor_id, 0.0) + error
+            errors[actor_id] = errors.get(actor_id, 0.0) + _summed_error(found)
     return {
         actor_id: {"psnr": psnr_from_error(errors[actor_id] / num), "num_pixels": num}
         for actor_id, num in pixels.items()

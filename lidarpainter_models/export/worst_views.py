@@ -11,7 +11,6 @@ from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.export.images import read_image, small_image, write_jpeg
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.metrics.images import score_image
-from lidarpainter_models.scenes.splits import sampled_views
 
 MOST_LOOKED_AT = 24
 """Views that are rendered for it, spread over all."""
@@ -32,7 +31,7 @@ class WorstView:
 def worst_views(held_out: HeldOut, fitted: GaussianScene) -> list[WorstView]:
     """Those of the least PSNR at interpolated poses, worst first."""
     found: list[tuple[float, WorstView]] = []
-    for view in sampled_views(held_out.test_views, MOST_LOOKED_AT):
+    for view in held_out.sampled(MOST_LOOKED_AT).test_views:
         camera = held_out.camera_of(fitted, view, "interpolated")
         rendered = fitted.render(camera, view.timestamp_ns, camera_name=view.camera_name)
         rgb, truth = rendered.rgb.clamp(0, 1).cpu(), held_out.image_of(view)

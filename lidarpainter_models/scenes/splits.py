@@ -11,13 +11,24 @@ camera at the same moment, and the LiDAR sweeps of test frames stay out as well.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.records import RecordedView
+from lidarpainter_models.scenes.records import RecordedView, ViewKey
+
+
+@runtime_checkable
+class Keyed(Protocol):
+    """A view that is named by its frame and camera, recorded or prepared for a fit."""
+
+    @property
+    def key(self) -> ViewKey:
+        """Frame and camera."""
+
 
 Item = TypeVar("Item")
+View = TypeVar("View", bound=Keyed)
 
 SPECS = "alternate, forward:N:M or all"
 
@@ -57,14 +68,14 @@ def split_views(
     )
 
 
-def sampled_views(views: Sequence[RecordedView], most_views: int) -> tuple[RecordedView, ...]:
+def sampled_views(views: Sequence[View], most_views: int) -> tuple[View, ...]:
     """So many of some views at most, each camera's evenly over time, in the order they came in.
 
     Args:
         views: each camera's in order of time, however the cameras take turns.
         most_views: at least 1; where there are more cameras than that, one view of each is taken.
     """
-    return tuple(views[row] for row in sampled_rows([one.camera_name for one in views], most_views))
+    return tuple(views[row] for row in sampled_rows([view.key[1] for view in views], most_views))
 
 
 def sampled_rows(cameras: Sequence[str], most: int) -> list[int]:

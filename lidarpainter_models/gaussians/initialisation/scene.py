@@ -37,7 +37,7 @@ from lidarpainter_models.lidar.map_building import LEAST_WAY_M
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
 from lidarpainter_models.scenes.categories import category_of
 from lidarpainter_models.scenes.driving_scene import ActorTrack
-from lidarpainter_models.scenes.splits import rows_of_each, sampled_rows
+from lidarpainter_models.scenes.splits import rows_of_each, sampled_views
 
 LEAST_UNSEEN_POINTS = 3
 """Voxels with fewer points that only a camera moved aside would see are dropped."""
@@ -295,13 +295,13 @@ def _actor_spacing(
     """
     footprint = torch.full((len(points),), torch.inf)
     total = torch.zeros(len(points))
-    rows = sampled_rows([view.key[1] for view in views], _MOST_VIEWS_PER_ACTOR)
-    for view in (views[row] for row in rows):
+    asked = sampled_views(views, _MOST_VIEWS_PER_ACTOR)
+    for view in asked:
         if not track.is_present(view.timestamp_ns):
             continue
         world_from_box = track.pose_at(view.timestamp_ns).float()
         xyz_world_m = transform_points(world_from_box, points.xyz_m)
         at_time, density = pixel_footprint(xyz_world_m, [view.camera])
         footprint = torch.minimum(footprint, at_time)
-        total += len(views) / len(rows) * density.square()
+        total += len(views) / len(asked) * density.square()
     return torch.maximum(total.sqrt(), footprint**-2) ** -0.5
