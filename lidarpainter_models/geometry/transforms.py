@@ -4,6 +4,8 @@ Rotations are unit quaternions with the scalar first (w, x, y, z) or 3x3 matrice
 radians, lengths metres. Tangent vectors are (rotation vector, translation), six numbers.
 """
 
+import math
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -84,11 +86,17 @@ def quaternion_from_rotation(
 def rotation_from_vector(
     rotation_vector_rad: Float[Tensor, "*batch 3"],
 ) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation about a vector by its length: the exponential map of SO(3), smooth at zero."""
+    """Rotation about a vector by its length: the exponential map of SO(3), smooth at zero.
+
+    Rodrigues' formula, its factors as sinc: a fit asks for it several times a step.
+    """
     x, y, z = rotation_vector_rad.unbind(-1)
     zero = torch.zeros_like(x)
     skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
-    return torch.linalg.matrix_exp(skew)
+    turns = torch.linalg.vector_norm(rotation_vector_rad, dim=-1)[..., None, None] / math.pi
+    identity = torch.eye(3, dtype=skew.dtype, device=skew.device)
+    half = torch.sinc(0.5 * turns)
+    return identity + torch.sinc(turns) * skew + 0.5 * half * half * (skew @ skew)
 
 
 def rigid_from_tangent(tangent: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:

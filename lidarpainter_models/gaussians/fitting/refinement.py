@@ -129,10 +129,11 @@ class Refinement:
         return pose if self.refines_cameras(step) else pose.detach()
 
     def exposure(self, image: FitImage) -> Float[Tensor, "3 4"] | None:
-        """How the camera of an image exposes it; None leaves colours as they are."""
+        """How the camera of an image exposes it, where that lies; None leaves colours as they are."""
         if not self.refines_exposure:
             return None
-        return self.scene.exposure.map_at(image.camera_name, image.timestamp_ns)
+        shown = self.scene.exposure.map_at(image.camera_name, image.timestamp_ns)
+        return None if shown is None else shown.to(image.rgb_u8.device, non_blocking=True)
 
     def prior(self, row: int, timestamp_ns: int, step: int) -> Float[Tensor, ""]:
         """Corrections are small, and an actor's change little from one knot to the next."""

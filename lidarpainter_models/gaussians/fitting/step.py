@@ -1,7 +1,8 @@
 """One step of a fit: gradients of a recorded view and perhaps a painted one, and the optimisers.
 
-Only the Gaussians that these views can show take part (`seen_gaussians`). Gaussians, sky, exposure
-and images lie on the device of the scene; poses (float64, a few 4x4 a step) on the CPU.
+Only the Gaussians that these views can show take part (`seen_gaussians`). Gaussians, sky and images
+lie on the device of the scene; poses (float64) and exposure, a few small matrices a step, on the
+CPU.
 """
 
 from collections.abc import Callable
@@ -44,10 +45,10 @@ from lidarpainter_models.observations.views import GuidanceView
 ACTOR_TERM_EVERY = 10
 """Steps between two actor terms: it needs one more blended channel."""
 _EDGE = 1e-4  # keeps logarithms finite
-WAITS = 3
+WAITS = 4
 """Of the host for the device in a step, without the rasteriser's own: how many Gaussians are in
-view, how many of them lag and by how much, and the gradients of the bodies' poses. Where somebody
-bends, one more for each view: which Gaussians do."""
+view, how many of them lag and by how much, and the gradients of the bodies' poses and of the
+exposure. Where somebody bends, one more for each view: which Gaussians do."""
 
 Perceptual = Callable[
     [Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]], Float[Tensor, ""]

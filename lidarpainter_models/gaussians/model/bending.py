@@ -8,7 +8,6 @@ and colours stay. Box frame: x along the length, y left, z up, metres.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import TypeVar
 
 import torch
@@ -25,6 +24,8 @@ REACH_M = 0.5
 REST = 0.1
 """How much a node's own way counts beside what parts it from a neighbour."""
 NUM_NODES = NODES[0] * NODES[1] * NODES[2]
+_LATTICE = ([count - 1 for count in NODES], [NODES[1] * NODES[2], NODES[2], 1], [2, 1, 0])
+"""By axis: the last node, how far neighbours lie apart in the list, and a cell's corners' bits."""
 
 AnyGaussians = TypeVar("AnyGaussians", GaussianSet, SeenGaussians, ShownGaussians)
 
@@ -133,28 +134,15 @@ class Bending:
         lattice: Int[Tensor, " rows"],
     ) -> Float[Tensor, "rows 3"]:
         """By how much the nodes around each centre take it along."""
-        (x, at_x), (y, at_y), (z, at_z) = (
-            _between(place, count)
-            for place, count in zip(
-                (means / self.size_m[lattice] + 0.5).unbind(1), NODES, strict=True
-            )
-        )
-        moved = torch.zeros_like(means)
-        for right, left, up in product((0, 1), repeat=3):
-            node = ((x + right) * NODES[1] + y + left) * NODES[2] + z + up
-            weight = at_x[right] * at_y[left] * at_z[up]
-            moved = moved + weight[:, None] * offset_m[lattice, node]
-        return moved
-
-
-def _between(
-    place: Float[Tensor, " rows"], count: int
-) -> tuple[Int[Tensor, " rows"], tuple[Float[Tensor, " rows"], Float[Tensor, " rows"]]]:
-    """The lower of two nodes around each place (0 to 1 along the box), and what both count."""
-    along = (place * (count - 1)).clamp(0, count - 1)
-    low = along.detach().floor().long().clamp(max=count - 2)
-    share = along - low
-    return low, (1 - share, share)
+        last, stride, bit = torch.tensor(_LATTICE).to(means.device, non_blocking=True)
+        along = (means / self.size_m[lattice] + 0.5) * last
+        along = along.clamp(torch.zeros_like(along), last.to(along).expand_as(along))
+        low = torch.minimum(along.detach().floor().long(), last - 1)
+        share = (along - low)[:, None]
+        corner = torch.arange(8, device=means.device)[:, None] >> bit & 1
+        node = ((low[:, None] + corner) * stride).sum(dim=-1)
+        x, y, z = torch.where(corner > 0, share, 1 - share).unbind(-1)
+        return ((x * y * z)[..., None] * offset_m[lattice[:, None], node]).sum(dim=1)
 
 
 def _cubic_weights(times_s: Sequence[float], after: int, now_s: float) -> list[float]:

@@ -130,14 +130,15 @@ class ExposureCorrections:
     """Colours as a camera shows them: shown = gain(time) * matrix @ rgb + offset.
 
     The gain follows what a camera does to its exposure during a log; over its knots the mean of its
-    logarithm is held at 0, so that the matrix alone says how cameras differ.
+    logarithm is held at 0, so that the matrix alone says how cameras differ. Few numbers, which
+    stay on the CPU wherever the Gaussians lie.
     """
 
     camera_names: tuple[str, ...]
     matrix: Float[Tensor, "cameras 3 4"]
     """The offset is the last column."""
     knots_ns: Int[Tensor, " knots"]
-    """Evenly spaced; on the CPU."""
+    """Evenly spaced."""
     log_gain: Float[Tensor, "cameras knots"]
     """Linear in time between knots."""
 
@@ -156,10 +157,6 @@ class ExposureCorrections:
             log_gain=torch.zeros(len(camera_names), count),
         )
 
-    def to(self, device: torch.device) -> "ExposureCorrections":
-        """The same on another device."""
-        return replace(self, matrix=self.matrix.to(device), log_gain=self.log_gain.to(device))
-
     def neighbours(self, timestamp_ns: int) -> tuple[int, int, float]:
         """The knots before and after a time, and the weight of the later one."""
         last = self.knots_ns.numel() - 1
@@ -174,7 +171,10 @@ class ExposureCorrections:
     ) -> Float[Tensor, "height width 3"]:
         """The image as this camera exposes it then; unchanged for a camera never trained on."""
         exposure = self.map_at(camera_name, timestamp_ns)
-        return rgb if exposure is None else rgb @ exposure[:, :3].T + exposure[:, 3]
+        if exposure is None:
+            return rgb
+        exposure = exposure.to(rgb.device)
+        return rgb @ exposure[:, :3].T + exposure[:, 3]
 
     def undone(
         self, rgb: Float[Tensor, "height width 3"], camera_name: str, timestamp_ns: int
@@ -184,7 +184,8 @@ class ExposureCorrections:
             exposure = self.map_at(camera_name, timestamp_ns)
             if exposure is None:
                 return rgb
-            return (rgb - exposure[:, 3]) @ torch.linalg.inv(exposure[:, :3]).T
+            inverse, offset = torch.linalg.inv(exposure[:, :3]).T, exposure[:, 3]
+            return (rgb - offset.to(rgb.device)) @ inverse.to(rgb.device)
 
     def map_at(self, camera_name: str | None, timestamp_ns: int) -> Float[Tensor, "3 4"] | None:
         """How this camera exposes colours then, what is added last; None for a strange camera."""

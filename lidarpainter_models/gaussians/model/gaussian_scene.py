@@ -114,7 +114,7 @@ class GaussianScene:
 
     @property
     def device(self) -> torch.device:
-        """Where the scene is drawn: Gaussians, sky and exposure lie there, poses on the CPU."""
+        """Where the scene is drawn: Gaussians and sky lie there, poses and exposure on the CPU."""
         return self.gaussians.means.device
 
     def to(self, device: torch.device) -> "GaussianScene":
@@ -126,7 +126,6 @@ class GaussianScene:
             gaussians=self.gaussians.to(device),
             actors=self.actors.to(device),
             sky=self.sky.to(device),
-            exposure=self.exposure.to(device),
             style=None if self.style is None else self.style.to(device),
         )
 
