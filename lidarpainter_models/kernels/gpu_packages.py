@@ -46,6 +46,16 @@ def why_no_triton() -> str | None:
     return None
 
 
+def check_triton_device(device: torch.device, kernel_function: object) -> None:
+    """Refuse tensors of a device that a Triton kernel cannot reach.
+
+    Raises:
+        BackendError: they are not on a CUDA device, nor does Triton interpret this kernel.
+    """
+    if device.type != "cuda" and isinstance(kernel_function, import_module("triton").JITFunction):
+        raise BackendError(f"the triton backend needs tensors on a CUDA device, got {device}")
+
+
 def import_gsplat() -> ModuleType:
     """Gsplat with kernels that can run; it compiles them here if no wheel brought them.
 

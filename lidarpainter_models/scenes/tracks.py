@@ -4,7 +4,7 @@ Box frame: x along the length, y to the left, z up, origin at the centre.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -60,6 +60,10 @@ class TrackPoses:
     """Ascending; a shorter track repeats its last time."""
     world_from_box: Float[Tensor, "tracks times 4 4"]
     """float64."""
+    _at: dict[int, Float[Tensor, "tracks 4 4"]] = field(
+        default_factory=dict, init=False, repr=False
+    )
+    """What was asked for: every view asks for the times of all its sources."""
 
     @classmethod
     def of(cls, tracks: Sequence[ActorTrack]) -> "TrackPoses":
@@ -103,9 +107,11 @@ class TrackPoses:
         )
 
     def all_at(self, timestamp_ns: int) -> Float[Tensor, "tracks 4 4"]:
-        """Poses of all tracks at one time."""
-        rows = torch.arange(len(self))
-        return self.at(rows, torch.full_like(rows, timestamp_ns))
+        """Poses of all tracks at one time; not to be changed."""
+        if timestamp_ns not in self._at:
+            rows = torch.arange(len(self))
+            self._at[timestamp_ns] = self.at(rows, torch.full_like(rows, timestamp_ns))
+        return self._at[timestamp_ns]
 
 
 def tracks_from_boxes(

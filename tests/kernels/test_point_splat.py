@@ -24,11 +24,15 @@ def random_splat(num_points, seed, *, height_px=37, width_px=53, max_radius_px=3
     }
 
 
-@pytest.mark.parametrize("num_points", [0, 1, 255, 256, 257, 20_000])
-def test_fast_splat_keeps_the_same_points(num_points):
+@pytest.mark.parametrize(
+    ("num_points", "backend"),
+    [(count, "cpu") for count in (0, 1, 255, 256, 257, 20_000)]
+    + [(count, "triton") for count in (0, 1, 255, 2000)],
+)
+def test_fast_splat_keeps_the_same_points(num_points, backend):
     inputs = random_splat(num_points, seed=num_points)
     expected = splat_points(**inputs, backend="reference")
-    actual = splat_points(**inputs, backend="cpu")
+    actual = splat_points(**inputs, backend=backend)
     assert torch.equal(actual, expected)  # a selection, so no tolerance
 
 
@@ -45,7 +49,7 @@ def test_points_of_different_pieces_compete_for_a_pixel():
     assert set((actual.unique() >= LEAST_RUN).tolist()) == {False, True}
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", ["reference", "cpu", "triton"])
 @pytest.mark.parametrize(("radius_px", "covered"), [(0, 1), (1, 9), (2, 21), (3, 37)])
 def test_a_disc_covers_its_pixels(radius_px, covered, backend):
     image = splat_points(
@@ -61,7 +65,7 @@ def test_a_disc_covers_its_pixels(radius_px, covered, backend):
     assert image[4, 5 + radius_px] == 0
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", ["reference", "cpu", "triton"])
 def test_the_nearest_point_wins_and_ties_go_to_the_lower_index(backend):
     pixels = torch.tensor([[1, 1], [1, 1], [1, 1], [0, 0], [0, 0]])
     depth_m = torch.tensor([3.0, 2.0, 2.0, 7.0, -1.0])
@@ -69,7 +73,7 @@ def test_the_nearest_point_wins_and_ties_go_to_the_lower_index(backend):
     assert image.tolist() == [[3, -1], [-1, 1]]
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", ["reference", "cpu", "triton"])
 def test_a_near_point_grows_over_its_neighbours(backend):
     pixels, depth_m = torch.tensor([[2, 2], [3, 2], [5, 2]]), torch.tensor([1.0, 5.0, 5.0])
     radius_px = torch.tensor([1, 0, 0])
@@ -79,7 +83,7 @@ def test_a_near_point_grows_over_its_neighbours(backend):
     assert image[2].tolist() == [-1, 0, 0, 0, -1, 2]
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", ["reference", "cpu", "triton"])
 def test_a_point_outside_still_reaches_into_the_image(backend):
     image = splat_points(
         torch.tensor([[-1, 1]]),

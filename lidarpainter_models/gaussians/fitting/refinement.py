@@ -129,7 +129,7 @@ class Refinement:
         return pose if self.refines_cameras(step) else pose.detach()
 
     def exposure(self, image: FitImage) -> Float[Tensor, "3 4"] | None:
-        """How the camera of an image exposes it, where that lies; None leaves colours as they are."""
+        """How the camera of an image exposes it, on its device; None leaves colours as they are."""
         if not self.refines_exposure:
             return None
         shown = self.scene.exposure.map_at(image.camera_name, image.timestamp_ns)

@@ -9,7 +9,7 @@ radians, translation in metres), float64, and stay on the CPU: a step reads one 
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch

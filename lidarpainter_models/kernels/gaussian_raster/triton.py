@@ -15,7 +15,6 @@ import triton
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.errors import BackendError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import TANGENT_MARGIN, TILE_PX
 from lidarpainter_models.kernels.gaussian_raster.projection import IS_VISIBLE, RECORD_FLOATS, SIGMA
@@ -31,6 +30,7 @@ from lidarpainter_models.kernels.gaussian_raster.triton_kernels.projection impor
 from lidarpainter_models.kernels.gaussian_raster.triton_kernels.projection_gradients import (
     unproject,
 )
+from lidarpainter_models.kernels.gpu_packages import check_triton_device
 
 IMAGES = 6
 """Tensors that a view gives: four images, visible and radius."""
@@ -51,9 +51,7 @@ def draw_views(
     Raises:
         BackendError: the tensors are not on a CUDA device, nor does Triton interpret.
     """
-    device = splats.means.device
-    if device.type != "cuda" and isinstance(project, triton.JITFunction):
-        raise BackendError(f"the triton backend needs tensors on a CUDA device, got {device}")
+    check_triton_device(splats.means.device, project)
     tensors = (
         splats.means,
         splats.rotation_wxyz,

@@ -31,8 +31,7 @@ def splat_points(
         height_px: Rows of the image.
         width_px: Columns of the image.
         radius_px: Radius of the discs, one for all or one per point, >= 0.
-        backend: `auto` takes numba on the CPU and the torch reference on any other device; all
-            keep the same points.
+        backend: `auto` takes numba on the CPU, Triton on a GPU; all keep the same points.
 
     Raises:
         ShapeError: the points do not fit together, or a radius or the image size is negative.

@@ -29,18 +29,21 @@ def random_points(num_points, *, height_px=23, width_px=37, seed=0):
     }
 
 
-@pytest.mark.parametrize("num_points", [0, 1, 255, 2000])
-def test_fast_blend_equals_the_plain_one(num_points):
+@pytest.mark.parametrize(
+    ("num_points", "backend"),
+    [*((count, "cpu") for count in (0, 1, 255, 2000)), *((n, "triton") for n in (0, 1, 400))],
+)
+def test_fast_blend_equals_the_plain_one(num_points, backend):
     inputs = random_points(num_points)
     expected, expected_total = blend_points(**inputs, backend="reference")
-    actual, actual_total = blend_points(**inputs, backend="cpu")
+    actual, actual_total = blend_points(**inputs, backend=backend)
     # up to a hundred positive numbers summed in another order, exponentials to a few roundings
     most = 128 * EPS
     assert torch.allclose(actual, expected, rtol=most, atol=most)
     assert torch.allclose(actual_total, expected_total, rtol=most, atol=0)
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", ["reference", "cpu", "triton"])
 def test_a_centred_point_fills_its_pixel_and_fades_with_distance(backend):
     rgb, total = blend_points(
         torch.tensor([[2.5, 1.5]]),
@@ -58,7 +61,7 @@ def test_a_centred_point_fills_its_pixel_and_fades_with_distance(backend):
     assert (rgb[total == 0] == 0).all()
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", ["reference", "cpu", "triton"])
 def test_points_of_another_surface_stay_out(backend):
     depths = torch.tensor([10.0, 20.0, 5.0])
     rgb, _ = blend_points(
