@@ -96,13 +96,13 @@ def may_run_on_host(device: torch.device) -> bool:
 
 
 def float32_backend(kernel: str, backend: Backend, like: Tensor) -> Backend:
-    """The backend of a kernel whose numba version takes float32 alone, for such numbers.
+    """The backend of a kernel whose fast versions take float32 alone, for such numbers.
 
     Raises:
-        BackendError: numba was asked for another kind of numbers.
+        BackendError: a fast version was asked for another kind of numbers.
     """
     if like.dtype == torch.float32:
         return backend
-    if backend == "cpu":
-        raise BackendError(f"the numba {kernel} takes float32, got {like.dtype}")
+    if backend in ("cpu", "triton"):
+        raise BackendError(f"the {backend} {kernel} takes float32, got {like.dtype}")
     return "reference" if backend == "auto" else backend

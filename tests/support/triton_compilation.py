@@ -22,6 +22,7 @@ from triton.compiler import ASTSource
 from lidarpainter_models.kernels.gaussian_raster import triton as backend
 
 TYPES = {
+    torch.bool: "*i1",
     torch.float32: "*fp32",
     torch.float64: "*fp64",
     torch.int32: "*i32",
@@ -40,7 +41,7 @@ def compiled(kernel, arguments, options, architecture):
         elif kernel.params[place].is_constexpr:
             signature[name], constants[name] = "constexpr", value
         else:
-            signature[name] = "i32"
+            signature[name] = "fp32" if isinstance(value, float) else "i32"
     source = ASTSource(fn=kernel, signature=signature, constexprs=constants, attrs=alignment)
     options = options | {"enable_fp_fusion": True}
     code = triton.compile(source, target=GPUTarget("cuda", architecture, 32), options=options)

@@ -228,7 +228,7 @@ def _step_sky(
     ratio = FINAL_LEARNING_RATE / LEARNING_RATE
     state.scene.sky.observe(
         sky_rgb.grad,
-        torch.where(learns, clear, torch.zeros_like(clear)),
+        torch.where(learns, clear, 0.0),
         rays,
         LEARNING_RATE * ratio ** (state.step / config.steps),
     )
