@@ -1,14 +1,44 @@
-"""Blocks in view: the numba version marks what plain torch marks, and both what by hand is seen."""
+"""Blocks in view: fast versions mark what plain torch marks, and all what by hand is seen."""
 
 import pytest
 import torch
 from gaussian_world import camera_at
+from splat_drawing import TRITON, home_of
 
 from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_tangent
 from lidarpainter_models.kernels.frustum_culling import Blocks, mark_seen, refresh_bounds
 
-BACKENDS = ["cpu", "reference"]
+BACKENDS = ["cpu", "reference", TRITON]
+
+
+def seeded(count, interpreted):
+    """Backends and seeds; Triton's interpreter takes a second for a world."""
+    by_numba = [pytest.param("cpu", seed) for seed in range(count)]
+    seeds = range(interpreted)
+    return by_numba + [pytest.param("triton", seed, marks=TRITON.marks) for seed in seeds]
+
+
+def on_home(blocks, backend):
+    """The blocks on the device that a backend runs on."""
+    home = home_of(backend)
+    names = ("order", "first", "body", "low", "high", "reach")
+    return Blocks(**{name: getattr(blocks, name).to(home) for name in names})
+
+
+def refreshed(blocks, means, log_scale, is_stale, backend, reach_sigmas=3.5):
+    """Blocks with bounds by a backend, on the CPU."""
+    moved = on_home(blocks, backend)
+    given = (each.to(home_of(backend)) for each in (means, log_scale, is_stale))
+    refresh_bounds(moved, *given, reach_sigmas=reach_sigmas, backend=backend)
+    return on_home(moved, "cpu")
+
+
+def marked(blocks, views, backend, **options):
+    """Who is seen according to a backend, on the CPU."""
+    is_seen = torch.zeros(len(blocks.order), dtype=torch.bool, device=home_of(backend))
+    mark_seen(on_home(blocks, backend), views, is_seen, backend=backend, **options)
+    return is_seen.cpu()
 
 
 def blocks_of(block_of_row, body):
@@ -35,8 +65,7 @@ def random_world(seed, *, count=600, num_blocks=90):
 def bounded(seed, backend):
     blocks, means, log_scale = random_world(seed)
     is_stale = torch.ones(len(blocks.body), dtype=torch.bool)
-    refresh_bounds(blocks, means, log_scale, is_stale, reach_sigmas=3.5, backend=backend)
-    return blocks
+    return refreshed(blocks, means, log_scale, is_stale, backend)
 
 
 def bodies_before(camera, seed):
@@ -45,27 +74,69 @@ def bodies_before(camera, seed):
     return torch.stack([camera_from_world, camera_from_world @ rigid_from_tangent(twist)])
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_fast_bounds_are_those_of_plain_torch(seed):
-    fast, plain = (bounded(seed, backend) for backend in BACKENDS)
+@pytest.mark.parametrize(("backend", "seed"), seeded(4, 1))
+def test_fast_bounds_are_those_of_plain_torch(backend, seed):
+    fast, plain = (bounded(seed, name) for name in (backend, "reference"))
     assert torch.equal(fast.low, plain.low)
     assert torch.equal(fast.high, plain.high)
     # one exponential in double
     assert torch.allclose(fast.reach, plain.reach, rtol=1e-14, atol=0)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize(("backend", "seed"), seeded(8, 2))
 @pytest.mark.parametrize("actor_slack", [(0.0, 0.0), (2.0, 0.1)])
-def test_fast_marks_are_those_of_plain_torch(seed, actor_slack):
+def test_fast_marks_are_those_of_plain_torch(backend, seed, actor_slack):
     blocks, camera = bounded(seed, "cpu"), camera_at(0.0)
-    marks = []
-    for backend in BACKENDS:
-        is_seen = torch.zeros(600, dtype=torch.bool)
-        bodies = bodies_before(camera, seed)
-        mark_seen(blocks, camera, bodies, is_seen, actor_slack=actor_slack, backend=backend)
-        marks.append(is_seen)
+    views = [(camera, bodies_before(camera, seed))]
+    marks = [
+        marked(blocks, views, name, actor_slack=actor_slack) for name in (backend, "reference")
+    ]
     assert torch.equal(*marks)  # a selection; no block lies within rounding of a plane
     assert 0 < int(marks[0].sum()) < 600
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_what_any_view_shows_is_marked(backend):
+    blocks, views = bounded(3, "cpu"), []
+    for place, x_m in enumerate((0.0, -40.0, 15.0)):
+        camera = camera_at(x_m, width_px=64 + 16 * place)
+        views.append((camera, bodies_before(camera, place)))
+    alone = [marked(blocks, [view], "reference") for view in views]
+    together = marked(blocks, views, backend)
+    assert torch.equal(together, alone[0] | alone[1] | alone[2])
+    assert int(together.sum()) > max(int(each.sum()) for each in alone)
+    assert not marked(blocks, [], backend).any()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_blocks_of_any_size_are_bounded_and_marked_whole(backend):
+    """More and fewer than are looked at together; the fourth has none, the fifth none finite."""
+    sizes = torch.tensor([1, 128, 129, 0, 2])
+    block_of_row = torch.arange(5).repeat_interleave(sizes)
+    means = torch.rand(len(block_of_row), 3, generator=torch.Generator().manual_seed(0))
+    means += torch.tensor([10.0, 0.0, 1.0])
+    log_scale = torch.full_like(means, -3.0)
+    log_scale[-2, 1], log_scale[-1, 2] = torch.nan, torch.inf
+    is_stale, body = torch.ones(5, dtype=torch.bool), torch.zeros(5, dtype=torch.int32)
+    blocks = refreshed(blocks_of(block_of_row, body), means, log_scale, is_stale, backend)
+    for block in range(3):
+        own = means[block_of_row == block].double()
+        assert torch.equal(blocks.low[block], own.amin(dim=0))
+        assert torch.equal(blocks.high[block], own.amax(dim=0))
+    assert bool((blocks.low[3:] == torch.inf).all())
+    assert bool((blocks.high[3:] == -torch.inf).all())
+    assert blocks.reach[3:].tolist() == [0.0, 0.0]
+    camera = camera_at(0.0)
+    seen = marked(blocks, [(camera, bodies_before(camera, 0)[:1])], backend)
+    assert torch.equal(seen, block_of_row < 3)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_without_blocks_nothing_is_done(backend):
+    blocks = blocks_of(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int32))
+    nothing, camera = torch.zeros(0, 3), camera_at(0.0)
+    blocks = refreshed(blocks, nothing, nothing, torch.zeros(0, dtype=torch.bool), backend)
+    assert len(marked(blocks, [(camera, bodies_before(camera, 0))], backend)) == 0
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -76,11 +147,8 @@ def test_one_gaussian_by_hand(backend):
     for y_m, expected in ((0.0, True), (-6.0, True), (-7.5, False)):
         blocks = blocks_of(torch.zeros(1, dtype=torch.int64), body)
         means, log_scale = torch.tensor([[10.0, y_m, 1.0]]), torch.full((1, 3), 0.05).log()
-        refresh_bounds(
-            blocks, means, log_scale, torch.tensor([True]), reach_sigmas=3.33, backend=backend
-        )
-        is_seen = torch.tensor([False])
-        mark_seen(blocks, camera, bodies_before(camera, 0)[:1], is_seen, backend=backend)
+        blocks = refreshed(blocks, means, log_scale, torch.tensor([True]), backend, 3.33)
+        is_seen = marked(blocks, [(camera, bodies_before(camera, 0)[:1])], backend)
         assert bool(is_seen[0]) == expected, y_m
 
 
@@ -89,7 +157,7 @@ def test_only_stale_blocks_are_bounded_again(backend):
     blocks, means, log_scale = random_world(0)
     is_stale = torch.zeros(len(blocks.body), dtype=torch.bool)
     is_stale[3] = True
-    refresh_bounds(blocks, means, log_scale, is_stale, reach_sigmas=3.5, backend=backend)
+    blocks = refreshed(blocks, means, log_scale, is_stale, backend)
     assert bool((blocks.low[~is_stale] == 99.0).all())
     assert bool((blocks.low[3] < blocks.high[3]).all())
 
@@ -102,4 +170,17 @@ def test_what_does_not_belong_together_is_refused():
     with pytest.raises(ShapeError, match="as many flags"):
         refresh_bounds(blocks, means, log_scale, everything[:2], reach_sigmas=3.0)
     with pytest.raises(ShapeError, match="as many flags"):
-        mark_seen(blocks, camera_at(0.0), torch.eye(4)[None], torch.zeros(2, dtype=torch.bool))
+        mark_seen(blocks, [(camera_at(0.0), torch.eye(4)[None])], torch.zeros(2, dtype=torch.bool))
+    views = [(camera_at(0.0), torch.eye(4).expand(count, 4, 4)) for count in (1, 2)]
+    with pytest.raises(ShapeError, match="same bodies"):
+        mark_seen(blocks, views, torch.zeros(600, dtype=torch.bool))
+
+
+@pytest.mark.parametrize("backend", [TRITON])
+def test_flags_that_lie_apart_are_marked_too(backend):
+    blocks, camera = bounded(0, "cpu"), camera_at(0.0)
+    views = [(camera, bodies_before(camera, 0))]
+    flags = torch.zeros(len(blocks.order), 2, dtype=torch.bool, device=home_of(backend))
+    mark_seen(on_home(blocks, backend), views, flags[:, 0], backend=backend)
+    assert torch.equal(flags[:, 0].cpu(), marked(blocks, views, "cpu"))
+    assert not flags[:, 1].any()

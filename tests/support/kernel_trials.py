@@ -222,7 +222,7 @@ def _culling(backend: str, device: torch.device) -> list[Tensor]:
     camera = camera_at(0.0)
     seen = torch.zeros(count, dtype=torch.bool, device=device)
     poses = invert_rigid(camera.world_from_camera)[None]
-    mark_seen(blocks, camera, poses, seen, backend=backend)
+    mark_seen(blocks, [(camera, poses)], seen, backend=backend)
     return [blocks.low, blocks.high, blocks.reach, seen]
 
 

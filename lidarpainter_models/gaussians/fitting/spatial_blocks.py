@@ -89,8 +89,7 @@ class SpatialBlocks:
         `actor_slack` is how far actors may still move (metres, radians) before they are drawn.
         """
         is_seen = torch.zeros_like(self.block_of_row, dtype=torch.bool)
-        for camera, camera_from_body in views:
-            mark_seen(self.blocks, camera, camera_from_body, is_seen, actor_slack=actor_slack)
+        mark_seen(self.blocks, views, is_seen, actor_slack=actor_slack)
         return is_seen.nonzero()[:, 0]
 
 

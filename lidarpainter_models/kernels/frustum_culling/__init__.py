@@ -3,13 +3,15 @@
 What is left out here is left out by the rasteriser too.
 """
 
+from collections.abc import Sequence
+
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.backends import Backend, implementation
-from lidarpainter_models.kernels.frustum_culling.blocks import MOST_SIGMAS, Blocks, frustum_of
+from lidarpainter_models.kernels.frustum_culling.blocks import MOST_SIGMAS, Blocks, Look, frustum_of
 
 __all__ = ["MOST_SIGMAS", "Blocks", "mark_seen", "refresh_bounds"]
 
@@ -43,22 +45,28 @@ def refresh_bounds(
 
 def mark_seen(
     blocks: Blocks,
-    camera: Camera,
-    camera_from_body: Float[Tensor, "bodies 4 4"],
+    views: Sequence[tuple[Camera, Float[Tensor, "bodies 4 4"]]],
     is_seen: Bool[Tensor, " gaussians"],
     *,
     actor_slack: tuple[float, float] = (0.0, 0.0),
     backend: Backend = "auto",
 ) -> None:
-    """Mark, in place, all Gaussians of blocks that may reach into the camera's view.
+    """Mark, in place, all Gaussians of blocks that may reach into any of the views.
 
-    `actor_slack` is how far actors may still move (metres, radians) before they are drawn.
+    A view is a camera and where it has the bodies. `actor_slack` is how far actors may still move
+    (metres, radians) before they are drawn.
 
     Raises:
-        ShapeError: there is not one flag for each Gaussian.
+        ShapeError: there is not one flag for each Gaussian, or views differ in bodies.
     """
     if is_seen.shape != blocks.order.shape:
         raise ShapeError(f"{len(blocks.order)} Gaussians need as many flags, got {len(is_seen)}")
+    counts = sorted({len(camera_from_body) for _, camera_from_body in views})
+    if len(counts) > 1:
+        raise ShapeError(f"views of one scene have the same bodies, got {counts} of them")
     mark = implementation("frustum_culling", "mark_seen", backend, is_seen.device)
-    bodies = camera_from_body.detach().double().to(is_seen.device, non_blocking=True)
-    mark(blocks, bodies, frustum_of(camera, actor_slack), is_seen)
+    looks = [
+        Look(camera_from_body.detach().double(), frustum_of(camera, actor_slack))
+        for camera, camera_from_body in views
+    ]
+    mark(blocks, looks, is_seen)

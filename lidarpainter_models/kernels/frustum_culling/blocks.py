@@ -57,6 +57,14 @@ class Frustum(NamedTuple):
     """How far the actors' boxes may still move before they are drawn: metres, radians."""
 
 
+class Look(NamedTuple):
+    """One view for a backend: where the camera has the bodies, and what it can show."""
+
+    camera_from_body: Float[Tensor, "bodies 4 4"]
+    """Rigid, float64, on any device."""
+    frustum: Frustum
+
+
 def frustum_of(camera: Camera, actor_slack: tuple[float, float]) -> Frustum:
     """What a camera can show, the blur of footprints included."""
     blur_px = MOST_SIGMAS * math.sqrt(BLUR_PX2)
@@ -71,3 +79,20 @@ def frustum_of(camera: Camera, actor_slack: tuple[float, float]) -> Frustum:
         near_m=NEAR_M,
         actor_slack=actor_slack,
     )
+
+
+def plane_rows(frustum: Frustum) -> list[list[float]]:
+    """The planes of a view: left, right, top, bottom, near.
+
+    How far outside a point is, by its x, y and z; how far the plane's own stretch lets a Gaussian
+    reach; and where the plane begins.
+    """
+    (left, top), (right, bottom) = frustum.lowest, frustum.highest
+    across, down = frustum.stretch
+    return [
+        [-1, 0, left, across, 0],
+        [1, 0, -right, across, 0],
+        [0, -1, top, down, 0],
+        [0, 1, -bottom, down, 0],
+        [0, 0, -1, 1, frustum.near_m],
+    ]

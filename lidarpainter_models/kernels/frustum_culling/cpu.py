@@ -3,13 +3,14 @@
 # ruff: noqa: ANN001, ANN202 - numba infers these types
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numba
 import numpy as np
 from torch import Tensor
 
-from lidarpainter_models.kernels.frustum_culling.blocks import Blocks, Frustum
+from lidarpainter_models.kernels.frustum_culling.blocks import Blocks, Look
 
 
 def refresh_bounds(
@@ -27,17 +28,18 @@ def refresh_bounds(
     )
 
 
-def mark_seen(blocks: Blocks, camera_from_body: Tensor, frustum: Frustum, is_seen: Tensor) -> None:
+def mark_seen(blocks: Blocks, views: Sequence[Look], is_seen: Tensor) -> None:
     """See `frustum_culling.mark_seen`."""
-    _mark_seen(
-        blocks.order.numpy(),
-        blocks.first.numpy(),
-        blocks.body.numpy(),
-        _bounds(blocks),
-        camera_from_body.numpy(),
-        frustum,
-        is_seen.numpy(),
-    )
+    for view in views:
+        _mark_seen(
+            blocks.order.numpy(),
+            blocks.first.numpy(),
+            blocks.body.numpy(),
+            _bounds(blocks),
+            view.camera_from_body.numpy(),
+            view.frustum,
+            is_seen.numpy(),
+        )
 
 
 class _Bounds(NamedTuple):
@@ -63,7 +65,10 @@ def _refresh_bounds(order, first, is_stale, means, log_scale, reach_sigmas, boun
         for place in range(first[block], first[block + 1]):
             row = order[place]
             size = max(log_scale[row, 0], log_scale[row, 1], log_scale[row, 2])
-            if not math.isfinite(means[row, 0] + means[row, 1] + means[row, 2] + size):
+            # a maximum may pass over what is no number
+            scales = log_scale[row, 0] + log_scale[row, 1] + log_scale[row, 2]
+            place_and_size = means[row, 0] + means[row, 1] + means[row, 2] + size
+            if math.isnan(scales) or not math.isfinite(place_and_size):
                 continue
             largest = max(largest, size)
             for axis in range(3):

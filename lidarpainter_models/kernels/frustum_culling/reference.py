@@ -1,10 +1,12 @@
 """Bounds of blocks of Gaussians and the test of a view in plain torch: the law, on any device."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lidarpainter_models.kernels.frustum_culling.blocks import Blocks, Frustum
+from lidarpainter_models.kernels.frustum_culling.blocks import Blocks, Look, plane_rows
 
 
 def refresh_bounds(
@@ -30,29 +32,33 @@ def refresh_bounds(
     blocks.reach.copy_(torch.where(is_stale, reach, blocks.reach))
 
 
-def mark_seen(
-    blocks: Blocks,
-    camera_from_body: Float[Tensor, "bodies 4 4"],
-    frustum: Frustum,
-    is_seen: Bool[Tensor, " gaussians"],
-) -> None:
+def mark_seen(blocks: Blocks, views: Sequence[Look], is_seen: Bool[Tensor, " gaussians"]) -> None:
     """See `frustum_culling.mark_seen`."""
+    for view in views:
+        is_in_view = _is_in_view(blocks, view)
+        is_seen |= torch.zeros_like(is_seen).index_copy(
+            0, blocks.order, is_in_view.index_select(0, blocks.of_ordered)
+        )
+
+
+def _is_in_view(blocks: Blocks, view: Look) -> Bool[Tensor, " blocks"]:
+    """Whether blocks may hold a Gaussian that reaches into a view."""
+    device, frustum = blocks.reach.device, view.frustum
+    camera_from_body = view.camera_from_body.to(device, non_blocking=True)
     transform = camera_from_body[blocks.body.long()]
     lever = torch.maximum(blocks.low.abs(), blocks.high.abs()).sum(dim=1)
     slack = frustum.actor_slack[0] + frustum.actor_slack[1] * lever
     reach = blocks.reach + torch.where(blocks.body > 0, slack, 0.0)
-    view = _planes(frustum).to(reach.device, non_blocking=True)
-    facing, stretch, begin = view[:, :3], view[:, 3], view[:, 4]
+    rows = torch.tensor(plane_rows(frustum), dtype=torch.float64)
+    rows = rows.to(device, non_blocking=True)
+    facing, stretch, begin = rows[:, :3], rows[:, 3], rows[:, 4]
     planes = facing @ transform[:, :3]
     middle, half = (blocks.low + blocks.high)[:, None] / 2, (blocks.high - blocks.low)[:, None] / 2
     slope = planes[..., :3]
     # of the corner of the box that is least outside
     outside = planes[..., 3] + (slope * middle - slope.abs() * half).sum(dim=2)
     reaches_in = outside + begin <= reach[:, None] * stretch
-    is_in_view = (blocks.low[:, 0] <= blocks.high[:, 0]) & reaches_in.all(dim=1)
-    is_seen |= torch.zeros_like(is_seen).index_copy(
-        0, blocks.order, is_in_view.index_select(0, blocks.of_ordered)
-    )
+    return (blocks.low[:, 0] <= blocks.high[:, 0]) & reaches_in.all(dim=1)
 
 
 def _of_each(
@@ -65,21 +71,3 @@ def _of_each(
     bound = torch.inf if which == "amin" else -torch.inf
     out = values.new_full((count, values.shape[1]), bound)
     return out.scatter_reduce(0, block[:, None].expand_as(values), values, which)
-
-
-def _planes(frustum: Frustum) -> Float[Tensor, "planes 5"]:
-    """The planes of a view, float64 on the CPU: left, right, top, bottom, near.
-
-    How far outside a point is, by its x, y and z; how far the plane's own stretch lets a Gaussian
-    reach; and where the plane begins.
-    """
-    (left, top), (right, bottom) = frustum.lowest, frustum.highest
-    across, down = frustum.stretch
-    rows = [
-        [-1, 0, left, across, 0],
-        [1, 0, -right, across, 0],
-        [0, -1, top, down, 0],
-        [0, 1, -bottom, down, 0],
-        [0, 0, -1, 1, frustum.near_m],
-    ]
-    return torch.tensor(rows, dtype=torch.float64)

@@ -9,6 +9,7 @@ import triton
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.kernels.dense_tensors import dense_in_place
 from lidarpainter_models.kernels.gpu_packages import check_triton_device
 from lidarpainter_models.kernels.sky_texture.layout import SkyLayout, SkyRays, TexelMoments
 from lidarpainter_models.kernels.sky_texture.triton_kernels import (
@@ -107,8 +108,7 @@ def adam(
     """See `sky_texture.step_texels`."""
     check_triton_device(texture.device, step_adam)
     kept = (texture, moments.first, moments.second, moments.visits)
-    dense = tuple(tensor.contiguous() for tensor in kept)
-    with torch.cuda.device_of(texture):
+    with torch.cuda.device_of(texture), dense_in_place(kept) as dense:
         step_adam[_programs(weight.numel())](
             *dense,
             gradient.contiguous(),
@@ -117,9 +117,6 @@ def adam(
             weight.numel(),
             num_warps=WARPS,
         )
-    for tensor, stepped in zip(kept, dense, strict=True):
-        if tensor is not stepped:
-            tensor.copy_(stepped)
 
 
 def _programs(lanes: int) -> tuple[int]:
