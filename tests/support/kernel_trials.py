@@ -116,12 +116,12 @@ def _blend(backend: str, device: torch.device) -> list[Tensor]:
     draw, (height_px, width_px) = Draw(device), SIZE_PX
     size = torch.tensor([width_px, height_px], device=device)
     found = blend_points(
-        draw.uniform(5000, 2) * size,
-        9.8 + 0.4 * draw.uniform(5000),
-        draw.uniform(5000, 3),
+        draw.uniform(1200, 2) * size,
+        9.8 + 0.4 * draw.uniform(1200),
+        draw.uniform(1200, 3),
         10.0 * (draw.uniform(*SIZE_PX) < 0.8),
-        weight=draw.uniform(5000),
-        radius_px=0.5 + 3 * draw.uniform(5000),
+        weight=draw.uniform(1200),
+        radius_px=0.5 + 3 * draw.uniform(1200),
         backend=backend,
     )
     return list(found)
