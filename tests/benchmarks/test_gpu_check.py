@@ -11,7 +11,10 @@ import pytest
 import torch
 from gpu_agreement import compare_kernels
 from gpu_findings import Agreement, Cost, Findings, StepPart
+from splat_drawing import TRITON, home_of
 from strict_device import strict_runs
+
+from lidarpainter_models.kernels.backends import available_backends
 
 CPU = torch.device("cpu")
 
@@ -80,6 +83,21 @@ def test_a_trial_runs_on_another_device_and_gives_what_the_cpu_gives(kernel, mon
     trial = kernel_trials.TRIALS[kernel]
     with strict_runs(monkeypatch) as device:
         found = [each.detach().cpu() for each in trial.run("reference", device)]
+    assert kernel_trials.disagreement(found, trial.run("cpu", CPU)) <= trial.tolerance
+
+
+@pytest.mark.parametrize("backend", [TRITON])
+@pytest.mark.parametrize(
+    "kernel",
+    [
+        pytest.param(kernel, marks=[pytest.mark.slow] if kernel in INTERPRETED_LONG else [])
+        for kernel in kernel_trials.TRIALS
+        if "triton" in available_backends(kernel)
+    ],
+)
+def test_a_trial_by_triton_gives_what_the_cpu_gives(kernel, backend):
+    trial = kernel_trials.TRIALS[kernel]
+    found = trial.run(backend, home_of(backend))
     assert kernel_trials.disagreement(found, trial.run("cpu", CPU)) <= trial.tolerance
 
 

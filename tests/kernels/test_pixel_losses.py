@@ -1,8 +1,9 @@
 import math
-from dataclasses import replace
+from importlib import import_module
 
 import pytest
 import torch
+from splat_drawing import TRITON, home_of
 
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
 from lidarpainter_models.kernels.pixel_losses import (
@@ -53,30 +54,66 @@ def image_of(rgb, depth_m, alpha):
 
 
 def terms_and_gradients(backend, dtype):
+    home = home_of(backend)
     leaves, facts = random_case()
-    leaves = [leaf.detach().to(dtype).requires_grad_(True) for leaf in leaves]
-    facts = replace(facts, rgb=facts.rgb.to(dtype), lidar_depth_m=facts.lidar_depth_m.to(dtype))
+    leaves = [leaf.detach().to(home, dtype).requires_grad_(True) for leaf in leaves]
+    facts = PixelFacts(
+        rgb=facts.rgb.to(home, dtype),
+        kind=facts.kind.to(home),
+        lidar_depth_m=facts.lidar_depth_m.to(home, dtype),
+    )
     rgb, depth_m, alpha, sky_rgb = leaves
-    exposure = EXPOSURE.to(dtype, copy=True).requires_grad_(True)
+    exposure = EXPOSURE.to(home, dtype, copy=True).requires_grad_(True)
     image = image_of(rgb, depth_m, alpha)
     terms = pixel_terms(image, sky_rgb, facts, RULES, exposure=exposure, backend=backend)
-    weight = torch.linspace(-1, 1, terms.shown.numel(), dtype=dtype).view_as(terms.shown)
+    weight = torch.linspace(-1, 1, terms.shown.numel(), dtype=dtype)
+    weight = weight.view(terms.shown.shape).to(home)
     ((terms.shown * weight).sum() + 3 * terms.sky + 5 * terms.depth).backward()
     found = {"shown": terms.shown, "sky": terms.sky, "depth": terms.depth}
     found |= {name: leaf.grad for name, leaf in zip(LEAVES, leaves, strict=True)}
     found["exposure"] = exposure.grad
-    return {name: value.detach().double() for name, value in found.items()}
+    return {name: value.detach().cpu().double() for name, value in found.items()}
 
 
-def test_fast_terms_and_gradients_are_those_of_plain_torch_in_double():
+@pytest.mark.parametrize("backend", ["cpu", TRITON])
+def test_fast_terms_and_gradients_are_those_of_plain_torch_in_double(backend):
     fast, truth = (
-        terms_and_gradients("cpu", torch.float32),
+        terms_and_gradients(backend, torch.float32),
         terms_and_gradients("reference", torch.float64),
     )
     for name, expected in truth.items():
         # a dozen operations a pixel, on numbers as large as the largest beside it
         most = 16 * EPS * torch.maximum(expected.abs(), expected.abs().mean())
         assert bool(((fast[name] - expected).abs() <= most).all()), name
+
+
+@pytest.mark.parametrize("backend", [TRITON])
+def test_blocks_of_pixels_add_up(backend, monkeypatch):
+    whole = terms_and_gradients(backend, torch.float32)
+    module = import_module("lidarpainter_models.kernels.pixel_losses.triton")
+    monkeypatch.setattr(module, "PIXELS_AT_ONCE", 32)
+    monkeypatch.setattr(module, "SUMS_AT_ONCE", 4)
+    found, again = (terms_and_gradients(backend, torch.float32) for _ in range(2))
+    for name, value in found.items():
+        torch.testing.assert_close(value, whole[name], rtol=1e-6, atol=1e-6)
+        assert torch.equal(value, again[name]), name
+
+
+@pytest.mark.parametrize("backend", ["cpu", TRITON])
+def test_strided_images_give_the_same_as_their_copies(backend):
+    home = home_of(backend)
+    (rgb, depth_m, alpha, sky_rgb), facts = random_case()
+    values = [value.detach().to(home) for value in (rgb, depth_m, alpha, sky_rgb, facts.rgb)]
+    spread = [torch.stack([value, value * 0], dim=1)[:, 0] for value in values]
+    assert not any(value.is_contiguous() for value in spread)
+    kind, lidar_depth_m = facts.kind.to(home), facts.lidar_depth_m.to(home)
+    shown = []
+    for *drawn, sky, target in (values, spread):
+        known = PixelFacts(rgb=target, kind=kind, lidar_depth_m=lidar_depth_m)
+        shown.append(pixel_terms(image_of(*drawn), sky, known, RULES, backend=backend))
+    assert torch.equal(shown[0].shown, shown[1].shown)
+    assert torch.equal(shown[0].sky, shown[1].sky)
+    assert torch.equal(shown[0].depth, shown[1].depth)
 
 
 def test_without_an_exposure_colours_are_shown_as_they_are():
@@ -109,9 +146,10 @@ def test_only_open_pixels_can_look_like_sky():
     assert found.tolist() == [[True, False, False]]
 
 
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("backend", ["cpu", "reference", TRITON])
 def test_open_pixels_are_held_against_the_sky_as_the_camera_shows_it(backend):
-    clear, black = torch.zeros(HEIGHT_PX, WIDTH_PX), torch.zeros(HEIGHT_PX, WIDTH_PX, 3)
+    clear = torch.zeros(HEIGHT_PX, WIDTH_PX, device=home_of(backend))
+    black = clear[..., None].expand(-1, -1, 3)
     sky_rgb = black + 0.4
     facts = PixelFacts(
         rgb=black + 0.8,  # twice the sky: a camera that is twice as bright
@@ -121,19 +159,22 @@ def test_open_pixels_are_held_against_the_sky_as_the_camera_shows_it(backend):
     image = image_of(black, clear, clear + 0.5)
     exposures = {1.0: 0.0, 2.0: math.log(2)}
     for gain, expected in exposures.items():
-        exposure = torch.cat([gain * torch.eye(3), torch.zeros(3, 1)], dim=1)
+        exposure = gain * torch.eye(3, 4).to(clear)
         terms = pixel_terms(image, sky_rgb, facts, RULES, exposure=exposure, backend=backend)
         assert float(terms.sky) == pytest.approx(expected)
 
 
-def test_image_without_returns_has_no_depth_term():
-    (rgb, depth_m, alpha, sky_rgb), facts = random_case()
+@pytest.mark.parametrize("backend", ["cpu", TRITON])
+def test_image_without_returns_has_no_depth_term(backend):
+    home = home_of(backend)
+    leaves, facts = random_case()
+    rgb, depth_m, alpha, sky_rgb = (leaf.detach().to(home).requires_grad_() for leaf in leaves)
     blind = PixelFacts(
-        rgb=facts.rgb,
-        kind=torch.full_like(facts.kind, SKY),
-        lidar_depth_m=torch.zeros_like(facts.lidar_depth_m),
+        rgb=facts.rgb.to(home),
+        kind=torch.full_like(facts.kind, SKY, device=home),
+        lidar_depth_m=torch.zeros_like(facts.lidar_depth_m, device=home),
     )
-    terms = pixel_terms(image_of(rgb, depth_m, alpha), sky_rgb, blind, RULES)
+    terms = pixel_terms(image_of(rgb, depth_m, alpha), sky_rgb, blind, RULES, backend=backend)
     (terms.depth + terms.shown.sum()).backward()
     assert float(terms.depth.detach()) == 0
     assert float(depth_m.grad.abs().sum()) == 0

@@ -38,7 +38,7 @@ from lidarpainter_models.kernels.sparse_adam import (
     present_rows,
     step_rows,
 )
-from lidarpainter_models.kernels.ssim import l1_ssim_loss
+from lidarpainter_models.kernels.ssim import l1_ssim_loss, ssim_map
 
 SIZE_PX = (90, 160)
 """Height and width of the images."""
@@ -145,9 +145,11 @@ def _projection(backend: str, device: torch.device) -> list[Tensor]:
 def _image_loss(backend: str, device: torch.device) -> list[Tensor]:
     draw = Draw(device)
     rendered, target = draw.uniform(*SIZE_PX, 3).requires_grad_(), draw.uniform(*SIZE_PX, 3)
-    loss = l1_ssim_loss(rendered, target, pixel_weight=draw.uniform(*SIZE_PX), backend=backend)
-    loss.backward()
-    return [loss.detach(), rendered.grad]
+    weighted = l1_ssim_loss(rendered, target, pixel_weight=draw.uniform(*SIZE_PX), backend=backend)
+    similarity = ssim_map(rendered, target, backend=backend)
+    (weighted + l1_ssim_loss(rendered, target, backend=backend) + similarity.mean()).backward()
+    alone = ssim_map(target, rendered.detach(), backend=backend)
+    return [weighted.detach(), similarity.detach(), alone, rendered.grad]
 
 
 def _pixel_terms(backend: str, device: torch.device) -> list[Tensor]:

@@ -1,7 +1,8 @@
 """Compile the Triton kernels that trials launch for a GPU that need not be there.
 
 `python triton_trial_compilation.py ARCHITECTURE KERNEL ...` runs `kernel_trials` of these kernel
-packages, and prints what `triton_compilation` does. `TRITON_INTERPRET` must not be set.
+packages, and prints what `triton_compilation` does, by kernel and the options that are on.
+`TRITON_INTERPRET` must not be set.
 """
 
 import json
@@ -23,7 +24,9 @@ def main():
         del grid, warmup
         arguments = dict(zip(kernel.arg_names, values, strict=False))
         arguments |= {name: named.pop(name) for name in kernel.arg_names if name in named}
-        found[kernel.fn.__name__] = compiled(kernel, arguments, named, architecture)
+        options = "".join(f" {name}" for name, value in arguments.items() if value is True)
+        name = kernel.fn.__name__ + options
+        found[name] = compiled(kernel, arguments, named, architecture)
 
     triton.JITFunction.run = catch
     backends.why_no_triton = lambda: None

@@ -64,5 +64,5 @@ def pixel_terms(
         image.rgb.device,
     )
     if exposure is None:
-        exposure = torch.eye(3, 4).to(image.rgb)
+        exposure = torch.eye(3, 4, dtype=image.rgb.dtype, device=image.rgb.device)
     return terms(image, sky_rgb, facts, rules, exposure)

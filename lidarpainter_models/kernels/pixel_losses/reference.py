@@ -14,7 +14,10 @@ from lidarpainter_models.kernels.pixel_losses.pixel_facts import (
     PixelTerms,
 )
 
-_EDGE = 1e-4  # keeps logarithms finite
+ALPHA_EDGE = 1e-4
+"""Keeps logarithms finite."""
+LEAST_KNOWN_ALPHA = 0.3
+"""The expected depth of a clearer pixel means nothing."""
 
 
 def pixel_terms(
@@ -65,7 +68,7 @@ def clear_sky_loss(
     between wires and branches, which are neither sky for certain nor solid. Those that look like
     the sky behind them are better counted as sky (`looks_like_sky`), the others are left alone.
     """
-    inside = alpha.clamp(_EDGE, 1 - _EDGE)
+    inside = alpha.clamp(ALPHA_EDGE, 1 - ALPHA_EDGE)
     wanted = torch.where(sky_mask, 1 - inside, inside)
     return -torch.where(sky_mask | solid_mask, wanted.log(), torch.zeros_like(alpha)).mean()
 
@@ -98,7 +101,7 @@ def depth_loss(
     occlusion more likely than a wrong surface) but never ends. Pixels that the Gaussians leave
     clear do not count: their expected depth means nothing.
     """
-    is_known = (lidar_depth_m > 0) & (alpha.detach() > 0.3)
+    is_known = (lidar_depth_m > 0) & (alpha.detach() > LEAST_KNOWN_ALPHA)
     safe_m = torch.where(is_known, lidar_depth_m, torch.ones_like(lidar_depth_m))
     expected_m = accumulated_m / alpha.clamp(min=0.05)
     error = torch.log1p((expected_m - safe_m).abs() / (safe_m * tolerance))

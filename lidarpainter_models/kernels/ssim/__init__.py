@@ -20,11 +20,12 @@ def ssim_map(
     """SSIM around every pixel for each channel, in [-1, 1].
 
     Differentiable in the first image; the second is taken as constant. `auto` takes numba for
-    float32 on the CPU and the torch reference for anything else (float64, a GPU).
+    float32 on the CPU, Triton for float32 on a GPU, and the torch reference for float64.
 
     Raises:
         ShapeError: the images differ in shape, or are not (height, width, 3).
-        BackendError: the numba version was asked for and the images are not float32 on the CPU.
+        BackendError: the version asked for cannot take the images: numba float32 on the CPU alone,
+            Triton those of a GPU.
     """
     _check_images(first_rgb, second_rgb)
     compute = implementation(
@@ -66,7 +67,8 @@ def l1_ssim_loss(
 
     Raises:
         ShapeError: images or weights do not fit together.
-        BackendError: the numba version was asked for and the images are not float32 on the CPU.
+        BackendError: the version asked for cannot take the images: numba float32 on the CPU alone,
+            Triton those of a GPU.
     """
     _check_images(rendered, target)
     if pixel_weight is not None and pixel_weight.shape != rendered.shape[:2]:
