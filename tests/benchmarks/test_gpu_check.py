@@ -104,7 +104,7 @@ def test_a_trial_by_triton_gives_what_the_cpu_gives(kernel, backend):
 def test_another_answer_is_a_disagreement():
     trial = kernel_trials.TRIALS["ssim"]
     found = trial.run("cpu", CPU)
-    assert kernel_trials.disagreement([found[0], found[1].flip(0)], found) > 0.1
+    assert kernel_trials.disagreement([*found[:-1], found[-1].flip(0)], found) > 0.1
     chosen = torch.tensor([1, 2, 3, 4])
     assert kernel_trials.disagreement([chosen], [torch.tensor([1, 2, 3, 5])]) == 0.25
 
