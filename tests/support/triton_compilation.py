@@ -32,17 +32,33 @@ TYPES = {
 CUOBJDUMP = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
 
 
+def type_of(value):
+    """How a launch names the type of an argument."""
+    if isinstance(value, tuple):
+        return tuple(map(type_of, value))
+    if torch.is_tensor(value):
+        return TYPES[value.dtype]
+    return "fp32" if isinstance(value, float) else "i32"
+
+
+def alignments(value, *path):
+    """Tensors of an argument, all of which begin at a multiple of 16 bytes."""
+    if isinstance(value, tuple):
+        for place, part in enumerate(value):
+            yield from alignments(part, *path, place)
+    elif torch.is_tensor(value):
+        yield path
+
+
 def compiled(kernel, arguments, options, architecture):
     """Registers and stack of a kernel as it is launched; both of the cubin."""
     signature, constants, alignment = {}, {}, {}
     for place, (name, value) in enumerate(arguments.items()):
-        if torch.is_tensor(value):
-            signature[name] = TYPES[value.dtype]
-            alignment[(place,)] = [["tt.divisibility", 16]]
-        elif kernel.params[place].is_constexpr:
+        if kernel.params[place].is_constexpr:
             signature[name], constants[name] = "constexpr", value
         else:
-            signature[name] = "fp32" if isinstance(value, float) else "i32"
+            signature[name] = type_of(value)
+            alignment |= {key: [["tt.divisibility", 16]] for key in alignments(value, place)}
     source = ASTSource(fn=kernel, signature=signature, constexprs=constants, attrs=alignment)
     options = options | {"enable_fp_fusion": True}
     code = triton.compile(source, target=GPUTarget("cuda", architecture, 32), options=options)
@@ -70,8 +86,11 @@ def scene(coefficients, features, count=5):
     return [*splats, poses, torch.zeros(count, dtype=torch.int32), (camera,), None]
 
 
-def main():
-    architecture, coefficients, features = (int(word) for word in sys.argv[1:])
+def catch_launches(architecture):
+    """Compile what is launched from now on instead of running it.
+
+    What a kernel uses is filled in, by its name and the options that are on.
+    """
     found = {}
 
     def catch(kernel, *values, grid, warmup, **named):
@@ -80,9 +99,16 @@ def main():
         arguments |= {name: named.pop(name) for name in kernel.arg_names if name in named}
         if "tile_count" in arguments:
             arguments["tile_count"].fill_(1)  # it says how much room the lists need
-        found[kernel.fn.__name__] = compiled(kernel, arguments, named, architecture)
+        options = "".join(f" {name}" for name, value in arguments.items() if value is True)
+        found[kernel.fn.__name__ + options] = compiled(kernel, arguments, named, architecture)
 
     triton.JITFunction.run = catch
+    return found
+
+
+def main():
+    architecture, coefficients, features = (int(word) for word in sys.argv[1:])
+    found = catch_launches(architecture)
     drawn = backend._DrawViews.apply(*scene(coefficients, features))
     sum(image.sum() for image in drawn[:4]).backward()
     sys.stdout.write(json.dumps(found))

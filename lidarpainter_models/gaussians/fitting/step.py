@@ -46,9 +46,10 @@ ACTOR_TERM_EVERY = 10
 """Steps between two actor terms: it needs one more blended channel."""
 _EDGE = 1e-4  # keeps logarithms finite
 WAITS = 4
-"""Of the host for the device in a step, without the rasteriser's own: how many Gaussians are in
-view, how many of them lag and by how much, and the gradients of the bodies' poses and of the
-exposure. Where somebody bends, one more for each view: which Gaussians do."""
+"""The most of the host for the device in a step, without the rasteriser's own: how many Gaussians
+are in view, how many of them lag and by how much (plain torch alone asks), and the gradients of the
+bodies' poses and of the exposure. Where somebody bends, one more for each view: which Gaussians
+do."""
 
 Perceptual = Callable[
     [Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]], Float[Tensor, ""]

@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lidarpainter_models.kernels.sparse_adam.device_rates import DeviceRates
+
 BETA1, BETA2 = 0.9, 0.99
 MOST_STEP = (1 - BETA1) / math.sqrt((1 - BETA2) * (1 - BETA1**2 / BETA2))
 """The largest step of Adam in learning rates: |m| <= 2.35 sqrt(v) by Cauchy and Schwarz."""
@@ -48,7 +50,10 @@ class AdamState:
     """The step after which a row was left; its parameters and moments are those of then."""
     count: int = 0
     missed: list[list[float]] = field(default_factory=list)
-    """Learning rates, one of each kind, of the steps since all rows were caught up."""
+    """Learning rates, one of each kind, of the steps since all rows were caught up; a backend may
+    keep a copy of such a list, so it is only added to or replaced."""
+    on_device: DeviceRates | None = None
+    """The copy of the Triton backend."""
 
     @classmethod
     def empty(

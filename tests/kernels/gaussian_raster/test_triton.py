@@ -4,16 +4,13 @@ Without a GPU the kernels are interpreted, by numpy and slowly: the scenes that 
 tried with take minutes here and run with the slow tests.
 """
 
-import json
-import os
-import subprocess
 import sys
 from importlib import import_module
-from pathlib import Path
 
 import pytest
 import torch
 from gaussian_world import build_world
+from machine_code import assert_fits, machine_code
 from splat_drawing import TRITON, WITHOUT_TRITON, home_of, render
 from splat_errors import CASES, image_errors, relative_errors
 
@@ -28,7 +25,7 @@ IMAGE_ERROR = 1e-6
 GRADIENT_ERROR = 1e-5
 OPAQUE_GRADIENT_ERROR = 1.5e-5
 """As for numba: one minus an alpha near the clamp has two digits fewer. Seen are 8.9e-6."""
-SUPPORT = Path(__file__).resolve().parents[2] / "support"
+KERNELS = {"project", "write_keys", "blend", "entry_sums", "gaussian_sums", "unproject"}
 SMALL = {
     "degree 3": {"count": 30, "coefficients": 16, "width_px": 40, "height_px": 24},
     "features, one body": {
@@ -115,38 +112,17 @@ def test_a_fit_by_triton_is_that_by_numba(monkeypatch):
         assert torch.allclose(value.cpu(), expected[name], atol=1e-4), name
 
 
-def machine_code(architecture, coefficients, features):
-    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
-    words = [str(number) for number in (architecture, coefficients, features)]
-    result = subprocess.run(
-        [sys.executable, SUPPORT / "triton_compilation.py", *words],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=environment | {"PYTHONPATH": os.pathsep.join(sys.path)},
-    )
-    assert result.returncode == 0, result.stderr
-    return json.loads(result.stdout)
-
-
-def assert_kernels_fit(found):
-    kernels = {"project", "write_keys", "blend", "entry_sums", "gaussian_sums", "unproject"}
-    assert set(found) == kernels
-    for name, use in found.items():
-        assert use["ptx"], name
-        assert use["REG"] <= 255, name
-        assert use["STACK"] == 0, f"{name} spills registers"
-
-
 def test_every_kernel_compiles_to_machine_code_without_spilling():
-    assert_kernels_fit(machine_code(90, coefficients=1, features=1))
+    found = machine_code("triton_compilation.py", 90, 1, 1)
+    assert set(found) == KERNELS
+    assert_fits(found)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("architecture", [80, 90])
 @pytest.mark.parametrize(("coefficients", "features"), [(16, 0), (4, 1)])
 def test_every_kernel_compiles_for_every_degree(architecture, coefficients, features):
-    assert_kernels_fit(machine_code(architecture, coefficients, features))
+    assert_fits(machine_code("triton_compilation.py", architecture, coefficients, features))
 
 
 @pytest.mark.parametrize(
