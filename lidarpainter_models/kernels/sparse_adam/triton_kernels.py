@@ -18,8 +18,6 @@ RUNS = tl.constexpr(len(state.MISSED_RUN_ENDS))
 KINDS = tl.constexpr(device_rates.KINDS)
 LOG_SCALE = tl.constexpr(7)
 """First of three columns, as the means' is 0; rotations lie between them."""
-OPACITY = tl.constexpr(10)
-HARMONICS = tl.constexpr(11)
 
 
 @triton.jit(do_not_specialize=["missed_steps", "now"])
@@ -247,6 +245,7 @@ def catch_up_rows(
     m, v, place, is_moment = _moments(first, second, row, lags, column, COLUMNS)
     tables = (nodes, run_ends, kind_of_column, eps)
     values = _drift(values, (m, v, is_moment), missed, column, tables, COLUMNS)
+    tl.debug_barrier()  # every warp has read `last`, of which each reads all
     _store(values, kept, row, lags, column, KEPT, KEPT_MORE)
     m, v = _faded(m, v, missed)
     tl.store(first + place, m, mask=is_moment)
@@ -328,6 +327,7 @@ def step(
     eps = tl.load(eps + column, mask=column < COLUMNS, other=1.0)
     move = (rate * growth)[None, :] * m / (tl.sqrt(v) / spread + eps[None, :])
     values -= _in_units(move, values, column)
+    tl.debug_barrier()  # every warp has read `last`, of which each reads all
     _store(values, kept, row, moves, column, KEPT, KEPT_MORE)
     tl.store(first + there, m, mask=is_moment)
     tl.store(second + there, v, mask=is_moment)
