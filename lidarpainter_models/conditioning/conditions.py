@@ -96,7 +96,7 @@ class ConditionBuilder:
                 alpha=torch.where(sky_mask, 0.0, render.alpha),
             )
             if view.hidden is not None:
-                source = source.without(view.hidden, render.rgb)
+                source = source.without(view.hidden.to(device), render.rgb)
             self._sources[key] = source
             most = max(MOST_SOURCE_BYTES // (SOURCE_PIXEL_BYTES * source.alpha.numel()), 1)
             while len(self._sources) > most:

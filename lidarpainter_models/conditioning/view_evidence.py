@@ -114,7 +114,9 @@ class EvidenceGatherer:
         )
         truth = view.rgb.to(render.rgb)
         error = (render.rgb.clamp(0, 1) - truth).square().mean(dim=-1)
-        return _decibels(error.mean() if view.hidden is None else error[~view.hidden].mean())
+        if view.hidden is not None:
+            error = error[~view.hidden.to(error.device)]
+        return _decibels(error.mean())
 
 
 def _difference(conditions: PaintingConditions) -> Float[Tensor, "height width"]:
