@@ -11,6 +11,7 @@ from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.novel_guidance import NovelCamera, paint_novel_views
 from lidarpainter_models.conditioning.settings import NovelGuidanceConfig, SequenceConfig
 from lidarpainter_models.evaluation.judged_views import JudgedView, score_views
+from lidarpainter_models.evaluation.round_gain import round_gain
 from lidarpainter_models.evaluation.shown import ShownScene, ViewTimePainting
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.geometry.trajectories import shift_pose
@@ -105,3 +106,12 @@ def test_a_scene_is_judged_where_it_lies(world, monkeypatch, view_time):
     assert found.psnr == pytest.approx(expected.psnr, abs=1e-3)
     assert found.ssim == pytest.approx(expected.ssim, abs=1e-5)
     assert found.actors_psnr == pytest.approx(expected.actors_psnr, abs=1e-3)
+
+
+def test_what_a_round_gained_is_told_where_its_scenes_lie(world, monkeypatch):
+    views = [each.guidance for each in painted(world, CPU)]
+    expected = round_gain(world.scene, world.scene, world.observations, views)
+    with strict_runs(monkeypatch) as device:
+        there = world.scene.to(device)
+        found = round_gain(there, there, world.observations, views)
+    assert found.before_db == pytest.approx(expected.before_db, abs=0.01)
