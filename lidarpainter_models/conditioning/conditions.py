@@ -8,16 +8,18 @@ named whose exposure all of them then take.
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
+from operator import itemgetter
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarpainter_models.conditioning.references import WarpTarget, warped_references
 from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.conditioning.surface_depth import surface_depth
-from lidarpainter_models.conditioning.warping import SKY_ALPHA, SourceImage, source_cost_m
+from lidarpainter_models.conditioning.warping import SKY_ALPHA, SourceImage, source_costs_m
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.scene_rendering import SceneRender
 from lidarpainter_models.geometry.cameras import Camera
@@ -67,6 +69,16 @@ class ConditionBuilder:
         """The training views' cameras at their refined poses."""
         return tuple(self._cameras.values())
 
+    @cached_property
+    def _placed(self) -> tuple[Float[Tensor, "views 4 4"], Int[Tensor, " views"]]:
+        """Poses of the training views, and when they were really taken."""
+        poses = [camera.world_from_camera.double() for camera in self._cameras.values()]
+        times_ns = [
+            self._cameras[key].taken_ns(view.timestamp_ns) for key, view in self._views.items()
+        ]
+        none = torch.zeros(0, 4, 4, dtype=torch.float64)
+        return torch.stack(poses) if poses else none, torch.tensor(times_ns, dtype=torch.int64)
+
     @property
     def training_views(self) -> tuple[TrainingView, ...]:
         """What was recorded, with cameras as recorded."""
@@ -84,14 +96,15 @@ class ConditionBuilder:
             device = self.scene.device
             rgb, sky_mask = view.rgb_u8.to(device).float() / 255, view.sky_mask.to(device)
             render = self.scene.render(camera, view.timestamp_ns)
-            lidar = self.lidar_image(camera, view.timestamp_ns)
+            taken_ns = camera.taken_ns(view.timestamp_ns)
+            lidar = self.lidar_image(camera, taken_ns)
             # the sky mask knows better than the render where there is sky; what else is clear in
             # the render is drawn by the sky too, so it stands at infinity in both views
             source = SourceImage(
                 key=key,
                 camera=camera,
-                timestamp_ns=view.timestamp_ns,
-                rgb=self.scene.exposure.undone(rgb, key[1], view.timestamp_ns),
+                timestamp_ns=taken_ns,
+                rgb=self.scene.exposure.undone(rgb, key[1], taken_ns),
                 depth_m=torch.where(sky_mask, 0.0, self.surface_m(render, lidar, camera)),
                 alpha=torch.where(sky_mask, 0.0, render.alpha),
             )
@@ -112,15 +125,9 @@ class ConditionBuilder:
         Neighbours of a slow drive show the same; images further off see round corners and
         past the edge of the frame.
         """
-        allowed = [key for key in self._views if key not in exclude]
-        allowed.sort(
-            key=lambda key: source_cost_m(
-                camera,
-                timestamp_ns,
-                self._cameras[key],
-                self._views[key].timestamp_ns,
-            )
-        )
+        costs_m = source_costs_m(camera, timestamp_ns, *self._placed)
+        nearest = sorted(zip(costs_m.tolist(), self._views, strict=True), key=itemgetter(0))
+        allowed = [key for _, key in nearest if key not in exclude]
         near = min(self.config.num_references, len(allowed))
         rest = allowed[near:]
         num_rest = min(self.config.num_sources - near, len(rest))
@@ -142,6 +149,7 @@ class ConditionBuilder:
         serve as no references; all images take the exposure of `camera_name`.
         """
         render = self.scene.render(camera, timestamp_ns)
+        timestamp_ns = camera.taken_ns(timestamp_ns)
         lidar = self.lidar_image(camera, timestamp_ns)
         is_sky = (render.alpha < SKY_ALPHA) & (lidar.depth_m == 0)
         sources = self.sources_for(camera, timestamp_ns, exclude=exclude)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
@@ -61,13 +61,19 @@ class SourceImage:
         return torch.stack(planes)[None]
 
 
-def source_cost_m(target_camera: Camera, timestamp_ns: int, camera: Camera, taken_ns: int) -> float:
-    """How far a recorded view is from a target in place, direction and time, as metres."""
-    distance_m = (camera.centre_world - target_camera.centre_world).norm()
-    axis, target_axis = camera.world_from_camera[:3, 2], target_camera.world_from_camera[:3, 2]
-    angle_rad = torch.arccos((axis @ target_axis).clamp(-1, 1))
-    seconds = abs(taken_ns - timestamp_ns) * 1e-9
-    return float(distance_m + ANGLE_WEIGHT_M_RAD * angle_rad + TIME_WEIGHT_M_S * seconds)
+def source_costs_m(
+    target_camera: Camera,
+    timestamp_ns: int,
+    world_from_cameras: Float[Tensor, "views 4 4"],
+    taken_ns: Int[Tensor, " views"],
+) -> Float[Tensor, " views"]:
+    """How far recorded views are from a target in place, direction and time, as metres."""
+    target = target_camera.world_from_camera.to(world_from_cameras)
+    distance_m = (world_from_cameras[:, :3, 3] - target[:3, 3]).norm(dim=1)
+    cosine = world_from_cameras[:, :3, 2] @ target[:3, 2]
+    seconds = (taken_ns - timestamp_ns).abs() * 1e-9
+    angle_rad = torch.arccos(cosine.clamp(-1, 1))
+    return distance_m + ANGLE_WEIGHT_M_RAD * angle_rad + TIME_WEIGHT_M_S * seconds
 
 
 def sample_source(

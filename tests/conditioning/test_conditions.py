@@ -13,6 +13,7 @@ from lidarpainter_models.conditioning.novel_guidance import (
 )
 from lidarpainter_models.conditioning.settings import ConditionConfig, NovelGuidanceConfig
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.painter.protocol import Painting
@@ -192,3 +193,15 @@ def test_no_view_is_painted_from_inside_a_wall_or_a_car(lidar_map, views, camera
     assert not has_room(in_wall, lidar_map, MovingBoxes([]))
     car = moving_track((0.0, 2.0, 1.0), (5.0, 2.0, 1.0))
     assert not has_room(novel, lidar_map, MovingBoxes([car]))
+
+
+def test_a_late_image_is_a_source_of_the_time_when_it_was_taken(builder):
+    late = Shutter(late_s=0.04, twist_per_s=torch.zeros(6, dtype=torch.float64))
+    views = [
+        replace(view, camera=replace(view.camera, shutter=late)) for view in builder.training_views
+    ]
+    found = ConditionBuilder(builder.scene, builder.lidar_map, views)
+    view = views[0]
+    assert found.source(view.key).timestamp_ns == view.timestamp_ns + 40_000_000
+    nearest = found.sources_for(view.camera.at(view.camera.world_from_camera), view.timestamp_ns)
+    assert nearest[0].timestamp_ns == view.timestamp_ns + 40_000_000
