@@ -66,6 +66,8 @@ def _drawn(turn: Turn, dice: np.random.Generator) -> torch.Tensor:
 
 def _beam_mask(turn: Turn, count: int) -> torch.Tensor:
     rings = turn.points.ring.long()
+    if len(rings) == 0:
+        return torch.zeros(0, dtype=torch.bool)
     if int(rings.min()) < 0 or len(rings.unique()) == 1:
         own = _own_points(turn)
         elevation = torch.atan2(own[:, 2], own[:, :2].norm(dim=1))
