@@ -31,7 +31,7 @@ class TrainingView:
     """The own frame's sweeps, 0 where no point falls."""
     hidden: Bool[Tensor, "height width"] | None = None
     """Where the image shows what the scene does not hold: the recording car itself, or what an edit
-    took away. Nothing takes colours from there; what LiDAR says there counts. None hides nothing."""
+    took away. Nothing takes colours from there; the depths of LiDAR count. None hides nothing."""
 
     @property
     def rgb(self) -> Float[Tensor, "height width 3"]:
