@@ -127,7 +127,7 @@ def test_stages_and_painters_are_rehearsed_on_another_device(monkeypatch):
     gpu_costs.measure_painters(findings, CPU, None)
     assert findings.failed == []
     assert len(findings.costs) == 3
-    assert [cost.what.split()[0] for cost in findings.painters] == ["nano,", "paper", "fast"]
+    assert [cost.what.split()[0] for cost in findings.painters] == ["nano,", "a", "paper", "fast"]
 
 
 @pytest.mark.slow

@@ -64,5 +64,5 @@ def pixel_terms(
         image.rgb.device,
     )
     if exposure is None:
-        exposure = torch.eye(3, 4, dtype=image.rgb.dtype, device=image.rgb.device)
+        exposure = torch.eye(3, 4).to(image.rgb, non_blocking=True)
     return terms(image, sky_rgb, facts, rules, exposure)
