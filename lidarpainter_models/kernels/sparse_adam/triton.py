@@ -5,12 +5,12 @@ rates that the steps left there (`device_rates`). Every row is worked on alone.
 """
 
 import math
-from collections.abc import Sequence
 
 import torch
 import triton
 from torch import Tensor
 
+from lidarpainter_models.kernels.dense_tensors import dense_in_place
 from lidarpainter_models.kernels.gpu_packages import check_triton_device
 from lidarpainter_models.kernels.sparse_adam import triton_kernels as kernels
 from lidarpainter_models.kernels.sparse_adam.device_rates import DeviceRates
@@ -32,12 +32,11 @@ def present_rows(state: AdamState, kept: Parameters, rows: Tensor, out: Paramete
     check_triton_device(rows.device, kernels.present)
     if len(rows) == 0:
         return
-    with torch.cuda.device_of(rows):
+    with torch.cuda.device_of(rows), dense_in_place(out) as written:
         there = _with_nodes(state)
-        written = _contiguous(out)
         kernels.present[_blocks(len(rows))](
             _contiguous(kept),
-            written,
+            tuple(written),
             state.first,
             state.second,
             state.last,
@@ -53,7 +52,6 @@ def present_rows(state: AdamState, kept: Parameters, rows: Tensor, out: Paramete
             *_columns(state),
             BLOCK=ROWS_AT_ONCE,
         )
-        _copy_back(written, out)
 
 
 def step_rows(
@@ -69,12 +67,11 @@ def step_rows(
     if len(rows) == 0:
         return
     before = len(state.missed) - 1
-    with torch.cuda.device_of(rows):
+    with torch.cuda.device_of(rows), dense_in_place(kept) as written:
         there = _rates(state)
         there.fill(before)
-        written = _contiguous(kept)
         kernels.step[_blocks(len(rows))](
-            written,
+            tuple(written),
             _contiguous(seen),
             _contiguous(gradients),
             tuple(rates),
@@ -96,7 +93,6 @@ def step_rows(
             BLOCK=ROWS_AT_ONCE,
         )
         there.filled = before + 1
-        _copy_back(written, kept)
 
 
 def catch_up(state: AdamState, kept: Parameters) -> None:
@@ -104,11 +100,10 @@ def catch_up(state: AdamState, kept: Parameters) -> None:
     check_triton_device(state.last.device, kernels.catch_up_rows)
     if len(state.last) == 0:
         return
-    with torch.cuda.device_of(state.last):
+    with torch.cuda.device_of(state.last), dense_in_place(kept) as written:
         there = _with_nodes(state)
-        written = _contiguous(kept)
         kernels.catch_up_rows[_blocks(len(state.last))](
-            written,
+            tuple(written),
             state.first,
             state.second,
             state.last,
@@ -122,7 +117,6 @@ def catch_up(state: AdamState, kept: Parameters) -> None:
             *_columns(state),
             BLOCK=ROWS_AT_ONCE,
         )
-        _copy_back(written, kept)
 
 
 def _rates(state: AdamState) -> DeviceRates:
@@ -158,13 +152,6 @@ def _blocks(rows: int) -> tuple[int]:
 
 def _contiguous(parameters: Parameters) -> tuple[Tensor, ...]:
     return tuple(value.contiguous() for value in parameters)
-
-
-def _copy_back(written: Sequence[Tensor], parameters: Parameters) -> None:
-    """Give what was written to copies to the tensors that are not contiguous themselves."""
-    for value, copy in zip(parameters, written, strict=True):
-        if copy is not value:
-            value.copy_(copy)
 
 
 def _widths(parameters: Parameters) -> tuple[int, int]:
