@@ -26,14 +26,14 @@ ARTEFACT_COLUMNS = (
     *("seconds", "num_bytes", "summary"),
 )
 RUN_COLUMNS = (
-    *("run_id", "scene_id", "parameters", "change"),
+    *("run_id", "scene_id", "parameters", "derived_from", "change"),
     *("status", "finished_at", "artefacts"),
 )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StaleRun:
-    """The newest run of a scene, parameters and change, if today's code would make it otherwise."""
+    """The newest run of a scene, parameters and history, if today's code would make another."""
 
     scene_id: str
     run_id: str
@@ -151,15 +151,28 @@ def _with_heirs(
 
 
 def _newest(runs: Iterable[Row]) -> Iterable[Row]:
-    """Of the complete runs of one scene with the same parameters and change, the newest."""
-    newest: dict[tuple[str, str, str | None], Row] = {}
-    for row in runs:
-        key = row["scene_id"], row["parameters"], row["change"]
+    """Of the complete runs of one scene with the same parameters and history, the newest."""
+    by_id = {row["run_id"]: row for row in runs}
+    newest: dict[tuple[str, str, tuple[str, ...]], Row] = {}
+    for row in by_id.values():
+        key = row["scene_id"], row["parameters"], _history(row, by_id)
         if row["status"] == "complete" and (
             key not in newest or row["finished_at"] > newest[key]["finished_at"]
         ):
             newest[key] = row
     return newest.values()
+
+
+def _history(run: Row, by_id: Mapping[str, Row]) -> tuple[str, ...]:
+    """All that a run was changed by, the last first; then a source that is gone, by its id."""
+    found: list[str] = []
+    row: Row | None = run
+    while row is not None and (source := row["derived_from"]) is not None:
+        found.append(row["change"] or "")
+        row = by_id.get(source)
+        if row is None:
+            found.append(source)
+    return tuple(found)
 
 
 def _of_scene(store: Store, table: str, scene_id: str) -> list[Row]:

@@ -101,6 +101,31 @@ def test_a_run_and_what_it_was_changed_into_are_both_told(tmp_path):
     assert set(kinds) == {"new", "edited", "more", "other"}
 
 
+def test_one_change_of_two_runs_makes_two_others(tmp_path):
+    books = Books(tmp_path / "store")
+    new = books.store.tables.row("runs", "new")
+    ways = {
+        "day": ("new", "edit"),
+        "foggy": ("new", "style"),
+        "foggy-edited": ("foggy", "edit"),
+        "of-one-gone": ("gone", "edit"),
+        "day-again": ("old", "edit"),  # of a run that `new` stands for
+    }
+    rows = [
+        {
+            **new,
+            "run_id": run_id,
+            "derived_from": source,
+            "change": f'{{"kind":"{kind}"}}',
+            "finished_at": new["finished_at"] + timedelta(hours=hours),
+        }
+        for hours, (run_id, (source, kind)) in enumerate(ways.items())
+    ]
+    books.store.tables.merge("runs", rows)
+    kinds = books.stale(**{"library.loss": "l2"})[1]
+    assert set(kinds) == {"new", "more", "other", *ways} - {"day"}
+
+
 def test_what_is_prepared_redoes_all_and_a_judge_only_itself(books):
     assert set(map(frozenset, books.stale(**{"tasks.prepare": "p2"})[1].values())) == {
         frozenset({"prepare", "fit", "judge"})
