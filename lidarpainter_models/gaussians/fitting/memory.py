@@ -124,17 +124,15 @@ def within_limit(
     if config.memory_bytes is None:
         return config
 
-    def taken(budget: int) -> int:
-        growth = replace(config.densification, budget=budget)
-        at_first = min(config.initialisation.num_gaussians, budget)
-        first = replace(config.initialisation, num_gaussians=at_first)
-        part = replace(config, densification=growth, initialisation=first)
+    def taken(count: int) -> int:
+        part = _with_at_most(count, config)
         return planned_memory(observations, part, sky, start=start, guidance=guidance).of_process
 
-    wanted = config.densification.budget
+    at_first = config.initialisation.num_gaussians if start is None else len(start)
+    wanted = max(config.densification.budget, at_first)
     if taken(wanted) <= config.memory_bytes:
         return config
-    least = max(wanted // LEAST_SHARE, 1 if start is None else len(start))
+    least = max(wanted // LEAST_SHARE, 1 if start is None else at_first)
     room = config.memory_bytes - taken(least)
     if room < 0:
         raise ConfigError(
@@ -142,15 +140,17 @@ def within_limit(
             f"{taken(least) / 1e9:.1f} GB; fewer cameras, frames or pixels "
             "(observation.width_px) take less"
         )
-    each = (taken(wanted) - taken(least)) / (wanted - least)
-    budget = least + int(room / each)
+    each = (taken(wanted) - taken(least)) / (wanted - least)  # equal ones were refused above
+    return _with_at_most(least + int(room / each), config)
+
+
+def _with_at_most(count: int, config: FitConfig) -> FitConfig:
+    """The config with at most so many Gaussians, at first and later."""
+    growth, first = config.densification, config.initialisation
     return replace(
         config,
-        densification=replace(config.densification, budget=budget),
-        initialisation=replace(
-            config.initialisation,
-            num_gaussians=min(config.initialisation.num_gaussians, budget),
-        ),
+        densification=replace(growth, budget=min(growth.budget, count)),
+        initialisation=replace(first, num_gaussians=min(first.num_gaussians, count)),
     )
 
 

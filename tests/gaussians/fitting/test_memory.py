@@ -43,6 +43,29 @@ def test_less_memory_gives_fewer_gaussians_that_fit_into_it(world, share):
     assert planned(world, config) <= allowed
 
 
+def test_a_start_above_the_budget_is_planned_too(world):
+    many = replace(CONFIG, initialisation=InitialisationConfig(num_gaussians=160_000))
+    allowed = (planned(world, CONFIG) + planned(world, many)) // 2
+    layout = world.scene.sky.layout
+    config = within_limit(world.observations, replace(many, memory_bytes=allowed), layout)
+    assert config.densification.budget == CONFIG.densification.budget
+    assert 115_000 < config.initialisation.num_gaussians <= 120_000
+    assert planned(world, config) <= allowed
+
+
+def test_a_fit_of_one_gaussian_fits_or_is_refused(world):
+    one = replace(
+        CONFIG,
+        initialisation=InitialisationConfig(num_gaussians=1),
+        densification=DensificationConfig(budget=1),
+    )
+    layout, enough = world.scene.sky.layout, planned(world, one)
+    fits = replace(one, memory_bytes=enough)
+    assert within_limit(world.observations, fits, layout) == fits
+    with pytest.raises(ConfigError, match="takes at least"):
+        within_limit(world.observations, replace(one, memory_bytes=enough - 1), layout)
+
+
 def test_a_limit_that_holds_no_fit_is_refused_with_what_it_takes(world):
     with pytest.raises(ConfigError, match=r"memory 0.1 GB: this fit takes at least 0\.\d GB"):
         limited(world, 100_000_000)
