@@ -5,7 +5,7 @@ and a bounded number of times. A full disk, a bucket or a dispatcher that does n
 interruption are nobody's fault and do not count.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any, Literal
@@ -36,6 +36,8 @@ FINAL: Mapping[Cause, State] = {
     "error": "failed",
     "cancelled": "failed",
 }
+UNKNOWN = "unknown"
+"""Of an attempt of whose end older code entered no cause."""
 CAN_PASS: tuple[Cause, ...] = ("killed", "memory", "timeout", "system")
 MAX_TRIES = 3
 """Attempts that may fail of what can pass, before the sequence counts as failed."""
@@ -113,3 +115,11 @@ def attempt_row(lease: Lease, ending: Ending) -> dict[str, Any]:
         "effort": ending.effort,
         "software_version": ending.software_version,
     }
+
+
+def by_cause(attempts: Iterable[Row]) -> dict[str, list[Row]]:
+    """Attempts by how they ended, in the order of the words for it; `unknown` where none is."""
+    found: dict[str, list[Row]] = {}
+    for row in attempts:
+        found.setdefault(row["cause"] or UNKNOWN, []).append(row)
+    return dict(sorted(found.items()))

@@ -13,6 +13,7 @@ from typing import Any
 import pyarrow.compute as pc
 
 from catalog.artefacts import ArtefactRef, Manifest
+from catalog.attempts import by_cause
 from catalog.errors import CatalogError, IdentityError, UnknownRecordError
 from catalog.explain import SCENE, CodeToday, changed_modules
 from catalog.records import json_of
@@ -91,10 +92,7 @@ def cost_of(store: Store, scene_id: str) -> dict[str, Any]:
     return {
         "scene": scene_id,
         "attempts": _spent(attempts, prices),
-        "by_cause": {
-            cause: _spent([row for row in attempts if row["cause"] == cause], prices)
-            for cause in sorted({row["cause"] for row in attempts})
-        },
+        "by_cause": {cause: _spent(ended, prices) for cause, ended in by_cause(attempts).items()},
         "stages": {kind: _sums(row for row in made if row["kind"] == kind) for kind in kinds},
         "stages_total": _sums(made),
         "runs": len(runs),

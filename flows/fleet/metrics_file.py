@@ -4,13 +4,13 @@
 run` of a name, since attempts are never forgotten.
 """
 
-from collections import Counter
 from pathlib import Path
 
 from prometheus_client import CollectorRegistry, Gauge, write_to_textfile
 from prometheus_client.core import CounterMetricFamily
 from prometheus_client.registry import Collector
 
+from catalog.attempts import by_cause
 from catalog.errors import storage_errors
 from catalog.fleets import FleetLedger
 from catalog.tables import Row
@@ -65,8 +65,8 @@ class _Counted(Collector):
         ended = CounterMetricFamily(
             f"{PREFIX}_attempts", "By how they ended.", labels=["fleet", "cause"]
         )
-        for cause, count in sorted(Counter(row["cause"] for row in self._attempts).items()):
-            ended.add_metric([self._fleet, cause], count)
+        for cause, rows in by_cause(self._attempts).items():
+            ended.add_metric([self._fleet, cause], len(rows))
         found = [ended]
         for column, (name, meaning) in SPENT.items():
             unit = "bytes" if column == "num_bytes" else "seconds"

@@ -12,6 +12,7 @@ import pyarrow.compute as pc
 
 import lidarpainter_models
 from catalog.artefacts import ArtefactRef
+from catalog.attempts import by_cause
 from catalog.errors import CatalogError
 from catalog.fleets import FleetLedger
 from catalog.tables import Row
@@ -214,10 +215,8 @@ def _failures(record: FleetRecord) -> list[Table]:
 
 def _causes(record: FleetRecord) -> Table:
     """Attempts by how they ended."""
-    causes = sorted({row["cause"] for row in record.attempts})
     cells: list[list[Cell]] = []
-    for cause in causes:
-        rows = [row for row in record.attempts if row["cause"] == cause]
+    for cause, rows in by_cause(record.attempts).items():
         hours, price = _sum(rows, "seconds") / HOUR_S, record.money_per_hour
         cells.append(
             [

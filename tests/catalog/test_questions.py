@@ -180,6 +180,8 @@ def test_what_a_scene_has_cost(books):
         {**attempt, "attempt_id": "2", "cause": "done", "seconds": 3600.0, "num_bytes": None},
         {**attempt, "attempt_id": "3", "cause": "done", "seconds": 60.0, "fleet": "unpriced"},
         {**attempt, "attempt_id": "4", "scene_id": "toy/c", "cause": "done", "seconds": 9.0},
+        {**attempt, "attempt_id": "5", "scene_id": "toy/d", "cause": None, "seconds": 7.0},
+        {**attempt, "attempt_id": "6", "scene_id": "toy/d", "cause": "done", "seconds": 9.0},
     ]
     attempts[1]["peak_memory_bytes"] = 10**9
     fleets = {"night": '{"money_per_hour": 0.5}', "unpriced": "{}"}
@@ -198,6 +200,10 @@ def test_what_a_scene_has_cost(books):
     assert found["by_cause"]["killed"]["money"] == 0.25
     assert {kind: one["seconds"] for kind, one in found["stages"].items()} == SECONDS
     assert found["stages_total"]["cpu_seconds"] == 30.0
+    spent = {
+        name: one["seconds"] for name, one in cost_of(books.store, "toy/d")["by_cause"].items()
+    }
+    assert spent == {"done": 9.0, "unknown": 7.0}
     shared = cost_of(books.store, "toy/a")
     assert shared["runs"] == 3
     assert shared["stages"]["prepare"]["seconds"] == 1.0  # three runs share it

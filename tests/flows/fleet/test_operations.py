@@ -8,6 +8,7 @@ from commands import call, succeed
 from prometheus_client.parser import text_string_to_metric_families
 from stub_fleet import behave, stub_ledger, stub_worker, write_stub_manifest
 
+from catalog.attempts import Ending
 from catalog.records import MetricRecord, metric_rows
 from catalog.store import open_store
 from flows.fleet.asked import wishes
@@ -129,6 +130,25 @@ def test_the_page_says_what_happened_and_stands_alone(worked, tmp_path):
     assert sum(row[-1] for row in causes.values()) == pytest.approx(spent_s)  # one a second
     assert {plot.title for plot in report.plots} == {"Throughput", "Cost", "Quality"}
     assert "Worst views" not in render_report(report)
+
+
+def test_an_attempt_that_older_code_left_without_a_cause_is_told_as_unknown(tmp_path):
+    store = open_store(tmp_path / "store")
+    store.make()
+    path = write_stub_manifest(tmp_path)
+    ledger = stub_ledger(store.root)
+    ledger.ask(wishes(read_manifest(path), path.parent))
+    (row,) = [row for row in ledger.rows("stub") if row["scene_id"] == STREETS[0]]
+    ledger.end(ledger.take(row, {}), Ending(cause="error", seconds=2.0))
+    (attempt,) = store.tables.rows("attempts")
+    store.tables.merge("attempts", [{**attempt, "attempt_id": "older", "cause": None}])
+    metrics = tmp_path / "stub.prom"
+    succeed("fleet", "status", "stub", "--metrics", metrics, store=store)
+    assert 'cause="unknown"' in metrics.read_text("utf-8")
+    succeed("fleet", "report", "stub", "--out", tmp_path / "stub.html", store=store)
+    tables = {table.title: table.rows for table in fleet_page(ledger, "stub").tables}
+    causes = {row[0]: row[1] for row in tables["Attempts and what they cost"]}
+    assert causes == {"error": 1, "unknown": 1}
 
 
 def test_a_fleet_that_nobody_has_begun_has_a_page_and_an_unknown_one_has_none(tmp_path):
