@@ -1,5 +1,6 @@
 """A finished run in a browser: the panel moves what it says, and the page holds the drive."""
 
+import socket
 import threading
 from contextlib import contextmanager
 from dataclasses import replace
@@ -240,24 +241,43 @@ def test_port_that_is_taken_is_refused(server):
         pass
 
 
-def connects(server, origin):
-    address = f"ws://127.0.0.1:{server.get_port()}"
+def connects(server, host, origin):
+    """Whether a page of an origin may connect to the server by the name of a host."""
     protocol = Subprotocol(f"viser-v{viser.__version__}")
+    there = socket.create_connection(("127.0.0.1", server.get_port()))
     try:
-        with connect(address, origin=origin, subprotocols=[protocol]) as connection:
+        with connect(
+            f"ws://{host}", sock=there, origin=origin, subprotocols=[protocol]
+        ) as connection:
             return bool(connection.recv(timeout=10))
     except InvalidStatus:
         return False
 
 
-def test_only_the_servers_own_page_and_programs_may_connect(server):
-    port = server.get_port()
-    assert connects(server, f"http://127.0.0.1:{port}")
-    assert connects(server, f"http://localhost:{port}")
-    assert connects(server, None)
-    assert not connects(server, "https://elsewhere.example")
-    assert not connects(server, f"http://127.0.0.1:{port + 1}")
-    assert not connects(server, "null")
+@pytest.mark.parametrize("name", ["127.0.0.1", "localhost", "[::1]"])
+@pytest.mark.parametrize("port", ["", ":9000"])
+def test_the_servers_own_page_may_connect_by_whatever_port_is_forwarded(server, name, port):
+    assert connects(server, f"{name}{port}", f"http://{name}{port}")
+
+
+def test_a_program_may_connect(server):
+    assert connects(server, f"127.0.0.1:{server.get_port()}", None)
+
+
+@pytest.mark.parametrize(
+    ("host", "origin"),
+    [
+        ("127.0.0.1:8080", "https://elsewhere.example"),
+        ("127.0.0.1:8080", "http://127.0.0.1:8081"),
+        ("127.0.0.1:8080", "http://localhost:8080"),
+        ("127.0.0.1:8080", "https://127.0.0.1:8080"),
+        ("127.0.0.1:8080", "null"),
+        ("elsewhere.example:8080", "http://elsewhere.example:8080"),  # a name that leads here
+        ("localhost.elsewhere.example", "http://localhost.elsewhere.example"),
+    ],
+)
+def test_other_pages_may_not_connect(server, host, origin):
+    assert not connects(server, host, origin)
 
 
 def test_viser_that_would_let_other_pages_in_is_refused(monkeypatch):
