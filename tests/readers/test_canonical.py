@@ -8,6 +8,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from parquet_footers import understate
 
 from lidarpainter_models.errors import DataError, LidarPainterError
 from lidarpainter_models.readers import ingest_scene, list_sequences
@@ -248,6 +249,17 @@ def test_text_that_all_rows_repeat_is_refused_before_it_is_unpacked(foreign, tmp
 def test_table_that_states_more_than_it_may_unpack_to_is_refused(foreign, tmp_path, monkeypatch):
     monkeypatch.setattr(checks, "MAX_TABLE_BYTES", 100)
     assert "expected 100 at most" in refusal(foreign, tmp_path)
+
+
+def test_table_that_unpacks_to_more_than_it_states_is_refused(foreign, tmp_path, monkeypatch):
+    monkeypatch.setattr(checks, "MAX_TABLE_BYTES", 1 << 20)
+    file = foreign / "boxes.parquet"
+    row = {**pq.read_table(file).to_pylist()[0], "category": "x" * (4 << 20)}
+    table = pa.Table.from_pylist([row], schema=schema.arrow_schema("boxes"))
+    pq.write_table(table, file, compression="zstd")
+    understate(file)
+    edit_manifest(foreign, lambda m: m["files"].update({file.name: file.stat().st_size}))
+    assert "bytes, expected 1048576 at most" in refusal(foreign, tmp_path)
 
 
 def test_column_of_another_type_is_refused(foreign, tmp_path):

@@ -16,6 +16,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from lidarpainter_models.errors import DataError
+from lidarpainter_models.readers.source_logs.parquet_pages import unpacked_bytes
 from lidarpainter_models.scenes import schema
 from lidarpainter_models.scenes.validation import require_classes, require_name, shown
 
@@ -150,7 +151,7 @@ def _stated_rows(name: str, entry: dict[str, Any], where: str) -> int:
 
 
 def _require_table(file: Path) -> None:
-    """Types, rows and values as stated by the footer before anything is unpacked, then the rest."""
+    """Types, rows and sizes as footer and pages say before any is unpacked, then the rest."""
     name = file.stem
     try:
         _require_footer(pq.read_metadata(file), file)
@@ -180,7 +181,7 @@ def _require_footer(footer: pq.FileMetaData, file: Path) -> None:
         counts = [group.column(index).num_values for group in groups]
         if any(count < 0 for count in counts) or sum(counts) > footer.num_rows * MAX_LIST_LENGTH:
             raise DataError(f"{file}: a column has more values than {MAX_LIST_LENGTH} a row")
-    num_bytes = sum(group.total_byte_size for group in groups)
+    num_bytes = sum(unpacked_bytes(file, footer))
     if num_bytes > MAX_TABLE_BYTES:
         raise DataError(f"{file}: unpacks to {num_bytes} bytes, expected {MAX_TABLE_BYTES} at most")
 

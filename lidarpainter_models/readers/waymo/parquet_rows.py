@@ -1,7 +1,7 @@
 """Rows of Parquet files as downloaded: small tables whole, large ones streamed frame by frame.
 
 Every column that is asked for must be there and every value is checked when it is taken, with the
-file, row and column in the error. Nothing is read before the footer has said how much it is.
+file, row and column in the error. Nothing is unpacked before the pages have said how much it is.
 """
 
 import hashlib
@@ -16,6 +16,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from lidarpainter_models.errors import DataError
+from lidarpainter_models.readers.source_logs.parquet_pages import unpacked_bytes
 
 MAX_SMALL_ROWS = 200_000
 MAX_ROWS = 1_000_000
@@ -26,7 +27,6 @@ MAX_ROWS_PER_FRAME = 64
 """No component that is streamed has more than eight sensors."""
 MAX_TEXT_BYTES = 256
 """Of one text; the name of a segment has 50."""
-_VALUE_BYTES = 8
 _BATCH_ROWS = 2
 _BUFFER_BYTES = 1 << 20
 """Read from a column at a time, so that a row group is never in memory whole."""
@@ -139,10 +139,7 @@ class ParquetRows:
                 raise DataError(
                     f"{self.path}: column {name} is {self._types[name]}, expected numbers or texts"
                 )
-        metadata = self._file.metadata
-        num_bytes = sum(
-            _unpacked_bytes(metadata.row_group(group)) for group in range(metadata.num_row_groups)
-        )
+        num_bytes = sum(self._unpacked_bytes())
         if self.num_rows > MAX_SMALL_ROWS or num_bytes > MAX_SMALL_BYTES:
             raise DataError(
                 f"{self.path}: {self.num_rows} rows of {num_bytes} bytes, expected at most "
@@ -161,12 +158,11 @@ class ParquetRows:
         metadata = self._file.metadata
         if self.num_rows > MAX_ROWS:
             raise DataError(f"{self.path}: {self.num_rows} rows, expected {MAX_ROWS} at most")
-        for number in range(metadata.num_row_groups):
-            group = metadata.row_group(number)
-            num_bytes = _unpacked_bytes(group)
-            if num_bytes > MAX_ROW_BYTES * max(group.num_rows, 1):
+        for number, num_bytes in enumerate(self._unpacked_bytes()):
+            num_rows = metadata.row_group(number).num_rows
+            if num_bytes > MAX_ROW_BYTES * max(num_rows, 1):
                 raise DataError(
-                    f"{self.path}, row group {number}: {group.num_rows} rows of "
+                    f"{self.path}, row group {number}: {num_rows} rows of "
                     f"{num_bytes} bytes, expected {MAX_ROW_BYTES} a row at most"
                 )
         yield from self._rows(batch_rows=_BATCH_ROWS)
@@ -178,6 +174,12 @@ class ParquetRows:
     def provenance(self) -> dict[str, object]:
         """How much there is, and one digest over what was used."""
         return {"num_rows": self.num_rows, "sha256": self._digest.hexdigest()}
+
+    def _unpacked_bytes(self) -> list[int]:
+        try:
+            return unpacked_bytes(self.path, self._file.metadata)
+        except (OSError, ValueError) as error:
+            raise self._damaged(error) from None
 
     def _rows(self, *, batch_rows: int) -> Iterator[ParquetRow]:
         number = 0
@@ -245,15 +247,9 @@ def _is_list(kind: pa.DataType) -> bool:
 
 
 def _is_small(kind: pa.DataType) -> bool:
-    """Whether values take no more than the footer says: numbers, lists of them, and texts."""
+    """Whether values take no more than pages say: numbers, lists of them, and texts."""
     number = kind.value_type if _is_list(kind) else kind
     return bool(_is_text(kind) or pa.types.is_primitive(number) or pa.types.is_null(number))
-
-
-def _unpacked_bytes(group: pq.RowGroupMetaData) -> int:
-    """What a row group takes in memory; a number that is repeated takes next to none in a file."""
-    num_values = sum(group.column(index).num_values for index in range(group.num_columns))
-    return int(max(group.total_byte_size, _VALUE_BYTES * num_values))
 
 
 def _require_short(column: pa.DictionaryArray, name: str) -> None:

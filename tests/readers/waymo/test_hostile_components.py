@@ -6,6 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from parquet_footers import understate
 from waymo_edits import (
     refused_line,
     with_value,
@@ -99,7 +100,7 @@ REPEATED = {
     "text": (pa.string(), "x" * 10_000, "a text of 10000 bytes, expected 256 at most"),
     "long text": (pa.large_string(), "x" * 10_000, "a text of 10000 bytes, expected 256 at most"),
     "file": (pa.binary(), b"x" * 10_000, "column x is binary, expected numbers or texts"),
-    "numbers": (pa.list_(pa.float64()), [0.0] * 1000, "1000 rows of 8000000 bytes, expected at"),
+    "numbers": (pa.list_(pa.float64()), [0.0] * 1000, "1000 rows of 8000008 bytes, expected at"),
 }
 
 
@@ -118,6 +119,26 @@ def test_value_that_all_rows_repeat_is_refused_before_it_is_unpacked(tmp_path, m
     finally:
         pa.set_memory_pool(usual)
     assert pool.max_memory() < 2 << 20
+
+
+@pytest.mark.parametrize("read", [ParquetRows.small_table, lambda rows: list(rows.stream())])
+def test_page_of_more_than_the_footer_says_is_refused_before_it_is_unpacked(
+    tmp_path, monkeypatch, read
+):
+    monkeypatch.setattr(parquet_rows, "MAX_SMALL_BYTES", 1 << 20)
+    monkeypatch.setattr(parquet_rows, "MAX_ROW_BYTES", 1 << 20)
+    path = tmp_path / "x.parquet"
+    pq.write_table(pa.table({"x": ["x" * (4 << 20)]}), path, compression="zstd")
+    understate(path)
+    assert path.stat().st_size < 10_000
+    pool, usual = pa.proxy_memory_pool(pa.default_memory_pool()), pa.default_memory_pool()
+    pa.set_memory_pool(pool)
+    try:
+        with pytest.raises(DataError, match=r"rows of \d{7} bytes, expected"):
+            read(ParquetRows(path, ("x",)))
+    finally:
+        pa.set_memory_pool(usual)
+    assert pool.max_memory() < 1 << 20
 
 
 def test_frame_that_stands_twice(components, tmp_path):
