@@ -5,7 +5,7 @@ file, row and column in the error. Nothing is unpacked before the pages have sai
 """
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -134,11 +134,7 @@ class ParquetRows:
             DataError: there are more than a small table has, files among them, or they cannot be
                 read.
         """
-        for name in self._columns:
-            if not _is_small(self._types[name]):
-                raise DataError(
-                    f"{self.path}: column {name} is {self._types[name]}, expected numbers or texts"
-                )
+        self._require_kinds(_is_small, "numbers or texts")
         num_bytes = sum(self._unpacked_bytes())
         if self.num_rows > MAX_SMALL_ROWS or num_bytes > MAX_SMALL_BYTES:
             raise DataError(
@@ -153,8 +149,12 @@ class ParquetRows:
         """Row by row; no more than a few are in memory.
 
         Raises:
-            DataError: the file states too many or too large rows, or they cannot be read.
+            DataError: the file states too many or too large rows, lists of files among them, or
+                they cannot be read.
         """
+        self._require_kinds(
+            lambda kind: _is_small(kind) or pa.types.is_binary(kind), "numbers, texts or files"
+        )
         metadata = self._file.metadata
         if self.num_rows > MAX_ROWS:
             raise DataError(f"{self.path}: {self.num_rows} rows, expected {MAX_ROWS} at most")
@@ -174,6 +174,12 @@ class ParquetRows:
     def provenance(self) -> dict[str, object]:
         """How much there is, and one digest over what was used."""
         return {"num_rows": self.num_rows, "sha256": self._digest.hexdigest()}
+
+    def _require_kinds(self, is_known: Callable[[pa.DataType], bool], expected: str) -> None:
+        for name in self._columns:
+            kind = self._types[name]
+            if not is_known(kind):
+                raise DataError(f"{self.path}: column {name} is {kind}, expected {expected}")
 
     def _unpacked_bytes(self) -> list[int]:
         try:

@@ -121,6 +121,15 @@ def test_value_that_all_rows_repeat_is_refused_before_it_is_unpacked(tmp_path, m
     assert pool.max_memory() < 2 << 20
 
 
+def test_list_of_one_file_again_and_again_is_refused_before_it_is_unpacked(tmp_path):
+    path = tmp_path / "x.parquet"
+    kind = pa.list_(pa.binary())
+    pq.write_table(pa.table({"x": pa.array([[bytes(1 << 20)] * 100], kind)}), path)
+    assert path.stat().st_size < 100_000
+    with pytest.raises(DataError, match=r"column x is list<.*>, expected numbers, texts or files"):
+        list(ParquetRows(path, ("x",)).stream())
+
+
 @pytest.mark.parametrize("read", [ParquetRows.small_table, lambda rows: list(rows.stream())])
 def test_page_of_more_than_the_footer_says_is_refused_before_it_is_unpacked(
     tmp_path, monkeypatch, read
