@@ -102,7 +102,7 @@ def _is_own_page(headers: Headers) -> bool:
     """
     origins, hosts = headers.get_all("Origin"), headers.get_all("Host")
     is_here = all(THIS_MACHINE.fullmatch(host) for host in hosts)
-    return not origins or (is_here and origins == [f"http://{host}" for host in hosts])
+    return is_here and origins in ([], [f"http://{host}" for host in hosts])
 
 
 @contextmanager
