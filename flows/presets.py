@@ -17,8 +17,8 @@ from lidarpainter_models.gaussians.fitting.config import (
 )
 from lidarpainter_models.observations.settings import ObservationConfig
 
-SHORT_REFINE_LOOKS = 250.0
-"""A round of the CPU preset: on one front camera fourteen looks at each of 35 painted views."""
+SHORT_REFINE_LOOKS = 150.0
+"""A round of the CPU preset: on one front camera eight looks at each of 35 painted views."""
 
 
 def preview(scene: str) -> ReconstructParameters:
@@ -40,7 +40,7 @@ def preview(scene: str) -> ReconstructParameters:
 
 def brief(scene: str) -> ReconstructParameters:
     """Half the steps of `preview` and two thirds of its Gaussians: what the demo shows."""
-    fit = FitConfig(effort=EffortConfig(looks=375.0, gaussians_per_pixel=0.2))
+    fit = FitConfig(effort=EffortConfig(looks=225.0, gaussians_per_pixel=0.2))
     refine = continuation(fit, looks=SHORT_REFINE_LOOKS / 2, guidance=GuidanceConfig())
     return preview(scene).model_copy(update={"preset": "brief", "fit": fit, "refine": refine})
 
@@ -51,7 +51,7 @@ def balanced(scene: str) -> ReconstructParameters:
     Fewer Gaussians for each pixel, half of the steps at half the size, and one painted round of
     fewer views.
     """
-    effort = EffortConfig(looks=700.0, gaussians_per_pixel=0.125)
+    effort = EffortConfig(looks=450.0, gaussians_per_pixel=0.125)
     fit = FitConfig(effort=effort, half_resolution=0.5)
     changes = {
         "preset": "balanced",
@@ -59,7 +59,7 @@ def balanced(scene: str) -> ReconstructParameters:
         "fit": fit,
         "novel": NovelGuidanceConfig(every_nth=4),
         "rounds": 1,
-        "refine": continuation(fit, looks=100.0, guidance=GuidanceConfig()),
+        "refine": continuation(fit, looks=75.0, guidance=GuidanceConfig()),
     }
     return preview(scene).model_copy(update=changes)
 

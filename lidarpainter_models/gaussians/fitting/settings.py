@@ -63,11 +63,12 @@ class LearningRates:
 
     means: tuple[float, float] = (0.03, 0.002)
     """In standard deviations of the Gaussian (mean of its two longer axes)."""
-    rotation_wxyz: tuple[float, float] = (2e-3, 4e-4)
+    rotation_wxyz: tuple[float, float] = (8e-3, 1.6e-3)
     """Quaternion units."""
-    log_scale: tuple[float, float] = (1e-2, 2e-3)
-    """Logarithm of metres."""
-    opacity_logit: tuple[float, float] = (3e-2, 1e-2)
+    log_scale: tuple[float, float] = (4e-2, 8e-3)
+    """Logarithm of metres. Shapes are what a fit waits for: at a quarter of these rates it takes
+    nearly twice the steps (docs/benchmarks.md)."""
+    opacity_logit: tuple[float, float] = (6e-2, 2e-2)
     """Logits."""
     sh_dc: tuple[float, float] = (6e-3, 1e-3)
     """Harmonics; a colour changes by 0.28 of it."""
