@@ -273,6 +273,7 @@ def test_a_program_may_connect(server):
         ("127.0.0.1:8080", "https://127.0.0.1:8080"),
         ("127.0.0.1:8080", "null"),
         ("elsewhere.example:8080", "http://elsewhere.example:8080"),  # a name that leads here
+        ("elsewhere.example:8080", None),
         ("localhost.elsewhere.example", "http://localhost.elsewhere.example"),
     ],
 )

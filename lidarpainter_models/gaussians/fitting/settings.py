@@ -84,8 +84,8 @@ class LearningRates:
     """Boxes are drawn by hand: a decimetre off is common."""
     bending_m: tuple[float, float] = (1e-2, 1e-3)
     """Of the lattice of somebody who walks."""
-    exposure: tuple[float, float] = (2e-3, 2e-4)
-    """Entries of a camera's colour matrix."""
+    exposure: tuple[float, float] = (6e-3, 6e-4)
+    """Entries of a camera's colour matrix; cameras are exposed up to a third apart."""
 
     def at(self, name: str, fraction: float) -> float:
         """The rate of one kind after a fraction of the fit."""
