@@ -74,9 +74,9 @@ class LearningRates:
     """Harmonics; a colour changes by 0.28 of it."""
     sh_rest: tuple[float, float] = (6e-4, 2e-4)
     """Harmonics of degree 1 and more."""
-    camera_rotation_rad: tuple[float, float] = (3e-4, 3e-5)
+    camera_rotation_rad: tuple[float, float] = (6e-4, 6e-5)
     """A pixel of a 480-pixel image is about 2e-3 rad."""
-    camera_translation_m: tuple[float, float] = (3e-3, 3e-4)
+    camera_translation_m: tuple[float, float] = (6e-3, 6e-4)
     """Recorded positions are good to centimetres."""
     actor_rotation_rad: tuple[float, float] = (2e-3, 2e-4)
     """Boxes are drawn by hand: a degree off is common."""
@@ -85,7 +85,7 @@ class LearningRates:
     bending_m: tuple[float, float] = (1e-2, 1e-3)
     """Of the lattice of somebody who walks."""
     exposure: tuple[float, float] = (6e-3, 6e-4)
-    """Entries of a camera's colour matrix; cameras are exposed up to a third apart."""
+    """Entries of a camera's colour matrix."""
 
     def at(self, name: str, fraction: float) -> float:
         """The rate of one kind after a fraction of the fit."""
