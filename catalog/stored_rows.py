@@ -1,4 +1,8 @@
-"""Read rows out of the Parquet files of a table, and of few files if few rows are wanted."""
+"""Read rows out of the Parquet files of a table, and of few files if few rows are wanted.
+
+Files are read on the caller's thread alone. Arrow's own threads hold files that Delta Lake opens in
+Python; one that lets go of such a file as the interpreter ends aborts the process.
+"""
 
 from collections.abc import Collection, Mapping
 from functools import reduce
@@ -6,6 +10,7 @@ from functools import reduce
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
+import pyarrow.parquet as pq
 
 
 def read_rows(
@@ -16,35 +21,40 @@ def read_rows(
     `where` takes rows with one of some values in any of these columns, None all. Of each file only
     these columns are read, and of those with such a row the wanted ones.
     """
-    names = [name for name in wanted.names if name in there.schema.names]
-    # pyarrow's threads may outlive the read and abort the interpreter as it ends
-    if where is None:
-        stored = there.to_table(columns=names, use_threads=False)
-    else:
-        stored = _matching(there, names, where)
+    asked = {name: values for name, values in (where or {}).items() if name in there.schema.names}
+    if where is not None and not any(asked.values()):
+        return wanted.empty_table()
+    keys = pa.schema([there.schema.field(name) for name in asked])
+    found = [wanted.empty_table()]
+    for fragment in there.get_fragments():
+        with fragment.open() as file, pq.ParquetFile(file, pre_buffer=False) as parquet:
+            if where is None:
+                found.append(_read(parquet, wanted))
+            # compared here, as Arrow cannot compare the statistics of Delta's texts
+            elif pc.any(mask := _has_one_of(_read(parquet, keys), asked)).as_py():
+                found.append(_read(parquet, wanted).filter(mask))
+    return pa.concat_tables(found)
+
+
+def _read(parquet: pq.ParquetFile, wanted: pa.Schema) -> pa.Table:
+    """A file in the columns of a schema; null where the file is older than a column."""
+    names = [name for name in wanted.names if name in parquet.schema_arrow.names]
+    read = parquet.read(names, use_threads=False)
     columns = [
-        stored[field.name].cast(field.type)
+        read[field.name].cast(field.type)
         if field.name in names
-        else pa.nulls(stored.num_rows, field.type)
+        else pa.nulls(parquet.metadata.num_rows, field.type)
         for field in wanted
     ]
     return pa.table(columns, schema=wanted)
 
 
-def _matching(
-    there: ds.Dataset, names: list[str], where: Mapping[str, Collection[str]]
-) -> pa.Table:
-    found = [there.schema.empty_table().select(names)]
-    asked = {name: values for name, values in where.items() if name in there.schema.names}
-    for fragment in there.get_fragments() if any(asked.values()) else ():
-        # without a filter of Arrow's, which cannot compare the statistics of Delta's texts
-        keys = fragment.to_table(there.schema, list(asked), use_threads=False)
-        hits = (
+def _has_one_of(keys: pa.Table, asked: Mapping[str, Collection[str]]) -> pa.Array:
+    """Which rows have one of some values in any of these columns."""
+    return reduce(
+        pc.or_,
+        (
             pc.is_in(keys[name], value_set=pa.array(values, keys[name].type))
             for name, values in asked.items()
-        )
-        mask = reduce(pc.or_, hits)
-        if pc.any(mask).as_py():
-            rows = fragment.to_table(there.schema, names, use_threads=False)
-            found.append(rows.filter(mask))
-    return pa.concat_tables(found)
+        ),
+    )
