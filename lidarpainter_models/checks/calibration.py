@@ -20,7 +20,7 @@ import numpy as np
 from lidarpainter_models.checks.depth_edges import (
     EdgeImage,
     SceneEdges,
-    edge_score,
+    edge_scores,
     reduced,
 )
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -112,7 +112,8 @@ def best_turn(images: Sequence[EdgeImage]) -> CameraTurn | None:
     num_points = sum(len(points) for image in images for points, _ in image.points.values())
     if num_points < MIN_EDGE_POINTS:
         return None
-    plane = np.array([[edge_score(images, (p, yaw, 0)) for yaw in _TURNS_DEG] for p in _TURNS_DEG])
+    turns_deg = np.stack(np.meshgrid(_TURNS_DEG, _TURNS_DEG, 0.0, indexing="ij"), axis=-1)
+    plane = edge_scores(images, turns_deg.reshape(-1, 3)).reshape(turns_deg.shape[:2])
     row, column = np.unravel_index(plane.argmax(), plane.shape)
     yaw_deg, pitch_deg = _TURNS_DEG[column], _TURNS_DEG[row]
     line = max(_roll_scores(images, pitch_deg, yaw_deg), _roll_scores(images, 0, 0), key=max)
@@ -146,7 +147,7 @@ def _why_untold(scene: DrivingScene, camera_name: str) -> str:
 
 
 def _roll_scores(images: Sequence[EdgeImage], pitch_deg: float, yaw_deg: float) -> np.ndarray:
-    return np.array([edge_score(images, (pitch_deg, yaw_deg, roll)) for roll in _ROLLS_DEG])
+    return edge_scores(images, np.array([(pitch_deg, yaw_deg, roll) for roll in _ROLLS_DEG]))
 
 
 def _peak(scores: np.ndarray, is_apart: np.ndarray) -> float:

@@ -17,9 +17,11 @@ from functools import cached_property
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.transforms import rotation_from_vector
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import Sweep
 
@@ -215,24 +217,26 @@ def _in_camera(
     return kinds
 
 
-def edge_score(
-    images: Sequence[EdgeImage], turn_deg: tuple[float, float, float] = (0, 0, 0)
-) -> float:
-    """Weighted mean edge strength at the points of all images, with the camera turned.
+def edge_scores(
+    images: Sequence[EdgeImage], turns_deg: Float[np.ndarray, "turns 3"]
+) -> Float[np.ndarray, " turns"]:
+    """Weighted mean edge strength at the points of all images, for each way to turn the camera.
 
-    The turn is a rotation vector: pitch, yaw, roll.
+    A turn is a rotation vector: pitch, yaw, roll.
     """
-    rotation = cv2.Rodrigues(np.radians(np.array(turn_deg, dtype=np.float64)))[0]
-    total = weights = 0.0
+    rotations = rotation_from_vector(torch.from_numpy(np.radians(turns_deg)).float())
+    total = torch.zeros(len(rotations), dtype=torch.float64)
+    weights = torch.zeros_like(total)
     for image in images:
         camera = image.camera
         for kind, (xyz_m, weight) in image.points.items():
-            x, y, z = rotation @ xyz_m.T
-            z = np.maximum(z, 0.1)
-            u = np.floor(camera.fx_px * x / z + camera.cx_px)
-            v = np.floor(camera.fy_px * y / z + camera.cy_px)
+            x, y, z = (rotations @ torch.from_numpy(xyz_m.T).float()).unbind(dim=1)
+            by_z = 1 / z.clamp(min=0.1)
+            u = (camera.fx_px * x * by_z + camera.cx_px).floor()
+            v = (camera.fy_px * y * by_z + camera.cy_px).floor()
             seen = (u >= 0) & (u < camera.width_px) & (v >= 0) & (v < camera.height_px)
-            strength = image.strengths[kind][v[seen].astype(int), u[seen].astype(int)]
-            total += float(strength @ weight[seen])
-            weights += float(weight[seen].sum())
-    return total / max(weights, 1e-9)
+            place = torch.where(seen, v * camera.width_px + u, 0).long()
+            counted = torch.where(seen, torch.from_numpy(weight).float(), 0)
+            total += (torch.from_numpy(image.strengths[kind]).take(place) * counted).sum(dim=1)
+            weights += counted.sum(dim=1)
+    return (total / weights.clamp(min=1e-9)).numpy()

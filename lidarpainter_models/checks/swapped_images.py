@@ -9,10 +9,12 @@ from dataclasses import replace
 from itertools import combinations
 from typing import Literal
 
+import numpy as np
+
 from lidarpainter_models.checks.depth_edges import (
     EdgeImage,
     SceneEdges,
-    edge_score,
+    edge_scores,
 )
 
 Verdict = Literal["ok", "warn", "fail"]
@@ -53,7 +55,8 @@ def _lead(own: Sequence[EdgeImage], other: Sequence[EdgeImage]) -> float:
     theirs = {image.frame_index: image.strengths for image in other}
     both = [image for image in own if image.frame_index in theirs]
     lent = [replace(image, strengths=theirs[image.frame_index]) for image in both]
-    return edge_score(both) - edge_score(lent)
+    (own_score,), (lent_score,) = (edge_scores(images, np.zeros((1, 3))) for images in (both, lent))
+    return float(own_score - lent_score)
 
 
 def _size(images: Sequence[EdgeImage]) -> tuple[int, ...] | None:
