@@ -12,7 +12,9 @@ from lidarpainter_models.gaussians.fitting.config import (
 from lidarpainter_models.gaussians.fitting.seen_surface import START_SHARE, SeenSurface, planned_fit
 from lidarpainter_models.gaussians.fitting.settings import DensificationConfig
 
-SURFACE = SeenSurface(num_pixels=200_000.0, whole_views=2.5, groups=((0,), (1,)))
+SURFACE = SeenSurface(
+    num_pixels=300_000.0, num_detailed=200_000.0, whole_views=2.5, groups=((0,), (1,))
+)
 CONFIG = FitConfig(effort=EffortConfig(looks=100, gaussians_per_pixel=0.5))
 
 
@@ -21,7 +23,7 @@ def test_numbers_left_open_follow_what_is_seen():
     assert planned.steps == 250
     assert planned.densification.budget == 100_000
     assert planned.initialisation.num_gaussians == round(START_SHARE * 100_000)
-    longer = replace(SURFACE, num_pixels=800_000.0, whole_views=10.0)
+    longer = replace(SURFACE, num_detailed=800_000.0, whole_views=10.0)
     assert planned_fit(CONFIG, longer).steps == 1000
     assert planned_fit(CONFIG, longer).densification.budget == 400_000
 
@@ -35,7 +37,7 @@ def test_numbers_that_are_set_stay():
 
 
 def test_views_of_nothing_but_sky_still_make_a_plan():
-    nothing = SeenSurface(num_pixels=0.0, whole_views=0.0, groups=((0,),))
+    nothing = SeenSurface(num_pixels=0.0, num_detailed=0.0, whole_views=0.0, groups=((0,),))
     planned = planned_fit(CONFIG, nothing)
     assert (planned.steps, planned.densification.budget) == (1, 1)
 

@@ -4,7 +4,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lidarpainter_models.gaussians.fitting.seen_surface import seen_surface
+from lidarpainter_models.gaussians.fitting.seen_surface import (
+    LEAST_DETAIL,
+    TYPICAL_CONTRAST,
+    seen_surface,
+)
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.observations.views import TrainingView
 
@@ -116,6 +120,25 @@ def test_a_street_four_times_as_long_has_four_times_the_surface():
     assert 3.0 < long.whole_views / short.whole_views <= 4.2
     denser = seen_surface(street_drive(24, metres_a_frame=0.5))
     assert denser.num_pixels == pytest.approx(short.num_pixels, rel=0.1)
+
+
+def striped(view, contrast):
+    """The view with stripes a pixel wide, of so much standard deviation."""
+    grey = 0.5 + contrast * (1 - 2 * (torch.arange(WIDTH_PX) % 2))
+    rgb_u8 = (255 * grey).round().to(torch.uint8)[None, :, None]
+    return replace(view, rgb_u8=rgb_u8.expand(HEIGHT_PX, WIDTH_PX, 3).contiguous())
+
+
+def test_surface_counts_by_its_contrast():
+    found = {
+        contrast: seen_surface([striped(view_at(0.0), contrast)]).num_detailed / PIXELS
+        for contrast in (0.0, TYPICAL_CONTRAST, 3 * TYPICAL_CONTRAST)
+    }
+    assert list(found.values()) == pytest.approx([LEAST_DETAIL, 1.0, 3.0], rel=0.05)
+    half_sky = torch.zeros(HEIGHT_PX, WIDTH_PX, dtype=torch.bool)
+    half_sky[: HEIGHT_PX // 2] = True
+    below = replace(striped(view_at(0.0), TYPICAL_CONTRAST), sky_mask=half_sky)
+    assert seen_surface([below]).num_detailed / PIXELS == pytest.approx(0.5, rel=0.05)
 
 
 def test_sky_is_no_surface():
