@@ -121,17 +121,17 @@ class MapColouring:
 
     def gains(self) -> Float[np.ndarray, "views 3"]:
         """What brings each view, in their order, to the exposure of the first view's camera."""
+        if not self._view_numbers:
+            return np.ones((1, 3), np.float32)
         cameras = [camera_name for _, camera_name in self._view_numbers]
         order = list(dict.fromkeys(cameras))
         return match_exposure(self._samples, np.array([order.index(name) for name in cameras]))
 
-    def coloured(self) -> LidarMap:
-        """The map with the colours that the images added gave it.
+    def coloured(self, gains: Float[np.ndarray, "views 3"]) -> LidarMap:
+        """The map with the colours that the images added gave it, brought to one exposure.
 
-        Colours have the exposure of the first view's camera. Points that no image showed keep
-        `has_colour` false.
+        `gains` are those that `gains` found. Points that no image showed keep `has_colour` false.
         """
-        gains = self.gains() if self._view_numbers else np.ones((1, 3), np.float32)
         rgb, has_colour = map(torch.from_numpy, combine_samples(self._samples, gains))
         sizes = [len(body.points) for body in self._bodies]
         street, *actors = (

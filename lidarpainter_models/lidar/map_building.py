@@ -59,7 +59,7 @@ def build_lidar_map(
     colouring = MapColouring(points, scene.tracks, colour_views)
     for view in colour_views:
         colouring.add(view, scene.read_image(view))
-    return colouring.coloured()
+    return colouring.coloured(colouring.gains())
 
 
 def gather_points(scene: DrivingScene, split_frames: Collection[int]) -> LidarMap:

@@ -72,10 +72,14 @@ def prepare_observations(
         if view.key in colours:
             colouring.add(view, image, bodies.get(view.camera_name))
         progress(done, len(split.train) + 1)
-    lidar_map = colouring.coloured()
+    gains = colouring.gains()
+    lidar_map = colouring.coloured(gains)
     progress(len(split.train) + 1, len(split.train) + 1)
     return SceneObservations(
-        views=tuple(views),
+        views=tuple(
+            replace(view, exposure_rgb=tuple(exposure))
+            for view, exposure in zip(views, (1 / gains).tolist(), strict=True)
+        ),
         lidar_map=lidar_map,
         tracks=tuple(track for track in scene.tracks if track.is_moving),
         faults=faults,

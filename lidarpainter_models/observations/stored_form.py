@@ -41,6 +41,7 @@ def observations_to_arrays(
         arrays[f"view.{index}.world_from_camera"] = view.camera.world_from_camera.contiguous()
         lens = {name: getattr(view.camera, name) for name in _LENS}
         record = {"key": list(view.key), "timestamp_ns": view.timestamp_ns, "lens": lens}
+        record["exposure_rgb"] = list(view.exposure_rgb)
         shutter = view.camera.shutter
         if shutter is not None:
             arrays[f"view.{index}.twist_per_s"] = shutter.twist_per_s.contiguous()
@@ -120,5 +121,6 @@ def _stored_view(
         ),
         timestamp_ns=record["timestamp_ns"],
         hidden=arrays.get(f"view.{index}.hidden", bodies.get(str(camera_name))),
+        exposure_rgb=tuple(record.get("exposure_rgb", TrainingView.exposure_rgb)),
         **images,
     )

@@ -32,6 +32,8 @@ class TrainingView:
     hidden: Bool[Tensor, "height width"] | None = None
     """Where the image shows what the scene does not hold: the recording car itself, or what an edit
     took away. Nothing takes colours from there; the depths of LiDAR count. None hides nothing."""
+    exposure_rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """What it shows of the map's colours, channel by channel: how its camera was exposed then."""
 
     @property
     def rgb(self) -> Float[Tensor, "height width 3"]:

@@ -7,6 +7,8 @@ from toy_street import ToyStreet
 
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.gaussians.fitting.images import full_image, half_image, shrink_depth
+from lidarpainter_models.gaussians.initialisation.scene import initialise_scene
+from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.kernels.pixel_losses import OPEN, SKY, SOLID
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.lidar.sparse_depth import sparse_lidar_depth
@@ -48,6 +50,24 @@ def test_every_training_image_is_decoded_once():
     points = observations.lidar_map.street
     assert sorted(points.frame_index.unique().tolist()) == [0]  # a car that stands
     assert float(points.has_colour.float().mean()) > 0.9
+
+
+def test_images_know_how_they_show_the_colours_of_the_map():
+    street = ToyStreet(camera_gains=(("front", 1.0), ("side", 0.8)))
+    split = split_views(street, "alternate")
+    observations = prepare_observations(street, split, ObservationConfig(width_px=120))
+    by_camera = {"front": 1.0, "side": 0.8}
+    for view in observations.views:
+        assert view.exposure_rgb == pytest.approx([by_camera[view.key[1]]] * 3, rel=0.02)
+    again = observations_from_arrays(*observations_to_arrays(observations))
+    assert again.views[1].exposure_rgb == observations.views[1].exposure_rgb
+    first = initialise_scene(observations, InitialisationConfig(num_gaussians=500))
+    side = observations.views[1]
+    shown = first.exposure.map_at("side", side.timestamp_ns)
+    assert shown[:, :3].diag().tolist() == pytest.approx([0.8] * 3, rel=0.02)
+    sky = first.sky.sample(first.sky.rays(side.camera))[side.sky_mask]
+    taken = side.rgb[side.sky_mask]
+    assert (0.8 * sky.mean(dim=0)).tolist() == pytest.approx(taken.mean(dim=0).tolist(), rel=0.03)
 
 
 def test_image_is_averaged_by_area():

@@ -102,6 +102,7 @@ def _scene_around(gaussians: GaussianSet, observations: SceneObservations) -> Ga
     timestamps_ns = torch.tensor([view.timestamp_ns for view in views], dtype=torch.int64)
     cameras = [view.camera for view in views]
     frame_times_ns = _frame_times(views)
+    exposure = _first_exposure(views, observations.camera_names)
     return GaussianScene(
         gaussians=gaussians,
         actors=Actors.uncorrected(
@@ -110,7 +111,8 @@ def _scene_around(gaussians: GaussianSet, observations: SceneObservations) -> Ga
         sky=sky_from_images(
             sky_layout(cameras),
             cameras,
-            (view.rgb for view in views),  # one at a time as floats
+            # one at a time as floats
+            (exposure.undone(view.rgb, view.key[1], view.timestamp_ns) for view in views),
             [view.sky_mask for view in views],
         ),
         cameras=CameraCorrections.none(
@@ -120,10 +122,19 @@ def _scene_around(gaussians: GaussianSet, observations: SceneObservations) -> Ga
             observations.faults,
             observations.own_bodies,
         ),
-        exposure=ExposureCorrections.none(
-            observations.camera_names, [view.timestamp_ns for view in views]
-        ),
+        exposure=exposure,
     )
+
+
+def _first_exposure(
+    views: Sequence[TrainingView], camera_names: Sequence[str]
+) -> ExposureCorrections:
+    """How cameras show the map's colours; one camera alone has no other to differ from."""
+    names, times_ns = [view.key[1] for view in views], [view.timestamp_ns for view in views]
+    if len(camera_names) == 1:
+        return ExposureCorrections.none(camera_names, times_ns)
+    shown = torch.tensor([view.exposure_rgb for view in views])
+    return ExposureCorrections.measured(camera_names, names, times_ns, shown)
 
 
 def _bent(

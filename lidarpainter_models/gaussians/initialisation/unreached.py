@@ -14,6 +14,7 @@ from torch import Tensor
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
 from lidarpainter_models.geometry.box_masks import project_boxes
+from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation
 from lidarpainter_models.lidar.ground_heights import GroundHeights
 from lidarpainter_models.observations.plane_sweep import (
@@ -90,7 +91,8 @@ def _seeds_of_view(
     depth_m = choose_depth(cost, depths_m, expected_m, prior=PRIOR)
     grid = torch.zeros_like(is_open)
     grid[stride // 2 :: stride, stride // 2 :: stride] = True
-    return _facing_discs(view, depth_m, is_open & grid, stride, scene.gaussians)
+    rgb = scene.exposure.undone(view.rgb, view.key[1], view.timestamp_ns)
+    return _facing_discs(view.camera, rgb, depth_m, is_open & grid, stride, scene.gaussians)
 
 
 def _above_ground(seeds: GaussianSet, ground: GroundHeights) -> GaussianSet:
@@ -111,23 +113,24 @@ def depth_from_below(
 
 
 def _facing_discs(
-    view: TrainingView,
+    camera: Camera,
+    rgb: Float[Tensor, "height width 3"],
     depth_m: Float[Tensor, "height width"],
     chosen: Bool[Tensor, "height width"],
     stride: int,
     like: GaussianSet,
 ) -> GaussianSet:
     """Discs that face the camera at the chosen pixels."""
-    xyz_m = view.camera.unproject(depth_m)[chosen]
-    sigma_m = 0.6 * stride * depth_m[chosen] / view.camera.fx_px
-    rotation = view.camera.world_from_camera[:3, :3]
+    xyz_m = camera.unproject(depth_m)[chosen]
+    sigma_m = 0.6 * stride * depth_m[chosen] / camera.fx_px
+    rotation = camera.world_from_camera[:3, :3]
     count = xyz_m.shape[0]
     return GaussianSet(
         means=xyz_m,
         rotation_wxyz=quaternion_from_rotation(rotation).float().expand(count, 4).clone(),
         log_scale=torch.stack([sigma_m, sigma_m, 0.3 * sigma_m], dim=1).log(),
         opacity_logit=torch.logit(torch.full((count,), OPACITY)),
-        sh_dc=sh_from_rgb(view.rgb[chosen]),
+        sh_dc=sh_from_rgb(rgb[chosen]),
         sh_rest=torch.zeros(count, like.sh_rest.shape[1], 3),
         body_index=torch.zeros(count, dtype=torch.int32),
     )

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -156,6 +157,34 @@ class ExposureCorrections:
             knots_ns=first_ns + steps,
             log_gain=torch.zeros(len(camera_names), count),
         )
+
+    @classmethod
+    def measured(
+        cls,
+        camera_names: Sequence[str],
+        names: Sequence[str],
+        timestamps_ns: Sequence[int],
+        shown: Float[Tensor, "images 3"],
+    ) -> "ExposureCorrections":
+        """As images show the colours of the scene, by channel; one of every camera at least.
+
+        What a camera's images depart from their median is the gain's, the rest the matrix'.
+        """
+        exposure = cls.none(camera_names, timestamps_ns)
+        for row, name in enumerate(camera_names):
+            own = sorted(
+                (index for index, one in enumerate(names) if one == name),
+                key=lambda index: timestamps_ns[index],
+            )
+            log_shown, times_ns = shown[own].log(), [timestamps_ns[index] for index in own]
+            departure = (log_shown - log_shown.median(dim=0).values).mean(dim=1)
+            gain = np.interp(exposure.knots_ns, times_ns, departure)
+            gain -= gain.mean()
+            exposure.log_gain[row] = torch.from_numpy(gain)
+            at_images = torch.from_numpy(np.interp(times_ns, exposure.knots_ns, gain)).float()
+            rest = log_shown - at_images[:, None]
+            exposure.matrix[row, :, :3] = rest.median(dim=0).values.exp().diag()
+        return exposure
 
     def neighbours(self, timestamp_ns: int) -> tuple[int, int, float]:
         """The knots before and after a time, and the weight of the later one."""

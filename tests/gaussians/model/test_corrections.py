@@ -78,6 +78,29 @@ def test_gain_is_linear_between_knots_and_constant_beyond():
     assert shown == pytest.approx(expected, rel=1e-5)
 
 
+def test_exposure_begins_as_images_show_colours():
+    """Of the right camera every image is half as red; that of second 1 is darker as well."""
+    second, names = 1_000_000_000, ["left"] * 3 + ["right"] * 3
+    shown = torch.ones(6, 3)
+    shown[3:, 0] = 0.5
+    shown[4] *= 0.8
+    order = [4, 0, 1, 5, 2, 3]  # not that of time
+    exposure = ExposureCorrections.measured(
+        ["left", "right"],
+        [names[index] for index in order],
+        [index % 3 * second for index in order],
+        shown[order],
+    )
+    found = [exposure.map_at("right", time * second) for time in range(3)]
+    for now, gain in zip(found, (1.0, 0.8, 1.0), strict=True):
+        assert now[:, :3].diag().tolist() == pytest.approx([0.5 * gain, gain, gain], rel=1e-5)
+        assert not now[:, 3].any()
+    assert torch.equal(exposure.map_at("left", second), torch.eye(3, 4))
+    assert float(exposure.log_gain.mean(dim=1).abs().max()) < 1e-6
+    early = ExposureCorrections.measured(["left"], ["left"] * 2, [0, 1], 0.5 * torch.ones(2, 3))
+    assert early.map_at("left", 1)[:, :3].diag().tolist() == pytest.approx([0.5] * 3)
+
+
 def test_exposure_is_undone():
     exposure = ExposureCorrections.none(["front"], [0, 2_000_000_000])
     exposure.matrix[0, :, 3] = 0.1
