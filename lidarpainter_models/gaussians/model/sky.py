@@ -1,8 +1,8 @@
 """The sky: a texture of colours by direction, behind everything else.
 
 What LiDAR never reaches is taken to be infinitely far. A texel learns only from pixels that the
-Gaussians leave clear (transmittance above a gate): seen through a nearly opaque surface, Adam's
-normalisation would drive it to any colour (rainbow speckle in every disocclusion). Texels that no
+Gaussians leave clear (transmittance above a gate): seen through a wire or the rim of a tree, it
+would grow as bright as these are dark, and from another lane shine beside them. Texels that no
 image shows are filled in from their neighbours by push and pull (Gortler et al., 1996).
 """
 
@@ -34,7 +34,8 @@ LEARNING_RATE, FINAL_LEARNING_RATE = 0.01, 0.001
 """First and last Adam step, in colour units."""
 MAX_TEXELS = 2_000_000
 """The texture is coarsened to stay below this (a full turn of sharp cameras is 8 million)."""
-MIN_TRANSMITTANCE = 0.2  # A texel learns only through pixels clearer than this
+MIN_TRANSMITTANCE = 0.9
+"""A texel learns only through pixels clearer than this."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
