@@ -59,8 +59,8 @@ class EffortConfig:
     """Steps for every view's worth of new surface. More of them sharpen the recorded views and cost
     the neighbouring lanes (docs/benchmarks.md)."""
     gaussians_per_pixel: float = 0.3
-    """Most Gaussians for a pixel of surface with the detail of a typical street (`SeenSurface`), at
-    the knee of their curve for one camera and for six (docs/measuring.md)."""
+    """Most Gaussians for a pixel of surface with the detail of a typical street (`SeenSurface`): at
+    the knee of their curve for one camera, a little beyond it for six (docs/measuring.md)."""
 
     def __post_init__(self) -> None:
         """Refuse an effort that comes to nothing."""

@@ -36,8 +36,8 @@ COMPARED_VIEWS = 32
 CONTRAST_CELL_PX = 4
 """Pixels along a cell whose contrast counts: what few Gaussians could show is finer."""
 TYPICAL_CONTRAST = 0.04
-"""Standard deviation of grey in such cells ahead of a car in a street, in parts of white; the same
-within a third from 96 to 960 pixels of width."""
+"""Standard deviation of grey in such cells ahead of a car in a street, in parts of white: 0.03 to
+0.055 in images 96 to 960 pixels wide of PandaSet 002 and two synthetic streets."""
 LEAST_DETAIL = 0.25
 """Detail of a pixel of surface at the least: by night LiDAR still sees it."""
 START_SHARE = 0.6875
