@@ -7,9 +7,11 @@ named whose exposure all of them then take.
 
 from collections import OrderedDict
 from collections.abc import Sequence
+from concurrent.futures import Future
 from dataclasses import replace
 from functools import cached_property
 from operator import itemgetter
+from threading import Lock
 
 import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
@@ -58,7 +60,8 @@ class ConditionBuilder:
         self.boxes = MovingBoxes(scene.tracks)
         self._views = {view.key: view for view in training_views}
         self._cameras = {view.key: scene.found_camera(view) for view in training_views}
-        self._sources: OrderedDict[ViewKey, SourceImage] = OrderedDict()
+        self._sources: OrderedDict[ViewKey, Future[SourceImage]] = OrderedDict()
+        self._of_sources = Lock()
 
     def forget_sources(self) -> None:
         """Free what was kept of training views; what is asked for again is rendered again."""
@@ -91,31 +94,42 @@ class ConditionBuilder:
 
     def source(self, key: ViewKey) -> SourceImage:
         """A training image with the surfaces it shows, colours before its exposure."""
-        if key not in self._sources:
-            view, camera = self._views[key], self._cameras[key]
-            device = self.scene.device
-            rgb, sky_mask = view.rgb_u8.to(device).float() / 255, view.sky_mask.to(device)
-            render = self.scene.render(camera, view.timestamp_ns)
-            taken_ns = camera.taken_ns(view.timestamp_ns)
-            lidar = self.lidar_image(camera, taken_ns)
-            # the sky mask knows better than the render where there is sky; what else is clear in
-            # the render is drawn by the sky too, so it stands at infinity in both views
-            source = SourceImage(
-                key=key,
-                camera=camera,
-                timestamp_ns=taken_ns,
-                rgb=self.scene.exposure.undone(rgb, key[1], taken_ns),
-                depth_m=torch.where(sky_mask, 0.0, self.surface_m(render, lidar, camera)),
-                alpha=torch.where(sky_mask, 0.0, render.alpha),
-            )
-            if view.hidden is not None:
-                source = source.without(view.hidden.to(device), render.rgb)
-            self._sources[key] = source
-            most = max(MOST_SOURCE_BYTES // (SOURCE_PIXEL_BYTES * source.alpha.numel()), 1)
-            while len(self._sources) > most:
+        with self._of_sources:  # views beside each other ask for the same ones
+            is_new = key not in self._sources
+            source = self._sources.setdefault(key, Future())
+            self._sources.move_to_end(key)
+            pixels = self._cameras[key].width_px * self._cameras[key].height_px
+            while len(self._sources) > max(MOST_SOURCE_BYTES // (SOURCE_PIXEL_BYTES * pixels), 1):
                 self._sources.popitem(last=False)
-        self._sources.move_to_end(key)
-        return self._sources[key]
+        if is_new:
+            try:
+                source.set_result(self._new_source(key))
+            except BaseException as error:  # whoever waits for it must not do so for ever
+                self._sources.pop(key, None)
+                source.set_exception(error)
+                raise
+        return source.result()
+
+    def _new_source(self, key: ViewKey) -> SourceImage:
+        view, camera = self._views[key], self._cameras[key]
+        device = self.scene.device
+        rgb, sky_mask = view.rgb_u8.to(device).float() / 255, view.sky_mask.to(device)
+        render = self.scene.render(camera, view.timestamp_ns)
+        taken_ns = camera.taken_ns(view.timestamp_ns)
+        lidar = self.lidar_image(camera, taken_ns)
+        # the sky mask knows better than the render where there is sky; what else is clear in
+        # the render is drawn by the sky too, so it stands at infinity in both views
+        source = SourceImage(
+            key=key,
+            camera=camera,
+            timestamp_ns=taken_ns,
+            rgb=self.scene.exposure.undone(rgb, key[1], taken_ns),
+            depth_m=torch.where(sky_mask, 0.0, self.surface_m(render, lidar, camera)),
+            alpha=torch.where(sky_mask, 0.0, render.alpha),
+        )
+        if view.hidden is None:
+            return source
+        return source.without(view.hidden.to(device), render.rgb)
 
     def sources_for(
         self, camera: Camera, timestamp_ns: int, *, exclude: frozenset[ViewKey] = frozenset()

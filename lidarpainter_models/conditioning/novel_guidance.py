@@ -31,9 +31,11 @@ from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.geometry.trajectories import road_directions, shift_pose
+from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.lidar_map import LidarMap
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.observations.views import GuidanceView, TrainingView
+from lidarpainter_models.painter.one_step.painter import OneStepPainter
 from lidarpainter_models.painter.protocol import Painter, Painting, PaintingConditions
 from lidarpainter_models.scenes.records import ViewKey
 
@@ -145,24 +147,33 @@ def paint_novel_views(
     config: NovelGuidanceConfig | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[NovelPainting]:
-    """Paint every view that has room to stand in."""
+    """Paint every view that has room to stand in, several at once where nothing leans on another.
+
+    Results do not depend on the number of threads.
+    """
     config = config or NovelGuidanceConfig()
-    paintings = []
-    paths: dict[tuple[Shift, str], SequencePainter] = {}
     standing = [one for one in cameras if has_room(one, builder.lidar_map, builder.boxes)]
     shown = _one_per_shift(standing)
-    for done, novel in enumerate(standing, start=len(cameras) - len(standing) + 1):
-        path = paths.setdefault(
-            (novel.shift, novel.key[1]),
-            SequencePainter(builder, painter, config=config.sequence),
+    device = builder.scene.device
+    paths = {
+        (novel.shift, novel.key[1]): SequencePainter(builder, painter, config=config.sequence)
+        for novel in standing
+    }
+
+    def painted(novel: NovelCamera) -> NovelPainting:
+        path = paths[novel.shift, novel.key[1]]
+        return within_memory(
+            partial(_paint, builder, path, novel, novel in shown),
+            device,
+            "painting: a narrower observation.width_px takes less",
         )
-        paintings.append(
-            within_memory(
-                partial(_paint, builder, path, novel, novel in shown),
-                builder.scene.device,
-                "painting: a narrower observation.width_px takes less",
-            )
-        )
+
+    # the one-step painter's network has work for all threads, and needs gigabytes for it
+    are_free = config.sequence.previous == "unused" and not isinstance(painter, OneStepPainter)
+    made = side_by_side(painted, standing, device) if are_free else map(painted, standing)
+    paintings = []
+    for done, painting in enumerate(made, start=len(cameras) - len(standing) + 1):
+        paintings.append(painting)
         if progress is not None:
             progress(done, len(cameras))
     return paintings

@@ -18,6 +18,7 @@ from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.geometry.trajectories import road_directions, shift_pose
+from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
 from lidarpainter_models.observations.settings import ObservationConfig
@@ -81,14 +82,12 @@ class HeldOut:
     def recorded_views(self, fitted: GaussianScene, poses: Poses) -> list[JudgedView]:
         """The held-out images."""
         bodies = fitted.cameras.own_bodies
+        images = side_by_side(self.image_of, self.test_views)
         return [
             self._judged(
-                view,
-                self.camera_of(fitted, view, poses),
-                self.image_of(view),
-                bodies.get(view.camera_name),
+                view, self.camera_of(fitted, view, poses), image, bodies.get(view.camera_name)
             )
-            for view in self.test_views
+            for view, image in zip(self.test_views, images, strict=True)
         ]
 
     def synthetic_views(

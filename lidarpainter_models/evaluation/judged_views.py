@@ -6,6 +6,8 @@ the scene followed by a painter. So every figure exists painted and unpainted.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -15,6 +17,7 @@ from torch import Tensor
 
 from lidarpainter_models.geometry.box_masks import box_outlines
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.metrics.images import (
     ImageScores,
@@ -96,10 +99,13 @@ def score_views(
     views: Sequence[JudgedView],
     *,
     distances: PerceptualDistances,
+    device: torch.device | None = None,
+    told: Callable[[], None] = lambda: None,
 ) -> ViewScores | None:
     """Render every view and average its scores; None without views.
 
-    Perceptual distances take the truth for what is hidden.
+    Perceptual distances take the truth for what is hidden. Views are rendered on the `device`, on
+    a CPU several at once; `told` is called after each.
     """
     if not views:
         return None
@@ -107,20 +113,16 @@ def score_views(
     features: list[float] = []
     lpips: list[float] = []
     of_actors: dict[str, list[Tensor]] = {}
-    for view in views:
-        image = render(view.camera, view.timestamp_ns).clamp(0, 1)
-        truth = view.truth_rgb.to(image.device)
-        is_actor = (view.actor_index != NOBODY).to(image.device)
-        hidden = None if view.hidden is None else view.hidden.to(image.device)
-        if hidden is not None:
-            image = torch.where(hidden[..., None], truth, image)
-        scores.append(score_image(image, truth, is_actor, hidden=hidden))
-        for actor_id, errors in _actor_errors(image, truth, view).items():
+    judged = partial(_one_scored, render, distances=distances)
+    for one in side_by_side(judged, views, device):
+        scores.append(one.image)
+        for actor_id, errors in one.actor_errors.items():
             of_actors.setdefault(actor_id, []).append(errors)
-        if distances.features is not None:
-            features.append(float(distances.features(image, truth)))
-        if distances.lpips is not None:
-            lpips.append(float(distances.lpips(image, truth)))
+        if one.feature_distance is not None:
+            features.append(one.feature_distance)
+        if one.lpips is not None:
+            lpips.append(one.lpips)
+        told()
     return ViewScores(
         psnr=sum(score.psnr_db for score in scores) / len(scores),
         ssim=sum(score.ssim for score in scores) / len(scores),
@@ -131,6 +133,31 @@ def score_views(
         num_views=len(scores),
         psnr_by_view={view.name: score.psnr_db for view, score in zip(views, scores, strict=True)},
         psnr_by_actor={name: _actor_score(torch.cat(found)) for name, found in of_actors.items()},
+    )
+
+
+class _Scored(NamedTuple):
+    """What is found of one view."""
+
+    image: ImageScores
+    actor_errors: dict[str, Float[Tensor, " pixels"]]
+    feature_distance: float | None
+    lpips: float | None
+
+
+def _one_scored(render: Renderer, view: JudgedView, *, distances: PerceptualDistances) -> _Scored:
+    image = render(view.camera, view.timestamp_ns).clamp(0, 1)
+    truth = view.truth_rgb.to(image.device)
+    is_actor = (view.actor_index != NOBODY).to(image.device)
+    hidden = None if view.hidden is None else view.hidden.to(image.device)
+    if hidden is not None:
+        image = torch.where(hidden[..., None], truth, image)
+    features, lpips = distances.features, distances.lpips
+    return _Scored(
+        image=score_image(image, truth, is_actor, hidden=hidden),
+        actor_errors=_actor_errors(image, truth, view),
+        feature_distance=None if features is None else float(features(image, truth)),
+        lpips=None if lpips is None else float(lpips(image, truth)),
     )
 
 

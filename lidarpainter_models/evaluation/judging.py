@@ -7,9 +7,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
-from jaxtyping import Float
-from torch import Tensor
-
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.scene_scores import (
     score_geometry,
@@ -19,7 +16,6 @@ from lidarpainter_models.evaluation.scene_scores import (
 from lidarpainter_models.evaluation.score_tables import DEPTH, Scores
 from lidarpainter_models.evaluation.settings import JudgeConfig
 from lidarpainter_models.evaluation.shown import ShownScene
-from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.metrics.images import psnr_from_error
 from lidarpainter_models.metrics.perceptual import PerceptualDistances, load_distances
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -78,18 +74,15 @@ class Judgement:
         shifts = self.config.scoring.shifts
         views = [view for view in held_out.test_views if view.camera_name == name]
         part = replace(held_out, test_views=views)
-        fitted, shows = shown.scene, shown.renderer(name)
-
-        def render(camera: Camera, timestamp_ns: int) -> Float[Tensor, "height width 3"]:
-            image = shows(camera, timestamp_ns)
-            told()
-            return image
-
-        recorded = score_recorded(render, part, fitted, distances=distances)
+        fitted = shown.scene
+        render = shown.renderer(name)
+        recorded = score_recorded(render, part, fitted, distances=distances, told=told)
         street = known_street(part.scene)
         if street is None:
             return recorded, {shift.name: _unknown(len(views)) for shift in shifts}
-        return recorded, score_synthetic(render, part, fitted, street, shifts, distances=distances)
+        return recorded, score_synthetic(
+            render, part, fitted, street, shifts, distances=distances, told=told
+        )
 
 
 @lru_cache(maxsize=1)

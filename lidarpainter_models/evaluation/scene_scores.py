@@ -2,15 +2,21 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
 
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.judged_views import Renderer, ViewScores, score_views
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.shifts import Shift
+from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.sparse_depth import FramePoints
 from lidarpainter_models.metrics.depth import DepthScores, pooled_inlier_fraction, score_depth
 from lidarpainter_models.metrics.perceptual import PerceptualDistances
+from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.synthetic.street import SyntheticStreet
 
 
@@ -30,14 +36,15 @@ def score_recorded(
     fitted: GaussianScene,
     *,
     distances: PerceptualDistances,
+    told: Callable[[], None],
 ) -> dict[str, Any]:
-    """Held-out images with interpolated poses, and beside them with recorded poses."""
-    interpolated = score_views(
-        render,
-        held_out.recorded_views(fitted, "interpolated"),
-        distances=distances,
-    )
-    recorded = score_views(render, held_out.recorded_views(fitted, "recorded"), distances=distances)
+    """Held-out images with interpolated poses, and beside them with recorded poses.
+
+    `told` is called after every render.
+    """
+    scored = partial(score_views, render, distances=distances, device=fitted.device, told=told)
+    interpolated = scored(held_out.recorded_views(fitted, "interpolated"))
+    recorded = scored(held_out.recorded_views(fitted, "recorded"))
     return {**_view_scores(interpolated), "recorded_poses": _view_scores(recorded)}
 
 
@@ -49,16 +56,12 @@ def score_synthetic(
     shifts: Sequence[Shift],
     *,
     distances: PerceptualDistances,
+    told: Callable[[], None],
 ) -> dict[str, Any]:
-    """Exact truth beside the path, per trajectory."""
+    """Exact truth beside the path, per trajectory; `told` is called after every render."""
+    scored = partial(score_views, render, distances=distances, device=fitted.device, told=told)
     return {
-        shift.name: _view_scores(
-            score_views(
-                render,
-                held_out.synthetic_views(fitted, street, shift),
-                distances=distances,
-            )
-        )
+        shift.name: _view_scores(scored(held_out.synthetic_views(fitted, street, shift)))
         for shift in shifts
     }
 
@@ -74,13 +77,22 @@ def score_geometry(
 
     `told` is called after every render.
     """
-    scores: dict[str, list[DepthScores]] = {shift.name: [] for shift in (Shift(), *shifts)}
+    moves = {shift.name: shift for shift in (Shift(), *shifts)}
+    scores: dict[str, list[DepthScores]] = {name: [] for name in moves}
     lidar = FramePoints(held_out.scene)
-    for view in held_out.test_views:
-        points = lidar.at_exposure(view)
-        for shift in (Shift(), *shifts):
+
+    def scored(seen: tuple[RecordedView, Float[Tensor, "points 3"]]) -> dict[str, DepthScores]:
+        view, points = seen
+        found = {}
+        for name, shift in moves.items():
             camera = held_out.shifted_camera(fitted, view, shift)
             depth_m = fitted.render(camera, view.timestamp_ns).depth_m.cpu()
-            scores[shift.name].append(score_depth(depth_m, camera, points))
+            found[name] = score_depth(depth_m, camera, points)
+        return found
+
+    views = ((view, lidar.at_exposure(view)) for view in held_out.test_views)
+    for found in side_by_side(scored, views, fitted.device):
+        for name, score in found.items():
+            scores[name].append(score)
             told()
     return {name: pooled_inlier_fraction(found) for name, found in scores.items()}

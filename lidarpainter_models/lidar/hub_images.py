@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera, Shutter
+from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.contrast_images import ContrastImage
 from lidarpainter_models.lidar.moving_boxes import BACKGROUND, MovingBoxes
 from lidarpainter_models.lidar.sparse_depth import sparse_lidar_depth
@@ -57,12 +58,12 @@ class Hub:
 def hubs_of(scene: DrivingScene, moved: Sequence[tuple[RecordedView, Shutter]]) -> list[Hub]:
     """What is compared of one camera's images; those that are nobody's neighbours are not read."""
     boxes = MovingBoxes([track for track in scene.tracks if track.is_moving])
-    images: dict[int, HubImage] = {}
+    neighbours = hub_neighbours(len(moved))
+    wanted = sorted({index for _, around in neighbours for index in around})
+    made = side_by_side(lambda index: _image(scene, *moved[index], boxes), wanted)
+    images = dict(zip(wanted, made, strict=True))
     hubs = []
-    for own, around in hub_neighbours(len(moved)):
-        for index in around:
-            if index not in images:
-                images[index] = _image(scene, *moved[index], boxes)
+    for own, around in neighbours:
         points = _hub_points(images[own])
         if len(points):
             hubs.append(Hub(points, [images[index] for index in around], around.index(own)))

@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import numba
 import pytest
 import torch
 
@@ -174,6 +175,26 @@ def test_painting_gives_guidance_that_trusts_what_was_recorded(builder, views, b
     guides = guidance.weight > 0.8
     assert guides.any()
     assert not (guides & ~trusted).any()
+
+
+def test_views_painted_beside_each_other_are_those_painted_one_by_one(builder, views):
+    config = NovelGuidanceConfig(shifts=(Shift(lateral_m=1), Shift(lateral_m=-1)), every_nth=1)
+    novel = novel_cameras(views, range(10), ego_path(), config=config)
+    before, painted = numba.get_num_threads(), []
+    try:
+        for threads in (numba.config.NUMBA_NUM_THREADS, 1):
+            numba.set_num_threads(threads)
+            builder.forget_sources()
+            painted.append(paint_novel_views(builder, EchoPainter(), novel, config=config))
+    finally:
+        numba.set_num_threads(before)
+    beside, alone = painted
+    assert len(beside) == len(alone) > 2
+    for one, other in zip(beside, alone, strict=True):
+        assert one.novel is other.novel
+        assert torch.equal(one.guidance.rgb, other.guidance.rgb)
+        assert torch.equal(one.guidance.weight, other.guidance.weight)
+        assert torch.equal(one.guidance.lidar_depth_m, other.guidance.lidar_depth_m)
 
 
 def test_a_painter_that_makes_things_worse_gives_no_guidance(builder, views):

@@ -4,7 +4,6 @@ Gaussians out of view lag behind (`gaussian_adam`). They are kept as they lag, t
 blocks: catching up for a checkpoint would split their way differently from an undisturbed run's.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -31,7 +30,6 @@ from lidarpainter_models.gaussians.model.stored_scene import (
     scene_from_arrays,
     scene_to_arrays,
 )
-from lidarpainter_models.kernels.sparse_adam import MOST_STEP
 
 
 @dataclass(eq=False, kw_only=True)
@@ -88,16 +86,9 @@ class FitState:
         return float(torch.rand((), generator=self.generator))
 
     def seen(self, views: Sequence[View]) -> SeenGaussians:
-        """All Gaussians that any of these views can show, as leaves for one step.
-
-        Views after the first are drawn when the actors' poses have been stepped.
-        """
-        rates, most = self.gaussian_adam.rates, math.sqrt(3.0) * MOST_STEP
-        slack = (most * max(rates.actor_translation_m), most * max(rates.actor_rotation_rad))
-        moved_m, turned_rad = slack if len(views) > 1 else (0.0, 0.0)
-        if len(self.scene.actors.bending.bodies):
-            moved_m += REACH_M
-        rows = self.blocks.rows_in_view(views, actor_slack=(moved_m, turned_rad))
+        """All Gaussians that any of these views can show, as leaves for one step."""
+        bent_m = REACH_M if len(self.scene.actors.bending.bodies) else 0.0
+        rows = self.blocks.rows_in_view(views, actor_slack=(bent_m, 0.0))
         return self.gaussian_adam.seen(self.scene.gaussians, rows)
 
     def step_gaussians(self, seen: SeenGaussians, fraction: float) -> None:

@@ -7,6 +7,8 @@ CPU.
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -38,6 +40,7 @@ from lidarpainter_models.kernels.pixel_losses import (
     depth_loss,
     pixel_terms,
 )
+from lidarpainter_models.kernels.side_by_side import both
 from lidarpainter_models.kernels.sky_texture import SkyRays
 from lidarpainter_models.kernels.ssim import l1_ssim_loss
 from lidarpainter_models.observations.views import GuidanceView
@@ -77,14 +80,32 @@ def fit_step(
         views.append((guidance.camera, _guidance_bodies(state, guidance)))
     read = bodies_while_read(recorded, state.scene.actors, image.timestamp_ns)
     seen = state.seen([*views, *((recorded, bodies) for bodies in read)])
-    told = _recorded_step(state, seen, image, row, views[0], config, perceptual)
-    if guidance is not None:
-        add_guidance_gradients(state, seen, guidance, config, perceptual)
+    of_recorded = partial(
+        _recorded_gradients, state, seen, image, row, views[0], config, perceptual
+    )
+    if guidance is None:
+        found = of_recorded()
+    else:
+        of_painted = partial(add_guidance_gradients, state, seen, guidance, config, perceptual)
+        found, _ = both(of_recorded, of_painted, state.scene.device)
+    state.tally.add(seen.rows, found.screen_gradient, found.splat.visible)
+    state.refinement.step(state.step, image)
+    _step_sky(state, found, config, image)
     state.step_gaussians(seen, state.step / config.steps)
-    return told
+    return found.told
 
 
-def _recorded_step(
+class _OfRecorded(NamedTuple):
+    """What a recorded view leaves beside the gradients of Gaussians, poses and exposure."""
+
+    told: Float[Tensor, "2"]
+    splat: SplatImage
+    screen_gradient: Float[Tensor, " seen"]
+    sky_rgb: Float[Tensor, "height width 3"]
+    sky_rays: SkyRays
+
+
+def _recorded_gradients(
     state: FitState,
     seen: SeenGaussians,
     image: FitImage,
@@ -92,8 +113,8 @@ def _recorded_step(
     view: View,
     config: FitConfig,
     perceptual: Perceptual | None,
-) -> Float[Tensor, "2"]:
-    """Collect the Gaussians' gradients from a recorded view; step poses, exposure and sky."""
+) -> _OfRecorded:
+    """Collect the gradients of a recorded view."""
     (camera, bodies), weights, sky = view, config.losses, state.scene.sky
     facts = image.facts()
     with_actors = _wants_actor_term(state, config)
@@ -124,11 +145,9 @@ def _recorded_step(
     prior = state.refinement.prior(row, image.timestamp_ns, state.step)
     # as a sum its gradient, which is the CPU's, would have to come from the device
     torch.autograd.backward([loss, prior] if prior.requires_grad else [loss])
-    state.tally.add(seen.rows, screen_gradient, splat.visible)
-    state.refinement.step(state.step, image)
-    _step_sky(state, sky_rgb, rays, splat.alpha.detach(), config, image)
     squared_error = (shown.detach() - facts.rgb).square().mean()
-    return torch.stack([loss.detach() + prior.detach(), squared_error.double()])
+    told = torch.stack([loss.detach() + prior.detach(), squared_error.double()])
+    return _OfRecorded(told, splat, screen_gradient, sky_rgb, rays)
 
 
 def _guidance_bodies(state: FitState, view: GuidanceView) -> Float[Tensor, "bodies 4 4"]:
@@ -210,26 +229,19 @@ def _actor_term(
     return actor_boundary_loss(splat.features[..., 0], in_boxes)
 
 
-def _step_sky(
-    state: FitState,
-    sky_rgb: Float[Tensor, "height width 3"],
-    rays: SkyRays,
-    alpha: Float[Tensor, "height width"],
-    config: FitConfig,
-    image: FitImage,
-) -> None:
+def _step_sky(state: FitState, found: _OfRecorded, config: FitConfig, image: FitImage) -> None:
     """Move the texels that were seen clearly enough, inside the sky mask alone.
 
     What is far but solid (towers beyond the LiDAR's reach) is left to the Gaussians.
     """
-    if sky_rgb.grad is None:
+    if found.sky_rgb.grad is None:
         return
-    clear = 1 - alpha
+    clear = 1 - found.splat.alpha.detach()
     learns = (clear > MIN_TRANSMITTANCE) & (image.kind == SKY)
     ratio = FINAL_LEARNING_RATE / LEARNING_RATE
     state.scene.sky.observe(
-        sky_rgb.grad,
+        found.sky_rgb.grad,
         torch.where(learns, clear, 0.0),
-        rays,
+        found.sky_rays,
         LEARNING_RATE * ratio ** (state.step / config.steps),
     )

@@ -20,13 +20,13 @@ def box_owners(
     return torch.from_numpy(owners)
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=True, nogil=True, inline="always")
 def _along(pose: np.ndarray, axis: int, point: np.ndarray) -> float:
     turned = pose[axis, 0] * point[0] + pose[axis, 1] * point[1] + pose[axis, 2] * point[2]
     return turned + pose[axis, 3]
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True, parallel=True)
 def _owners(
     points_m: np.ndarray,
     poses: np.ndarray,

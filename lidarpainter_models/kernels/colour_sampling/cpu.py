@@ -22,7 +22,7 @@ def project_inside(
     return rows, pixels_uv, depth_m
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _project_inside(
     xyz_m: np.ndarray,
     pixels_from_points: np.ndarray,
@@ -53,7 +53,7 @@ def _project_inside(
     return rows[:count].copy(), pixels_uv[:count].copy(), depth_m[:count].copy()
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True, parallel=True)
 def insert_samples(
     best: BestSamples, rows: np.ndarray, weight: np.ndarray, rgb: np.ndarray, view: int
 ) -> None:
@@ -77,7 +77,7 @@ def insert_samples(
             slot_rgb[row, slot, c] = rgb[i, c]
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True, parallel=True)
 def steps_inside(
     cells_uv: np.ndarray,
     depth_m: np.ndarray,
@@ -104,7 +104,7 @@ def steps_inside(
     return steps, is_found
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True, parallel=True)
 def sample_levels(
     pixels_uv: np.ndarray,
     level: np.ndarray,
@@ -128,7 +128,7 @@ def sample_levels(
     return rgb
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _bilinear(image: np.ndarray, u: float, v: float, rgb: np.ndarray) -> None:
     """Mix of the four pixels around a position (pixel centres at halves), edges repeated."""
     height, width = image.shape[0], image.shape[1]
@@ -143,7 +143,7 @@ def _bilinear(image: np.ndarray, u: float, v: float, rgb: np.ndarray) -> None:
         rgb[c] = np.uint8((1 - fv) * top + fv * bottom + 0.5)
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True, parallel=True)
 def combine_samples(best: BestSamples, view_gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """One colour (uint8) per point from its samples, and whether it has any.
 
@@ -170,7 +170,7 @@ def combine_samples(best: BestSamples, view_gain: np.ndarray) -> tuple[np.ndarra
     return rgb, has_colour
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _median_slot(matched: np.ndarray, weight: np.ndarray, count: int) -> int:
     """The slot whose brightness is the weighted median; the lower slot of equals."""
     half = 0.0
@@ -190,7 +190,7 @@ def _median_slot(matched: np.ndarray, weight: np.ndarray, count: int) -> int:
     return 0
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _agreed_colour(matched: np.ndarray, weight: np.ndarray, count: int, rgb: np.ndarray) -> None:
     """Mean of the samples that agree with the typical one, into `rgb`."""
     typical = _median_slot(matched, weight, count)

@@ -53,7 +53,7 @@ def _bounds(blocks: Blocks) -> _Bounds:
     return _Bounds(blocks.low.numpy(), blocks.high.numpy(), blocks.reach.numpy())
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _refresh_bounds(order, first, is_stale, means, log_scale, reach_sigmas, bounds):
     """Bounds of the stale blocks; a Gaussian that is not finite is never drawn and has none."""
     for block in range(len(is_stale)):
@@ -77,7 +77,7 @@ def _refresh_bounds(order, first, is_stale, means, log_scale, reach_sigmas, boun
         bounds.reach[block] = reach_sigmas * math.exp(largest)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _is_in_view(low, high, reach, transform, frustum):
     """Whether a box of centres may hold a Gaussian that reaches into the view."""
     if not low[0] <= high[0]:
@@ -102,7 +102,7 @@ def _is_in_view(low, high, reach, transform, frustum):
     return True
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _mark_seen(order, first, body, bounds, camera_from_body, frustum, is_seen):
     """Mark the rows of all blocks in view."""
     for block in range(len(body)):

@@ -31,4 +31,4 @@ SOURCES = _sources_digest()
 def compiled_entry(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function with `prange` loops that Python calls; cache it for these sources."""
     function.__qualname__ = f"{function.__qualname__}_{SOURCES}"
-    return numba.njit(cache=True, parallel=True, **_ENTRY)(function)
+    return numba.njit(cache=True, nogil=True, parallel=True, **_ENTRY)(function)

@@ -4,7 +4,6 @@ Images and gradients are bitwise the same for any number of threads (numba's set
 `numba.set_num_threads`). Input is read as float32 (transforms as float64) and must lie on the CPU.
 """
 
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -29,11 +28,10 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
 )
 from lidarpainter_models.kernels.gaussian_raster.projection_gradients import Gradients, unproject
 from lidarpainter_models.kernels.gaussian_raster.splats import DrawnImages, Splats
+from lidarpainter_models.kernels.side_by_side import kernels_to_oneself
 
 IMAGES = 6
 """Tensors that a view gives: four images, visible and radius."""
-ONE_AT_A_TIME = threading.Lock()
-"""numba's thread pools may not be entered by two Python threads at once."""
 
 
 def draw_views(
@@ -121,7 +119,7 @@ class _DrawViews(torch.autograd.Function):
         gaussians = _gaussians(tuple(tensors))
         drawn: list[Tensor] = []
         ctx.views = []
-        with ONE_AT_A_TIME:
+        with kernels_to_oneself():
             for place, view in enumerate(cameras):
                 compiled = _compiled_view(view)
                 records = project(_of_view(gaussians, place), compiled)
@@ -146,7 +144,7 @@ class _DrawViews(torch.autograd.Function):
         tensors, images = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
         gaussians = _gaussians(tensors)
         found = _room_for_gradients(gaussians)
-        with ONE_AT_A_TIME:
+        with kernels_to_oneself():
             for place, drawn in enumerate(ctx.views):
                 given = output_gradients[IMAGES * place : IMAGES * place + 4]
                 slots = entry_sums(

@@ -19,7 +19,7 @@ from lidarpainter_models.kernels.pixel_losses.pixel_facts import PixelFacts, Pix
 _EDGE = 1e-4
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True, parallel=True)
 def _forward(rgb, depth, alpha, sky, target, kind, lidar, exposure, tolerances):
     """Image over sky, exposed; sums of both terms; their derivatives by alpha and depth."""
     height, width = alpha.shape
@@ -62,7 +62,7 @@ def _forward(rgb, depth, alpha, sky, target, kind, lidar, exposure, tolerances):
     return shown, by_alpha, by_depth, total[0] / (height * width), total[1] / count, count
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True, parallel=True)
 def _backward(gradient, rgb, alpha, sky, exposure, by_alpha, by_depth, factors, min_transmittance):
     """Gradients by what is shown; factors are those of both terms, the mean included."""
     height, width = alpha.shape

@@ -17,13 +17,13 @@ def _gaussian_terms() -> tuple[np.float32, ...]:
 _C0, _C1, _C2, _C3, _C4, _C5, _C6, _C7, _C8 = _gaussian_terms()
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=True, nogil=True, inline="always")
 def _gaussian(y):
     high = _C4 + y * (_C5 + y * (_C6 + y * (_C7 + y * _C8)))
     return _C0 + y * (_C1 + y * (_C2 + y * (_C3 + y * high)))
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _scatter(uv, depth, attributes, surface, weight, radius, tolerance, sums, totals):
     height, width = surface.shape
     channels = attributes.shape[1]
@@ -50,7 +50,7 @@ def _scatter(uv, depth, attributes, surface, weight, radius, tolerance, sums, to
                     sums[row, col, channel] += share * attributes[point, channel]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _divide(sums, totals):
     for row in range(totals.shape[0]):
         for col in range(totals.shape[1]):

@@ -27,7 +27,7 @@ def splat_points(
     return torch.from_numpy(winner)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _draw(
     pixels_uv: np.ndarray,
     depth_m: np.ndarray,
@@ -53,7 +53,7 @@ def _draw(
                     winner[row, column] = point
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True, parallel=True)
 def _splat(
     pixels_uv: np.ndarray,
     depth_m: np.ndarray,

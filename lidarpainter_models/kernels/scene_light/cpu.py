@@ -12,8 +12,8 @@ from torch import Tensor
 
 from lidarpainter_models.kernels.frustum_culling.blocks import Frustum
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import NEAR_M
-from lidarpainter_models.kernels.gaussian_raster.cpu import ONE_AT_A_TIME
 from lidarpainter_models.kernels.scene_light import parts
+from lidarpainter_models.kernels.side_by_side import kernels_to_oneself
 from lidarpainter_models.weather import darkness, water
 from lidarpainter_models.weather.light import to_display
 
@@ -23,7 +23,12 @@ _ROOTS = torch.linspace(0, 1, STEPS + 1)[:, None].expand(-1, 3)
 CURVE = to_display(_ROOTS**2)[:, 0].numpy().copy()
 """Displayed brightness by the root of light, in equal steps."""
 _FAST = {"contract", "arcp", "nsz", "afn", "reassoc"}  # infinities keep their meaning
-_COMPILED: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": _FAST}
+_COMPILED: dict[str, Any] = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": _FAST,
+}
 _INNER = _COMPILED | {"forceinline": True}  # calls would pass every array's parts one by one
 
 # single precision throughout: a double constant would turn all that it meets to doubles
@@ -85,7 +90,7 @@ class _Surroundings(NamedTuple):
 def irradiance(surfaces: parts.Surfaces, world_from_body: Tensor, lamps: parts.Lamps) -> Tensor:
     """See `scene_light.irradiance`."""
     found = np.zeros((len(surfaces.means), 3), np.float32)
-    with ONE_AT_A_TIME:
+    with kernels_to_oneself():
         every = torch.ones(len(world_from_body), len(lamps.reach_m))
         _irradiance(_surfaces(surfaces, world_from_body), _lamps(lamps, every > 0), found)
     return torch.from_numpy(found)
@@ -117,7 +122,7 @@ def seen_harmonics(
         _array(surroundings.sky_light),
         _array(surroundings.skylines),
     )
-    with ONE_AT_A_TIME:
+    with kernels_to_oneself():
         _seen_harmonics(
             _surfaces(surfaces, world_from_body),
             own,

@@ -70,7 +70,7 @@ def adam(
     )
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=True, nogil=True, inline="always")
 def _atan2(y, x):
     """Arc tangent by the odd polynomial of degree 11 on [0, 1]; error under 2e-6 rad."""
     smaller, larger = min(abs(y), abs(x)), max(abs(y), abs(x))
@@ -88,7 +88,7 @@ def _atan2(y, x):
     return -r if y < 0 else r
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True, parallel=True)
 def _locate(world_from_camera, lens, layout, wanted):
     """Continuous (column, row) in the texture of the wanted pixels' rays, texel centres at +0.5.
 
@@ -120,7 +120,7 @@ def _locate(world_from_camera, lens, layout, wanted):
     return places
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=True, nogil=True, inline="always")
 def _corners(column, row, columns, rows, wraps):
     """The four texels around a place and the weights of the second column and row."""
     column -= np.float32(0.5)
@@ -137,7 +137,7 @@ def _corners(column, row, columns, rows, wraps):
     return c0, c1, r0, min(r0 + 1, rows - 1), wc, wr
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True, parallel=True)
 def _sample(texture, places, wanted, wraps):
     """Bilinear colours at the places of the wanted pixels, black elsewhere."""
     rows, columns = texture.shape[:2]
@@ -158,7 +158,7 @@ def _sample(texture, places, wanted, wraps):
     return rgb
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _scatter(shape, places, gradient, weight, wraps):
     """Transpose of `sample` on pixels of positive weight: texel gradients and summed weights."""
     rows, columns = shape
@@ -185,7 +185,7 @@ def _scatter(shape, places, gradient, weight, wraps):
     return texel_gradient, texel_weight
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True, parallel=True)
 def _adam(texture, first, second, visits, gradient, weight, rate):
     """One Adam step in place on every texel of positive weight, each with its own step count."""
     beta1, beta2 = np.float32(0.9), np.float32(0.99)

@@ -14,14 +14,12 @@ from torch import Tensor
 from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.kernels.backends import Backend, float32_backend, implementation
 from lidarpainter_models.kernels.sparse_adam.state import (
-    MOST_STEP,
     MOST_UNITS,
     AdamState,
     Parameters,
 )
 
 __all__ = [
-    "MOST_STEP",
     "MOST_UNITS",
     "AdamState",
     "Parameters",

@@ -39,7 +39,12 @@ RUN_ENDS = np.array(MISSED_RUN_ENDS)
 CHUNKS = 64
 """Rows are shared out in this many chunks, whatever the number of threads."""
 
-_VECTORS: dict[str, Any] = {"cache": True, "fastmath": {"contract"}, "error_model": "numpy"}
+_VECTORS: dict[str, Any] = {
+    "cache": True,
+    "nogil": True,
+    "fastmath": {"contract"},
+    "error_model": "numpy",
+}
 """A division that may raise cannot be part of a vector loop."""
 
 
@@ -132,7 +137,7 @@ def _nodes(state: AdamState, rows: np.ndarray) -> _Nodes:
     return _missed_nodes(state.last.numpy(), rows, missed, kind_of_column, state.count)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _pair(rates, left, begin, end):
     """Two nodes (weights, depths) with the moments of the missed steps `begin` to `end`.
 
@@ -157,7 +162,7 @@ def _pair(rates, left, begin, end):
     return -total * far / (near - far), mean + near, total * near / (near - far), mean + far
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _missed_nodes(last, rows, rates, kind_of_column, now):
     """The nodes for every step at which one of the rows was left, up to the step `now`.
 
@@ -190,7 +195,7 @@ def _missed_nodes(last, rows, rates, kind_of_column, now):
     return _Nodes(weight, depth, lead, length)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _load(parameters, row, out):
     """Copy one row of parameters into one array."""
     for c in range(3):
@@ -206,7 +211,7 @@ def _load(parameters, row, out):
         first += part.shape[1]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _store(values, parameters, row):
     """Copy one array into one row of parameters."""
     for c in range(3):
@@ -252,7 +257,7 @@ def _drift(values, first, second, nodes, start, eps, work):
     values[MEANS], values[MEANS + 1], values[MEANS + 2] = x, y, z
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True, parallel=True)
 def _present(kept, first, second, last, rows, nodes, now, eps, out):
     """Write the given rows as the steps they missed left them to `out`."""
     count, starts = len(rows), len(nodes.length)
@@ -267,7 +272,7 @@ def _present(kept, first, second, last, rows, nodes, now, eps, out):
             _store(values, out, k)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _fade(first, second, missed):
     """Shrink the moments of one row by the steps it missed."""
     by_first, by_second = np.float32(BETA1**missed), np.float32(BETA2**missed)
@@ -276,7 +281,7 @@ def _fade(first, second, missed):
         second[c] *= by_second
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True, parallel=True)
 def _catch_up(kept, first, second, last, nodes, now, eps):
     """Bring every row and its moments up to the step `now`, in place."""
     count, starts = len(last), len(nodes.length)
@@ -309,7 +314,7 @@ def _step(values, gradient, first, second, rates, spread, eps):
         values[c] -= gradient[c]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _is_any(gradient):
     """Whether a number differs from zero."""
     for g in gradient:
@@ -318,7 +323,7 @@ def _is_any(gradient):
     return False
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, nogil=True, parallel=True)
 def _step_rows(kept, first, second, last, rows, seen, gradients, rates, now, eps):
     """Adam's step number `now` on the rows with a gradient, in place.
 

@@ -103,7 +103,7 @@ def _rows(image: Tensor) -> np.ndarray:
     return image.detach().contiguous().flatten(1).numpy()
 
 
-@numba.njit(cache=True, parallel=True, fastmath=_CONTRACT)
+@numba.njit(cache=True, nogil=True, parallel=True, fastmath=_CONTRACT)
 def _weighted_rows(
     rendered: np.ndarray, target: np.ndarray, weight: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -122,7 +122,7 @@ def _weighted_rows(
     return first, upstream, absolute
 
 
-@numba.njit(cache=True, fastmath=_CONTRACT, inline="always")
+@numba.njit(cache=True, nogil=True, fastmath=_CONTRACT, inline="always")
 def _blur_row(padded: np.ndarray, blurred: np.ndarray) -> None:
     """Blur one row of interleaved channels that has `PAD` zeros on both sides."""
     for i in range(blurred.shape[0]):
@@ -137,7 +137,7 @@ def _blur_row(padded: np.ndarray, blurred: np.ndarray) -> None:
         )
 
 
-@numba.njit(cache=True, fastmath=_CONTRACT, inline="always")
+@numba.njit(cache=True, nogil=True, fastmath=_CONTRACT, inline="always")
 def _blur_column(padded_rows: np.ndarray, row: int, blurred: np.ndarray) -> None:
     """Blur across the rows around `row` of an array with `RADIUS` rows of zeros at both ends."""
     r = row + RADIUS
@@ -152,7 +152,7 @@ def _blur_column(padded_rows: np.ndarray, row: int, blurred: np.ndarray) -> None
         )
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _padded_rows(outside: np.ndarray, height: int, length: int) -> np.ndarray:
     """Room for the row blurs of some fields, with rows of their outside value above and below."""
     rows = np.empty((outside.shape[0], height + 2 * RADIUS, length), dtype=np.float32)
@@ -162,7 +162,7 @@ def _padded_rows(outside: np.ndarray, height: int, length: int) -> np.ndarray:
     return rows
 
 
-@numba.njit(cache=True, parallel=True, fastmath=_CONTRACT)
+@numba.njit(cache=True, nogil=True, parallel=True, fastmath=_CONTRACT)
 def _blurred_along_rows(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Row blurs of d, s, d^2 and s^2: (4, height + 2 RADIUS, 3 width)."""
     height, length = first.shape
@@ -184,7 +184,7 @@ def _blurred_along_rows(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return blurs
 
 
-@numba.njit(cache=True, parallel=True, fastmath=_CONTRACT)
+@numba.njit(cache=True, nogil=True, parallel=True, fastmath=_CONTRACT)
 def _similarity_rows(blurs: np.ndarray) -> np.ndarray:
     """The SSIM map from the row blurs."""
     height, length = blurs.shape[1] - 2 * RADIUS, blurs.shape[2]
@@ -203,7 +203,7 @@ def _similarity_rows(blurs: np.ndarray) -> np.ndarray:
     return similarity
 
 
-@numba.njit(cache=True, parallel=True, fastmath=_CONTRACT)
+@numba.njit(cache=True, nogil=True, parallel=True, fastmath=_CONTRACT)
 def _partial_rows(blurs: np.ndarray, upstream: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The SSIM map and the row blurs of `upstream` times its three partial derivatives."""
     height, length = upstream.shape
@@ -232,7 +232,7 @@ def _partial_rows(blurs: np.ndarray, upstream: np.ndarray) -> tuple[np.ndarray, 
     return similarity, partials
 
 
-@numba.njit(cache=True, parallel=True, fastmath=_CONTRACT)
+@numba.njit(cache=True, nogil=True, parallel=True, fastmath=_CONTRACT)
 def _gradient_rows(first: np.ndarray, second: np.ndarray, partials: np.ndarray) -> np.ndarray:
     """The gradient to `first` of the sum of upstream times SSIM."""
     height, length = first.shape
@@ -250,7 +250,7 @@ def _gradient_rows(first: np.ndarray, second: np.ndarray, partials: np.ndarray) 
     return gradient
 
 
-@numba.njit(cache=True, parallel=True, fastmath=_CONTRACT)
+@numba.njit(cache=True, nogil=True, parallel=True, fastmath=_CONTRACT)
 def _finish_gradient(
     first: np.ndarray,
     second: np.ndarray,
@@ -267,7 +267,7 @@ def _finish_gradient(
             gradient[row, i] = full if weight[row, i] > ZERO else ZERO
 
 
-@numba.njit(cache=True, parallel=True, fastmath=_CONTRACT)
+@numba.njit(cache=True, nogil=True, parallel=True, fastmath=_CONTRACT)
 def _weighted_dissimilarity(similarity: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Sum over each row of weight (1 - SSIM), float64."""
     sums = np.empty(similarity.shape[0], dtype=np.float64)

@@ -3,6 +3,7 @@
 Views of any size: edges are repeated up to multiples of 64 pixels and cut off again.
 """
 
+from threading import Lock
 from typing import Any
 
 import torch
@@ -50,6 +51,7 @@ class OneStepPainter:
         self.prompts = prompts
         self.provenance = provenance
         self._graphed = GraphedNetwork(self.network)
+        self._alone = Lock()  # several threads would need the memory several times
 
     @property
     def precision(self) -> torch.dtype:
@@ -74,7 +76,8 @@ class OneStepPainter:
         text = self.prompts.encode(conditions.prompt).to(device)[None]
         batch = stack_conditions([conditions], num_sources=NUM_WARPS).to(device)
         images, masks = painter_inputs(batch, self.network.config)
-        rgb = self._graphed(images, text, masks)
+        with self._alone:
+            rgb = self._graphed(images, text, masks)
         height_px, width_px = conditions.height_width_px
         rgb = rgb[..., :height_px, :width_px].clamp(0, 1)
         confidence = support(batch, rgb)[0]

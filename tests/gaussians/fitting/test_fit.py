@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import numba
 import pytest
 import torch
 from gaussian_world import FRAME_NS, HEIGHT_PX, WIDTH_PX, scene_of
@@ -208,6 +209,24 @@ def test_painted_views_pull_the_scene_towards_them(world):
         for scene in (with_guidance, without)
     ]
     assert errors[0] < errors[1] - 0.02
+
+
+def test_painted_and_recorded_views_beside_each_other_make_the_fit_of_one_thread(world):
+    guided = continuation(
+        short_fit(), steps=20, guidance=GuidanceConfig(probability=1.0, weight=3.0)
+    )
+    before, fitted = numba.get_num_threads(), []
+    try:
+        for threads in (1, numba.config.NUMBA_NUM_THREADS):
+            numba.set_num_threads(threads)
+            fitted.append(
+                fit_gaussians(
+                    world.observations, guided, start=world.scene, guidance=[painted_view(world)]
+                )
+            )
+    finally:
+        numba.set_num_threads(before)
+    assert_same_scene(*(found.scene for found in fitted))
 
 
 def test_the_last_steps_fit_recorded_views_alone(world):
