@@ -9,16 +9,18 @@ are brought to one exposure and combined robustly.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.colour_sampling import BestSamples, combine_samples, insert_samples
+from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.exposure_matching import match_exposure
 from lidarpainter_models.lidar.lidar_map import LidarMap
 from lidarpainter_models.lidar.point_visibility import (
@@ -37,6 +39,7 @@ from lidarpainter_models.lidar.points_in_view import (
     points_in_view,
 )
 from lidarpainter_models.lidar.rim_colours import EDGE_TOLERANCE, ImageLevels, rim_samples
+from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.scenes.tracks import ActorTrack
 
@@ -56,6 +59,15 @@ STANDING_BOX_SHARE = 0.85
 """Share of each side of a standing actor's box that hides what is behind it."""
 NEAR_M = 0.5  # points nearer to the camera plane than this are not sampled
 WIDTH_PX = 960  # images are shrunk to this width before they are sampled
+
+
+class PointSamples(NamedTuple):
+    """Colours that one image gives points of the map."""
+
+    view_number: int
+    rows: Int[np.ndarray, " points"]
+    weight: Float[np.ndarray, " points"]
+    rgb: UInt8[np.ndarray, "points 3"]
 
 
 class MapColouring:
@@ -80,13 +92,15 @@ class MapColouring:
         self._view_numbers = {view.key: number for number, view in enumerate(views)}
         self._placed = place_actors(views, tracks)
 
-    def add(
+    def seen_in(
         self,
         view: RecordedView,
         image: UInt8[Tensor, "height width 3"],
         hidden: Bool[np.ndarray, "rows columns"] | None = None,
-    ) -> None:
-        """Take samples from the recorded image of one of the views, none from hidden pixels.
+    ) -> PointSamples | None:
+        """What the recorded image of one of the views gives, or None; none of hidden pixels.
+
+        Nothing is changed, so that images may be looked at beside each other.
 
         Args:
             view: which one.
@@ -101,7 +115,7 @@ class MapColouring:
             self._bodies, camera, view.timestamp_ns, actors, grid, near_m=NEAR_M
         )
         if len(inside) == 0:
-            return
+            return None
         visibility = _visibility(inside, grid.camera, actors)
         is_visible = visible_points(
             inside.cells_uv, inside.depth_m, visibility, tolerance=HIDDEN_TOLERANCE
@@ -117,7 +131,24 @@ class MapColouring:
         weight = trust / (1 + (seen.age_s / RECENCY_S) ** 2)
         weight *= footprint_px.clamp(max=_FINE_ENOUGH_PX) ** 2
         number = self._view_numbers[view.key]
-        insert_samples(self._samples, seen.rows.numpy(), weight.numpy(), rgb.numpy(), number)
+        return PointSamples(number, seen.rows.numpy(), weight.numpy(), rgb.numpy())
+
+    def add(self, samples: PointSamples | None) -> None:
+        """Keep the best of what one of the views gave."""
+        if samples is None:
+            return
+        insert_samples(
+            self._samples, samples.rows, samples.weight, samples.rgb, samples.view_number
+        )
+
+    def add_recorded(self, scene: DrivingScene, views: Sequence[RecordedView]) -> None:
+        """Take samples from the images of some of the views."""
+
+        def seen(view: RecordedView) -> PointSamples | None:
+            return self.seen_in(view, scene.read_image(view))
+
+        for samples in side_by_side(seen, views):
+            self.add(samples)
 
     def gains(self) -> Float[np.ndarray, "views 3"]:
         """What brings each view, in their order, to the exposure of the first view's camera."""

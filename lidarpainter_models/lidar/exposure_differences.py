@@ -38,8 +38,7 @@ def exposure_differences(scene: DrivingScene) -> list[str]:
         )
     some = street.keep(torch.arange(0, len(street), -(-len(street) // _MOST_POINTS)))
     colouring = MapColouring(LidarMap(street=some, actors={}), scene.tracks, views)
-    for view in views:
-        colouring.add(view, scene.read_image(view))
+    colouring.add_recorded(scene, views)
     brightness = 1 / colouring.gains().mean(axis=1)
     names = np.array([view.camera_name for view in views])
     return _in_words(names, brightness)

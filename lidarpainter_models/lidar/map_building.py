@@ -57,8 +57,7 @@ def build_lidar_map(
             f"frames {sorted(split_frames)}"
         )
     colouring = MapColouring(points, scene.tracks, colour_views)
-    for view in colour_views:
-        colouring.add(view, scene.read_image(view))
+    colouring.add_recorded(scene, colour_views)
     return colouring.coloured(colouring.gains())
 
 

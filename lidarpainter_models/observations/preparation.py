@@ -6,6 +6,7 @@ street, points come from the images.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -13,7 +14,8 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
-from lidarpainter_models.lidar.colouring import MapColouring
+from lidarpainter_models.kernels.side_by_side import side_by_side
+from lidarpainter_models.lidar.colouring import MapColouring, PointSamples
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.lidar.map_building import MAX_RANGE_M, gather_points, showing_more
 from lidarpainter_models.lidar.recording_faults import find_faults
@@ -59,18 +61,27 @@ def prepare_observations(
     points, is_estimated = _points(scene, split, taken, bodies)
     colouring, colours = MapColouring(points, scene.tracks, taken), _keys_showing_more(taken)
     lidar, views = FramePoints(scene), []
-    for done, (recorded, view) in enumerate(zip(split.train, taken, strict=True), start=1):
-        image = scene.read_image(recorded)
+
+    def with_lidar(recorded: RecordedView, view: RecordedView) -> _WithLidar:
         near = lidar.measured(view.frame_index)
         if is_estimated or len(near) == 0:
             near = torch.cat([near, _nearest_in_time(points.street, view.timestamp_ns)])
-        made = _training_view(view, image, config, near=near, exposed=lidar.at_exposure(view))
+        return _WithLidar(recorded, view, near, lidar.at_exposure(view))
+
+    def prepared(given: _WithLidar) -> tuple[TrainingView, PointSamples | None]:
+        view, image = given.view, scene.read_image(given.recorded)
+        made = _training_view(given, image, config)
         if view.camera_name in hidden:
             body = hidden[view.camera_name]
             made = replace(made, hidden=body, sky_mask=made.sky_mask & ~body)
-        views.append(replace(made, timestamp_ns=recorded.timestamp_ns))
-        if view.key in colours:
-            colouring.add(view, image, bodies.get(view.camera_name))
+        if view.key not in colours:
+            return made, None
+        return made, colouring.seen_in(view, image, bodies.get(view.camera_name))
+
+    given = map(with_lidar, split.train, taken)
+    for done, (made, samples) in enumerate(side_by_side(prepared, given), start=1):
+        views.append(made)
+        colouring.add(samples)
         progress(done, len(split.train) + 1)
     gains = colouring.gains()
     lidar_map = colouring.coloured(gains)
@@ -150,30 +161,31 @@ def _nearest_in_time(street: MapPoints, timestamp_ns: int) -> Float[Tensor, "nea
     return street.xyz_m[age_ns <= age_ns.min() + SAME_SWEEP_NS]
 
 
+class _WithLidar(NamedTuple):
+    """A view and what LiDAR tells of it, in the world."""
+
+    recorded: RecordedView
+    view: RecordedView
+    """Where and when its image was really taken."""
+    near: Float[Tensor, "points 3"]
+    """Points measured or estimated about then: no sky is where they are."""
+    exposed: Float[Tensor, "placed 3"]
+    """Its frame's LiDAR points, moving actors where they are in the image."""
+
+
 def _training_view(
-    recorded: RecordedView,
+    given: _WithLidar,
     image: UInt8[Tensor, "recorded_height recorded_width 3"],
     config: ObservationConfig,
-    *,
-    near: Float[Tensor, "points 3"],
-    exposed: Float[Tensor, "placed 3"],
 ) -> TrainingView:
-    """A recorded image at fit size, with its sky and its frame's LiDAR depth.
-
-    Args:
-        recorded: which image.
-        image: as it was recorded.
-        config: see there.
-        near: points measured or estimated about then, in the world: no sky is where they are.
-        exposed: its frame's LiDAR points, moving actors where they are in the image.
-    """
-    camera = fit_camera(recorded, config)
+    """A recorded image at fit size, with its sky and its frame's LiDAR depth."""
+    camera = fit_camera(given.view, config)
     rgb_u8 = shrink_image(image, width_px=camera.width_px, height_px=camera.height_px)
     return TrainingView(
-        key=recorded.key,
+        key=given.view.key,
         camera=camera,
-        timestamp_ns=recorded.timestamp_ns,
+        timestamp_ns=given.recorded.timestamp_ns,
         rgb_u8=rgb_u8,
-        sky_mask=sky_mask(rgb_u8, near, camera),
-        lidar_depth_m=sparse_lidar_depth(exposed, camera),
+        sky_mask=sky_mask(rgb_u8, given.near, camera),
+        lidar_depth_m=sparse_lidar_depth(given.exposed, camera),
     )

@@ -44,8 +44,8 @@ class GradientTally:
         visible: Bool[Tensor, " seen"],
     ) -> None:
         """Collect one view's gradients of some rows, in place."""
-        self.total[rows] += torch.where(visible, gradient, torch.zeros_like(gradient))
-        self.visits[rows] += visible.float()
+        self.total.index_add_(0, rows, torch.where(visible, gradient, 0.0))
+        self.visits.index_add_(0, rows, visible.float())
 
     @property
     def mean(self) -> Float[Tensor, " gaussians"]:
