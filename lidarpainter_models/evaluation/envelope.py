@@ -10,8 +10,9 @@ straight on past the end of the log. One step at a time: no step says anything a
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import repeat
 from typing import Any
 
 from lidarpainter_models.conditioning.moved_cameras import MovedCameras
@@ -27,6 +28,7 @@ from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
 from lidarpainter_models.geometry.trajectory_words import ConstantStep
+from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.observations.fit_size import fit_camera
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene, driven_road
@@ -38,7 +40,8 @@ ASIDE_M = (*UP_M, 6.0)
 AHEAD_M = (*ASIDE_M, 8.0)
 LEVELS_DEG = (2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 45.0, 60.0)
 """No farther than frames were drawn to calibrate what is promised (`confidence_trials`)."""
-DIRECTIONS: dict[str, tuple[tuple[float, ...], Callable[[float], ConstantStep]]] = {
+Direction = tuple[tuple[float, ...], Callable[[float], ConstantStep]]
+DIRECTIONS: dict[str, Direction] = {
     "left_m": (ASIDE_M, lambda level: ConstantStep(lateral_m=level)),
     "right_m": (ASIDE_M, lambda level: ConstantStep(lateral_m=-level)),
     "up_m": (UP_M, lambda level: ConstantStep(up_m=level)),
@@ -139,6 +142,7 @@ def trust_envelope(
         if (moments := _moments(views.scene, stretch, camera_names))
     ]
     rows, num_frames, total = [], 0, len(looked_at) * (1 + len(DIRECTIONS))
+    device = views.gatherer.scene.device
     for number, (stretch, moments) in enumerate(looked_at):
         walk = _Walk(views, moments, calibration)
         row: dict[str, Any] = {
@@ -149,12 +153,16 @@ def trust_envelope(
         }
         row["recorded_confidence"], row["recorded_db"] = walk.recorded()
         is_trusted = row["recorded_confidence"] >= PROMISED
-        progress(number * (1 + len(DIRECTIONS)) + 1, total)
-        for place, (name, (levels, step_of)) in enumerate(DIRECTIONS.items(), start=2):
-            row[name] = walk.farthest(levels, step_of) if is_trusted else None
-            progress(number * (1 + len(DIRECTIONS)) + place, total)
+        done = number * (1 + len(DIRECTIONS)) + 1
+        progress(done, total)
+        reached: Iterator[float | None] = repeat(None, len(DIRECTIONS))
+        if is_trusted:
+            reached = side_by_side(walk.farthest, DIRECTIONS.values(), device)
+        for place, (name, level) in enumerate(zip(DIRECTIONS, reached, strict=True), start=1):
+            row[name] = level
+            progress(done + place, total)
         rows.append(row)
-        num_frames += walk.num_frames
+        num_frames += len(walk.said)
     return {
         "good_db": GOOD_DB,
         "promised": PROMISED,
@@ -172,8 +180,8 @@ class _Walk:
         self, views: MovedViews, moments: Sequence[RecordedView], calibration: Calibration
     ) -> None:
         self._views, self._moments, self._calibration = views, moments, calibration
-        self.num_frames = 0
-        """Where something was said."""
+        self.said: list[FrameConfidence] = []
+        """Of all frames where somebody can stand, as several directions come to them."""
 
     def recorded(self) -> tuple[float, float]:
         """Least confidence and least predicted PSNR on the path itself."""
@@ -181,13 +189,13 @@ class _Walk:
         found = [one for one in said if one is not None]
         return min(one.confidence for one in found), min(one.predicted_db for one in found)
 
-    def farthest(self, levels: Sequence[float], step_of: Callable[[float], ConstantStep]) -> float:
-        """The last level before the first that is not promised.
+    def farthest(self, way: Direction) -> float:
+        """The last level of a direction before the first that is not promised.
 
         The first view walks outwards; every other one is asked where that came to, and nearer
         until it is promised there too.
         """
-        first, *others = self._moments
+        (levels, step_of), (first, *others) = way, self._moments
         count = 0
         while count < len(levels) and self._is_promised(first, step_of(levels[count])):
             count += 1
@@ -208,7 +216,8 @@ class _Walk:
 
     def _said(self, view: RecordedView, step: ConstantStep) -> FrameConfidence | None:
         found = self._views.said(view, step, self._calibration)
-        self.num_frames += found is not None
+        if found is not None:
+            self.said.append(found)
         return found
 
 

@@ -68,7 +68,9 @@ class FadingEvidence(EvidenceGatherer):
             lidar_map=LidarMap(street=map_points(points, torch.ones_like(points)), actors={}),
             boxes=MovingBoxes([]),
         )
-        self.scene = SimpleNamespace(found_camera=lambda _view, camera: camera)
+        self.scene = SimpleNamespace(
+            found_camera=lambda _view, camera: camera, device=torch.device("cpu")
+        )
 
     def of(self, camera, timestamp_ns, _camera_name=None):
         frame = round(timestamp_ns / 1e8)
