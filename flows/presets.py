@@ -18,7 +18,7 @@ from lidarpainter_models.gaussians.fitting.config import (
 from lidarpainter_models.observations.settings import ObservationConfig
 
 SHORT_REFINE_LOOKS = 150.0
-"""A round of the CPU preset: on one front camera eight looks at each of 35 painted views."""
+"""A round of the CPU preset: on one front camera ten looks at each of 21 painted views."""
 
 
 def preview(scene: str) -> ReconstructParameters:

@@ -90,7 +90,7 @@ def check_inputs(parameters: ReconstructParameters, store_path: Path) -> None:
     """
     run = opened(parameters.run_spec(store_path))
     if parameters.rounds and parameters.painter != NO_PAINTER:
-        parameters.novel.in_round(parameters.rounds)
+        parameters.novel.in_round(parameters.rounds, parameters.rounds)
     width_px = parameters.observation.width_px
     if width_px != preset_named(parameters.preset, parameters.scene).observation.width_px:
         require_recorded_width(width_px, run.views.train, "observation.width_px")
@@ -198,7 +198,7 @@ def _painted(course: Course, fitted: FittedRef, stage: str, number: int) -> Stag
         course.run,
         f"paint-{number}",
         fitted,
-        parameters.novel.in_round(number),
+        parameters.novel.in_round(number, parameters.rounds),
         parameters.conditions,
         start_frame=number - 1,
     )

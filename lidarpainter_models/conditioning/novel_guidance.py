@@ -33,6 +33,7 @@ from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.geometry.trajectories import road_directions, shift_pose
 from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.lidar_map import LidarMap
+from lidarpainter_models.lidar.map_building import views_showing_more
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.observations.views import GuidanceView, TrainingView
 from lidarpainter_models.painter.one_step.painter import OneStepPainter
@@ -87,7 +88,8 @@ def novel_cameras(
     """The training cameras of every n-th training frame, at every shift.
 
     `frame_indices` are those of `world_from_ego`, in order of time. Training frames are counted
-    from `start`, so that another round may paint other frames.
+    from `start`, so that another round may paint other frames. Of a car that stands an image each
+    half second counts (`views_showing_more`).
 
     Raises:
         ConfigError: a view's frame is not among `frame_indices`, or a camera named in the config
@@ -96,10 +98,11 @@ def novel_cameras(
     config = config or NovelGuidanceConfig()
     directions = dict(zip(frame_indices, road_directions(world_from_ego), strict=True))
     _check_names(config.camera_names, training_views)
-    frames = sorted({view.key[0] for view in training_views})
-    unknown = [frame for frame in frames if frame not in directions]
+    unknown = sorted({view.key[0] for view in training_views} - set(directions))
     if unknown:
         raise ConfigError(f"no ego pose is given for the frames {unknown} of training views")
+    training_views = views_showing_more(training_views)
+    frames = sorted({view.key[0] for view in training_views})
     chosen = set(frames[start % config.every_nth :: config.every_nth])
     return [
         NovelCamera(

@@ -54,7 +54,8 @@ class NovelGuidanceConfig:
     shifts: tuple[Shift, ...] = DEFAULT_SHIFTS
     """Where the recorded cameras are moved to; the paper's 2 and 3 m to both sides and 1.5 m up."""
     outwards_m: float = 0.0
-    """How much farther to the side each round paints than the one before."""
+    """How much farther to the side each round paints than the one before; with 0 rounds share the
+    distances to the side among them."""
     every_nth: int = 2
     """Of the training frames, every n-th is painted at every shift."""
     camera_names: tuple[str, ...] | None = None
@@ -74,12 +75,17 @@ class NovelGuidanceConfig:
                 f"{self.outwards_m}"
             )
 
-    def in_round(self, number: int) -> "NovelGuidanceConfig":
-        """What is painted in a round, of which the first is 1.
+    def in_round(self, number: int, rounds: int) -> "NovelGuidanceConfig":
+        """What is painted in one of so many rounds, of which the first is 1.
+
+        Each distance to the side is painted in one of them, the nearest first: all of them in each
+        took longer and gave nothing more (docs/benchmarks.md). What is not aside is painted in all.
 
         Raises:
             ConfigError: that is farther away than a scene shows anything.
         """
+        if self.outwards_m == 0:
+            return replace(self, shifts=self._of_round(number, rounds))
         farther_m = self.outwards_m * (number - 1)
         try:
             shifts = tuple(
@@ -91,3 +97,9 @@ class NovelGuidanceConfig:
         except ConfigError as error:
             raise ConfigError(f"novel.outwards_m in round {number}: {error}") from None
         return replace(self, shifts=shifts, outwards_m=0.0)
+
+    def _of_round(self, number: int, rounds: int) -> tuple[Shift, ...]:
+        away_m = sorted({abs(shift.lateral_m) for shift in self.shifts if shift.lateral_m})
+        turns = max(min(rounds, len(away_m)), 1)
+        own_m = (0.0, *away_m[(number - 1) % turns :: turns])
+        return tuple(shift for shift in self.shifts if abs(shift.lateral_m) in own_m)

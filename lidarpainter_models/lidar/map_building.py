@@ -8,12 +8,14 @@ they are then, is decided when one is rendered. Colours come from the given imag
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
+from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.actor_separation import (
     ACTOR_MARGIN_M,
     CLEARANCE_M,
@@ -27,7 +29,24 @@ from lidarpainter_models.lidar.ground_heights import GroundHeights
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView, Sweep
+from lidarpainter_models.scenes.splits import Keyed
 from lidarpainter_models.scenes.tracks import ActorTrack
+
+
+@runtime_checkable
+class Placed(Keyed, Protocol):
+    """A view of a camera somewhere, recorded or prepared for a fit."""
+
+    @property
+    def camera(self) -> Camera:
+        """Where it stands."""
+
+    @property
+    def timestamp_ns(self) -> int:
+        """When its image is of."""
+
+
+View = TypeVar("View", bound=Placed)
 
 _GROUND_SAMPLE = 400_000
 """Points that the ground is estimated from; more do not change it."""
@@ -109,6 +128,16 @@ def showing_more(
             last[sensor] = (time_ns, place)
         are_new.append(is_new)
     return are_new
+
+
+def views_showing_more(views: Sequence[View]) -> list[View]:
+    """Views that show more of the street than those before of their camera; in order of time."""
+    are_new = showing_more(
+        [view.key[1] for view in views],
+        [view.timestamp_ns for view in views],
+        [view.camera.world_from_camera for view in views],
+    )
+    return [view for view, is_new in zip(views, are_new, strict=True) if is_new]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

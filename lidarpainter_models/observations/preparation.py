@@ -17,7 +17,7 @@ from lidarpainter_models.errors import SceneError
 from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.colouring import MapColouring, PointSamples
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
-from lidarpainter_models.lidar.map_building import MAX_RANGE_M, gather_points, showing_more
+from lidarpainter_models.lidar.map_building import MAX_RANGE_M, gather_points, views_showing_more
 from lidarpainter_models.lidar.recording_faults import find_faults
 from lidarpainter_models.lidar.sky_masks import sky_mask
 from lidarpainter_models.lidar.sparse_depth import FramePoints, sparse_lidar_depth
@@ -29,7 +29,7 @@ from lidarpainter_models.observations.sparse_lidar import LEAST_TOLD, completed,
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
 from lidarpainter_models.scenes.camera_faults import CameraFault
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.records import RecordedView, ViewKey
+from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.scenes.splits import ViewSplit
 
 SAME_SWEEP_NS = 100_000_000
@@ -59,7 +59,8 @@ def prepare_observations(
     bodies = own_bodies(scene, taken)
     hidden = {name: _at_fit_size(body, taken, name, config) for name, body in bodies.items()}
     points, is_estimated = _points(scene, split, taken, bodies)
-    colouring, colours = MapColouring(points, scene.tracks, taken), _keys_showing_more(taken)
+    colouring = MapColouring(points, scene.tracks, taken)
+    colours = {view.key for view in views_showing_more(taken)}
     lidar, views = FramePoints(scene), []
 
     def with_lidar(recorded: RecordedView, view: RecordedView) -> _WithLidar:
@@ -68,18 +69,15 @@ def prepare_observations(
             near = torch.cat([near, _nearest_in_time(points.street, view.timestamp_ns)])
         return _WithLidar(recorded, view, near, lidar.at_exposure(view))
 
-    def prepared(given: _WithLidar) -> tuple[TrainingView, PointSamples | None]:
+    def read(given: _WithLidar) -> tuple[TrainingView, PointSamples | None]:
         view, image = given.view, scene.read_image(given.recorded)
-        made = _training_view(given, image, config)
-        if view.camera_name in hidden:
-            body = hidden[view.camera_name]
-            made = replace(made, hidden=body, sky_mask=made.sky_mask & ~body)
+        made = _training_view(given, image, config, hidden=hidden.get(view.camera_name))
         if view.key not in colours:
             return made, None
         return made, colouring.seen_in(view, image, bodies.get(view.camera_name))
 
     given = map(with_lidar, split.train, taken)
-    for done, (made, samples) in enumerate(side_by_side(prepared, given), start=1):
+    for done, (made, samples) in enumerate(side_by_side(read, given), start=1):
         views.append(made)
         colouring.add(samples)
         progress(done, len(split.train) + 1)
@@ -125,16 +123,6 @@ def _points(
     return measured, False
 
 
-def _keys_showing_more(views: Sequence[RecordedView]) -> set[ViewKey]:
-    """The views that show more of the street than those before of their camera."""
-    are_new = showing_more(
-        [view.camera_name for view in views],
-        [view.timestamp_ns for view in views],
-        [view.camera.world_from_camera for view in views],
-    )
-    return {view.key for view, is_new in zip(views, are_new, strict=True) if is_new}
-
-
 def _as_taken(view: RecordedView, faults: Mapping[str, CameraFault]) -> RecordedView:
     """The view where and when its image was really taken."""
     fault = faults.get(view.camera_name)
@@ -177,15 +165,22 @@ def _training_view(
     given: _WithLidar,
     image: UInt8[Tensor, "recorded_height recorded_width 3"],
     config: ObservationConfig,
+    *,
+    hidden: Bool[Tensor, "height width"] | None,
 ) -> TrainingView:
-    """A recorded image at fit size, with its sky and its frame's LiDAR depth."""
+    """A recorded image at fit size, with its sky and its frame's LiDAR depth.
+
+    What shows the recording car itself is `hidden`, and no sky.
+    """
     camera = fit_camera(given.view, config)
     rgb_u8 = shrink_image(image, width_px=camera.width_px, height_px=camera.height_px)
+    is_sky = sky_mask(rgb_u8, given.near, camera)
     return TrainingView(
         key=given.view.key,
         camera=camera,
         timestamp_ns=given.recorded.timestamp_ns,
         rgb_u8=rgb_u8,
-        sky_mask=sky_mask(rgb_u8, given.near, camera),
+        sky_mask=is_sky if hidden is None else is_sky & ~hidden,
         lidar_depth_m=sparse_lidar_depth(given.exposed, camera),
+        hidden=hidden,
     )

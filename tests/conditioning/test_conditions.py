@@ -126,14 +126,28 @@ def test_novel_cameras_stand_beside_and_above_the_path(views):
 def test_rounds_paint_ever_farther_out():
     shifts = (Shift(lateral_m=2), Shift(lateral_m=-3), Shift(up_m=1.5))
     config = NovelGuidanceConfig(shifts=shifts, outwards_m=1)
-    assert config.in_round(1).shifts == shifts
-    names = [shift.name for shift in config.in_round(3).shifts]
+    assert config.in_round(1, 7).shifts == shifts
+    names = [shift.name for shift in config.in_round(3, 7).shifts]
     assert names == ["left-4m", "right-5m", "up-1.5m"]
     with pytest.raises(ConfigError, match="outwards_m in round 7: -9 m"):
-        config.in_round(7)
+        config.in_round(7, 7)
     for metres in (-1.0, float("nan"), 9.0):
         with pytest.raises(ConfigError, match="outwards_m must lie between 0 and 8"):
             NovelGuidanceConfig(outwards_m=metres)
+
+
+def test_rounds_share_the_distances_to_the_side():
+    config = NovelGuidanceConfig()
+
+    def painted(number, rounds):
+        return [shift.name for shift in config.in_round(number, rounds).shifts]
+
+    assert config.in_round(1, 1) == config
+    assert painted(1, 2) == ["left-2m", "right-2m", "up-1.5m"]
+    assert painted(2, 2) == ["left-3m", "right-3m", "up-1.5m"]
+    assert painted(3, 3) == painted(1, 3) == painted(1, 2)
+    up = NovelGuidanceConfig(shifts=(Shift(up_m=1.5),))
+    assert up.in_round(2, 2) == up
 
 
 def test_a_standing_car_still_has_a_left_side(views):
@@ -141,6 +155,16 @@ def test_a_standing_car_still_has_a_left_side(views):
     novel = novel_cameras(views, range(10), ego_path(step_m=0.0), config=config)
     offset = novel[0].camera.centre_world - views[0].camera.centre_world
     assert offset.tolist() == pytest.approx([0, 3, 0])
+
+
+def test_of_a_standing_car_an_image_each_half_second_is_painted(views):
+    standing = [
+        replace(views[0], key=(frame, "front"), timestamp_ns=100_000_000 * frame)
+        for frame in range(40)
+    ]
+    config = NovelGuidanceConfig(shifts=(Shift(lateral_m=3),), every_nth=2)
+    novel = novel_cameras(standing, range(40), ego_path(40, step_m=0.0), config=config)
+    assert [camera.key[0] for camera in novel] == [0, 10, 20, 30]
 
 
 def test_a_frame_without_an_ego_pose_is_refused(views):

@@ -93,17 +93,18 @@ def planned_memory(
     painted = [view.camera.width_px * view.camera.height_px for view in guidance]
     kept = sum(pixels) * (1 + HALF_IMAGES * bool(config.half_resolution)) * IMAGE_BYTES
     texels = sky.rows * sky.columns
+    views_at_once = 2 if painted else 1  # on a CPU
     return FitMemory(
         gaussians=count * (FLOAT * (columns + 2 * padded) + ROW_BYTES),
         sky=texels * TEXEL_BYTES,
         images=round(kept + sum(painted) * GUIDANCE_BYTES) if keeps_images else 0,
         step=FLOAT
         * (
-            count * (3 * columns + 4 * padded)
-            + max([*pixels, *painted]) * STEP_FLOATS_PER_PIXEL
+            count * ((2 + views_at_once) * columns + 4 * padded)
+            + (max(pixels) + max(painted, default=0)) * STEP_FLOATS_PER_PIXEL
             + texels * STEP_FLOATS_PER_TEXEL
         ),
-        rasteriser=count * RASTER_BYTES_PER_GAUSSIAN,
+        rasteriser=views_at_once * count * RASTER_BYTES_PER_GAUSSIAN,
         observed=_observed_bytes(observations),
     )
 

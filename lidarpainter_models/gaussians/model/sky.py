@@ -9,6 +9,7 @@ image shows are filled in from their neighbours by push and pull (Gortler et al.
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -36,6 +37,14 @@ MAX_TEXELS = 2_000_000
 """The texture is coarsened to stay below this (a full turn of sharp cameras is 8 million)."""
 MIN_TRANSMITTANCE = 0.9
 """A texel learns only through pixels clearer than this."""
+
+
+class _Part(NamedTuple):
+    """Some columns of a texture, as a texture of their own."""
+
+    first: int
+    layout: SkyLayout
+    rays: SkyRays
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -97,9 +106,37 @@ class SkyTexture:
         learning_rate: float,
     ) -> None:
         """One optimiser step on the texels seen through pixels of positive `clear`, in place."""
-        texel_gradient, texel_weight = scatter_gradient(gradient, clear, rays, self.layout)
-        self.weight.add_(texel_weight)
-        step_texels(self.rgb, self.moments, texel_gradient, texel_weight, learning_rate)
+        part = self._met(rays, clear > 0)
+        first, last = part.first, part.first + part.layout.columns
+        texel_gradient, texel_weight = scatter_gradient(gradient, clear, part.rays, part.layout)
+        self.weight[:, first:last] += texel_weight
+        moments = TexelMoments(
+            first=self.moments.first[:, first:last],
+            second=self.moments.second[:, first:last],
+            visits=self.moments.visits[:, first:last],
+        )
+        step_texels(self.rgb[:, first:last], moments, texel_gradient, texel_weight, learning_rate)
+
+    def _met(self, rays: SkyRays, learns: Bool[Tensor, "height width"]) -> _Part:
+        """The columns that rays meet, on a CPU: a camera sees a part, and to clear all takes time.
+
+        All of them on a GPU, which would have to be waited for, and where rays meet the seam.
+        """
+        everything = _Part(0, self.layout, rays)
+        if rays.places.device.type != "cpu" or not bool(learns.any()):
+            return everything
+        columns = rays.places[..., 0][learns] - 0.5  # between the centres of two texels each
+        first, last = int(columns.min().floor()), int(columns.max().floor()) + 2
+        if self.layout.wraps and (first < 0 or last > self.layout.columns):
+            return everything
+        first, last = max(first, 0), min(last, self.layout.columns)
+        layout = replace(
+            self.layout,
+            azimuth_left_rad=self.layout.azimuth_left_rad - first * self.layout.texel_rad,
+            columns=last - first,
+        )
+        places = rays.places - torch.tensor([float(first), 0.0])
+        return _Part(first, layout, replace(rays, places=places))
 
     def filled(self) -> "SkyTexture":
         """The same sky with every unseen texel filled in from seen ones."""

@@ -23,12 +23,8 @@ _ROOTS = torch.linspace(0, 1, STEPS + 1)[:, None].expand(-1, 3)
 CURVE = to_display(_ROOTS**2)[:, 0].numpy().copy()
 """Displayed brightness by the root of light, in equal steps."""
 _FAST = {"contract", "arcp", "nsz", "afn", "reassoc"}  # infinities keep their meaning
-_COMPILED: dict[str, Any] = {
-    "cache": True,
-    "nogil": True,
-    "error_model": "numpy",
-    "fastmath": _FAST,
-}
+_CACHED: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": _FAST}
+_COMPILED = _CACHED | {"error_model": "numpy"}
 _INNER = _COMPILED | {"forceinline": True}  # calls would pass every array's parts one by one
 
 # single precision throughout: a double constant would turn all that it meets to doubles

@@ -1,7 +1,9 @@
+import pytest
 import torch
 from gaussian_world import camera_at, turned_camera
 
 from lidarpainter_models.gaussians.model.sky import (
+    SkyTexture,
     push_pull,
     seen_as_sky,
     sky_from_images,
@@ -9,7 +11,7 @@ from lidarpainter_models.gaussians.model.sky import (
 )
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_rotation, rotation_from_vector
-from lidarpainter_models.kernels.sky_texture import sky_rays
+from lidarpainter_models.kernels.sky_texture import scatter_gradient, sky_rays, step_texels
 
 
 def test_crop_holds_every_ray_of_its_cameras():
@@ -72,3 +74,27 @@ def test_a_direction_is_sky_for_all_views_if_it_is_for_one():
     assert bool(other[:18, ahead.width_px // 2 :].all())
     assert not bool(other[:, 0].any())
     assert not bool(other[30:].any())
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, 1.5, 3.1])
+def test_a_camera_moves_the_texels_it_sees_as_if_all_were_looked_at(yaw_rad):
+    layout = sky_layout([turned_camera(yaw) for yaw in (0.0, 1.5, 3.1, -1.5)])
+    assert layout.wraps
+    camera = turned_camera(yaw_rad)
+    generator = torch.Generator().manual_seed(1)
+    size = (camera.height_px, camera.width_px)
+    gradient = torch.randn(*size, 3, generator=generator)
+    clear = torch.rand(size, generator=generator) * (torch.arange(size[0]) < 20)[:, None]
+    rays = sky_rays(camera, layout, clear > 0)
+    found, whole = (SkyTexture.constant(layout, torch.full((3,), 0.5)) for _ in range(2))
+    for _ in range(3):
+        found.observe(gradient, clear, rays, 0.01)
+        texel_gradient, texel_weight = scatter_gradient(gradient, clear, rays, layout)
+        whole.weight.add_(texel_weight)
+        step_texels(whole.rgb, whole.moments, texel_gradient, texel_weight, 0.01)
+    assert bool((whole.weight > 0).any())
+    assert torch.equal(found.rgb, whole.rgb)
+    assert torch.equal(found.weight, whole.weight)
+    assert torch.equal(found.moments.visits, whole.moments.visits)
+    found.observe(gradient, torch.zeros(size), rays, 0.01)
+    assert torch.equal(found.rgb, whole.rgb)
