@@ -7,7 +7,7 @@ are left out; refused paintings stay in the result, for the report, but give no 
 forward, y left, z up; metres.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -36,7 +36,6 @@ from lidarpainter_models.lidar.lidar_map import LidarMap
 from lidarpainter_models.lidar.map_building import views_showing_more
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.observations.views import GuidanceView, TrainingView
-from lidarpainter_models.painter.one_step.painter import OneStepPainter
 from lidarpainter_models.painter.protocol import Painter, Painting, PaintingConditions
 from lidarpainter_models.scenes.records import ViewKey
 
@@ -171,9 +170,11 @@ def paint_novel_views(
             "painting: a narrower observation.width_px takes less",
         )
 
-    # the one-step painter's network has work for all threads, and needs gigabytes for it
-    are_free = config.sequence.previous == "unused" and not isinstance(painter, OneStepPainter)
-    made = side_by_side(painted, standing, device) if are_free else map(painted, standing)
+    made: Iterator[NovelPainting]
+    if any(path.goes_in_order for path in paths.values()):
+        made = map(painted, standing)
+    else:
+        made = side_by_side(painted, standing, device)
     paintings = []
     for done, painting in enumerate(made, start=len(cameras) - len(standing) + 1):
         paintings.append(painting)

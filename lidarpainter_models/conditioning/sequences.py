@@ -16,6 +16,7 @@ from lidarpainter_models.conditioning.references import WarpTarget, warped_refer
 from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.conditioning.warping import SourceImage
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.painter.one_step.painter import OneStepPainter
 from lidarpainter_models.painter.protocol import (
     DEFAULT_PROMPT,
     Painter,
@@ -59,6 +60,14 @@ class SequencePainter:
         self._camera_name = camera_name
         self._prompt = prompt
         self._previous: SourceImage | None = None
+
+    @property
+    def goes_in_order(self) -> bool:
+        """Whether views must be painted one after the other, in their order.
+
+        So they are by the one-step painter too, whose network has work for all threads.
+        """
+        return self._config.previous != "unused" or isinstance(self._painter, OneStepPainter)
 
     def paint(self, camera: Camera, timestamp_ns: int) -> PaintedFrame:
         """Paint the next view of the path."""

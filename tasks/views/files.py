@@ -1,10 +1,12 @@
 """What is written of a followed path: images, depth, who is where, films, pairs side by side."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -23,6 +25,7 @@ from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.instance_images import SKY, STREET, instance_image
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid
+from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.observations.fit_size import shrink_image
 from lidarpainter_models.scenes.records import RecordedView
 from tasks.json_files import write_json
@@ -104,7 +107,6 @@ def write_views(
         advanced: called after every view.
     """
     rates = [_images_per_second(path, kinds) for path in paths]
-    numbers = [{view.frame_index: n for n, view in enumerate(path.views)} for path in paths]
     rows: list[list[dict[str, Any]]] = [[] for _ in paths]
     with ExitStack() as stack:
         writers = [
@@ -112,15 +114,14 @@ def write_views(
             for film, rate in zip(films, rates, strict=False)
         ]
         rig = stack.enter_context(video_file(together, max(rates))) if together else None
-        for frame_index in sorted({index for own in numbers for index in own}):
+        written = _written(paths, folders, kinds, companion)
+        for _, of_moment in groupby(written, key=attrgetter("frame_index")):
             seen: dict[int, list[Tensor]] = {}
-            for place, path in enumerate(paths):
-                if (number := numbers[place].get(frame_index)) is None:
-                    continue
-                row, seen[place] = _write_view(path, number, kinds, folders[place], companion)
-                rows[place].append(row)
+            for view in of_moment:
+                rows[view.place].append(view.row)
+                seen[view.place] = view.images
                 if writers:
-                    writers[place].add(torch.cat(seen[place], dim=1))
+                    writers[view.place].add(torch.cat(view.images, dim=1))
                 advanced()
             if rig is not None:
                 rig.add(_rig_image(paths, seen))
@@ -129,6 +130,41 @@ def write_views(
         for path, own, folder in zip(paths, rows, folders, strict=True)
     ]
     return [one | ({"fps": max(rates)} if kinds.video else {}) for one in made]
+
+
+class _Written(NamedTuple):
+    """One view whose files are written."""
+
+    frame_index: int
+    place: int
+    """Of its path among all."""
+    row: dict[str, Any]
+    """Where it was taken."""
+    images: list[Tensor]
+    """What films show of it."""
+
+
+def _written(
+    paths: Sequence[FollowedPath],
+    folders: Sequence[Path],
+    kinds: ViewKinds,
+    companion: Companion | None,
+) -> Iterator[_Written]:
+    """Write all views, moment by moment; several at once where none leans on the one before."""
+    moments = sorted(
+        (view.frame_index, place, number)
+        for place, path in enumerate(paths)
+        for number, view in enumerate(path.views)
+    )
+
+    def write(moment: tuple[int, int, int]) -> _Written:
+        frame_index, place, number = moment
+        found = _write_view(paths[place], number, kinds, folders[place], companion)
+        return _Written(frame_index, place, *found)
+
+    if any(path.painter is not None and path.painter.goes_in_order for path in paths):
+        return map(write, moments)
+    return side_by_side(write, moments, paths[0].builder.scene.device)
 
 
 def _images_per_second(path: FollowedPath, kinds: ViewKinds) -> float:
