@@ -94,12 +94,13 @@ class ConditionBuilder:
 
     def source(self, key: ViewKey) -> SourceImage:
         """A training image with the surfaces it shows, colours before its exposure."""
+        pixels = self._cameras[key].width_px * self._cameras[key].height_px
+        most = max(MOST_SOURCE_BYTES // (SOURCE_PIXEL_BYTES * pixels), 1)
         with self._of_sources:  # views beside each other ask for the same ones
             is_new = key not in self._sources
             source = self._sources.setdefault(key, Future())
             self._sources.move_to_end(key)
-            pixels = self._cameras[key].width_px * self._cameras[key].height_px
-            while len(self._sources) > max(MOST_SOURCE_BYTES // (SOURCE_PIXEL_BYTES * pixels), 1):
+            while len(self._sources) > most:
                 self._sources.popitem(last=False)
         if is_new:
             try:

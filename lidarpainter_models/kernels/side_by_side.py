@@ -65,9 +65,10 @@ def side_by_side(
 def both(
     first: Callable[[], Made], second: Callable[[], Other], device: torch.device
 ) -> tuple[Made, Other]:
-    """What two different pieces make; on a CPU each has half of the threads.
+    """What two different pieces make: at once on a CPU, each with half of the threads.
 
-    Neither may change what the other reads. Else they are made one after the other.
+    Neither may change what the other reads. On a GPU, and where there is one thread or a pool that
+    holds no other, they are made one after the other.
     """
     threads = _shared_threads(device)
     if threads == 1:

@@ -86,7 +86,10 @@ def fit_step(
     if guidance is None:
         found = of_recorded()
     else:
-        of_painted = partial(add_guidance_gradients, state, seen, guidance, config, perceptual)
+        bodies = views[1][1]
+        of_painted = partial(
+            add_guidance_gradients, state, seen, guidance, bodies, config, perceptual
+        )
         found, _ = both(of_recorded, of_painted, state.scene.device)
     state.tally.add(seen.rows, found.screen_gradient, found.splat.visible)
     state.refinement.step(state.step, image)
@@ -161,6 +164,7 @@ def add_guidance_gradients(
     state: FitState,
     seen: SeenGaussians,
     view: GuidanceView,
+    camera_from_bodies: Float[Tensor, "bodies 4 4"],
     config: FitConfig,
     perceptual: Perceptual | None = None,
 ) -> None:
@@ -172,9 +176,7 @@ def add_guidance_gradients(
     sky, settings = state.scene.sky, config.guidance
     bending = state.scene.actors.bending
     held = replace(bending, offset_m=bending.offset_m.detach())
-    splat = draw_gaussians(
-        held.bent(seen, view.timestamp_ns), _guidance_bodies(state, view), view.camera
-    )
+    splat = draw_gaussians(held.bent(seen, view.timestamp_ns), camera_from_bodies, view.camera)
     sky_rgb = sky.sample(sky.rays(view.camera, splat.alpha.detach() < OPAQUE))
     shown = splat.rgb + (1 - splat.alpha)[..., None] * sky_rgb
     loss = settings.weight * l1_ssim_loss(

@@ -186,7 +186,7 @@ def with_guidance_gradients(world, view, config, perceptual=None):
     poses = state.scene.actors.corrected_poses(view.timestamp_ns)
     bodies = camera_from_body(view.camera.world_from_camera, *poses)
     seen = state.seen([(view.camera, bodies)])
-    add_guidance_gradients(state, seen, view, config, perceptual)
+    add_guidance_gradients(state, seen, view, bodies, config, perceptual)
     return state, seen
 
 
