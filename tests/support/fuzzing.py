@@ -166,9 +166,11 @@ def _contents(sandbox, store):
 def _memory_limit(num_bytes):
     """An error once the process asks for so much more; the resident set is judged afterwards.
 
-    Both count from where the process stands: tests before may have left gigabytes with it.
+    Both count from where the process stands, the set from its highest yet where no peak can be
+    reset: tests before may have left gigabytes with it.
     """
-    resident_bytes = _process_bytes("VmRSS")
+    with measured() as before:
+        pass
     earlier = resource.getrlimit(resource.RLIMIT_DATA)
     most_bytes = _process_bytes("VmData") + 2 * num_bytes
     resource.setrlimit(resource.RLIMIT_DATA, (most_bytes, earlier[1]))
@@ -177,7 +179,7 @@ def _memory_limit(num_bytes):
             yield
     finally:
         resource.setrlimit(resource.RLIMIT_DATA, earlier)
-    taken_bytes = cost.peak_memory_bytes - resident_bytes
+    taken_bytes = cost.peak_memory_bytes - before.peak_memory_bytes
     assert taken_bytes < num_bytes, f"{taken_bytes} bytes of memory"
 
 
