@@ -149,14 +149,16 @@ def continuation(
 ) -> FitConfig:
     """How a fit goes on from a fitted scene, for so many steps or looks.
 
-    Full images and free poses from the first step; growth and rates as in the first fit. Rates
-    started lower held nothing better and took in a fifth less of what was painted.
+    Full images and actors free to move from the first step; growth and rates as in the first fit.
+    Rates started lower held nothing better and took in a fifth less of what was painted. Cameras
+    stay where the first fit has them: what they still move is noise, which painted views, seen from
+    where they were, pay for (docs/benchmarks.md).
     """
     return replace(
         config,
         effort=replace(config.effort, looks=looks or config.effort.looks),
         steps=steps,
         half_resolution=0.0,
-        refinement=replace(config.refinement, start_step=0),
+        refinement=replace(config.refinement, cameras=False, start_step=0),
         guidance=guidance or config.guidance,
     )
