@@ -131,7 +131,7 @@ def _are_twins(first: ActorTrack, second: ActorTrack) -> bool:
 def _largest_miscount(scene: DrivingScene) -> str:
     """Recount the points of some well-filled boxes; names the worst if it is far off."""
     frame_index = scene.sweeps[len(scene.sweeps) // 2].frame_index
-    xyz_m = scene.read_points(frame_index).xyz_m
+    xyz_m = scene.read_positions(frame_index)
     for track in scene.tracks[:_NUM_RECOUNTED]:
         rows = (track.frame_indices == frame_index).nonzero()[:, 0]
         for row in rows.tolist():

@@ -43,7 +43,7 @@ def check_box_places(scene: DrivingScene) -> tuple[Verdict, str]:
     ]
     off_m = []
     for frame_index in (swept[place] for place in np.unique(places)):
-        xyz_m = scene.read_points(frame_index).xyz_m.double()
+        xyz_m = scene.read_positions(frame_index).double()
         for track in standing:
             row = (track.frame_indices == frame_index).nonzero()[:, 0]
             if len(row) and (found := _off_m(scene, track, int(row[0]), xyz_m)) is not None:

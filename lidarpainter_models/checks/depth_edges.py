@@ -150,7 +150,7 @@ def _depth_edges(scene: DrivingScene, frame_index: int) -> dict[str, EdgePoints]
 
 def _standing_points(scene: DrivingScene, sweep: Sweep) -> np.ndarray:
     """The points of a sweep outside moving actors, float64."""
-    xyz_m = scene.read_sweep(sweep).xyz_m
+    xyz_m = scene.read_column(sweep, "xyz_m")
     stands = torch.ones(len(xyz_m), dtype=torch.bool)
     for track in scene.tracks:
         if track.is_moving and track.is_present(sweep.timestamp_ns):

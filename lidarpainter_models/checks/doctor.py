@@ -219,7 +219,7 @@ def check_camera_rig(scene: DrivingScene) -> tuple[Verdict, str]:
 def check_ground(scene: DrivingScene) -> tuple[Verdict, str]:
     """Whether up is up: the lowest points around the car form a level plane below it."""
     position = scene.world_from_ego[0, :3, 3]
-    xyz_m = scene.read_points(scene.sweeps[0].frame_index).xyz_m.double() - position
+    xyz_m = scene.read_positions(scene.sweeps[0].frame_index).double() - position
     near = xyz_m[(xyz_m[:, :2].norm(dim=1) < NEIGHBOURHOOD_M) & (xyz_m[:, 2].abs() < 4)].numpy()
     if len(near) < 100:
         return "warn", f"only {len(near)} points within {NEIGHBOURHOOD_M:.0f} m of the car"
@@ -254,7 +254,7 @@ def check_coverage(scene: DrivingScene) -> tuple[Verdict, str]:
     covered: dict[str, list[float]] = {name: [] for name in scene.camera_names}
     frames = sorted({sweep.frame_index for sweep in scene.sweeps})
     for position in sampled_positions(len(frames)):
-        xyz_m = scene.read_points(frames[position]).xyz_m[::_POINT_STRIDE]
+        xyz_m = scene.read_positions(frames[position])[::_POINT_STRIDE]
         for view in scene.views:
             if view.frame_index == frames[position]:
                 covered[view.camera_name].append(_covered_share(view, xyz_m))
@@ -289,7 +289,7 @@ def _covered_share(view: RecordedView, xyz_m: Float[Tensor, "points 3"]) -> floa
 
 def _points_near_ego(scene: DrivingScene, frame_index: int) -> np.ndarray:
     centre_m = scene.world_from_ego[scene.frame_position(frame_index), :3, 3]
-    return points_near(scene.read_points(frame_index).xyz_m, centre_m)
+    return points_near(scene.read_positions(frame_index), centre_m)
 
 
 def _lowest_in_cells(points_m: np.ndarray) -> np.ndarray:

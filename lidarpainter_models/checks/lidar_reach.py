@@ -69,7 +69,7 @@ class LidarReach:
 def reaches_of(scene: DrivingScene, frame_index: int) -> list[LidarReach]:
     """What each sweep of a frame covered."""
     return [
-        LidarReach.of(scene.read_sweep(sweep).xyz_m, sweep.world_from_lidar)
+        LidarReach.of(scene.read_column(sweep, "xyz_m"), sweep.world_from_lidar)
         for sweep in scene.sweeps_of(frame_index)
     ]
 

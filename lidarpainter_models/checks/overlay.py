@@ -28,7 +28,7 @@ def draw_overlay(
     view = scene.view(frame_index, camera_name)
     image = np.ascontiguousarray(scene.read_image(view).numpy())
     if scene.sweeps_of(frame_index):
-        _draw_points(image, view.camera, scene.read_points(frame_index).xyz_m)
+        _draw_points(image, view.camera, scene.read_positions(frame_index))
     draw_boxes(image, view.camera, scene.tracks, view.timestamp_ns)
     return torch.from_numpy(image)
 

@@ -89,7 +89,7 @@ def _image(
     )
     size = (camera.width_px, camera.height_px)
     rgb = cv2.resize(scene.read_image(view).numpy(), size, interpolation=cv2.INTER_AREA)
-    clouds = [(scene.read_sweep(s).xyz_m, s) for s in scene.sweeps_of(view.frame_index)]
+    clouds = [(scene.read_column(s, "xyz_m"), s) for s in scene.sweeps_of(view.frame_index)]
     standing = [
         xyz_m[boxes.owners(xyz_m, sweep.timestamp_ns, floor_m=-torch.inf) == BACKGROUND]
         for xyz_m, sweep in clouds

@@ -166,6 +166,11 @@ class DrivingScene:
         sweeps = self._sweeps_required(frame_index)
         return SweepPoints.concatenate([self.read_sweep(sweep) for sweep in sweeps])
 
+    def read_positions(self, frame_index: int) -> Float[Tensor, "points 3"]:
+        """Where the points of `read_points` are, for whoever needs no more."""
+        sweeps = self._sweeps_required(frame_index)
+        return torch.cat([self.read_column(sweep, "xyz_m") for sweep in sweeps])
+
     def read_semantics(self, frame_index: int) -> UInt8[Tensor, " points"] | None:
         """Class of each point of `read_points`, or None where the dataset has no classes."""
         if not self._stored.has_array("point_semantics"):

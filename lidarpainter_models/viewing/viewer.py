@@ -94,7 +94,7 @@ class LiveViewer:
                 self._place_rig(view.frame_index)
             self._lidar.cloud.visible = wanted.lidar.value
             if wanted.lidar.value and self._drive.path.recorded.sweeps_of(view.frame_index):
-                points = self._drive.path.recorded.read_points(view.frame_index).xyz_m
+                points = self._drive.path.recorded.read_positions(view.frame_index)
                 every = max(-(-len(points) // MOST_POINTS), 1)
                 self._lidar.place(points[::every], self._seat.centre_world)
 

@@ -102,6 +102,6 @@ def _view(
     else:
         size = {"width_px": camera.width_px, "height_px": camera.height_px}
         rgb_u8 = shrink_image(path.recorded.read_image(moment), **size)
-        points_world = path.recorded.read_points(moment.frame_index).xyz_m
+        points_world = path.recorded.read_positions(moment.frame_index)
         rgb, sky = rgb_u8.float() / 255, sky_mask(rgb_u8, points_world, camera)
     return style_view(path.builder, camera, moment.timestamp_ns, rgb, sky)

@@ -30,20 +30,20 @@ def street(tmp_path_factory):
     return record_street(drawn_street(config), tmp_path_factory.mktemp("street"))
 
 
-def cropped(sweep, points):
+def is_ahead(sweep, xyz_m):
     """What a LiDAR would have measured that looks ahead alone."""
-    away_m = transform_points(invert_rigid(sweep.world_from_lidar).to(points.xyz_m), points.xyz_m)
-    ahead = torch.atan2(away_m[:, 1], away_m[:, 0]).rad2deg().abs() < HALF_SECTOR_DEG
-    columns = {name: getattr(points, name)[ahead] for name in points.__dataclass_fields__}
-    return replace(points, **columns)
+    away_m = transform_points(invert_rigid(sweep.world_from_lidar).to(xyz_m), xyz_m)
+    return torch.atan2(away_m[:, 1], away_m[:, 0]).rad2deg().abs() < HALF_SECTOR_DEG
 
 
 def looking_ahead(path):
     """The street as recorded by a LiDAR of a sector, with labels all round."""
     scene = DrivingScene.open(path)
-    read_whole = scene.read_sweep
-    scene.read_sweep = lambda sweep: cropped(sweep, read_whole(sweep))
-    scene.read_points = cache(scene.read_points)  # every track asks for them
+    whole = scene.read_column
+    scene.read_column = lambda sweep, name: whole(sweep, name)[
+        is_ahead(sweep, whole(sweep, "xyz_m"))
+    ]
+    scene.read_positions = cache(scene.read_positions)  # every track asks for them
     scene.tracks = tuple(recounted(scene, track) for track in scene.tracks)
     return scene
 
@@ -51,7 +51,7 @@ def looking_ahead(path):
 def recounted(scene, track):
     counts = []
     for frame_index, pose in zip(track.frame_indices.tolist(), track.world_from_box, strict=True):
-        xyz_m = scene.read_points(frame_index).xyz_m
+        xyz_m = scene.read_positions(frame_index)
         counts.append(int(is_inside_box(xyz_m, pose, track.size_m).sum()))
     return replace(track, num_points=torch.tensor(counts))
 
