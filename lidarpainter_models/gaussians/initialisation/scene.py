@@ -6,6 +6,7 @@ what the recorded views never show still needs geometry once the camera leaves i
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -32,6 +33,7 @@ from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.sky import sky_from_images, sky_layout
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import transform_points
+from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.lidar_map import MapPoints
 from lidarpainter_models.lidar.map_building import LEAST_WAY_M
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
@@ -62,6 +64,8 @@ OUTLINE_VIEWS_PER_CAMERA = 8
 """Views that tell what stands against the sky."""
 MOST_STREET_POINTS = 5_000_000
 """Of the street's points so many are looked at, evenly: dozens for each Gaussian."""
+POINTS_AT_ONCE = 32_768
+"""Points that are asked for by one view after the other: what is kept of them fits a cache."""
 _MOST_VIEWS_PER_ACTOR = 24
 
 
@@ -181,9 +185,21 @@ def pixel_footprint(
     pixel, so many of them make the error of all images least where n follows the root of the sum
     of f^-4 over the images; that root is the density, 0 for a point in no image.
     """
+    parts = side_by_side(
+        partial(_part_footprint, cameras=cameras, images=images or [1] * len(cameras)),
+        xyz_m.split(POINTS_AT_ONCE),
+    )
+    footprint, density = zip(*parts, strict=True)
+    return torch.cat(footprint), torch.cat(density)
+
+
+def _part_footprint(
+    xyz_m: Float[Tensor, "points 3"], cameras: Sequence[Camera], images: Sequence[int]
+) -> tuple[Float[Tensor, " points"], Float[Tensor, " points"]]:
+    """`pixel_footprint` of a few points."""
     footprint = torch.full((xyz_m.shape[0],), torch.inf)
     total = torch.zeros(xyz_m.shape[0])
-    for camera, count in zip(cameras, images or [1] * len(cameras), strict=True):
+    for camera, count in zip(cameras, images, strict=True):
         pixels_uv, depth_m = camera.project(xyz_m)
         is_inside = camera.contains(pixels_uv, depth_m, near_m=0.5)
         margin_px = camera.fx_px * ASIDE_M / depth_m.clamp(min=0.5)

@@ -11,11 +11,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene, SceneRender
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
 from lidarpainter_models.geometry.box_masks import project_boxes
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation
+from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.ground_heights import GroundHeights
 from lidarpainter_models.observations.plane_sweep import (
     choose_depth,
@@ -28,8 +29,6 @@ COMPARED_VIEWS = 3
 """Other views of the same camera that each is compared with."""
 STRIDE_PX = 3
 """Pixels between two Gaussians; splitting refines them later."""
-NUM_DEPTHS = 24
-"""Depths tried."""
 PRIOR = 0.03
 """Colour difference for which a depth far from the surroundings' is believed."""
 OPACITY = 0.6
@@ -38,6 +37,8 @@ VIEWS_PER_CAMERA = 4  # training views that are looked at, evenly over the log
 MOST_SHARE = 0.12  # at most this part of the start size; a larger stride is taken if need be
 NEAREST_M = 8.0  # nearer things are within every LiDAR's reach
 FARTHEST_M = 800.0  # beyond it a lane's width moves nothing by a pixel
+DEPTHS_M = sweep_depths(NEAREST_M, FARTHEST_M, 24)
+"""Depths tried."""
 MOST_BELOW_GROUND_M = 1.0
 """Deeper ones are dropped; roads fall away further than the LiDAR sees them."""
 
@@ -60,39 +61,58 @@ def unreached_gaussians(
         for of_camera in [[view for view in views if view.key[1] == name]]
         for view in _evenly(of_camera, VIEWS_PER_CAMERA)
     ]
-    for done, (view, of_camera) in enumerate(chosen):
+    costs = side_by_side(lambda one: _cost_of_depths(scene, *one), chosen, scene.device)
+    for done, ((view, _), cost) in enumerate(zip(chosen, costs, strict=True)):
         rest = budget - len(found)
         share = rest // (len(chosen) - done)
-        grown = scene.with_gaussians(scene.gaussians.append(found))
-        seeds = _seeds_of_view(grown, view, of_camera, budget=share)
-        found = found.append(_above_ground(seeds, ground))
+        if cost is not None and share > 0:
+            grown = scene.with_gaussians(scene.gaussians.append(found))
+            seeds = _seeds_of_view(grown, view, cost, budget=share)
+            found = found.append(_above_ground(seeds, ground))
         progress((done + 1) / len(chosen))
     return found
 
 
+def _cost_of_depths(
+    scene: GaussianScene, view: TrainingView, of_camera: Sequence[TrainingView]
+) -> Float[Tensor, "depths height width"] | None:
+    """How badly others of a camera agree with a view at each depth; None where nobody asks."""
+    others = [other for other in of_camera if other.key != view.key]
+    if not others or not bool(_open_places(scene, view, _render(scene, view)).any()):
+        return None
+    compared = [(other.camera, other.rgb) for other in _evenly(others, COMPARED_VIEWS)]
+    return sweep_cost(view.camera, view.rgb, compared, DEPTHS_M)
+
+
 def _seeds_of_view(
-    scene: GaussianScene, view: TrainingView, of_camera: Sequence[TrainingView], *, budget: int
+    scene: GaussianScene,
+    view: TrainingView,
+    cost: Float[Tensor, "depths height width"],
+    *,
+    budget: int,
 ) -> GaussianSet:
     """The Gaussians that one view asks for."""
-    render = scene.render(view.camera, view.timestamp_ns)
-    is_open = (render.alpha < 0.5) & view.shows_surface & ~_moving(scene, view)
-    is_open &= ~_thin(is_open)
-    count = int(is_open.sum())
-    if count == 0 or budget <= 0 or len(of_camera) < 2:
-        return GaussianSet.empty(sh_degree=scene.gaussians.sh_degree)
-    stride = max(STRIDE_PX, int((count / budget) ** 0.5) + 1)
-    others = [other for other in of_camera if other.key != view.key]
-    compared = _evenly(others, COMPARED_VIEWS)
-    depths_m = sweep_depths(NEAREST_M, FARTHEST_M, NUM_DEPTHS)
-    cost = sweep_cost(
-        view.camera, view.rgb, [(other.camera, other.rgb) for other in compared], depths_m
-    )
+    render = _render(scene, view)
+    is_open = _open_places(scene, view, render)
+    stride = max(STRIDE_PX, int((int(is_open.sum()) / budget) ** 0.5) + 1)
     expected_m = depth_from_below(render.depth_m, fallback_m=FARTHEST_M)
-    depth_m = choose_depth(cost, depths_m, expected_m, prior=PRIOR)
+    depth_m = choose_depth(cost, DEPTHS_M, expected_m, prior=PRIOR)
     grid = torch.zeros_like(is_open)
     grid[stride // 2 :: stride, stride // 2 :: stride] = True
     rgb = scene.exposure.undone(view.rgb, view.key[1], view.timestamp_ns)
     return _facing_discs(view.camera, rgb, depth_m, is_open & grid, stride, scene.gaussians)
+
+
+def _render(scene: GaussianScene, view: TrainingView) -> SceneRender:
+    return scene.render(view.camera, view.timestamp_ns)
+
+
+def _open_places(
+    scene: GaussianScene, view: TrainingView, render: SceneRender
+) -> Bool[Tensor, "height width"]:
+    """Pixels of what stands still and is not sky, through which the scene can be looked."""
+    is_open = (render.alpha < 0.5) & view.shows_surface & ~_moving(scene, view)
+    return is_open & ~_thin(is_open)
 
 
 def _above_ground(seeds: GaussianSet, ground: GroundHeights) -> GaussianSet:
