@@ -21,7 +21,7 @@ class RefinementConfig:
     """Which poses and colours of the recording may be corrected."""
 
     cameras: bool = True
-    """Refine the pose of every training view (+0.9 dB on a real log)."""
+    """Refine the pose of every training view (+0.9 dB on a real log); rounds hold it."""
     actors: bool = True
     """Refine the pose of every actor over time (+1.2 dB inside boxes)."""
     exposure: bool = False
