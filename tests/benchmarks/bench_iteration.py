@@ -22,7 +22,7 @@ from splat_drawing import render
 from lidarpainter_models.gaussians.fitting.config import FitConfig, RefinementConfig
 from lidarpainter_models.gaussians.fitting.images import full_image
 from lidarpainter_models.gaussians.fitting.state import FitState
-from lidarpainter_models.gaussians.fitting.step import Look, fit_step
+from lidarpainter_models.gaussians.fitting.step import fit_step
 from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
@@ -121,8 +121,7 @@ class Fit:
 
     def step(self):
         """What every step of a fit does, on one recorded view after the other."""
-        look = Look(self.view, self.images[self.view])
-        fit_step(self.state, [look], None, self.config, None)
+        fit_step(self.state, self.images[self.view], self.view, None, self.config, None)
         self.state.step += 1
         self.view = (self.view + 1) % len(self.images)
 

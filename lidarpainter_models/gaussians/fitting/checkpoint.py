@@ -18,11 +18,6 @@ from lidarpainter_models.storage.tensor_files import read_tensors, write_tensors
 FILE_NAME = "fit.safetensors"
 
 
-def has_passed(every: int, before: int, step: int) -> bool:
-    """Whether a multiple of `every` lies after `before` and not after `step`."""
-    return step // every > before // every
-
-
 @dataclass(kw_only=True)
 class CheckpointFolder:
     """Where and how often a fit is kept."""
@@ -42,9 +37,9 @@ class CheckpointFolder:
         if self.every_steps is not None and self.every_steps < 1:
             raise ConfigError(f"every_steps must be positive, got {self.every_steps}")
 
-    def is_due(self, before: int, step: int) -> bool:
-        """Whether a checkpoint should be written after this many steps, `before` the last ones."""
-        if self.every_steps is not None and has_passed(self.every_steps, before, step):
+    def is_due(self, step: int) -> bool:
+        """Whether a checkpoint should be written after this many steps."""
+        if self.every_steps is not None and step % self.every_steps == 0:
             return True
         is_late = self.every_seconds is not None
         return is_late and time.monotonic() - self._last_time >= (self.every_seconds or 0.0)

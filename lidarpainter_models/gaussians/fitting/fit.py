@@ -16,7 +16,7 @@ import torch
 
 from lidarpainter_models.devices import within_memory
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder, has_passed
+from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.densification import densify, prune
 from lidarpainter_models.gaussians.fitting.images import FitImage, full_image, half_image
@@ -32,8 +32,7 @@ from lidarpainter_models.gaussians.fitting.shape_limits import (
     viewing_rays,
 )
 from lidarpainter_models.gaussians.fitting.state import FitState
-from lidarpainter_models.gaussians.fitting.step import Look, Perceptual, fit_step
-from lidarpainter_models.gaussians.fitting.view_order import ViewOrder
+from lidarpainter_models.gaussians.fitting.step import Perceptual, fit_step
 from lidarpainter_models.gaussians.initialisation.scene import initialise_scene
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.sky import seen_as_sky, sky_layout
@@ -181,18 +180,18 @@ def _steps(  # noqa: PLR0913 - as `fit_gaussians`
         full, half = ([image.to(device) for image in images] for images in (full, half))
         guidance = [view.to(device) for view in guidance]
     clock, look, planned_steps = _Clock(state.step), told.first_look, config.steps
-    order = ViewOrder.of(surface.groups, observations.views)
-    while (before := state.step) < config.steps:
-        is_half = before < config.half_resolution * config.steps
-        _advance(state, half if is_half else full, order, guidance, config, perceptual)
+    while state.step < config.steps:
+        is_half = state.step < config.half_resolution * config.steps
+        row = state.next_view(surface.groups)
+        _advance(state, half if is_half else full, row, guidance, config, perceptual)
         state.cpu_s = time.process_time() - cpu_before_s
-        if has_passed(config.log_every, before, state.step) or state.step == config.steps:
+        if state.step % config.log_every == 0 or state.step == config.steps:
             config = clock.in_time(state.step, config)
             _log(state, config, told.progress)
         if look is not None and state.step >= config.steps * FIRST_LOOK:
             look(state.caught_up())
             look = None
-        if checkpoints is not None and checkpoints.is_due(before, state.step):
+        if checkpoints is not None and checkpoints.is_due(state.step):
             checkpoints.save(*state.keep())
     return FitResult(
         scene=_finished(state),
@@ -225,35 +224,32 @@ def _images(
 def _advance(
     state: FitState,
     images: Sequence[FitImage],
-    order: ViewOrder,
+    row: int,
     guidance: Sequence[GuidanceView],
     config: FitConfig,
     perceptual: Perceptual | None,
 ) -> None:
-    """One step or two: gradients, optimisers, and at their times the rounds that change the set."""
-    before = state.step
-    is_guided = bool(guidance) and before < config.guidance.until * config.steps
-    at_most = 1 if is_guided else config.steps - before
-    rows = order.next_rows(state.waiting, state.generator, at_most=at_most)
+    """One step: gradients, optimisers, and at their times the rounds that change the set."""
     painted = None
-    if is_guided and state.random() < config.guidance.probability:
+    takes_part = state.step < config.guidance.until * config.steps
+    if guidance and takes_part and state.random() < config.guidance.probability:
         painted = guidance[int(torch.randint(len(guidance), (), generator=state.generator))]
         painted = painted.to(state.scene.device)
-    looks = [Look(row, images[row].to(state.scene.device)) for row in rows]
-    state.recent += fit_step(state, looks, painted, config, perceptual)
-    state.step += len(looks)
-    _change_set(state, before, config)
-    if has_passed(LIMITS_EVERY, before, state.step):
+    image = images[row].to(state.scene.device)
+    told = fit_step(state, image, row, painted, config, perceptual)
+    state.step += 1
+    state.recent.append(told)
+    _change_set(state, config)
+    if state.step % LIMITS_EVERY == 0:
         scene = state.caught_up()
         limit_shapes(scene.gaussians, viewing_rays(scene), config.shapes)
         state.blocks.refresh(scene.gaussians)
 
 
-def _change_set(state: FitState, before: int, config: FitConfig) -> None:
-    """Split and prune when it is time, after the steps since `before`."""
+def _change_set(state: FitState, config: FitConfig) -> None:
+    """Split and prune when it is time."""
     settings, fraction = config.densification, state.step / config.steps
-    is_due = has_passed(settings.every, before, state.step)
-    if not is_due or fraction < settings.start or state.step == config.steps:
+    if state.step % settings.every or fraction < settings.start or state.step == config.steps:
         return
     sizes = [track.size_m for track in state.scene.actors.recorded_tracks]
     gaussians = state.caught_up().gaussians

@@ -55,15 +55,8 @@ class GaussianAdam:
         present_rows(self.state, _kept(gaussians), rows, _of_seen(seen.values()))
         return seen
 
-    def seen_again(self, gaussians: GaussianSet, seen: SeenGaussians) -> None:
-        """Move the leaves to where a step in between left their rows; their gradients stay."""
-        present_rows(self.state, _kept(gaussians), seen.rows, _of_seen(seen.values()))
-
     def step(self, gaussians: GaussianSet, seen: SeenGaussians, fraction: float) -> None:
-        """Move every row that collected a gradient, in place, after a fraction of the fit.
-
-        Rows that were stepped since they were seen must have been `seen_again`.
-        """
+        """Move every row that collected a gradient, in place, after a fraction of the fit."""
         step_rows(
             self.state,
             _kept(gaussians),

@@ -93,9 +93,7 @@ def planned_memory(
     painted = [view.camera.width_px * view.camera.height_px for view in guidance]
     kept = sum(pixels) * (1 + HALF_IMAGES * bool(config.half_resolution)) * IMAGE_BYTES
     texels = sky.rows * sky.columns
-    views_at_once = 2 if painted else 1  # on a CPU; two recorded ones see other Gaussians
-    is_rig = len({view.key[1] for view in observations.views}) > 1
-    beside = max(painted, default=max(pixels) if is_rig else 0)
+    views_at_once = 2 if painted else 1  # on a CPU
     return FitMemory(
         gaussians=count * (FLOAT * (columns + 2 * padded) + ROW_BYTES),
         sky=texels * TEXEL_BYTES,
@@ -103,7 +101,7 @@ def planned_memory(
         step=FLOAT
         * (
             count * ((2 + views_at_once) * columns + 4 * padded)
-            + (max(pixels) + beside) * STEP_FLOATS_PER_PIXEL
+            + (max(pixels) + max(painted, default=0)) * STEP_FLOATS_PER_PIXEL
             + texels * STEP_FLOATS_PER_TEXEL
         ),
         rasteriser=views_at_once * count * RASTER_BYTES_PER_GAUSSIAN,

@@ -1,6 +1,5 @@
 """What a fit corrects about the recording while it goes on: camera poses, actors, exposure."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -156,8 +155,8 @@ class Refinement:
             return 0.0
         return BEND_PRIOR / BEND_NOISE_M**2 * self.scene.actors.bending.strain(timestamp_ns)
 
-    def step(self, step: int, images: Sequence[FitImage]) -> None:
-        """Move the corrections that are refined by the gradients that images left; drop these."""
+    def step(self, step: int, image: FitImage) -> None:
+        """Move the corrections that are refined by the gradients they received; drop these."""
         if self.refines_cameras(step):
             table = self.scene.cameras.view_tangent
             self.adams["camera_adam"].step(table, _gradient(table), self._rate("camera", step))
@@ -169,10 +168,9 @@ class Refinement:
                 rate = self._rate("actor", step)
                 self.adams["actor_adam"].step(tangent.view(-1, 6), gradient, rate)
             if self._bends:
-                self._step_bending(step, images)
+                self._step_bending(step, image)
         if self.refines_exposure:
-            for later, image in enumerate(images):
-                self._step_exposure(step + later, image)
+            self._step_exposure(step, image)
         for table in self._tables():
             table.grad = None
 
@@ -180,10 +178,9 @@ class Refinement:
     def _bends(self) -> bool:
         return len(self.scene.actors.bending.bodies) > 0
 
-    def _step_bending(self, step: int, images: Sequence[FitImage]) -> None:
+    def _step_bending(self, step: int, image: FitImage) -> None:
         bending = self.scene.actors.bending
-        knots = [bending.weights_at(image.timestamp_ns)[0] for image in images]
-        near = slice(min(one.start for one in knots), max(one.stop for one in knots))
+        near, _ = bending.weights_at(image.timestamp_ns)
         rate = self.config.learning_rates.at("bending_m", step / self.config.steps)
         with torch.no_grad():
             table = bending.offset_m.view(len(bending.knots_ns), -1)

@@ -69,6 +69,18 @@ class FitState:
             generator=generator,
         )
 
+    def next_view(self, groups: Sequence[Sequence[int]]) -> int:
+        """Any view of the next group, of a random order that has each group once before any twice.
+
+        Views that show the same count as one (see `seen_surface`).
+        """
+        if not self.waiting:
+            self.waiting = torch.randperm(len(groups), generator=self.generator).tolist()
+        group = groups[self.waiting.pop()]
+        if len(group) == 1:
+            return group[0]
+        return group[int(torch.randint(len(group), (), generator=self.generator))]
+
     def random(self) -> float:
         """A uniform number in [0, 1)."""
         return float(torch.rand((), generator=self.generator))
@@ -79,16 +91,10 @@ class FitState:
         rows = self.blocks.rows_in_view(views, actor_slack=(bent_m, 0.0))
         return self.gaussian_adam.seen(self.scene.gaussians, rows)
 
-    def step_gaussians(self, seen: Sequence[SeenGaussians], steps: int) -> None:
-        """Move the Gaussians that collected gradients: of `steps` steps, one for each set of them.
-
-        A later set goes on from where the earlier ones leave its rows.
-        """
-        for number, one in enumerate(seen):
-            if number > 0:
-                self.gaussian_adam.seen_again(self.scene.gaussians, one)
-            self.gaussian_adam.step(self.scene.gaussians, one, (self.step + number) / steps)
-        self.blocks.refresh(self.scene.gaussians, torch.cat([one.rows for one in seen]))
+    def step_gaussians(self, seen: SeenGaussians, fraction: float) -> None:
+        """Move the Gaussians that collected gradients, after a fraction of the fit."""
+        self.gaussian_adam.step(self.scene.gaussians, seen, fraction)
+        self.blocks.refresh(self.scene.gaussians, seen.rows)
 
     def caught_up(self) -> GaussianScene:
         """The scene with every Gaussian where the steps so far put it."""

@@ -1,11 +1,11 @@
-"""One step of a fit: gradients of a recorded view and perhaps another view, and the optimisers.
+"""One step of a fit: gradients of a recorded view and perhaps a painted one, and the optimisers.
 
 Only the Gaussians that these views can show take part (`seen_gaussians`). Gaussians, sky and images
 lie on the device of the scene; poses (float64) and exposure, a few small matrices a step, on the
 CPU.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -52,7 +52,7 @@ WAITS = 4
 """The most of the host for the device in a step, without the rasteriser's own: how many Gaussians
 are in view, how many of them lag and by how much (plain torch alone asks), and the gradients of the
 bodies' poses and of the exposure. Where somebody bends, one more for each view: which Gaussians
-do. For two recorded views at once twice as often, and once more in plain torch."""
+do."""
 
 Perceptual = Callable[
     [Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]], Float[Tensor, ""]
@@ -60,62 +60,42 @@ Perceptual = Callable[
 """Distance of a rendered and a true image, differentiable in the first."""
 
 
-class Look(NamedTuple):
-    """A recorded view that is looked at."""
-
-    row: int
-    """Its place among the training views."""
-    image: FitImage
-
-
-class _Sight(NamedTuple):
-    """What one step sees of a recorded view."""
-
-    look: Look
-    step: int
-    pose: Float[Tensor, "4 4"]
-    """Differentiable where it is refined."""
-    camera: Camera
-    bodies: Float[Tensor, "bodies 4 4"]
-
-    @classmethod
-    def of(cls, state: FitState, look: Look, step: int) -> "_Sight":
-        pose = state.refinement.world_from_camera(look.row, step)
-        actors = state.scene.actors.corrected_poses(look.image.timestamp_ns)
-        camera = look.image.camera.refined(pose.detach())
-        return cls(look, step, pose, camera, camera_from_body(pose, *actors))
-
-    def views(self, state: FitState) -> list[View]:
-        """At each time that the image was read."""
-        read = bodies_while_read(self.camera, state.scene.actors, self.look.image.timestamp_ns)
-        return [(self.camera, self.bodies), *((self.camera, bodies) for bodies in read)]
-
-
 def fit_step(
     state: FitState,
-    looks: Sequence[Look],
+    image: FitImage,
+    row: int,
     guidance: GuidanceView | None,
     config: FitConfig,
     perceptual: Perceptual | None,
-) -> list[Float[Tensor, "2"]]:
-    """Step everything once for each recorded view: one with the painted view that is given, or two.
+) -> Float[Tensor, "2"]:
+    """Step everything by one recorded view, the `row`-th, and the painted one if it is given.
 
-    Gradients of two are found at once, so those of the second step are of the scene before the
-    first: for views that show nothing of each other (`ViewOrder`) that is nearly the same.
-    Returns the loss and the mean squared error of each recorded image, where the scene lies.
+    Returns the loss and the mean squared error of the recorded image, where the scene lies.
     """
-    sights = [_Sight.of(state, look, state.step + later) for later, look in enumerate(looks)]
+    pose = state.refinement.world_from_camera(row, state.step)
+    recorded = image.camera.refined(pose.detach())
+    actors = state.scene.actors.corrected_poses(image.timestamp_ns)
+    views = [(recorded, camera_from_body(pose, *actors))]
     if guidance is not None:
-        seen, found = _beside_painted(state, sights[0], guidance, config, perceptual)
+        views.append((guidance.camera, _guidance_bodies(state, guidance)))
+    read = bodies_while_read(recorded, state.scene.actors, image.timestamp_ns)
+    seen = state.seen([*views, *((recorded, bodies) for bodies in read)])
+    of_recorded = partial(
+        _recorded_gradients, state, seen, image, row, views[0], config, perceptual
+    )
+    if guidance is None:
+        found = of_recorded()
     else:
-        seen, found = _recorded_alone(state, sights, config, perceptual)
-    for rows, one in zip(seen, found, strict=True):
-        state.tally.add(rows.rows, one.screen_gradient, one.splat.visible)
-    state.refinement.step(state.step, [look.image for look in looks])
-    for sight, one in zip(sights, found, strict=True):
-        _step_sky(state, one, config, sight)
-    state.step_gaussians(seen, config.steps)
-    return [one.told for one in found]
+        bodies = views[1][1]
+        of_painted = partial(
+            add_guidance_gradients, state, seen, guidance, bodies, config, perceptual
+        )
+        found, _ = both(of_recorded, of_painted, state.scene.device)
+    state.tally.add(seen.rows, found.screen_gradient, found.splat.visible)
+    state.refinement.step(state.step, image)
+    _step_sky(state, found, config, image)
+    state.step_gaussians(seen, state.step / config.steps)
+    return found.told
 
 
 class _OfRecorded(NamedTuple):
@@ -128,50 +108,19 @@ class _OfRecorded(NamedTuple):
     sky_rays: SkyRays
 
 
-def _beside_painted(
-    state: FitState,
-    sight: _Sight,
-    guidance: GuidanceView,
-    config: FitConfig,
-    perceptual: Perceptual | None,
-) -> tuple[list[SeenGaussians], list[_OfRecorded]]:
-    """Collect the gradients of a recorded and a painted view in the same leaves."""
-    bodies = _guidance_bodies(state, guidance)
-    seen = state.seen([*sight.views(state), (guidance.camera, bodies)])
-    found, _ = both(
-        partial(_recorded_gradients, state, seen, sight, config, perceptual),
-        partial(add_guidance_gradients, state, seen, guidance, bodies, config, perceptual),
-        state.scene.device,
-    )
-    return [seen], [found]
-
-
-def _recorded_alone(
-    state: FitState, sights: Sequence[_Sight], config: FitConfig, perceptual: Perceptual | None
-) -> tuple[list[SeenGaussians], list[_OfRecorded]]:
-    """Collect the gradients of one recorded view or of two, each in leaves of its own."""
-    seen = [state.seen(sight.views(state)) for sight in sights]
-    pieces = [
-        partial(_recorded_gradients, state, rows, sight, config, perceptual)
-        for rows, sight in zip(seen, sights, strict=True)
-    ]
-    if len(pieces) == 1:
-        return seen, [pieces[0]()]
-    return seen, list(both(pieces[0], pieces[1], state.scene.device))
-
-
 def _recorded_gradients(
     state: FitState,
     seen: SeenGaussians,
-    sight: _Sight,
+    image: FitImage,
+    row: int,
+    view: View,
     config: FitConfig,
     perceptual: Perceptual | None,
 ) -> _OfRecorded:
     """Collect the gradients of a recorded view."""
-    (row, image), step, camera, bodies = sight.look, sight.step, sight.camera, sight.bodies
-    weights, sky = config.losses, state.scene.sky
+    (camera, bodies), weights, sky = view, config.losses, state.scene.sky
     facts = image.facts()
-    with_actors = _wants_actor_term(state, step, config)
+    with_actors = _wants_actor_term(state, config)
     screen_gradient = torch.zeros(len(seen), device=seen.means.device)
     actors = state.scene.actors
     bent = actors.bending.bent(seen, image.timestamp_ns)
@@ -195,8 +144,8 @@ def _recorded_gradients(
     loss = loss + weights.sky * terms.sky + weights.depth * terms.depth
     if with_actors:
         loss = loss + weights.actors * _actor_term(state, splat, image, camera)
-    loss = loss + state.refinement.bend_prior(image.timestamp_ns, step)
-    prior = state.refinement.prior(row, image.timestamp_ns, step)
+    loss = loss + state.refinement.bend_prior(image.timestamp_ns, state.step)
+    prior = state.refinement.prior(row, image.timestamp_ns, state.step)
     # as a sum its gradient, which is the CPU's, would have to come from the device
     torch.autograd.backward([loss, prior] if prior.requires_grad else [loss])
     squared_error = (shown.detach() - facts.rgb).square().mean()
@@ -264,8 +213,8 @@ def _pixel_rules(config: FitConfig) -> PixelRules:
     )
 
 
-def _wants_actor_term(state: FitState, step: int, config: FitConfig) -> bool:
-    is_due = step % ACTOR_TERM_EVERY == 0
+def _wants_actor_term(state: FitState, config: FitConfig) -> bool:
+    is_due = state.step % ACTOR_TERM_EVERY == 0
     return is_due and config.losses.actors > 0 and bool(state.scene.actors.recorded_tracks)
 
 
@@ -282,7 +231,7 @@ def _actor_term(
     return actor_boundary_loss(splat.features[..., 0], in_boxes)
 
 
-def _step_sky(state: FitState, found: _OfRecorded, config: FitConfig, sight: _Sight) -> None:
+def _step_sky(state: FitState, found: _OfRecorded, config: FitConfig, image: FitImage) -> None:
     """Move the texels that were seen clearly enough, inside the sky mask alone.
 
     What is far but solid (towers beyond the LiDAR's reach) is left to the Gaussians.
@@ -290,11 +239,11 @@ def _step_sky(state: FitState, found: _OfRecorded, config: FitConfig, sight: _Si
     if found.sky_rgb.grad is None:
         return
     clear = 1 - found.splat.alpha.detach()
-    learns = (clear > MIN_TRANSMITTANCE) & (sight.look.image.kind == SKY)
+    learns = (clear > MIN_TRANSMITTANCE) & (image.kind == SKY)
     ratio = FINAL_LEARNING_RATE / LEARNING_RATE
     state.scene.sky.observe(
         found.sky_rgb.grad,
         torch.where(learns, clear, 0.0),
         found.sky_rays,
-        LEARNING_RATE * ratio ** (sight.step / config.steps),
+        LEARNING_RATE * ratio ** (state.step / config.steps),
     )

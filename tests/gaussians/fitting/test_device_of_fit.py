@@ -20,7 +20,7 @@ from lidarpainter_models.gaussians.fitting.images import full_image
 from lidarpainter_models.gaussians.fitting.memory import planned_memory
 from lidarpainter_models.gaussians.fitting.settings import DensificationConfig
 from lidarpainter_models.gaussians.fitting.state import FitState
-from lidarpainter_models.gaussians.fitting.step import WAITS, Look, fit_step
+from lidarpainter_models.gaussians.fitting.step import WAITS, fit_step
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.observations.views import GuidanceView
@@ -89,14 +89,11 @@ def test_a_step_makes_the_host_wait_no_oftener_than_it_says(world, device, bent)
     state.step = 3  # corrections are refined by now, and actors are not looked at
     for guidance in (None, painted, painted):
         waits.clear()
-        fit_step(state, [Look(0, image)], guidance, CONFIG, None)
+        fit_step(state, image, 0, guidance, CONFIG, None)
         state.step += 1
         views = 1 if guidance is None else 2
         # of plain torch: no other kernel runs on this device
         assert waits.total() <= WAITS + views * len(bent), waits
-    waits.clear()
-    fit_step(state, [Look(0, image), Look(1, image)], None, CONFIG, None)
-    assert waits.total() <= 2 * (WAITS + len(bent)) + 1, waits
 
 
 def out_of_memory(times):

@@ -17,7 +17,7 @@ from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.gaussians.fitting.images import full_image
 from lidarpainter_models.gaussians.fitting.settings import DensificationConfig, LearningRates
 from lidarpainter_models.gaussians.fitting.state import FitState
-from lidarpainter_models.gaussians.fitting.step import Look, add_guidance_gradients, fit_step
+from lidarpainter_models.gaussians.fitting.step import add_guidance_gradients, fit_step
 from lidarpainter_models.gaussians.initialisation.scene import initialise_scene
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.gaussians.model.rolling_shutter import as_read
@@ -103,7 +103,7 @@ def test_a_step_sees_what_only_the_first_row_shows(world):
     read = as_read(world.scene.gaussians, bodies, view.camera, actors, view.timestamp_ns)
     shown = draw_gaussians(read, bodies, view.camera).visible
     state = FitState.begin(world.scene, short_fit(), WIDTH_PX * HEIGHT_PX)
-    fit_step(state, [Look(0, full_image(view))], None, short_fit(), None)
+    fit_step(state, full_image(view), 0, None, short_fit(), None)
     assert torch.equal(state.tally.visits > 0, shown)
 
 
