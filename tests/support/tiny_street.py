@@ -17,6 +17,7 @@ SETTINGS = (
     'scoring.shifts=[{"lateral_m": 2}, {"up_m": 1.5}]',
     "novel.every_nth=2",
     "fit.steps=40",
+    "fit.refinement.start_step=20",  # rounds hold the cameras where this leaves them
     "fit.log_every=20",
     "fit.initialisation.num_gaussians=1500",
     "fit.densification.budget=2000",
