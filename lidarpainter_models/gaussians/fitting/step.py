@@ -92,11 +92,9 @@ def fit_step(
         )
         found, _ = both(of_recorded, of_painted, state.scene.device)
     state.tally.add(seen.rows, found.screen_gradient, found.splat.visible)
-    both(
-        partial(state.step_gaussians, seen, state.step / config.steps),
-        partial(_step_others, state, found, config, image),
-        state.scene.device,
-    )
+    state.refinement.step(state.step, image)
+    _step_sky(state, found, config, image)
+    state.step_gaussians(seen, state.step / config.steps)
     return found.told
 
 
@@ -231,12 +229,6 @@ def _actor_term(
         in_boxes = project_boxes(camera, world_from_actors, sizes, present > 0)
     in_boxes = in_boxes.to(splat.alpha.device, non_blocking=True)
     return actor_boundary_loss(splat.features[..., 0], in_boxes)
-
-
-def _step_others(state: FitState, found: _OfRecorded, config: FitConfig, image: FitImage) -> None:
-    """Move what does not belong to the Gaussians."""
-    state.refinement.step(state.step, image)
-    _step_sky(state, found, config, image)
 
 
 def _step_sky(state: FitState, found: _OfRecorded, config: FitConfig, image: FitImage) -> None:
