@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from flows.fleet.manifest import Configuration
 
-LOOKS, REFINE_LOOKS, GAUSSIANS_PER_PIXEL = 450.0, 150.0, 0.3
+LOOKS, REFINE_LOOKS, GAUSSIANS_PER_PIXEL = 300.0, 150.0, 0.3
 """The effort of the preset; what a scene shows makes steps and Gaussians of it."""
 
 

@@ -55,7 +55,7 @@ class GuidanceConfig:
 class EffortConfig:
     """How much a fit spends on what the views show; see `planned_fit`."""
 
-    looks: float = 450.0
+    looks: float = 300.0
     """Steps for every view's worth of new surface. More of them sharpen the recorded views and cost
     the neighbouring lanes (docs/benchmarks.md)."""
     gaussians_per_pixel: float = 0.3

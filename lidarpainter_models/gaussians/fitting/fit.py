@@ -121,6 +121,8 @@ def fit_gaussians(  # noqa: PLR0913 - what was recorded, and one option each
     surface = seen_surface(observations.views, street)
     pixels = fmean(view.camera.width_px * view.camera.height_px for view in observations.views)
     config = planned_fit(config, surface)
+    looks = config.steps / max(surface.whole_views, 1.0)
+    config = replace(config, learning_rates=config.learning_rates.over(looks))
     if device.type == "cpu":
         config = within_limit(
             observations,

@@ -1,6 +1,6 @@
 """What the parts of a fit can be told, each setting with its reason; read without tensors."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from lidarpainter_models.errors import ConfigError
 
@@ -15,7 +15,7 @@ class DensificationConfig:
     """Fraction of the fit after which splitting begins: gradients must mean something."""
     stop: float = 0.6
     """Fraction of the fit after which it ends: new Gaussians need time to settle."""
-    every: int = 100
+    every: int = 50
     """Steps between two rounds; several passes over the views of a short log."""
     threshold: float = 0.0
     """Splits what has a larger mean gradient than this, up to the budget, as plain 3DGS does: 4e-6
@@ -57,6 +57,12 @@ class FitLossWeights:
     """Relative depth error from which on the pull of the LiDAR weakens."""
 
 
+COLOUR_LOOKS = 300.0
+"""Colours move no further in a longer fit than in one of so many looks. Those that recorded views
+hardly show move as fast as Adam lets them, and what they end up as stands in full view of the next
+lane: the longer the fit, the further off (docs/benchmarks.md)."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LearningRates:
     """First and last step sizes; each falls exponentially from the one to the other."""
@@ -70,8 +76,8 @@ class LearningRates:
     nearly twice the steps (docs/benchmarks.md)."""
     opacity_logit: tuple[float, float] = (6e-2, 2e-2)
     """Logits."""
-    sh_dc: tuple[float, float] = (6e-3, 1e-3)
-    """Harmonics; a colour changes by 0.28 of it."""
+    sh_dc: tuple[float, float] = (12e-3, 2e-3)
+    """Harmonics; a colour changes by 0.28 of it. In fits of more than `COLOUR_LOOKS` less."""
     sh_rest: tuple[float, float] = (6e-4, 2e-4)
     """Harmonics of degree 1 and more."""
     camera_rotation_rad: tuple[float, float] = (6e-4, 6e-5)
@@ -91,6 +97,12 @@ class LearningRates:
         """The rate of one kind after a fraction of the fit."""
         first, last = getattr(self, name)
         return first * (last / first) ** min(max(fraction, 0.0), 1.0)
+
+    def over(self, looks: float) -> "LearningRates":
+        """The rates of a fit of so many looks at every view's worth of new surface."""
+        share = min(COLOUR_LOOKS / looks, 1.0)
+        first, last = self.sh_dc
+        return replace(self, sh_dc=(first * share, last * share))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
