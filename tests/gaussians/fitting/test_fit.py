@@ -6,6 +6,7 @@ import torch
 from gaussian_world import FRAME_NS, HEIGHT_PX, WIDTH_PX, scene_of
 
 from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.gaussians.fitting import settings
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import (
     FitConfig,
@@ -15,6 +16,7 @@ from lidarpainter_models.gaussians.fitting.config import (
 )
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.gaussians.fitting.images import full_image
+from lidarpainter_models.gaussians.fitting.seen_surface import seen_surface
 from lidarpainter_models.gaussians.fitting.settings import DensificationConfig, LearningRates
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import add_guidance_gradients, fit_step
@@ -111,6 +113,17 @@ def test_fit_gets_closer_to_the_images(world, undisturbed):
     start = initialise_scene(world.observations, short_fit().initialisation)
     assert image_error(world, undisturbed.scene) < 0.95 * image_error(world, start)
     assert undisturbed.history[-1]["step"] == STEPS
+
+
+def test_colours_of_a_longer_fit_move_slower(world, undisturbed, monkeypatch):
+    first, last = LearningRates().sh_dc
+    slower = short_fit(learning_rates=LearningRates(sh_dc=(first / 4, last / 4)))
+    expected = fit_gaussians(world.observations, slower).scene
+    looks = STEPS / max(seen_surface(world.observations.views).whole_views, 1.0)
+    monkeypatch.setattr(settings, "COLOUR_LOOKS", looks / 4)
+    longer = fit_gaussians(world.observations, short_fit()).scene
+    assert_same_scene(longer, expected)
+    assert not torch.equal(longer.gaussians.sh_dc, undisturbed.scene.gaussians.sh_dc)
 
 
 def test_budget_is_never_exceeded(undisturbed):

@@ -10,7 +10,11 @@ from lidarpainter_models.gaussians.fitting.config import (
     continuation,
 )
 from lidarpainter_models.gaussians.fitting.seen_surface import START_SHARE, SeenSurface, planned_fit
-from lidarpainter_models.gaussians.fitting.settings import DensificationConfig
+from lidarpainter_models.gaussians.fitting.settings import (
+    COLOUR_LOOKS,
+    DensificationConfig,
+    LearningRates,
+)
 
 SURFACE = SeenSurface(
     num_pixels=300_000.0, num_detailed=200_000.0, whole_views=2.5, groups=((0,), (1,))
@@ -45,6 +49,17 @@ def test_views_of_nothing_but_sky_still_make_a_plan():
 def test_going_on_has_its_own_looks_and_the_same_size():
     planned = planned_fit(continuation(CONFIG, looks=20), SURFACE)
     assert (planned.steps, planned.densification.budget) == (50, 100_000)
+
+
+def test_colours_move_no_further_in_a_longer_fit():
+    rates = LearningRates()
+
+    def way(looks):
+        return sum(rates.over(looks).at("sh_dc", step / looks) for step in range(round(looks)))
+
+    assert way(COLOUR_LOOKS / 2) == pytest.approx(way(COLOUR_LOOKS) / 2, rel=0.01)
+    assert way(COLOUR_LOOKS * 10) == pytest.approx(way(COLOUR_LOOKS), rel=0.01)
+    assert replace(rates.over(COLOUR_LOOKS * 10), sh_dc=rates.sh_dc) == rates
 
 
 @pytest.mark.parametrize("name", ["looks", "gaussians_per_pixel"])
