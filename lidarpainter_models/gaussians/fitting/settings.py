@@ -76,8 +76,9 @@ class LearningRates:
     nearly twice the steps (docs/benchmarks.md)."""
     opacity_logit: tuple[float, float] = (6e-2, 2e-2)
     """Logits."""
-    sh_dc: tuple[float, float] = (12e-3, 2e-3)
-    """Harmonics; a colour changes by 0.28 of it. In fits of more than `COLOUR_LOOKS` less."""
+    sh_dc: tuple[float, float] = (6e-3, 1e-3)
+    """Harmonics; a colour changes by 0.28 of it. In fits of more than `COLOUR_LOOKS` less. Twice as
+    fast, recorded views gain 0.07 dB and the next lane's lose 0.3 (docs/benchmarks.md)."""
     sh_rest: tuple[float, float] = (6e-4, 2e-4)
     """Harmonics of degree 1 and more."""
     camera_rotation_rad: tuple[float, float] = (6e-4, 6e-5)
