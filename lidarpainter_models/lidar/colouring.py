@@ -117,6 +117,7 @@ class MapColouring:
         if len(inside) == 0:
             return None
         visibility = _visibility(inside, grid.camera, actors)
+        inside = inside.keep(self._may_gain(inside, camera))
         is_visible = visible_points(
             inside.cells_uv, inside.depth_m, visibility, tolerance=HIDDEN_TOLERANCE
         )
@@ -125,13 +126,19 @@ class MapColouring:
             column, row = (inside.cells_uv * torch.tensor(hidden.shape[::-1]) // size).unbind(-1)
             is_visible &= ~torch.from_numpy(hidden)[row, column]
         seen = inside.keep(is_visible.nonzero()[:, 0])
-        footprint_px = seen.range_m * FOOTPRINT_RAD * camera.fx_px / seen.depth_m
-        levels = ImageLevels(image, footprint_px)
+        levels = ImageLevels(image, _footprint_px(seen, camera))
         rgb, trust = rim_samples(levels, seen, visibility, grid.cells_per_pixel)
-        weight = trust / (1 + (seen.age_s / RECENCY_S) ** 2)
-        weight *= footprint_px.clamp(max=_FINE_ENOUGH_PX) ** 2
+        weight = _weight(trust, seen, camera)
         number = self._view_numbers[view.key]
         return PointSamples(number, seen.rows.numpy(), weight.numpy(), rgb.numpy())
+
+    def _may_gain(self, inside: PointsInView, camera: Camera) -> Int[Tensor, " points"]:
+        """Of the points in an image, those that have no better samples from others already.
+
+        What others are adding meanwhile can only make it fewer.
+        """
+        least = torch.from_numpy(self._samples.weight[:, -1])[inside.rows]
+        return (_weight(torch.ones(len(inside)), inside, camera) > least).nonzero()[:, 0]
 
     def add(self, samples: PointSamples | None) -> None:
         """Keep the best of what one of the views gave."""
@@ -172,6 +179,19 @@ class MapColouring:
             )
         )
         return LidarMap(street=street, actors=dict(zip(self._actor_ids, actors, strict=True)))
+
+
+def _footprint_px(points: PointsInView, camera: Camera) -> Float[Tensor, " points"]:
+    """How many pixels the patch that each point stands for is wide."""
+    return points.range_m * FOOTPRINT_RAD * camera.fx_px / points.depth_m
+
+
+def _weight(
+    trust: Float[Tensor, " points"], points: PointsInView, camera: Camera
+) -> Float[Tensor, " points"]:
+    """How much a sample counts among those of its point."""
+    weight = trust / (1 + (points.age_s / RECENCY_S) ** 2)
+    return weight * _footprint_px(points, camera).clamp(max=_FINE_ENOUGH_PX) ** 2
 
 
 def _visibility(inside: PointsInView, cells: Camera, actors: PlacedActors) -> Visibility:

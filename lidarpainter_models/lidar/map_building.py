@@ -93,11 +93,7 @@ def gather_points(scene: DrivingScene, split_frames: Collection[int]) -> LidarMa
         [sweep.timestamp_ns for sweep in taken],
         [sweep.world_from_lidar for sweep in taken],
     )
-    street_parts = [
-        placed.points.keep(~placed.is_near)
-        for placed, is_new in zip(sweeps, are_new, strict=True)
-        if is_new
-    ]
+    street_parts = [placed.away for placed, is_new in zip(sweeps, are_new, strict=True) if is_new]
     ground = _ground(street_parts)
     actor_parts: dict[str, list[MapPoints]] = {}
     for placed, is_new in zip(sweeps, are_new, strict=True):
@@ -144,15 +140,11 @@ def views_showing_more(views: Sequence[View]) -> list[View]:
 class _PlacedSweep:
     """A sweep in the world and what of it lies in or beside actors."""
 
-    points: MapPoints
+    away: MapPoints
+    """Away from all actors."""
+    beside: MapPoints
+    """In or beside actors, as `near` lists them."""
     near: NearActors
-
-    @property
-    def is_near(self) -> Tensor:
-        """Marks the points in or beside actors."""
-        marks = torch.zeros(len(self.points), dtype=torch.bool)
-        marks[self.near.rows] = True
-        return marks
 
 
 def _place_sweep(scene: DrivingScene, sweep: Sweep, tracks: Sequence[ActorTrack]) -> _PlacedSweep:
@@ -172,7 +164,9 @@ def _place_sweep(scene: DrivingScene, sweep: Sweep, tracks: Sequence[ActorTrack]
         range_m=range_m[used],
     )
     near = near_actors(points.xyz_m, timestamp_ns, tracks)
-    return _PlacedSweep(points=points, near=near)
+    is_away = torch.ones(len(points), dtype=torch.bool)
+    is_away[near.rows] = False
+    return _PlacedSweep(away=points.keep(is_away), beside=points.keep(near.rows), near=near)
 
 
 def _ground(street_parts: Sequence[MapPoints]) -> GroundHeights:
@@ -190,7 +184,7 @@ def _sort_near_points(
 
     What is neither (the margin around an actor, tyres where they touch the road) is dropped.
     """
-    near, beside = placed.near, placed.points.keep(placed.near.rows)
+    near, beside = placed.near, placed.beside
     height_m = height_above_ground(beside.xyz_m, near.bottom_m, ground)
     road = beside.keep(height_m < ROAD_HEIGHT_M)
     is_actor = (height_m >= CLEARANCE_M) & (near.outside_m <= ACTOR_MARGIN_M)

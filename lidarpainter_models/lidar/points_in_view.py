@@ -6,7 +6,9 @@ camera z in metres. The grid is coarse: its cells follow an angle, not the pixel
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -18,6 +20,9 @@ from lidarpainter_models.lidar.lidar_map import MapPoints
 from lidarpainter_models.scenes.records import RecordedView, ViewKey
 from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses
 
+MOST_AGE_NS = 3_000_000_000
+"""Images further in time from a point say nothing of it that nearer ones do not say better."""
+
 PlacedActors = Mapping[str, tuple[ActorTrack, Float[Tensor, "4 4"]]]
 """The tracks present at one time by actor id, with `world_from_box` then."""
 
@@ -28,6 +33,27 @@ class Body:
 
     track: ActorTrack | None
     points: MapPoints
+
+    def stretches_about(self, timestamp_ns: int) -> list[slice]:
+        """Stretches of the points that hold all that were measured about a time.
+
+        Their length does not grow with that of the log.
+        """
+        first_row, first_ns, last_ns = self._runs
+        is_near = last_ns >= timestamp_ns - MOST_AGE_NS
+        is_near &= first_ns <= timestamp_ns + MOST_AGE_NS
+        ends = np.diff(is_near, prepend=False, append=False).nonzero()[0].reshape(-1, 2)
+        return [slice(*first_row[pair].tolist()) for pair in ends]
+
+    @cached_property
+    def _runs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where points of another sweep begin, all in all, and the time of each run's ends."""
+        frame, time_ns = self.points.frame_index.numpy(), self.points.timestamp_ns.numpy()
+        if not len(frame):
+            return np.zeros(1, np.int64), time_ns, time_ns
+        begins = np.concatenate([[0], np.diff(frame).nonzero()[0] + 1])
+        first_ns, last_ns = (ends.reduceat(time_ns, begins) for ends in (np.minimum, np.maximum))
+        return np.append(begins, len(frame)), first_ns, last_ns
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,43 +135,58 @@ def points_in_view(
 ) -> PointsInView:
     """Where the points of all bodies stand in an image taken at a time; absent actors have none.
 
-    The street stands where a rolling shutter reads it, actors where they are in the middle.
+    Those measured long before or after it are left out. The street stands where a rolling shutter
+    reads it, actors where they are in the middle.
     """
-    lens = torch.tensor(
-        [[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]],
-        dtype=torch.float64,
-    )
-    parts: list[dict[str, Tensor]] = []
-    first_row = 0
-    for body in bodies:
-        start, first_row = first_row, first_row + len(body.points)
+    parts = []
+    first_rows = np.cumsum([0, *(len(body.points) for body in bodies)]).tolist()
+    for first_row, body in zip(first_rows, bodies, strict=False):
         camera_from_points = camera.camera_from_world
         if body.track is not None:
             if body.track.actor_id not in actors:
                 continue
-            _, world_from_box = actors[body.track.actor_id]
-            camera_from_points = camera_from_points @ world_from_box
-        inside, pixels_uv, depth_m = project_inside(
-            body.points.xyz_m,
-            lens @ camera_from_points[:3],
-            camera.width_px,
-            camera.height_px,
-            near_m,
-        )
-        if body.track is None and camera.shutter is not None and camera.shutter.is_rolling:
-            read_uv, _ = camera.project(body.points.xyz_m[inside].double())
-            size = torch.tensor([camera.width_px, camera.height_px]) - 1e-3
-            pixels_uv = read_uv.clamp(torch.zeros(2), size).to(pixels_uv)
-        age_ns = (body.points.timestamp_ns[inside] - timestamp_ns).abs()
-        parts.append(
-            {
-                "rows": inside + start,
-                "pixels_uv": pixels_uv,
-                "depth_m": depth_m,
-                "range_m": body.points.range_m[inside],
-                "age_s": age_ns.float() * 1e-9,
-                "is_actor": torch.full(inside.shape, body.track is not None),
-            }
-        )
+            camera_from_points = camera_from_points @ actors[body.track.actor_id][1]
+        for stretch in body.stretches_about(timestamp_ns):
+            part = _in_image(body, stretch, camera_from_points, camera, near_m)
+            parts.append({**part, "rows": part["rows"] + first_row})
+    if not parts:  # no sweep is near in time
+        parts.append(_in_image(bodies[0], slice(0), camera.camera_from_world, camera, near_m))
     columns = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-    return PointsInView(**columns, cells_uv=grid.cells_of(columns["pixels_uv"]))
+    age_ns = (columns.pop("timestamp_ns") - timestamp_ns).abs()
+    return PointsInView(
+        **columns, cells_uv=grid.cells_of(columns["pixels_uv"]), age_s=age_ns.float() * 1e-9
+    )
+
+
+def _in_image(
+    body: Body,
+    stretch: slice,
+    camera_from_points: Float[Tensor, "4 4"],
+    camera: Camera,
+    near_m: float,
+) -> dict[str, Tensor]:
+    """What of a stretch of a body's points falls into an image; rows are the body's."""
+    lens = torch.tensor(
+        [[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]],
+        dtype=torch.float64,
+    )
+    inside, pixels_uv, depth_m = project_inside(
+        body.points.xyz_m[stretch],
+        lens @ camera_from_points[:3],
+        camera.width_px,
+        camera.height_px,
+        near_m,
+    )
+    rows = inside + (stretch.start or 0)
+    if body.track is None and camera.shutter is not None and camera.shutter.is_rolling:
+        read_uv, _ = camera.project(body.points.xyz_m[rows].double())
+        size = torch.tensor([camera.width_px, camera.height_px]) - 1e-3
+        pixels_uv = read_uv.clamp(torch.zeros(2), size).to(pixels_uv)
+    return {
+        "rows": rows,
+        "pixels_uv": pixels_uv,
+        "depth_m": depth_m,
+        "range_m": body.points.range_m[rows],
+        "timestamp_ns": body.points.timestamp_ns[rows],
+        "is_actor": torch.full(rows.shape, body.track is not None),
+    }

@@ -1,12 +1,17 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from toy_street import BLUE, CAR_X_M, GREEN, GROUND, RED, WALL_X_M, ToyStreet
 
 from lidarpainter_models.kernels.colour_sampling import BestSamples
-from lidarpainter_models.lidar import map_building
+from lidarpainter_models.lidar import map_building, points_in_view
+from lidarpainter_models.lidar.colouring import MapColouring
 from lidarpainter_models.lidar.exposure_matching import match_exposure
+from lidarpainter_models.lidar.lidar_map import MapPoints
 from lidarpainter_models.lidar.map_building import build_lidar_map
+from lidarpainter_models.lidar.points_in_view import MOST_AGE_NS, Body
 
 FRAMES = (0, 1, 2, 3)
 
@@ -55,6 +60,48 @@ def test_only_the_given_images_give_colours():
     street.read_image = lambda view: read.append(view.key) or ToyStreet.read_image(street, view)
     build_lidar_map(street, split_frames=FRAMES, colour_views=street.views[1:2])
     assert read == [(1, "front")]
+
+
+def test_points_that_have_better_samples_are_not_asked_again(monkeypatch):
+    street = ToyStreet(camera_gains=(("front", 1.0), ("dim", 0.7)))
+    asked, may_gain = [], MapColouring._may_gain
+
+    def everything(colouring, inside, camera):
+        asked.append((len(may_gain(colouring, inside, camera)), len(inside)))
+        return torch.arange(len(inside))
+
+    found = build_lidar_map(street, split_frames=FRAMES, colour_views=street.views)
+    monkeypatch.setattr(MapColouring, "_may_gain", everything)
+    of_all = build_lidar_map(street, split_frames=FRAMES, colour_views=street.views)
+    assert torch.equal(found.street.rgb_u8, of_all.street.rgb_u8)
+    assert torch.equal(found.street.has_colour, of_all.street.has_colour)
+    assert sum(few for few, _ in asked) < 0.9 * sum(every for _, every in asked)
+
+
+def test_images_long_before_or_after_a_sweep_are_not_asked(monkeypatch):
+    street = ToyStreet()
+    monkeypatch.setattr(points_in_view, "MOST_AGE_NS", 0)
+    later = [replace(view, timestamp_ns=view.timestamp_ns + 10**10) for view in street.views]
+    points = build_lidar_map(street, split_frames=FRAMES, colour_views=later).street
+    assert not points.has_colour.any()
+    assert len(points) > 1000
+
+
+def test_the_stretches_about_a_time_hold_the_sweeps_measured_then():
+    frame = torch.tensor([0, 0, 3, 6, 6, 9, 0, 3, 9])  # near points come after all others
+    points = MapPoints.uncoloured(
+        xyz_m=torch.zeros(len(frame), 3),
+        frame_index=frame,
+        timestamp_ns=frame * MOST_AGE_NS // 3 - torch.tensor([0, 9, 0, 0, 0, 0, 0, 0, 0]),
+        range_m=torch.ones(len(frame)),
+    )
+    body = Body(None, points)
+    assert body.stretches_about(0) == [slice(0, 3), slice(6, 8)]
+    assert body.stretches_about(MOST_AGE_NS) == [slice(0, 5), slice(6, 8)]
+    assert body.stretches_about(MOST_AGE_NS + 1) == [slice(2, 5), slice(7, 8)]
+    assert body.stretches_about(2 * MOST_AGE_NS) == [slice(2, 6), slice(7, 9)]
+    assert body.stretches_about(10 * MOST_AGE_NS) == []
+    assert Body(None, points.keep(frame < 0)).stretches_about(0) == []
 
 
 def test_cameras_are_brought_to_the_exposure_of_the_first(monkeypatch):
