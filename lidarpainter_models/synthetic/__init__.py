@@ -7,10 +7,12 @@ from lidarpainter_models.synthetic.config import (
     SyntheticStreetConfig,
 )
 from lidarpainter_models.synthetic.sequence import record_street, street_name, write_street
-from lidarpainter_models.synthetic.street import SyntheticStreet, TrueImage
+from lidarpainter_models.synthetic.street import SyntheticStreet
+from lidarpainter_models.synthetic.truth import LensState, TrueImage
 
 __all__ = [
     "DEFAULT_CAMERAS",
+    "LensState",
     "RigCamera",
     "RigLidar",
     "SyntheticStreet",

@@ -124,6 +124,8 @@ class SyntheticStreetConfig:
     """First and last speed of the recording car, 0 for one that stands; None draws it."""
     are_people_walking: bool = False
     """Whether people who move swing arms and legs, or glide in mid-stride."""
+    are_lamps_switching: bool = False
+    """Whether signals change and cars brake, or every lamp stays as it is."""
 
     def __post_init__(self) -> None:
         if self.seed < 0 or self.num_frames < 1 or self.frame_interval_s <= 0:

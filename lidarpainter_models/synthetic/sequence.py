@@ -17,7 +17,8 @@ from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, RollingShutter
 from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
 from lidarpainter_models.synthetic.config import RigCamera, SyntheticStreetConfig
-from lidarpainter_models.synthetic.street import SEMANTIC_NAMES, SimulatedSweep, SyntheticStreet
+from lidarpainter_models.synthetic.street import SEMANTIC_NAMES, SyntheticStreet
+from lidarpainter_models.synthetic.truth import SimulatedSweep
 
 DATASET = "synthetic"
 LICENCE = "Apache-2.0, drawn by LidarPainter"

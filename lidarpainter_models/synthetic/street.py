@@ -7,13 +7,12 @@ of its sweep.
 
 from collections.abc import Mapping
 from copy import copy
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError, SceneError
@@ -28,6 +27,7 @@ from lidarpainter_models.synthetic.lidar_sensor import (
 )
 from lidarpainter_models.synthetic.raytracing.scene_arrays import InstanceArrays, ViewArrays
 from lidarpainter_models.synthetic.textures.surfaces import StreetClass
+from lidarpainter_models.synthetic.truth import ActorState, LensState, SimulatedSweep, TrueImage
 from lidarpainter_models.synthetic.world.city import ActorChange, City, build_city
 from lidarpainter_models.synthetic.world.traffic import StreetActor
 
@@ -37,47 +37,20 @@ WORLD_VERSION = 2
 """Raise it whenever equal settings would give another world."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TrueImage:
-    """What is really there: free of noise, at exposure 1."""
-
-    rgb: Float[Tensor, "height width 3"]
-    depth_m: Float[Tensor, "height width"]
-    """Camera z on the ray through the pixel centre; 0 in the sky."""
-    semantics: Int[Tensor, "height width"]
-    """`StreetClass` at the pixel centre."""
-    actor_index: Int[Tensor, "height width"]
-    """Index in `SyntheticStreet.actors` at the pixel centre, -1 for none."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ActorState:
-    """One actor at one time."""
-
-    actor_id: str
-    category: str
-    is_moving: bool
-    size_m: tuple[float, float, float]
-    """Length, width, height."""
-    world_from_box: Float[Tensor, "4 4"]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SimulatedSweep:
-    """One turn of the LiDAR."""
-
-    timestamp_ns: int
-    world_from_lidar: Float[Tensor, "4 4"]
-    points: SweepPoints
-    semantics: Int[Tensor, " points"]
-    actor_index: Int[Tensor, " points"]
-    """Index in `SyntheticStreet.actors`, -1 for none."""
-
-
 @lru_cache(maxsize=1)
-def _city(seed: int, speed_mps: tuple[float, float] | None, are_people_walking: bool) -> City:
+def _city(
+    seed: int,
+    speed_mps: tuple[float, float] | None,
+    are_people_walking: bool,
+    are_lamps_switching: bool,
+) -> City:
     """The last one is kept: whoever records a street judges it later."""
-    return build_city(seed, speed_mps=speed_mps, are_people_walking=are_people_walking)
+    return build_city(
+        seed,
+        speed_mps=speed_mps,
+        are_people_walking=are_people_walking,
+        are_lamps_switching=are_lamps_switching,
+    )
 
 
 class SyntheticStreet:
@@ -85,7 +58,9 @@ class SyntheticStreet:
 
     def __init__(self, config: SyntheticStreetConfig) -> None:
         self.config = config
-        self._city = _city(config.seed, config.speed_mps, config.are_people_walking)
+        self._city = _city(
+            config.seed, config.speed_mps, config.are_people_walking, config.are_lamps_switching
+        )
 
     def changed(self, change: ActorChange) -> "SyntheticStreet":
         """The same street with other actors in it: the exact truth of an edit."""
@@ -95,6 +70,7 @@ class SyntheticStreet:
             config.seed,
             speed_mps=config.speed_mps,
             are_people_walking=config.are_people_walking,
+            are_lamps_switching=config.are_lamps_switching,
             change=change,
         )
         return other
@@ -173,6 +149,27 @@ class SyntheticStreet:
                 world_from_box=torch.from_numpy(actor.world_from_box(line, time_s)[0]),
             )
             for actor in self._city.actors
+        ]
+
+    def lamps(self, timestamp_ns: int) -> list[LensState]:
+        """Every lens of a lamp that switches at a time: those of signals, then those of cars.
+
+        There are none where the settings let no lamp switch.
+        """
+        city = self._city
+        is_lit = city.lamps.is_lit(_seconds(timestamp_ns))[0]
+        lenses = [(-1, lens) for lens in city.lamps.standing]
+        lenses += [
+            (index, lens) for index, actor in enumerate(city.actors) for lens in actor.lenses
+        ]
+        return [
+            LensState(
+                actor_index=index,
+                centre_m=torch.from_numpy(lens.centre_m),
+                size_m=torch.from_numpy(lens.size_m),
+                is_lit=bool(is_lit[lens.lamp]),
+            )
+            for index, lens in lenses
         ]
 
     def _rig(self, name: str) -> RigCamera:
@@ -272,7 +269,7 @@ class SyntheticStreet:
         )
 
     def _instances(self, time_s: np.ndarray) -> InstanceArrays:
-        """Where everything that moves is at given times."""
+        """Where everything that moves is at given times, and which lamps are on."""
         city = self._city
         moving = [actor for actor in city.actors if actor.is_moving]
         poses = np.stack([actor.world_from_box(city.plan.line, time_s) for actor in moving], 1)
@@ -288,6 +285,7 @@ class SyntheticStreet:
             radius_m=city.radius_m,
             world_from_box=np.ascontiguousarray(poses[:, :, :3]),
             contact=contact,
+            is_lit=city.lamps.is_lit(time_s),
         )
 
     def _roots(self, moving: list[StreetActor], time_s: np.ndarray) -> np.ndarray:

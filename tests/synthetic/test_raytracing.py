@@ -52,12 +52,13 @@ def looking_ahead(position=(0.0, 0.0, 1.5), offsets=None):
     )
 
 
-def nothing_moving(times=1):
+def nothing_moving(times=1, is_lit=None):
     return InstanceArrays(
         roots=np.zeros((1, 0), np.int32),
         radius_m=np.zeros(0),
         world_from_box=np.zeros((times, 0, 3, 4)),
         contact=np.zeros((times, 0, 6)),
+        is_lit=np.zeros((times, 0), np.float32) if is_lit is None else is_lit,
     )
 
 
@@ -193,7 +194,9 @@ def test_a_moving_mesh_is_drawn_where_its_box_is():
         cosine, sine = np.cos(yaw_rad), np.sin(yaw_rad)
         pose[0, 0, :, :3] = [[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]]
         pose[0, 0, :, 3] = ahead_m, 0.0, 1.5
-        instances = InstanceArrays(roots[None], radius_m, pose, np.zeros((1, 0, 6)))
+        instances = nothing_moving()._replace(
+            roots=roots[None], radius_m=radius_m, world_from_box=pose
+        )
         _, depth_m, _, actor = render(arrays, instances, looking_ahead())
         middle = HEIGHT_PX // 2, WIDTH_PX // 2
         assert depth_m[middle] == pytest.approx(ahead_m - 1.0, rel=1e-5)
@@ -212,7 +215,9 @@ def test_each_lidar_column_sees_the_world_of_its_own_time():
     lidar[:, :, :3] = np.eye(3)
     lidar[:, 0, 3] = 0.25 * np.arange(columns)  # and the LiDAR follows
     shown = np.tile(roots, (columns, 1))
-    instances = InstanceArrays(shown, radius_m, poses, np.zeros((columns, 0, 6)))
+    instances = nothing_moving(columns)._replace(
+        roots=shown, radius_m=radius_m, world_from_box=poses
+    )
     inclinations = np.array([0.0, 0.02, 1.2])
     range_m, surface, label = cast_sweep(
         arrays, instances, lidar, np.zeros(columns), inclinations, 100.0
@@ -222,6 +227,37 @@ def test_each_lidar_column_sees_the_world_of_its_own_time():
     assert np.isinf(range_m[:, 2]).all()
     assert (label[:, 0, 1] == 3).all()
     assert np.allclose(surface[:, 0, 2], 1.0)  # head-on
+
+
+def wall_with(**looks):
+    """A wall across the view."""
+    world = World(sun=(-1.0, 0.0, 0.0))
+    surface = world.surfaces.add(
+        Surface(semantics=StreetClass.SIGN, tint=(0.2, 0.02, 0.03), **looks)
+    )
+    world.builder.quad([5, 9, 9], [0, -18, 0], [0, 0, -18], surface)
+    return world.arrays()[0]
+
+
+def test_a_lamp_adds_its_emission_while_it_is_lit_and_nothing_else():
+    lit, dark = np.array([[0, 1]], np.float32), np.array([[1, 0]], np.float32)
+    lamp = wall_with(emission=3.0, lamp=1)
+    bright = render(wall_with(emission=3.0), nothing_moving(), looking_ahead())[0]
+    plain = render(wall_with(), nothing_moving(), looking_ahead())[0]
+    assert np.array_equal(render(lamp, nothing_moving(is_lit=lit), looking_ahead())[0], bright)
+    assert np.array_equal(render(lamp, nothing_moving(is_lit=dark), looking_ahead())[0], plain)
+    assert (bright[..., 0] > plain[..., 0] + 0.2).all()
+
+
+def test_each_row_shows_the_lamps_of_its_own_time():
+    is_lit = (np.arange(HEIGHT_PX) % 3 == 0).astype(np.float32)[:, None]
+    view = looking_ahead()
+    rows = view._replace(world_from_camera=np.repeat(view.world_from_camera, HEIGHT_PX, axis=0))
+    moments = nothing_moving(HEIGHT_PX, is_lit)
+    shown = render(wall_with(emission=3.0, lamp=0), moments, rows)[0]
+    bright = render(wall_with(emission=3.0), nothing_moving(), view)[0]
+    plain = render(wall_with(), nothing_moving(), view)[0]
+    assert np.array_equal(shown, np.where(is_lit[..., None] > 0, bright, plain))
 
 
 def test_closed_solids_have_no_holes():

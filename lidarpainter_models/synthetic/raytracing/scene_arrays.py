@@ -37,7 +37,8 @@ TEXTURE = 0
 DETAIL_TEXTURE = 1
 KIND = 2
 SEMANTICS = 3
-INDEX_COLUMNS = 4
+LAMP = 4
+INDEX_COLUMNS = 5
 
 # kinds of surface: what the fourth channel of the texture means
 KIND_GLOSS = 0
@@ -77,7 +78,7 @@ class SceneArrays(NamedTuple):
     surface_value: np.ndarray
     """float32 (surfaces, VALUE_COLUMNS)."""
     surface_index: np.ndarray
-    """int32 (surfaces, INDEX_COLUMNS)."""
+    """int32 (surfaces, INDEX_COLUMNS); the lamp is a column of `is_lit`, -1 for none."""
     texels: np.ndarray
     """uint8 (texels, 4): sRGB and the fourth channel, every level of every texture."""
     texture_index: np.ndarray
@@ -94,7 +95,7 @@ DISPLAY_LIMIT = 8.0
 
 
 class InstanceArrays(NamedTuple):
-    """The moving objects at one or more times."""
+    """The moving objects and the lamps at one or more times."""
 
     roots: np.ndarray
     """int32 (times, instances): root node of each one's own tree; that of a walker changes."""
@@ -105,6 +106,8 @@ class InstanceArrays(NamedTuple):
     contact: np.ndarray
     """float64 (times, vehicles, 6): centre x y, cos and sin of heading, half length and width of
     everything that darkens the ground it stands on."""
+    is_lit: np.ndarray
+    """float32 (times, lamps): 1 where a lamp is on, 0 where it is off."""
 
 
 class ViewArrays(NamedTuple):

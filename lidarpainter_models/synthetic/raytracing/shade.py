@@ -21,6 +21,7 @@ from lidarpainter_models.synthetic.raytracing.scene_arrays import (
     KIND_CUT_OUT,
     KIND_GLOSS,
     KIND_ROAD,
+    LAMP,
     SEMANTICS,
     SUN_DIRECTION,
     SUN_RGB,
@@ -274,7 +275,9 @@ def shade(
     kind = scene.surface_index[surface, KIND]
     if normal[2] > 0.8 and kind != KIND_CUT_OUT and scene.prim_index[prim, ACTOR] < 0:
         open_sky = _contact_shade(instances, time_index, point[0], point[1])
-    emission = value[EMISSION]
+    emission, lamp = value[EMISSION], scene.surface_index[surface, LAMP]
+    if lamp >= 0:
+        emission *= instances.is_lit[time_index, lamp]
     diffuse = (
         red * (sun * light[SUN_RGB] + open_sky * _ambient(light, up, 0) + emission),
         green * (sun * light[SUN_RGB + 1] + open_sky * _ambient(light, up, 1) + emission),

@@ -66,6 +66,8 @@ class Surface:
     detail_per_m: float = 0.5
     detail_strength: float = 0.0
     translucency: float = 0.0
+    lamp: int = -1
+    """Whose emission it is: column of `InstanceArrays.is_lit`, -1 where it never changes."""
 
 
 @dataclass(eq=False)
@@ -133,7 +135,13 @@ class SurfaceSet:
                 surface.detail_strength,
                 surface.translucency,
             )
-            index[row] = surface.texture, surface.detail_texture, surface.kind, surface.semantics
+            index[row] = (
+                surface.texture,
+                surface.detail_texture,
+                surface.kind,
+                surface.semantics,
+                surface.lamp,
+            )
         return value, index
 
 

@@ -17,6 +17,7 @@ from lidarpainter_models.synthetic.textures.surfaces import (
 from lidarpainter_models.synthetic.world.buildings import Lot, add_buildings, add_skyline, draw_lots
 from lidarpainter_models.synthetic.world.furniture import StreetFurniture
 from lidarpainter_models.synthetic.world.ground import add_ground
+from lidarpainter_models.synthetic.world.lamps import SwitchingLamps
 from lidarpainter_models.synthetic.world.meshes import Mesh, MeshBuilder
 from lidarpainter_models.synthetic.world.packing import Light, MovingMesh, pack_scene
 from lidarpainter_models.synthetic.world.traffic import StreetActor, Traffic
@@ -46,6 +47,8 @@ class City:
     """int32 (moving actors, postures): root nodes of their trees, the last one repeated."""
     radius_m: np.ndarray
     """float64 (moving actors)."""
+    lamps: SwitchingLamps
+    """Empty where every lamp stays as it is."""
 
 
 def build_city(
@@ -53,6 +56,7 @@ def build_city(
     *,
     speed_mps: tuple[float, float] | None = None,
     are_people_walking: bool = False,
+    are_lamps_switching: bool = False,
     change: ActorChange | None = None,
 ) -> City:
     """Draw a street; each part has its own stream of random numbers.
@@ -60,10 +64,11 @@ def build_city(
     First and last speed of the recording car may be given, and in `change` who stands in the street
     in place of those drawn, moving ones first; all else stays.
     """
-    streams = np.random.SeedSequence([seed, 20_261]).spawn(9)
+    streams = np.random.SeedSequence([seed, 20_261]).spawn(11)
     plan_rng, ground_rng, house_rng, green_rng, thing_rng, car_rng, sky_rng, ego_rng, lot_rng = (
-        np.random.default_rng(stream) for stream in streams
+        np.random.default_rng(stream) for stream in streams[:9]
     )
+    lamps = SwitchingLamps.of_streams(*streams[9:]) if are_lamps_switching else SwitchingLamps()
     plan = draw_plan(plan_rng)
     surfaces, builder = SurfaceSet(), MeshBuilder()
     add_ground(builder, surfaces, plan, ground_rng)
@@ -71,11 +76,13 @@ def build_city(
     add_buildings(builder, surfaces, plan, lots, house_rng)
     add_skyline(builder, surfaces, plan, house_rng)
     _add_greenery(builder, surfaces, plan, lots, green_rng)
-    StreetFurniture(builder, surfaces, plan, thing_rng).add_all()
+    StreetFurniture(builder, surfaces, plan, thing_rng, lamps).add_all()
     ego = draw_ego_motion(plan.line, ego_rng)
     if speed_mps is not None:
         ego = ego.at_speed(*speed_mps)
-    traffic = Traffic(plan, ego, surfaces, car_rng, are_people_walking=are_people_walking)
+    traffic = Traffic(
+        plan, ego, surfaces, car_rng, are_people_walking=are_people_walking, lamps=lamps
+    )
     actors = tuple(traffic.draw())
     actors = actors if change is None else change(actors)
     light = draw_light(surfaces, plan, sky_rng)
@@ -87,7 +94,7 @@ def build_city(
     most = max(len(actors[index].meshes) for index in owners)
     first = np.concatenate([[0], last[:-1]])
     places = np.minimum(first[:, None] + np.arange(most), last[:, None] - 1)
-    return City(plan, ego, actors, arrays, roots[places], radius_m[places].max(axis=1))
+    return City(plan, ego, actors, arrays, roots[places], radius_m[places].max(axis=1), lamps)
 
 
 def _standing(

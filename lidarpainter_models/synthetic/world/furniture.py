@@ -1,6 +1,6 @@
 """What stands on the sidewalks: lamps, signals, signs, poles with wires, meters, bins, shelters."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -20,12 +20,18 @@ from lidarpainter_models.synthetic.textures.surfaces import (
     SurfaceSet,
     tint_from_bytes,
 )
+from lidarpainter_models.synthetic.world.lamps import Lens, SwitchingLamps
 from lidarpainter_models.synthetic.world.meshes import MeshBuilder
 from lidarpainter_models.synthetic.world.solids import add_ball, add_box, add_tube
 
 UP = np.array([0.0, 0.0, 1.0])
 EDGE_M = 0.55
 WIRE_RADIUS_M = 0.022
+LIT = 2.6
+"""Emission of the lamps of signals, on their full colour."""
+LENS_RADII_M = (0.05, 0.13, 0.13)
+SUNK_M = 0.02
+"""How far the middle of a round glass lies behind where a hood begins."""
 
 
 @dataclass(eq=False)
@@ -36,13 +42,21 @@ class StreetFurniture:
     surfaces: SurfaceSet
     plan: StreetPlan
     rng: np.random.Generator
+    lamps: SwitchingLamps = field(default_factory=SwitchingLamps)
 
     def plain(
-        self, colour: tuple[int, int, int], kind: StreetClass, *, emission: float = 0.0
+        self,
+        colour: tuple[int, int, int],
+        kind: StreetClass,
+        *,
+        emission: float = 0.0,
+        lamp: int = -1,
     ) -> int:
         """A surface of one colour."""
         tint = tint_from_bytes(colour)
-        return self.surfaces.add(Surface(semantics=kind, tint=tint, gloss=0.15, emission=emission))
+        return self.surfaces.add(
+            Surface(semantics=kind, tint=tint, gloss=0.15, emission=emission, lamp=lamp)
+        )
 
     def foot(self, s_m: float, side: int, inset_m: float = EDGE_M) -> np.ndarray:
         """A place on the sidewalk; `inset_m` from the kerb."""
@@ -178,7 +192,7 @@ class StreetFurniture:
 
     def _add_signals(self) -> None:
         """A mast over the road on the far side of the crossing, one low signal at each corner."""
-        plan = self.plan
+        plan, switching = self.plan, self.lamps.add_signals()
         far = plan.cross_end_m + 1.9
         metal = self.plain((60, 66, 64), StreetClass.POLE)
         foot, (_, inward, heading) = self.foot(far, -1, 0.8), self.axes(far, -1)
@@ -188,8 +202,8 @@ class StreetFurniture:
         add_tube(self.builder, foot + 5.9 * UP, tip, (0.08, 0.045), metal)
         for along in (reach - 0.4, reach - 4.1):
             centre = foot + (5.9 + 0.5 * along / reach) * UP + along * inward
-            self._add_lights(centre - 0.55 * UP, heading + np.pi, shows="green")
-        self._add_lights(foot + 3.0 * UP + 0.2 * inward, heading + np.pi, shows="green")
+            self._add_lights(centre - 0.55 * UP, heading + np.pi, switching)
+        self._add_lights(foot + 3.0 * UP + 0.2 * inward, heading + np.pi, switching)
         name = STREET_NAMES[int(self.rng.integers(len(STREET_NAMES)))]
         sign = foot + 6.05 * UP + 2.6 * inward
         plate = street_name_plate(name)
@@ -197,25 +211,48 @@ class StreetFurniture:
         near = plan.cross_start_m - 1.9
         foot, (_, inward, heading) = self.foot(near, 1, 0.8), self.axes(near, 1)
         add_tube(self.builder, foot, foot + 3.7 * UP, (0.08, 0.07), metal)
-        self._add_lights(foot + 3.1 * UP + 0.2 * inward, heading, shows="green")
-        self._add_lights(foot + 3.1 * UP - 0.25 * inward, heading + np.pi, shows="green")
+        self._add_lights(foot + 3.1 * UP + 0.2 * inward, heading, switching)
+        self._add_lights(foot + 3.1 * UP - 0.25 * inward, heading + np.pi, switching)
 
-    def _add_lights(self, centre: np.ndarray, yaw_rad: float, *, shows: str) -> None:
-        """A black box with three lamps, one of them lit."""
+    def _add_lights(self, centre: np.ndarray, yaw_rad: float, switching: dict[str, int]) -> None:
+        """A black box with three lamps: green is lit, or whichever of those that switch."""
         black = self.plain((20, 21, 22), StreetClass.SIGN)
         add_box(self.builder, centre, (0.26, 0.36, 1.05), black, yaw_rad=yaw_rad)
         front = np.array([np.cos(yaw_rad), np.sin(yaw_rad), 0])
         lamps = {"red": (236, 44, 36), "yellow": (240, 180, 40), "green": (60, 232, 150)}
         for row, (name, colour) in enumerate(lamps.items()):
-            lit = name == shows
-            red, green, blue = (c if lit else int(c * 0.28) for c in colour)
-            surface = self.plain((red, green, blue), StreetClass.SIGN, emission=2.6 if lit else 0.0)
             place = centre + 0.14 * front + (0.33 - 0.33 * row) * UP
-            add_ball(self.builder, place, (0.05, 0.05, 0.12), surface, rows=8)
+            if switching:
+                self._add_lens(place, yaw_rad, colour, switching.get(name, -1))
+            else:
+                lit = name == "green"
+                surface = self.plain(
+                    colour if lit else _unlit(colour), StreetClass.SIGN, emission=LIT * lit
+                )
+                add_ball(self.builder, place, (0.05, 0.05, 0.12), surface, rows=8)
             add_tube(
                 self.builder, place + 0.02 * UP, place + 0.2 * front + 0.02 * UP, (0.15, 0.15),
                 black, sides=10,
             )  # fmt: skip
+
+    def _add_lens(
+        self, place: np.ndarray, yaw_rad: float, colour: tuple[int, int, int], lamp: int
+    ) -> None:
+        """A round glass that looks along `yaw_rad` and shows a lamp, or stays dark (-1)."""
+        dark = _unlit(colour)
+        brighter = max(tint_from_bytes(colour)) / max(tint_from_bytes(dark))
+        emission = LIT * brighter if lamp >= 0 else 0.0
+        surface = self.plain(dark, StreetClass.SIGN, emission=emission, lamp=lamp)
+        glass = MeshBuilder()
+        add_ball(glass, (0.0, 0.0, 0.0), LENS_RADII_M, surface, rows=8)
+        pose = np.eye(4)
+        pose[:2, 0] = np.cos(yaw_rad), np.sin(yaw_rad)
+        pose[:2, 1] = -np.sin(yaw_rad), np.cos(yaw_rad)
+        pose[:3, 3] = place - SUNK_M * pose[:3, 0]
+        mesh = glass.build().transformed(pose)
+        self.builder.add(mesh)
+        if lamp >= 0:
+            self.lamps.standing.append(Lens.of_mesh(lamp, mesh))
 
     def _add_crossing_signs(self) -> None:
         """Street names and a stop sign for who comes out of the cross street."""
@@ -292,6 +329,12 @@ class StreetFurniture:
             place = middle + end * ahead + 1.3 * UP
             faces = {"front": face, "back": face}
             add_box(self.builder, place, (0.08, 1.2, 1.8), metal, yaw_rad=heading, faces=faces)
+
+
+def _unlit(colour: tuple[int, int, int]) -> tuple[int, int, int]:
+    """What is seen of the glass of a signal while its lamp is off."""
+    red, green, blue = (int(value * 0.28) for value in colour)
+    return red, green, blue
 
 
 def plan_clear(plan: StreetPlan, s_m: float) -> float:

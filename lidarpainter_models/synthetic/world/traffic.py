@@ -20,7 +20,9 @@ from lidarpainter_models.synthetic.plan.layout import (
 from lidarpainter_models.synthetic.plan.street_line import StreetLine
 from lidarpainter_models.synthetic.textures.cars import CarAtlas, add_car_surfaces
 from lidarpainter_models.synthetic.textures.surfaces import SurfaceSet
+from lidarpainter_models.synthetic.world.brake_lenses import brake_lens_surface, with_brake_lenses
 from lidarpainter_models.synthetic.world.car_shapes import build_car
+from lidarpainter_models.synthetic.world.lamps import Lens, SwitchingLamps
 from lidarpainter_models.synthetic.world.meshes import Mesh
 from lidarpainter_models.synthetic.world.pedestrians import draw_person
 
@@ -51,6 +53,8 @@ class StreetActor:
     ground_m: float = 0.0
     cycle_m: float = 1.0
     """The way of one cycle of steps."""
+    lenses: tuple[Lens, ...] = ()
+    """Of lamps that switch, in the box frame."""
 
     @property
     def is_moving(self) -> bool:
@@ -82,6 +86,7 @@ class Traffic:
     surfaces: SurfaceSet
     rng: np.random.Generator
     are_people_walking: bool = False
+    lamps: SwitchingLamps = field(default_factory=SwitchingLamps)
     actors: list[StreetActor] = field(default_factory=list)
     _painted: list[tuple[str, CarAtlas]] = field(default_factory=list)
     _meshes: dict[tuple[int, bool], tuple[Mesh, np.ndarray]] = field(default_factory=dict)
@@ -101,17 +106,24 @@ class Traffic:
         return self.actors
 
     def _add_car(self, kind: str, pace: Pace, **way: float) -> None:
-        """A moving car of its own paint."""
-        atlas = add_car_surfaces(self.surfaces, SHAPES[kind], self.rng)
-        mesh, size = build_car(SHAPES[kind], atlas)
+        """A moving car of its own paint, with brake lamps where lamps switch."""
+        shape = SHAPES[kind]
+        atlas = add_car_surfaces(self.surfaces, shape, self.rng)
+        mesh, size = build_car(shape, atlas)
+        lenses: tuple[Lens, ...] = ()
+        lamp = self.lamps.add_brakes()
+        if lamp >= 0:
+            surface = brake_lens_surface(self.surfaces, lamp)
+            mesh, lenses = with_brake_lenses(mesh, size, shape, surface, lamp)
         name = f"car-{len(self.actors):03d}"
         self.actors.append(
             StreetActor(
                 actor_id=name,
-                category=SHAPES[kind].category,
+                category=shape.category,
                 size_m=size,
                 meshes=(mesh,),
                 pace=pace,
+                lenses=lenses,
                 **way,
             )
         )
