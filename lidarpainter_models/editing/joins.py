@@ -128,7 +128,7 @@ def _joined_actor(world: EditedWorld, other: OtherRun, track: ActorTrack) -> Edi
     longer = replace(actors, recorded_tracks=tuple(tracks))
     own = world.scene.gaussians
     rows = own.body_index == number + 1
-    points = dict(world.lidar_map.actors)
+    points, blinking = dict(world.lidar_map.actors), world.scene.blinking
     if model is not None and len(model.gaussians) > FINER * int(rows.sum()):
         look = model.exposed_like(world.road_rgb).of_degree(own.sh_degree)
         columns = look.gaussians.columns()
@@ -136,9 +136,10 @@ def _joined_actor(world: EditedWorld, other: OtherRun, track: ActorTrack) -> Edi
         own = own.select((~rows).nonzero()[:, 0]).append(replace(look.gaussians, **columns))
         points[track.actor_id] = look.points
         longer = replace(longer, bending=longer.bending.rigid(number + 1))
+        blinking = blinking.of_others(number + 1)
     return replace(
         world,
-        scene=replace(world.scene, gaussians=own, actors=longer),
+        scene=replace(world.scene, gaussians=own, actors=longer, blinking=blinking),
         lidar_map=LidarMap(street=world.lidar_map.street, actors=points),
     )
 

@@ -226,6 +226,7 @@ def _without_body(scene: GaussianScene, body: int) -> GaussianScene:
         scene,
         gaussians=GaussianSet(**columns),
         actors=scene.actors.without(body),
+        blinking=scene.blinking.without(body),
     )
 
 

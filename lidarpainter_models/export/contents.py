@@ -87,8 +87,9 @@ def scene_contents(
 ) -> SceneContents:
     """Take a scene apart.
 
-    Poses are wanted at `timestamps_ns`, ascending; at one time alone, people are bent as they are
-    then, else they are at rest. None takes all actors; `with_sky` shows the sky by far Gaussians.
+    Poses are wanted at `timestamps_ns`, ascending; at one time alone, people are bent and lamps
+    lit as they are then, else people are at rest and lamps are off. None takes all actors;
+    `with_sky` shows the sky by far Gaussians.
 
     Raises:
         SceneError: the scene has no such actor.
@@ -102,6 +103,7 @@ def scene_contents(
     gaussians = scene.gaussians
     if len(timestamps_ns) == 1:
         gaussians = scene.actors.bending.bent(gaussians, timestamps_ns[0])
+        gaussians = scene.blinking.lit(gaussians, timestamps_ns[0])
     bodies = _bodies(gaussians, len(tracks) + 1)
     street = bodies[0].append(sky_gaussians(scene.sky, scene)) if with_sky else bodies[0]
     rows = [places[one] for one in wanted]

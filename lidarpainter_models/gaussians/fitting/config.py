@@ -26,6 +26,8 @@ class RefinementConfig:
     """Refine the pose of every actor over time (+1.2 dB inside boxes)."""
     exposure: bool = False
     """Fit a colour matrix per camera even if there is one camera only."""
+    lamps: bool = True
+    """Look for lamps that go on and off (`lamp_search`); rounds keep those that were found."""
     start_step: int = 100
     """Before this the image is too coarse to align anything."""
 
@@ -159,6 +161,6 @@ def continuation(
         effort=replace(config.effort, looks=looks or config.effort.looks),
         steps=steps,
         half_resolution=0.0,
-        refinement=replace(config.refinement, cameras=False, start_step=0),
+        refinement=replace(config.refinement, cameras=False, lamps=False, start_step=0),
         guidance=guidance or config.guidance,
     )

@@ -20,6 +20,7 @@ from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.densification import densify, prune
 from lidarpainter_models.gaussians.fitting.images import FitImage, full_image, half_image
+from lidarpainter_models.gaussians.fitting.lamp_search import with_lamps_found
 from lidarpainter_models.gaussians.fitting.memory import planned_memory, within_limit
 from lidarpainter_models.gaussians.fitting.seen_surface import (
     SeenSurface,
@@ -41,6 +42,10 @@ from lidarpainter_models.observations.views import GuidanceView, SceneObservatio
 
 FIRST_LOOK = 0.1
 """Part of the steps after which the scene is shown for the first time."""
+LAMPS_AT = 0.6
+"""Part of the steps after which lamps are looked for: Gaussians are split, colours have settled."""
+LAMP_STEPS = 0.1
+"""Images that are looked through for lamps, as a part of the steps."""
 FirstLook = Callable[[GaussianScene], None]
 Progress = Callable[[int, int, dict[str, float]], None]
 """Told the steps done, the steps in all and the newest entry of the history; before the first step
@@ -242,6 +247,8 @@ def _advance(
     state.step += 1
     state.recent.append(told)
     _change_set(state, config)
+    if config.refinement.lamps and not state.sought_lamps:
+        _seek_lamps(state, images, config)
     if state.step % LIMITS_EVERY == 0:
         scene = state.caught_up()
         limit_shapes(scene.gaussians, viewing_rays(scene), config.shapes)
@@ -267,6 +274,18 @@ def _change_set(state: FitState, config: FitConfig) -> None:
             threshold=settings.threshold,
         )
     )
+
+
+def _seek_lamps(state: FitState, images: Sequence[FitImage], config: FitConfig) -> None:
+    """Look for lamps that go on and off when it is time."""
+    if state.step < LAMPS_AT * config.steps:
+        return
+    cameras = [
+        image.camera.refined(state.refinement.world_from_camera(row, state.step).detach())
+        for row, image in enumerate(images)
+    ]
+    most = math.ceil(LAMP_STEPS * config.steps)
+    state.take_lamps(with_lamps_found(state.caught_up(), images, cameras, most))
 
 
 def _target(num_gaussians: int, fraction: float, config: FitConfig) -> int:

@@ -5,7 +5,7 @@ blocks: catching up for a checkpoint would split their way differently from an u
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -46,6 +46,8 @@ class FitState:
     waiting: list[int] = field(default_factory=list)
     """Groups of views still to be drawn from in this pass."""
     step: int = 0
+    sought_lamps: bool = False
+    """Whether lamps were looked for already."""
     cpu_s: float = 0.0
     """Process CPU seconds spent so far, earlier runs included."""
     history: list[dict[str, float]] = field(default_factory=list)
@@ -108,6 +110,13 @@ class FitState:
         self.blocks = SpatialBlocks.of(self.scene.gaussians, self.gaussian_adam.rates)
         self.tally = GradientTally.zeros(len(change.gaussians), self.scene.device)
 
+    def take_lamps(self, scene: GaussianScene) -> None:
+        """Take over lamps that were found in `caught_up`, and the Gaussians as dark as off."""
+        with torch.no_grad():
+            self.scene.gaussians.sh_dc.copy_(scene.gaussians.sh_dc)
+        self.scene = replace(self.scene, blinking=scene.blinking)
+        self.sought_lamps = True
+
     def keep(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Tensors and JSON-able numbers of the whole state."""
         scene_arrays, scene_metadata = scene_to_arrays(self.scene)
@@ -125,6 +134,7 @@ class FitState:
             "scene": scene_metadata,
             "waiting": self.waiting,
             "step": self.step,
+            "sought_lamps": self.sought_lamps,
             "cpu_s": self.cpu_s,
             "history": self.history,
             "recent": self.recent_numbers(),
@@ -158,6 +168,7 @@ class FitState:
         state.generator = generator_from(tensors["random/state"])
         state.waiting = list(numbers["waiting"])
         state.step, state.cpu_s = numbers["step"], numbers["cpu_s"]
+        state.sought_lamps = numbers["sought_lamps"]
         state.history = list(numbers["history"])
         state.recent = [
             torch.tensor(pair, dtype=torch.float64, device=device) for pair in numbers["recent"]

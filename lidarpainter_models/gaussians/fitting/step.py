@@ -52,7 +52,7 @@ WAITS = 4
 """The most of the host for the device in a step, without the rasteriser's own: how many Gaussians
 are in view, how many of them lag and by how much (plain torch alone asks), and the gradients of the
 bodies' poses and of the exposure. Where somebody bends, one more for each view: which Gaussians
-do."""
+do; where lamps blink, two more for each: which are in one."""
 
 Perceptual = Callable[
     [Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]], Float[Tensor, ""]
@@ -124,8 +124,9 @@ def _recorded_gradients(
     screen_gradient = torch.zeros(len(seen), device=seen.means.device)
     actors = state.scene.actors
     bent = actors.bending.bent(seen, image.timestamp_ns)
+    lit = state.scene.blinking.lit(bent, image.timestamp_ns)
     splat = draw_gaussians(
-        as_read(bent, bodies, camera, actors, image.timestamp_ns),
+        as_read(lit, bodies, camera, actors, image.timestamp_ns),
         bodies,
         camera,
         with_actor_alpha=with_actors,
@@ -176,7 +177,8 @@ def add_guidance_gradients(
     sky, settings = state.scene.sky, config.guidance
     bending = state.scene.actors.bending
     held = replace(bending, offset_m=bending.offset_m.detach())
-    splat = draw_gaussians(held.bent(seen, view.timestamp_ns), camera_from_bodies, view.camera)
+    lit = state.scene.blinking.lit(held.bent(seen, view.timestamp_ns), view.timestamp_ns)
+    splat = draw_gaussians(lit, camera_from_bodies, view.camera)
     sky_rgb = sky.sample(sky.rays(view.camera, splat.alpha.detach() < OPAQUE))
     shown = splat.rgb + (1 - splat.alpha)[..., None] * sky_rgb
     loss = settings.weight * l1_ssim_loss(

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, ShownGaussians
 from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
+from lidarpainter_models.geometry.lattices import lattice_values
 
 NODES = (3, 3, 5)
 """Along a box's length, width and height: legs part, arms swing, the head follows."""
@@ -24,8 +25,6 @@ REACH_M = 0.5
 REST = 0.1
 """How much a node's own way counts beside what parts it from a neighbour."""
 NUM_NODES = NODES[0] * NODES[1] * NODES[2]
-_LATTICE = ([count - 1 for count in NODES], [NODES[1] * NODES[2], NODES[2], 1], [2, 1, 0])
-"""By axis: the last node, how far neighbours lie apart in the list, and a cell's corners' bits."""
 
 AnyGaussians = TypeVar("AnyGaussians", GaussianSet, SeenGaussians, ShownGaussians)
 
@@ -124,25 +123,9 @@ class Bending:
         if not len(rows):
             return gaussians
         lattice = torch.searchsorted(self.bodies, body[rows])
-        moved = self._moved(self.offset_at(timestamp_ns), gaussians.means[rows], lattice)
+        along = gaussians.means[rows] / self.size_m[lattice] + 0.5
+        moved = lattice_values(self.offset_at(timestamp_ns), lattice, along, NODES)
         return replace(gaussians, means=gaussians.means.index_add(0, rows, moved))
-
-    def _moved(
-        self,
-        offset_m: Float[Tensor, "bent nodes 3"],
-        means: Float[Tensor, "rows 3"],
-        lattice: Int[Tensor, " rows"],
-    ) -> Float[Tensor, "rows 3"]:
-        """By how much the nodes around each centre take it along."""
-        last, stride, bit = torch.tensor(_LATTICE).to(means.device, non_blocking=True)
-        along = (means / self.size_m[lattice] + 0.5) * last
-        along = along.clamp(torch.zeros_like(along), last.to(along).expand_as(along))
-        low = torch.minimum(along.detach().floor().long(), last - 1)
-        share = (along - low)[:, None]
-        corner = torch.arange(8, device=means.device)[:, None] >> bit & 1
-        node = ((low[:, None] + corner) * stride).sum(dim=-1)
-        x, y, z = torch.where(corner > 0, share, 1 - share).unbind(-1)
-        return ((x * y * z)[..., None] * offset_m[lattice[:, None], node]).sum(dim=1)
 
 
 def _cubic_weights(times_s: Sequence[float], after: int, now_s: float) -> list[float]:

@@ -1,6 +1,6 @@
 """A dynamic scene: street, actors and sky, and what was corrected about the cameras."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.gaussians.model.actors import Actors
+from lidarpainter_models.gaussians.model.blinking import Blinking
 from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.rolling_shutter import as_read
@@ -39,6 +40,8 @@ class GaussianScene:
     sky: SkyTexture
     cameras: CameraCorrections
     exposure: ExposureCorrections
+    blinking: Blinking = field(default_factory=Blinking.none)
+    """Lamps that went on and off."""
     style: SceneStyle | None = None
     """Weather and night that the scene is rendered in."""
 
@@ -80,7 +83,8 @@ class GaussianScene:
                 poses = self.actors.likely_poses(timestamp_ns)
                 bodies = camera_from_body(camera.world_from_camera, *poses)
                 bent = self.actors.bending.bent(self.gaussians, timestamp_ns)
-                read = as_read(bent, bodies, camera, self.actors, timestamp_ns)
+                lit = self.blinking.lit(bent, timestamp_ns)
+                read = as_read(lit, bodies, camera, self.actors, timestamp_ns)
                 drawn = draw_over_sky(read, bodies, self.sky, camera, backend=backend)
             return replace(drawn, rgb=self.exposure.apply(drawn.rgb, camera_name, timestamp_ns))
 
@@ -125,6 +129,7 @@ class GaussianScene:
             self,
             gaussians=self.gaussians.to(device),
             actors=self.actors.to(device),
+            blinking=self.blinking.to(device),
             sky=self.sky.to(device),
             style=None if self.style is None else self.style.to(device),
         )
@@ -150,7 +155,11 @@ class GaussianScene:
         if self.style is None:
             return None
         return DressedScene(
-            gaussians=self.gaussians, actors=self.actors, sky=self.sky, style=self.style
+            gaussians=self.gaussians,
+            actors=self.actors,
+            blinking=self.blinking,
+            sky=self.sky,
+            style=self.style,
         )
 
     def with_gaussians(self, gaussians: GaussianSet) -> "GaussianScene":
@@ -166,6 +175,7 @@ def describe(scene: GaussianScene) -> dict[str, Any]:
         "num_actor_gaussians": int((body > 0).sum()),
         "num_actors": len(scene.actors.recorded_tracks),
         "num_bent_actors": len(scene.actors.bending.bodies),
+        "num_blinking_lamps": len(scene.blinking),
         "style": None if scene.style is None else scene.style.mix.text,
         "sky_texels": [scene.sky.layout.rows, scene.sky.layout.columns],
     }

@@ -8,6 +8,7 @@ from torch import Tensor
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.bending import Bending
+from lidarpainter_models.gaussians.model.blinking import Blinking
 from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
@@ -38,6 +39,7 @@ def scene_to_arrays(scene: GaussianScene) -> tuple[dict[str, Tensor], dict[str, 
         "own_body": dict(cameras.own_bodies),
         "actors": {"knots_ns": scene.actors.knots_ns, "tangent": scene.actors.tangent},
         "bending": scene.actors.bending.tensors(),
+        "blinking": scene.blinking.tensors(),
         "exposure": {
             "matrix": scene.exposure.matrix,
             "knots_ns": scene.exposure.knots_ns,
@@ -96,6 +98,7 @@ def scene_from_arrays(arrays: dict[str, Tensor], metadata: dict[str, Any]) -> Ga
                 **groups["cameras"],
             ),
             exposure=_exposure(groups["exposure"], metadata["exposure_camera_names"]),
+            blinking=Blinking(**groups["blinking"]) if "blinking" in groups else Blinking.none(),
             style=style_from_arrays(groups["style"], metadata["style"])
             if "style" in metadata
             else None,

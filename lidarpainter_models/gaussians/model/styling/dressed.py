@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.gaussians.model.actors import ActorPoses, Actors
+from lidarpainter_models.gaussians.model.blinking import Blinking
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, ShownGaussians
 from lidarpainter_models.gaussians.model.scene_rendering import (
     SceneRender,
@@ -47,6 +48,7 @@ class DressedScene:
 
     gaussians: GaussianSet
     actors: Actors
+    blinking: Blinking
     sky: SkyTexture
     style: SceneStyle
     _lit: dict[tuple[tuple[str, float], ...], StyledLight] = field(
@@ -69,6 +71,7 @@ class DressedScene:
             light = self.light(strengths)
             shown = self._shown(light, camera, bodies, poses, timestamp_ns)
             shown = self.actors.bending.bent(shown, timestamp_ns)
+            shown = self.blinking.lit(shown, timestamp_ns)
             drawn = draw_over_sky(shown, bodies, light.sky, camera, backend=backend)
             night = strengths.get("night", 0.0)
             if night == 0:

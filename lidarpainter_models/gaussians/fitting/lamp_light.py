@@ -1,0 +1,121 @@
+"""How lamps shine: what being on adds to their Gaussians, and when they are on."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lidarpainter_models.gaussians.fitting.lamp_images import (
+    LEAST_PX,
+    Levels,
+    Look,
+    series,
+    two_levels,
+)
+from lidarpainter_models.gaussians.model.blinking import NUM_NODES, Blinking, with_added_colour
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
+
+NEAREST_M = 0.2
+"""What is nearer to a camera than this is not before it."""
+STEADINESS = 0.3
+"""Pixels with no change that each node of a lattice starts with."""
+ROUNDS = 10
+"""In which a lattice is fitted to its Gaussians."""
+
+
+def with_measured_lamps(
+    scene: GaussianScene, lamps: Blinking, looks: Sequence[Look]
+) -> GaussianScene:
+    """The scene with these lamps, as all images that may show one tell when and how they shine."""
+    gaussians = scene.gaussians
+    everyone = torch.ones(len(lamps), dtype=torch.bool, device=scene.device)
+    rows, lamp = lamps.inside(gaussians.means, gaussians.body_index, everyone)
+    used = [look for look in looks if _may_show(scene, lamps, look)]
+    own = torch.full_like(gaussians.body_index, len(rows), dtype=torch.int64)
+    own[rows] = torch.arange(len(rows), device=scene.device)
+    pixels, error = (part[:-1] for part in series(scene, used, own, len(rows) + 1))
+    in_lamp = [
+        part.new_zeros(len(lamps), *part.shape[1:]).index_add(0, lamp, part)
+        for part in (pixels, error)
+    ]
+    levels = two_levels(*in_lamp)
+    is_on = levels.is_high[lamp]
+    is_off = ((in_lamp[0] >= LEAST_PX) & ~levels.is_high)[lamp]
+    off_rgb, off_px = _mean(pixels, error, is_off)
+    on_rgb, on_px = _mean(pixels, error, is_on)
+    change_px = off_px * on_px / (off_px + on_px).clamp(min=1e-9)
+    dark = _fitted(lamps, gaussians.means[rows], lamp, off_rgb, off_px)
+    lit = _fitted(lamps, gaussians.means[rows], lamp, on_rgb - off_rgb, change_px)
+    darker = lamps.colours(dark, gaussians.means[rows], lamp)
+    return replace(
+        scene.with_gaussians(with_added_colour(gaussians, rows, darker)),
+        blinking=_over_time(replace(lamps, lit_rgb=lit), used, in_lamp[0] >= LEAST_PX, levels),
+    )
+
+
+def _may_show(scene: GaussianScene, lamps: Blinking, look: Look) -> bool:
+    """Whether the middle of a lamp is before the camera, in its image or near it."""
+    poses = scene.actors.likely_poses(look.image.timestamp_ns)
+    bodies = camera_from_body(look.camera.world_from_camera, *poses)[lamps.bodies.cpu()]
+    x, y, z = (bodies[:, :3, :3] @ lamps.centre_m.cpu()[..., None] + bodies[:, :3, 3:])[..., 0].T
+    camera, depth_m = look.camera, z.clamp(min=NEAREST_M)
+    u, v = x / depth_m * camera.fx_px + camera.cx_px, y / depth_m * camera.fy_px + camera.cy_px
+    is_shown = (z > NEAREST_M) & (u > 0) & (u < camera.width_px) & (v > 0) & (v < camera.height_px)
+    return bool(is_shown.any())
+
+
+def _mean(
+    pixels: Float[Tensor, "rows images"],
+    error: Float[Tensor, "rows images 3"],
+    taken: Bool[Tensor, "rows images"],
+) -> tuple[Float[Tensor, "rows 3"], Float[Tensor, " rows"]]:
+    """What some images have more of colour where each Gaussian is, and of how many pixels."""
+    total_px = torch.where(taken, pixels, 0.0).sum(dim=1)
+    total = torch.where(taken[..., None], error, 0.0).sum(dim=1)
+    return total / total_px.clamp(min=1e-6)[:, None], total_px
+
+
+def _fitted(
+    lamps: Blinking,
+    means: Float[Tensor, "rows 3"],
+    lamp: Int[Tensor, " rows"],
+    rgb: Float[Tensor, "rows 3"],
+    pixels: Float[Tensor, " rows"],
+) -> Float[Tensor, "lamps nodes 3"]:
+    """Lattices that have these colours where the Gaussians are, by how many pixels show them."""
+    leaf = torch.zeros(len(lamps), NUM_NODES, 3, device=means.device, requires_grad=True)
+
+    def at_nodes(of_rows: Float[Tensor, "rows 3"]) -> Float[Tensor, "lamps nodes 3"]:
+        """Sums of what Gaussians have, each parted among the nodes around it."""
+        with torch.enable_grad():
+            (sums,) = torch.autograd.grad((lamps.colours(leaf, means, lamp) * of_rows).sum(), leaf)
+        return sums
+
+    total = at_nodes(pixels[:, None].expand(-1, 3)) + STEADINESS
+    found = torch.zeros_like(total)
+    for _ in range(ROUNDS):
+        missing = rgb - lamps.colours(found, means, lamp)
+        found = found + (at_nodes(pixels[:, None] * missing) - STEADINESS * found) / total
+    return found
+
+
+def _over_time(
+    lamps: Blinking, looks: Sequence[Look], is_seen: Bool[Tensor, "lamps images"], levels: Levels
+) -> Blinking:
+    """The lamps with when they are on: as the images of a time say, in between where none does."""
+    times_ns = torch.tensor([look.image.timestamp_ns for look in looks])
+    knots_ns, at = torch.unique(times_ns, return_inverse=True)
+    is_seen, is_high = is_seen.cpu().float(), levels.is_high.cpu().float()
+    seen = torch.zeros(len(lamps), len(knots_ns)).index_add(1, at, is_seen)
+    high = torch.zeros(len(lamps), len(knots_ns)).index_add(1, at, is_high)
+    knots_s = (knots_ns - knots_ns[0]).numpy() * 1e-9
+    is_lit = [
+        np.interp(knots_s, knots_s[known], (high[row] / seen[row].clamp(min=1)).numpy()[known])
+        for row in range(len(lamps))
+        for known in [(seen[row] > 0).numpy()]
+    ]
+    return replace(lamps, knots_ns=knots_ns, is_lit=torch.tensor(np.array(is_lit)).float().T)
