@@ -28,13 +28,17 @@ ROUNDS = 10
 
 
 def with_measured_lamps(
-    scene: GaussianScene, lamps: Blinking, looks: Sequence[Look]
+    scene: GaussianScene, lamps: Blinking, looks: Sequence[Look], most: int
 ) -> GaussianScene:
-    """The scene with these lamps, as all images that may show one tell when and how they shine."""
+    """The scene with these lamps, as images that may show one tell when and how they shine.
+
+    Of more than `most` evenly chosen ones are looked at.
+    """
     gaussians = scene.gaussians
     everyone = torch.ones(len(lamps), dtype=torch.bool, device=scene.device)
     rows, lamp = lamps.inside(gaussians.means, gaussians.body_index, everyone)
     used = [look for look in looks if _may_show(scene, lamps, look)]
+    used = used[:: max(-(-len(used) // most), 1)]
     own = torch.full_like(gaussians.body_index, len(rows), dtype=torch.int64)
     own[rows] = torch.arange(len(rows), device=scene.device)
     pixels, error = (part[:-1] for part in series(scene, used, own, len(rows) + 1))

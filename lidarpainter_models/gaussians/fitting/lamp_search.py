@@ -43,8 +43,10 @@ CANDIDATE_CHANGE, CANDIDATE_EXPLAINED = 0.1, 0.85
 AROUND_CELLS, MOST_AROUND = 3, 0.4
 """What is around a lamp, within so many cells of it, changes by less than this share of its change:
 shadows and people that pass are wide."""
-STRETCH = 48
-"""Images of one camera that are compared at a time: a lamp is passed, and it changes, in less."""
+STRETCH = 32
+"""Images of one camera that are compared at a time: a lamp is passed, and it changes, in less. What
+they say of all places takes no more memory than a step of the fit."""
+CELLS_AT_ONCE = 16_384
 
 
 def with_lamps_found(
@@ -57,7 +59,7 @@ def with_lamps_found(
         images: what was recorded.
         cameras: where each image was taken from, as far as is known.
         most: images to look through; where there are more, evenly chosen ones of each camera.
-            All that show what is found are looked at once more.
+            Of those that show what is found, twice as many are looked at once more.
     """
     looks = [Look(image, camera) for image, camera in zip(images, cameras, strict=True)]
     looks.sort(key=lambda look: (look.image.camera_name, look.image.timestamp_ns))
@@ -71,7 +73,7 @@ def with_lamps_found(
     if not parts:
         return scene
     lamps = _boxes(cells[torch.tensor(sorted(parts), device=cells.device)])
-    return with_measured_lamps(scene, lamps, looks) if len(lamps) else scene
+    return with_measured_lamps(scene, lamps, looks, 2 * most) if len(lamps) else scene
 
 
 def _stretches(looks: Sequence[Look], most: int) -> list[list[Look]]:
@@ -92,9 +94,13 @@ def _lamp_cells(
 ) -> list[int]:
     """The cells that go on and off together with their neighbours, as one stretch shows."""
     pixels, error = series(scene, looks, cell_of_row, len(cells))
-    levels = two_levels(pixels, error)
-    may_be = levels.explained >= CANDIDATE_EXPLAINED
-    may_be &= levels.change >= CANDIDATE_CHANGE
+    may_be = torch.cat(
+        [
+            (levels.explained >= CANDIDATE_EXPLAINED) & (levels.change >= CANDIDATE_CHANGE)
+            for some in zip(pixels.split(CELLS_AT_ONCE), error.split(CELLS_AT_ONCE), strict=True)
+            for levels in [two_levels(*some)]
+        ]
+    )
     rows = may_be.nonzero()[:, 0]
     if not len(rows):
         return []

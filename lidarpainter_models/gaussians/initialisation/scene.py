@@ -38,8 +38,8 @@ from lidarpainter_models.lidar.lidar_map import MapPoints
 from lidarpainter_models.lidar.map_building import LEAST_WAY_M
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
 from lidarpainter_models.scenes.categories import category_of
-from lidarpainter_models.scenes.driving_scene import ActorTrack
 from lidarpainter_models.scenes.splits import rows_of_each, sampled_views
+from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses
 
 LEAST_UNSEEN_POINTS = 3
 """Voxels with fewer points that only a camera moved aside would see are dropped."""
@@ -62,8 +62,11 @@ MOST_VIEWS_PER_CAMERA = 60
 every point for every view would take the square of a log's length."""
 OUTLINE_VIEWS_PER_CAMERA = 8
 """Views that tell what stands against the sky."""
-MOST_STREET_POINTS = 5_000_000
-"""Of the street's points so many are looked at, evenly: dozens for each Gaussian."""
+MOST_STREET_POINTS, POINTS_PER_GAUSSIAN = 5_000_000, 100
+"""Of the street's points so many are looked at, evenly, in all and for each Gaussian: the sweeps of
+a car that stands are of one place."""
+MOST_ACTOR_POINTS = 60_000
+"""The same of an actor: many sweeps show one side of it alike."""
 POINTS_AT_ONCE = 32_768
 """Points that are asked for by one view after the other: what is kept of them fits a cache."""
 _MOST_VIEWS_PER_ACTOR = 24
@@ -150,18 +153,21 @@ def _bent(
     if len(frame_times_ns) < 2 or int(frame_times_ns.diff().median()) > MOST_BENT_NS:
         return []
     rows = [row for row, track in enumerate(tracks) if category_of(track.category) in BENDING]
-    shown: set[int] = set()
-    for view in views:
-        there = [row for row in rows if tracks[row].is_present(view.timestamp_ns)]
-        if not there:
-            continue
-        poses = [tracks[row].pose_at(view.timestamp_ns) for row in there]
-        pixels_uv, depth_m = view.camera.project(torch.stack(poses)[:, :3, 3].float())
-        size_m = torch.stack([tracks[row].size_m[2] for row in there])
-        is_large = view.camera.fy_px * size_m >= LEAST_BENT_PX * depth_m
-        is_large &= view.camera.contains(pixels_uv, depth_m)
-        shown |= {row for row, one in zip(there, is_large.tolist(), strict=True) if one}
-    return sorted(shown)
+    if not rows:
+        return []
+    poses = TrackPoses.of([tracks[row] for row in rows])
+    height_m = torch.stack([tracks[row].size_m[2] for row in rows])
+    times_ns = torch.tensor([view.timestamp_ns for view in views])
+    number, who = poses.present(times_ns[:, None]).nonzero().unbind(1)
+    centres = poses.at(who, times_ns[number])[:, :3, 3].float()
+    in_view = torch.bincount(number, minlength=len(views)).tolist()
+    shown = torch.zeros(len(rows), dtype=torch.bool)
+    for view, those, there in zip(views, who.split(in_view), centres.split(in_view), strict=True):
+        if len(those):
+            pixels_uv, depth_m = view.camera.project(there)
+            is_large = view.camera.fy_px * height_m[those] >= LEAST_BENT_PX * depth_m
+            shown[those] |= is_large & view.camera.contains(pixels_uv, depth_m)
+    return [row for row, is_shown in zip(rows, shown.tolist(), strict=True) if is_shown]
 
 
 def _frame_times(views: Sequence[TrainingView]) -> Int[Tensor, " frames"]:
@@ -243,7 +249,7 @@ def _on_surfaces(
 ) -> GaussianSet:
     """Surfels where images show LiDAR surfaces, and some where only a moved camera would."""
     street = observations.lidar_map.street
-    street = street.keep(torch.arange(0, len(street), math.ceil(len(street) / MOST_STREET_POINTS)))
+    street = _spread(street, min(MOST_STREET_POINTS, POINTS_PER_GAUSSIAN * budget))
     cameras, images = _spread_cameras(observations.views)
     footprint, density = pixel_footprint(street.xyz_m, cameras, images)
     density *= math.sqrt(len(observations.views) / sum(images))
@@ -260,6 +266,7 @@ def _on_surfaces(
         points = observations.lidar_map.actors.get(track.actor_id)
         if points is None:
             continue
+        points = _spread(points, MOST_ACTOR_POINTS)
         spacing_m = _actor_spacing(points, track, observations.views)
         in_sight = spacing_m.isfinite()
         if int(in_sight.sum()) >= LEAST_ACTOR_POINTS:
@@ -272,6 +279,11 @@ def _on_surfaces(
     for body, voxels in zip(list(clouds)[1:], seen[1:], strict=True):
         gaussians = gaussians.append(_surfels([voxels], [2.0], config, body=body))
     return gaussians
+
+
+def _spread(points: MapPoints, most: int) -> MapPoints:
+    """At most so many of the points, evenly over the log."""
+    return points.keep(torch.arange(0, len(points), max(math.ceil(len(points) / most), 1)))
 
 
 def _cloud(
