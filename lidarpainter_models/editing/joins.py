@@ -79,7 +79,8 @@ def joined(world: EditedWorld, other: OtherRun) -> EditedWorld:
 
 
 def _joined_street(world: EditedWorld, other: OtherRun, seen: "_SeenTwice") -> EditedWorld:
-    own, theirs = world.scene.gaussians, other.world.scene.gaussians
+    own, their_scene = world.scene.gaussians, other.world.scene
+    theirs = their_scene.blinking.lit_on_average(their_scene.gaussians)
     theirs = theirs.select((theirs.body_index == 0).nonzero()[:, 0])
     coming = carried_gaussians(theirs, other.world_from_other)
     enters = seen.whole_is_theirs(coming)
@@ -94,6 +95,10 @@ def _joined_street(world: EditedWorld, other: OtherRun, seen: "_SeenTwice") -> E
         if track.actor_id in drive_off:  # the other run saw its place without it
             leaves[world.rows_of(track)] = False
     kept = own.select((~leaves).nonzero()[:, 0])
+    lamps = world.scene.blinking
+    rows, lamp = lamps.inside(own.means, own.body_index, torch.arange(len(lamps)))
+    stays = torch.ones(len(lamps), dtype=torch.bool)
+    stays[lamp[leaves[rows]]] = False
     street, points = world.lidar_map.street, other.world.lidar_map.street
     carried_m = transform_points(other.world_from_other.to(points.xyz_m), points.xyz_m)
     points = replace(points, xyz_m=carried_m)
@@ -102,7 +107,11 @@ def _joined_street(world: EditedWorld, other: OtherRun, seen: "_SeenTwice") -> E
     stands = [_carried(track, other) for track in other.world.parked if track.actor_id not in known]
     return replace(
         world,
-        scene=world.scene.with_gaussians(kept.append(of_degree(coming, own.sh_degree))),
+        scene=replace(
+            world.scene,
+            gaussians=kept.append(of_degree(coming, own.sh_degree)),
+            blinking=lamps.kept(stays),
+        ),
         lidar_map=LidarMap(street=MapPoints.concatenate(both), actors=world.lidar_map.actors),
         parked=(*world.parked, *stands),
     )

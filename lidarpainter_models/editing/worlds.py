@@ -102,7 +102,7 @@ class EditedWorld:
         if self._body_of(track) is None:
             pose = invert_rigid(_parked_pose(track))
             points = _carried_points(points, pose)
-        gaussians = self.scene.gaussians.select(rows)
+        gaussians = self.scene.blinking.lit_on_average(self.scene.gaussians).select(rows)
         if not len(gaussians):
             raise SceneError(f"actor {track.actor_id!r} has no Gaussians here: nobody saw it")
         gaussians = gaussians if pose is None else carried_gaussians(gaussians, pose)
@@ -128,6 +128,10 @@ class EditedWorld:
             gone |= self._ghosts(track)
             actors.pop(track.actor_id, None)
         scene = self.scene.with_gaussians(self.scene.gaussians.select((~gone).nonzero()[:, 0]))
+        if body is None:
+            lamps = scene.blinking
+            theirs = self._holds(track, lamps.centre_m) & (lamps.bodies == 0)
+            scene = replace(scene, blinking=lamps.kept(~theirs))
         was_there = track if body is not None else _always(track, self.log)
         return replace(
             self,

@@ -88,7 +88,7 @@ def scene_contents(
     """Take a scene apart.
 
     Poses are wanted at `timestamps_ns`, ascending; at one time alone, people are bent and lamps
-    lit as they are then, else people are at rest and lamps are off. None takes all actors;
+    lit as they are then, else people are at rest and lamps as on average. None takes all actors;
     `with_sky` shows the sky by far Gaussians.
 
     Raises:
@@ -102,8 +102,10 @@ def scene_contents(
         raise SceneError(f"scene {name} has no actor {missing[0]!r}, it has {known}")
     gaussians = scene.gaussians
     if len(timestamps_ns) == 1:
-        gaussians = scene.actors.bending.bent(gaussians, timestamps_ns[0])
         gaussians = scene.blinking.lit(gaussians, timestamps_ns[0])
+        gaussians = scene.actors.bending.bent(gaussians, timestamps_ns[0])
+    else:
+        gaussians = scene.blinking.lit_on_average(gaussians)
     bodies = _bodies(gaussians, len(tracks) + 1)
     street = bodies[0].append(sky_gaussians(scene.sky, scene)) if with_sky else bodies[0]
     rows = [places[one] for one in wanted]

@@ -1,10 +1,10 @@
 """Give LiDAR points the colours that recorded images saw, and only those images.
 
-Every point is projected into every given image; points of moving actors stand where their box is
-at the exposure. A sample counts where nothing known hides the point (`point_visibility`), most
-where the image was taken near in time to the point, fine enough, and away from depth edges, where
-a small error of pose or calibration would take the colour of the other side. The best few samples
-are brought to one exposure and combined robustly.
+Points are projected into every given image that is not too far in time; those of moving actors
+stand where their box is at the exposure. A sample counts where nothing known hides the point
+(`point_visibility`), most where the image was taken near in time to the point, fine enough, and
+away from depth edges, where a small error of pose or calibration would take the colour of the other
+side. The best few samples are brought to one exposure and combined robustly.
 """
 
 from collections.abc import Sequence
@@ -31,6 +31,7 @@ from lidarpainter_models.lidar.point_visibility import (
     visible_points,
 )
 from lidarpainter_models.lidar.points_in_view import (
+    MOST_AGE_NS,
     Body,
     CellGrid,
     PlacedActors,
@@ -74,9 +75,16 @@ class MapColouring:
     """Colours the points of a map, one image after another."""
 
     def __init__(
-        self, lidar_map: LidarMap, tracks: Sequence[ActorTrack], views: Sequence[RecordedView]
+        self,
+        lidar_map: LidarMap,
+        tracks: Sequence[ActorTrack],
+        views: Sequence[RecordedView],
+        *,
+        most_age_ns: int | None = MOST_AGE_NS,
     ) -> None:
         """Take the points, all actors of the scene, and the views whose images will be added.
+
+        Images further in time from points of the street than `most_age_ns` are not asked for them.
 
         Raises:
             SceneError: the points of an actor that has no track.
@@ -87,7 +95,7 @@ class MapColouring:
             raise SceneError(f"points of actors without a track: {', '.join(unknown)}")
         self._actor_ids = list(lidar_map.actors)
         actors = [Body(known[name], points) for name, points in lidar_map.actors.items()]
-        self._bodies = [Body(None, lidar_map.street), *actors]
+        self._bodies = [Body(None, lidar_map.street, most_age_ns), *actors]
         self._samples = BestSamples.none_yet(sum(len(body.points) for body in self._bodies))
         self._view_numbers = {view.key: number for number, view in enumerate(views)}
         self._placed = place_actors(views, tracks)

@@ -37,7 +37,9 @@ def exposure_differences(scene: DrivingScene) -> list[str]:
             "images could be compared"
         )
     some = street.keep(torch.arange(0, len(street), -(-len(street) // _MOST_POINTS)))
-    colouring = MapColouring(LidarMap(street=some, actors={}), scene.tracks, views)
+    colouring = MapColouring(
+        LidarMap(street=some, actors={}), scene.tracks, views, most_age_ns=None
+    )
     colouring.add_recorded(scene, views)
     brightness = 1 / colouring.gains().mean(axis=1)
     names = np.array([view.camera_name for view in views])

@@ -73,7 +73,7 @@ def surface_visibility(
         radius_px=radius_px,
     )
     is_surface = (seen >= 0).numpy()
-    depth = np.where(is_surface, depth_m.numpy()[seen.clamp(min=0).numpy()], np.float32(_FAR_M))
+    depth = np.append(depth_m.numpy(), np.float32(_FAR_M))[seen.numpy()]  # -1 is the last
     steps = ((1, 0), (-1, 0), (0, 1), (0, -1))
     sides = [_nearest_towards(depth, around.gap_px, *step) for step in steps]
     hidden = np.minimum(np.maximum(sides[0], sides[1]), np.maximum(sides[2], sides[3]))

@@ -84,7 +84,7 @@ def _seen(
     scene: GaussianScene, camera: Camera, timestamp_ns: int
 ) -> tuple[Int[Tensor, " seen"], Float[Tensor, "seen 3"]]:
     """The Gaussians whose centres lie in an image, and their colours in it."""
-    gaussians = scene.gaussians
+    gaussians = scene.blinking.lit(scene.gaussians, timestamp_ns)
     poses = scene.actors.likely_poses(timestamp_ns)
     bodies = camera_from_body(camera.world_from_camera, *poses)
     own = bodies[gaussians.body_index.long()]

@@ -20,6 +20,7 @@ from lidarpainter_models.editing.motions import LogTimes
 from lidarpainter_models.editing.operations import ActorSource, parse_operations
 from lidarpainter_models.editing.worlds import EditedWorld
 from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.gaussians.model.blinking import Blinking
 from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
@@ -99,6 +100,19 @@ def test_a_larger_actor_keeps_its_wheels_on_the_road(world):
         float(track.world_from_box[0, 2, 3] - track.size_m[2] / 2) for track in (before, larger)
     ]
     assert bottoms[0] == pytest.approx(bottoms[1])
+
+
+def test_who_is_moved_shows_its_lamps_as_on_average_and_who_goes_takes_them_along(world):
+    lamp = Blinking.dark(torch.tensor([1, 0]), torch.zeros(2, 3), torch.full((2, 3), 9.0))
+    lamp.lit_rgb[:] = 0.1
+    lamp = replace(lamp, is_lit=torch.tensor([[0.0, 1.0], [1.0, 1.0]]), knots_ns=TIMES_NS[:2])
+    lit = replace(world, scene=replace(world.scene, blinking=lamp))
+    car, before = (one.model_of(one.moving[0]).gaussians for one in (lit, world))
+    assert torch.allclose(car.base_rgb - before.base_rgb, torch.full((120, 3), 0.05), atol=1e-6)
+    after = done(lit, {"op": "move", "actor": "car", "trajectory": "along:2"})
+    assert after.scene.blinking.bodies.tolist() == [0]
+    removed = done(lit, {"op": "remove", "actors": ["car"]})
+    assert removed.scene.blinking.bodies.tolist() == [0]
 
 
 def test_time_can_be_frozen(world):

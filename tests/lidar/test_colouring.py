@@ -6,7 +6,7 @@ import torch
 from toy_street import BLUE, CAR_X_M, GREEN, GROUND, RED, WALL_X_M, ToyStreet
 
 from lidarpainter_models.kernels.colour_sampling import BestSamples
-from lidarpainter_models.lidar import map_building, points_in_view
+from lidarpainter_models.lidar import map_building
 from lidarpainter_models.lidar.colouring import MapColouring
 from lidarpainter_models.lidar.exposure_matching import match_exposure
 from lidarpainter_models.lidar.lidar_map import MapPoints
@@ -78,13 +78,14 @@ def test_points_that_have_better_samples_are_not_asked_again(monkeypatch):
     assert sum(few for few, _ in asked) < 0.9 * sum(every for _, every in asked)
 
 
-def test_images_long_before_or_after_a_sweep_are_not_asked(monkeypatch):
+@pytest.mark.parametrize("way", [-1, 1])
+def test_images_long_before_or_after_a_sweep_are_not_asked_for_the_street(way):
     street = ToyStreet()
-    monkeypatch.setattr(points_in_view, "MOST_AGE_NS", 0)
-    later = [replace(view, timestamp_ns=view.timestamp_ns + 10**10) for view in street.views]
-    points = build_lidar_map(street, split_frames=FRAMES, colour_views=later).street
-    assert not points.has_colour.any()
-    assert len(points) > 1000
+    for age_ns, are_asked in ((MOST_AGE_NS - 10**9, True), (MOST_AGE_NS + 10**9, False)):
+        shift_ns = way * age_ns
+        moved = [replace(view, timestamp_ns=view.timestamp_ns + shift_ns) for view in street.views]
+        points = build_lidar_map(street, split_frames=FRAMES, colour_views=moved).street
+        assert bool(points.has_colour.any()) == are_asked
 
 
 def test_the_stretches_about_a_time_hold_the_sweeps_measured_then():
@@ -95,13 +96,14 @@ def test_the_stretches_about_a_time_hold_the_sweeps_measured_then():
         timestamp_ns=frame * MOST_AGE_NS // 3 - torch.tensor([0, 9, 0, 0, 0, 0, 0, 0, 0]),
         range_m=torch.ones(len(frame)),
     )
-    body = Body(None, points)
+    body = Body(None, points, MOST_AGE_NS)
     assert body.stretches_about(0) == [slice(0, 3), slice(6, 8)]
     assert body.stretches_about(MOST_AGE_NS) == [slice(0, 5), slice(6, 8)]
     assert body.stretches_about(MOST_AGE_NS + 1) == [slice(2, 5), slice(7, 8)]
     assert body.stretches_about(2 * MOST_AGE_NS) == [slice(2, 6), slice(7, 9)]
     assert body.stretches_about(10 * MOST_AGE_NS) == []
-    assert Body(None, points.keep(frame < 0)).stretches_about(0) == []
+    assert Body(None, points.keep(frame < 0), MOST_AGE_NS).stretches_about(0) == []
+    assert Body(None, points).stretches_about(10 * MOST_AGE_NS) == [slice(0, 9)]
 
 
 def test_cameras_are_brought_to_the_exposure_of_the_first(monkeypatch):

@@ -27,7 +27,7 @@ class RefinementConfig:
     exposure: bool = False
     """Fit a colour matrix per camera even if there is one camera only."""
     lamps: bool = True
-    """Look for lamps that go on and off (`lamp_search`); rounds keep those that were found."""
+    """Look for lamps that go on and off (`lamp_search`) unless there are some; rounds do not."""
     start_step: int = 100
     """Before this the image is too coarse to align anything."""
 

@@ -247,7 +247,7 @@ def _advance(
     state.step += 1
     state.recent.append(told)
     _change_set(state, config)
-    if config.refinement.lamps and not state.sought_lamps:
+    if config.refinement.lamps and not state.sought_lamps and not len(state.scene.blinking):
         _seek_lamps(state, images, config)
     if state.step % LIMITS_EVERY == 0:
         scene = state.caught_up()

@@ -115,9 +115,9 @@ def lacking(
         recorded = image.facts().rgb
         true = scene.exposure.undone(recorded, image.camera_name, image.timestamp_ns)
         lacks = true - shown
-        if image.hidden is not None:
-            lacks = torch.where(image.hidden[..., None], 0.0, lacks)
-        ((drawn.rgb * lacks).sum() + drawn.features.sum()).backward()
+        counts = torch.ones_like(alpha) if image.hidden is None else (~image.hidden).float()
+        told = (drawn.rgb * lacks).sum(dim=-1) + drawn.features[..., 0]
+        (counts * told).sum().backward()
     return _gradient(ones)[:, 0], _gradient(harmonics)[:, 0] / SH_CONSTANT
 
 

@@ -32,13 +32,16 @@ def with_measured_lamps(
 ) -> GaussianScene:
     """The scene with these lamps, as images that may show one tell when and how they shine.
 
-    Of more than `most` evenly chosen ones are looked at.
+    Of more than `most` evenly chosen ones are looked at. A lamp that these do not show both on and
+    off is left out.
     """
     gaussians = scene.gaussians
-    everyone = torch.ones(len(lamps), dtype=torch.bool, device=scene.device)
-    rows, lamp = lamps.inside(gaussians.means, gaussians.body_index, everyone)
+    every = torch.arange(len(lamps), device=scene.device)
+    rows, lamp = lamps.inside(gaussians.means, gaussians.body_index, every)
     used = [look for look in looks if _may_show(scene, lamps, look)]
     used = used[:: max(-(-len(used) // most), 1)]
+    if not used:
+        return scene
     own = torch.full_like(gaussians.body_index, len(rows), dtype=torch.int64)
     own[rows] = torch.arange(len(rows), device=scene.device)
     pixels, error = (part[:-1] for part in series(scene, used, own, len(rows) + 1))
@@ -47,29 +50,31 @@ def with_measured_lamps(
         for part in (pixels, error)
     ]
     levels = two_levels(*in_lamp)
-    is_on = levels.is_high[lamp]
-    is_off = ((in_lamp[0] >= LEAST_PX) & ~levels.is_high)[lamp]
+    is_seen = in_lamp[0] >= LEAST_PX
+    both = levels.is_high.any(dim=1) & (is_seen & ~levels.is_high).any(dim=1)
+    is_on, is_off = levels.is_high[lamp], (is_seen & ~levels.is_high & both[:, None])[lamp]
     off_rgb, off_px = _mean(pixels, error, is_off)
     on_rgb, on_px = _mean(pixels, error, is_on)
     change_px = off_px * on_px / (off_px + on_px).clamp(min=1e-9)
     dark = _fitted(lamps, gaussians.means[rows], lamp, off_rgb, off_px)
     lit = _fitted(lamps, gaussians.means[rows], lamp, on_rgb - off_rgb, change_px)
     darker = lamps.colours(dark, gaussians.means[rows], lamp)
+    shining = _over_time(replace(lamps, lit_rgb=lit), used, is_seen, levels).kept(both)
     return replace(
-        scene.with_gaussians(with_added_colour(gaussians, rows, darker)),
-        blinking=_over_time(replace(lamps, lit_rgb=lit), used, in_lamp[0] >= LEAST_PX, levels),
+        scene.with_gaussians(with_added_colour(gaussians, rows, darker)), blinking=shining
     )
 
 
 def _may_show(scene: GaussianScene, lamps: Blinking, look: Look) -> bool:
-    """Whether the middle of a lamp is before the camera, in its image or near it."""
+    """Whether the middle of a lamp is in an image, or beside it by less than the lamp is wide."""
     poses = scene.actors.likely_poses(look.image.timestamp_ns)
     bodies = camera_from_body(look.camera.world_from_camera, *poses)[lamps.bodies.cpu()]
     x, y, z = (bodies[:, :3, :3] @ lamps.centre_m.cpu()[..., None] + bodies[:, :3, 3:])[..., 0].T
     camera, depth_m = look.camera, z.clamp(min=NEAREST_M)
+    wide_px = lamps.size_m.cpu().amax(dim=1) * camera.fx_px / depth_m
     u, v = x / depth_m * camera.fx_px + camera.cx_px, y / depth_m * camera.fy_px + camera.cy_px
-    is_shown = (z > NEAREST_M) & (u > 0) & (u < camera.width_px) & (v > 0) & (v < camera.height_px)
-    return bool(is_shown.any())
+    is_shown = (z > NEAREST_M) & (u > -wide_px) & (u < camera.width_px + wide_px)
+    return bool((is_shown & (v > -wide_px) & (v < camera.height_px + wide_px)).any())
 
 
 def _mean(
@@ -119,6 +124,8 @@ def _over_time(
     knots_s = (knots_ns - knots_ns[0]).numpy() * 1e-9
     is_lit = [
         np.interp(knots_s, knots_s[known], (high[row] / seen[row].clamp(min=1)).numpy()[known])
+        if known.any()
+        else np.zeros(len(knots_s))
         for row in range(len(lamps))
         for known in [(seen[row] > 0).numpy()]
     ]

@@ -27,6 +27,9 @@ from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.geometry.cameras import Camera
 
+_Box = tuple[int, Tensor, Tensor]
+"""A body, and the lower and upper corner in cells."""
+
 CELL_M = 0.2
 """Places are cubes of this side: about a lamp."""
 MOST_SIDE_M = 1.2
@@ -36,8 +39,8 @@ LEAST_MEAN_PX = 2.0
 LEAST_CHANGE = 0.12
 """From off to on, in the channel that changes most; images are 0 to 1."""
 LEAST_EXPLAINED = 0.97
-"""Share of a lamp's change over time that two levels explain. PandaSet 002 has one place of a
-thousand above it, a signal that flashes; what is next is at 0.966."""
+"""Share of a lamp's change over time that two levels explain. On PandaSet 002 a signal that
+flashes has 0.99, what is next 0.966 (docs/benchmarks.md)."""
 CANDIDATE_CHANGE, CANDIDATE_EXPLAINED = 0.1, 0.85
 """The same of a single cube that may be part of a lamp."""
 AROUND_CELLS, MOST_AROUND = 3, 0.4
@@ -172,17 +175,33 @@ def _neighbours(cells: Int[Tensor, "cells 4"]) -> list[int]:
 
 
 def _boxes(cells: Int[Tensor, "cells 4"]) -> Blinking:
-    """A box around those cells of a body that touch, half a cell wider; nothing known of it yet."""
+    """Boxes around cells of a body that touch, half a cell wider; those that overlap are one."""
     groups = torch.tensor(_neighbours(cells), device=cells.device)
-    ends = [
-        (of_lamp[0, 0], of_lamp[:, 1:].amin(dim=0) - 0.5, of_lamp[:, 1:].amax(dim=0) + 1.5)
+    boxes = [
+        (int(of_lamp[0, 0]), of_lamp[:, 1:].amin(dim=0) - 0.5, of_lamp[:, 1:].amax(dim=0) + 1.5)
         for group in range(int(groups.max()) + 1)
-        for of_lamp in [cells[groups == group]]
+        for of_lamp in [cells[groups == group].cpu()]
     ]
-    bodies, low, high = (torch.stack(parts) for parts in zip(*ends, strict=True))
-    is_small = ((high - low) * CELL_M <= MOST_SIDE_M + CELL_M).all(dim=1)
-    return Blinking.dark(
-        bodies[is_small],
-        ((low + high) / 2 * CELL_M)[is_small],
-        ((high - low) * CELL_M)[is_small],
-    )
+    apart: list[_Box] = []
+    while boxes:
+        body, low, high = boxes.pop()
+        beside = [box for box in apart if _overlap(box, (body, low, high))]
+        apart = [box for box in apart if not any(box is one for one in beside)]
+        if beside:  # what they make together may overlap with more
+            lows, highs = zip(*(box[1:] for box in beside), strict=True)
+            low, high = torch.stack([low, *lows]).amin(dim=0), torch.stack([high, *highs]).amax(0)
+            boxes.append((body, low, high))
+        else:
+            apart.append((body, low, high))
+    most = MOST_SIDE_M / CELL_M + 1
+    small = [box for box in apart if float((box[2] - box[1]).max()) <= most]
+    if not small:
+        return Blinking.none()
+    bodies, lows, highs = zip(*small, strict=True)
+    low_m, high_m = CELL_M * torch.stack(lows), CELL_M * torch.stack(highs)
+    lamps = Blinking.dark(torch.tensor(bodies), (low_m + high_m) / 2, high_m - low_m)
+    return lamps.to(cells.device)
+
+
+def _overlap(one: _Box, other: _Box) -> bool:
+    return one[0] == other[0] and bool(((one[1] < other[2]) & (other[1] < one[2])).all())

@@ -168,7 +168,7 @@ class FitState:
         state.generator = generator_from(tensors["random/state"])
         state.waiting = list(numbers["waiting"])
         state.step, state.cpu_s = numbers["step"], numbers["cpu_s"]
-        state.sought_lamps = numbers["sought_lamps"]
+        state.sought_lamps = numbers.get("sought_lamps", False)
         state.history = list(numbers["history"])
         state.recent = [
             torch.tensor(pair, dtype=torch.float64, device=device) for pair in numbers["recent"]

@@ -123,10 +123,10 @@ def _recorded_gradients(
     with_actors = _wants_actor_term(state, config)
     screen_gradient = torch.zeros(len(seen), device=seen.means.device)
     actors = state.scene.actors
-    bent = actors.bending.bent(seen, image.timestamp_ns)
-    lit = state.scene.blinking.lit(bent, image.timestamp_ns)
+    lit = state.scene.blinking.lit(seen, image.timestamp_ns)
+    bent = actors.bending.bent(lit, image.timestamp_ns)
     splat = draw_gaussians(
-        as_read(lit, bodies, camera, actors, image.timestamp_ns),
+        as_read(bent, bodies, camera, actors, image.timestamp_ns),
         bodies,
         camera,
         with_actor_alpha=with_actors,
@@ -177,8 +177,9 @@ def add_guidance_gradients(
     sky, settings = state.scene.sky, config.guidance
     bending = state.scene.actors.bending
     held = replace(bending, offset_m=bending.offset_m.detach())
-    lit = state.scene.blinking.lit(held.bent(seen, view.timestamp_ns), view.timestamp_ns)
-    splat = draw_gaussians(lit, camera_from_bodies, view.camera)
+    lit = state.scene.blinking.lit(seen, view.timestamp_ns)
+    shown_then = held.bent(lit, view.timestamp_ns)
+    splat = draw_gaussians(shown_then, camera_from_bodies, view.camera)
     sky_rgb = sky.sample(sky.rays(view.camera, splat.alpha.detach() < OPAQUE))
     shown = splat.rgb + (1 - splat.alpha)[..., None] * sky_rgb
     loss = settings.weight * l1_ssim_loss(

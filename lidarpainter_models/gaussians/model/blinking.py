@@ -82,17 +82,20 @@ class Blinking:
         """Everything to be stored."""
         return dict(vars(self))
 
-    def of_others(self, body: int) -> "Blinking":
-        """The lamps of all bodies but one."""
-        kept = self.bodies != body
+    def kept(self, chosen: Bool[Tensor, " lamps"]) -> "Blinking":
+        """Some of the lamps."""
         return replace(
             self,
-            bodies=self.bodies[kept],
-            centre_m=self.centre_m[kept],
-            size_m=self.size_m[kept],
-            lit_rgb=self.lit_rgb[kept],
-            is_lit=self.is_lit[:, kept.cpu()],
+            bodies=self.bodies[chosen],
+            centre_m=self.centre_m[chosen],
+            size_m=self.size_m[chosen],
+            lit_rgb=self.lit_rgb[chosen],
+            is_lit=self.is_lit[:, chosen.cpu()],
         )
+
+    def of_others(self, body: int) -> "Blinking":
+        """The lamps of all bodies but one."""
+        return self.kept(self.bodies != body)
 
     def without(self, body: int) -> "Blinking":
         """The same once a body has gone; those after it move up."""
@@ -111,24 +114,32 @@ class Blinking:
 
     def lit(self, gaussians: AnyGaussians, timestamp_ns: int) -> AnyGaussians:
         """The Gaussians in the light of their own lamps at a time; differentiable in colours."""
-        if not len(self):
+        return self._lit_by(gaussians, self.lit_at(timestamp_ns))
+
+    def lit_on_average(self, gaussians: AnyGaussians) -> AnyGaussians:
+        """The Gaussians as lit in the mean of all knots: for what has no time."""
+        return self._lit_by(gaussians, self.is_lit.mean(dim=0))
+
+    def _lit_by(self, gaussians: AnyGaussians, strength: Float[Tensor, " lamps"]) -> AnyGaussians:
+        lamps = (strength > 0).nonzero()[:, 0]
+        if not len(lamps):
             return gaussians
-        strength = self.lit_at(timestamp_ns).to(self.bodies.device, non_blocking=True)
-        means = gaussians.means.detach()
-        rows, lamp = self.inside(means, gaussians.body_index, strength > 0)
+        device, means = self.bodies.device, gaussians.means.detach()
+        lamps = lamps.to(device, non_blocking=True)
+        rows, lamp = self.inside(means, gaussians.body_index, lamps)
         if not len(rows):
             return gaussians
-        added = strength[lamp, None] * self.colours(self.lit_rgb, means[rows], lamp)
+        share = strength.to(device, non_blocking=True)[lamp, None]
+        added = share * self.colours(self.lit_rgb, means[rows], lamp)
         return with_added_colour(gaussians, rows, added)
 
     def inside(
         self,
         means: Float[Tensor, "gaussians 3"],
         body_index: Int[Tensor, " gaussians"],
-        chosen: Bool[Tensor, " lamps"],
+        lamps: Int[Tensor, " chosen"],
     ) -> tuple[Int[Tensor, " rows"], Int[Tensor, " rows"]]:
         """Rows of the Gaussians in the boxes of the chosen lamps, and in which; once for each."""
-        lamps = chosen.nonzero()[:, 0]
         low = (self.centre_m - self.size_m / 2)[lamps]
         high = (self.centre_m + self.size_m / 2)[lamps]
         may_be = torch.ones_like(body_index, dtype=torch.bool)

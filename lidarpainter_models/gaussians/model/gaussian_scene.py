@@ -82,9 +82,9 @@ class GaussianScene:
             else:
                 poses = self.actors.likely_poses(timestamp_ns)
                 bodies = camera_from_body(camera.world_from_camera, *poses)
-                bent = self.actors.bending.bent(self.gaussians, timestamp_ns)
-                lit = self.blinking.lit(bent, timestamp_ns)
-                read = as_read(lit, bodies, camera, self.actors, timestamp_ns)
+                lit = self.blinking.lit(self.gaussians, timestamp_ns)
+                bent = self.actors.bending.bent(lit, timestamp_ns)
+                read = as_read(bent, bodies, camera, self.actors, timestamp_ns)
                 drawn = draw_over_sky(read, bodies, self.sky, camera, backend=backend)
             return replace(drawn, rgb=self.exposure.apply(drawn.rgb, camera_name, timestamp_ns))
 

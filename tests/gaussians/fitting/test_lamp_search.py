@@ -8,6 +8,7 @@ from fitted_street import FittedStreet
 from gaussian_world import FRAME_NS, camera_at, map_points, round_gaussians, scene_of
 from strict_device import NAME, strict_runs
 
+from lidarpainter_models.gaussians.fitting import lamp_search
 from lidarpainter_models.gaussians.fitting.config import FitConfig, RefinementConfig
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.gaussians.fitting.images import FitImage
@@ -90,9 +91,8 @@ def test_a_lamp_is_found_where_it_is_with_when_it_is_on(wall):
     assert float((found.blinking.centre_m[0] - torch.tensor(PLACE_M)).abs().max()) < 0.4
     assert found.blinking.is_lit[:, 0].tolist() == list(FLASHES)
     assert error(found, true_scene, cameras) < 0.25 * error(dimmed, true_scene, cameras)
-    own = found.blinking.inside(
-        found.gaussians.means, found.gaussians.body_index, torch.tensor([True])
-    )[0]
+    lamps = torch.arange(len(found.blinking))
+    own, _ = found.blinking.inside(found.gaussians.means, found.gaussians.body_index, lamps)
     stays = torch.ones(len(found.gaussians), dtype=torch.bool)
     stays[own] = False
     assert torch.equal(found.gaussians.sh_dc[stays], dimmed.gaussians.sh_dc[stays])
@@ -148,6 +148,41 @@ def test_lamps_are_found_alike_on_another_device(wall, monkeypatch):
     assert torch.allclose(again.gaussians.sh_dc, on_cpu.gaussians.sh_dc, atol=1e-5)
 
 
+def test_a_lamp_at_the_border_of_all_images_is_left_out_or_measured(wall):
+    scene, cameras = wall
+    beside = [replace(camera, cx_px=-3.0) for camera in cameras]
+    found = found_in(scene, with_lamp(scene, FLASHES), beside)
+    assert len(found.blinking) <= 1
+    assert error(found, with_lamp(scene, FLASHES), beside) <= error(
+        scene, with_lamp(scene, FLASHES), beside
+    )
+
+
+def test_what_is_hidden_tells_nothing_of_a_lamp(wall):
+    scene, cameras = wall
+    images = images_of(with_lamp(scene, FLASHES), cameras)
+    is_left = (torch.arange(96) < 70).expand(72, 96)
+    covered = [
+        replace(image, hidden=is_left) if frame % 3 == 1 else image
+        for frame, image in enumerate(images)
+    ]
+    found = with_lamps_found(scene, covered, cameras, NUM_IMAGES)
+    lit = found.blinking.is_lit[:, 0]
+    seen = [frame for frame in range(NUM_IMAGES) if frame % 3 != 1]
+    assert lit[seen].tolist() == [FLASHES[frame] for frame in seen]
+
+
+def test_boxes_that_overlap_are_one():
+    cells = torch.tensor([[0, 0, 0, 0], [0, 0, 2, 0], [0, 1, 2, 0], [0, 2, 2, 0], [0, 2, 1, 0]])
+    cells = torch.cat([cells, torch.tensor([[0, 2, 0, 0], [1, 0, 0, 0], [1, 9, 0, 0]])])
+    lamps = lamp_search._boxes(cells)
+    assert sorted(lamps.bodies.tolist()) == [0, 1, 1]
+    (large,) = lamps.size_m[lamps.bodies == 0]
+    assert large.tolist() == pytest.approx([0.8, 0.8, 0.4])
+    far_apart = torch.tensor([[0, 10 * place, 0, 0] for place in range(3)])
+    assert len(lamp_search._boxes(far_apart)) == 3
+
+
 def test_levels_are_parted_where_most_is_explained():
     pixels = torch.full((3, 7), 4.0)
     value = torch.tensor(
@@ -193,8 +228,9 @@ def test_a_fit_keeps_the_lamps_it_finds_and_a_continuation_does_not_look(wall):
     assert found.blinking.is_lit[:, 0].tolist() == list(FLASHES)
     blind = replace(config, refinement=replace(refinement, lamps=False))
     assert not len(fit_gaussians(seen, blind, start=scene).scene.blinking)
-    again = fit_gaussians(seen, replace(blind, steps=5), start=found).scene
-    assert torch.equal(again.blinking.lit_rgb, found.blinking.lit_rgb)
+    for continued in (blind, config):
+        again = fit_gaussians(seen, replace(continued, steps=5), start=found).scene
+        assert torch.equal(again.blinking.lit_rgb, found.blinking.lit_rgb)
 
 
 def lens_pixels(street, camera, timestamp_ns):

@@ -70,8 +70,8 @@ class DressedScene:
             bodies = camera_from_body(camera.world_from_camera, *poses)
             light = self.light(strengths)
             shown = self._shown(light, camera, bodies, poses, timestamp_ns)
-            shown = self.actors.bending.bent(shown, timestamp_ns)
             shown = self.blinking.lit(shown, timestamp_ns)
+            shown = self.actors.bending.bent(shown, timestamp_ns)
             drawn = draw_over_sky(shown, bodies, light.sky, camera, backend=backend)
             night = strengths.get("night", 0.0)
             if night == 0:
