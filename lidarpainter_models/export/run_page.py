@@ -52,8 +52,8 @@ class Pictures:
     worst: Sequence[WorstView] = ()
     actor_gaussians: Mapping[str, int] = field(default_factory=dict)
     """How many Gaussians each fitted actor has, by its id."""
-    faults: Sequence[str] = ()
-    """What was wrong about the recording and is corrected, in sentences."""
+    found: Sequence[str] = ()
+    """What was wrong about the recording and is corrected, and its lamps, in sentences."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +82,7 @@ class RunPage:
         return Report(
             title=f"LidarPainter: {self.result['scene']}",
             summary=[_scene_in_words(scene), _summary(self.result)],
-            verdict=[*verdict(self.result), *self._estimated(), *pictures.faults],
+            verdict=[*verdict(self.result), *self._estimated(), *pictures.found],
             moving=pictures.moving,
             worst=pictures.worst,
             repeat=_repeat(self.result, json.loads(self.settings.get("train_cameras", "null"))),

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from lidarpainter_models.devices import return_freed_memory
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.colouring import MapColouring, PointSamples
@@ -109,6 +110,7 @@ def _points(
         SceneError: neither sweeps nor images tell anything of the street.
     """
     measured = gather_points(scene, split.train_frames)
+    return_freed_memory()  # as much as the map: the sweeps one by one
     is_swept = len(measured.street) > 0
     if is_swept and share_told(measured.street, taken, bodies) >= LEAST_TOLD:
         return measured, False

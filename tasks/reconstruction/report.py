@@ -132,10 +132,11 @@ def _pictures(
         moving=recorded_beside(held_out, fitted, beside),
         worst=worst_views(held_out, fitted),
         actor_gaussians=dict(zip(names, counts, strict=True)),
-        faults=[
+        found=[
             *said,
             *(f"{name} {fault}; corrected." for name, fault in fitted.cameras.faults.items()),
             *(in_words(name, body) for name, body in fitted.cameras.own_bodies.items()),
+            *fitted.blinking.in_words(names),
         ],
     )
 

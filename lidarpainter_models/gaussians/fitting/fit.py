@@ -14,7 +14,7 @@ from statistics import fmean
 
 import torch
 
-from lidarpainter_models.devices import within_memory
+from lidarpainter_models.devices import return_freed_memory, within_memory
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import FitConfig
@@ -214,6 +214,7 @@ def _first_scene(
         if progress is not None:
             progress(0, config.steps, {"initialised": share})
 
+    return_freed_memory()  # of what prepared the observations
     return initialise_scene(observations, config.initialisation, progress=told)
 
 
@@ -240,8 +241,8 @@ def _advance(
     painted = None
     takes_part = state.step < config.guidance.until * config.steps
     if guidance and takes_part and state.random() < config.guidance.probability:
-        painted = guidance[int(torch.randint(len(guidance), (), generator=state.generator))]
-        painted = painted.to(state.scene.device)
+        place = int(torch.randint(len(guidance), (), generator=state.generator))
+        painted = (place, guidance[place].to(state.scene.device))
     image = images[row].to(state.scene.device)
     told = fit_step(state, image, row, painted, config, perceptual)
     state.step += 1

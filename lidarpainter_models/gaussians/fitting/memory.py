@@ -34,8 +34,10 @@ RASTER_BYTES_PER_GAUSSIAN = 512
 """Projected Gaussians, their gradients, and entries of about eight tiles each, sorted."""
 LEAST_SHARE = 10
 """A limit that leaves less than one in so many of the Gaussians wanted is refused."""
-ROW_BYTES = 48
-"""Of a Gaussian: its body, block, place among blocks, tallies and last step."""
+ROW_BYTES = 64
+"""Of a Gaussian: its body, block, place among blocks, tallies, last step, number and its place."""
+HIDDEN_BYTES = 0.5
+"""Of a Gaussian and a view: the numbers of those that the view leaves out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,7 +45,7 @@ class FitMemory:
     """Bytes on the device of a fit at its largest."""
 
     gaussians: int
-    """Parameters and the optimiser's moments."""
+    """Parameters, the optimiser's moments, and what each view leaves out."""
     sky: int
     images: int
     """Recorded and painted, where they are kept there."""
@@ -93,9 +95,10 @@ def planned_memory(
     painted = [view.camera.width_px * view.camera.height_px for view in guidance]
     kept = sum(pixels) * (1 + HALF_IMAGES * bool(config.half_resolution)) * IMAGE_BYTES
     texels = sky.rows * sky.columns
+    row_bytes = ROW_BYTES + HIDDEN_BYTES * (len(pixels) + len(painted))
     views_at_once = 2 if painted else 1  # on a CPU
     return FitMemory(
-        gaussians=count * (FLOAT * (columns + 2 * padded) + ROW_BYTES),
+        gaussians=round(count * (FLOAT * (columns + 2 * padded) + row_bytes)),
         sky=texels * TEXEL_BYTES,
         images=round(kept + sum(painted) * GUIDANCE_BYTES) if keeps_images else 0,
         step=FLOAT

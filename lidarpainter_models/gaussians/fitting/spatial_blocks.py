@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.gaussians.fitting.settings import LearningRates
@@ -81,16 +81,16 @@ class SpatialBlocks:
             reach_sigmas=self.reach_sigmas,
         )
 
-    def rows_in_view(
+    def in_view(
         self, views: Sequence[View], *, actor_slack: tuple[float, float] = (0.0, 0.0)
-    ) -> Int[Tensor, " seen"]:
-        """Rows, in order, of all Gaussians that any of the views can show, and some more.
+    ) -> Bool[Tensor, " gaussians"]:
+        """Which Gaussians any of the views can show, and some more.
 
         `actor_slack` is how far actors may still move (metres, radians) before they are drawn.
         """
         is_seen = torch.zeros_like(self.block_of_row, dtype=torch.bool)
         mark_seen(self.blocks, views, is_seen, actor_slack=actor_slack)
-        return is_seen.nonzero()[:, 0]
+        return is_seen
 
 
 def _reach_sigmas(rates: LearningRates) -> float:

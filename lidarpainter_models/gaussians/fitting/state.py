@@ -4,7 +4,7 @@ Gaussians out of view lag behind (`gaussian_adam`). They are kept as they lag, t
 blocks: catching up for a checkpoint would split their way differently from an undisturbed run's.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -20,6 +20,7 @@ from lidarpainter_models.gaussians.fitting.checkpoint import (
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.densification import GradientTally, SetChange
 from lidarpainter_models.gaussians.fitting.gaussian_adam import GaussianAdam
+from lidarpainter_models.gaussians.fitting.hidden_gaussians import HiddenGaussians
 from lidarpainter_models.gaussians.fitting.refinement import Refinement
 from lidarpainter_models.gaussians.fitting.spatial_blocks import SpatialBlocks, View
 from lidarpainter_models.gaussians.model.bending import REACH_M
@@ -40,6 +41,7 @@ class FitState:
     """Its Gaussians out of view lag behind until `caught_up`."""
     gaussian_adam: GaussianAdam
     blocks: SpatialBlocks
+    hidden: HiddenGaussians
     refinement: Refinement
     tally: GradientTally
     generator: torch.Generator
@@ -66,6 +68,7 @@ class FitState:
             scene=scene,
             gaussian_adam=GaussianAdam(scene.gaussians, config.learning_rates, pixels_per_view),
             blocks=SpatialBlocks.of(scene.gaussians, config.learning_rates),
+            hidden=HiddenGaussians.none_yet(scene.num_gaussians, scene.device),
             refinement=Refinement.begin(scene, config),
             tally=GradientTally.zeros(scene.num_gaussians, scene.device),
             generator=generator,
@@ -87,10 +90,18 @@ class FitState:
         """A uniform number in [0, 1)."""
         return float(torch.rand((), generator=self.generator))
 
-    def seen(self, views: Sequence[View]) -> SeenGaussians:
-        """All Gaussians that any of these views can show, as leaves for one step."""
+    def seen(self, looks: Mapping[int, Sequence[View]]) -> SeenGaussians:
+        """All Gaussians that any of these can show, as leaves for one step.
+
+        By number of the view (`hidden_gaussians`) where it and its bodies stand, in one or more
+        moments.
+        """
         bent_m = REACH_M if len(self.scene.actors.bending.bodies) else 0.0
-        rows = self.blocks.rows_in_view(views, actor_slack=(bent_m, 0.0))
+        seen = [
+            self.hidden.without(self.blocks.in_view(views, actor_slack=(bent_m, 0.0)), number)
+            for number, views in looks.items()
+        ]
+        rows = torch.stack(seen).any(dim=0).nonzero()[:, 0]
         return self.gaussian_adam.seen(self.scene.gaussians, rows)
 
     def step_gaussians(self, seen: SeenGaussians, fraction: float) -> None:
@@ -108,6 +119,7 @@ class FitState:
         self.scene = self.scene.with_gaussians(change.gaussians.as_leaves())
         self.gaussian_adam.rebuild(change.kept, change.num_added)
         self.blocks = SpatialBlocks.of(self.scene.gaussians, self.gaussian_adam.rates)
+        self.hidden.follow(change.kept, change.num_added)
         self.tally = GradientTally.zeros(len(change.gaussians), self.scene.device)
 
     def take_lamps(self, scene: GaussianScene) -> None:
@@ -125,6 +137,7 @@ class FitState:
                 "scene": scene_arrays,
                 "gaussian_adam": self.gaussian_adam.tensors(),
                 "blocks": {"block_of_row": self.blocks.block_of_row},
+                "hidden": self.hidden.tensors(),
                 **{name: adam.tensors() for name, adam in self.refinement.adams.items()},
                 "tally": vars(self.tally),
                 "random": {"state": self.generator.get_state()},
@@ -163,6 +176,8 @@ class FitState:
         state.blocks = SpatialBlocks.with_rows_in(
             tensors["blocks/block_of_row"].to(device), state.scene.gaussians, config.learning_rates
         )
+        kept_hidden = ungroup_tensors(tensors, "hidden")
+        state.hidden = HiddenGaussians.from_tensors(kept_hidden, state.scene.device)
         tally = ungroup_tensors(tensors, "tally")
         state.tally = GradientTally(**{name: value.to(device) for name, value in tally.items()})
         state.generator = generator_from(tensors["random/state"])

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarpainter_models.gaussians.fitting.config import FitConfig
+from lidarpainter_models.gaussians.fitting.hidden_gaussians import PROBE, filled_by, probe
 from lidarpainter_models.gaussians.fitting.images import FitImage
 from lidarpainter_models.gaussians.fitting.spatial_blocks import View
 from lidarpainter_models.gaussians.fitting.state import FitState
@@ -52,7 +53,8 @@ WAITS = 4
 """The most of the host for the device in a step, without the rasteriser's own: how many Gaussians
 are in view, how many of them lag and by how much (plain torch alone asks), and the gradients of the
 bodies' poses and of the exposure. Where somebody bends, one more for each view: which Gaussians
-do; where lamps blink, two more for each: which are in one."""
+do; where lamps blink, two more for each: which are in one; for each that looks at everything, one:
+which of it shows nothing."""
 
 Perceptual = Callable[
     [Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]], Float[Tensor, ""]
@@ -64,33 +66,40 @@ def fit_step(
     state: FitState,
     image: FitImage,
     row: int,
-    guidance: GuidanceView | None,
+    guidance: tuple[int, GuidanceView] | None,
     config: FitConfig,
     perceptual: Perceptual | None,
 ) -> Float[Tensor, "2"]:
-    """Step everything by one recorded view, the `row`-th, and the painted one if it is given.
+    """Step everything by one recorded view, the `row`-th, and a painted one if it is given.
+
+    A painted view comes with its place among all of them.
 
     Returns the loss and the mean squared error of the recorded image, where the scene lies.
     """
     pose = state.refinement.world_from_camera(row, state.step)
     recorded = image.camera.refined(pose.detach())
     actors = state.scene.actors.corrected_poses(image.timestamp_ns)
-    views = [(recorded, camera_from_body(pose, *actors))]
-    if guidance is not None:
-        views.append((guidance.camera, _guidance_bodies(state, guidance)))
+    view = (recorded, camera_from_body(pose, *actors))
     read = bodies_while_read(recorded, state.scene.actors, image.timestamp_ns)
-    seen = state.seen([*views, *((recorded, bodies) for bodies in read)])
+    looks = {row: [view, *((recorded, bodies) for bodies in read)]}
+    if guidance is not None:
+        place, painted = guidance
+        bodies = _guidance_bodies(state, painted)
+        looks[~place] = [(painted.camera, bodies)]
+    seen = state.seen(looks)
+    probes = [_probe(state, seen, number) for number in looks]
     of_recorded = partial(
-        _recorded_gradients, state, seen, image, row, views[0], config, perceptual
+        _recorded_gradients, state, seen, image, row, view, config, perceptual, probes[0]
     )
     if guidance is None:
         found = of_recorded()
     else:
-        bodies = views[1][1]
         of_painted = partial(
-            add_guidance_gradients, state, seen, guidance, bodies, config, perceptual
+            add_guidance_gradients, state, seen, painted, bodies, config, perceptual, probes[1]
         )
         found, _ = both(of_recorded, of_painted, state.scene.device)
+    for number, collected in zip(looks, probes, strict=True):
+        state.hidden.learn(number, seen.rows, filled_by(collected))
     state.tally.add(seen.rows, found.screen_gradient, found.splat.visible)
     state.refinement.step(state.step, image)
     _step_sky(state, found, config, image)
@@ -108,7 +117,12 @@ class _OfRecorded(NamedTuple):
     sky_rays: SkyRays
 
 
-def _recorded_gradients(
+def _probe(state: FitState, seen: SeenGaussians, number: int) -> Float[Tensor, "seen 1"] | None:
+    """What a view blends along in order to measure, when it is time."""
+    return probe(len(seen), seen.means.device) if state.hidden.is_due(number) else None
+
+
+def _recorded_gradients(  # noqa: PLR0913 - what a step is made of
     state: FitState,
     seen: SeenGaussians,
     image: FitImage,
@@ -116,6 +130,7 @@ def _recorded_gradients(
     view: View,
     config: FitConfig,
     perceptual: Perceptual | None,
+    measured: Float[Tensor, "seen 1"] | None,
 ) -> _OfRecorded:
     """Collect the gradients of a recorded view."""
     (camera, bodies), weights, sky = view, config.losses, state.scene.sky
@@ -130,28 +145,35 @@ def _recorded_gradients(
         bodies,
         camera,
         with_actor_alpha=with_actors,
+        channel=measured,
         screen_gradient_out=screen_gradient,
     )
     rays = sky.rays(camera, (splat.alpha.detach() < OPAQUE) | image.is_open)
     sky_rgb = sky.sample(rays).requires_grad_(True)
     exposure = state.refinement.exposure(image)
-    terms = pixel_terms(splat, sky_rgb, facts, _pixel_rules(config), exposure=exposure)
-    shown = terms.shown
+    of_pixels = pixel_terms(splat, sky_rgb, facts, _pixel_rules(config), exposure=exposure)
+    shown = of_pixels.shown
     if image.hidden is not None:
         shown = torch.where(image.hidden[..., None], facts.rgb, shown)
     loss = l1_ssim_loss(shown, facts.rgb, ssim_weight=weights.ssim)
     if perceptual is not None and weights.perceptual > 0:
         loss = loss + weights.perceptual * perceptual(shown, facts.rgb)
-    loss = loss + weights.sky * terms.sky + weights.depth * terms.depth
+    loss = loss + weights.sky * of_pixels.sky + weights.depth * of_pixels.depth
     if with_actors:
         loss = loss + weights.actors * _actor_term(state, splat, image, camera)
     loss = loss + state.refinement.bend_prior(image.timestamp_ns, state.step)
     prior = state.refinement.prior(row, image.timestamp_ns, state.step)
     # as a sum its gradient, which is the CPU's, would have to come from the device
-    torch.autograd.backward([loss, prior] if prior.requires_grad else [loss])
+    terms = [loss, prior] if prior.requires_grad else [loss]
+    torch.autograd.backward(terms if measured is None else [*terms, _probed(splat)])
     squared_error = (shown.detach() - facts.rgb).square().mean()
     told = torch.stack([loss.detach() + prior.detach(), squared_error.double()])
     return _OfRecorded(told, splat, screen_gradient, sky_rgb, rays)
+
+
+def _probed(splat: SplatImage) -> Float[Tensor, ""]:
+    """The term whose gradient says what each Gaussian fills."""
+    return PROBE * splat.features[..., -1].sum()
 
 
 def _guidance_bodies(state: FitState, view: GuidanceView) -> Float[Tensor, "bodies 4 4"]:
@@ -168,6 +190,7 @@ def add_guidance_gradients(
     camera_from_bodies: Float[Tensor, "bodies 4 4"],
     config: FitConfig,
     perceptual: Perceptual | None = None,
+    measured: Float[Tensor, "seen 1"] | None = None,
 ) -> None:
     """Add one painted view's gradients to the Gaussians; nothing else is changed by it.
 
@@ -179,7 +202,7 @@ def add_guidance_gradients(
     held = replace(bending, offset_m=bending.offset_m.detach())
     lit = state.scene.blinking.lit(seen, view.timestamp_ns)
     shown_then = held.bent(lit, view.timestamp_ns)
-    splat = draw_gaussians(shown_then, camera_from_bodies, view.camera)
+    splat = draw_gaussians(shown_then, camera_from_bodies, view.camera, channel=measured)
     sky_rgb = sky.sample(sky.rays(view.camera, splat.alpha.detach() < OPAQUE))
     shown = splat.rgb + (1 - splat.alpha)[..., None] * sky_rgb
     loss = settings.weight * l1_ssim_loss(
@@ -195,6 +218,8 @@ def add_guidance_gradients(
         )
     is_hit = view.lidar_depth_m > 0
     loss = loss + config.losses.sky * clear_sky_loss(splat.alpha, torch.zeros_like(is_hit), is_hit)
+    if measured is not None:
+        loss = loss + _probed(splat)
     loss.backward()
 
 

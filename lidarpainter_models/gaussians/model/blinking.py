@@ -6,6 +6,8 @@ adds to the colours of the Gaussians in it, and how much it is on over time. Bod
 the lamp off.
 """
 
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -67,6 +69,18 @@ class Blinking:
 
     def __len__(self) -> int:
         return len(self.bodies)
+
+    def in_words(self, actor_ids: Sequence[str]) -> list[str]:
+        """Where lamps go on and off, as a sentence; none without lamps."""
+        counts = Counter(self.bodies.tolist())
+        of_bodies = [
+            f"{counts[body]} of {name}"
+            for body, name in enumerate(["the street", *actor_ids])
+            if counts[body]
+        ]
+        if not of_bodies:
+            return []
+        return [f"Lamps go on and off ({', '.join(of_bodies)}): shown on when they were."]
 
     def to(self, device: torch.device) -> "Blinking":
         """The same on another device, but for what changes over time."""

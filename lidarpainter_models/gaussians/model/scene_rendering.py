@@ -67,10 +67,16 @@ def draw_gaussians(
     camera: Camera,
     *,
     with_actor_alpha: bool = False,
+    channel: Float[Tensor, "gaussians 1"] | None = None,
     screen_gradient_out: Float[Tensor, " gaussians"] | None = None,
     backend: Backend = "auto",
 ) -> SplatImage:
-    """Blend Gaussians whose bodies stand before the camera like this, without sky."""
+    """Blend Gaussians whose bodies stand before the camera like this, without sky.
+
+    The image's features are the actors' alpha if it is wanted, then the `channel` if it is given.
+    """
+    features = [(gaussians.body_index > 0).float()[:, None]] if with_actor_alpha else []
+    features += [] if channel is None else [channel]
     splats = Splats(
         means=gaussians.means,
         rotation_wxyz=gaussians.rotation_wxyz,
@@ -83,7 +89,7 @@ def draw_gaussians(
         splats,
         bodies.to(gaussians.means.device, non_blocking=True),
         camera,
-        features=(gaussians.body_index > 0).float()[:, None] if with_actor_alpha else None,
+        features=torch.cat(features, dim=1) if features else None,
         screen_gradient_out=screen_gradient_out,
         backend=backend,
     )

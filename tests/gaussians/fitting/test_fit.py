@@ -198,7 +198,7 @@ def with_guidance_gradients(world, view, config, perceptual=None):
     state = FitState.begin(world.scene, config, WIDTH_PX * HEIGHT_PX)
     poses = state.scene.actors.corrected_poses(view.timestamp_ns)
     bodies = camera_from_body(view.camera.world_from_camera, *poses)
-    seen = state.seen([(view.camera, bodies)])
+    seen = state.seen({~0: [(view.camera, bodies)]})
     add_guidance_gradients(state, seen, view, bodies, config, perceptual)
     return state, seen
 

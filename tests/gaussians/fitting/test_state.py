@@ -34,7 +34,7 @@ def test_a_step_sees_its_own_part_of_the_street():
     for row, image in enumerate(fit.images):
         pose = scene.cameras.world_from_camera(row).detach()
         bodies = camera_from_body(pose, *scene.actors.corrected_poses(0))
-        rows = blocks.rows_in_view([(image.camera.at(pose), bodies)])
+        rows = blocks.in_view([(image.camera.at(pose), bodies)]).nonzero()[:, 0]
         assert set((rows // 400).tolist()) == {row}
 
 
@@ -44,8 +44,8 @@ def test_what_is_out_of_view_changes_nothing_beyond_rounding(monkeypatch):
     steps_of(fit, BLOCKS * PASSES)
     monkeypatch.setattr(
         type(everything.state.blocks),
-        "rows_in_view",
-        lambda blocks, _views, **_slack: torch.arange(len(blocks.block_of_row)),
+        "in_view",
+        lambda blocks, _views, **_slack: torch.ones_like(blocks.block_of_row, dtype=torch.bool),
     )
     steps_of(everything, BLOCKS * PASSES)
     truth, steps = parameters_of(everything), BLOCKS * PASSES

@@ -56,7 +56,7 @@ def test_painted_views_leave_no_gradient_to_how_somebody_moves(world):
     state = FitState.begin(with_lattice(world.scene), config, painted.weight_u8.numel())
     poses = state.scene.actors.corrected_poses(FRAME_NS)
     bodies = camera_from_body(view.camera.world_from_camera, *poses)
-    seen = state.seen([(view.camera, bodies)])
+    seen = state.seen({~0: [(view.camera, bodies)]})
     add_guidance_gradients(state, seen, painted, bodies, config)
     assert state.scene.actors.bending.offset_m.grad is None
 

@@ -57,6 +57,14 @@ def test_a_lamp_lights_what_is_in_its_box_and_of_its_body():
     assert not added(two_lamps(), gaussians(places, 1), 100_000_000).any()
 
 
+def test_lamps_are_named_by_whose_they_are():
+    of_both = two_lamps().in_words(["car-001", "car-002"])
+    assert of_both == [
+        "Lamps go on and off (1 of the street, 1 of car-002): shown on when they were."
+    ]
+    assert Blinking.none().in_words(["car-001"]) == []
+
+
 @pytest.mark.parametrize(
     ("time_ms", "share"), [(-50, 0.0), (0, 0.0), (25, 0.25), (100, 1.0), (300, 1.0), (900, 1.0)]
 )
