@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-LOOKS = 8
+LOOKS = 16
 """Looks from one at everything to the next."""
 LEAST_PX = 0.02
 """A Gaussian that fills less is left out: together they make some thousandths of an image."""
