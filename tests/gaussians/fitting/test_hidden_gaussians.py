@@ -4,6 +4,7 @@ import pytest
 import torch
 from gaussian_world import HEIGHT_PX, WIDTH_PX, camera_at, round_gaussians, scene_of
 
+from lidarpainter_models.gaussians.fitting.config import FitConfig, RefinementConfig
 from lidarpainter_models.gaussians.fitting.hidden_gaussians import (
     LEAST_PX,
     LOOKS,
@@ -12,7 +13,11 @@ from lidarpainter_models.gaussians.fitting.hidden_gaussians import (
     filled_by,
     probe,
 )
+from lidarpainter_models.gaussians.fitting.images import full_image
+from lidarpainter_models.gaussians.fitting.state import FitState
+from lidarpainter_models.gaussians.fitting.step import fit_step
 from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body, draw_gaussians
+from lidarpainter_models.observations.views import TrainingView
 
 CPU = torch.device("cpu")
 SHOWN, HIDDEN = 10.0, 0.0
@@ -93,11 +98,11 @@ def test_a_fresh_state_can_be_kept():
 
 
 def wall_and_what_is_behind():
-    """An opaque Gaussian that fills the image, one behind it and one before it."""
-    means = torch.tensor([[10.0, 0.0, 1.5], [20.0, 0.0, 1.5], [5.0, 0.0, 1.5]])
-    gaussians = round_gaussians(means, torch.rand(3, 3), sigma_m=0.1)
-    gaussians.log_scale[0] = 3.0
-    gaussians.opacity_logit[0] = 12.0
+    """Two opaque Gaussians that fill the image, one behind them and one before them."""
+    means = torch.tensor([[10.0, 0.0, 1.5], [12.0, 0.0, 1.5], [20.0, 0.0, 1.5], [5.0, 0.0, 1.5]])
+    gaussians = round_gaussians(means, torch.rand(4, 3), sigma_m=0.1)
+    gaussians.log_scale[:2] = 3.0
+    gaussians.opacity_logit[:2] = 12.0
     camera = camera_at(0.0)
     scene = scene_of(gaussians, [camera])
     return scene, camera, camera_from_body(camera.world_from_camera, *scene.actors.likely_poses(0))
@@ -105,21 +110,44 @@ def wall_and_what_is_behind():
 
 def test_a_probe_measures_the_pixels_that_each_gaussian_fills():
     scene, camera, bodies = wall_and_what_is_behind()
-    ones = probe(3, CPU)
+    ones = probe(4, CPU)
     image = draw_gaussians(scene.gaussians, bodies, camera, channel=ones)
     (PROBE * image.features[..., -1].sum()).backward()
     px = filled_by(ones)
     assert float(px.sum()) == pytest.approx(float(image.alpha.detach().sum()), rel=1e-4)
     assert float(px[0]) > 0.9 * WIDTH_PX * HEIGHT_PX
-    assert float(px[1]) < 0.02 * float(px[2])
+    assert float(px[2]) < 0.001 * float(px[3])
 
 
 def test_a_probe_beside_the_actors_changes_no_image():
     scene, camera, bodies = wall_and_what_is_behind()
     plain = draw_gaussians(scene.gaussians, bodies, camera, with_actor_alpha=True)
     probed = draw_gaussians(
-        scene.gaussians, bodies, camera, with_actor_alpha=True, channel=probe(3, CPU)
+        scene.gaussians, bodies, camera, with_actor_alpha=True, channel=probe(4, CPU)
     )
     assert torch.equal(plain.rgb, probed.rgb)
     assert torch.equal(plain.features[..., 0], probed.features[..., 0])
     torch.testing.assert_close(probed.features[..., 1], probed.alpha, atol=1e-5, rtol=0)
+
+
+def test_steps_leave_out_what_is_behind_a_wall_until_everything_is_looked_at():
+    scene, camera, bodies = wall_and_what_is_behind()
+    config = FitConfig(steps=100, refinement=RefinementConfig(start_step=100))
+    state = FitState.begin(scene, config, WIDTH_PX * HEIGHT_PX)
+    image = full_image(
+        TrainingView(
+            key=(0, "front"),
+            camera=camera,
+            timestamp_ns=0,
+            rgb_u8=torch.full((HEIGHT_PX, WIDTH_PX, 3), 99, dtype=torch.uint8),
+            sky_mask=torch.zeros(HEIGHT_PX, WIDTH_PX, dtype=torch.bool),
+            lidar_depth_m=torch.zeros(HEIGHT_PX, WIDTH_PX),
+        )
+    )
+    looked_at = []
+    for _ in range(LOOKS + 1):
+        looked_at.append(len(state.seen({0: [(camera, bodies)]})))
+        fit_step(state, image, 0, None, config, None)
+        state.step += 1
+    assert looked_at == [4, *[3] * (LOOKS - 1), 4]
+    assert len(state.seen({1: [(camera, bodies)]})) == 4
