@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lidarpainter_models.kernels.gaussian_raster import SplatImage
+
 LOOKS = 16
 """Looks from one at everything to the next."""
 LEAST_PX = 0.02
@@ -53,14 +55,22 @@ class HiddenGaussians:
         flags = torch.cat([is_seen, is_seen.new_zeros(1)])  # the last for those that are gone
         return flags.index_fill_(0, self.row[self.hidden[view].long()], False)[:-1]
 
+    def probe(self, view: int, count: int) -> Float[Tensor, "gaussians 1"] | None:
+        """Ones to blend along where a view looks at everything; collects what each fills."""
+        if not self.is_due(view):
+            return None
+        return torch.ones(count, 1, device=self.row.device, requires_grad=True)
+
     def learn(
-        self, view: int, rows: Int[Tensor, " seen"], filled_px: Float[Tensor, " seen"] | None
+        self, view: int, rows: Int[Tensor, " seen"], probe: Float[Tensor, "seen 1"] | None
     ) -> None:
-        """Take up what a look at everything measured of some rows; None was another look."""
-        if filled_px is None:
+        """Take up what the probe of a look at these rows collected; None was another look."""
+        if probe is None:
             self.looks[view] += 1
             return
-        self.hidden[view] = self.number[rows[filled_px < LEAST_PX]]
+        if probe.grad is None:
+            raise AssertionError("the probe took no part in the loss")
+        self.hidden[view] = self.number[rows[probe.grad[:, 0] < PROBE * LEAST_PX]]
         self.looks[view] = 1
 
     def follow(self, kept: Int[Tensor, " kept"], num_added: int) -> None:
@@ -98,15 +108,6 @@ class HiddenGaussians:
         )
 
 
-def probe(count: int, device: torch.device) -> Float[Tensor, "gaussians 1"]:
-    """A channel of ones to blend with the colours, which collects what each Gaussian fills."""
-    return torch.ones(count, 1, device=device, requires_grad=True)
-
-
-def filled_by(probe: Float[Tensor, "gaussians 1"] | None) -> Float[Tensor, " gaussians"] | None:
-    """Pixels that each Gaussian fills, from what a probe collected; None without one."""
-    if probe is None:
-        return None
-    if probe.grad is None:
-        raise AssertionError("the probe took no part in the loss")
-    return probe.grad[:, 0] / PROBE
+def probed(splat: SplatImage, probe: Float[Tensor, "gaussians 1"] | None) -> Float[Tensor, ""]:
+    """The term of the loss from which a probe, the last channel blended, collects."""
+    return splat.alpha.new_zeros(()) if probe is None else PROBE * splat.features[..., -1].sum()

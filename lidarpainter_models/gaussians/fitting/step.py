@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarpainter_models.gaussians.fitting.config import FitConfig
-from lidarpainter_models.gaussians.fitting.hidden_gaussians import PROBE, filled_by, probe
+from lidarpainter_models.gaussians.fitting.hidden_gaussians import probed
 from lidarpainter_models.gaussians.fitting.images import FitImage
 from lidarpainter_models.gaussians.fitting.spatial_blocks import View
 from lidarpainter_models.gaussians.fitting.state import FitState
@@ -87,7 +87,7 @@ def fit_step(
         bodies = _guidance_bodies(state, painted)
         looks[~place] = [(painted.camera, bodies)]
     seen = state.seen(looks)
-    probes = [_probe(state, seen, number) for number in looks]
+    probes = [state.hidden.probe(number, len(seen)) for number in looks]
     of_recorded = partial(
         _recorded_gradients, state, seen, image, row, view, config, perceptual, probes[0]
     )
@@ -98,8 +98,8 @@ def fit_step(
             add_guidance_gradients, state, seen, painted, bodies, config, perceptual, probes[1]
         )
         found, _ = both(of_recorded, of_painted, state.scene.device)
-    for number, collected in zip(looks, probes, strict=True):
-        state.hidden.learn(number, seen.rows, filled_by(collected))
+    for number, probe in zip(looks, probes, strict=True):
+        state.hidden.learn(number, seen.rows, probe)
     state.tally.add(seen.rows, found.screen_gradient, found.splat.visible)
     state.refinement.step(state.step, image)
     _step_sky(state, found, config, image)
@@ -117,11 +117,6 @@ class _OfRecorded(NamedTuple):
     sky_rays: SkyRays
 
 
-def _probe(state: FitState, seen: SeenGaussians, number: int) -> Float[Tensor, "seen 1"] | None:
-    """What a view blends along in order to measure, when it is time."""
-    return probe(len(seen), seen.means.device) if state.hidden.is_due(number) else None
-
-
 def _recorded_gradients(  # noqa: PLR0913 - what a step is made of
     state: FitState,
     seen: SeenGaussians,
@@ -130,7 +125,7 @@ def _recorded_gradients(  # noqa: PLR0913 - what a step is made of
     view: View,
     config: FitConfig,
     perceptual: Perceptual | None,
-    measured: Float[Tensor, "seen 1"] | None,
+    probe: Float[Tensor, "seen 1"] | None,
 ) -> _OfRecorded:
     """Collect the gradients of a recorded view."""
     (camera, bodies), weights, sky = view, config.losses, state.scene.sky
@@ -145,35 +140,30 @@ def _recorded_gradients(  # noqa: PLR0913 - what a step is made of
         bodies,
         camera,
         with_actor_alpha=with_actors,
-        channel=measured,
+        channel=probe,
         screen_gradient_out=screen_gradient,
     )
     rays = sky.rays(camera, (splat.alpha.detach() < OPAQUE) | image.is_open)
     sky_rgb = sky.sample(rays).requires_grad_(True)
     exposure = state.refinement.exposure(image)
-    of_pixels = pixel_terms(splat, sky_rgb, facts, _pixel_rules(config), exposure=exposure)
-    shown = of_pixels.shown
+    terms = pixel_terms(splat, sky_rgb, facts, _pixel_rules(config), exposure=exposure)
+    shown = terms.shown
     if image.hidden is not None:
         shown = torch.where(image.hidden[..., None], facts.rgb, shown)
     loss = l1_ssim_loss(shown, facts.rgb, ssim_weight=weights.ssim)
     if perceptual is not None and weights.perceptual > 0:
         loss = loss + weights.perceptual * perceptual(shown, facts.rgb)
-    loss = loss + weights.sky * of_pixels.sky + weights.depth * of_pixels.depth
+    loss = loss + weights.sky * terms.sky + weights.depth * terms.depth
     if with_actors:
         loss = loss + weights.actors * _actor_term(state, splat, image, camera)
     loss = loss + state.refinement.bend_prior(image.timestamp_ns, state.step)
     prior = state.refinement.prior(row, image.timestamp_ns, state.step)
     # as a sum its gradient, which is the CPU's, would have to come from the device
-    terms = [loss, prior] if prior.requires_grad else [loss]
-    torch.autograd.backward(terms if measured is None else [*terms, _probed(splat)])
+    total = loss + probed(splat, probe)
+    torch.autograd.backward([total, prior] if prior.requires_grad else [total])
     squared_error = (shown.detach() - facts.rgb).square().mean()
     told = torch.stack([loss.detach() + prior.detach(), squared_error.double()])
     return _OfRecorded(told, splat, screen_gradient, sky_rgb, rays)
-
-
-def _probed(splat: SplatImage) -> Float[Tensor, ""]:
-    """The term whose gradient says what each Gaussian fills."""
-    return PROBE * splat.features[..., -1].sum()
 
 
 def _guidance_bodies(state: FitState, view: GuidanceView) -> Float[Tensor, "bodies 4 4"]:
@@ -190,7 +180,7 @@ def add_guidance_gradients(
     camera_from_bodies: Float[Tensor, "bodies 4 4"],
     config: FitConfig,
     perceptual: Perceptual | None = None,
-    measured: Float[Tensor, "seen 1"] | None = None,
+    probe: Float[Tensor, "seen 1"] | None = None,
 ) -> None:
     """Add one painted view's gradients to the Gaussians; nothing else is changed by it.
 
@@ -202,7 +192,7 @@ def add_guidance_gradients(
     held = replace(bending, offset_m=bending.offset_m.detach())
     lit = state.scene.blinking.lit(seen, view.timestamp_ns)
     shown_then = held.bent(lit, view.timestamp_ns)
-    splat = draw_gaussians(shown_then, camera_from_bodies, view.camera, channel=measured)
+    splat = draw_gaussians(shown_then, camera_from_bodies, view.camera, channel=probe)
     sky_rgb = sky.sample(sky.rays(view.camera, splat.alpha.detach() < OPAQUE))
     shown = splat.rgb + (1 - splat.alpha)[..., None] * sky_rgb
     loss = settings.weight * l1_ssim_loss(
@@ -218,9 +208,7 @@ def add_guidance_gradients(
         )
     is_hit = view.lidar_depth_m > 0
     loss = loss + config.losses.sky * clear_sky_loss(splat.alpha, torch.zeros_like(is_hit), is_hit)
-    if measured is not None:
-        loss = loss + _probed(splat)
-    loss.backward()
+    (loss + probed(splat, probe)).backward()
 
 
 def actor_boundary_loss(

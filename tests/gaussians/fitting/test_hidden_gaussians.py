@@ -10,8 +10,7 @@ from lidarpainter_models.gaussians.fitting.hidden_gaussians import (
     LOOKS,
     PROBE,
     HiddenGaussians,
-    filled_by,
-    probe,
+    probed,
 )
 from lidarpainter_models.gaussians.fitting.images import full_image
 from lidarpainter_models.gaussians.fitting.state import FitState
@@ -23,10 +22,19 @@ CPU = torch.device("cpu")
 SHOWN, HIDDEN = 10.0, 0.0
 
 
+def collected(*filled_px):
+    """A probe that found Gaussians to fill so many pixels."""
+    probe = torch.ones(len(filled_px), 1, requires_grad=True)
+    probe.grad = PROBE * torch.tensor(filled_px)[:, None]
+    return probe
+
+
 def filled(hidden_rows, count):
-    px = torch.full((count,), SHOWN)
-    px[hidden_rows] = HIDDEN
-    return px
+    return collected(*(HIDDEN if row in hidden_rows else SHOWN for row in range(count)))
+
+
+def ones(count):
+    return HiddenGaussians.none_yet(count, CPU).probe(0, count)
 
 
 def left_out(hidden, view):
@@ -39,6 +47,7 @@ def test_a_view_looks_at_everything_first_and_every_few_looks():
     at_everything = []
     for _ in range(2 * LOOKS + 1):
         is_due = hidden.is_due(0)
+        assert (hidden.probe(0, 5) is not None) == is_due
         at_everything.append(is_due)
         assert left_out(hidden, 0) == ([] if is_due else [1, 3])
         hidden.learn(0, torch.arange(5), filled([1, 3], 5) if is_due else None)
@@ -56,7 +65,7 @@ def test_views_leave_out_what_they_do_not_show_themselves():
 
 def test_the_least_that_is_looked_at():
     hidden = HiddenGaussians.none_yet(2, CPU)
-    hidden.learn(0, torch.arange(2), torch.tensor([LEAST_PX * 0.99, LEAST_PX]))
+    hidden.learn(0, torch.arange(2), collected(LEAST_PX * 0.99, LEAST_PX * 1.01))
     assert left_out(hidden, 0) == [0]
 
 
@@ -110,10 +119,10 @@ def wall_and_what_is_behind():
 
 def test_a_probe_measures_the_pixels_that_each_gaussian_fills():
     scene, camera, bodies = wall_and_what_is_behind()
-    ones = probe(4, CPU)
-    image = draw_gaussians(scene.gaussians, bodies, camera, channel=ones)
-    (PROBE * image.features[..., -1].sum()).backward()
-    px = filled_by(ones)
+    probe = ones(4)
+    image = draw_gaussians(scene.gaussians, bodies, camera, channel=probe)
+    probed(image, probe).backward()
+    px = probe.grad[:, 0] / PROBE
     assert float(px.sum()) == pytest.approx(float(image.alpha.detach().sum()), rel=1e-4)
     assert float(px[0]) > 0.9 * WIDTH_PX * HEIGHT_PX
     assert float(px[2]) < 0.001 * float(px[3])
@@ -122,9 +131,7 @@ def test_a_probe_measures_the_pixels_that_each_gaussian_fills():
 def test_a_probe_beside_the_actors_changes_no_image():
     scene, camera, bodies = wall_and_what_is_behind()
     plain = draw_gaussians(scene.gaussians, bodies, camera, with_actor_alpha=True)
-    probed = draw_gaussians(
-        scene.gaussians, bodies, camera, with_actor_alpha=True, channel=probe(4, CPU)
-    )
+    probed = draw_gaussians(scene.gaussians, bodies, camera, with_actor_alpha=True, channel=ones(4))
     assert torch.equal(plain.rgb, probed.rgb)
     assert torch.equal(plain.features[..., 0], probed.features[..., 0])
     torch.testing.assert_close(probed.features[..., 1], probed.alpha, atol=1e-5, rtol=0)
