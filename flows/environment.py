@@ -21,9 +21,8 @@ THREADS = {
     # numba looks for TBB first and warns where the one it finds is too old
     "NUMBA_THREADING_LAYER_PRIORITY": "omp workqueue tbb",
 }
-KEPT_BYTES = 8 << 20
-"""Largest freed block that the C library keeps for the next use: an image of 960x540 in float. By
-itself glibc goes to 32 MB; columns of a LiDAR map would leave holes that nothing fits into."""
+KEPT_BYTES = 32 << 20
+"""Largest freed block that the C library keeps for the next use: as far as glibc goes by itself."""
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8  # of malloc.h
 CPU_LIMIT = Path("/sys/fs/cgroup/cpu.max")
 """Quota and period in microseconds, where a container has one."""

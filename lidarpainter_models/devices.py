@@ -1,4 +1,4 @@
-"""Which device does the work, and how; names alone are read without torch."""
+"""Which device does the work, how, and with what memory; names alone are read without torch."""
 
 import ctypes
 import os

@@ -110,7 +110,7 @@ def _points(
         SceneError: neither sweeps nor images tell anything of the street.
     """
     measured = gather_points(scene, split.train_frames)
-    return_freed_memory()  # as much as the map: the sweeps one by one
+    return_freed_memory()  # the sweeps one by one, as large as the map made of them
     is_swept = len(measured.street) > 0
     if is_swept and share_told(measured.street, taken, bodies) >= LEAST_TOLD:
         return measured, False

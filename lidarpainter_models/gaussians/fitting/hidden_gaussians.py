@@ -2,10 +2,10 @@
 
 Of what lies before a camera in a street much is behind something else, the more the longer the
 street. It has no gradient, but would be brought up to date, projected, sorted and stepped all the
-same. So a view takes all that its frustum holds at its first look and again every few looks, and
-learns by the way how many pixels each Gaussian fills there: the sum of the weights with which it is
-blended. What fills next to none is left out until then, by its number, which a Gaussian keeps for
-as long as it lives; new ones are never left out unseen.
+same. So a view looks at all that its frustum holds at first and now and then again, and learns by
+the way how many pixels each Gaussian fills there: the sum of the weights with which it is blended.
+What fills next to none is left out until then, by its number, which a Gaussian keeps for as long as
+it lives; new ones are never left out unseen.
 """
 
 from dataclasses import dataclass, field
@@ -16,81 +16,87 @@ from torch import Tensor
 
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
 
-LOOKS = 16
-"""Looks from one at everything to the next."""
+FIRST_LOOKS = (0, 4, 12)
+"""Looks of a view, counted from 0, at everything while the scene still changes fast."""
+LOOKS_BETWEEN = 16
+"""Looks from one at everything to the next, later on."""
 LEAST_PX = 0.02
 """A Gaussian that fills less is left out: together they make some thousandths of an image."""
-PROBE = 1e-12
-"""Weight of the channel that measures, in the loss: its gradient is read, and moves nothing by more
-than a rounding."""
+PROBE = 1e-24
+"""Weight in the loss of the channel that measures. Adam makes whole steps of the smallest gradient
+that stands alone, so this one lies far below the least that it tells from none."""
 
 
 @dataclass(eq=False, kw_only=True)
 class HiddenGaussians:
-    """What each view leaves out. Views are numbered: n-th recorded one n, n-th painted one ~n."""
+    """What each view leaves out. The n-th recorded view is called n, the n-th painted one ~n."""
 
     number: Int[Tensor, " gaussians"]
     """Of each Gaussian, int32; never given again."""
-    row: Int[Tensor, " numbers"]
+    row_of_number: Int[Tensor, " numbers"]
     """Where each number stands in the set; one past its end where the Gaussian is gone."""
-    hidden: dict[int, Int[Tensor, " hidden"]] = field(default_factory=dict)
+    left_out: dict[int, Int[Tensor, " hidden"]] = field(default_factory=dict)
     """By view the numbers of those left out."""
     looks: dict[int, int] = field(default_factory=dict)
-    """By view the looks since the last one at everything."""
+    """By view the looks so far."""
+    _in_view: dict[int, Bool[Tensor, " gaussians"]] = field(default_factory=dict, repr=False)
+    """By view that looks at everything in this step, what its frustum holds."""
 
     @classmethod
-    def none_yet(cls, count: int, device: torch.device) -> "HiddenGaussians":
+    def none_yet(cls, num_gaussians: int, device: torch.device) -> "HiddenGaussians":
         """Of so many Gaussians, which no view has looked at."""
-        number = torch.arange(count, dtype=torch.int32, device=device)
-        return cls(number=number, row=number.long())
+        number = torch.arange(num_gaussians, dtype=torch.int32, device=device)
+        return cls(number=number, row_of_number=number.long())
 
     def is_due(self, view: int) -> bool:
         """Whether a view is to look at everything this time."""
-        return self.looks.get(view, LOOKS) >= LOOKS
+        looks = self.looks.get(view, 0)
+        return looks in FIRST_LOOKS or looks % LOOKS_BETWEEN == FIRST_LOOKS[-1]
 
-    def without(self, is_seen: Bool[Tensor, " gaussians"], view: int) -> Bool[Tensor, " gaussians"]:
+    def without(self, in_view: Bool[Tensor, " gaussians"], view: int) -> Bool[Tensor, " gaussians"]:
         """Of what a view's frustum holds, what it looks at this time."""
         if self.is_due(view):
-            return is_seen
-        flags = torch.cat([is_seen, is_seen.new_zeros(1)])  # the last for those that are gone
-        return flags.index_fill_(0, self.row[self.hidden[view].long()], False)[:-1]
+            self._in_view[view] = in_view
+            return in_view
+        flags = torch.cat([in_view, in_view.new_zeros(1)])  # the last for those that are gone
+        return flags.index_fill_(0, self.row_of_number[self.left_out[view].long()], False)[:-1]
 
-    def probe(self, view: int, count: int) -> Float[Tensor, "gaussians 1"] | None:
+    def probe(self, view: int, num_seen: int) -> Float[Tensor, "seen 1"] | None:
         """Ones to blend along where a view looks at everything; collects what each fills."""
         if not self.is_due(view):
             return None
-        return torch.ones(count, 1, device=self.row.device, requires_grad=True)
+        return torch.ones(num_seen, 1, device=self.number.device, requires_grad=True)
 
     def learn(
         self, view: int, rows: Int[Tensor, " seen"], probe: Float[Tensor, "seen 1"] | None
     ) -> None:
         """Take up what the probe of a look at these rows collected; None was another look."""
+        self.looks[view] = self.looks.get(view, 0) + 1
         if probe is None:
-            self.looks[view] += 1
             return
         if probe.grad is None:
             raise AssertionError("the probe took no part in the loss")
-        self.hidden[view] = self.number[rows[probe.grad[:, 0] < PROBE * LEAST_PX]]
-        self.looks[view] = 1
+        is_hidden = self._in_view.pop(view)[rows] & (probe.grad[:, 0] < PROBE * LEAST_PX)
+        self.left_out[view] = self.number[rows[is_hidden]]
 
     def follow(self, kept: Int[Tensor, " kept"], num_added: int) -> None:
         """Take up a change of the set: rows kept, in order, then fresh ones."""
-        device, given = self.row.device, len(self.row)
-        fresh = torch.arange(given, given + num_added, dtype=torch.int32, device=device)
+        device, first = self.number.device, len(self.row_of_number)
+        fresh = torch.arange(first, first + num_added, dtype=torch.int32, device=device)
         self.number = torch.cat([self.number[kept], fresh])
-        count = len(self.number)
-        self.row = torch.full((given + num_added,), count, device=device)
-        self.row.scatter_(0, self.number.long(), torch.arange(count, device=device))
+        num_gaussians = len(self.number)
+        self.row_of_number = torch.full((first + num_added,), num_gaussians, device=device)
+        rows = torch.arange(num_gaussians, device=device)
+        self.row_of_number.scatter_(0, self.number.long(), rows)
 
     def tensors(self) -> dict[str, Tensor]:
         """State to be kept in a checkpoint."""
-        views = list(self.hidden)
-        lists = [self.hidden[view] for view in views]
+        lists = list(self.left_out.values())
         return {
             "number": self.number,
-            "row": self.row,
-            "views": torch.tensor(views, dtype=torch.int64),
-            "looks": torch.tensor([self.looks[view] for view in views], dtype=torch.int64),
+            "row_of_number": self.row_of_number,
+            "views": torch.tensor(list(self.left_out), dtype=torch.int64),
+            "looks": torch.tensor([self.looks[view] for view in self.left_out], dtype=torch.int64),
             "sizes": torch.tensor([len(listed) for listed in lists], dtype=torch.int64),
             "listed": torch.cat([self.number[:0], *lists]),
         }
@@ -102,12 +108,12 @@ class HiddenGaussians:
         lists = tensors["listed"].to(device).split(tensors["sizes"].tolist())
         return cls(
             number=tensors["number"].to(device),
-            row=tensors["row"].to(device),
-            hidden=dict(zip(views, lists, strict=True)),
+            row_of_number=tensors["row_of_number"].to(device),
+            left_out={view: own.clone() for view, own in zip(views, lists, strict=True)},
             looks=dict(zip(views, looks, strict=True)),
         )
 
 
-def probed(splat: SplatImage, probe: Float[Tensor, "gaussians 1"] | None) -> Float[Tensor, ""]:
+def probed(splat: SplatImage) -> Float[Tensor, ""]:
     """The term of the loss from which a probe, the last channel blended, collects."""
-    return splat.alpha.new_zeros(()) if probe is None else PROBE * splat.features[..., -1].sum()
+    return PROBE * splat.features[..., -1].sum()

@@ -34,9 +34,9 @@ RASTER_BYTES_PER_GAUSSIAN = 512
 """Projected Gaussians, their gradients, and entries of about eight tiles each, sorted."""
 LEAST_SHARE = 10
 """A limit that leaves less than one in so many of the Gaussians wanted is refused."""
-ROW_BYTES = 64
+ROW_BYTES = 68
 """Of a Gaussian: its body, block, place among blocks, tallies, last step, number and its place."""
-HIDDEN_BYTES = 0.5
+HIDDEN_BYTES = 1.0
 """Of a Gaussian and a view: the numbers of those that the view leaves out."""
 
 

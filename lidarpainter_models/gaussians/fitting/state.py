@@ -93,13 +93,13 @@ class FitState:
     def seen(self, looks: Mapping[int, Sequence[View]]) -> SeenGaussians:
         """All Gaussians that any of these can show, as leaves for one step.
 
-        By number of the view (`hidden_gaussians`) where it and its bodies stand, in one or more
+        By view, as `hidden_gaussians` calls them, where it and its bodies stand, in one or more
         moments.
         """
         bent_m = REACH_M if len(self.scene.actors.bending.bodies) else 0.0
         seen = [
-            self.hidden.without(self.blocks.in_view(views, actor_slack=(bent_m, 0.0)), number)
-            for number, views in looks.items()
+            self.hidden.without(self.blocks.in_view(views, actor_slack=(bent_m, 0.0)), name)
+            for name, views in looks.items()
         ]
         rows = torch.stack(seen).any(dim=0).nonzero()[:, 0]
         return self.gaussian_adam.seen(self.scene.gaussians, rows)

@@ -87,7 +87,7 @@ def fit_step(
         bodies = _guidance_bodies(state, painted)
         looks[~place] = [(painted.camera, bodies)]
     seen = state.seen(looks)
-    probes = [state.hidden.probe(number, len(seen)) for number in looks]
+    probes = [state.hidden.probe(name, len(seen)) for name in looks]
     of_recorded = partial(
         _recorded_gradients, state, seen, image, row, view, config, perceptual, probes[0]
     )
@@ -98,8 +98,8 @@ def fit_step(
             add_guidance_gradients, state, seen, painted, bodies, config, perceptual, probes[1]
         )
         found, _ = both(of_recorded, of_painted, state.scene.device)
-    for number, probe in zip(looks, probes, strict=True):
-        state.hidden.learn(number, seen.rows, probe)
+    for name, probe in zip(looks, probes, strict=True):
+        state.hidden.learn(name, seen.rows, probe)
     state.tally.add(seen.rows, found.screen_gradient, found.splat.visible)
     state.refinement.step(state.step, image)
     _step_sky(state, found, config, image)
@@ -159,7 +159,7 @@ def _recorded_gradients(  # noqa: PLR0913 - what a step is made of
     loss = loss + state.refinement.bend_prior(image.timestamp_ns, state.step)
     prior = state.refinement.prior(row, image.timestamp_ns, state.step)
     # as a sum its gradient, which is the CPU's, would have to come from the device
-    total = loss + probed(splat, probe)
+    total = loss if probe is None else loss + probed(splat)
     torch.autograd.backward([total, prior] if prior.requires_grad else [total])
     squared_error = (shown.detach() - facts.rgb).square().mean()
     told = torch.stack([loss.detach() + prior.detach(), squared_error.double()])
@@ -208,7 +208,9 @@ def add_guidance_gradients(
         )
     is_hit = view.lidar_depth_m > 0
     loss = loss + config.losses.sky * clear_sky_loss(splat.alpha, torch.zeros_like(is_hit), is_hit)
-    (loss + probed(splat, probe)).backward()
+    if probe is not None:
+        loss = loss + probed(splat)
+    loss.backward()
 
 
 def actor_boundary_loss(

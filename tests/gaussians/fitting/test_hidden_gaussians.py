@@ -6,8 +6,9 @@ from gaussian_world import HEIGHT_PX, WIDTH_PX, camera_at, round_gaussians, scen
 
 from lidarpainter_models.gaussians.fitting.config import FitConfig, RefinementConfig
 from lidarpainter_models.gaussians.fitting.hidden_gaussians import (
+    FIRST_LOOKS,
     LEAST_PX,
-    LOOKS,
+    LOOKS_BETWEEN,
     PROBE,
     HiddenGaussians,
     probed,
@@ -16,7 +17,7 @@ from lidarpainter_models.gaussians.fitting.images import full_image
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import fit_step
 from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body, draw_gaussians
-from lidarpainter_models.observations.views import TrainingView
+from lidarpainter_models.observations.views import GuidanceView, TrainingView
 
 CPU = torch.device("cpu")
 SHOWN, HIDDEN = 10.0, 0.0
@@ -42,30 +43,45 @@ def left_out(hidden, view):
     return (~hidden.without(everything, view)).nonzero()[:, 0].tolist()
 
 
-def test_a_view_looks_at_everything_first_and_every_few_looks():
+def look_at_everything(hidden, view, rows, probe, in_view=None):
+    everything = torch.ones(len(hidden.number), dtype=torch.bool)
+    hidden.without(everything if in_view is None else in_view, view)
+    hidden.learn(view, rows, probe)
+
+
+def test_a_view_looks_at_everything_at_first_and_now_and_then():
     hidden = HiddenGaussians.none_yet(5, CPU)
     at_everything = []
-    for _ in range(2 * LOOKS + 1):
+    for look in range(FIRST_LOOKS[-1] + 2 * LOOKS_BETWEEN + 1):
         is_due = hidden.is_due(0)
+        if is_due:
+            at_everything.append(look)
         assert (hidden.probe(0, 5) is not None) == is_due
-        at_everything.append(is_due)
         assert left_out(hidden, 0) == ([] if is_due else [1, 3])
         hidden.learn(0, torch.arange(5), filled([1, 3], 5) if is_due else None)
-    assert [k for k, is_due in enumerate(at_everything) if is_due] == [0, LOOKS, 2 * LOOKS]
+    later = [FIRST_LOOKS[-1] + k * LOOKS_BETWEEN for k in (1, 2)]
+    assert at_everything == [*FIRST_LOOKS, *later]
 
 
 def test_views_leave_out_what_they_do_not_show_themselves():
     hidden = HiddenGaussians.none_yet(4, CPU)
-    hidden.learn(0, torch.arange(4), filled([0], 4))
-    hidden.learn(~0, torch.arange(1, 4), filled([2], 3))
+    look_at_everything(hidden, 0, torch.arange(4), filled([0], 4))
+    look_at_everything(hidden, ~0, torch.arange(1, 4), filled([2], 3))
     assert left_out(hidden, 0) == [0]
     assert left_out(hidden, ~0) == [3]
     assert left_out(hidden, 1) == []
 
 
+def test_nothing_is_said_of_what_another_view_brought_along():
+    hidden = HiddenGaussians.none_yet(4, CPU)
+    in_view = torch.tensor([True, True, False, False])
+    look_at_everything(hidden, 0, torch.arange(4), filled([1, 3], 4), in_view)
+    assert left_out(hidden, 0) == [1]
+
+
 def test_the_least_that_is_looked_at():
     hidden = HiddenGaussians.none_yet(2, CPU)
-    hidden.learn(0, torch.arange(2), collected(LEAST_PX * 0.99, LEAST_PX * 1.01))
+    look_at_everything(hidden, 0, torch.arange(2), collected(LEAST_PX * 0.99, LEAST_PX * 1.01))
     assert left_out(hidden, 0) == [0]
 
 
@@ -75,7 +91,7 @@ def test_numbers_follow_every_change_of_the_set(seed):
     generator = torch.Generator().manual_seed(seed)
     hidden, names = HiddenGaussians.none_yet(20, CPU), list(range(20))
     listed = [3, 8, 15]
-    hidden.learn(0, torch.arange(20), filled(listed, 20))
+    look_at_everything(hidden, 0, torch.arange(20), filled(listed, 20))
     for _ in range(4):
         is_kept = torch.rand(len(names), generator=generator) < 0.7
         kept = is_kept.nonzero()[:, 0]
@@ -88,8 +104,8 @@ def test_numbers_follow_every_change_of_the_set(seed):
 
 def test_kept_state_is_taken_up_again():
     hidden = HiddenGaussians.none_yet(6, CPU)
-    hidden.learn(2, torch.arange(6), filled([1], 6))
-    hidden.learn(~1, torch.arange(6), filled([4, 5], 6))
+    look_at_everything(hidden, 2, torch.arange(6), filled([1], 6))
+    look_at_everything(hidden, ~1, torch.arange(6), filled([4, 5], 6))
     hidden.learn(2, torch.arange(6), None)
     hidden.follow(torch.tensor([1, 2, 4]), 2)
     again = HiddenGaussians.from_tensors(hidden.tensors(), CPU)
@@ -121,7 +137,7 @@ def test_a_probe_measures_the_pixels_that_each_gaussian_fills():
     scene, camera, bodies = wall_and_what_is_behind()
     probe = ones(4)
     image = draw_gaussians(scene.gaussians, bodies, camera, channel=probe)
-    probed(image, probe).backward()
+    probed(image).backward()
     px = probe.grad[:, 0] / PROBE
     assert float(px.sum()) == pytest.approx(float(image.alpha.detach().sum()), rel=1e-4)
     assert float(px[0]) > 0.9 * WIDTH_PX * HEIGHT_PX
@@ -131,30 +147,67 @@ def test_a_probe_measures_the_pixels_that_each_gaussian_fills():
 def test_a_probe_beside_the_actors_changes_no_image():
     scene, camera, bodies = wall_and_what_is_behind()
     plain = draw_gaussians(scene.gaussians, bodies, camera, with_actor_alpha=True)
-    probed = draw_gaussians(scene.gaussians, bodies, camera, with_actor_alpha=True, channel=ones(4))
-    assert torch.equal(plain.rgb, probed.rgb)
-    assert torch.equal(plain.features[..., 0], probed.features[..., 0])
-    torch.testing.assert_close(probed.features[..., 1], probed.alpha, atol=1e-5, rtol=0)
+    measured = draw_gaussians(
+        scene.gaussians, bodies, camera, with_actor_alpha=True, channel=ones(4)
+    )
+    assert torch.equal(plain.rgb, measured.rgb)
+    assert torch.equal(plain.features[..., 0], measured.features[..., 0])
+    torch.testing.assert_close(measured.features[..., 1], measured.alpha, atol=1e-5, rtol=0)
+
+
+def image_of(camera, **changes):
+    plain = torch.zeros(HEIGHT_PX, WIDTH_PX)
+    view = TrainingView(
+        key=(0, "front"),
+        camera=camera,
+        timestamp_ns=0,
+        rgb_u8=torch.full((HEIGHT_PX, WIDTH_PX, 3), 99, dtype=torch.uint8),
+        sky_mask=plain > 0,
+        lidar_depth_m=plain,
+        **changes,
+    )
+    return full_image(view)
+
+
+def begun(scene):
+    config = FitConfig(steps=100, refinement=RefinementConfig(start_step=100))
+    return FitState.begin(scene, config, WIDTH_PX * HEIGHT_PX), config
 
 
 def test_steps_leave_out_what_is_behind_a_wall_until_everything_is_looked_at():
     scene, camera, bodies = wall_and_what_is_behind()
-    config = FitConfig(steps=100, refinement=RefinementConfig(start_step=100))
-    state = FitState.begin(scene, config, WIDTH_PX * HEIGHT_PX)
-    image = full_image(
-        TrainingView(
-            key=(0, "front"),
-            camera=camera,
-            timestamp_ns=0,
-            rgb_u8=torch.full((HEIGHT_PX, WIDTH_PX, 3), 99, dtype=torch.uint8),
-            sky_mask=torch.zeros(HEIGHT_PX, WIDTH_PX, dtype=torch.bool),
-            lidar_depth_m=torch.zeros(HEIGHT_PX, WIDTH_PX),
-        )
-    )
+    state, config = begun(scene)
     looked_at = []
-    for _ in range(LOOKS + 1):
+    for _ in range(FIRST_LOOKS[1] + 1):
         looked_at.append(len(state.seen({0: [(camera, bodies)]})))
-        fit_step(state, image, 0, None, config, None)
+        fit_step(state, image_of(camera), 0, None, config, None)
         state.step += 1
-    assert looked_at == [4, *[3] * (LOOKS - 1), 4]
+    assert looked_at == [4, *[3] * (FIRST_LOOKS[1] - 1), 4]
     assert len(state.seen({1: [(camera, bodies)]})) == 4
+
+
+def test_a_painted_view_keeps_a_list_of_its_own():
+    scene, camera, _ = wall_and_what_is_behind()
+    state, config = begun(scene)
+    aside = camera_at(1.0)
+    whole = torch.ones(HEIGHT_PX, WIDTH_PX)
+    painted = GuidanceView.of(
+        aside, 0, rgb=whole[..., None].expand(-1, -1, 3), weight=whole, lidar_depth_m=0 * whole
+    )
+    fit_step(state, image_of(camera), 0, None, config, None)
+    fit_step(state, image_of(camera), 0, (7, painted), config, None)
+    assert state.hidden.looks == {0: 2, ~7: 1}
+    assert state.hidden.left_out[0].tolist() == state.hidden.left_out[~7].tolist() == [2]
+
+
+def test_measuring_moves_nothing():
+    """Adam makes whole steps of the smallest gradient that stands alone."""
+    scene, camera, _ = wall_and_what_is_behind()
+    state, config = begun(scene)
+    before = {name: value.clone() for name, value in scene.gaussians.columns().items()}
+    everything = torch.ones(HEIGHT_PX, WIDTH_PX, dtype=torch.bool)
+    for _ in range(3):
+        fit_step(state, image_of(camera, hidden=everything), 0, None, config, None)
+        state.step += 1
+    for name, value in state.caught_up().gaussians.columns().items():
+        torch.testing.assert_close(value.detach(), before[name], rtol=0, atol=1e-5)
