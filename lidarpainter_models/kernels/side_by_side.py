@@ -67,8 +67,9 @@ def both(
 ) -> tuple[Made, Other]:
     """What two different pieces make: at once on a CPU, each with half of the threads.
 
-    Neither may change what the other reads. On a GPU, and where there is one thread or a pool that
-    holds no other, they are made one after the other.
+    Neither may change what the other reads, nor may they share a tensor that collects gradients:
+    torch's lock of it and the interpreter's are taken in either order. On a GPU, and where there is
+    one thread or a pool that holds no other, they are made one after the other.
     """
     threads = _shared_threads(device)
     if threads == 1:

@@ -94,10 +94,12 @@ def fit_step(
     if guidance is None:
         found = of_recorded()
     else:
+        twin = seen.twin()
         of_painted = partial(
-            add_guidance_gradients, state, seen, painted, bodies, config, perceptual, probes[1]
+            add_guidance_gradients, state, twin, painted, bodies, config, perceptual, probes[1]
         )
         found, _ = both(of_recorded, of_painted, state.scene.device)
+        seen.take_gradients_of(twin)
     for name, probe in zip(looks, probes, strict=True):
         state.hidden.learn(name, seen.rows, probe)
     state.tally.add(seen.rows, found.screen_gradient, found.splat.visible)

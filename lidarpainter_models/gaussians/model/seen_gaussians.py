@@ -1,6 +1,6 @@
 """The Gaussians that one step of a fit may see, as leaves that collect its gradients."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -52,6 +52,22 @@ class SeenGaussians:
     def opacity(self) -> Float[Tensor, " seen"]:
         """In (0, 1)."""
         return self.opacity_logit.sigmoid()
+
+    def twin(self) -> "SeenGaussians":
+        """The same values as leaves of their own, for another thread.
+
+        Threads must not share leaves: where autograd meets one it takes its lock and then asks for
+        the interpreter's, which a thread that waits for the first may hold: both wait for ever.
+        """
+        own = {name: value.requires_grad_(True) for name, value in self.values().items()}
+        return replace(self, **own)
+
+    def take_gradients_of(self, twin: "SeenGaussians") -> None:
+        """Add what a twin collected to what these did."""
+        for name in LEAVES:
+            leaf, found = getattr(self, name), getattr(twin, name).grad
+            if found is not None:
+                leaf.grad = found if leaf.grad is None else leaf.grad + found
 
     def values(self) -> dict[str, Tensor]:
         """The leaves by name, detached."""

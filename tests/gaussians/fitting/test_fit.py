@@ -6,7 +6,7 @@ import torch
 from gaussian_world import FRAME_NS, HEIGHT_PX, WIDTH_PX, scene_of
 
 from lidarpainter_models.errors import ConfigError, SceneError
-from lidarpainter_models.gaussians.fitting import settings
+from lidarpainter_models.gaussians.fitting import settings, step
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import (
     FitConfig,
@@ -207,6 +207,37 @@ def test_painted_views_move_geometry_and_colour(world):
     _, seen = with_guidance_gradients(world, painted_view(world), short_fit())
     assert float(seen.means.grad.abs().sum()) > 0
     assert float(seen.sh.grad.abs().sum()) > 0
+
+
+def test_the_threads_of_a_step_share_no_leaf(world, monkeypatch):
+    """Where two threads meet one, each may come to wait for what the other holds."""
+    made = []
+
+    def one_after_the_other(first, second, _device):
+        made.extend(work.args[1] for work in (first, second))
+        return first(), second()
+
+    monkeypatch.setattr(step, "both", one_after_the_other)
+    state = FitState.begin(world.scene, short_fit(), WIDTH_PX * HEIGHT_PX)
+    image = full_image(world.observations.views[0])
+    fit_step(state, image, 0, (0, painted_view(world)), short_fit(), None)
+    ours, theirs = made
+    for name, value in ours.values().items():
+        assert getattr(ours, name) is not getattr(theirs, name)
+        assert getattr(theirs, name).is_leaf
+        assert value.data_ptr() == theirs.values()[name].data_ptr()
+
+
+def test_gradients_of_both_views_count(world):
+    view, config = painted_view(world), short_fit()
+    _, alone = with_guidance_gradients(world, view, config)
+    _, seen = with_guidance_gradients(world, view, config)
+    twin = seen.twin()
+    assert all(not gradient.any() for gradient in twin.gradients().values())
+    twin.take_gradients_of(seen)
+    seen.take_gradients_of(twin)
+    for name, gradient in alone.gradients().items():
+        assert torch.equal(seen.gradients()[name], 2 * gradient)
 
 
 def test_painted_views_pull_the_scene_towards_them(world):

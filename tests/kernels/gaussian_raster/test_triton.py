@@ -120,7 +120,7 @@ def test_every_kernel_compiles_to_machine_code_without_spilling():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("architecture", [80, 90])
-@pytest.mark.parametrize(("coefficients", "features"), [(16, 0), (4, 1)])
+@pytest.mark.parametrize(("coefficients", "features"), [(16, 0), (4, 1), (4, 2)])
 def test_every_kernel_compiles_for_every_degree(architecture, coefficients, features):
     assert_fits(machine_code("triton_compilation.py", architecture, coefficients, features))
 
