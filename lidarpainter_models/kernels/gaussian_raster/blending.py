@@ -17,18 +17,20 @@ from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
     TILE_PX,
 )
 from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry
-from lidarpainter_models.kernels.gaussian_raster.lanes import (
+from lidarpainter_models.kernels.gaussian_raster.lane_types import (
     choose,
-    lane_array,
-    lane_centres,
-    lane_exp,
     largest,
     load,
     magnitude,
-    prefetch,
     smallest,
-    spread,
     store,
+)
+from lidarpainter_models.kernels.gaussian_raster.lanes import (
+    lane_array,
+    lane_centres,
+    lane_exp,
+    prefetch,
+    spread,
     store_triples,
     widest,
 )

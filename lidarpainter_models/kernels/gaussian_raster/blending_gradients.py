@@ -30,19 +30,21 @@ from lidarpainter_models.kernels.gaussian_raster.blending import (
 )
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import TILE_PX
 from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry
-from lidarpainter_models.kernels.gaussian_raster.lanes import (
+from lidarpainter_models.kernels.gaussian_raster.lane_types import (
     choose,
+    largest,
+    load,
+    magnitude,
+    smallest,
+    store,
+)
+from lidarpainter_models.kernels.gaussian_raster.lanes import (
     lane_array,
     lane_centres,
     lane_exp,
-    largest,
-    load,
     load_triples,
-    magnitude,
     prefetch,
-    smallest,
     spread,
-    store,
     store_sums,
 )
 from lidarpainter_models.kernels.gaussian_raster.projection import (

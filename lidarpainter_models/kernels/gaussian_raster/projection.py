@@ -1,4 +1,4 @@
-"""Place Gaussians on the screen: compiled code, one Gaussian at a time, in float64.
+"""Place Gaussians on the screen: compiled code, eight Gaussians at a time, in float64.
 
 The footprint of a Gaussian is that of Zwicker et al. (2001), "EWA splatting": covariance
 J W S W^T J^T plus a blur. It is kept in the form
@@ -24,6 +24,25 @@ from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
     NEAR_M,
 )
 from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry
+from lidarpainter_models.kernels.gaussian_raster.gaussian_lanes import (
+    EIGHT,
+    Rows,
+    in_all,
+    lanes_at,
+    pick,
+    put,
+    rows_of,
+    transforms_of,
+    vector_of,
+)
+from lidarpainter_models.kernels.gaussian_raster.lane_types import (
+    any_of,
+    choose,
+    largest,
+    magnitude,
+    rounded_down,
+    smallest,
+)
 from lidarpainter_models.kernels.gaussian_raster.small_vectors import Matrix, Quaternion, Vector
 from lidarpainter_models.kernels.gaussian_raster.work_sharing import jump_of
 
@@ -73,7 +92,7 @@ class View(NamedTuple):
 
 
 class Footprint(NamedTuple):
-    """One Gaussian between body frame and screen; vectors are tuples (`small_vectors`)."""
+    """Eight Gaussians between body frame and screen, as lanes; vectors are tuples of them."""
 
     point: Vector
     inverse_z: float
@@ -93,43 +112,22 @@ class Footprint(NamedTuple):
 
 
 @numba.njit(**EXACT)
-def transform_of(gaussians: Gaussians, index: int) -> tuple[Matrix, Vector]:
-    """Rotation rows and translation of the body a Gaussian belongs to."""
-    t = gaussians.camera_from_body[gaussians.body_index[index]]
-    rotation = (
-        (t[0, 0], t[0, 1], t[0, 2]),
-        (t[1, 0], t[1, 1], t[1, 2]),
-        (t[2, 0], t[2, 1], t[2, 2]),
-    )
-    return rotation, (t[0, 3], t[1, 3], t[2, 3])
-
-
-@numba.njit(**EXACT)
-def vector_of(array: np.ndarray, index: int) -> Vector:
-    """A row of three as float64."""
-    return (
-        np.float64(array[index, 0]),
-        np.float64(array[index, 1]),
-        np.float64(array[index, 2]),
-    )
-
-
-@numba.njit(**EXACT)
 def footprint_of(
     gaussians: Gaussians,
-    index: int,
+    rows: Rows,
     point: Vector,
     rotation: Matrix,
     translation: Vector,
     view: View,
 ) -> Footprint:
-    """Screen covariance of a Gaussian whose centre lies at `point` in the camera frame."""
-    q = gaussians.rotation_wxyz[index]
-    w, x, y, z = np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])
-    length = max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
+    """Screen covariances of Gaussians whose centres lie at `point` in the camera frame."""
+    q, places = gaussians.rotation_wxyz, rows.places
+    w, x = pick(q, places, 4, 0), pick(q, places, 4, 1)
+    y, z = pick(q, places, 4, 2), pick(q, places, 4, 3)
+    length = largest(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
     inverse = 1.0 / length
     unit = (w * inverse, x * inverse, y * inverse, z * inverse)
-    scale = vector_of(gaussians.scale_m, index)
+    scale = vector_of(gaussians.scale_m, rows)
     turned = v3.rotation_matrix(unit)
     from_axes = (
         (turned[0][0] * scale[0], turned[0][1] * scale[1], turned[0][2] * scale[2]),
@@ -138,8 +136,8 @@ def footprint_of(
     )
     axes = v3.product(rotation, from_axes)
     inverse_z = 1.0 / point[2]
-    tangent_x = min(max(point[0] * inverse_z, view.lowest_x), view.highest_x)
-    tangent_y = min(max(point[1] * inverse_z, view.lowest_y), view.highest_y)
+    tangent_x = smallest(largest(point[0] * inverse_z, view.lowest_x), view.highest_x)
+    tangent_y = smallest(largest(point[1] * inverse_z, view.lowest_y), view.highest_y)
     row_x = v3.add(axes[0], v3.scaled(axes[2], -tangent_x))
     row_y = v3.add(axes[1], v3.scaled(axes[2], -tangent_y))
     row_x = v3.scaled(row_x, view.fx * inverse_z)
@@ -170,91 +168,123 @@ def view_direction(mean: Vector, rotation: Matrix, translation: Vector) -> Vecto
 
 
 @numba.njit(**EXACT)
+def _write(records: np.ndarray, rows: Rows, column: int, value: float) -> None:
+    put(records, rows.places, RECORD_FLOATS, column, value, False)
+
+
+@numba.njit(**EXACT)
 def _write_colour(
-    gaussians: Gaussians, index: int, footprint: Footprint, weights: np.ndarray, record: np.ndarray
-) -> bool:
-    mean = vector_of(gaussians.means, index)
+    gaussians: Gaussians,
+    rows: Rows,
+    footprint: Footprint,
+    weights: np.ndarray,
+    records: np.ndarray,
+) -> float:
+    """Write colours; return by how much they are off black, before they are cut off there."""
+    mean = vector_of(gaussians.means, rows)
     offset = view_direction(mean, footprint.rotation, footprint.translation)
     direction, _ = v3.direction_of(offset)
     coefficients = gaussians.sh.shape[1]
     spherical_harmonics.basis(coefficients, direction, weights)
+    extent = in_all(0.0)
     for channel in range(3):
-        colour = COLOUR_OFFSET
+        colour = in_all(COLOUR_OFFSET)
         for k in range(coefficients):
-            colour += weights[k] * gaussians.sh[index, k, channel]
-        record[RED + channel] = max(colour, 0.0)
-    return math.isfinite(record[RED] + record[GREEN] + record[BLUE])
+            harmonic = pick(gaussians.sh, rows.places, 3 * coefficients, 3 * k + channel)
+            colour += lanes_at(weights, k) * harmonic
+        extent += magnitude(colour)
+        _write(records, rows, RED + channel, largest(colour, 0.0))
+    return extent
 
 
 @numba.njit(**EXACT)
-def _write_centre(position: float, record: np.ndarray, column: int) -> None:
-    whole = math.floor(position)
-    record[column] = whole
-    record[column + 1] = position - whole
+def _write_centre(position: float, records: np.ndarray, rows: Rows, column: int) -> None:
+    whole = rounded_down(position)
+    _write(records, rows, column, whole)
+    _write(records, rows, column + 1, position - whole)
 
 
 @numba.njit(**EXACT)
 def _write_shape(
-    footprint: Footprint, determinant: float, log_opacity: float, record: np.ndarray
-) -> None:
+    footprint: Footprint, determinant: float, log_opacity: float, records: np.ndarray, rows: Rows
+) -> float:
+    """Write the footprint's form; return its largest standard deviation, pixels."""
     inverse_yy = 1.0 / footprint.yy
-    record[ACROSS] = 0.5 * footprint.yy / determinant
-    record[SHEAR] = -footprint.xy * inverse_yy
-    record[ALONG] = 0.5 * inverse_yy
-    record[LOG_OPACITY] = log_opacity
+    _write(records, rows, ACROSS, 0.5 * footprint.yy / determinant)
+    _write(records, rows, SHEAR, -footprint.xy * inverse_yy)
+    _write(records, rows, ALONG, 0.5 * inverse_yy)
+    _write(records, rows, LOG_OPACITY, log_opacity)
     middle = 0.5 * (footprint.xx + footprint.yy)
-    spread = math.sqrt(max(middle * middle - determinant, 0.0))
-    record[SIGMA] = math.sqrt(middle + spread)
+    spread = math.sqrt(largest(middle * middle - determinant, 0.0))
+    return math.sqrt(middle + spread)
 
 
 @numba.njit(**EXACT)
-def _write_place(footprint: Footprint, reach: float, view: View, record: np.ndarray) -> bool:
-    """Write where a Gaussian lies and how far it reaches; return whether that is in the image."""
+def _write_place(
+    footprint: Footprint, reach: float, view: View, records: np.ndarray, rows: Rows
+) -> bool:
+    """Write where Gaussians lie and how far they reach; return whether that is in the image."""
     x, y, z = footprint.point
     x = view.fx * x * footprint.inverse_z + view.cx
     y = view.fy * y * footprint.inverse_z + view.cy
     half_width, half_height = math.sqrt(reach * footprint.xx), math.sqrt(reach * footprint.yy)
-    record[HALF_WIDTH], record[HALF_HEIGHT], record[DEPTH] = half_width, half_height, z
-    _write_centre(x, record, MEAN_X)
-    _write_centre(y, record, MEAN_Y)
-    inside_x = x + half_width >= 0.5 and x - half_width <= view.width - 0.5
-    return inside_x and y + half_height >= 0.5 and y - half_height <= view.height - 0.5
+    _write(records, rows, HALF_WIDTH, half_width)
+    _write(records, rows, HALF_HEIGHT, half_height)
+    _write(records, rows, DEPTH, z)
+    _write_centre(x, records, rows, MEAN_X)
+    _write_centre(y, records, rows, MEAN_Y)
+    is_inside = (x + half_width >= 0.5) & (x - half_width <= view.width - 0.5)
+    return is_inside & (y + half_height >= 0.5) & (y - half_height <= view.height - 0.5)
 
 
 @numba.njit(**EXACT)
-def _project_one(
-    gaussians: Gaussians, index: int, view: View, weights: np.ndarray, record: np.ndarray
-) -> bool:
-    """Fill a Gaussian's record; return whether it can reach a pixel."""
-    rotation, translation = transform_of(gaussians, index)
-    point = v3.add(v3.apply(rotation, vector_of(gaussians.means, index)), translation)
-    if not NEAR_M <= point[2] < LARGEST:
-        return False
-    opacity = np.float64(gaussians.opacity[index])
-    if not ALPHA_CUT <= opacity < LARGEST:
-        return False
-    footprint = footprint_of(gaussians, index, point, rotation, translation, view)
+def _hide(records: np.ndarray, rows: Rows) -> None:
+    for place in rows.places:
+        records[place, IS_VISIBLE] = records[place, SIGMA] = 0.0
+
+
+@numba.njit(**EXACT)
+def _project_eight(
+    gaussians: Gaussians,
+    rows: Rows,
+    of_one_body: bool,
+    view: View,
+    weights: np.ndarray,
+    records: np.ndarray,
+) -> None:
+    """Fill the records of eight Gaussians, visible where they can reach a pixel."""
+    rotation, translation = transforms_of(gaussians.camera_from_body, rows, of_one_body)
+    point = v3.add(v3.apply(rotation, vector_of(gaussians.means, rows)), translation)
+    opacity = pick(gaussians.opacity, rows.places, 1, 0)
+    visible = (point[2] >= NEAR_M) & (point[2] < LARGEST)
+    visible = visible & (opacity >= ALPHA_CUT) & (opacity < LARGEST)
+    if not any_of(visible):
+        _hide(records, rows)
+        return
+    log_opacity = math.log(choose(visible, opacity, 1.0))
+    footprint = footprint_of(gaussians, rows, point, rotation, translation, view)
     determinant = footprint.xx * footprint.yy - footprint.xy * footprint.xy
-    if not (determinant > 0.0 and footprint.xx + footprint.yy < LARGEST):
-        return False
-    log_opacity = math.log(opacity)
+    visible = visible & (determinant > 0.0) & (footprint.xx + footprint.yy < LARGEST)
     reach = 2.0 * (log_opacity - LOG_CUT)
-    if not _write_place(footprint, reach, view, record):
-        return False
-    _write_shape(footprint, determinant, log_opacity, record)
-    return _write_colour(gaussians, index, footprint, weights, record)
+    visible = visible & _write_place(footprint, reach, view, records, rows)
+    if not any_of(visible):
+        _hide(records, rows)
+        return
+    sigma = _write_shape(footprint, determinant, log_opacity, records, rows)
+    visible = visible & (_write_colour(gaussians, rows, footprint, weights, records) < LARGEST)
+    _write(records, rows, SIGMA, choose(visible, sigma, 0.0))
+    _write(records, rows, IS_VISIBLE, choose(visible, 1.0, 0.0))
 
 
 @numba.njit(**EXACT)
 def _project_run(
     gaussians: Gaussians, view: View, first: int, end: int, records: np.ndarray
 ) -> None:
-    weights = np.empty(16)
-    for index in range(first, end):
-        visible = _project_one(gaussians, index, view, weights, records[index])
-        records[index, IS_VISIBLE] = 1.0 if visible else 0.0
-        if not visible:
-            records[index, SIGMA] = 0.0
+    weights = np.empty(16 * EIGHT)
+    rows = Rows(np.empty(EIGHT, np.int64), np.empty(EIGHT, np.int64))
+    for start in range(first, end, EIGHT):
+        of_one_body = rows_of(gaussians.body_index, start, end, rows)
+        _project_eight(gaussians, rows, of_one_body, view, weights, records)
 
 
 @compiled_entry

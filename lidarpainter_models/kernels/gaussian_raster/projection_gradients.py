@@ -1,9 +1,9 @@
-"""Carry screen gradients back through the projection: compiled code, one Gaussian at a time.
+"""Carry screen gradients back through the projection: compiled code, eight Gaussians at a time.
 
 Each Gaussian first adds up the sums of its entries, tiles in reading order. The projection is
 computed again rather than kept. Everything is float64; the gradient of `camera_from_body` is summed
-over fixed runs of Gaussians and then over runs, in order, so it does not depend on the number of
-threads.
+over fixed eights, then over fixed runs of Gaussians and over these, in order, so it does not depend
+on the number of threads.
 """
 
 import math
@@ -31,26 +31,43 @@ from lidarpainter_models.kernels.gaussian_raster.blending_gradients import (
     prefetch_entries,
 )
 from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry
+from lidarpainter_models.kernels.gaussian_raster.footprint_gradients import (
+    axes_gradient,
+    centre_gradient,
+    covariance_gradient,
+    shape_gradient,
+)
+from lidarpainter_models.kernels.gaussian_raster.gaussian_lanes import (
+    EIGHT,
+    Rows,
+    in_all,
+    lane_numbers,
+    lanes_at,
+    pick,
+    put,
+    rows_of,
+    set_lanes,
+    total,
+    transforms_of,
+    vector_of,
+)
+from lidarpainter_models.kernels.gaussian_raster.lane_types import choose
 from lidarpainter_models.kernels.gaussian_raster.projection import (
     ACROSS,
     ALONG,
     CHUNKS,
     IS_VISIBLE,
+    RECORD_FLOATS,
     RED,
     SHEAR,
     Footprint,
     Gaussians,
     View,
     footprint_of,
-    transform_of,
-    vector_of,
     view_direction,
 )
 from lidarpainter_models.kernels.gaussian_raster.small_vectors import Matrix, Vector
 from lidarpainter_models.kernels.gaussian_raster.work_sharing import jump_of
-
-AHEAD = 8
-"""Gaussians between asking for sums and adding them up: some hundred nanoseconds each."""
 
 
 class Gradients(NamedTuple):
@@ -69,203 +86,188 @@ class Gradients(NamedTuple):
     camera_from_body: np.ndarray
 
 
-@numba.njit(**EXACT)
-def _put(array: np.ndarray, place: tuple[int, ...], value: float, adds: bool) -> None:
-    """Write a number, or add it in float32 as if it had been written and added then."""
-    array[place] = array[place] + np.float32(value) if adds else np.float32(value)
+class _Eight(NamedTuple):
+    """Eight Gaussians of a run, and room to work on them."""
+
+    rows: Rows
+    lanes: np.ndarray
+    """0 to 7: their rows in `sums`."""
+    sums: np.ndarray
+    """Of each over its entries, (8, SUMS)."""
+    features: np.ndarray
+    """The same of one Gaussian's features."""
+    weights: np.ndarray
+    """Lanes for each harmonic, or for each number of a transform."""
 
 
 @numba.njit(**EXACT)
-def _screen_gradient(sums: np.ndarray, record: np.ndarray) -> tuple[float, float]:
+def _sum_of(eight: _Eight, column: int) -> float:
+    return pick(eight.sums, eight.lanes, SUMS, column)
+
+
+@numba.njit(**EXACT)
+def _screen_gradient(eight: _Eight, records: np.ndarray) -> tuple[float, float]:
     """Gradient with respect to the projected centre, pixels."""
-    across, shear, along = record[ACROSS], record[SHEAR], record[ALONG]
-    x = 2.0 * across * sums[SUM_GU]
-    return x, x * shear + 2.0 * along * sums[SUM_GY]
+    places = eight.rows.places
+    x = 2.0 * pick(records, places, RECORD_FLOATS, ACROSS) * _sum_of(eight, SUM_GU)
+    along = pick(records, places, RECORD_FLOATS, ALONG)
+    shear = pick(records, places, RECORD_FLOATS, SHEAR)
+    return x, x * shear + 2.0 * along * _sum_of(eight, SUM_GY)
 
 
 @numba.njit(**EXACT)
-def _covariance_gradient(sums: np.ndarray, footprint: Footprint) -> Vector:
-    """Gradient with respect to the blurred screen covariance's xx, xy and yy."""
-    by_yy = 1.0 / footprint.yy
-    slope = footprint.xy * by_yy
-    by_remaining = 1.0 / (footprint.xx - slope * footprint.xy)
-    # exponent = -u^2 / (2 remaining) - dy^2 / (2 yy), u = dx - slope dy
-    to_remaining = 0.5 * sums[SUM_GUU] * by_remaining * by_remaining
-    to_slope = by_remaining * sums[SUM_GUY] * by_yy
-    to_yy = 0.5 * sums[SUM_GYY] * by_yy * by_yy
-    return (
-        to_remaining,
-        to_slope - 2.0 * slope * to_remaining,
-        slope * slope * to_remaining - slope * to_slope + to_yy,
-    )
+def _colour_gradient(eight: _Eight, visible: bool, records: np.ndarray, channel: int) -> float:
+    """Gradient of a channel's colour, none where it was cut off at black."""
+    colour = pick(records, eight.rows.places, RECORD_FLOATS, RED + channel)
+    return choose(visible & (colour > 0.0), _sum_of(eight, SUM_RED + channel), 0.0)
 
 
 @numba.njit(**EXACT)
-def _axes_gradient(
-    footprint: Footprint, covariance_gradient: Vector, view: View
-) -> tuple[Matrix, Vector]:
-    """Gradients of the Gaussian's axes in the camera frame and of its centre there."""
-    to_xx, to_xy, to_yy = covariance_gradient
-    row_x, row_y, axes = footprint.row_x, footprint.row_y, footprint.axes_in_camera
-    x, y, _ = footprint.point
-    by_z = footprint.inverse_z
-    to_row_x = v3.add(v3.scaled(row_x, 2.0 * to_xx), v3.scaled(row_y, to_xy))
-    to_row_y = v3.add(v3.scaled(row_y, 2.0 * to_yy), v3.scaled(row_x, to_xy))
-    to_axis_x = v3.scaled(to_row_x, view.fx * by_z)
-    to_axis_y = v3.scaled(to_row_y, view.fy * by_z)
-    to_axis_z = v3.add(
-        v3.scaled(to_axis_x, -footprint.tangent_x), v3.scaled(to_axis_y, -footprint.tangent_y)
-    )
-    to_z = -(v3.dot(to_row_x, row_x) + v3.dot(to_row_y, row_y)) * by_z
-    to_x, to_y = 0.0, 0.0
-    if view.lowest_x <= x * by_z <= view.highest_x:
-        to_x = -v3.dot(to_axis_x, axes[2]) * by_z
-    if view.lowest_y <= y * by_z <= view.highest_y:
-        to_y = -v3.dot(to_axis_y, axes[2]) * by_z
-    to_point = (to_x, to_y, to_z - (to_x * x + to_y * y) * by_z)
-    return (to_axis_x, to_axis_y, to_axis_z), to_point
-
-
-@numba.njit(**EXACT)
-def _centre_gradient(
-    footprint: Footprint, to_screen: tuple[float, float], to_depth: float, view: View
-) -> Vector:
-    """Gradient of the centre in the camera frame through its pixel position and depth."""
-    x, y, _ = footprint.point
-    by_z = footprint.inverse_z
-    to_x, to_y = to_screen[0] * view.fx * by_z, to_screen[1] * view.fy * by_z
-    return (to_x, to_y, to_depth - (to_x * x + to_y * y) * by_z)
-
-
-@numba.njit(**EXACT)
-def _store_shape(
+def _store_colour(
     gaussians: Gaussians,
-    index: int,
+    eight: _Eight,
+    visible: bool,
     footprint: Footprint,
-    to_axes: Matrix,
-    gradients: Gradients,
-    adds: bool,
-) -> Matrix:
-    """Store gradients of scale and rotation; return that of the transform's rotation."""
-    to_from_axes = v3.product(v3.transposed(footprint.rotation), to_axes)
-    turned = v3.rotation_matrix(footprint.unit_wxyz)
-    scale = vector_of(gaussians.scale_m, index)
-    by_axis, turned_axes = v3.transposed(to_from_axes), v3.transposed(turned)
-    for k, gradient in enumerate(
-        (
-            v3.dot(by_axis[0], turned_axes[0]),
-            v3.dot(by_axis[1], turned_axes[1]),
-            v3.dot(by_axis[2], turned_axes[2]),
-        )
-    ):
-        _put(gradients.scale_m, (index, k), gradient, adds)
-    to_turned = v3.transposed(
-        (
-            v3.scaled(by_axis[0], scale[0]),
-            v3.scaled(by_axis[1], scale[1]),
-            v3.scaled(by_axis[2], scale[2]),
-        )
-    )
-    unit = footprint.unit_wxyz
-    to_unit = v3.rotation_gradient(unit, to_turned)
-    along = to_unit[0] * unit[0] + to_unit[1] * unit[1] + to_unit[2] * unit[2]
-    along += to_unit[3] * unit[3]
-    by_length = 1.0 / footprint.wxyz_length
-    for k in range(4):
-        _put(gradients.rotation_wxyz, (index, k), (to_unit[k] - along * unit[k]) * by_length, adds)
-    return v3.product(to_axes, v3.transposed(footprint.from_axes))
-
-
-@numba.njit(**EXACT)
-def _store_colour(  # noqa: PLR0913 - a compiled loop body
-    gaussians: Gaussians,
-    index: int,
-    footprint: Footprint,
-    record: np.ndarray,
-    sums: np.ndarray,
-    weights: np.ndarray,
+    records: np.ndarray,
     gradients: Gradients,
     adds: bool,
 ) -> Vector:
     """Store the gradient of the coefficients; return that of the view direction, metres."""
-    mean = vector_of(gaussians.means, index)
+    places, weights = eight.rows.places, eight.weights
+    mean = vector_of(gaussians.means, eight.rows)
     offset = view_direction(mean, footprint.rotation, footprint.translation)
     direction, length = v3.direction_of(offset)
     coefficients = gaussians.sh.shape[1]
     spherical_harmonics.basis(coefficients, direction, weights)
     to_colour = (
-        sums[SUM_RED] if record[RED] > 0.0 else 0.0,
-        sums[SUM_RED + 1] if record[RED + 1] > 0.0 else 0.0,
-        sums[SUM_RED + 2] if record[RED + 2] > 0.0 else 0.0,
+        _colour_gradient(eight, visible, records, 0),
+        _colour_gradient(eight, visible, records, 1),
+        _colour_gradient(eight, visible, records, 2),
     )
     for k in range(coefficients):
-        weight = weights[k]
+        weight, to_weight = lanes_at(weights, k), in_all(0.0)
         for channel in range(3):
-            _put(gradients.sh, (index, k, channel), weight * to_colour[channel], adds)
-        weights[k] = v3.dot(vector_of(gaussians.sh[index], k), to_colour)
+            place = 3 * k + channel
+            found = choose(visible, weight * to_colour[channel], 0.0)
+            put(gradients.sh, places, 3 * coefficients, place, found, adds)
+            harmonic = pick(gaussians.sh, places, 3 * coefficients, place)
+            to_weight += harmonic * to_colour[channel]
+        set_lanes(weights, k, to_weight)
     to_direction = spherical_harmonics.direction_gradient(coefficients, direction, weights)
     return v3.direction_of_gradient(direction, length, to_direction)
 
 
 @numba.njit(**EXACT)
-def _store_transform(to_rotation: Matrix, to_translation: Vector, out: np.ndarray) -> None:
+def _add_transform(
+    to_rotation: Matrix,
+    to_translation: Vector,
+    eight: _Eight,
+    counted: bool,
+    of_one_body: bool,
+    out: np.ndarray,
+) -> None:
+    """Add to the gradients of the bodies' transforms, (bodies, 3, 4), what each Gaussian gives."""
     for row in range(3):
         for column in range(3):
-            out[row, column] += to_rotation[row][column]
-        out[row, 3] += to_translation[row]
+            found = choose(counted, to_rotation[row][column], 0.0)
+            set_lanes(eight.weights, 4 * row + column, found)
+        set_lanes(eight.weights, 4 * row + 3, choose(counted, to_translation[row], 0.0))
+    bodies = eight.rows.bodies
+    for number in range(12):
+        row, column = number // 4, number % 4
+        if of_one_body:
+            out[bodies[0], row, column] += total(lanes_at(eight.weights, number))
+        else:
+            for lane in range(EIGHT):
+                out[bodies[lane], row, column] += eight.weights[EIGHT * number + lane]
 
 
 @numba.njit(**EXACT)
-def _unproject_one(  # noqa: PLR0913 - a compiled loop body
+def _unproject_eight(  # noqa: PLR0913 - a compiled loop body
     gaussians: Gaussians,
-    index: int,
+    eight: _Eight,
+    count: int,
+    of_one_body: bool,
     view: View,
-    record: np.ndarray,
-    sums: np.ndarray,
-    weights: np.ndarray,
+    records: np.ndarray,
     gradients: Gradients,
-    run: int,
+    transforms: np.ndarray,
     adds: bool,
 ) -> None:
-    rotation, translation = transform_of(gaussians, index)
-    mean = vector_of(gaussians.means, index)
+    rows, places = eight.rows, eight.rows.places
+    visible = pick(records, places, RECORD_FLOATS, IS_VISIBLE) > 0.0
+    rotation, translation = transforms_of(gaussians.camera_from_body, rows, of_one_body)
+    mean = vector_of(gaussians.means, rows)
     point = v3.add(v3.apply(rotation, mean), translation)
-    footprint = footprint_of(gaussians, index, point, rotation, translation, view)
-    to_screen = _screen_gradient(sums, record)
-    absolute_x, absolute_y = record[ACROSS] * sums[SUM_ABS_X], sums[SUM_ABS_Y]
-    absolute = math.sqrt(absolute_x * absolute_x + absolute_y * absolute_y)
-    gradients.absolute[index] = 2.0 * absolute
-    _put(gradients.opacity, (index,), sums[SUM_G] / gaussians.opacity[index], adds)
-    to_covariance = _covariance_gradient(sums, footprint)
-    to_axes, to_point = _axes_gradient(footprint, to_covariance, view)
-    to_centre = _centre_gradient(footprint, to_screen, sums[SUM_DEPTH], view)
+    footprint = footprint_of(gaussians, rows, point, rotation, translation, view)
+    to_screen = _screen_gradient(eight, records)
+    across = pick(records, places, RECORD_FLOATS, ACROSS)
+    absolute_x, absolute_y = across * _sum_of(eight, SUM_ABS_X), _sum_of(eight, SUM_ABS_Y)
+    absolute = 2.0 * math.sqrt(absolute_x * absolute_x + absolute_y * absolute_y)
+    put(gradients.absolute, places, 1, 0, choose(visible, absolute, 0.0), False)
+    to_opacity = _sum_of(eight, SUM_G) / pick(gaussians.opacity, places, 1, 0)
+    put(gradients.opacity, places, 1, 0, choose(visible, to_opacity, 0.0), adds)
+    sum_uu, sum_uy = _sum_of(eight, SUM_GUU), _sum_of(eight, SUM_GUY)
+    to_covariance = covariance_gradient(footprint, sum_uu, sum_uy, _sum_of(eight, SUM_GYY))
+    to_axes, to_point = axes_gradient(footprint, to_covariance, view)
+    to_centre = centre_gradient(footprint, to_screen, _sum_of(eight, SUM_DEPTH), view)
     to_point = v3.add(to_point, to_centre)
-    to_rotation = _store_shape(gaussians, index, footprint, to_axes, gradients, adds)
-    to_direction = _store_colour(
-        gaussians, index, footprint, record, sums, weights, gradients, adds
-    )
+    scale = vector_of(gaussians.scale_m, rows)
+    to_scale, to_wxyz, to_rotation = shape_gradient(footprint, scale, to_axes)
+    for axis in range(3):
+        put(gradients.scale_m, places, 3, axis, choose(visible, to_scale[axis], 0.0), adds)
+    for k in range(4):
+        put(gradients.rotation_wxyz, places, 4, k, choose(visible, to_wxyz[k], 0.0), adds)
+    to_direction = _store_colour(gaussians, eight, visible, footprint, records, gradients, adds)
     to_mean = v3.add(v3.apply(v3.transposed(rotation), to_point), to_direction)
     for axis in range(3):
-        _put(gradients.means, (index, axis), to_mean[axis], adds)
+        put(gradients.means, places, 3, axis, choose(visible, to_mean[axis], 0.0), adds)
     # the direction is mean + rotation^T translation
     to_rotation = v3.added(to_rotation, v3.outer(to_point, mean))
     to_rotation = v3.added(to_rotation, v3.outer(translation, to_direction))
     to_translation = v3.add(to_point, v3.apply(rotation, to_direction))
-    body = gaussians.body_index[index]
-    _store_transform(to_rotation, to_translation, gradients.camera_from_body[run, body])
+    counted = visible & (lane_numbers() < count)
+    _add_transform(to_rotation, to_translation, eight, counted, of_one_body, transforms)
 
 
 @numba.njit(**EXACT)
-def _store_nothing(index: int, gradients: Gradients, adds: bool) -> None:
-    """Gradients of a Gaussian that the view does not see."""
-    gradients.absolute[index] = 0.0
-    if not adds:
-        gradients.means[index] = 0.0
-        gradients.rotation_wxyz[index] = 0.0
-        gradients.scale_m[index] = 0.0
-        gradients.opacity[index] = 0.0
-        gradients.sh[index] = 0.0
-        gradients.features[index] = 0.0
+def _sum_entries(
+    lists: TileLists,
+    slots: tuple[np.ndarray, np.ndarray],
+    eight: _Eight,
+    count: int,
+    records: np.ndarray,
+    gradients: Gradients,
+    adds: bool,
+) -> bool:
+    """Sum up the entries of eight Gaussians, store their features'; whether any is visible."""
+    is_any = False
+    for lane in range(EIGHT):
+        place = eight.rows.places[lane]
+        if records[place, IS_VISIBLE] > 0.0:
+            is_any = True
+            add_entries(lists, place, slots[0], slots[1], eight.sums[lane], eight.features)
+        else:
+            eight.features[:] = 0.0
+        if lane < count:
+            for k in range(len(eight.features)):
+                found = np.float32(eight.features[k])
+                before = gradients.features[place, k] if adds else np.float32(0.0)
+                gradients.features[place, k] = before + found
+    return is_any
+
+
+@numba.njit(**EXACT)
+def _store_nothing(rows: Rows, gradients: Gradients, adds: bool) -> None:
+    """Gradients of Gaussians that the view does not see."""
+    for place in rows.places:
+        gradients.absolute[place] = 0.0
+        if not adds:
+            gradients.means[place] = 0.0
+            gradients.rotation_wxyz[place] = 0.0
+            gradients.scale_m[place] = 0.0
+            gradients.opacity[place] = 0.0
+            gradients.sh[place] = 0.0
 
 
 @numba.njit(**EXACT)
@@ -279,21 +281,34 @@ def _unproject_run(  # noqa: PLR0913 - a compiled loop body
     run: int,
     adds: bool,
 ) -> None:
-    weights, sums = np.empty(16), np.empty(SUMS)
-    feature_sums = np.empty(slots[1].shape[1])
+    eight = _Eight(
+        Rows(np.empty(EIGHT, np.int64), np.empty(EIGHT, np.int64)),
+        np.arange(EIGHT),
+        np.zeros((EIGHT, SUMS)),
+        np.empty(slots[1].shape[1]),
+        np.empty(16 * EIGHT),
+    )
     count = len(records)
     first, end = run * count // CHUNKS, (run + 1) * count // CHUNKS
-    for index in range(first, end):
-        prefetch_entries(lists, min(index + AHEAD, end - 1), records, slots[0])
-        if records[index, IS_VISIBLE] > 0.0:
-            add_entries(lists, index, slots[0], slots[1], sums, feature_sums)
-            for k in range(len(feature_sums)):
-                _put(gradients.features, (index, k), feature_sums[k], adds)
-            _unproject_one(
-                gaussians, index, view, records[index], sums, weights, gradients, run, adds
+    for start in range(first, end, EIGHT):
+        of_one_body = rows_of(gaussians.body_index, start, end, eight.rows)
+        for ahead in range(start + EIGHT, min(start + 2 * EIGHT, end)):
+            prefetch_entries(lists, ahead, records, slots[0])
+        here = min(EIGHT, end - start)
+        if _sum_entries(lists, slots, eight, here, records, gradients, adds):
+            _unproject_eight(
+                gaussians,
+                eight,
+                here,
+                of_one_body,
+                view,
+                records,
+                gradients,
+                gradients.camera_from_body[run],
+                adds,
             )
         else:
-            _store_nothing(index, gradients, adds)
+            _store_nothing(eight.rows, gradients, adds)
 
 
 @compiled_entry

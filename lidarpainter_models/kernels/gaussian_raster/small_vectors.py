@@ -1,4 +1,4 @@
-"""Vectors of three and 3x3 matrices as tuples, for compiled code that works on one Gaussian.
+"""Vectors of three and 3x3 matrices as tuples of lanes, for compiled code on eight Gaussians.
 
 A matrix is a tuple of its rows. Tuples stay in registers; small arrays would go through memory.
 """
@@ -8,6 +8,7 @@ import math
 import numba
 
 from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT
+from lidarpainter_models.kernels.gaussian_raster.lane_types import largest
 
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
@@ -95,7 +96,7 @@ def rotation_gradient(wxyz: Quaternion, gradient: Matrix) -> Quaternion:
 @numba.njit(**EXACT)
 def direction_of(vector: Vector) -> tuple[Vector, float]:
     """Unit vector along `vector`, and the length it was divided by."""
-    length = max(math.sqrt(dot(vector, vector)), 1e-12)
+    length = largest(math.sqrt(dot(vector, vector)), 1e-12)
     return scaled(vector, 1.0 / length), length
 
 

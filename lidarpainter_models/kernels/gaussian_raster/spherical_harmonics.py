@@ -1,12 +1,14 @@
 """Colour of a Gaussian seen from one direction: real spherical harmonics up to degree 3.
 
-Order, signs and constants are those of Kerbl et al. (2023). Compiled code on one Gaussian.
+Order, signs and constants are those of Kerbl et al. (2023). Compiled code on eight Gaussians, whose
+weights stand in flat arrays (`gaussian_lanes.lanes_at`).
 """
 
 import numba
 import numpy as np
 
 from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT
+from lidarpainter_models.kernels.gaussian_raster.gaussian_lanes import in_all, lanes_at, set_lanes
 from lidarpainter_models.kernels.gaussian_raster.small_vectors import Vector
 
 BAND_0 = 0.28209479177387814
@@ -25,37 +27,45 @@ BAND_3 = (
 def basis(coefficients: int, direction: Vector, out: np.ndarray) -> None:
     """Fill `out` with the first `coefficients` basis values at a unit direction."""
     x, y, z = direction
-    out[0] = BAND_0
+    set_lanes(out, 0, BAND_0)
     if coefficients > 1:
-        out[1] = -BAND_1 * y
-        out[2] = BAND_1 * z
-        out[3] = -BAND_1 * x
+        set_lanes(out, 1, -BAND_1 * y)
+        set_lanes(out, 2, BAND_1 * z)
+        set_lanes(out, 3, -BAND_1 * x)
     if coefficients > 4:
-        out[4] = BAND_2[0] * x * y
-        out[5] = -BAND_2[0] * y * z
-        out[6] = BAND_2[1] * (2.0 * z * z - x * x - y * y)
-        out[7] = -BAND_2[0] * x * z
-        out[8] = BAND_2[2] * (x * x - y * y)
+        set_lanes(out, 4, BAND_2[0] * x * y)
+        set_lanes(out, 5, -BAND_2[0] * y * z)
+        set_lanes(out, 6, BAND_2[1] * (2.0 * z * z - x * x - y * y))
+        set_lanes(out, 7, -BAND_2[0] * x * z)
+        set_lanes(out, 8, BAND_2[2] * (x * x - y * y))
     if coefficients > 9:
-        out[9] = -BAND_3[0] * y * (3.0 * x * x - y * y)
-        out[10] = BAND_3[1] * x * y * z
-        out[11] = -BAND_3[2] * y * (4.0 * z * z - x * x - y * y)
-        out[12] = BAND_3[3] * z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y)
-        out[13] = -BAND_3[2] * x * (4.0 * z * z - x * x - y * y)
-        out[14] = BAND_3[4] * z * (x * x - y * y)
-        out[15] = -BAND_3[0] * x * (x * x - 3.0 * y * y)
+        set_lanes(out, 9, -BAND_3[0] * y * (3.0 * x * x - y * y))
+        set_lanes(out, 10, BAND_3[1] * x * y * z)
+        set_lanes(out, 11, -BAND_3[2] * y * (4.0 * z * z - x * x - y * y))
+        set_lanes(out, 12, BAND_3[3] * z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y))
+        set_lanes(out, 13, -BAND_3[2] * x * (4.0 * z * z - x * x - y * y))
+        set_lanes(out, 14, BAND_3[4] * z * (x * x - y * y))
+        set_lanes(out, 15, -BAND_3[0] * x * (x * x - 3.0 * y * y))
 
 
 @numba.njit(**EXACT)
 def direction_gradient(coefficients: int, direction: Vector, weight: np.ndarray) -> Vector:
     """Gradient of sum_k weight[k] basis[k] with respect to the direction."""
     x, y, z = direction
-    gx, gy, gz = 0.0, 0.0, 0.0
+    gx = gy = gz = in_all(0.0)
     if coefficients > 1:
-        gx, gy, gz = -BAND_1 * weight[3], -BAND_1 * weight[1], BAND_1 * weight[2]
+        gx, gy, gz = (
+            -BAND_1 * lanes_at(weight, 3),
+            -BAND_1 * lanes_at(weight, 1),
+            BAND_1 * lanes_at(weight, 2),
+        )
     if coefficients > 4:
-        w4, w5, w7 = BAND_2[0] * weight[4], -BAND_2[0] * weight[5], -BAND_2[0] * weight[7]
-        w6, w8 = 2.0 * BAND_2[1] * weight[6], 2.0 * BAND_2[2] * weight[8]
+        w4, w5, w7 = (
+            BAND_2[0] * lanes_at(weight, 4),
+            -BAND_2[0] * lanes_at(weight, 5),
+            -BAND_2[0] * lanes_at(weight, 7),
+        )
+        w6, w8 = 2.0 * BAND_2[1] * lanes_at(weight, 6), 2.0 * BAND_2[2] * lanes_at(weight, 8)
         gx += w4 * y - w6 * x + w7 * z + w8 * x
         gy += w4 * x + w5 * z - w6 * y - w8 * y
         gz += w5 * y + 2.0 * w6 * z + w7 * x
@@ -69,9 +79,17 @@ def direction_gradient(coefficients: int, direction: Vector, weight: np.ndarray)
 def _band_3_gradient(direction: Vector, weight: np.ndarray) -> Vector:
     x, y, z = direction
     xx, yy, zz = x * x, y * y, z * z
-    w9, w10, w11 = -BAND_3[0] * weight[9], BAND_3[1] * weight[10], -BAND_3[2] * weight[11]
-    w12, w13, w14 = BAND_3[3] * weight[12], -BAND_3[2] * weight[13], BAND_3[4] * weight[14]
-    w15 = -BAND_3[0] * weight[15]
+    w9, w10, w11 = (
+        -BAND_3[0] * lanes_at(weight, 9),
+        BAND_3[1] * lanes_at(weight, 10),
+        -BAND_3[2] * lanes_at(weight, 11),
+    )
+    w12, w13, w14 = (
+        BAND_3[3] * lanes_at(weight, 12),
+        -BAND_3[2] * lanes_at(weight, 13),
+        BAND_3[4] * lanes_at(weight, 14),
+    )
+    w15 = -BAND_3[0] * lanes_at(weight, 15)
     gx = w9 * 6.0 * x * y + w10 * y * z - w11 * 2.0 * x * y - w12 * 6.0 * x * z
     gx += w13 * (4.0 * zz - 3.0 * xx - yy) + w14 * 2.0 * x * z + w15 * 3.0 * (xx - yy)
     gy = w9 * 3.0 * (xx - yy) + w10 * x * z + w11 * (4.0 * zz - xx - 3.0 * yy)
