@@ -118,7 +118,15 @@ def stress(  # noqa: PLR0913 - the options of a command
     Example: lidarpainter stress synthetic/street-0001 --only beams,clock --out stress
     """
     from catalog.store import existing_store
-    from flows.measure.stress import PUBLISHED, WAYS, spoil_scenes, stress_of, trials_of
+    from flows.measure.stress import (
+        PUBLISHED,
+        SEEDS_IN_DOUBT,
+        WAYS,
+        in_doubt,
+        spoil_scenes,
+        stress_of,
+        trials_of,
+    )
     from flows.measure.sweep import foretold, was_asked
     from lidarpainter_models.stress.causes import CAUSES
 
@@ -136,6 +144,10 @@ def stress(  # noqa: PLR0913 - the options of a command
     spoil_scenes(store, trials)
     everything = sweep([*scenes, *(trial.spoilt for trial in trials)])
     points = _made(everything, workers=workers, accept_stale=accept_stale)
+    if doubted := in_doubt(points, trials):
+        _told(f"painting seems to harm {len(doubted)} recordings: {SEEDS_IN_DOUBT} seeds of them")
+        again = replace(sweep(doubted), seeds=tuple(range(SEEDS_IN_DOUBT)))
+        points = _made(again, workers=workers, accept_stale=accept_stale)
     _show(stress_of(points, trials, out), as_json=as_json)
 
 

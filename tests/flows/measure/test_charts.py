@@ -151,6 +151,24 @@ def test_stress_says_where_painting_hurts(tmp_path):
     assert all(Path(path).stat().st_size > 5_000 for path in result["pictures"])
 
 
+def test_levels_at_which_painting_seems_to_hurt_are_given_more_seeds():
+    from flows.measure.stress import SEEDS_IN_DOUBT, Trial, in_doubt
+
+    gains = {"8": -0.15, "4": -0.05, "1": -0.15}
+    seeds = {"8": 1, "4": 1, "1": SEEDS_IN_DOUBT}
+    trials = [
+        Trial(scene=SCENES[0], cause="beams", level=float(level), spoilt=f"stress/beams-{level}")
+        for level in gains
+    ]
+    points = [
+        point(f"stress/beams-{level}", way, seed, 25.0 + (gain if way == "painted" else 0.0), 100)
+        for level, gain in gains.items()
+        for way in ("painted", "unpainted")
+        for seed in range(seeds[level])
+    ]
+    assert in_doubt(points, trials) == ["stress/beams-8"]
+
+
 def test_stress_says_from_which_level_on_a_cause_is_noticed(tmp_path):
     from flows.measure.stress import Trial, stress_of
 
