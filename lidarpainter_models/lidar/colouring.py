@@ -52,6 +52,7 @@ GRID_RAD = 0.002  # angle of a cell of the grid on which occlusion is judged
 BEAM_SPACING_RAD = 0.004
 """Angle between neighbouring returns: the width of a disc that closes a surface."""
 SURFACE_WINDOW_S = 0.5  # points measured this near in time to an image hide others in it
+_SURFACE_AGE_NS = round(1.1e9 * SURFACE_WINDOW_S)  # a little more: ages are rounded
 GAP_RAD = 0.012  # gaps between scan lines up to this angle are closed to the background
 HIDDEN_TOLERANCE = 0.05  # a point is behind a surface when further by this share of its depth
 EDGE_RAD = 0.004  # nearer surface within this angle spoils a sample: errors of pose and calibration
@@ -96,6 +97,7 @@ class MapColouring:
         self._actor_ids = list(lidar_map.actors)
         actors = [Body(known[name], points) for name, points in lidar_map.actors.items()]
         self._bodies = [Body(None, lidar_map.street, most_age_ns), *actors]
+        self._surfaces = [Body(None, lidar_map.street, _SURFACE_AGE_NS), *actors]
         self._samples = BestSamples.none_yet(sum(len(body.points) for body in self._bodies))
         self._view_numbers = {view.key: number for number, view in enumerate(views)}
         self._placed = place_actors(views, tracks)
@@ -105,8 +107,8 @@ class MapColouring:
         view: RecordedView,
         image: UInt8[Tensor, "height width 3"],
         hidden: Bool[np.ndarray, "rows columns"] | None = None,
-    ) -> PointSamples | None:
-        """What the recorded image of one of the views gives, or None; none of hidden pixels.
+    ) -> PointSamples:
+        """What the recorded image of one of the views gives; nothing of hidden pixels.
 
         Nothing is changed, so that images may be looked at beside each other.
 
@@ -119,26 +121,27 @@ class MapColouring:
         image = _shrunk(image)
         camera = view.camera.resized(width_px=image.shape[1], height_px=image.shape[0])
         grid = CellGrid.over(camera, GRID_RAD)
-        inside = points_in_view(
-            self._bodies, camera, view.timestamp_ns, actors, grid, near_m=NEAR_M
-        )
-        if len(inside) == 0:
-            return None
-        visibility = _visibility(inside, grid.camera, actors)
-        inside = inside.keep(self._may_gain(inside, camera))
-        is_visible = visible_points(
-            inside.cells_uv, inside.depth_m, visibility, tolerance=HIDDEN_TOLERANCE
-        )
-        if hidden is not None:
-            size = torch.tensor([grid.camera.width_px, grid.camera.height_px])
-            column, row = (inside.cells_uv * torch.tensor(hidden.shape[::-1]) // size).unbind(-1)
-            is_visible &= ~torch.from_numpy(hidden)[row, column]
-        seen = inside.keep(is_visible.nonzero()[:, 0])
+        visibility = self._visibility(view, grid, camera)
+        pieces = [PointsInView.none()]
+        for inside in points_in_view(
+            self._bodies, camera, view.timestamp_ns, actors, near_m=NEAR_M
+        ):
+            asked = inside.keep(self._may_gain(inside, camera))
+            is_shown = _is_shown(asked, visibility, grid, hidden)
+            pieces.append(asked.keep(is_shown.nonzero()[:, 0]))
+        seen = PointsInView.joined(pieces)
         levels = ImageLevels(image, _footprint_px(seen, camera))
-        rgb, trust = rim_samples(levels, seen, visibility, grid.cells_per_pixel)
+        rgb, trust = rim_samples(levels, seen, visibility, grid)
         weight = _weight(trust, seen, camera)
         number = self._view_numbers[view.key]
         return PointSamples(number, seen.rows.numpy(), weight.numpy(), rgb.numpy())
+
+    def _visibility(self, view: RecordedView, grid: CellGrid, camera: Camera) -> Visibility:
+        """What stood before and around each cell when the image was taken."""
+        actors = self._placed[view.key]
+        near = points_in_view(self._surfaces, camera, view.timestamp_ns, actors, near_m=NEAR_M)
+        solid = [inside.keep(_is_solid(inside).nonzero()[:, 0]) for inside in near]
+        return _visibility(PointsInView.joined([PointsInView.none(), *solid]), grid, actors)
 
     def _may_gain(self, inside: PointsInView, camera: Camera) -> Int[Tensor, " points"]:
         """Of the points in an image, those that have no better samples from others already.
@@ -159,7 +162,7 @@ class MapColouring:
     def add_recorded(self, scene: DrivingScene, views: Sequence[RecordedView]) -> None:
         """Take samples from the images of some of the views."""
 
-        def seen(view: RecordedView) -> PointSamples | None:
+        def seen(view: RecordedView) -> PointSamples:
             return self.seen_in(view, scene.read_image(view))
 
         for samples in side_by_side(seen, views):
@@ -202,17 +205,37 @@ def _weight(
     return weight * _footprint_px(points, camera).clamp(max=_FINE_ENOUGH_PX) ** 2
 
 
-def _visibility(inside: PointsInView, cells: Camera, actors: PlacedActors) -> Visibility:
-    """What stood before and around each cell when the image was taken."""
-    is_solid = inside.is_actor | (inside.age_s <= SURFACE_WINDOW_S)
-    solid = inside.keep(is_solid.nonzero()[:, 0])
+def _is_solid(points: PointsInView) -> Bool[Tensor, " points"]:
+    """Which points hide others: where the street was a while ago something else may be by now."""
+    return points.is_actor | (points.age_s <= SURFACE_WINDOW_S)
+
+
+def _is_shown(
+    points: PointsInView,
+    visibility: Visibility,
+    grid: CellGrid,
+    hidden: Bool[np.ndarray, "rows columns"] | None,
+) -> Bool[Tensor, " points"]:
+    """Whether nothing known stands before each point, the recording car's own body neither."""
+    cells_uv = grid.cells_of(points.pixels_uv)
+    is_shown = visible_points(cells_uv, points.depth_m, visibility, tolerance=HIDDEN_TOLERANCE)
+    if hidden is not None:
+        size = torch.tensor([grid.camera.width_px, grid.camera.height_px])
+        column, row = (cells_uv * torch.tensor(hidden.shape[::-1]) // size).unbind(-1)
+        is_shown &= ~torch.from_numpy(hidden)[row, column]
+    return is_shown
+
+
+def _visibility(solid: PointsInView, grid: CellGrid, actors: PlacedActors) -> Visibility:
+    """What these points and boxes let each cell show."""
+    cells = grid.camera
     footprint_px = solid.range_m * BEAM_SPACING_RAD * cells.fx_px / solid.depth_m
     boxes = [
         (world_from_box, track.size_m * _solid_share(track))
         for track, world_from_box in actors.values()
     ]
     return surface_visibility(
-        solid.cells_uv,
+        grid.cells_of(solid.pixels_uv),
         solid.depth_m,
         (footprint_px / 2).round().long().clamp(max=2),
         cells,

@@ -4,7 +4,7 @@ The street stands in the world; an actor's points stand where its box is at the 
 camera z in metres. The grid is coarse: its cells follow an angle, not the pixels of the image.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 
@@ -23,6 +23,9 @@ from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses
 MOST_AGE_NS = 3_000_000_000
 """Images further in time from a point of the street than this are not asked for its colour: where a
 nearer one shows it, it counts for less than half a percent beside that."""
+POINTS_AT_ONCE = 1 << 16
+"""Points of the map that are looked at before those that matter of them are kept: all that an image
+of a long log holds are many times as many."""
 
 PlacedActors = Mapping[str, tuple[ActorTrack, Float[Tensor, "4 4"]]]
 """The tracks present at one time by actor id, with `world_from_box` then."""
@@ -91,13 +94,11 @@ class CellGrid:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PointsInView:
-    """Points of all bodies that fall into an image."""
+    """Points of bodies that fall into an image."""
 
     rows: Int[Tensor, " points"]
     """Position among the points of all bodies."""
     pixels_uv: Float[Tensor, "points 2"]
-    cells_uv: Int[Tensor, "points 2"]
-    """Column and row on the grid."""
     depth_m: Float[Tensor, " points"]
     range_m: Float[Tensor, " points"]
     """From the LiDAR that measured the point."""
@@ -111,6 +112,28 @@ class PointsInView:
     def keep(self, kept: Tensor) -> "PointsInView":
         """The points listed."""
         return PointsInView(**{part.name: getattr(self, part.name)[kept] for part in fields(self)})
+
+    @classmethod
+    def none(cls) -> "PointsInView":
+        """No points."""
+        return cls(
+            rows=torch.zeros(0, dtype=torch.int64),
+            pixels_uv=torch.zeros(0, 2),
+            depth_m=torch.zeros(0),
+            range_m=torch.zeros(0),
+            age_s=torch.zeros(0),
+            is_actor=torch.zeros(0, dtype=torch.bool),
+        )
+
+    @classmethod
+    def joined(cls, pieces: Sequence["PointsInView"]) -> "PointsInView":
+        """All points of at least one piece, in their order."""
+        return cls(
+            **{
+                part.name: torch.cat([getattr(piece, part.name) for piece in pieces])
+                for part in fields(cls)
+            }
+        )
 
 
 def place_actors(
@@ -134,16 +157,15 @@ def points_in_view(
     camera: Camera,
     timestamp_ns: int,
     actors: PlacedActors,
-    grid: CellGrid,
     *,
     near_m: float,
-) -> PointsInView:
+) -> Iterator[PointsInView]:
     """Where the points of all bodies stand in an image taken at a time; absent actors have none.
 
-    Those measured long before or after it are left out. The street stands where a rolling shutter
+    They come a piece after the other, in their order, so that nobody need hold them all. Those
+    measured long before or after the image are left out. The street stands where a rolling shutter
     reads it, actors where they are in the middle.
     """
-    parts = []
     first_rows = np.cumsum([0, *(len(body.points) for body in bodies)]).tolist()
     for first_row, body in zip(first_rows, bodies, strict=False):
         camera_from_points = camera.camera_from_world
@@ -151,47 +173,45 @@ def points_in_view(
             if body.track.actor_id not in actors:
                 continue
             camera_from_points = camera_from_points @ actors[body.track.actor_id][1]
+        pixels_from_points = _lens(camera) @ camera_from_points[:3]
         for stretch in body.stretches_about(timestamp_ns):
-            part = _in_image(body, stretch, camera_from_points, camera, near_m)
-            parts.append({**part, "rows": part["rows"] + first_row})
-    if not parts:  # no sweep is near in time
-        parts.append(_in_image(bodies[0], slice(0), camera.camera_from_world, camera, near_m))
-    columns = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-    age_ns = (columns.pop("timestamp_ns") - timestamp_ns).abs()
-    return PointsInView(
-        **columns, cells_uv=grid.cells_of(columns["pixels_uv"]), age_s=age_ns.float() * 1e-9
+            for start in range(stretch.start, stretch.stop, POINTS_AT_ONCE):
+                piece = slice(start, min(start + POINTS_AT_ONCE, stretch.stop))
+                rows, pixels_uv, depth_m = _in_image(
+                    body, piece, pixels_from_points, camera, near_m
+                )
+                age_ns = (body.points.timestamp_ns[rows] - timestamp_ns).abs()
+                yield PointsInView(
+                    rows=rows + first_row,
+                    pixels_uv=pixels_uv,
+                    depth_m=depth_m,
+                    range_m=body.points.range_m[rows],
+                    age_s=age_ns.float() * 1e-9,
+                    is_actor=torch.full(rows.shape, body.track is not None),
+                )
+
+
+def _lens(camera: Camera) -> Float[Tensor, "3 3"]:
+    return torch.tensor(
+        [[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]],
+        dtype=torch.float64,
     )
 
 
 def _in_image(
     body: Body,
-    stretch: slice,
-    camera_from_points: Float[Tensor, "4 4"],
+    piece: slice,
+    pixels_from_points: Float[Tensor, "3 4"],
     camera: Camera,
     near_m: float,
-) -> dict[str, Tensor]:
-    """What of a stretch of a body's points falls into an image; rows are the body's."""
-    lens = torch.tensor(
-        [[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]],
-        dtype=torch.float64,
-    )
+) -> tuple[Int[Tensor, " rows"], Float[Tensor, "rows 2"], Float[Tensor, " rows"]]:
+    """What of a piece of a body falls into an image: its rows in the body, pixels and depth."""
     inside, pixels_uv, depth_m = project_inside(
-        body.points.xyz_m[stretch],
-        lens @ camera_from_points[:3],
-        camera.width_px,
-        camera.height_px,
-        near_m,
+        body.points.xyz_m[piece], pixels_from_points, camera.width_px, camera.height_px, near_m
     )
-    rows = inside + (stretch.start or 0)
+    rows = inside + piece.start
     if body.track is None and camera.shutter is not None and camera.shutter.is_rolling:
         read_uv, _ = camera.project(body.points.xyz_m[rows].double())
         size = torch.tensor([camera.width_px, camera.height_px]) - 1e-3
         pixels_uv = read_uv.clamp(torch.zeros(2), size).to(pixels_uv)
-    return {
-        "rows": rows,
-        "pixels_uv": pixels_uv,
-        "depth_m": depth_m,
-        "range_m": body.points.range_m[rows],
-        "timestamp_ns": body.points.timestamp_ns[rows],
-        "is_actor": torch.full(rows.shape, body.track is not None),
-    }
+    return rows, pixels_uv, depth_m

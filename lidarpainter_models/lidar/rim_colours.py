@@ -7,7 +7,7 @@ from torch import Tensor
 
 from lidarpainter_models.kernels.colour_sampling import sample_levels, steps_inside
 from lidarpainter_models.lidar.point_visibility import Visibility
-from lidarpainter_models.lidar.points_in_view import PointsInView
+from lidarpainter_models.lidar.points_in_view import CellGrid, PointsInView
 
 EDGE_TOLERANCE = 0.15  # a neighbour nearer or further by this share of the depth makes an edge
 BEHIND_EDGE_WEIGHT = 0.2  # weight of a sample beside a nearer surface
@@ -46,18 +46,18 @@ def rim_samples(
     levels: ImageLevels,
     points: PointsInView,
     visibility: Visibility,
-    cells_per_pixel: Float[Tensor, "2"],
+    grid: CellGrid,
 ) -> tuple[UInt8[Tensor, "points 3"], Float[Tensor, " points"]]:
     """Colours of visible points, and how far the place of each is to be trusted.
 
     On the rim of a surface a small error of pose takes the colour of what is beside it. Where the
     colour there is more like that beyond the rim than like that of the nearest inner cell, the
-    inner one is taken. `points` are those that nothing hides; `cells_per_pixel` is of the grid, in
-    u and v.
+    inner one is taken. `points` are those that nothing hides; `grid` is that of the visibility.
     """
     rgb = levels.sample(points.pixels_uv)
     trust = torch.ones_like(points.depth_m)
-    column, row = points.cells_uv.unbind(-1)
+    cells_uv = grid.cells_of(points.pixels_uv)
+    column, row = cells_uv.unbind(-1)
     nearest_m, furthest_m = visibility.nearest_m[row, column], visibility.furthest_m[row, column]
     is_behind = nearest_m < points.depth_m * (1 - EDGE_TOLERANCE)
     is_before = furthest_m > points.depth_m * (1 + EDGE_TOLERANCE)
@@ -67,14 +67,14 @@ def rim_samples(
     steps, has_inner = map(
         torch.from_numpy,
         steps_inside(
-            points.cells_uv[on_rim].numpy(),
+            cells_uv[on_rim].numpy(),
             points.depth_m[on_rim].numpy(),
             visibility.inner_m.numpy(),
             INNER_REACH,
             EDGE_TOLERANCE,
         ),
     )
-    moved, steps_px = on_rim[has_inner], steps[has_inner] / cells_per_pixel
+    moved, steps_px = on_rim[has_inner], steps[has_inner] / grid.cells_per_pixel
     own = rgb[moved].float()
     inner = levels.sample(points.pixels_uv[moved] + steps_px, moved)
     beyond = levels.sample(points.pixels_uv[moved] - steps_px, moved)

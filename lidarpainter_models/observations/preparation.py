@@ -55,6 +55,18 @@ def prepare_observations(
     """
     if not split.train:
         raise SceneError(f"the split of {scene.dataset}/{scene.sequence} has no training views")
+    observations = _prepared(scene, split, config, progress)
+    return_freed_memory()  # images, and samples of colours nine times as large as the colours
+    return observations
+
+
+def _prepared(
+    scene: DrivingScene,
+    split: ViewSplit,
+    config: ObservationConfig,
+    progress: Callable[[int, int], None],
+) -> SceneObservations:
+    """`prepare_observations` of a split that has training views."""
     faults = find_faults(scene, split.train) if config.corrects_cameras else {}
     taken = [_as_taken(view, faults) for view in split.train]
     bodies = own_bodies(scene, taken)

@@ -80,7 +80,7 @@ def normals_row(xyz_m):
 
 def voxels_row(xyz_m):
     points, count = torch.from_numpy(xyz_m), len(xyz_m)
-    grey, known = torch.zeros(count, 3), torch.zeros(count, dtype=torch.bool)
+    grey, known = torch.zeros(count, 3, dtype=torch.uint8), torch.zeros(count, dtype=torch.bool)
     sizes = torch.full((count,), VOXEL_M)
     first, ours_s = timed(lambda: mean_by_voxel(points, grey, known, sizes))
     low = np.floor(xyz_m.min(axis=0) / VOXEL_M) * VOXEL_M

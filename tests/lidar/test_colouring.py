@@ -6,7 +6,7 @@ import torch
 from toy_street import BLUE, CAR_X_M, GREEN, GROUND, RED, WALL_X_M, ToyStreet
 
 from lidarpainter_models.kernels.colour_sampling import BestSamples
-from lidarpainter_models.lidar import map_building
+from lidarpainter_models.lidar import map_building, points_in_view
 from lidarpainter_models.lidar.colouring import MapColouring
 from lidarpainter_models.lidar.exposure_matching import match_exposure
 from lidarpainter_models.lidar.lidar_map import MapPoints
@@ -76,6 +76,19 @@ def test_points_that_have_better_samples_are_not_asked_again(monkeypatch):
     assert torch.equal(found.street.rgb_u8, of_all.street.rgb_u8)
     assert torch.equal(found.street.has_colour, of_all.street.has_colour)
     assert sum(few for few, _ in asked) < 0.9 * sum(every for _, every in asked)
+
+
+def test_pieces_of_the_map_change_no_bit(coloured, monkeypatch):
+    monkeypatch.setattr(points_in_view, "POINTS_AT_ONCE", 1000)
+    street = ToyStreet()
+    pieces = build_lidar_map(street, split_frames=FRAMES, colour_views=street.views)
+    assert len(pieces.street) > 3000
+    for ours, whole in (
+        (pieces.street, coloured.street),
+        (pieces.actors["car"], coloured.actors["car"]),
+    ):
+        assert torch.equal(ours.rgb_u8, whole.rgb_u8)
+        assert torch.equal(ours.has_colour, whole.has_colour)
 
 
 @pytest.mark.parametrize("way", [-1, 1])

@@ -9,8 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
+
+POINTS_AT_ONCE = 1 << 18
+"""Points that are copied to float64 at a time: copies of all take more than the points."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,10 +42,14 @@ def voxel_keys(
 
     Collisions of the 63-bit mix are possible and harmless: two far voxels would share a mean.
     """
-    cell = torch.floor(xyz_m.double() / size_m.double()[:, None]).long()
-    level = torch.round(torch.log2(size_m.double()) * 8).long()
-    key = (cell[:, 0] * 73_856_093) ^ (cell[:, 1] * 19_349_669_117) ^ (cell[:, 2] * 83_492_791_363)
-    return key ^ (level * 2_654_435_761_123)
+    keys = torch.empty(len(xyz_m), dtype=torch.int64)
+    parts = (column.split(POINTS_AT_ONCE) for column in (keys, xyz_m, size_m))
+    for key, xyz, size in zip(*parts, strict=True):
+        cell = torch.floor(xyz.double() / size.double()[:, None]).long()
+        level = torch.round(torch.log2(size.double()) * 8).long()
+        key.copy_((cell[:, 0] * 73_856_093) ^ (cell[:, 1] * 19_349_669_117))
+        key ^= (cell[:, 2] * 83_492_791_363) ^ (level * 2_654_435_761_123)
+    return keys
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,8 +57,7 @@ class Cloud:
     """Points of one body, to be thinned out."""
 
     xyz_m: Float[Tensor, "points 3"]
-    rgb: Float[Tensor, "points 3"]
-    """In [0, 1]."""
+    rgb_u8: UInt8[Tensor, "points 3"]
     has_colour: Bool[Tensor, " points"]
     """Which of the colours mean anything."""
     spacing_m: Float[Tensor, " points"]
@@ -75,9 +81,10 @@ def adaptive_voxels(
     """
 
     def count(factor: float) -> int:
-        sizes = [cloud.sizes(factor, most_m=most_m) for cloud in clouds]
-        keys = [voxel_keys(cloud.xyz_m, size) for cloud, size in zip(clouds, sizes, strict=True)]
-        return sum(torch.unique(key).numel() for key in keys)
+        return sum(
+            _num_unique(voxel_keys(cloud.xyz_m, cloud.sizes(factor, most_m=most_m)))
+            for cloud in clouds
+        )
 
     low, high = 0.25, 1024.0
     best = low
@@ -87,11 +94,17 @@ def adaptive_voxels(
             low, high = (low, middle) if count(middle) <= budget else (middle, high)
         best = high
     voxels = [
-        mean_by_voxel(cloud.xyz_m, cloud.rgb, cloud.has_colour, cloud.sizes(best, most_m=most_m))
+        mean_by_voxel(cloud.xyz_m, cloud.rgb_u8, cloud.has_colour, cloud.sizes(best, most_m=most_m))
         for cloud in clouds
     ]
     share = budget / max(sum(part.size_m.numel() for part in voxels), 1)
     return voxels if share >= 1 else [_evenly_chosen(part, share) for part in voxels]
+
+
+def _num_unique(keys: Int[Tensor, " points"]) -> int:
+    """How many different keys there are; sorts them in place, as `torch.unique` would a copy."""
+    keys.numpy().sort()
+    return int((keys[1:] != keys[:-1]).sum()) + min(len(keys), 1)
 
 
 def _evenly_chosen(voxels: VoxelPoints, share: float) -> VoxelPoints:
@@ -105,7 +118,7 @@ def _evenly_chosen(voxels: VoxelPoints, share: float) -> VoxelPoints:
 
 def mean_by_voxel(
     xyz_m: Float[Tensor, "points 3"],
-    rgb: Float[Tensor, "points 3"],
+    rgb_u8: UInt8[Tensor, "points 3"],
     has_colour: Bool[Tensor, " points"],
     size_m: Float[Tensor, " points"],
 ) -> VoxelPoints:
@@ -114,9 +127,11 @@ def mean_by_voxel(
     count = torch.bincount(voxel, minlength=unique.numel())
     coloured = torch.bincount(voxel[has_colour], minlength=unique.numel())
     xyz = torch.zeros(unique.numel(), 3, dtype=torch.float64)
-    xyz.index_add_(0, voxel, xyz_m.double())
     colour = torch.zeros(unique.numel(), 3, dtype=torch.float64)
-    colour.index_add_(0, voxel[has_colour], rgb[has_colour].double())
+    columns = (voxel, xyz_m, rgb_u8, has_colour)
+    for own, place, seen, has in zip(*(c.split(POINTS_AT_ONCE) for c in columns), strict=True):
+        xyz.index_add_(0, own, place.double())
+        colour.index_add_(0, own[has], (seen[has].float() / 255).double())
     edge = torch.zeros(unique.numel()).scatter_reduce(0, voxel, size_m, reduce="amax")
     return VoxelPoints(
         xyz_m=(xyz / count[:, None]).float(),

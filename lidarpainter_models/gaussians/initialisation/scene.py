@@ -90,9 +90,8 @@ def initialise_scene(
         raise ConfigError("the start needs num_gaussians, which `planned_fit` takes from the views")
     views = observations.views
     for_unreached = int(config.num_gaussians * MOST_SHARE)
-    gaussians = _on_surfaces(
-        observations, config, max(config.num_gaussians - for_unreached, 1), progress
-    )
+    on_surfaces = max(config.num_gaussians - for_unreached, 1)
+    gaussians = _on_surfaces(observations, config, on_surfaces, progress)
     if len(gaussians) == 0:
         raise ConfigError("no LiDAR point lies where a training camera could see it")
     progress(0.5)
@@ -248,25 +247,14 @@ def _on_surfaces(
     progress: Callable[[float], None],
 ) -> GaussianSet:
     """Surfels where images show LiDAR surfaces, and some where only a moved camera would."""
-    street = observations.lidar_map.street
-    street = _spread(street, min(MOST_STREET_POINTS, POINTS_PER_GAUSSIAN * budget))
-    cameras, images = _spread_cameras(observations.views)
-    footprint, density = pixel_footprint(street.xyz_m, cameras, images)
-    density *= math.sqrt(len(observations.views) / sum(images))
-    in_image = density > 0
-    is_aside = ~in_image & footprint.isfinite()
     for_aside = int(budget * UNSEEN_SHARE)
-    least_m = config.street_voxel_m
-    (aside,) = adaptive_voxels([_cloud(street, footprint, is_aside, least_m)], budget=for_aside)
-    # no image will ever shrink a lone blob there, and beside the lane it is large in the view
-    aside = aside.keep(aside.num_points >= LEAST_UNSEEN_POINTS)
+    street, aside = _street(observations, config, budget, for_aside)
     progress(0.25)
-    clouds = {0: _cloud(street, density**-0.5, in_image, least_m)}
+    clouds = {0: street}
     for index, track in enumerate(observations.tracks, start=1):
-        points = observations.lidar_map.actors.get(track.actor_id)
-        if points is None:
+        if track.actor_id not in observations.lidar_map.actors:
             continue
-        points = _spread(points, MOST_ACTOR_POINTS)
+        points = _spread(observations.lidar_map.actors[track.actor_id], MOST_ACTOR_POINTS)
         spacing_m = _actor_spacing(points, track, observations.views)
         in_sight = spacing_m.isfinite()
         if int(in_sight.sum()) >= LEAST_ACTOR_POINTS:
@@ -279,6 +267,22 @@ def _on_surfaces(
     for body, voxels in zip(list(clouds)[1:], seen[1:], strict=True):
         gaussians = gaussians.append(_surfels([voxels], [2.0], config, body=body))
     return gaussians
+
+
+def _street(
+    observations: SceneObservations, config: InitialisationConfig, budget: int, for_aside: int
+) -> tuple[Cloud, VoxelPoints]:
+    """Points that images show, and voxels of those that only a moved camera would."""
+    street = observations.lidar_map.street
+    street = _spread(street, min(MOST_STREET_POINTS, POINTS_PER_GAUSSIAN * budget))
+    cameras, images = _spread_cameras(observations.views)
+    footprint, density = pixel_footprint(street.xyz_m, cameras, images)
+    density *= math.sqrt(len(observations.views) / sum(images))
+    is_aside, least_m = (density == 0) & footprint.isfinite(), config.street_voxel_m
+    (aside,) = adaptive_voxels([_cloud(street, footprint, is_aside, least_m)], budget=for_aside)
+    # no image will ever shrink a lone blob there, and beside the lane it is large in the view
+    aside = aside.keep(aside.num_points >= LEAST_UNSEEN_POINTS)
+    return _cloud(street, density**-0.5, density > 0, least_m), aside
 
 
 def _spread(points: MapPoints, most: int) -> MapPoints:
@@ -295,7 +299,7 @@ def _cloud(
     """The chosen points, to be thinned out."""
     return Cloud(
         xyz_m=points.xyz_m[chosen],
-        rgb=points.rgb_u8[chosen].float() / 255,
+        rgb_u8=points.rgb_u8[chosen],
         has_colour=points.has_colour[chosen],
         spacing_m=spacing_m[chosen],
         least_m=least_m,

@@ -1,4 +1,4 @@
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -13,10 +13,12 @@ from gaussian_world import (
 )
 
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.gaussians.initialisation import adaptive_voxels as thinning
 from lidarpainter_models.gaussians.initialisation.adaptive_voxels import (
     Cloud,
     adaptive_voxels,
     mean_by_voxel,
+    voxel_keys,
 )
 from lidarpainter_models.gaussians.initialisation.scene import (
     _spread_cameras,
@@ -43,20 +45,34 @@ def plane(count=400, seed=0):
 
 def test_points_of_one_voxel_become_their_mean():
     xyz_m = torch.tensor([[0.01, 0.0, 0.0], [0.03, 0.0, 0.0], [0.15, 0.0, 0.0]])
-    rgb = torch.tensor([[1.0, 0, 0], [0.0, 1.0, 0], [0, 0, 1.0]])
+    rgb_u8 = torch.tensor([[255, 0, 0], [0, 255, 0], [0, 0, 255]], dtype=torch.uint8)
     has_colour = torch.tensor([True, False, True])
-    voxels = mean_by_voxel(xyz_m, rgb, has_colour, torch.full((3,), 0.1))
+    voxels = mean_by_voxel(xyz_m, rgb_u8, has_colour, torch.full((3,), 0.1))
     order = voxels.xyz_m[:, 0].argsort()
     assert torch.allclose(voxels.xyz_m[order][:, 0], torch.tensor([0.02, 0.15]))
     assert torch.allclose(voxels.rgb[order], torch.tensor([[1.0, 0, 0], [0, 0, 1.0]]))
     assert voxels.num_points[order].tolist() == [2, 1]
 
 
+@pytest.mark.parametrize("count", [0, 1, 50])
+def test_pieces_of_a_cloud_change_no_bit(count, monkeypatch):
+    cloud = cloud_of(plane(count), 0.3)
+    sizes = cloud.sizes(1.0, most_m=2.0)
+
+    def found():
+        voxels = mean_by_voxel(cloud.xyz_m, cloud.rgb_u8, cloud.has_colour, sizes)
+        return [voxel_keys(cloud.xyz_m, sizes), *(getattr(voxels, f.name) for f in fields(voxels))]
+
+    whole = found()
+    monkeypatch.setattr(thinning, "POINTS_AT_ONCE", 7)
+    assert all(map(torch.equal, found(), whole))
+
+
 def cloud_of(xyz_m, spacing_m):
     count = len(xyz_m)
     return Cloud(
         xyz_m=xyz_m,
-        rgb=torch.rand(count, 3),
+        rgb_u8=torch.randint(256, (count, 3), dtype=torch.uint8),
         has_colour=torch.ones(count, dtype=torch.bool),
         spacing_m=torch.as_tensor(spacing_m).expand(count),
     )
