@@ -4,8 +4,9 @@ The street stands in the world; an actor's points stand where its box is at the 
 camera z in metres. The grid is coarse: its cells follow an angle, not the pixels of the image.
 """
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -26,6 +27,10 @@ nearer one shows it, it counts for less than half a percent beside that."""
 POINTS_AT_ONCE = 1 << 16
 """Points of the map that are looked at before those that matter of them are kept: all that an image
 of a long log holds are many times as many."""
+
+READ_MARGIN = 0.25
+"""How far beside a rolling shutter's image, in parts of its size, what stands may be and yet be
+read in it: at 30 m/s and 30 ms all that is 1 m before the camera or further."""
 
 PlacedActors = Mapping[str, tuple[ActorTrack, Float[Tensor, "4 4"]]]
 """The tracks present at one time by actor id, with `world_from_box` then."""
@@ -173,12 +178,11 @@ def points_in_view(
             if body.track.actor_id not in actors:
                 continue
             camera_from_points = camera_from_points @ actors[body.track.actor_id][1]
-        pixels_from_points = _lens(camera) @ camera_from_points[:3]
         for stretch in body.stretches_about(timestamp_ns):
             for start in range(stretch.start, stretch.stop, POINTS_AT_ONCE):
                 piece = slice(start, min(start + POINTS_AT_ONCE, stretch.stop))
                 rows, pixels_uv, depth_m = _in_image(
-                    body, piece, pixels_from_points, camera, near_m
+                    body, piece, camera_from_points, camera, near_m
                 )
                 age_ns = (body.points.timestamp_ns[rows] - timestamp_ns).abs()
                 yield PointsInView(
@@ -191,27 +195,43 @@ def points_in_view(
                 )
 
 
-def _lens(camera: Camera) -> Float[Tensor, "3 3"]:
-    return torch.tensor(
-        [[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]],
-        dtype=torch.float64,
-    )
-
-
 def _in_image(
     body: Body,
     piece: slice,
-    pixels_from_points: Float[Tensor, "3 4"],
+    camera_from_points: Float[Tensor, "4 4"],
     camera: Camera,
     near_m: float,
 ) -> tuple[Int[Tensor, " rows"], Float[Tensor, "rows 2"], Float[Tensor, " rows"]]:
     """What of a piece of a body falls into an image: its rows in the body, pixels and depth."""
+    rolls = body.track is None and camera.shutter is not None and camera.shutter.is_rolling
+    window = _with_margin(camera, READ_MARGIN) if rolls else camera
+    lens = torch.tensor(
+        [[window.fx_px, 0, window.cx_px], [0, window.fy_px, window.cy_px], [0, 0, 1]],
+        dtype=torch.float64,
+    )
     inside, pixels_uv, depth_m = project_inside(
-        body.points.xyz_m[piece], pixels_from_points, camera.width_px, camera.height_px, near_m
+        body.points.xyz_m[piece],
+        lens @ camera_from_points[:3],
+        window.width_px,
+        window.height_px,
+        near_m,
     )
     rows = inside + piece.start
-    if body.track is None and camera.shutter is not None and camera.shutter.is_rolling:
-        read_uv, _ = camera.project(body.points.xyz_m[rows].double())
-        size = torch.tensor([camera.width_px, camera.height_px]) - 1e-3
-        pixels_uv = read_uv.clamp(torch.zeros(2), size).to(pixels_uv)
+    if rolls:
+        read_uv, read_m = camera.project(body.points.xyz_m[rows].double())
+        read_uv, read_m = read_uv.to(pixels_uv), read_m.to(depth_m)
+        is_read = camera.contains(read_uv, read_m, near_m=near_m)
+        rows, pixels_uv, depth_m = rows[is_read], read_uv[is_read], read_m[is_read]
     return rows, pixels_uv, depth_m
+
+
+def _with_margin(camera: Camera, share: float) -> Camera:
+    """The same view with so many parts of its size more on each side."""
+    aside_px, above_px = (math.ceil(share * size) for size in (camera.width_px, camera.height_px))
+    return replace(
+        camera,
+        cx_px=camera.cx_px + aside_px,
+        cy_px=camera.cy_px + above_px,
+        width_px=camera.width_px + 2 * aside_px,
+        height_px=camera.height_px + 2 * above_px,
+    )

@@ -20,9 +20,9 @@ class FittedStreet:
         self.scene = fit_gaussians(seen, config).scene
         self.held_out = HeldOut(scene=recording, test_views=split.test, observation=size)
 
-    def shown(self):
-        """Camera, truth and render of every held-out view."""
-        for view in self.held_out.recorded_views(self.scene, "interpolated"):
+    def shown(self, held_out=None):
+        """Camera, truth and render of every held-out view, its own or those of a twin."""
+        for view in (held_out or self.held_out).recorded_views(self.scene, "interpolated"):
             name = view.name.partition("/")[0]
             image = self.scene.render(view.camera, view.timestamp_ns, camera_name=name).rgb
             yield name, view, image.clamp(0, 1)
