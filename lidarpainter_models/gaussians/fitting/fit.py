@@ -19,7 +19,7 @@ from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.densification import densify, prune
-from lidarpainter_models.gaussians.fitting.images import FitImage, full_image, half_image
+from lidarpainter_models.gaussians.fitting.images import FitImage, fit_images
 from lidarpainter_models.gaussians.fitting.lamp_search import with_lamps_found
 from lidarpainter_models.gaussians.fitting.memory import planned_memory, within_limit
 from lidarpainter_models.gaussians.fitting.seen_surface import (
@@ -36,7 +36,7 @@ from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import Perceptual, fit_step
 from lidarpainter_models.gaussians.initialisation.scene import initialise_scene
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.gaussians.model.sky import seen_as_sky, sky_layout
+from lidarpainter_models.gaussians.model.sky import sky_layout
 from lidarpainter_models.gaussians.model.stored_scene import copy_scene
 from lidarpainter_models.observations.views import GuidanceView, SceneObservations
 
@@ -181,7 +181,8 @@ def _steps(  # noqa: PLR0913 - as `fit_gaussians`
             "most_gaussians": float(config.densification.budget),
         }
         told.progress(state.step, config.steps, sizes)
-    full, half = _images(observations, state.scene, config)
+    half_too = config.half_resolution > 0
+    full, half = fit_images(observations.views, state.scene.sky.layout, half_too=half_too)
     if keeps_images:
         device = state.scene.device
         full, half = ([image.to(device) for image in images] for images in (full, half))
@@ -216,17 +217,6 @@ def _first_scene(
 
     return_freed_memory()  # of what prepared the observations
     return initialise_scene(observations, config.initialisation, progress=told)
-
-
-def _images(
-    observations: SceneObservations, scene: GaussianScene, config: FitConfig
-) -> tuple[list[FitImage], list[FitImage]]:
-    """The training images, and those at half size if they are wanted; on the CPU."""
-    views = observations.views
-    cameras, masks = [view.camera for view in views], [view.sky_mask for view in views]
-    pairs = list(zip(views, seen_as_sky(scene.sky.layout, cameras, masks), strict=True))
-    halves = pairs if config.half_resolution else []
-    return [full_image(*pair) for pair in pairs], [half_image(*pair) for pair in halves]
 
 
 def _advance(

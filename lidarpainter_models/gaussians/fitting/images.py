@@ -1,16 +1,22 @@
 """Training images at full and half size, kept as bytes until a step of the fit asks for one."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from lidarpainter_models.gaussians.model.sky import seen_as_sky
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.pixel_losses import NOTHING, OPEN, SKY, SOLID, PixelFacts
+from lidarpainter_models.kernels.sky_texture import SkyLayout
 from lidarpainter_models.observations.fit_size import shrink_image
 from lidarpainter_models.observations.views import TrainingView
+
+_BESIDE = np.ones((3, 3), np.uint8)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,6 +57,20 @@ class FitImage:
     def is_open(self) -> Bool[Tensor, "height width"]:
         """Pixels that may be sky without being in its mask."""
         return self.kind == OPEN
+
+
+def fit_images(
+    views: Sequence[TrainingView], sky: SkyLayout, *, half_too: bool
+) -> tuple[list[FitImage], list[FitImage]]:
+    """The views' images, and those at half size if they are wanted; on the CPU.
+
+    What lies in the direction of any image's sky mask may be sky in all of them.
+    """
+    cameras, masks = [view.camera for view in views], [view.sky_mask for view in views]
+    # nothing below the horizon may be; a pixel of half the size reaches one pixel below it
+    asked = [_grown(_above_horizon(camera)) for camera in cameras]
+    pairs = list(zip(views, seen_as_sky(sky, cameras, masks, asked), strict=True))
+    return [full_image(*pair) for pair in pairs], [half_image(*pair) for pair in pairs * half_too]
 
 
 def full_image(
@@ -104,10 +124,17 @@ def shrink_depth(
     return nearest.view(height_px, width_px)
 
 
-def above_horizon(camera: Camera) -> Bool[Tensor, "height width"]:
+def _above_horizon(camera: Camera) -> Bool[Tensor, "height width"]:
     """Pixels whose rays rise, world z being up."""
     up = camera.world_from_camera[2, :3].float()
-    return (camera.pixel_directions() @ up) > 0
+    u = (torch.arange(camera.width_px) + 0.5 - camera.cx_px) / camera.fx_px
+    v = (torch.arange(camera.height_px) + 0.5 - camera.cy_px) / camera.fy_px
+    return (up[1] * v)[:, None] + up[0] * u > -up[2]
+
+
+def _grown(mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """The mask and the pixels beside it, corner to corner too."""
+    return torch.from_numpy(cv2.dilate(mask.numpy().view(np.uint8), _BESIDE)).bool()
 
 
 def _shrink_mask(
@@ -125,10 +152,8 @@ def _kinds(
     may_be_sky: Bool[Tensor, "height width"] | None,
 ) -> UInt8[Tensor, "height width"]:
     """Tell the pixels apart; solid ones are at most one pixel away from a LiDAR return."""
-    beside = torch.nn.functional.max_pool2d((lidar_depth_m > 0).float()[None], 3, 1, 1)[0] > 0
-    kind = torch.full(sky_mask.shape, NOTHING, dtype=torch.uint8)
-    is_above = above_horizon(camera)
-    kind[is_above if may_be_sky is None else is_above & may_be_sky] = OPEN
-    kind[beside] = SOLID
-    kind[sky_mask] = SKY
-    return kind
+    is_open = _above_horizon(camera)
+    if may_be_sky is not None:
+        is_open &= may_be_sky
+    kind = torch.full(sky_mask.shape, NOTHING, dtype=torch.uint8).masked_fill_(is_open, OPEN)
+    return kind.masked_fill_(_grown(lidar_depth_m > 0), SOLID).masked_fill_(sky_mask, SKY)

@@ -194,15 +194,19 @@ def seen_as_sky(
     layout: SkyLayout,
     cameras: Sequence[Camera],
     masks: Sequence[Bool[Tensor, "height width"]],
+    asked: Sequence[Bool[Tensor, "height width"]],
 ) -> list[Bool[Tensor, "height width"]]:
-    """Each camera's pixels whose direction lies in the mask of any of the cameras."""
+    """Each camera's pixels, of those asked for, whose direction lies in any camera's mask."""
     weight = torch.zeros(layout.rows, layout.columns)
     for camera, mask in zip(cameras, masks, strict=True):
         nothing = torch.zeros(*mask.shape, 3)
         rays = sky_rays(camera, layout, mask)
         weight += scatter_gradient(nothing, mask.float(), rays, layout)[1]
     seen = (weight > 0).float()[..., None].expand(-1, -1, 3).contiguous()
-    return [sample_sky(seen, sky_rays(camera, layout), layout)[..., 0] > 0.5 for camera in cameras]
+    return [
+        sample_sky(seen, sky_rays(camera, layout, wanted), layout)[..., 0] > 0.5
+        for camera, wanted in zip(cameras, asked, strict=True)
+    ]
 
 
 def push_pull(

@@ -67,11 +67,14 @@ def test_a_direction_is_sky_for_all_views_if_it_is_for_one():
     mask = torch.zeros(ahead.height_px, ahead.width_px, dtype=torch.bool)
     mask[:20] = True
     nothing = torch.zeros_like(mask)
-    own, other = seen_as_sky(layout, [ahead, turned], [mask, nothing])
-    assert bool(own[mask].all())
+    asked = torch.ones_like(mask)
+    asked[:, -1] = False
+    own, other = seen_as_sky(layout, [ahead, turned], [mask, nothing], [asked, asked])
+    assert bool(own[mask & asked].all())
+    assert not bool(other[:, -1].any())
     assert not bool(own[22:].any())
     # turned to the left, the view shares its right part with the other's left part
-    assert bool(other[:18, ahead.width_px // 2 :].all())
+    assert bool(other[:18, ahead.width_px // 2 : -1].all())
     assert not bool(other[:, 0].any())
     assert not bool(other[30:].any())
 
