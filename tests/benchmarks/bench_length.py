@@ -3,7 +3,8 @@
     PYTHONPATH=. python tests/benchmarks/bench_length.py [--width 320]
 
 Each log is a synthetic street with its front camera and LiDAR, prepared and fitted at `preview` in
-a process of its own, every view used. Prints Gaussians, steps, time, memory and their ratios.
+a process of its own, every view used. Prints Gaussians, steps, time, the most memory that preparing
+or fitting took, and their ratios.
 """
 
 import argparse
@@ -39,8 +40,8 @@ COMPARED = (
 FIGURES = ("gaussians", "steps", "prepare_cpu_s", "fit_cpu_s", "fit_s", "peak_bytes")
 
 
-def costs_of(name, width_px):
-    """Prepare and fit one log; its figures."""
+def written(name, width_px, folder):
+    """Write one log; its scene's folder."""
     frames, speed_mps = LOGS[name]
     street = SyntheticStreetConfig(
         seed=SEED,
@@ -51,12 +52,16 @@ def costs_of(name, width_px):
         cameras=DEFAULT_CAMERAS[:1],
         speed_mps=(speed_mps, speed_mps),
     )
+    return write_street(street, folder)
+
+
+def costs_of(folder, width_px):
+    """Prepare and fit one log; its figures."""
     chosen = preview("synthetic/street")
     observation = replace(chosen.observation, width_px=width_px)
-    with tempfile.TemporaryDirectory() as folder:
-        scene = DrivingScene.open(write_street(street, Path(folder)))
-        with measured() as preparing:
-            seen = prepare_observations(scene, split_views(scene, "all"), observation)
+    scene = DrivingScene.open(folder)
+    with measured() as preparing:
+        seen = prepare_observations(scene, split_views(scene, "all"), observation)
     plan = planned_fit(chosen.fit, seen_surface(seen.views))
     with measured() as fitting:
         fitted = fit_gaussians(seen, chosen.fit).scene
@@ -66,24 +71,26 @@ def costs_of(name, width_px):
         "prepare_cpu_s": preparing.cpu_seconds,
         "fit_cpu_s": fitting.cpu_seconds,
         "fit_s": fitting.seconds,
-        "peak_bytes": fitting.peak_memory_bytes,
+        "peak_bytes": max(preparing.peak_memory_bytes, fitting.peak_memory_bytes),
     }
 
 
 def in_its_own_process(name, width_px):
-    """As `costs_of`; peaks of memory are a process's."""
-    command = [sys.executable, __file__, "--width", str(width_px), "--log", name]
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    """As `costs_of`; peaks of memory are a process's, and another one writes the log."""
+    with tempfile.TemporaryDirectory() as place:
+        folder = written(name, width_px, Path(place))
+        command = [sys.executable, __file__, "--width", str(width_px), "--folder", str(folder)]
+        done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     return json.loads(done.stdout)
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--width", type=int, default=320)
-    parser.add_argument("--log", choices=LOGS, help="this one alone, its figures as JSON")
+    parser.add_argument("--folder", type=Path, help="the figures of this log alone, as JSON")
     options = parser.parse_args()
-    if options.log:
-        json.dump(costs_of(options.log, options.width), sys.stdout)
+    if options.folder:
+        json.dump(costs_of(options.folder, options.width), sys.stdout)
         return
     costs = {name: in_its_own_process(name, options.width) for name in LOGS}
     rows = [
