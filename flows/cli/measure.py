@@ -146,8 +146,10 @@ def stress(  # noqa: PLR0913 - the options of a command
     points = _made(everything, workers=workers, accept_stale=accept_stale)
     if doubted := in_doubt(points, trials):
         _told(f"painting seems to harm {len(doubted)} recordings: {SEEDS_IN_DOUBT} seeds of them")
-        again = replace(sweep(doubted), seeds=tuple(range(SEEDS_IN_DOUBT)))
-        points = _made(again, workers=workers, accept_stale=accept_stale)
+        # a fleet of their own: one that is asked for less forgets the rest
+        more = tuple(range(seeds, SEEDS_IN_DOUBT))
+        again = replace(sweep(doubted), name="stress-in-doubt", seeds=more)
+        points += _made(again, workers=workers, accept_stale=accept_stale)
     _show(stress_of(points, trials, out), as_json=as_json)
 
 
