@@ -5,7 +5,7 @@ Without a GPU everything is small and the networks tiny: a rehearsal of the code
 
 import time
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -25,7 +25,6 @@ from lidarpainter_models.errors import WeightsError
 from lidarpainter_models.kernels.backends import available_backends
 from lidarpainter_models.painter.augmentation import AugmentationConfig
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig, train_nano
-from lidarpainter_models.painter.protocol import PaintingConditions
 from lidarpainter_models.painter.selection import PainterChoice
 from tasks.measuring import measured
 
@@ -138,7 +137,7 @@ def _with_gaussians(config: lp.FitConfig, count: int) -> lp.FitConfig:
 def measure_painters(findings: Findings, device: torch.device, model: str | None) -> None:
     """One view by the small painter and by presets of the one-step painter."""
     height_px, width_px = PAINTED_PX if device.type == "cuda" else REHEARSED_PAINTED_PX
-    known = _on(device, random_conditions(height_px, width_px))
+    known = kernel_trials.moved(random_conditions(height_px, width_px), device)
     size = f"{width_px}x{height_px}"
     with findings.part("painter nano"), torch.inference_mode():
         painter = PainterChoice.of("nano").load(device)
@@ -155,13 +154,6 @@ def measure_painters(findings: Findings, device: torch.device, model: str | None
             what = f"{preset} ({weights}), {size}"
             findings.painters.append(cost_of(what, run, device, 5))
             del painter, run
-
-
-def _on(device: torch.device, conditions: PaintingConditions) -> PaintingConditions:
-    """What is known of a view, where a fit has it."""
-    known = {field.name: getattr(conditions, field.name) for field in fields(conditions)}
-    tensors = {name: value.to(device) for name, value in known.items() if torch.is_tensor(value)}
-    return replace(conditions, **tensors)
 
 
 def measure_training(findings: Findings, device: torch.device) -> None:

@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 from gaussian_world import camera_at
+from lit_surfaces import random_scene
 
 from lidarpainter_models.errors import ShapeError
-from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.kernels.scene_light import (
     Appearance,
     Lamps,
@@ -19,52 +19,8 @@ from lidarpainter_models.kernels.scene_light import (
 )
 from lidarpainter_models.weather.light import to_display
 
-BODIES = 4
 CURVE_ERROR = 1e-4 / 0.28
 """Of the compiled display curve, a table of 2048 steps, as a harmonic."""
-
-
-def random_scene(count, lamps=7, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-
-    def rand(*size):
-        return torch.rand(*size, generator=generator)
-
-    unit = torch.nn.functional.normalize
-    surfaces = Surfaces(
-        means=30 * (rand(count, 3) - 0.5),
-        body_index=torch.randint(0, BODIES, (count,), generator=generator).int(),
-        reach_m=rand(count),
-        normals=unit(rand(count, 3) - 0.5, dim=1) * rand(count, 1),
-        facing=rand(count),
-        least_facing=0.1 * rand(count),
-    )
-    appearance = Appearance(
-        light=rand(count, 3),
-        reflectance=rand(count, 3),
-        harmonics=rand(count, 3, 3) - 0.5,
-        per_base=1 + rand(count, 3),
-        shine=rand(count) * (rand(count) < 0.5),
-        skyline=torch.randint(-1, 3, (count,), generator=generator).int(),
-    )
-    around = Surroundings(
-        extinction_per_m=0.02,
-        airlight=rand(3),
-        sky_light=rand(3),
-        skylines=rand(3, 8, 4),
-    )
-    heading = unit((rand(lamps, 3) - 0.5) * torch.tensor([1.0, 1.0, 0.0]), dim=1)
-    heading[::2] = 0
-    shining = Lamps(
-        position_world=20 * (rand(lamps, 3) - 0.5),
-        heading_world=heading,
-        power_rgb=10 * rand(lamps, 3),
-        reach_m=5 + 20 * rand(lamps),
-        is_fixed=rand(lamps) < 0.5,
-    )
-    poses = rigid_from_tangent(torch.randn(BODIES, 6, generator=generator).double())
-    poses[0] = torch.eye(4)
-    return surfaces, appearance, around, shining, poses
 
 
 def see(scene, camera, backend):

@@ -6,12 +6,13 @@ number that a threshold on which a pixel sits does not spoil.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
 import torch
 from bench_scenes import LEARNED, street_like_splats
 from gaussian_world import camera_at
+from lit_surfaces import random_scene
 from splat_drawing import SPLATS
 from torch import Tensor
 
@@ -23,6 +24,7 @@ from lidarpainter_models.kernels.gaussian_raster import SplatImage, Splats, rend
 from lidarpainter_models.kernels.pixel_losses import PixelFacts, PixelRules, pixel_terms
 from lidarpainter_models.kernels.point_blend import blend_points
 from lidarpainter_models.kernels.point_splat import splat_points
+from lidarpainter_models.kernels.scene_light import irradiance, seen_harmonics
 from lidarpainter_models.kernels.sky_texture import (
     SkyLayout,
     TexelMoments,
@@ -83,6 +85,16 @@ def disagreement(found: list[Tensor], expected: list[Tensor]) -> float:
         else:
             worst = max(worst, float((one != other).double().mean()))
     return worst
+
+
+def moved(part: Any, device: torch.device) -> Any:
+    """A tensor on a device, or a dataclass of which some fields are, or hold, tensors."""
+    if isinstance(part, Tensor):
+        return part.to(device)
+    if not is_dataclass(part):
+        return part
+    kept = {field.name: getattr(part, field.name) for field in fields(part)}
+    return replace(part, **{name: moved(value, device) for name, value in kept.items()})
 
 
 def _boxes(backend: str, device: torch.device) -> list[Tensor]:
@@ -243,6 +255,17 @@ def _adam(backend: str, device: torch.device) -> list[Tensor]:
     return list(kept)
 
 
+def _light(backend: str, device: torch.device) -> list[Tensor]:
+    surfaces, appearance, around, lamps, poses = (moved(part, device) for part in random_scene(500))
+    camera = camera_at(-3.0)
+    before = camera.camera_from_world.to(device) @ poses
+    thrown = irradiance(surfaces, poses, lamps, backend=backend)
+    seen = seen_harmonics(
+        surfaces, appearance, around, lamps, camera, poses, before, backend=backend
+    )
+    return [thrown, seen]
+
+
 def raster(size: tuple[int, int, int], backend: str, device: torch.device) -> list[Tensor]:
     """Images of a street-like scene, and the gradients of a loss on them."""
     return draw_and_go_back(raster_scene(size, device), backend)
@@ -272,6 +295,7 @@ TRIALS = {
     "pixel_losses": Trial(_pixel_terms, 1e-4),
     "point_blend": Trial(_blend, 1e-3),
     "point_splat": Trial(_splat, 2e-3),
+    "scene_light": Trial(_light, 1e-3),
     "sky_texture": Trial(_sky, 1e-3),
     "sparse_adam": Trial(_adam, 1e-4),
     "ssim": Trial(_image_loss, 1e-4),

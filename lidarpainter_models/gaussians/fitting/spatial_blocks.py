@@ -82,14 +82,14 @@ class SpatialBlocks:
         )
 
     def in_view(
-        self, views: Sequence[View], *, actor_slack: tuple[float, float] = (0.0, 0.0)
+        self, views: Sequence[View], *, actor_slack_m: float = 0.0
     ) -> Bool[Tensor, " gaussians"]:
         """Which Gaussians any of the views can show, and some more.
 
-        `actor_slack` is how far actors may still move (metres, radians) before they are drawn.
+        `actor_slack_m` is how far actors may still move before they are drawn.
         """
         is_seen = torch.zeros_like(self.block_of_row, dtype=torch.bool)
-        mark_seen(self.blocks, views, is_seen, actor_slack=actor_slack)
+        mark_seen(self.blocks, views, is_seen, actor_slack_m=actor_slack_m)
         return is_seen
 
 

@@ -98,7 +98,7 @@ class FitState:
         """
         bent_m = REACH_M if len(self.scene.actors.bending.bodies) else 0.0
         seen = [
-            self.hidden.without(self.blocks.in_view(views, actor_slack=(bent_m, 0.0)), name)
+            self.hidden.without(self.blocks.in_view(views, actor_slack_m=bent_m), name)
             for name, views in looks.items()
         ]
         rows = torch.stack(seen).any(dim=0).nonzero()[:, 0]

@@ -48,13 +48,13 @@ def mark_seen(
     views: Sequence[tuple[Camera, Float[Tensor, "bodies 4 4"]]],
     is_seen: Bool[Tensor, " gaussians"],
     *,
-    actor_slack: tuple[float, float] = (0.0, 0.0),
+    actor_slack_m: float = 0.0,
     backend: Backend = "auto",
 ) -> None:
     """Mark, in place, all Gaussians of blocks that may reach into any of the views.
 
-    A view is a camera and where it has the bodies. `actor_slack` is how far actors may still move
-    (metres, radians) before they are drawn.
+    A view is a camera and where it has the bodies. `actor_slack_m` is how far actors may still
+    move before they are drawn.
 
     Raises:
         ShapeError: there is not one flag for each Gaussian, or views differ in bodies.
@@ -66,7 +66,7 @@ def mark_seen(
         raise ShapeError(f"views of one scene have the same bodies, got {counts} of them")
     mark = implementation("frustum_culling", "mark_seen", backend, is_seen.device)
     looks = [
-        Look(camera_from_body.detach().double(), frustum_of(camera, actor_slack))
+        Look(camera_from_body.detach().double(), frustum_of(camera, actor_slack_m))
         for camera, camera_from_body in views
     ]
     mark(blocks, looks, is_seen)

@@ -53,8 +53,8 @@ class Frustum(NamedTuple):
     stretch: tuple[float, float]
     """Most that the linearised projection stretches a Gaussian across the ray."""
     near_m: float
-    actor_slack: tuple[float, float]
-    """How far the actors' boxes may still move before they are drawn: metres, radians."""
+    actor_slack_m: float
+    """How far the actors may still move before they are drawn."""
 
 
 class Look(NamedTuple):
@@ -65,7 +65,7 @@ class Look(NamedTuple):
     frustum: Frustum
 
 
-def frustum_of(camera: Camera, actor_slack: tuple[float, float]) -> Frustum:
+def frustum_of(camera: Camera, actor_slack_m: float = 0.0) -> Frustum:
     """What a camera can show, the blur of footprints included."""
     blur_px = MOST_SIGMAS * math.sqrt(BLUR_PX2)
     left, right = camera.cx_px + blur_px, camera.width_px - camera.cx_px + blur_px
@@ -77,7 +77,7 @@ def frustum_of(camera: Camera, actor_slack: tuple[float, float]) -> Frustum:
         highest=(right / camera.fx_px, bottom / camera.fy_px),
         stretch=(math.hypot(1.0, widest_x), math.hypot(1.0, widest_y)),
         near_m=NEAR_M,
-        actor_slack=actor_slack,
+        actor_slack_m=actor_slack_m,
     )
 
 

@@ -109,9 +109,7 @@ def _mark_seen(order, first, body, bounds, camera_from_body, frustum, is_seen):
         transform = camera_from_body[body[block]]
         low, high, reach = bounds.low[block], bounds.high[block], bounds.reach[block]
         if body[block] > 0:
-            lever = max(abs(low[0]), abs(high[0])) + max(abs(low[1]), abs(high[1]))
-            lever += max(abs(low[2]), abs(high[2]))
-            reach += frustum.actor_slack[0] + frustum.actor_slack[1] * lever
+            reach += frustum.actor_slack_m
         if _is_in_view(low, high, reach, transform, frustum):
             for place in range(first[block], first[block + 1]):
                 is_seen[order[place]] = True

@@ -46,9 +46,7 @@ def _is_in_view(blocks: Blocks, view: Look) -> Bool[Tensor, " blocks"]:
     device, frustum = blocks.reach.device, view.frustum
     camera_from_body = view.camera_from_body.to(device, non_blocking=True)
     transform = camera_from_body[blocks.body.long()]
-    lever = torch.maximum(blocks.low.abs(), blocks.high.abs()).sum(dim=1)
-    slack = frustum.actor_slack[0] + frustum.actor_slack[1] * lever
-    reach = blocks.reach + torch.where(blocks.body > 0, slack, 0.0)
+    reach = blocks.reach + torch.where(blocks.body > 0, frustum.actor_slack_m, 0.0)
     rows = torch.tensor(plane_rows(frustum), dtype=torch.float64)
     rows = rows.to(device, non_blocking=True)
     facing, stretch, begin = rows[:, :3], rows[:, 3], rows[:, 4]

@@ -65,7 +65,7 @@ def _told(views: Sequence[Look]) -> Tensor:
     numbers = [
         number
         for view in views
-        for row in (*plane_rows(view.frustum), view.frustum.actor_slack)
+        for row in (*plane_rows(view.frustum), [view.frustum.actor_slack_m])
         for number in row
     ]
     poses = [view.camera_from_body.flatten() for view in views]

@@ -7,8 +7,8 @@ LANES = tl.constexpr(128)
 """Gaussians of a block that are looked at together."""
 PLANES = tl.constexpr(5)
 PLANE_FLOATS = tl.constexpr(5)
-VIEW_FLOATS = tl.constexpr(27)
-"""Numbers of a view: its planes, then how far actors may still move (metres, radians)."""
+VIEW_FLOATS = tl.constexpr(26)
+"""Numbers of a view: its planes, then how many metres actors may still move."""
 
 
 @triton.jit
@@ -58,14 +58,6 @@ def _column(pose, axis, facing):
 
 
 @triton.jit
-def _lever(low, high):
-    """How far from the body's origin a box reaches at most."""
-    x = tl.maximum(tl.abs(low[0]), tl.abs(high[0]))
-    y = tl.maximum(tl.abs(low[1]), tl.abs(high[1]))
-    return x + y + tl.maximum(tl.abs(low[2]), tl.abs(high[2]))
-
-
-@triton.jit
 def _is_in_view(view, pose, is_actor, low, high, reach):
     """Whether a box of centres may hold a Gaussian that reaches into the view."""
     side = tl.arange(0, 8)
@@ -81,9 +73,8 @@ def _is_in_view(view, pose, is_actor, low, high, reach):
         slope = _column(pose, axis, facing)
         middle, half = (low[axis] + high[axis]) * 0.5, (high[axis] - low[axis]) * 0.5
         outside += slope * middle - tl.abs(slope) * half  # the corner that is least outside
-    slack = view + PLANES * PLANE_FLOATS
-    moves = tl.load(slack) + tl.load(slack + 1) * _lever(low, high)
-    reach += tl.where(is_actor, moves, 0.0)
+    slack_m = tl.load(view + PLANES * PLANE_FLOATS)
+    reach += tl.where(is_actor, slack_m, 0.0)
     reaches_in = outside <= reach * stretch
     return tl.min(tl.where(reaches_in | (side >= PLANES), 1, 0)) == 1
 

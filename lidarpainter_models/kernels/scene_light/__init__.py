@@ -73,7 +73,7 @@ def seen_harmonics(  # noqa: PLR0913 - surfaces, their light, and where everythi
     _check_bodies(surfaces, camera_from_body)
     _check_bodies(surfaces, world_from_body)
     seen = implementation("scene_light", "seen_harmonics", backend, surfaces.means.device)
-    frustum = None if camera is None else frustum_of(camera, (0.0, 0.0))
+    frustum = None if camera is None else frustum_of(camera)
     return seen(
         surfaces, appearance, surroundings, lamps, frustum, world_from_body, camera_from_body
     )

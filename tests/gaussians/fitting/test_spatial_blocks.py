@@ -124,7 +124,7 @@ def test_slack_takes_in_an_actor_that_may_move_into_view():
     poses[0, 1, 3] = 40.0  # far to the left
     view = (camera, camera_from_body(camera.world_from_camera, poses, present))
     of_actor = [
-        int((scene.gaussians.body_index[blocks.in_view([view], actor_slack=slack)] > 0).sum())
-        for slack in ((0.0, 0.0), (40.0, 0.0))
+        int((scene.gaussians.body_index[blocks.in_view([view], actor_slack_m=slack_m)] > 0).sum())
+        for slack_m in (0.0, 40.0)
     ]
     assert of_actor == [0, 50]
