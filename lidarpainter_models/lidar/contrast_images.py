@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-LEVELS_PER_OCTAVE = 2
+from lidarpainter_models.kernels.point_contrasts import LEVELS_PER_OCTAVE
+
 FINEST_PX = 0.8
 """Deviation of the blur of level 0."""
-NUM_LEVELS = 8
+NUM_LEVELS = 6
 _SURROUNDINGS = 4  # levels; two octaves wider than the level itself
 _DARKEST = 0.04
 _CALM = 0.02
@@ -36,32 +37,16 @@ class ContrastImage:
         blurs_px = [_blur_px(level) for level in range(NUM_LEVELS + _SURROUNDINGS)]
         light = np.log(grey + _DARKEST)
         blurred = [cv2.GaussianBlur(light, (0, 0), blur_px) for blur_px in blurs_px]
-        levels = []
+        levels = np.empty((NUM_LEVELS, *grey.shape, 3), np.float32)
         for level in range(NUM_LEVELS):
             wide = level + _SURROUNDINGS
             band = blurred[level] - blurred[wide]
             spread = np.sqrt(cv2.GaussianBlur(band**2, (0, 0), blurs_px[wide]))
             contrast = band / (spread + _CALM)
-            slopes = [cv2.Sobel(contrast, cv2.CV_32F, *axis, scale=1 / 8) for axis in _AXES]
-            levels.append(np.stack([contrast, *slopes], axis=-1))
-        return cls(np.stack(levels))
-
-    def sample(self, pixels_uv: np.ndarray, level: np.ndarray) -> np.ndarray:
-        """Contrast and slopes (points, 3) at continuous pixels and levels, linear between."""
-        count, height, width, _ = self.levels.shape
-        places = (level, pixels_uv[:, 1] - 0.5, pixels_uv[:, 0] - 0.5)
-        ends = (count, height, width)
-        inside = [np.clip(x, 0, end - 1.001) for x, end in zip(places, ends, strict=True)]
-        first = [place.astype(np.int64) for place in inside]
-        later = [place - low for place, low in zip(inside, first, strict=True)]
-        flat, found = self.levels.reshape(-1, 3), np.zeros((len(level), 3))
-        for corner in np.ndindex(2, 2, 2):
-            weight = np.ones(len(level))
-            for step, share in zip(corner, later, strict=True):
-                weight = weight * (share if step else 1 - share)
-            level_at, row, column = (low + step for low, step in zip(first, corner, strict=True))
-            found += weight[:, None] * flat[(level_at * height + row) * width + column]
-        return found
+            levels[level, ..., 0] = contrast
+            for number, axis in enumerate(_AXES, start=1):
+                levels[level, ..., number] = cv2.Sobel(contrast, cv2.CV_32F, *axis, scale=1 / 8)
+        return cls(levels)
 
 
 _AXES = ((1, 0), (0, 1))

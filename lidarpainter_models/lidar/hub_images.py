@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera, Shutter
+from lidarpainter_models.kernels.point_contrasts import NEAR_M
 from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.contrast_images import ContrastImage
 from lidarpainter_models.lidar.moving_boxes import BACKGROUND, MovingBoxes
@@ -23,8 +24,6 @@ from lidarpainter_models.scenes.records import RecordedView
 
 WIDTH_PX = 480
 """Images that are wider are made as small as this."""
-NEAR_M = 1.0
-"""Nothing nearer is compared."""
 _HUBS, _NEIGHBOURS, _POINTS = 8, 2, 1000
 """Images whose points are followed, into how many before and after, and of how many points."""
 _FAR_M = 80.0

@@ -20,8 +20,15 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lidarpainter_models.lidar.contrast_images import LEVELS_PER_OCTAVE
-from lidarpainter_models.lidar.hub_images import NEAR_M, WIDTH_PX, Hub, HubImage, hubs_of
+from lidarpainter_models.kernels.point_contrasts import (
+    LATE,
+    READOUT,
+    TURN,
+    AssumedCamera,
+    depths_before,
+    seen_contrasts,
+)
+from lidarpainter_models.lidar.hub_images import WIDTH_PX, Hub, HubImage, hubs_of
 from lidarpainter_models.scenes.camera_faults import CameraFault
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
@@ -33,7 +40,6 @@ LEAST_LATE_S, LEAST_READOUT_S = 0.015, 0.01
 MIN_STANDS_OUT = 4.0  # standard errors
 MIN_SPEED_MPS = 2.0  # a slower car's images look alike whenever they were taken
 MIN_PX_PER_DEG = 2.2  # as in the doctor's check of calibration
-_TURN, _LATE, _READOUT = slice(0, 3), 3, 4
 _SEARCHED_S = np.linspace(-0.06, 0.06, 7)
 _SEARCH_LEVEL, _SEARCH_ROUNDS, _SEARCH_STRIDE = 3, 3, 3
 _SCHEDULE = ((3, 5), (2, 14))  # level and rounds of Gauss-Newton
@@ -41,8 +47,7 @@ _STEP = 1.5  # derivatives of images that do not fit yet are too small
 _OUTLIER = 5.0  # medians from which on a difference counts little
 _EXPECTED = np.array([0.01, 0.01, 0.01, 0.05, 0.03])
 _SAMPLES_OF_PRIOR = 500.0  # neighbouring points look alike
-_BORDER_PX = 3
-_HIDDEN, _HIDDEN_M = 1.15, 0.5  # a point farther behind a return than this is hidden
+_LEAST_HUB_DEPTH_M = 0.5
 
 
 class Found(NamedTuple):
@@ -71,9 +76,9 @@ def believed(found: Found) -> CameraFault | None:
     """Those parameters that are large and sure enough, None if there are none."""
     size, error = np.abs(found.values), np.maximum(found.errors, 1e-9)
     is_sure = size > MIN_STANDS_OUT * error
-    turn = found.values[_TURN] * (size[_TURN] > LEAST_TURN_RAD) * is_sure[_TURN]
-    late = found.values[_LATE] * (size[_LATE] > LEAST_LATE_S) * is_sure[_LATE]
-    readout = found.values[_READOUT] * (size[_READOUT] > LEAST_READOUT_S) * is_sure[_READOUT]
+    turn = found.values[TURN] * (size[TURN] > LEAST_TURN_RAD) * is_sure[TURN]
+    late = found.values[LATE] * (size[LATE] > LEAST_LATE_S) * is_sure[LATE]
+    readout = found.values[READOUT] * (size[READOUT] > LEAST_READOUT_S) * is_sure[READOUT]
     if not (turn.any() or late or readout):
         return None
     x, y, z = turn.tolist()
@@ -101,41 +106,23 @@ def measured_faults(scene: DrivingScene, views: Sequence[RecordedView]) -> Found
     if not hubs:
         return None
     is_told = any(shutter.is_rolling for shutter in shutters)
-    free = np.arange(_READOUT if is_told else _READOUT + 1)
+    free = np.arange(READOUT if is_told else READOUT + 1)
     return _refined(hubs, _searched(hubs, free), free)
 
 
-def _projected(
-    points: Float[np.ndarray, "points 3"], image: HubImage, values: Float[np.ndarray, "5"]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels (points, 2), depth, and derivatives of the pixels (points, 2, 5)."""
-    camera, across_s = image.camera, np.array([0.0, values[_READOUT]])
+def _assumed(image: HubImage, values: Float[np.ndarray, "5"]) -> AssumedCamera:
+    """An image's camera under some parameters; a told readout is kept."""
+    camera, across_s = image.camera, (0.0, float(values[READOUT]))
     if camera.shutter is not None and camera.shutter.is_rolling:
-        across_s = np.array(camera.shutter.across_s)
-    camera_from_world = camera.camera_from_world.numpy()
-    start = points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
-    flow = -(np.cross(image.twist_per_s[:3], start) + image.twist_per_s[3:])
-    turned_from_camera = cv2.Rodrigues(-values[_TURN])[0]
-    focal, centre = np.array([camera.fx_px, camera.fy_px]), np.array([camera.cx_px, camera.cy_px])
-    size, after_s = np.array([camera.width_px, camera.height_px]), np.full(len(points), 0.0)
-    for _ in range(3):
-        moved = start + (values[_LATE] + after_s)[:, None] * flow
-        x, y, depth = (moved @ turned_from_camera.T).T
-        ahead = np.maximum(depth, 0.1)
-        pixels_uv = focal * np.stack([x, y], 1) / ahead[:, None] + centre
-        share = np.clip(pixels_uv / size - 0.5, -0.5, 0.5)
-        after_s = share @ across_s
-    change = np.zeros((len(points), 3, 5))
-    change[:, 0, 1], change[:, 0, 2] = -depth, y
-    change[:, 1, 0], change[:, 1, 2] = depth, -x
-    change[:, 2, 0], change[:, 2, 1] = -y, x
-    change[:, :, _LATE] = flow @ turned_from_camera.T
-    change[:, :, _READOUT] = change[:, :, _LATE] * share[:, 1:]
-    slant = (pixels_uv - centre)[..., None] / ahead[:, None, None]
-    return (
-        pixels_uv,
-        depth,
-        focal[:, None] * change[:, :2] / ahead[:, None, None] - slant * change[:, 2:],
+        across_s = camera.shutter.across_s
+    focal, centre = (camera.fx_px, camera.fy_px), (camera.cx_px, camera.cy_px)
+    return AssumedCamera(
+        camera_from_world=camera.camera_from_world.numpy(),
+        twist_per_s=image.twist_per_s,
+        turned_from_camera=cv2.Rodrigues(-values[TURN])[0],
+        lens=np.array([*focal, *centre, camera.width_px, camera.height_px], np.float64),
+        late_s=float(values[LATE]),
+        across_s=np.array(across_s),
     )
 
 
@@ -152,26 +139,21 @@ class _Compared(NamedTuple):
 
 def _compared(hub: Hub, values: Float[np.ndarray, "5"], level: int, stride: int) -> _Compared:
     points = hub.points[::stride]
-    placed = [_projected(points, image, values) for image in hub.images]
-    hub_depth = np.maximum(placed[hub.own][1], 0.5)
-    contrast, is_seen, slope, gradient, motion = [], [], [], [], []
-    for image, (pixels_uv, depth, change) in zip(hub.images, placed, strict=True):
-        size = np.array([image.camera.width_px, image.camera.height_px])
-        octaves = np.log2(hub_depth / np.maximum(depth, 0.5))
-        seen = (depth > NEAR_M) & (np.abs(octaves) < 1)
-        seen &= ((pixels_uv > _BORDER_PX) & (pixels_uv < size - _BORDER_PX)).all(1)
-        column, row = np.clip(pixels_uv.astype(int), 0, size - 1).T
-        seen &= depth <= image.nearest_m[row, column] * _HIDDEN + _HIDDEN_M
-        found = image.contrast.sample(pixels_uv, level + LEVELS_PER_OCTAVE * octaves)
-        scale = np.maximum(depth, 1)[:, None]  # a gradient per metre of the surface
-        contrast.append(found[:, 0])
-        is_seen.append(seen)
-        slope.append(np.einsum("pa,pab->pb", found[:, 1:], change))
-        gradient.append(found[:, 1:] / scale * seen[:, None])
-        motion.append(change * scale[..., None])
-    mean = np.sum(gradient, 0) / np.maximum(np.sum(is_seen, 0), 1)[:, None]
-    shared = np.einsum("pa,ipab->ipb", mean, np.array(motion))
-    return _Compared(np.array(contrast), np.array(is_seen), np.array(slope), shared)
+    cameras = [_assumed(image, values) for image in hub.images]
+    hub_depth_m = np.maximum(depths_before(points, cameras[hub.own]), _LEAST_HUB_DEPTH_M)
+    seen = [
+        seen_contrasts(points, camera, image.contrast.levels, image.nearest_m, level, hub_depth_m)
+        for image, camera in zip(hub.images, cameras, strict=True)
+    ]
+    is_seen = np.array([one.is_seen for one in seen])
+    gradient = np.sum([one.gradient for one in seen], 0)
+    mean = gradient / np.maximum(is_seen.sum(0), 1)[:, None]
+    return _Compared(
+        contrast=np.array([one.contrast for one in seen]),
+        is_seen=is_seen,
+        slope=np.array([one.slope for one in seen]),
+        shared_slope=np.array([np.einsum("pa,pab->pb", mean, one.motion) for one in seen]),
+    )
 
 
 class _Equations(NamedTuple):
@@ -240,11 +222,11 @@ def _searched(hubs: Sequence[Hub], free: np.ndarray) -> Float[np.ndarray, "5"]:
     outlier = None
     for late_s in _SEARCHED_S:
         values = np.zeros(5)
-        values[_LATE] = late_s
+        values[LATE] = late_s
         for _ in range(_SEARCH_ROUNDS):
             found = _equations(hubs, values, _SEARCH_LEVEL, outlier, _SEARCH_STRIDE)
             outlier, before = found.outlier, values
-            values, _ = _stepped(found, values, free[_TURN], _SAMPLES_OF_PRIOR / _SEARCH_STRIDE)
+            values, _ = _stepped(found, values, free[TURN], _SAMPLES_OF_PRIOR / _SEARCH_STRIDE)
         tried.append((found.difference, len(tried), before))
     return min(tried)[2]
 
