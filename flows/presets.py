@@ -46,7 +46,7 @@ def brief(scene: str) -> ReconstructParameters:
 
 
 def balanced(scene: str) -> ReconstructParameters:
-    """The best trade for a whole log: twice as fine, in under an hour on two CPU cores.
+    """The best trade for a whole log: twice as fine, in half an hour on two CPU cores.
 
     Fewer Gaussians for each pixel, half of the steps at half the size, and one painted round of
     fewer views.
