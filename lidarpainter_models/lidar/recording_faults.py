@@ -47,7 +47,6 @@ _STEP = 1.5  # derivatives of images that do not fit yet are too small
 _OUTLIER = 5.0  # medians from which on a difference counts little
 _EXPECTED = np.array([0.01, 0.01, 0.01, 0.05, 0.03])
 _SAMPLES_OF_PRIOR = 500.0  # neighbouring points look alike
-_LEAST_HUB_DEPTH_M = 0.5
 
 
 class Found(NamedTuple):
@@ -140,7 +139,7 @@ class _Compared(NamedTuple):
 def _compared(hub: Hub, values: Float[np.ndarray, "5"], level: int, stride: int) -> _Compared:
     points = hub.points[::stride]
     cameras = [_assumed(image, values) for image in hub.images]
-    hub_depth_m = np.maximum(depths_before(points, cameras[hub.own]), _LEAST_HUB_DEPTH_M)
+    hub_depth_m = depths_before(points, cameras[hub.own])
     seen = [
         seen_contrasts(points, camera, image.contrast.levels, image.nearest_m, level, hub_depth_m)
         for image, camera in zip(hub.images, cameras, strict=True)

@@ -63,7 +63,7 @@ def test_both_backends_see_the_same(level, columns_s):
     levels = draw.normal(size=(6, HEIGHT_PX, WIDTH_PX, 3)).astype(np.float32)
     nearest_m = draw.uniform(0.0, 60.0, (HEIGHT_PX, WIDTH_PX)).astype(np.float32)
     camera = assumed((0.01, -0.02, 0.03, 0.04, -0.02), columns_s)
-    hub_depth_m = 1.4 * np.maximum(depths_before(points, assumed(), backend="reference"), 0.5)
+    hub_depth_m = 1.4 * depths_before(points, assumed(), backend="reference")
     fast, plain = (
         seen_contrasts(points, camera, levels, nearest_m, level, hub_depth_m, backend=backend)
         for backend in BACKENDS

@@ -138,7 +138,8 @@ def _look(
     lens, change = camera.lens, np.zeros((3, 5))
     for index in range(len(points)):
         u, v, (x, y, depth), flow, down = _placed(points[index], camera)
-        octaves = np.log2(hub_depth_m[index] / max(depth, LEAST_DEPTH_M))
+        hub_m = max(hub_depth_m[index], LEAST_DEPTH_M)
+        octaves = np.log2(hub_m / max(depth, LEAST_DEPTH_M))
         is_seen = _is_seen(u, v, depth, octaves, lens, nearest_m)
         found = _sampled(levels, level + LEVELS_PER_OCTAVE * octaves, v, u)
         contrast, slope_u, slope_v = found

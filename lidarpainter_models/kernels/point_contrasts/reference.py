@@ -39,7 +39,8 @@ def seen_contrasts(
     """See `point_contrasts.seen_contrasts`."""
     pixels_uv, depth_m, change = _projected(points, camera)
     size = camera.lens[4:]
-    octaves = np.log2(hub_depth_m / np.maximum(depth_m, LEAST_DEPTH_M))
+    nearer = np.maximum(hub_depth_m, LEAST_DEPTH_M) / np.maximum(depth_m, LEAST_DEPTH_M)
+    octaves = np.log2(nearer)
     is_seen = (depth_m > NEAR_M) & (np.abs(octaves) < 1)
     is_seen &= ((pixels_uv > BORDER_PX) & (pixels_uv < size - BORDER_PX)).all(1)
     column, row = np.clip(pixels_uv, 0, size - 1).astype(int).T
