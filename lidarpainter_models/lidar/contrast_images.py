@@ -17,6 +17,7 @@ from lidarpainter_models.kernels.point_contrasts import LEVELS_PER_OCTAVE
 FINEST_PX = 0.8
 """Deviation of the blur of level 0."""
 NUM_LEVELS = 6
+"""Levels 2 and 3 are compared, of points up to an octave nearer or farther."""
 _SURROUNDINGS = 4  # levels; two octaves wider than the level itself
 _DARKEST = 0.04
 _CALM = 0.02
