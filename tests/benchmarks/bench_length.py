@@ -3,8 +3,8 @@
     PYTHONPATH=. python tests/benchmarks/bench_length.py [--width 320]
 
 Each log is a synthetic street with its front camera and LiDAR, prepared and fitted at `preview` in
-a process of its own, every view used. Prints Gaussians, steps, time, the most memory that preparing
-or fitting took, and their ratios.
+a process of its own, set up as the command sets up its own, every view used. Prints Gaussians,
+steps, time, the most memory that preparing or fitting took, and their ratios.
 """
 
 import argparse
@@ -15,6 +15,7 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+from flows.environment import prepare_environment
 from flows.presets import preview
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.gaussians.fitting.seen_surface import planned_fit, seen_surface
@@ -89,6 +90,7 @@ def main():
     parser.add_argument("--width", type=int, default=320)
     parser.add_argument("--folder", type=Path, help="the figures of this log alone, as JSON")
     options = parser.parse_args()
+    prepare_environment()  # memory here, and threads of the processes that this one starts
     if options.folder:
         json.dump(costs_of(options.folder, options.width), sys.stdout)
         return
