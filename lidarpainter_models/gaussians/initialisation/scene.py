@@ -251,18 +251,22 @@ def _on_surfaces(
     street, aside = _street(observations, config, budget, for_aside)
     progress(0.25)
     clouds = {0: street}
-    for index, track in enumerate(observations.tracks, start=1):
+    views, tracks = observations.views, observations.tracks
+    times_ns = torch.tensor([view.timestamp_ns for view in views], dtype=torch.int64)
+    is_there = TrackPoses.of(tracks).present(times_ns[:, None]).T
+    for index, track in enumerate(tracks, start=1):
         if track.actor_id not in observations.lidar_map.actors:
             continue
         points = _spread(observations.lidar_map.actors[track.actor_id], MOST_ACTOR_POINTS)
-        spacing_m = _actor_spacing(points, track, observations.views)
+        present = [views[row] for row in is_there[index - 1].nonzero()[:, 0].tolist()]
+        spacing_m = _actor_spacing(points, track, present)
         in_sight = spacing_m.isfinite()
         if int(in_sight.sum()) >= LEAST_ACTOR_POINTS:
             clouds[index] = _cloud(points, spacing_m, in_sight, ACTOR_VOXEL_M)
     seen = adaptive_voxels(list(clouds.values()), budget=max(budget - for_aside, 1))
     gaussians = within_outlines(
         _surfels([seen[0], aside], [2.0, SPACING_SIGMA], config),
-        _some_of_each_camera(observations.views),
+        _some_of_each_camera(views),
     )
     for body, voxels in zip(list(clouds)[1:], seen[1:], strict=True):
         gaussians = gaussians.append(_surfels([voxels], [2.0], config, body=body))
@@ -334,14 +338,13 @@ def _actor_spacing(
 ) -> Float[Tensor, " points"]:
     """Distance at which detail pays at each point of an actor over its time, as on the street.
 
-    A point in no image counts as in the nearest it might be in; one beyond is infinite.
+    The views are those at whose times it is there. A point in no image counts as in the nearest it
+    might be in; one beyond is infinite.
     """
     footprint = torch.full((len(points),), torch.inf)
     total = torch.zeros(len(points))
     asked = sampled_views(views, _MOST_VIEWS_PER_ACTOR)
     for view in asked:
-        if not track.is_present(view.timestamp_ns):
-            continue
         world_from_box = track.pose_at(view.timestamp_ns).float()
         xyz_world_m = transform_points(world_from_box, points.xyz_m)
         at_time, density = pixel_footprint(xyz_world_m, [view.camera])

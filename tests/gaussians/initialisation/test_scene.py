@@ -215,6 +215,17 @@ def test_an_actor_that_one_camera_of_six_sees_is_modelled(world):
     assert int((scene.gaussians.body_index > 0).sum()) > 0
 
 
+def test_an_actor_that_is_there_for_a_moment_of_a_long_log_is_modelled(world):
+    config = InitialisationConfig(num_gaussians=500, street_voxel_m=0.1)
+    view = world.observations.views[0]
+    views = [
+        replace(view, key=(frame, "front"), timestamp_ns=(frame - 33) * 100_000_000)
+        for frame in range(120)
+    ]
+    scene = initialise_scene(replace(world.observations, views=tuple(views)), config)
+    assert int((scene.gaussians.body_index > 0).sum()) > 0
+
+
 def test_first_scene_holds_what_was_found_of_the_cameras(world):
     late = CameraFault(late_s=0.012)
     views = tuple(
