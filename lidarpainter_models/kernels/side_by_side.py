@@ -97,8 +97,10 @@ def kernels_to_oneself() -> AbstractContextManager[object]:
 
 def _shared_threads(device: torch.device | None) -> int:
     """How many threads pieces on a device may share; 1 where they are made one by one."""
-    is_on_gpu = device is not None and device.type != "cpu"
-    return 1 if is_on_gpu or not _are_reentrant() else numba.get_num_threads()
+    if device is not None and device.type != "cpu":
+        return 1
+    threads = numba.get_num_threads()  # the pool starts, and is known from then on
+    return threads if _are_reentrant() else 1
 
 
 def _are_reentrant() -> bool:

@@ -1,5 +1,8 @@
 """Pieces of work beside each other make what they make one after the other."""
 
+import os
+import subprocess
+import sys
 import threading
 import time
 
@@ -41,6 +44,22 @@ def _two_threads():
 def place_of(_item):
     time.sleep(0.05)
     return threading.get_ident(), numba.get_num_threads(), torch.get_num_threads()
+
+
+def test_pieces_share_threads_before_any_kernel_ran_in_parallel():
+    script = (
+        "import threading, time\n"
+        "from lidarpainter_models.kernels.side_by_side import side_by_side\n"
+        "def place_of(_item):\n"
+        "    time.sleep(0.05)\n"
+        "    return threading.get_ident()\n"
+        "print(len(set(side_by_side(place_of, range(7)))))\n"
+    )
+    threads = os.environ | {"NUMBA_NUM_THREADS": str(THREADS)}
+    ran = subprocess.run(
+        [sys.executable, "-c", script], env=threads, stdout=subprocess.PIPE, check=True
+    )
+    assert int(ran.stdout) == 1 + THREADS  # the first piece is made here
 
 
 def test_pieces_come_in_order_and_take_their_time_together():
