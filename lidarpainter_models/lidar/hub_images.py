@@ -4,7 +4,7 @@ Hubs lie evenly over a recording; the points of each are followed into the image
 it. Camera frame: x right, y down, z forward; lengths are metres.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -54,19 +54,56 @@ class Hub:
     own: int
 
 
-def hubs_of(scene: DrivingScene, moved: Sequence[tuple[RecordedView, Shutter]]) -> list[Hub]:
-    """What is compared of one camera's images; those that are nobody's neighbours are not read."""
+@dataclass(frozen=True, eq=False)
+class FrameReturns:
+    """What a frame's sweeps met, in the world."""
+
+    xyz_m: Float[Tensor, "points 3"]
+    standing: Float[Tensor, "standing 3"]
+    """Those outside moving boxes."""
+
+
+def returns_of(scene: DrivingScene, frames: Sequence[int]) -> dict[int, FrameReturns]:
+    """The returns of some frames, read once for all cameras."""
     boxes = MovingBoxes([track for track in scene.tracks if track.is_moving])
-    neighbours = hub_neighbours(len(moved))
-    wanted = sorted({index for _, around in neighbours for index in around})
-    made = side_by_side(lambda index: _image(scene, *moved[index], boxes), wanted)
+
+    def read(frame_index: int) -> FrameReturns:
+        clouds = [(scene.read_column(s, "xyz_m"), s) for s in scene.sweeps_of(frame_index)]
+        standing = [
+            xyz_m[boxes.owners(xyz_m, sweep.timestamp_ns, floor_m=-torch.inf) == BACKGROUND]
+            for xyz_m, sweep in clouds
+        ]
+        none = torch.zeros(0, 3)
+        return FrameReturns(
+            xyz_m=torch.cat([none, *(xyz_m for xyz_m, _ in clouds)]),
+            standing=torch.cat([none, *standing]),
+        )
+
+    return dict(zip(frames, side_by_side(read, frames), strict=True))
+
+
+def hubs_of(
+    scene: DrivingScene,
+    moved: Sequence[tuple[RecordedView, Shutter]],
+    returns: Mapping[int, FrameReturns],
+) -> list[Hub]:
+    """What is compared of one camera's images; those that are nobody's neighbours are not read."""
+    wanted = compared_images(len(moved))
+    made = side_by_side(
+        lambda index: _image(scene, *moved[index], returns[moved[index][0].frame_index]), wanted
+    )
     images = dict(zip(wanted, made, strict=True))
     hubs = []
-    for own, around in neighbours:
+    for own, around in hub_neighbours(len(moved)):
         points = _hub_points(images[own])
         if len(points):
             hubs.append(Hub(points, [images[index] for index in around], around.index(own)))
     return hubs
+
+
+def compared_images(num_images: int) -> list[int]:
+    """Positions of the hubs and of their neighbours among a camera's images."""
+    return sorted({index for _, around in hub_neighbours(num_images) for index in around})
 
 
 def hub_neighbours(num_images: int) -> list[tuple[int, range]]:
@@ -79,7 +116,7 @@ def hub_neighbours(num_images: int) -> list[tuple[int, range]]:
 
 
 def _image(
-    scene: DrivingScene, view: RecordedView, shutter: Shutter, boxes: MovingBoxes
+    scene: DrivingScene, view: RecordedView, shutter: Shutter, returns: FrameReturns
 ) -> HubImage:
     share = min(1.0, WIDTH_PX / view.camera.width_px)
     camera = view.camera.resized(
@@ -88,19 +125,13 @@ def _image(
     )
     size = (camera.width_px, camera.height_px)
     rgb = cv2.resize(scene.read_image(view).numpy(), size, interpolation=cv2.INTER_AREA)
-    clouds = [(scene.read_column(s, "xyz_m"), s) for s in scene.sweeps_of(view.frame_index)]
-    standing = [
-        xyz_m[boxes.owners(xyz_m, sweep.timestamp_ns, floor_m=-torch.inf) == BACKGROUND]
-        for xyz_m, sweep in clouds
-    ]
-    everything = torch.cat([xyz_m for xyz_m, _ in clouds]) if clouds else torch.zeros(0, 3)
-    depth_m = sparse_lidar_depth(everything, camera).numpy()
+    depth_m = sparse_lidar_depth(returns.xyz_m, camera).numpy()
     far_m = np.where(depth_m > 0, depth_m, np.float32(1e6))
     return HubImage(
         camera=camera,
         twist_per_s=shutter.twist_per_s.numpy(),
         contrast=ContrastImage.of(rgb),
-        standing=torch.cat(standing) if standing else everything,
+        standing=returns.standing,
         depth_m=depth_m,
         nearest_m=cv2.erode(far_m, np.ones((5, 5), np.uint8)),
     )

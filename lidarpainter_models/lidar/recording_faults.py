@@ -13,13 +13,14 @@ out from the scatter between groups of images (Liang and Zeger, 1986). A car tha
 neither clock nor readout. Camera frame: x right, y down, z forward.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.kernels.point_contrasts import (
     LATE,
     READOUT,
@@ -28,7 +29,16 @@ from lidarpainter_models.kernels.point_contrasts import (
     depths_before,
     seen_contrasts,
 )
-from lidarpainter_models.lidar.hub_images import WIDTH_PX, Hub, HubImage, hubs_of
+from lidarpainter_models.kernels.side_by_side import side_by_side
+from lidarpainter_models.lidar.hub_images import (
+    WIDTH_PX,
+    FrameReturns,
+    Hub,
+    HubImage,
+    compared_images,
+    hubs_of,
+    returns_of,
+)
 from lidarpainter_models.scenes.camera_faults import CameraFault
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
@@ -61,14 +71,13 @@ def find_faults(scene: DrivingScene, views: Sequence[RecordedView]) -> dict[str,
 
     Views are each camera's in order of time.
     """
-    faults = {}
-    for name in sorted({view.camera_name for view in views}):
-        own = [view for view in views if view.camera_name == name]
-        found = measured_faults(scene, own)
-        fault = None if found is None else believed(found)
-        if fault is not None:
-            faults[name] = fault
-    return faults
+    names = sorted({view.camera_name for view in views})
+    moved = [_comparable([view for view in views if view.camera_name == name]) for name in names]
+    compared = {own[index][0].frame_index for own in moved for index in compared_images(len(own))}
+    returns = returns_of(scene, sorted(compared))
+    found = side_by_side(lambda own: _measured(scene, own, returns), moved)
+    faults = [None if one is None else believed(one) for one in found]
+    return {name: fault for name, fault in zip(names, faults, strict=True) if fault is not None}
 
 
 def believed(found: Found) -> CameraFault | None:
@@ -84,27 +93,34 @@ def believed(found: Found) -> CameraFault | None:
     return CameraFault(turn_rad=(x, y, z), late_s=float(late), readout_s=float(readout))
 
 
-def measured_faults(scene: DrivingScene, views: Sequence[RecordedView]) -> Found | None:
-    """The parameters of one camera under which its images agree; a told readout is kept.
+def _comparable(views: Sequence[RecordedView]) -> list[tuple[RecordedView, Shutter]]:
+    """A camera's views with how they moved; none where too little is seen.
 
-    Views are in order of time.
-
-    Returns:
-        None where too little is seen: three images or fewer, coarse ones, or a car that stands.
+    Three images or fewer show too little, and so do coarse ones and a car that stands.
     """
     moved = [(view, shutter) for view in views if (shutter := view.camera.shutter) is not None]
-    shutters = [shutter for _, shutter in moved]
-    speeds_mps = [float(shutter.twist_per_s[3:].norm()) for shutter in shutters]
+    speeds_mps = [float(shutter.twist_per_s[3:].norm()) for _, shutter in moved]
     if len(moved) <= 3 or np.median(speeds_mps) < MIN_SPEED_MPS:
-        return None
+        return []
     camera = views[0].camera
     share = min(1.0, WIDTH_PX / camera.width_px)
-    if camera.fx_px * share * np.radians(1) < MIN_PX_PER_DEG:
-        return None
-    hubs = hubs_of(scene, moved)
+    return moved if camera.fx_px * share * np.radians(1) >= MIN_PX_PER_DEG else []
+
+
+def _measured(
+    scene: DrivingScene,
+    moved: Sequence[tuple[RecordedView, Shutter]],
+    returns: Mapping[int, FrameReturns],
+) -> Found | None:
+    """The parameters of one camera under which its images agree; a told readout is kept.
+
+    Returns:
+        None where nothing can be compared.
+    """
+    hubs = hubs_of(scene, moved, returns)
     if not hubs:
         return None
-    is_told = any(shutter.is_rolling for shutter in shutters)
+    is_told = any(shutter.is_rolling for _, shutter in moved)
     free = np.arange(READOUT if is_told else READOUT + 1)
     return _refined(hubs, _searched(hubs, free), free)
 

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
@@ -56,21 +57,25 @@ def own_bodies(
         views: those that may be looked at.
     """
     moving = MovingBoxes([track for track in scene.tracks if track.is_moving])
-    found = {}
-    for name in sorted({view.camera_name for view in views}):
-        chosen = _far_apart([view for view in views if view.camera_name == name])
-        if len(chosen) < LEAST_IMAGES:
-            continue
-        cameras = [view.camera.no_wider(WIDTH_PX) for view in chosen]
-        seen = [
-            _seen_change(scene.read_image(view), camera, _way(cameras, place), moving, view)
-            for place, (view, camera) in enumerate(zip(chosen, cameras, strict=True))
-        ]
-        edges, sure = (mask & _would_have_moved(cameras) for mask in _what_stays(seen))
-        body = _enclosed(edges, sure)
-        if body.any():
-            found[name] = body
-    return found
+    names = sorted({view.camera_name for view in views})
+    chosen = [_far_apart([view for view in views if view.camera_name == name]) for name in names]
+    bodies = side_by_side(lambda own: _own_body(scene, own, moving), chosen)
+    return {name: body for name, body in zip(names, bodies, strict=True) if body.any()}
+
+
+def _own_body(
+    scene: DrivingScene, views: Sequence[RecordedView], moving: MovingBoxes
+) -> Bool[np.ndarray, "height width"]:
+    """What stays in views of one camera that are far apart."""
+    cameras = [view.camera.no_wider(WIDTH_PX) for view in views]
+    if len(views) < LEAST_IMAGES:
+        return np.zeros((cameras[0].height_px, cameras[0].width_px), np.bool_)
+    seen = [
+        _seen_change(scene.read_image(view), camera, _way(cameras, place), moving, view)
+        for place, (view, camera) in enumerate(zip(views, cameras, strict=True))
+    ]
+    edges, sure = (mask & _would_have_moved(cameras) for mask in _what_stays(seen))
+    return _enclosed(edges, sure)
 
 
 def in_words(camera_name: str, body: Bool[np.ndarray | Tensor, "height width"]) -> str:

@@ -5,7 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
+from toy_street import ToyStreet
 
+from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.lidar.contrast_images import ContrastImage
 from lidarpainter_models.lidar.recording_faults import Found, believed, find_faults
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -44,6 +47,18 @@ def test_contrast_does_not_see_exposure():
     rgb = np.random.default_rng(0).integers(60, 120, (64, 64, 3)).astype(np.uint8)
     dark, bright = (ContrastImage.of(image).levels[3] for image in (rgb, 2 * rgb))
     assert np.allclose(dark, bright, atol=0.1)  # black is not quite black
+
+
+def test_each_sweep_is_read_once_for_all_cameras(monkeypatch):
+    street = ToyStreet(num_frames=4, camera_gains=(("front", 1.0), ("beside", 0.8)))
+    driving = Shutter(twist_per_s=torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 10.0]))
+    moved = [replace(v, camera=replace(v.camera, shutter=driving)) for v in street.views]
+    read, read_column = [], street.read_column
+    monkeypatch.setattr(
+        street, "read_column", lambda sweep, name: read.append(sweep) or read_column(sweep, name)
+    )
+    find_faults(street, moved)
+    assert sorted(sweep.frame_index for sweep in read) == list(street.frame_indices)
 
 
 @pytest.mark.slow
