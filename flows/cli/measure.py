@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from catalog.points import Point
     from flows.fleet.manifest import Configuration
     from flows.measure.sweep import Sweep
+    from flows.parameters import ReconstructParameters
 
 NOT_OVER = 2
 """How the command ends where a table was left."""
@@ -59,10 +60,11 @@ def chart(  # noqa: PLR0913 - the options of a command
     Example: lidarpainter chart synthetic/street-0001 --seeds 2 --out chart
     """
     from flows.measure.chart import chart_of
-    from flows.measure.configurations import CHART
+    from flows.measure.configurations import chart_ways
 
-    names = _known(only, [one.name for one in CHART])
-    chosen = [one for one in CHART if one.name in names]
+    ways = chart_ways(_given(preset, scenes, settings))
+    names = _known(only, [way.name for way in ways])
+    chosen = [way for way in ways if way.name in names]
     sweep = _sweep("chart", scenes, chosen, preset, train_cameras, seeds, settings)
     points = _made(sweep, workers=workers, accept_stale=accept_stale)
     _show(chart_of(points, out), as_json=as_json)
@@ -87,10 +89,11 @@ def size(  # noqa: PLR0913 - the options of a command
     Example: lidarpainter size synthetic/street-0001 --only gaussians --out size
     """
     from flows.measure.chart import sizes_of
-    from flows.measure.configurations import SIZE
+    from flows.measure.configurations import size_factors
 
-    names = _known(only, [factor.name for factor in SIZE])
-    factors = [factor for factor in SIZE if factor.name in names]
+    compared = size_factors(_given(preset, scenes, settings))
+    names = _known(only, [factor.name for factor in compared])
+    factors = [factor for factor in compared if factor.name in names]
     levels = [level for factor in factors for level in factor.levels]
     sweep = _sweep("size", scenes, levels, preset, train_cameras, seeds, settings)
     points = _made(sweep, workers=workers, accept_stale=accept_stale)
@@ -204,6 +207,16 @@ def _known(only: str | None, names: Sequence[str]) -> tuple[str, ...]:
             f"--only: nothing is called {', '.join(unknown)}, expected some of {', '.join(names)}"
         )
     return chosen
+
+
+def _given(
+    preset: str, scenes: Sequence[str], settings: Sequence[str] | None
+) -> "ReconstructParameters":
+    """What is asked for, of which one thing is changed at a time."""
+    from flows.overrides import with_overrides
+    from flows.presets import preset as preset_named
+
+    return with_overrides(preset_named(preset, scenes[0]), settings or ())
 
 
 def _sweep(

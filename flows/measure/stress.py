@@ -246,11 +246,13 @@ def _told(curves: Sequence[_Curve], quality: str) -> list[str]:
     for curve in curves:
         gains, levels = curve.gains, curve.levels
         title, unit = f"{curve.cause}, {curve.scene}", CAUSES[curve.cause].unit
-        halved = next((lv for lv, g in zip(levels, gains, strict=True) if g < gains[0] / 2), None)
-        hurts = next((lv for lv, g in zip(levels, gains, strict=True) if g < -HARM_DB), None)
+        named = list(zip(["as recorded", *levels[1:]], gains, strict=True))
+        halved = next((level for level, gain in named if gain < gains[0] / 2), "no level")
+        hurts = next((level for level, gain in named if gain < -HARM_DB), "no level")
+        lead = f"halved at {halved}" if gains[0] > 0 else "no lead to halve"
         says.append(
             f"{title}, {LABELS[quality]}: gains {gains[0]:+.2f} as recorded, {gains[-1]:+.2f} at "
-            f"{levels[-1]} {unit}; halved at {halved or 'none'}, hurts at {hurts or 'none'}"
+            f"{levels[-1]} {unit}; {lead}, hurts at {hurts}"
         )
         worst = min(worst, (min(gains), f"{title} at {levels[gains.index(min(gains))]} {unit}"))
     spoilt = [gain for curve in curves for gain in curve.gains[1:]]

@@ -9,8 +9,10 @@ import pytest
 
 from catalog.points import Point
 from flows.measure.chart import chart_of, sizes_of
-from flows.measure.configurations import CHART, SIZE
-from flows.measure.figures import LANES, QUALITIES, qualities
+from flows.measure.configurations import chart_ways, size_factors
+from flows.measure.figures import LANES, qualities
+from flows.overrides import with_overrides
+from flows.presets import PRESETS, preview
 
 SCENES = ("synthetic/street-0001", "pandaset/002")
 GAINS = {"preset": 0.0, "first-fit": -1.0, "steps-x2": 0.3, "steps-x0.5": -0.4, "warp": -0.6}
@@ -90,7 +92,7 @@ def test_the_same_points_draw_the_same_file(points, tmp_path):
 
 
 def test_each_level_is_held_against_the_one_before(tmp_path):
-    factor = SIZE[0]
+    factor = size_factors(preview(SCENES[0]))[0]
     points = [
         point(SCENES[0], level.name, seed, psnr, 100 + 10 * number, 20_000 * 2**number)
         for number, (level, psnr) in enumerate(
@@ -107,19 +109,20 @@ def test_each_level_is_held_against_the_one_before(tmp_path):
     ]
 
 
-def test_configurations_are_changes_that_a_preset_can_take():
-    from flows.overrides import with_overrides
-    from flows.presets import preview
-
-    names = [way.name for way in CHART]
+@pytest.mark.parametrize("preset", PRESETS)
+def test_one_thing_is_changed_at_a_time_from_what_is_given(preset):
+    given = PRESETS[preset](SCENES[0])
+    ways, factors = chart_ways(given), size_factors(given)
+    names = [way.name for way in ways]
     assert len(set(names)) == len(names) >= 12
-    for way in (*CHART, *(level for factor in SIZE for level in factor.levels)):
-        with_overrides(preview("a/b"), way.settings)
-    for factor in SIZE:
-        assert factor.default in {level.name for level in factor.levels}
-        default = next(level for level in factor.levels if level.name == factor.default)
-        assert with_overrides(preview("a/b"), default.settings) == preview("a/b")
-    assert set(QUALITIES) >= {"recorded_psnr", "aside_psnr"}
+    changed = [with_overrides(given, way.settings) for way in ways[1:] if way.painter is None]
+    assert sum(one == given for one in changed) == (given.rounds == 1)  # its one round
+    halved = next(way for way in ways if way.name == "gaussians-x0.5")
+    effort = with_overrides(given, halved.settings).fit.effort
+    assert effort.gaussians_per_pixel == given.fit.effort.gaussians_per_pixel / 2
+    for factor in factors:
+        same = [way.name for way in factor.levels if with_overrides(given, way.settings) == given]
+        assert same == [factor.default]
 
 
 def test_stress_says_where_painting_hurts(tmp_path):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from flows.measure.configurations import CHART
+from flows.measure.configurations import chart_ways
 from flows.measure.figure_manifest import cells_of, read_figure_manifest
 from flows.measure.figures import figure_of, written
 from flows.measure.tables import (
@@ -16,6 +16,7 @@ from flows.measure.tables import (
     rendered,
     with_tables,
 )
+from flows.presets import preview
 from lidarpainter_models.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -108,7 +109,7 @@ def test_no_page_of_ours_has_a_table_that_the_manifest_does_not_know():
 
 def test_the_chart_of_our_manifest_is_that_of_the_command():
     chart = next(fleet for fleet in read_figure_manifest(OURS).fleet if fleet.name == "chart")
-    assert chart.configuration == CHART
+    assert chart.configuration == chart_ways(preview("pandaset/002"))
 
 
 # --- how a table reads
