@@ -194,7 +194,7 @@ def _steps(  # noqa: PLR0913 - as `fit_gaussians`
         _advance(state, half if is_half else full, row, guidance, config, perceptual)
         state.cpu_s = time.process_time() - cpu_before_s
         if state.step % config.log_every == 0 or state.step == config.steps:
-            config = clock.in_time(state.step, config)
+            config = state.refinement.config = clock.in_time(state.step, config)
             _log(state, config, told.progress)
         if look is not None and state.step >= config.steps * FIRST_LOOK:
             look(state.caught_up())

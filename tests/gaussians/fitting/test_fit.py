@@ -6,6 +6,7 @@ import torch
 from gaussian_world import FRAME_NS, HEIGHT_PX, WIDTH_PX, scene_of
 
 from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.gaussians.fitting import fit as fit_module
 from lidarpainter_models.gaussians.fitting import settings, step
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import (
@@ -341,6 +342,13 @@ def test_a_fit_out_of_time_ends_early_and_is_whole(world):
     found = fit_gaussians(world.observations, short_fit(log_every=4, time_limit_s=1e-9))
     assert found.history[-1]["step"] == 4
     assert found.scene.num_gaussians > 0
+
+
+def test_all_schedules_are_those_of_as_many_steps_as_the_time_allows(world, monkeypatch):
+    ends, end = [], fit_module._finished
+    monkeypatch.setattr(fit_module, "_finished", lambda state: ends.append(state) or end(state))
+    fit_gaussians(world.observations, short_fit(log_every=4, time_limit_s=1e-9))
+    assert ends[0].refinement.config.steps == ends[0].step == 4
 
 
 def test_a_limit_that_is_not_reached_changes_nothing(world, undisturbed):
