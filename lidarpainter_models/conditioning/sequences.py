@@ -80,6 +80,7 @@ class SequencePainter:
         self, conditions: PaintingConditions, camera: Camera, timestamp_ns: int
     ) -> Painting:
         """Paint the next view, whose conditions were gathered before."""
+        timestamp_ns = camera.taken_ns(timestamp_ns)
         with torch.inference_mode():
             painting = self._painted(conditions, camera, timestamp_ns)
         if self._config.previous != "unused":

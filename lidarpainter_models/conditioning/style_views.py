@@ -24,7 +24,7 @@ def style_view(
         LiDAR hit, 0 elsewhere. All on the CPU, where styles are made.
     """
     render = builder.scene.render(camera, timestamp_ns)
-    lidar = builder.lidar_image(camera, timestamp_ns)
+    lidar = builder.lidar_image(camera, camera.taken_ns(timestamp_ns))
     sky = 1 - render.alpha.clamp(0, 1).cpu() if sky_mask is None else sky_mask.float()
     view = StyleView(
         rgb=image.cpu(),

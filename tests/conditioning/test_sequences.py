@@ -6,8 +6,11 @@ import pytest
 import torch
 
 from lidarpainter_models.conditioning.novel_guidance import novel_cameras, paint_novel_views
+from lidarpainter_models.conditioning.references import WarpTarget
 from lidarpainter_models.conditioning.sequences import SequencePainter
 from lidarpainter_models.conditioning.settings import NovelGuidanceConfig, SequenceConfig
+from lidarpainter_models.conditioning.style_views import style_view
+from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.painter.protocol import Painting
 
@@ -42,12 +45,38 @@ def paint_path(builder, painter, config, path):
     return [sequence.paint(*view).painting.rgb for view in path]
 
 
+def late(camera):
+    """The camera with a clock that is one step of the path late."""
+    return replace(camera, shutter=Shutter(late_s=STEP_NS / 1e9, twist_per_s=torch.zeros(6)))
+
+
 @pytest.mark.parametrize("previous", ["unused", "mixed", "shown"])
 def test_the_first_frame_is_the_one_painted_alone(previous, builder, path):
     config = SequenceConfig(previous=previous)
     first = paint_path(builder, FlickeringPainter(), config, path)[0]
     alone = FlickeringPainter().paint(builder.conditions(*path[0])).rgb
     assert torch.equal(first, alone)
+
+
+def test_a_late_frame_is_carried_on_from_when_it_was_taken(builder, path, monkeypatch):
+    placed, of_render = [], WarpTarget.of_render
+    monkeypatch.setattr(
+        WarpTarget, "of_render", lambda *given: placed.append(given[1]) or of_render(*given)
+    )
+    delayed = [(late(camera), time_ns - STEP_NS) for camera, time_ns in path]
+    paint_path(builder, FlickeringPainter(), MIXED, delayed)
+    assert placed == [time_ns for _, time_ns in path[1:]]
+
+
+def test_a_late_image_is_styled_with_the_lidar_of_when_it_was_taken(builder, path, monkeypatch):
+    asked, lidar_image = [], builder.lidar_image
+    monkeypatch.setattr(
+        builder, "lidar_image", lambda *given: asked.append(given[1]) or lidar_image(*given)
+    )
+    camera, time_ns = path[2]
+    image = torch.zeros(camera.height_px, camera.width_px, 3)
+    style_view(builder, late(camera), time_ns - STEP_NS, image)
+    assert asked == [time_ns]
 
 
 def test_unused_frames_change_nothing(builder, path):

@@ -1,7 +1,7 @@
 from dataclasses import replace
 
 import torch
-from gaussian_world import FRAME_NS, camera_at, round_gaussians, scene_of
+from gaussian_world import FRAME_NS, camera_at, car_track, round_gaussians, scene_of
 from wall_images import image_of_wall, sideways_cameras
 
 from lidarpainter_models.gaussians.initialisation import unreached
@@ -10,6 +10,7 @@ from lidarpainter_models.gaussians.initialisation.unreached import (
     unreached_gaussians,
 )
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.observations.views import TrainingView
 
 
@@ -17,6 +18,32 @@ def test_depth_goes_straight_up_over_gaps():
     depth_m = torch.tensor([[0.0, 0.0], [0.0, 7.0], [5.0, 0.0], [0.0, 0.0]])
     filled = depth_from_below(depth_m, fallback_m=99.0)
     assert filled.tolist() == [[5.0, 7.0], [5.0, 7.0], [5.0, 99.0], [99.0, 99.0]]
+
+
+def test_actors_are_where_they_were_when_a_late_image_was_taken():
+    camera = camera_at(0.0)
+    late = replace(camera, shutter=Shutter(late_s=FRAME_NS / 1e9, twist_per_s=torch.zeros(6)))
+    nothing = GaussianSet.empty(sh_degree=1)
+    scene = scene_of(nothing, [camera] * 4, [car_track(4)])
+    of_late, before, then = (
+        unreached._moving(scene, view_of(camera, time_ns))
+        for camera, time_ns in ((late, FRAME_NS), (camera, FRAME_NS), (camera, 2 * FRAME_NS))
+    )
+    assert then.any()
+    assert not torch.equal(before, then)
+    assert torch.equal(of_late, then)
+
+
+def view_of(camera, timestamp_ns):
+    size = camera.height_px, camera.width_px
+    return TrainingView(
+        key=(0, "front"),
+        camera=camera,
+        timestamp_ns=timestamp_ns,
+        rgb_u8=torch.zeros(*size, 3, dtype=torch.uint8),
+        sky_mask=torch.zeros(size, dtype=torch.bool),
+        lidar_depth_m=torch.zeros(size),
+    )
 
 
 def views_of_wall(cameras):
