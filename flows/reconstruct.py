@@ -253,6 +253,7 @@ def _result(course: Course, scores: dict[str, Scores], final: FittedRef) -> dict
         "rounds": parameters.rounds,
         "seconds": {name: stage.seconds for name, stage in stages.items()},
         "cpu_seconds": {name: stage.cpu_seconds for name, stage in stages.items()},
+        "memory_bytes": {name: stage.peak_memory_bytes for name, stage in stages.items()},
         "computed_now": {name: stage.is_new for name, stage in stages.items()},
         "peak_memory_bytes": max(stage.peak_memory_bytes for stage in stages.values()),
         "num_gaussians": last_fit.summary["num_gaussians"],

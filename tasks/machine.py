@@ -5,24 +5,29 @@ import platform
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-
-import torch
+from typing import TYPE_CHECKING
 
 import lidarpainter_models
 
+if TYPE_CHECKING:
+    import torch
+
 PACKAGES = ("torch", "numba", "numpy")
 _CPU_FACTS = Path("/proc/cpuinfo")
+MEMORY_LIMIT = Path("/sys/fs/cgroup/memory.max")
+"""Bytes, where a container has a limit."""
 
 
-def machine(device: torch.device) -> dict[str, str]:
+def machine(device: "torch.device") -> dict[str, str]:
     """Names and values: date, processor, cores, memory, device, versions."""
-    pages, page_bytes = os.sysconf("SC_PHYS_PAGES"), os.sysconf("SC_PAGE_SIZE")
+    import torch
+
     is_gpu = device.type == "cuda"
     return {
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "processor": _processor(),
         "cores": f"{_usable_cores()} to be used of {os.cpu_count()}",
-        "memory": f"{pages * page_bytes / 1e9:.1f} GB",
+        "memory": f"{machine_memory_bytes() / 1e9:.1f} GB",
         "device": f"{device.type}, {torch.cuda.get_device_name(device)}" if is_gpu else device.type,
         "system": platform.platform(),
         "versions": ", ".join(
@@ -33,6 +38,16 @@ def machine(device: torch.device) -> dict[str, str]:
             ]
         ),
     }
+
+
+def machine_memory_bytes(limit: Path = MEMORY_LIMIT) -> float:
+    """Memory of this machine, or of its container."""
+    memory = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    try:
+        allowed = limit.read_text("ascii").strip()
+    except OSError:
+        return memory
+    return memory if allowed == "max" else min(memory, float(allowed))
 
 
 def _processor() -> str:

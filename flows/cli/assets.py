@@ -113,10 +113,10 @@ def list_assets(  # noqa: PLR0913 - the options of a command
     found = find_assets(sql, wanted, sort=sort, most=limit)
     if as_json:
         rows = [opened_row(row) for row in found.rows]
-        print_json({"store": str(store.root), "assets": rows, "is_cut": found.is_cut})
+        print_json({"store": store.name, "assets": rows, "is_cut": found.is_cut})
         return
     note = f"only the first {limit} by {sort}: --limit shows more" if found.is_cut else ""
-    _show_assets(f"assets in {store.root}", found.rows, note)
+    _show_assets(f"assets in {store.name}", found.rows, note)
 
 
 @app.command()

@@ -52,7 +52,7 @@ def stale(as_json: AsJson = False) -> None:
         f"{scenes} scenes; to redo them took {total['seconds']:.0f} s, "
         f"{total['cpu_seconds']:.0f} s of CPU, and {format_bytes(total['num_bytes'])}"
     )
-    print_table(f"stale in {store.root}", columns, rows, note, num_text_columns=4)
+    print_table(f"stale in {store.name}", columns, rows, note, num_text_columns=4)
 
 
 @app.command("cost")

@@ -1,19 +1,16 @@
 """What holds a fleet back: the room on the disk, the memory of the machine, its budget of hours."""
 
-import os
 from collections.abc import Sequence
-from pathlib import Path
 
 from catalog.fleets import FleetLedger
 from catalog.leases import Lease, Leases
 from catalog.tables import Row
 from flows.fleet.manifest import Budget
+from tasks.machine import machine_memory_bytes
 
 GIGABYTE = 1e9
 MEMORY_SHARE = 0.9
 """Of the machine's memory that sequences may be planned into."""
-MEMORY_LIMIT = Path("/sys/fs/cgroup/memory.max")
-"""Bytes, where a container has a limit."""
 
 
 def lacks_disk(ledger: FleetLedger, budget: Budget, num_bytes: float = 0.0) -> str | None:
@@ -51,16 +48,6 @@ def admits(leases: Leases, lease: Lease, budget: Budget) -> bool:
         return True
     limit = budget.memory_gb * 1e9 if budget.memory_gb else MEMORY_SHARE * machine_memory_bytes()
     return sum(_planned_bytes(one) for one in [lease, *others]) <= limit
-
-
-def machine_memory_bytes(limit: Path = MEMORY_LIMIT) -> float:
-    """Memory of this machine, or of its container."""
-    memory = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    try:
-        allowed = limit.read_text("ascii").strip()
-    except OSError:
-        return memory
-    return memory if allowed == "max" else min(memory, float(allowed))
 
 
 def _planned_bytes(lease: Lease) -> float:

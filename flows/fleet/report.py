@@ -126,7 +126,7 @@ def fleet_page(ledger: FleetLedger, fleet: str) -> Report:
         plots=_plots(record),
         facts={
             "Provenance": {
-                "store": str(ledger.store.root),
+                "store": ledger.store.name,
                 "software": f"lidarpainter {lidarpainter_models.__version__}",
             }
         },

@@ -19,6 +19,7 @@ from flows.fleet.local_workers import run_workers, starter
 from flows.fleet.manifest import STORED, Configuration, Manifest, Publication, Source
 from flows.fleet.planner import Planner
 from flows.fleet.status import counts_of
+from tasks.opened import open_scene
 
 THREADS = 1
 """Of the workers that make points."""
@@ -82,7 +83,12 @@ def make_points(
     """Make the points of a fleet that are not there yet, one thread each, and say what is to come.
 
     Its sources name no folder. Returns the points that are done, and the sequences that are not.
+
+    Raises:
+        SceneError: a stored scene is not there.
     """
+    for scene_id in (one for source in manifest.source for one in source.scenes or ()):
+        open_scene(store, scene_id)
     ledger = FleetLedger(store)
     for line in ledger.reconcile():
         say(line)
@@ -102,7 +108,8 @@ def undone(points: Sequence[Point], missing: Sequence[Row]) -> str:
     made = first["configuration"] or first["fleet"]
     return (
         f"{len(missing)} of {len(points) + len(missing)} points are not done, such as "
-        f"{made} on {first['scene_id']}: {first['reason'] or first['state']}"
+        f"{made} on {first['scene_id']}: {first['reason'] or first['state']} (`fleet retry "
+        f"{first['fleet']}` makes what failed wait again)"
     )
 
 

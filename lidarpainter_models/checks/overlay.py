@@ -10,6 +10,7 @@ from lidarpainter_models.geometry.boxes import BOX_EDGES, box_corners
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.scenes.tracks import ActorTrack
 
 _NEAREST_M, _FARTHEST_M = 3.0, 90.0
@@ -17,18 +18,15 @@ _NEAR_PLANE_M = 0.3
 _MOVING_RGB, _PARKED_RGB = (80, 255, 80), (255, 255, 255)
 
 
-def draw_overlay(
-    scene: DrivingScene, frame_index: int, camera_name: str
-) -> UInt8[Tensor, "height width 3"]:
-    """The recorded image with the frame's points coloured by depth and all boxes in view.
+def draw_overlay(scene: DrivingScene, view: RecordedView) -> UInt8[Tensor, "height width 3"]:
+    """The recorded image with its frame's points coloured by depth and all boxes in view.
 
     Boxes stand where they are at the moment of the exposure: green moves, white is parked, the
     cross marks the front of the actor.
     """
-    view = scene.view(frame_index, camera_name)
     image = np.ascontiguousarray(scene.read_image(view).numpy())
-    if scene.sweeps_of(frame_index):
-        _draw_points(image, view.camera, scene.read_positions(frame_index))
+    if scene.sweeps_of(view.frame_index):
+        _draw_points(image, view.camera, scene.read_positions(view.frame_index))
     draw_boxes(image, view.camera, scene.tracks, view.timestamp_ns)
     return torch.from_numpy(image)
 

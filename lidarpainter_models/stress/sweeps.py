@@ -50,7 +50,9 @@ def clutter(frame: Frame, level: float, dice: np.random.Generator) -> Frame:
 
 
 def _each(frame: Frame, change: Callable[[Turn], Turn]) -> Frame:
-    return replace(frame, turns=tuple(change(turn) for turn in frame.turns))
+    """All turns changed; those that are left without points go."""
+    turns = map(change, frame.turns)
+    return replace(frame, turns=tuple(turn for turn in turns if len(turn.points.xyz_m)))
 
 
 def _own_points(turn: Turn) -> torch.Tensor:

@@ -17,6 +17,7 @@ from lidarpainter_models.observations.own_body import in_words, own_bodies
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from tasks.health import Finding
+from tasks.ingest.bucket_roots import root_at_hand
 from tasks.ingest.sequences import find_sequences
 from tasks.opened import open_scene
 
@@ -60,7 +61,8 @@ def check_dataset(store: Store, dataset: str, root: Path, out: Path | None) -> l
     for sequence in find_sequences(dataset, root):
         with tempfile.TemporaryDirectory(prefix="lidarpainter-doctor-") as trial:
             try:
-                path = ingest_scene(dataset, root, sequence, Path(trial), frames=TRIAL_FRAMES)
+                with root_at_hand(root, sequence) as folder:
+                    path = ingest_scene(dataset, folder, sequence, Path(trial), frames=TRIAL_FRAMES)
                 image = (out or store.root / "doctor" / dataset) / f"{sequence}.png"
                 scene = DrivingScene.open(path)
                 found = _examined(scene, image, _findings(scene))
@@ -116,6 +118,6 @@ def _own_bodies(scene: DrivingScene) -> list[Finding]:
 
 
 def _write_overlay(scene: DrivingScene, path: Path) -> Path:
-    frame_index = scene.frame_indices[len(scene.frame_indices) // 2]
-    rgb_u8 = draw_overlay(scene, frame_index, scene.camera_names[0])
+    of_camera = scene.views_of(scene.views[0].camera_name)
+    rgb_u8 = draw_overlay(scene, of_camera[len(of_camera) // 2])
     return write_png(rgb_u8.float() / 255, path)

@@ -13,7 +13,8 @@ from catalog.store import open_store
 RESULT = {
     "seconds": {"fit": 3.0, "total": 9.0},
     "cpu_seconds": {"fit": 5.0, "evaluate": 2.0, "total": 7.0},
-    "peak_memory_bytes": 100,
+    "memory_bytes": {"fit": 100, "evaluate": 300},
+    "peak_memory_bytes": 300,
     "num_gaussians": 10,
 }
 

@@ -242,7 +242,7 @@ def test_single_frame_has_no_motion_to_check(sound_pandaset, tmp_path):
 
 @pytest.mark.parametrize("camera", ["front_camera", "back_camera"])
 def test_overlay_draws_over_the_recorded_image(small_scene, camera):
-    image = draw_overlay(small_scene, 1, camera)
+    image = draw_overlay(small_scene, small_scene.view(1, camera))
     recorded = small_scene.read_image(small_scene.view(1, camera))
     changed = (image != recorded).any(dim=-1)
     assert image.shape == recorded.shape
@@ -252,7 +252,7 @@ def test_overlay_draws_over_the_recorded_image(small_scene, camera):
 
 def test_overlay_draws_moving_boxes_green_where_the_car_is(small_scene):
     view = small_scene.view(1, "front_camera")
-    image = draw_overlay(small_scene, 1, "front_camera").float()
+    image = draw_overlay(small_scene, small_scene.view(1, "front_camera")).float()
     greenness = image[..., 1] - image[..., [0, 2]].mean(dim=-1)
     track = next(track for track in small_scene.tracks if track.is_moving)
     pixels_uv, _ = view.camera.project(track.pose_at(view.timestamp_ns)[None, :3, 3])

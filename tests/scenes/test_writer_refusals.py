@@ -99,7 +99,7 @@ def test_scene_without_lidar_is_read_back_and_examined(tmp_path):
     assert found["LiDAR"].verdict == "warn"
     assert [check for check in found.values() if check.verdict == "fail"] == []
     assert not {"ground", "sweeps agree", "boxes hold points"} & found.keys()
-    assert draw_overlay(scene, 0, scene.camera_names[0]).shape[2] == 3
+    assert draw_overlay(scene, scene.views[0]).shape[2] == 3
 
 
 def ego_pose(degrees, axis, place_m=(0.0, 0.0, 0.0)):

@@ -14,7 +14,7 @@ from lidarpainter_models.stress.causes import CAUSES
 from lidarpainter_models.stress.frames import read_frame
 from lidarpainter_models.stress.labels import clock_offset
 from lidarpainter_models.stress.spoiling import write_spoilt
-from lidarpainter_models.stress.sweeps import beams
+from lidarpainter_models.stress.sweeps import beams, reach
 
 TRAINS, JUDGES = 2, 1
 """Positions of frames; the first one holds the origin of the world."""
@@ -113,13 +113,12 @@ def test_beams_are_counted(clean, spoilt):
     assert frame_of(spoilt("beams", 0), TRAINS).turns == ()
 
 
-def test_a_turn_without_a_point_keeps_none(clean):
-    frame = frame_of(clean, TRAINS)
+def test_a_turn_that_keeps_no_point_goes(clean):
+    frame, dice = frame_of(clean, TRAINS), np.random.default_rng(0)
+    assert reach(frame, 0.0, dice).turns == ()  # no scene stores a sweep without points
     turn = frame.turns[0]
     nothing = torch.zeros(turn.points.num_points, dtype=torch.bool)
-    emptied = replace(frame, turns=(turn.kept(nothing),))
-    found = beams(emptied, 4, np.random.default_rng(0))
-    assert found.turns[0].points.num_points == 0
+    assert beams(replace(frame, turns=(turn.kept(nothing),)), 4, dice).turns == ()
 
 
 def test_drops_lie_between_the_sensor_and_what_it_saw(clean, spoilt):

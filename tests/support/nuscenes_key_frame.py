@@ -153,7 +153,8 @@ def draw_key_frame(folder, camera_name="CAM_FRONT"):
     with tempfile.TemporaryDirectory() as place:
         write_key_frame(folder, Path(place) / "log")
         path = ingest_scene("nuscenes", Path(place) / "log", SCENE_NAME, Path(place) / "store")
-        overlay = draw_overlay(DrivingScene.open(path), 0, camera_name).numpy()
+        scene = DrivingScene.open(path)
+        overlay = draw_overlay(scene, scene.view(0, camera_name)).numpy()
     return cv2.cvtColor(overlay, cv2.COLOR_RGB2BGR)
 
 

@@ -8,11 +8,14 @@ import cv2
 import pytest
 
 from catalog.points import Point
+from catalog.store import open_store
 from flows.measure.chart import chart_of, sizes_of
 from flows.measure.configurations import chart_ways, size_factors
 from flows.measure.figures import LANES, qualities
+from flows.measure.sweep import Sweep, run_sweep, was_asked
 from flows.overrides import with_overrides
 from flows.presets import PRESETS, preview
+from lidarpainter_models.errors import SceneError
 
 SCENES = ("synthetic/street-0001", "pandaset/002")
 GAINS = {"preset": 0.0, "first-fit": -1.0, "steps-x2": 0.3, "steps-x0.5": -0.4, "warp": -0.6}
@@ -123,6 +126,23 @@ def test_one_thing_is_changed_at_a_time_from_what_is_given(preset):
     for factor in factors:
         same = [way.name for way in factor.levels if with_overrides(given, way.settings) == given]
         assert same == [factor.default]
+
+
+def test_points_of_a_scene_that_is_not_there_are_not_asked_for(tmp_path):
+    store = open_store(tmp_path)
+    store.make()
+    sweep = Sweep(
+        name="chart",
+        scenes=("pandaset/404",),
+        cameras=None,
+        preset="preview",
+        settings=(),
+        configurations=chart_ways(preview("pandaset/404")),
+        seeds=(0,),
+    )
+    with pytest.raises(SceneError, match="pandaset/404"):
+        run_sweep(sweep, store, workers=1, accept_stale=False, say=print)
+    assert not was_asked("chart", store)
 
 
 def test_stress_says_where_painting_hurts(tmp_path):

@@ -5,8 +5,10 @@ import shutil
 
 import pytest
 from toy_store import TOY_SCENE, write_toy_scene
+from toy_street import ToyStreet
 
 from catalog.store import open_store
+from tasks.ingest import data_checks
 from tasks.ingest.data_checks import check_dataset, check_stored_scene
 
 
@@ -27,6 +29,12 @@ def test_stored_scene_gets_a_verdict_per_check_a_image_and_a_json(store):
     assert report["scene"] == TOY_SCENE
     assert [found["name"] for found in report["findings"]] == names[:-1]
     assert report["is_fit"] == all(found["verdict"] != "fail" for found in report["findings"])
+
+
+def test_the_overlay_shows_an_image_that_is_there(tmp_path):
+    street = ToyStreet(num_frames=3)
+    street.views = tuple(view for view in street.views if view.frame_index != 1)
+    assert data_checks._write_overlay(street, tmp_path / "overlay.png").stat().st_size > 1_000
 
 
 def test_dataset_on_disk_is_examined_sequence_by_sequence(store, tmp_path):
