@@ -130,15 +130,11 @@ def _check_names(names: tuple[str, ...] | None, views: Sequence[TrainingView]) -
 
 def has_room(novel: NovelCamera, lidar_map: LidarMap, actors: MovingBoxes) -> bool:
     """Whether a camera stands in free space: not in or at a moving actor, a parked car, a wall."""
-    street_m = lidar_map.street.xyz_m
-    centre = novel.camera.centre_world.to(street_m.dtype)
+    centre = novel.camera.centre_world.float()
     for track, box in actors.placed(novel.timestamp_ns):
         if bool(is_inside_box(centre[None], box, track.size_m, margin_m=ROOM_M)):
             return False
-    centre = centre.to(street_m.device)
-    near = ((street_m[:, 0] - centre[0]).abs() < ROOM_M).nonzero()[:, 0]
-    distance_m = (street_m[near] - centre).norm(dim=-1)
-    return int((distance_m < ROOM_M).sum()) <= MAX_POINTS_IN_ROOM
+    return lidar_map.num_street_points_near(centre, ROOM_M) <= MAX_POINTS_IN_ROOM
 
 
 def paint_novel_views(

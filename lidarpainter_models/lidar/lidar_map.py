@@ -5,6 +5,7 @@ The street stands in the world, each moving actor in the frame of its box; metre
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -32,8 +33,8 @@ class MapPoints:
         """How many points there are."""
         return self.xyz_m.shape[0]
 
-    def keep(self, kept: Tensor) -> "MapPoints":
-        """The points marked or listed."""
+    def keep(self, kept: Tensor | slice) -> "MapPoints":
+        """The points marked or listed; of a slice nothing is copied."""
         return type(self)(**{field.name: getattr(self, field.name)[kept] for field in fields(self)})
 
     def to(self, device: torch.device) -> "MapPoints":
@@ -98,6 +99,22 @@ class LidarMap:
             return self
         actors = {name: points.to(device) for name, points in self.actors.items()}
         return LidarMap(street=self.street.to(device), actors=actors)
+
+    def num_street_points_near(self, place_m: Float[Tensor, "3"], radius_m: float) -> int:
+        """How many points of the street are nearer than that to a place in the world."""
+        xyz_m = self.street.xyz_m
+        place_m = place_m.to(xyz_m)
+        x_m, rows = self._street_by_x
+        ends = torch.searchsorted(x_m, place_m[0] + place_m.new_tensor([-radius_m, radius_m]))
+        first, last = ends.tolist()
+        near_m = xyz_m[rows[first:last]]
+        return int(((near_m - place_m).norm(dim=-1) < radius_m).sum())
+
+    @cached_property
+    def _street_by_x(self) -> tuple[Float[Tensor, " points"], Int[Tensor, " points"]]:
+        """The street's x in order, and the rows they are of: every painted camera asks."""
+        x_m, rows = self.street.xyz_m[:, 0].sort()
+        return x_m, rows.int()
 
     def newest_age_ns(self, timestamp_ns: int) -> int:
         """How far in time the nearest street point is; kept, as many views share a time."""

@@ -8,7 +8,7 @@ from lidarpainter_models.errors import SceneError
 from lidarpainter_models.lidar import map_building
 from lidarpainter_models.lidar.actor_separation import CLEARANCE_M, ROAD_HEIGHT_M, poses_at
 from lidarpainter_models.lidar.ground_heights import GroundHeights
-from lidarpainter_models.lidar.lidar_map import MapPoints
+from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.lidar.map_building import build_lidar_map, gather_points
 from lidarpainter_models.scenes.records import SweepPoints
 
@@ -118,3 +118,19 @@ def test_ground_is_a_low_quantile_and_unknown_where_nothing_fell():
     assert float(heights_m[:2].abs().max()) < 0.02
     assert bool(heights_m[2].isnan())
     assert bool(GroundHeights(torch.zeros(0, 3)).at(torch.zeros(1, 2)).isnan())
+
+
+def test_points_near_a_place_are_those_nearer_than_the_radius():
+    xyz_m = 4 * torch.rand(3_000, 3, generator=torch.Generator().manual_seed(0)) - 2
+    street = MapPoints.uncoloured(
+        xyz_m=xyz_m,
+        frame_index=torch.zeros(len(xyz_m), dtype=torch.int64),
+        timestamp_ns=torch.zeros(len(xyz_m), dtype=torch.int64),
+        range_m=torch.ones(len(xyz_m)),
+    )
+    lidar_map = LidarMap(street=street, actors={})
+    for place_m in (*xyz_m[:5], torch.tensor([9.0, 0.0, 0.0])):
+        expected = int(((xyz_m - place_m).norm(dim=1) < 0.6).sum())
+        assert lidar_map.num_street_points_near(place_m.double(), 0.6) == expected
+    nothing = LidarMap(street=street.keep(slice(0, 0)), actors={})
+    assert nothing.num_street_points_near(xyz_m[0], 0.6) == 0

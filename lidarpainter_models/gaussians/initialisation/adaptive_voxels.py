@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from lidarpainter_models.lidar.lidar_map import MapPoints
+
 POINTS_AT_ONCE = 1 << 18
 """Points that are copied to float64 at a time: copies of all take more than the points."""
 
@@ -64,6 +66,23 @@ class Cloud:
     """What is asked for at each point, up to a factor for all."""
     least_m: float = 0.03
     """Smallest edge of a voxel."""
+
+    @classmethod
+    def of(
+        cls,
+        points: MapPoints,
+        spacing_m: Float[Tensor, " points"],
+        chosen: Bool[Tensor, " points"],
+        least_m: float,
+    ) -> "Cloud":
+        """The chosen ones of some points."""
+        return cls(
+            xyz_m=points.xyz_m[chosen],
+            rgb_u8=points.rgb_u8[chosen],
+            has_colour=points.has_colour[chosen],
+            spacing_m=spacing_m[chosen],
+            least_m=least_m,
+        )
 
     def sizes(self, factor: float, *, most_m: float) -> Float[Tensor, " points"]:
         """Voxel edge of each point: about `factor` spacings, as a power of two times the least."""

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError
@@ -250,27 +250,35 @@ def _on_surfaces(
     for_aside = int(budget * UNSEEN_SHARE)
     street, aside = _street(observations, config, budget, for_aside)
     progress(0.25)
-    clouds = {0: street}
+    clouds = {0: street, **_actor_clouds(observations)}
+    bodies, budget = list(clouds)[1:], max(budget - for_aside, 1)
+    seen = adaptive_voxels(list(clouds.values()), budget=budget)
+    del street, clouds  # 20 bytes a point, which nobody asks any more
+    gaussians = within_outlines(
+        _surfels([seen[0], aside], [2.0, SPACING_SIGMA], config),
+        _some_of_each_camera(observations.views),
+    )
+    for body, voxels in zip(bodies, seen[1:], strict=True):
+        gaussians = gaussians.append(_surfels([voxels], [2.0], config, body=body))
+    return gaussians
+
+
+def _actor_clouds(observations: SceneObservations) -> dict[int, Cloud]:
+    """Points of the actors that images show, by body."""
     views, tracks = observations.views, observations.tracks
     times_ns = torch.tensor([view.timestamp_ns for view in views], dtype=torch.int64)
     is_there = TrackPoses.of(tracks).present(times_ns[:, None]).T
-    for index, track in enumerate(tracks, start=1):
+    clouds = {}
+    for body, (track, present) in enumerate(zip(tracks, is_there, strict=True), start=1):
         if track.actor_id not in observations.lidar_map.actors:
             continue
         points = _spread(observations.lidar_map.actors[track.actor_id], MOST_ACTOR_POINTS)
-        present = [views[row] for row in is_there[index - 1].nonzero()[:, 0].tolist()]
-        spacing_m = _actor_spacing(points, track, present)
+        own = [views[row] for row in present.nonzero()[:, 0].tolist()]
+        spacing_m = _actor_spacing(points, track, own)
         in_sight = spacing_m.isfinite()
         if int(in_sight.sum()) >= LEAST_ACTOR_POINTS:
-            clouds[index] = _cloud(points, spacing_m, in_sight, ACTOR_VOXEL_M)
-    seen = adaptive_voxels(list(clouds.values()), budget=max(budget - for_aside, 1))
-    gaussians = within_outlines(
-        _surfels([seen[0], aside], [2.0, SPACING_SIGMA], config),
-        _some_of_each_camera(views),
-    )
-    for body, voxels in zip(list(clouds)[1:], seen[1:], strict=True):
-        gaussians = gaussians.append(_surfels([voxels], [2.0], config, body=body))
-    return gaussians
+            clouds[body] = Cloud.of(points, spacing_m, in_sight, ACTOR_VOXEL_M)
+    return clouds
 
 
 def _street(
@@ -280,34 +288,18 @@ def _street(
     street = observations.lidar_map.street
     street = _spread(street, min(MOST_STREET_POINTS, POINTS_PER_GAUSSIAN * budget))
     cameras, images = _spread_cameras(observations.views)
-    footprint, density = pixel_footprint(street.xyz_m, cameras, images)
+    footprint, density = pixel_footprint(street.xyz_m.contiguous(), cameras, images)
     density *= math.sqrt(len(observations.views) / sum(images))
     is_aside, least_m = (density == 0) & footprint.isfinite(), config.street_voxel_m
-    (aside,) = adaptive_voxels([_cloud(street, footprint, is_aside, least_m)], budget=for_aside)
+    (aside,) = adaptive_voxels([Cloud.of(street, footprint, is_aside, least_m)], budget=for_aside)
     # no image will ever shrink a lone blob there, and beside the lane it is large in the view
     aside = aside.keep(aside.num_points >= LEAST_UNSEEN_POINTS)
-    return _cloud(street, density**-0.5, density > 0, least_m), aside
+    return Cloud.of(street, density**-0.5, density > 0, least_m), aside
 
 
 def _spread(points: MapPoints, most: int) -> MapPoints:
-    """At most so many of the points, evenly over the log."""
-    return points.keep(torch.arange(0, len(points), max(math.ceil(len(points) / most), 1)))
-
-
-def _cloud(
-    points: MapPoints,
-    spacing_m: Float[Tensor, " points"],
-    chosen: Bool[Tensor, " points"],
-    least_m: float,
-) -> Cloud:
-    """The chosen points, to be thinned out."""
-    return Cloud(
-        xyz_m=points.xyz_m[chosen],
-        rgb_u8=points.rgb_u8[chosen],
-        has_colour=points.has_colour[chosen],
-        spacing_m=spacing_m[chosen],
-        least_m=least_m,
-    )
+    """At most so many of the points, evenly over the log; nothing is copied."""
+    return points.keep(slice(None, None, max(math.ceil(len(points) / most), 1)))
 
 
 def _surfels(
@@ -344,9 +336,10 @@ def _actor_spacing(
     footprint = torch.full((len(points),), torch.inf)
     total = torch.zeros(len(points))
     asked = sampled_views(views, _MOST_VIEWS_PER_ACTOR)
+    xyz_box_m = points.xyz_m.contiguous()
     for view in asked:
         world_from_box = track.pose_at(view.timestamp_ns).float()
-        xyz_world_m = transform_points(world_from_box, points.xyz_m)
+        xyz_world_m = transform_points(world_from_box, xyz_box_m)
         at_time, density = pixel_footprint(xyz_world_m, [view.camera])
         footprint = torch.minimum(footprint, at_time)
         total += len(views) / len(asked) * density.square()
