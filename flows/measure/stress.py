@@ -1,6 +1,5 @@
 """Stability where methods fail: one cause at a time, with and without painting."""
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,6 +26,8 @@ WAYS = (
 PUBLISHED: tuple[Publication, ...] = ("scores", "examination")
 QUALITIES = ("aside_psnr", "recorded_psnr")
 _NUMBER = re.compile(r"[-+]?\d+(\.\d+)?")
+_Trials = Mapping[int, Mapping[str, float]]
+"""Figures by seed."""
 HARM_DB = 0.1
 """Painting that costs more hurts."""
 SEEDS_IN_DOUBT = 3
@@ -96,7 +97,7 @@ def stress_of(points: Sequence[Point], trials: Sequence[Trial], out: Path) -> di
     Returns:
         What `stress --json` prints: `points`, `pictures`, the `curves` in them, and what they say.
     """
-    figures = {(group.scene, group.configuration): group.figures for group in groups_of(points)}
+    figures = {(group.scene, group.configuration): group.trials for group in groups_of(points)}
     causes = dict.fromkeys(trial.cause for trial in trials)
     pictures, drawn, says = [], [], []
     for quality in QUALITIES:
@@ -167,16 +168,14 @@ class _Curve:
     levels: list[str]
     painted: list[Spread]
     unpainted: list[Spread]
-
-    @property
-    def gains(self) -> list[float]:
-        return [a.mean - b.mean for a, b in zip(self.painted, self.unpainted, strict=True)]
+    gains: list[Spread]
+    """Of pairs of one seed."""
 
 
 def _curves(
     trials: Sequence[Trial],
     cause: str,
-    figures: Mapping[tuple[str, str], Mapping[str, Spread]],
+    figures: Mapping[tuple[str, str], _Trials],
     quality: str,
 ) -> list[_Curve]:
     """Of all scenes that have the cause and the figure."""
@@ -184,25 +183,33 @@ def _curves(
     for number, scene in enumerate(dict.fromkeys(trial.scene for trial in trials)):
         spoilt = [t for t in trials if (t.cause, t.scene) == (cause, scene)]
         steps = [("none", scene), *((f"{t.level:g}", t.spoilt) for t in spoilt)]
-        known = [
-            (level, painted[quality], unpainted[quality])
-            for level, name in steps
-            if quality in (painted := figures.get((name, PAINTED), {}))
-            and quality in (unpainted := figures.get((name, UNPAINTED), {}))
-        ]
+        pairs = {level: _pairs(figures, name, quality) for level, name in steps}
+        known = {level: pair for level, pair in pairs.items() if pair}
         if spoilt and known:
-            levels, painted_values, unpainted_values = map(list, zip(*known, strict=True))
             curves.append(
                 _Curve(
                     cause=cause,
                     scene=scene,
                     number=number,
-                    levels=levels,
-                    painted=painted_values,
-                    unpainted=unpainted_values,
+                    levels=list(known),
+                    painted=[Spread.of([ours for ours, _ in pair]) for pair in known.values()],
+                    unpainted=[Spread.of([own for _, own in pair]) for pair in known.values()],
+                    gains=[Spread.of([a - b for a, b in pair]) for pair in known.values()],
                 )
             )
     return curves
+
+
+def _pairs(
+    figures: Mapping[tuple[str, str], _Trials], scene: str, quality: str
+) -> list[tuple[float, float]]:
+    """A figure with painting and without, of every seed that has both."""
+    painted, unpainted = (figures.get((scene, way), {}) for way in (PAINTED, UNPAINTED))
+    return [
+        (painted[seed][quality], unpainted[seed][quality])
+        for seed in sorted(painted.keys() & unpainted.keys())
+        if quality in painted[seed] and quality in unpainted[seed]
+    ]
 
 
 def _row(curve: _Curve, quality: str) -> dict[str, Any]:
@@ -231,20 +238,14 @@ def _as_it_falls(curve: _Curve) -> list[Line]:
 
 
 def _as_it_gains(curve: _Curve) -> list[Line]:
-    """Bars as wide as if both ways were tried with seeds of their own."""
-    bars = [
-        math.hypot(a.half_width, b.half_width)
-        for a, b in zip(curve.painted, curve.unpainted, strict=True)
-    ]
-    values = [Spread(gain, bar) for gain, bar in zip(curve.gains, bars, strict=True)]
-    return [Line(name=curve.scene, levels=curve.levels, values=values, colour=curve.number)]
+    return [Line(name=curve.scene, levels=curve.levels, values=curve.gains, colour=curve.number)]
 
 
 def _told(curves: Sequence[_Curve], quality: str) -> list[str]:
     """By cause: where the lead of painting is halved, where it hurts; the worst case last."""
     says, worst = [], (0.0, "")
     for curve in curves:
-        gains, levels = curve.gains, curve.levels
+        gains, levels = [gain.mean for gain in curve.gains], curve.levels
         title, unit = f"{curve.cause}, {curve.scene}", CAUSES[curve.cause].unit
         named = list(zip(["as recorded", *levels[1:]], gains, strict=True))
         halved = next((level for level, gain in named if gain < gains[0] / 2), "no level")
@@ -255,7 +256,7 @@ def _told(curves: Sequence[_Curve], quality: str) -> list[str]:
             f"{levels[-1]} {unit}; {lead}, hurts at {hurts}"
         )
         worst = min(worst, (min(gains), f"{title} at {levels[gains.index(min(gains))]} {unit}"))
-    spoilt = [gain for curve in curves for gain in curve.gains[1:]]
+    spoilt = [gain.mean for curve in curves for gain in curve.gains[1:]]
     harmed = sum(gain < -HARM_DB for gain in spoilt)
     return [
         *says,
