@@ -105,8 +105,8 @@ class LidarMap:
         xyz_m = self.street.xyz_m
         place_m = place_m.to(xyz_m)
         x_m, rows = self._street_by_x
-        ends = torch.searchsorted(x_m, place_m[0] + place_m.new_tensor([-radius_m, radius_m]))
-        first, last = ends.tolist()
+        ends = torch.stack([place_m[0] - radius_m, place_m[0] + radius_m])
+        first, last = torch.searchsorted(x_m, ends).tolist()
         near_m = xyz_m[rows[first:last]]
         return int(((near_m - place_m).norm(dim=-1) < radius_m).sum())
 
