@@ -111,7 +111,7 @@ def _suspicions(result: Mapping[str, Any]) -> tuple[str, ...] | None:
 
 
 def _cost(result: Mapping[str, Any], scene_bytes: int) -> dict[str, float]:
-    # runs of before 2026-11-28 tell the peak of all stages alone
+    # edited runs, and those of before 2026-11-28, tell the peak of all stages alone
     peaks = result.get("memory_bytes") or {"run": result["peak_memory_bytes"]}
     return {
         "seconds": _made(result["seconds"]),
