@@ -228,7 +228,7 @@ class FleetLedger:
 
 
 class _StandingRuns:
-    """The runs that are complete and whose artefacts are all there; reads each listing once."""
+    """Complete runs, all there, of scenes as the store has them now; reads each listing once."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -238,11 +238,14 @@ class _StandingRuns:
 
     @cached_property
     def _ids(self) -> set[str]:
-        there = self._store.artefacts.ids()
+        there, tables = self._store.artefacts.ids(), self._store.tables
+        now = {row["scene_id"]: row["content_digest"] for row in tables.rows("scenes")}
         return {
             row["run_id"]
-            for row in self._store.tables.rows("runs")
-            if row["status"] == "complete" and there.issuperset(row["artefacts"])
+            for row in tables.rows("runs")
+            if row["status"] == "complete"
+            and there.issuperset(row["artefacts"])
+            and now.get(row["scene_id"], row["scene_digest"]) == row["scene_digest"]
         }
 
 

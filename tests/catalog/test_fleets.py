@@ -62,8 +62,9 @@ def causes(ledger):
     return [row["cause"] for row in sorted(rows, key=lambda row: row["attempt_id"])]
 
 
-def complete(ledger, run_id="run"):
-    ledger.store.tables.merge("runs", [{"run_id": run_id, "status": "complete", "artefacts": []}])
+def complete(ledger, run_id="run", **about):
+    row = {"run_id": run_id, "status": "complete", "artefacts": [], **about}
+    ledger.store.tables.merge("runs", [row])
 
 
 def test_what_is_done_as_asked_stays_done(ledger):
@@ -128,6 +129,16 @@ def test_what_was_deleted_from_the_store_is_done_again(ledger):
     attempted(ledger, DONE)  # its run is not in the catalog
     ledger.ask([wish()])
     assert one(ledger)["state"] == "waiting"
+
+
+@pytest.mark.parametrize(("content", "state"), [("as it was", "done"), ("changed", "waiting")])
+def test_what_was_made_of_a_scene_that_was_read_anew_is_done_again(ledger, content, state):
+    ledger.ask([wish()])
+    complete(ledger, scene_id="x/one", scene_digest="as it was")
+    attempted(ledger, DONE)
+    ledger.store.tables.merge("scenes", [{"scene_id": "x/one", "content_digest": content}])
+    ledger.ask([wish()])
+    assert one(ledger)["state"] == state
 
 
 def test_what_is_no_longer_asked_for_is_forgotten_but_not_its_attempts(ledger):
