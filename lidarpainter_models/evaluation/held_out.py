@@ -107,7 +107,8 @@ class HeldOut:
         truth_rgb: Float[Tensor, "height width 3"],
         hidden: Bool[Tensor, "height width"] | None = None,
     ) -> JudgedView:
-        actor_ids, actor_index = actors_in_view(camera, self._moving, view.timestamp_ns)
+        taken_ns = camera.taken_ns(view.timestamp_ns)
+        actor_ids, actor_index = actors_in_view(camera, self._moving, taken_ns)
         if hidden is not None:
             actor_index[hidden] = NOBODY
         return JudgedView(

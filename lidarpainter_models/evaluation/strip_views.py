@@ -122,7 +122,7 @@ def strip_views(
         )
         found_from_logged = found.world_from_camera @ invert_rigid(logged.world_from_camera)
         camera = fit_camera(own, held_out.observation)
-        camera = camera.at(found_from_logged @ camera.world_from_camera)
+        camera = camera.refined(found_from_logged @ camera.world_from_camera)
         views.append(
             StripView(
                 camera=camera,

@@ -201,7 +201,7 @@ def score_strips(
     for view in views:
         mask = strip_mask(view)
         raw = render_at_fitted_detail(render, view)
-        turned_camera = view.camera.at(view.camera.world_from_camera @ turn)
+        turned_camera = view.camera.refined(view.camera.world_from_camera @ turn)
         turned_view = replace(view, camera=turned_camera)
         turned = apply_affine_colour(render_at_fitted_detail(render, turned_view), affine)
         wrong = squared_error(raw, view.truth_rgb).double()

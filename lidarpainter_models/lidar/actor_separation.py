@@ -57,12 +57,17 @@ def near_actors(
     tracks: Sequence[ActorTrack],
 ) -> NearActors:
     """Find the points that moving actors keep out of the street."""
-    across = xyz_m[:, 0].sort()
-    parts = [
-        part
-        for index, track in enumerate(tracks)
-        if (part := _near_one(xyz_m, timestamp_ns, across, index, track)) is not None
-    ]
+    parts = []
+    if len(xyz_m):
+        across = xyz_m[:, 0].sort()
+        middle_ns = (int(timestamp_ns.min()) + int(timestamp_ns.max())) // 2
+        margin_ns = round(_LONGEST_EXTRAPOLATION_S * 1e9)
+        parts = [
+            part
+            for index, track in enumerate(tracks)
+            if track.is_present(middle_ns, margin_ns=margin_ns)
+            and (part := _near_one(xyz_m, timestamp_ns, middle_ns, across, index, track))
+        ]
     if not parts:
         none, zero = torch.zeros(0, dtype=torch.int64), torch.zeros(0)
         return NearActors(
@@ -134,19 +139,16 @@ def _between(
 def _near_one(
     xyz_m: Float[Tensor, "points 3"],
     timestamp_ns: Int[Tensor, " points"],
+    middle_ns: int,
     across: tuple[Float[Tensor, " points"], Int[Tensor, " points"]],
     index: int,
     track: ActorTrack,
 ) -> NearActors | None:
-    """The points in or beside one actor, None where there are none.
+    """The points in or beside one actor that is there, None where there are none.
 
-    `across` is the points' x in ascending order and their rows: of a sweep, an actor has few.
+    `middle_ns` is the middle of their times; `across` is their x in ascending order and their rows:
+    of a sweep, an actor has few.
     """
-    if xyz_m.shape[0] == 0:
-        return None
-    middle_ns = (int(timestamp_ns.min()) + int(timestamp_ns.max())) // 2
-    if not track.is_present(middle_ns, margin_ns=round(_LONGEST_EXTRAPOLATION_S * 1e9)):
-        return None
     around_ns = torch.tensor([-_HALF_SWEEP_NS, 0, _HALF_SWEEP_NS])
     earlier, centre, later = _centres_at(track, middle_ns + around_ns)
     speed_mps = float((later - earlier).norm()) * 1e9 / (2 * _HALF_SWEEP_NS)

@@ -98,7 +98,8 @@ class MapColouring:
         actors = [Body(known[name], points) for name, points in lidar_map.actors.items()]
         self._bodies = [Body(None, lidar_map.street, most_age_ns), *actors]
         self._surfaces = [Body(None, lidar_map.street, _SURFACE_AGE_NS), *actors]
-        self._samples = BestSamples.none_yet(sum(len(body.points) for body in self._bodies))
+        num_points = sum(len(body.points) for body in self._bodies)
+        self._samples = BestSamples.none_yet(num_points, len(views))
         self._view_numbers = {view.key: number for number, view in enumerate(views)}
         self._placed = place_actors(views, tracks)
 

@@ -16,7 +16,8 @@ LEAST_SHARED = 100
 SMALLEST_DEPARTURE = 0.03
 """A view that departs less (in log gain) from its camera's other views keeps its camera's gain."""
 _ROUNDS = 8
-_MOST_POINTS = 40_000
+_MOST_POINTS, _MOST_POINTS_PER_VIEW = 40_000, 100
+"""Points that are compared: so many, or more where so many for each view are more."""
 
 
 def match_exposure(samples: BestSamples, view_camera: np.ndarray) -> np.ndarray:
@@ -26,7 +27,8 @@ def match_exposure(samples: BestSamples, view_camera: np.ndarray) -> np.ndarray:
     (views,) is the camera of each view.
     """
     several = np.flatnonzero(samples.weight[:, 1] > 0)
-    several = several[:: max(1, len(several) // _MOST_POINTS)]
+    most = max(_MOST_POINTS, _MOST_POINTS_PER_VIEW * len(view_camera))
+    several = several[:: max(1, len(several) // most)]
     rgb, view = samples.rgb[several], samples.view[several]
     usable = (samples.weight[several] > 0) & (rgb >= DARKEST).all(-1) & (rgb <= BRIGHTEST).all(-1)
     log_rgb = np.log(np.maximum(rgb, 1).astype(np.float32))
@@ -41,19 +43,22 @@ def _departures(
 ) -> np.ndarray:
     """Log gains (views, 3) that bring each view to the median view of its camera."""
     gains = np.zeros((len(view_camera), 3), np.float32)
-    pairs = [_pairs(view_camera[view], usable, 0, slot) for slot in range(1, view.shape[1])]
+    pairs = [
+        (view[rows, 0], view[rows, slot], log_rgb[rows, slot] - log_rgb[rows, 0])
+        for slot in range(1, view.shape[1])
+        for rows in [_pairs(view_camera[view], usable, 0, slot)]
+    ]
+    whose = np.concatenate([number for first, second, _ in pairs for number in (first, second)])
+    order = np.argsort(whose, kind="stable")
+    ends = np.searchsorted(whose[order], np.arange(len(view_camera) + 1))
     for _ in range(_ROUNDS):
-        steps: dict[int, list[np.ndarray]] = {}
-        for slot, rows in enumerate(pairs, start=1):
-            first, second = view[rows, 0], view[rows, slot]
-            ratio = log_rgb[rows, slot] + gains[second] - log_rgb[rows, 0] - gains[first]
-            for number in range(len(view_camera)):
-                steps.setdefault(number, []).append(ratio[first == number])
-                steps[number].append(-ratio[second == number])
-        for number, found in steps.items():
-            ratios = np.concatenate(found)
-            if len(ratios) >= LEAST_SHARED:
-                gains[number] += 0.5 * np.median(ratios, axis=0)
+        ratios = []
+        for first, second, ratio in pairs:
+            ratio_now = ratio + gains[second] - gains[first]
+            ratios += [ratio_now, -ratio_now]
+        found = np.concatenate(ratios)[order]
+        for number in np.flatnonzero(np.diff(ends) >= LEAST_SHARED):
+            gains[number] += 0.5 * np.median(found[ends[number] : ends[number + 1]], axis=0)
     for camera in np.unique(view_camera):
         own = view_camera == camera
         gains[own] -= np.median(gains[own], axis=0)

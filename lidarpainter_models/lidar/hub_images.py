@@ -16,8 +16,8 @@ from torch import Tensor
 from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.kernels.point_contrasts import NEAR_M
 from lidarpainter_models.kernels.side_by_side import side_by_side
+from lidarpainter_models.lidar.actor_separation import near_actors
 from lidarpainter_models.lidar.contrast_images import ContrastImage
-from lidarpainter_models.lidar.moving_boxes import BACKGROUND, MovingBoxes
 from lidarpainter_models.lidar.sparse_depth import sparse_lidar_depth
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
@@ -60,24 +60,22 @@ class FrameReturns:
 
     xyz_m: Float[Tensor, "points 3"]
     standing: Float[Tensor, "standing 3"]
-    """Those outside moving boxes."""
+    """Those that moving actors do not keep out of the street."""
 
 
 def returns_of(scene: DrivingScene, frames: Sequence[int]) -> dict[int, FrameReturns]:
     """The returns of some frames, read once for all cameras."""
-    boxes = MovingBoxes([track for track in scene.tracks if track.is_moving])
+    moving = [track for track in scene.tracks if track.is_moving]
 
     def read(frame_index: int) -> FrameReturns:
-        clouds = [(scene.read_column(s, "xyz_m"), s) for s in scene.sweeps_of(frame_index)]
-        standing = [
-            xyz_m[boxes.owners(xyz_m, sweep.timestamp_ns, floor_m=-torch.inf) == BACKGROUND]
-            for xyz_m, sweep in clouds
-        ]
-        none = torch.zeros(0, 3)
-        return FrameReturns(
-            xyz_m=torch.cat([none, *(xyz_m for xyz_m, _ in clouds)]),
-            standing=torch.cat([none, *standing]),
-        )
+        clouds, standing = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
+        for sweep in scene.sweeps_of(frame_index):
+            xyz_m = scene.read_column(sweep, "xyz_m")
+            stands = torch.ones(len(xyz_m), dtype=torch.bool)
+            stands[near_actors(xyz_m, scene.measured_ns(sweep), moving).rows] = False
+            clouds.append(xyz_m)
+            standing.append(xyz_m[stands])
+        return FrameReturns(xyz_m=torch.cat(clouds), standing=torch.cat(standing))
 
     return dict(zip(frames, side_by_side(read, frames), strict=True))
 

@@ -13,7 +13,8 @@ meet the nearest direct hit of a pixel, so silhouettes stay sharp and discs do n
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -21,11 +22,11 @@ from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.kernels.colour_sampling import project_inside
 from lidarpainter_models.kernels.point_blend import blend_points
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.lidar.point_surfaces import curtain, disc_surface, spread, surface_gaps
+from lidarpainter_models.lidar.points_in_view import read_in_image, with_margin
 
 WINDOW_S = 1.0
 """Street points measured this long before or after the image are drawn first; where no
@@ -99,15 +100,8 @@ def render_lidar(
     """
     # what stands just outside the image hides and covers pixels inside
     margin_px = max(2, round(HIDDEN_REACH_RAD * camera.fx_px))
-    wide = replace(
-        camera,
-        width_px=camera.width_px + 2 * margin_px,
-        height_px=camera.height_px + 2 * margin_px,
-        cx_px=camera.cx_px + margin_px,
-        cy_px=camera.cy_px + margin_px,
-    )
-    recent, older = view_points(lidar_map, actors, wide, timestamp_ns)
-    image = _image(recent, older, wide, margin_px)
+    recent, older = _points_around(lidar_map, actors, camera, timestamp_ns, margin_px)
+    image = _image(recent, older, with_margin(camera, margin_px, margin_px), margin_px)
     image = image[margin_px:-margin_px, margin_px:-margin_px]
     hit = image[..., 3] > 0
     return LidarImage(
@@ -134,10 +128,10 @@ def _image(
     return image + _fill_gaps(image[..., 4], (recent, older), camera)
 
 
-def view_points(
-    lidar_map: LidarMap, actors: MovingBoxes, camera: Camera, timestamp_ns: int
+def _points_around(
+    lidar_map: LidarMap, actors: MovingBoxes, camera: Camera, timestamp_ns: int, margin_px: int
 ) -> tuple[ViewPoints, ViewPoints]:
-    """Every map point within reach of the time that falls into the image, hidden or not.
+    """Every map point within reach of the time that is in the image or its margin, hidden or not.
 
     First the recent ones: street points within the window of the newest sweep at that time, and
     all actors'.
@@ -145,12 +139,13 @@ def view_points(
     newest_ns = lidar_map.newest_age_ns(timestamp_ns)
     window_ns, reach_ns = (newest_ns + round(limit_s * 1e9) for limit_s in (WINDOW_S, REACH_S))
     world = torch.eye(4, dtype=torch.float64)
-    street = _Projected.of(lidar_map.street, world, camera, timestamp_ns)
+    where = partial(_Projected.of, camera=camera, timestamp_ns=timestamp_ns, margin_px=margin_px)
+    street = where(lidar_map.street, world, stand_still=True)
     recent = [street.points(street.age_ns <= window_ns)]
     older = street.points((street.age_ns > window_ns) & (street.age_ns <= reach_ns))
     for track, world_from_box in actors.placed(timestamp_ns):
         if (points := lidar_map.actors.get(track.actor_id)) is not None:
-            actor = _Projected.of(points, world_from_box, camera, timestamp_ns)
+            actor = where(points, world_from_box, stand_still=False)
             recent.append(actor.points(torch.ones_like(actor.age_ns, dtype=torch.bool)))
     return ViewPoints.concatenate(recent), older
 
@@ -170,17 +165,20 @@ class _Projected(NamedTuple):
         cls,
         body: MapPoints,
         world_from_body: Float[Tensor, "4 4"],
+        *,
+        stand_still: bool,
         camera: Camera,
         timestamp_ns: int,
+        margin_px: int,
     ) -> "_Projected":
-        """Bring points into the image; those outside it are dropped."""
-        camera_from_body = camera.camera_from_world @ world_from_body.to(torch.float64)
-        lens = torch.tensor(
-            [[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]],
-            dtype=torch.float64,
-        )
-        rows, positions_uv, depth_m = project_inside(
-            body.xyz_m, lens @ camera_from_body[:3], camera.width_px, camera.height_px, NEAR_M
+        """Bring points into the image and its margin; those outside are dropped."""
+        rows, positions_uv, depth_m = read_in_image(
+            body.xyz_m,
+            camera.camera_from_world @ world_from_body.to(torch.float64),
+            camera,
+            stand_still=stand_still,
+            near_m=NEAR_M,
+            margin_px=margin_px,
         )
         age_ns = (body.timestamp_ns.index_select(0, rows) - timestamp_ns).abs()
         focal_px = (camera.fx_px + camera.fy_px) / 2

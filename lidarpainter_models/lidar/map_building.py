@@ -155,8 +155,7 @@ def _place_sweep(scene: DrivingScene, sweep: Sweep, tracks: Sequence[ActorTrack]
     left = scene.world_from_ego[scene.frame_position(sweep.frame_index), :3, 1].to(away)
     is_ego = (range_m < EGO_RANGE_M) & ((away @ left).abs() < EGO_HALF_WIDTH_M)
     used = (range_m >= MIN_RANGE_M) & (range_m <= MAX_RANGE_M) & ~is_ego
-    time_offset_ns = scene.read_column(sweep, "time_offset_ns")
-    timestamp_ns = sweep.timestamp_ns + time_offset_ns[used].to(torch.int64)
+    timestamp_ns = scene.measured_ns(sweep)[used]
     points = MapPoints.uncoloured(
         xyz_m=xyz_m[used],
         frame_index=torch.full_like(timestamp_ns, sweep.frame_index),

@@ -13,7 +13,7 @@ from lidarpainter_models.geometry.box_masks import project_boxes
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.kernels.box_owners import NO_BOX, box_owners
-from lidarpainter_models.scenes.tracks import PRESENCE_MARGIN_NS, ActorTrack, TrackPoses
+from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses
 
 BACKGROUND = NO_BOX
 """Actor index of a point that no moving box holds."""
@@ -42,16 +42,13 @@ class MovingBoxes:
         self,
         points_world: Float[Tensor, "points 3"],
         timestamp_ns: int,
-        *,
-        floor_m: float = FLOOR_M,
-        presence_margin_ns: int = PRESENCE_MARGIN_NS,
     ) -> Int[Tensor, " points"]:
         """Index of the actor that holds each point at a time, or `BACKGROUND`.
 
         Boxes are grown a little, but not into the road beside and under the actor: what is lower
-        than `floor_m` over the bottom of a box must be inside the true box.
+        than `FLOOR_M` over the bottom of a box must be inside the true box.
         """
-        present = self._poses.present(timestamp_ns, presence_margin_ns).nonzero()[:, 0]
+        present = self._poses.present(timestamp_ns).nonzero()[:, 0]
         if self._size_m is None or not len(present):
             return torch.full(points_world.shape[:1], BACKGROUND, device=points_world.device)
         boxes = box_owners(
@@ -59,7 +56,7 @@ class MovingBoxes:
             invert_rigid(self._poses.all_at(timestamp_ns)[present]),
             self._size_m[present],
             margin_m=MARGIN_M,
-            floor_m=floor_m,
+            floor_m=FLOOR_M,
         )
         present = present.to(boxes.device, non_blocking=True)
         return torch.where(boxes == NO_BOX, BACKGROUND, present[boxes])

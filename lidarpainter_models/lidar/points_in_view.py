@@ -181,9 +181,14 @@ def points_in_view(
         for stretch in body.stretches_about(timestamp_ns):
             for start in range(stretch.start, stretch.stop, POINTS_AT_ONCE):
                 piece = slice(start, min(start + POINTS_AT_ONCE, stretch.stop))
-                rows, pixels_uv, depth_m = _in_image(
-                    body, piece, camera_from_points, camera, near_m
+                inside, pixels_uv, depth_m = read_in_image(
+                    body.points.xyz_m[piece],
+                    camera_from_points,
+                    camera,
+                    stand_still=body.track is None,
+                    near_m=near_m,
                 )
+                rows = inside + piece.start
                 age_ns = (body.points.timestamp_ns[rows] - timestamp_ns).abs()
                 yield PointsInView(
                     rows=rows + first_row,
@@ -195,39 +200,45 @@ def points_in_view(
                 )
 
 
-def _in_image(
-    body: Body,
-    piece: slice,
+def read_in_image(
+    xyz_m: Float[Tensor, "points 3"],
     camera_from_points: Float[Tensor, "4 4"],
     camera: Camera,
+    *,
+    stand_still: bool,
     near_m: float,
+    margin_px: int = 0,
 ) -> tuple[Int[Tensor, " rows"], Float[Tensor, "rows 2"], Float[Tensor, " rows"]]:
-    """What of a piece of a body falls into an image: its rows in the body, pixels and depth."""
-    rolls = body.track is None and camera.shutter is not None and camera.shutter.is_rolling
-    window = _with_margin(camera, READ_MARGIN) if rolls else camera
+    """What falls into an image with a margin: rows, pixels from the margin's corner, and depth.
+
+    Points that stand still in the world are where a rolling shutter reads them, others where they
+    are in the middle of it.
+    """
+    rolls = stand_still and camera.shutter is not None and camera.shutter.is_rolling
+    image = with_margin(camera, margin_px, margin_px)
+    window = image
+    if rolls:
+        aside_px, above_px = (
+            math.ceil(READ_MARGIN * size) for size in (camera.width_px, camera.height_px)
+        )
+        window = with_margin(image, aside_px, above_px)
     lens = torch.tensor(
         [[window.fx_px, 0, window.cx_px], [0, window.fy_px, window.cy_px], [0, 0, 1]],
         dtype=torch.float64,
     )
-    inside, pixels_uv, depth_m = project_inside(
-        body.points.xyz_m[piece],
-        lens @ camera_from_points[:3],
-        window.width_px,
-        window.height_px,
-        near_m,
+    rows, pixels_uv, depth_m = project_inside(
+        xyz_m, lens @ camera_from_points[:3], window.width_px, window.height_px, near_m
     )
-    rows = inside + piece.start
     if rolls:
-        read_uv, read_m = camera.project(body.points.xyz_m[rows].double())
-        read_uv, read_m = read_uv.to(pixels_uv), read_m.to(depth_m)
-        is_read = camera.contains(read_uv, read_m, near_m=near_m)
+        read_uv, read_m = camera.project(xyz_m[rows].double())
+        read_uv, read_m = (read_uv + margin_px).to(pixels_uv), read_m.to(depth_m)
+        is_read = image.contains(read_uv, read_m, near_m=near_m)
         rows, pixels_uv, depth_m = rows[is_read], read_uv[is_read], read_m[is_read]
     return rows, pixels_uv, depth_m
 
 
-def _with_margin(camera: Camera, share: float) -> Camera:
-    """The same view with so many parts of its size more on each side."""
-    aside_px, above_px = (math.ceil(share * size) for size in (camera.width_px, camera.height_px))
+def with_margin(camera: Camera, aside_px: int, above_px: int) -> Camera:
+    """The same view with so many pixels more on each side."""
     return replace(
         camera,
         cx_px=camera.cx_px + aside_px,

@@ -5,14 +5,17 @@ sees over roofs and behind posts; a point with nearer returns above or beside it
 Nearer returns below it hide nothing: that is how a road looks.
 """
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.lidar.moving_boxes import MovingBoxes
+from lidarpainter_models.lidar.actor_separation import ACTOR_MARGIN_M, near_actors
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView, Sweep
+from lidarpainter_models.scenes.tracks import TrackPoses
 
 MIN_DEPTH_M = 1.0  # nearer returns are the car itself or noise
 MAX_DEPTH_M = 250.0  # beyond the reach of the sensors in use
@@ -42,39 +45,58 @@ def sparse_lidar_depth(
     return torch.where(is_visible & nearest.isfinite(), nearest, torch.zeros_like(nearest))
 
 
+@dataclass(frozen=True, eq=False)
+class _Swept:
+    """A sweep in the world, and which of its points moving actors hold, and where."""
+
+    xyz_m: Float[Tensor, "points 3"]
+    rows: Int[Tensor, " held"]
+    """Positions of what is held."""
+    track: Int[Tensor, " held"]
+    """Position among the moving actors."""
+    xyz_box_m: Float[Tensor, "held 3"]
+    """In the box as it stood when the point was measured."""
+
+
 class FramePoints:
     """The LiDAR points of the frame asked for last, read once for all that its cameras ask."""
 
     def __init__(self, scene: DrivingScene) -> None:
         """Take the scene; nothing is read yet."""
         self._scene = scene
-        self._boxes = MovingBoxes([track for track in scene.tracks if track.is_moving])
+        self._moving = [track for track in scene.tracks if track.is_moving]
+        self._poses = TrackPoses.of(self._moving)
         self._frame_index: int | None = None
-        self._sweeps: list[tuple[int, Float[Tensor, "_ 3"], Int[Tensor, " _"]]] = []
+        self._sweeps: list[_Swept] = []
 
     def measured(self, frame_index: int) -> Float[Tensor, "points 3"]:
         """The points in the world, where the LiDARs met them; none where none swept."""
-        swept = [points_world for _, points_world, _ in self._of(frame_index)]
-        return torch.cat(swept) if swept else torch.zeros(0, 3)
+        return torch.cat([torch.zeros(0, 3), *(swept.xyz_m for swept in self._of(frame_index))])
 
     def at_exposure(self, view: RecordedView) -> Float[Tensor, "points 3"]:
         """The points in the world, moving actors where they are in the view's image."""
-        moved = [
-            self._boxes.moved(points_world, owners, from_ns=taken_ns, to_ns=view.timestamp_ns)[0]
-            for taken_ns, points_world, owners in self._of(view.frame_index)
-        ]
-        return torch.cat(moved) if moved else torch.zeros(0, 3)
+        world_from_box = self._poses.all_at(view.timestamp_ns)
+        moved = [_at(swept, world_from_box) for swept in self._of(view.frame_index)]
+        return torch.cat([torch.zeros(0, 3), *moved])
 
-    def _of(self, frame_index: int) -> list[tuple[int, Float[Tensor, "_ 3"], Int[Tensor, " _"]]]:
-        """Of each sweep of a frame its time, its points and the actors that hold them."""
+    def _of(self, frame_index: int) -> list[_Swept]:
         if frame_index != self._frame_index:
             self._sweeps = [self._read(sweep) for sweep in self._scene.sweeps_of(frame_index)]
             self._frame_index = frame_index
         return self._sweeps
 
-    def _read(self, sweep: Sweep) -> tuple[int, Float[Tensor, "points 3"], Int[Tensor, " points"]]:
-        points_world = self._scene.read_column(sweep, "xyz_m")
-        owners = self._boxes.owners(
-            points_world, sweep.timestamp_ns, floor_m=-torch.inf, presence_margin_ns=0
-        )
-        return sweep.timestamp_ns, points_world, owners
+    def _read(self, sweep: Sweep) -> _Swept:
+        xyz_m = self._scene.read_column(sweep, "xyz_m")
+        near = near_actors(xyz_m, self._scene.measured_ns(sweep), self._moving)
+        held = near.outside_m <= ACTOR_MARGIN_M
+        return _Swept(xyz_m, near.rows[held], near.track[held], near.xyz_box_m[held])
+
+
+def _at(swept: _Swept, world_from_box: Float[Tensor, "tracks 4 4"]) -> Float[Tensor, "points 3"]:
+    """The points of a sweep, what actors hold where the actors are."""
+    if not len(swept.rows):
+        return swept.xyz_m
+    pose = world_from_box.to(swept.xyz_m)[swept.track]
+    placed = swept.xyz_m.clone()
+    placed[swept.rows] = (pose[:, :3, :3] @ swept.xyz_box_m[..., None])[..., 0] + pose[:, :3, 3]
+    return placed

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import torch
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Float, Int, Shaped, UInt8
 from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
@@ -152,6 +152,10 @@ class DrivingScene:
         """One field of `read_sweep`, for whoever needs no other."""
         array = _POINT_COLUMNS[name]
         return torch.from_numpy(self._stored.read_rows(array, sweep.offset, sweep.num_points))
+
+    def measured_ns(self, sweep: Sweep) -> Int[Tensor, " points"]:
+        """When each point of a sweep was measured."""
+        return sweep.timestamp_ns + self.read_column(sweep, "time_offset_ns").to(torch.int64)
 
     def has_lidar(self, frame_indices: Collection[int]) -> bool:
         """Whether a LiDAR swept in any of these frames."""

@@ -56,7 +56,7 @@ def test_the_same_samples_are_kept():
     slots = []
     for backend in BACKENDS:
         generator = rng(1)
-        kept = BestSamples.none_yet(300)
+        kept = BestSamples.none_yet(300, 9)
         for view in range(9):
             rows = generator.permutation(300)[:200]
             # few different weights, so that equal ones meet
@@ -67,6 +67,14 @@ def test_the_same_samples_are_kept():
     for fast, plain in zip(*slots, strict=True):
         assert np.array_equal(fast, plain)
     assert bool((np.diff(slots[0].weight, axis=1) <= 0).all())
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_samples_of_very_many_views_keep_their_views(backend):
+    kept = BestSamples.none_yet(1, 70_000)
+    weight, rgb = np.ones(1, np.float32), np.zeros((1, 3), np.uint8)
+    insert_samples(kept, np.zeros(1, np.int64), weight, rgb, 69_999, backend=backend)
+    assert kept.view[0, 0] == 69_999
 
 
 def test_the_same_inner_cells_are_found():

@@ -144,6 +144,20 @@ def test_an_exposure_jump_of_one_view_is_found():
     np.testing.assert_allclose(found[[0, 1, 3]], 1.0, rtol=0.01)
 
 
+def test_an_exposure_jump_is_found_in_a_long_log():
+    views, points = 3000, 350_000
+    generator = np.random.default_rng(1)
+    first = generator.integers(0, views - 1, points)
+    view = np.stack([first, first + 1], axis=1)
+    gains = np.ones(views)
+    gains[1500] = 0.8
+    rgb = np.repeat((120 * gains[view])[..., None], 3, axis=2).round().astype(np.uint8)
+    samples = BestSamples(np.ones((points, 2), np.float32), rgb, view)
+    found = match_exposure(samples, np.zeros(views, int))
+    np.testing.assert_allclose(found[1500], 1.25, rtol=0.03)
+    np.testing.assert_allclose(np.delete(found, 1500, axis=0), 1, rtol=0.01)
+
+
 def test_a_camera_without_shared_points_keeps_its_exposure():
     weight = np.ones((500, 2), np.float32)
     rgb = np.full((500, 2, 3), 100, np.uint8)

@@ -1,5 +1,8 @@
+from dataclasses import replace
+
 import torch
 
+from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.lidar import lidar_images
 from lidarpainter_models.lidar.lidar_images import render_lidar
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
@@ -164,3 +167,27 @@ def test_a_gap_in_one_surface_is_closed_but_its_outside_is_not(camera_at, monkey
     image = render_lidar(street(points(wall_m[~gap[:, 0]])), MovingBoxes([]), camera_at(), 0)
     assert image.hit[20:28, 28:36].all()
     assert not image.hit[:, :17].any()
+
+
+def test_points_are_where_a_rolling_shutter_reads_them(camera_at):
+    shutter = Shutter(
+        across_s=(0.0, 0.03), twist_per_s=torch.tensor([0.0, 0.0, 0.0, 60.0, 0.0, 0.0])
+    )
+    camera = replace(camera_at(), shutter=shutter)
+    posts = [
+        wall(8.0, left_m=y, right_m=y - 0.1, bottom_m=z, top_m=z + 0.1, spacing_m=0.1)
+        for y in (-2.0, 2.0)
+        for z in (-1.0, 4.0)
+    ]
+    world = torch.cat(posts)
+    image = render_lidar(street(points(world)), MovingBoxes([]), camera, 0)
+    pixels_uv, depth_m = camera.project(world)
+    assert bool(camera.contains(pixels_uv, depth_m).all())
+    column, row = pixels_uv.long().unbind(-1)
+    assert bool(image.hit[row, column].all())
+    standing_uv, _ = replace(camera, shutter=None).project(world)
+    assert float((standing_uv - pixels_uv).norm(dim=-1).min()) > 3
+    apart = replace(camera, shutter=None)
+    assert not bool(
+        render_lidar(street(points(world)), MovingBoxes([]), apart, 0).hit[row, column].any()
+    )

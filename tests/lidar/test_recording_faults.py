@@ -55,10 +55,13 @@ def test_each_sweep_is_read_once_for_all_cameras(monkeypatch):
     moved = [replace(v, camera=replace(v.camera, shutter=driving)) for v in street.views]
     read, read_column = [], street.read_column
     monkeypatch.setattr(
-        street, "read_column", lambda sweep, name: read.append(sweep) or read_column(sweep, name)
+        street,
+        "read_column",
+        lambda sweep, name: read.append((sweep.frame_index, name)) or read_column(sweep, name),
     )
     find_faults(street, moved)
-    assert sorted(sweep.frame_index for sweep in read) == list(street.frame_indices)
+    columns = ("time_offset_ns", "xyz_m")
+    assert sorted(read) == [(frame, name) for frame in street.frame_indices for name in columns]
 
 
 @pytest.mark.slow

@@ -12,8 +12,8 @@ from lidarpainter_models.synthetic import write_street
 class FittedStreet:
     """A fit of a street, and the held-out images it is judged on."""
 
-    def __init__(self, street, folder, config):
-        size = ObservationConfig(width_px=street.width_px)
+    def __init__(self, street, folder, config, **observed):
+        size = ObservationConfig(width_px=street.width_px, **observed)
         recording = DrivingScene.open(write_street(street, folder / f"seed-{config.seed}"))
         split = split_views(recording, "alternate", None)
         seen = prepare_observations(recording, split, size)

@@ -18,13 +18,14 @@ class BestSamples(NamedTuple):
     rgb: np.ndarray
     """(points, slots, 3) uint8."""
     view: np.ndarray
-    """(points, slots) int16: number of the view that each sample is from."""
+    """(points, slots) int16, or int32 of many views: number of the one each sample is from."""
 
     @classmethod
-    def none_yet(cls, num_points: int) -> "BestSamples":
-        """Empty slots."""
+    def none_yet(cls, num_points: int, num_views: int) -> "BestSamples":
+        """Empty slots, for samples of so many views."""
+        number = np.result_type(np.int16, np.min_scalar_type(-num_views))
         return cls(
             weight=np.zeros((num_points, SLOTS), np.float32),
             rgb=np.zeros((num_points, SLOTS, 3), np.uint8),
-            view=np.zeros((num_points, SLOTS), np.int16),
+            view=np.zeros((num_points, SLOTS), number),
         )
