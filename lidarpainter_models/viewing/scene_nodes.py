@@ -39,13 +39,15 @@ class SceneNodes:
         """Send the scene, its actors where they stand at the first camera's time.
 
         Recorded cameras come with their times; the scene is shown in their colours, with the
-        exposure of `camera_name` at the first of these times.
+        exposure of `camera_name` at the first of these times. A style stands still: it is that of
+        the middle of these times, seen from where the car was.
         """
         self._scene = scene
+        baked = scene.baked((cameras[0][1] + cameras[-1][1]) // 2)
         self._root = api.add_frame(root, show_axes=False)
         self._sky = api.add_frame(f"{root}/sky", show_axes=False)
         self._actors = api.add_frame(f"{root}/actors", show_axes=False)
-        for panel in sky_panels(scene.sky):
+        for panel in sky_panels(baked.sky):
             api.add_image(
                 f"{root}/sky/{panel.name}",
                 to_bytes(scene.exposure.apply(panel.rgb, camera_name, cameras[0][1])),
@@ -58,10 +60,10 @@ class SceneNodes:
                 wxyz=quaternion_from_rotation(panel.world_from_panel).numpy(),
                 position=(SKY_M * panel.world_from_panel[:, 2]).numpy(),
             )
-        recorded = recorded_rgb(scene, cameras)[None]
+        recorded = recorded_rgb(baked, cameras)[None]
         rgb = scene.exposure.apply(recorded, camera_name, cameras[0][1])[0]
         self._bodies: dict[int, viser.GaussianSplatHandle] = {}
-        for body, splats in splats_by_body(scene.gaussians, rgb).items():
+        for body, splats in splats_by_body(baked.gaussians, rgb).items():
             if body == _STREET:
                 add_splats(api, f"{root}/street", splats)
             else:

@@ -9,6 +9,7 @@ from unittest.mock import Mock, patch
 import pytest
 import torch
 import viser
+from styled_world import styled
 from viser import transforms
 from websockets import Subprotocol
 from websockets.exceptions import InvalidStatus
@@ -16,7 +17,6 @@ from websockets.sync.client import connect
 
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.evaluation.shown import ViewTimePainting
-from lidarpainter_models.gaussians.model.styling.scene_style import SceneStyle
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.geometry.transforms import invert_rigid, quaternion_from_rotation
 from lidarpainter_models.viewing import servers
@@ -186,7 +186,7 @@ def test_boxes_and_clicks_are_those_of_the_scene_that_is_shown(drive):
 
 def test_only_the_drives_own_scene_can_be_painted(drive):
     painting = Mock(ViewTimePainting)  # nobody paints
-    foggy = replace(drive.path.builder.scene, style=Mock(SceneStyle))
+    foggy = styled("foggy", scene=drive.path.builder.scene)
     with local_server(port=0) as server:
         viewer = LiveViewer(server, drive, painting)
         assert not viewer.controls.painted.disabled
