@@ -16,7 +16,7 @@ from lidarpainter_models.scenes.actor_names import path_of_track
 from lidarpainter_models.scenes.tracks import ActorTrack
 
 MOST_STEP_M = 1.5
-"""Ground that is so much higher or lower elsewhere is a roof or a hole: it is not followed."""
+"""Ground that is so much higher or lower than the path is a roof or a hole: it is not followed."""
 AFTER_NS = 1_000_000_000
 """Who stands all the time stands so long before and after the log too."""
 
@@ -72,16 +72,27 @@ def rerouted(
         log_s=log.seconds,
     )
     poses = trajectory.placed(road.world_from_body, road, moments, path_of)
-    return on_ground(replace(track, world_from_box=poses), road.world_from_body, ground)
+    moved = replace(track, world_from_box=poses)
+    if trajectory.tells_height:
+        return moved
+    return on_ground(moved, road.world_from_body, ground, up_m=trajectory.up_m)
 
 
 def on_ground(
-    track: ActorTrack, before: Float[Tensor, "times 4 4"], ground: GroundHeights
+    track: ActorTrack,
+    before: Float[Tensor, "times 4 4"],
+    ground: GroundHeights,
+    *,
+    up_m: float = 0.0,
 ) -> ActorTrack:
-    """A moved track, raised by how much higher the ground is than where it was before."""
+    """A moved track, as high over the ground as it was before, and `up_m` more.
+
+    Its own rise stays where the ground is unknown or no road.
+    """
     poses = track.world_from_box.clone()
     there, here = (ground.around(pose[:, :2, 3].float()) for pose in (poses, before))
-    step_m = (there - here).double()
+    own_rise_m = poses[:, 2, 3] - before[:, 2, 3] - up_m
+    step_m = (there - here).double() - own_rise_m
     poses[:, 2, 3] += torch.where(step_m.abs() <= MOST_STEP_M, step_m, 0.0)  # NaN fails too
     return replace(track, world_from_box=poses)
 

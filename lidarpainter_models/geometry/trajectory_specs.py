@@ -25,7 +25,12 @@ from lidarpainter_models.geometry.trajectory_parts import (
     offsets_of,
     turns,
 )
-from lidarpainter_models.geometry.trajectory_words import PathWords, Step, read_trajectory_words
+from lidarpainter_models.geometry.trajectory_words import (
+    ConstantStep,
+    PathWords,
+    Step,
+    read_trajectory_words,
+)
 from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_rotation
 from lidarpainter_models.geometry.waypoints import read_waypoints
 
@@ -58,6 +63,19 @@ class Trajectory:
     def is_recorded(self) -> bool:
         """Whether it leads nowhere else."""
         return self.other is None and not self.steps
+
+    @property
+    def up_m(self) -> float:
+        """How far its steps lead up."""
+        return sum((one.up_m for one in self.steps if isinstance(one, ConstantStep)), start=0.0)
+
+    @property
+    def tells_height(self) -> bool:
+        """Whether it says how high the body is; other ways lead over the ground."""
+        other = self.other
+        if other is None:
+            return False
+        return other.looks or (other.waypoints is not None and other.waypoints.z_m is not None)
 
     def placed(
         self,
