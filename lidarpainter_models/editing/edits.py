@@ -15,6 +15,7 @@ from lidarpainter_models.editing.motions import (
     retimed,
     standing,
     stopped,
+    with_poses,
 )
 from lidarpainter_models.editing.operations import (
     ActorSource,
@@ -151,7 +152,7 @@ def _otherwise(
         return rerouted(track, way, log, world.ground, world.path_of)
     if isinstance(operation, Retime):
         return retimed(track, log, delay_s=operation.delay_s, speed=operation.speed)
-    return stopped(track, log.time_ns(operation.at_s, "at_s"), over_s=operation.over_s)
+    return stopped(track, log.time_ns(operation.at_s, "at_s"), log, over_s=operation.over_s)
 
 
 def _at_every_frame(track: ActorTrack, log: LogTimes) -> ActorTrack:
@@ -159,13 +160,8 @@ def _at_every_frame(track: ActorTrack, log: LogTimes) -> ActorTrack:
     frames_ns = log.ego.timestamps_ns
     inside = (frames_ns > track.timestamps_ns[0]) & (frames_ns < track.timestamps_ns[-1])
     times_ns = torch.cat([track.timestamps_ns, frames_ns[inside]]).unique()
-    return replace(
-        track,
-        frame_indices=torch.zeros_like(times_ns),
-        timestamps_ns=times_ns,
-        world_from_box=torch.stack([track.pose_at(time) for time in times_ns.tolist()]),
-        num_points=torch.zeros_like(times_ns),
-    )
+    poses = torch.stack([track.pose_at(time) for time in times_ns.tolist()])
+    return with_poses(track, times_ns, poses)
 
 
 def _inserted(world: EditedWorld, operation: Insert, model: ActorModel) -> EditedWorld:

@@ -13,7 +13,7 @@ from lidarpainter_models.geometry.trajectory_parts import Moments, PathOf, heade
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
 from lidarpainter_models.lidar.ground_heights import GroundHeights
 from lidarpainter_models.scenes.actor_names import path_of_track
-from lidarpainter_models.scenes.tracks import ActorTrack
+from lidarpainter_models.scenes.tracks import ActorTrack, does_move
 
 MOST_STEP_M = 1.5
 """Ground that is so much higher or lower than the path is a roof or a hole: it is not followed."""
@@ -125,33 +125,62 @@ def beside_ego(
 
 
 def retimed(track: ActorTrack, log: LogTimes, *, delay_s: float, speed: float) -> ActorTrack:
-    """The same way, begun later and driven faster or slower."""
-    since_ns = (track.timestamps_ns - log.start_ns).double()
-    times_ns = log.start_ns + (since_ns / speed).round().long() + round(delay_s * 1e9)
+    """The same way, begun later than it was first seen, faster or slower; who stands stays.
+
+    Raises:
+        ConfigError: nothing of it is left within the log.
+    """
+    if not does_move(track.world_from_box[:, :3, 3]):
+        return track
+    first_ns = int(track.timestamps_ns[0])
+    since_ns = (track.timestamps_ns - first_ns).double()
+    times_ns = first_ns + (since_ns / speed).round().long() + round(delay_s * 1e9)
+    if int(times_ns[-1]) < log.start_ns or int(times_ns[0]) > log.end_ns:
+        from_s, to_s = ((int(times_ns[row]) - log.start_ns) * 1e-9 for row in (0, -1))
+        raise ConfigError(
+            f"{track.actor_id!r} would be there from {from_s:.1f} to {to_s:.1f} s, "
+            f"expected some of the log's 0 to {log.seconds:.1f} s"
+        )
     return replace(track, timestamps_ns=times_ns)
 
 
-def stopped(track: ActorTrack, at_ns: int, *, over_s: float) -> ActorTrack:
-    """The same way up to a time, then evenly braked; it stays there until its track ends."""
+def stopped(track: ActorTrack, at_ns: int, log: LogTimes, *, over_s: float) -> ActorTrack:
+    """The same way up to a time, then evenly braked.
+
+    Who stands before it is last seen stays there as long as the log goes on.
+    """
 
     def warped(since_s: Float[Tensor, " times"]) -> Float[Tensor, " times"]:
         braking = since_s.clamp(0, over_s)
         way = braking - braking**2 / (2 * over_s) if over_s > 0 else torch.zeros_like(since_s)
         return torch.where(since_s <= 0, since_s, way)
 
-    return _at_other_times(track, at_ns, warped)
+    braked = _at_other_times(track, at_ns, warped)
+    last_ns, stays_ns = int(track.timestamps_ns[-1]), log.end_ns + AFTER_NS
+    if at_ns + round(over_s * 1e9) > last_ns or last_ns >= stays_ns:
+        return braked
+    times_ns = torch.cat([braked.timestamps_ns, torch.tensor([stays_ns])])
+    poses = torch.cat([braked.world_from_box, braked.world_from_box[-1:]])
+    return with_poses(braked, times_ns, poses)
 
 
 def standing(track: ActorTrack, at_ns: int, log: LogTimes) -> ActorTrack:
     """An actor that stands where it is at a time, as long as the log goes on."""
     pose = track.pose_at(at_ns)
     times_ns = torch.tensor([log.start_ns - AFTER_NS, log.end_ns + AFTER_NS])
+    return with_poses(track, times_ns, pose.double().expand(2, 4, 4).clone())
+
+
+def with_poses(
+    track: ActorTrack, times_ns: Int[Tensor, " times"], world_from_box: Float[Tensor, "times 4 4"]
+) -> ActorTrack:
+    """An actor at other places, where no LiDAR saw it."""
     return replace(
         track,
-        frame_indices=torch.zeros(2, dtype=torch.int64),
+        frame_indices=torch.zeros_like(times_ns),
         timestamps_ns=times_ns,
-        world_from_box=pose.double().expand(2, 4, 4).clone(),
-        num_points=torch.zeros(2, dtype=torch.int64),
+        world_from_box=world_from_box,
+        num_points=torch.zeros_like(times_ns),
     )
 
 

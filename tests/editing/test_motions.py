@@ -1,4 +1,4 @@
-"""Other ways for an actor, on a road that rises by one metre in twenty."""
+"""Other ways and times for an actor; the road rises by one metre in twenty."""
 
 from dataclasses import replace
 
@@ -6,7 +6,8 @@ import pytest
 import torch
 from gaussian_world import FRAME_NS, car_track
 
-from lidarpainter_models.editing.motions import LogTimes, rerouted
+from lidarpainter_models.editing.motions import AFTER_NS, LogTimes, rerouted, retimed, stopped
+from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.lidar.ground_heights import GroundHeights
@@ -82,3 +83,40 @@ def test_a_roof_beside_the_way_is_not_climbed(log):
     ground = GroundHeights(torch.cat([xy, GRADE * xy[:, 1:] + roof_m], dim=1))
     found_m = above_m(car_on_slope(), "lateral:-6", log, ground)
     assert float((found_m - ABOVE_M).abs().max()) < 0.03
+
+
+def brief(first, last):
+    """There in some frames of the log alone."""
+    track, some = car_track(NUM_FRAMES), slice(first, last + 1)
+    return replace(
+        track,
+        frame_indices=track.frame_indices[some],
+        timestamps_ns=track.timestamps_ns[some],
+        world_from_box=track.world_from_box[some],
+        num_points=track.num_points[some],
+    )
+
+
+def test_who_stands_before_it_was_last_seen_stays(log):
+    track = stopped(brief(1, 4), 2 * FRAME_NS, log, over_s=0.1)
+    assert track.is_present(log.end_ns + AFTER_NS)
+    assert float(track.pose_at(log.end_ns)[1, 3]) == pytest.approx(0.5)  # braked over half a metre
+    for at_ns in (4 * FRAME_NS, 6 * FRAME_NS):  # it has gone before it stands
+        assert not stopped(brief(1, 4), at_ns, log, over_s=0.1).is_present(6 * FRAME_NS)
+
+
+@pytest.mark.parametrize(("speed", "last"), [(0.5, 7), (2.0, 4)])
+def test_who_is_slower_or_faster_comes_when_it_came(log, speed, last):
+    track = retimed(brief(3, 5), log, delay_s=0, speed=speed)
+    assert track.timestamps_ns[[0, -1]].tolist() == [3 * FRAME_NS, last * FRAME_NS]
+
+
+def test_who_stands_is_not_moved_in_time(log):
+    parked = replace(brief(0, 1), world_from_box=car_track(1).world_from_box.expand(2, 4, 4))
+    assert retimed(parked, log, delay_s=5, speed=0.5) is parked
+
+
+@pytest.mark.parametrize("delay_s", [-0.6, 0.5])
+def test_who_would_not_be_there_at_all_is_refused(log, delay_s):
+    with pytest.raises(ConfigError, match=r"'car' would be there from .* the log's 0 to 0\.7 s"):
+        retimed(brief(3, 5), log, delay_s=delay_s, speed=1)
