@@ -17,7 +17,7 @@ from tasks.exports.scene import SceneFormat, SceneRequest, export_scene
 from tasks.exports.sweeps import SweepFormat, export_sweeps
 from tasks.exports.views import export_images, export_video
 from tasks.opened import open_scene
-from tasks.runs import FinishedRun, open_run
+from tasks.runs import FinishedRun, lineage, open_run
 from tasks.specs import RunSpec
 from tasks.views.drive import write_page
 from tasks.views.files import ViewKinds
@@ -100,8 +100,14 @@ def _options_of(wanted: str) -> tuple[str, ...]:
 
 
 def export_run(store: Store, request: ExportRequest, out: Path) -> dict[str, Any]:
-    """Write a run in one format."""
+    """Write a run in one format.
+
+    Raises:
+        ConfigError: see `export_request`, or what was recorded is asked of a run that was changed.
+    """
     finished = open_run(store, request.path.run)
+    if request.format in (*DATASET_FORMATS, *SWEEP_FORMATS):
+        _refuse_changed(store, finished, request.format)
     run = view_parameters(finished).run_spec(store.address, painter=request.path.painter)
     made = _export(store, request, finished, run, out)
     return {
@@ -110,6 +116,17 @@ def export_run(store: Store, request: ExportRequest, out: Path) -> dict[str, Any
         "format": request.format,
         **made,
     }
+
+
+def _refuse_changed(store: Store, finished: FinishedRun, wanted: str) -> None:
+    """Refuse what was recorded where the run shows something else."""
+    if finished.change is not None:
+        first = lineage(store, finished)[-1]
+        raise ConfigError(
+            f"--format {wanted} holds what was recorded, and run {finished.run_id} was changed "
+            f"({finished.change['kind']}): export {first.derived_from or first.run_id}, "
+            "which it was derived from"
+        )
 
 
 def _export(

@@ -1,5 +1,6 @@
 """What a finished run left in the store."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,6 +63,15 @@ def open_run(store: Store, run_id: str) -> FinishedRun:
         derived_from=row["derived_from"],
         change=json_of(row, "change") if row["change"] else None,
     )
+
+
+def lineage(store: Store, run: FinishedRun) -> tuple[FinishedRun, ...]:
+    """A run and those that it was changed from, the nearest first, as far as they are there."""
+    found = [run]
+    with suppress(UnknownRecordError):  # a source may have been deleted
+        while found[-1].derived_from is not None:
+            found.append(open_run(store, found[-1].derived_from))
+    return tuple(found)
 
 
 def is_of_its_scene(store: Store, row: dict[str, Any]) -> bool:

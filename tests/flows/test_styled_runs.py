@@ -1,6 +1,7 @@
 """A run whose scene lives in a style: derived by a word, recalled, shown, and not painted."""
 
 import numpy as np
+import pytest
 from commands import call, seen_image, succeed
 from tiny_street import HEIGHT_PX, WIDTH_PX
 
@@ -26,6 +27,17 @@ def test_a_run_in_a_style_is_shown_in_it_and_leads_back(own_run, tmp_path):
     refused = call("render", result["run_id"], *PATH, *painted, store=own_run.store)
     assert refused.code == 2
     assert "painters know clear days" in refused.err
+
+
+@pytest.mark.parametrize("wanted", ["colmap", "nerfstudio", "lidar", "lidar-bin"])
+def test_what_was_recorded_is_not_exported_of_a_run_in_a_style(own_run, tmp_path, wanted):
+    words = ("stylize", own_run.run_id, "--prompt", "night", "--in-scene", "--json")
+    styled = succeed(*words, store=own_run.store).json["run_id"]
+    words = ("export", styled, "--format", wanted, "--out", tmp_path / "out")
+    refused = call(*words, store=own_run.store)
+    assert refused.code == 2
+    assert f"was changed (style): export {own_run.run_id}, which it was derived" in refused.err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_half_a_fog_hides_less_than_a_whole_one(own_run, tmp_path):
