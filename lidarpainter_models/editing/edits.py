@@ -11,11 +11,13 @@ from lidarpainter_models.editing.joins import OtherRun, joined
 from lidarpainter_models.editing.motions import (
     LogTimes,
     beside_ego,
+    continued,
     rerouted,
     retimed,
     standing,
     stopped,
     with_poses,
+    within,
 )
 from lidarpainter_models.editing.operations import (
     ActorSource,
@@ -85,7 +87,10 @@ def encounters(world: EditedWorld) -> list[Encounter]:
     for track in (here[one.actor_id] for one in world.came if one.actor_id in here):
         others = [other for other in world.tracks if other.actor_id != track.actor_id]
         hits = find_collisions(
-            MovingBody.car(track), world.lidar_map.street, others, start_ns=world.log.start_ns
+            MovingBody.car(within(track, world.log)),
+            world.lidar_map.street,
+            others,
+            start_ns=world.log.start_ns,
         )
         found += [Encounter(actor_id=track.actor_id, collision=hit) for hit in hits]
     return found
@@ -187,7 +192,7 @@ def _inserted(world: EditedWorld, operation: Insert, model: ActorModel) -> Edite
     way = parse_trajectory(operation.trajectory, max_shift_m=None)
     if not way.is_recorded:
         track = rerouted(track, way, world.log, world.ground, world.path_of)
-    return world.with_actor(model, track)
+    return world.with_actor(model, continued(track, world.log, world.ground))
 
 
 def _removed(world: EditedWorld, operation: Remove) -> EditedWorld:
@@ -199,20 +204,20 @@ def _removed(world: EditedWorld, operation: Remove) -> EditedWorld:
 def _switched(world: EditedWorld, operation: Lamps) -> EditedWorld:
     """The world with an actor's lamps switched; a parked car gets a body, and so lamps."""
     track, log = world.find(operation.actor), world.log
-    last_ns = log.end_ns
+    before_ns, after_ns = log.around_ns
+    first_ns, last_ns = before_ns, after_ns
+    if operation.from_s > 0:
+        first_ns = log.time_ns(operation.from_s, "from_s")
     if operation.until_s is not None:
         last_ns = log.time_ns(operation.until_s, "until_s")
     change = LampChange(
-        actor_id=track.actor_id,
-        state=operation.state,
-        first_ns=log.time_ns(operation.from_s, "from_s"),
-        last_ns=last_ns,
+        actor_id=track.actor_id, state=operation.state, first_ns=first_ns, last_ns=last_ns
     )
     if change.first_ns > change.last_ns:
         raise ConfigError("expected from_s <= until_s")
     changes = [change]
     if track in world.parked:
-        dark = replace(change, state="off", first_ns=log.start_ns, last_ns=log.end_ns)
+        dark = replace(change, state="off", first_ns=before_ns, last_ns=after_ns)
         model = world.model_of(track)
         world = world.without(track).with_recorded_actor(model, as_moving(track, log))
         changes = [dark, change]

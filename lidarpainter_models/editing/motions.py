@@ -18,7 +18,7 @@ from lidarpainter_models.scenes.tracks import ActorTrack, does_move
 MOST_STEP_M = 1.5
 """Ground that is so much higher or lower than the path is a roof or a hole: it is not followed."""
 AFTER_NS = 1_000_000_000
-"""Who stands all the time stands so long before and after the log too."""
+"""So long before and after the log, edits hold too: cameras expose before its first frame."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,6 +41,11 @@ class LogTimes:
     def seconds(self) -> float:
         """How long it is."""
         return (self.end_ns - self.start_ns) * 1e-9
+
+    @property
+    def around_ns(self) -> tuple[int, int]:
+        """Before and after whatever was recorded."""
+        return self.start_ns - AFTER_NS, self.end_ns + AFTER_NS
 
     def time_ns(self, seconds: float, what: str) -> int:
         """A time of the log.
@@ -132,7 +137,7 @@ def retimed(track: ActorTrack, log: LogTimes, *, delay_s: float, speed: float) -
     """
     if not does_move(track.world_from_box[:, :3, 3]):
         return track
-    first_ns = int(track.timestamps_ns[0])
+    first_ns = max(int(track.timestamps_ns[0]), log.start_ns)
     since_ns = (track.timestamps_ns - first_ns).double()
     times_ns = first_ns + (since_ns / speed).round().long() + round(delay_s * 1e9)
     if int(times_ns[-1]) < log.start_ns or int(times_ns[0]) > log.end_ns:
@@ -156,7 +161,7 @@ def stopped(track: ActorTrack, at_ns: int, log: LogTimes, *, over_s: float) -> A
         return torch.where(since_s <= 0, since_s, way)
 
     braked = _at_other_times(track, at_ns, warped)
-    last_ns, stays_ns = int(track.timestamps_ns[-1]), log.end_ns + AFTER_NS
+    last_ns, stays_ns = int(track.timestamps_ns[-1]), log.around_ns[1]
     if at_ns + round(over_s * 1e9) > last_ns or last_ns >= stays_ns:
         return braked
     times_ns = torch.cat([braked.timestamps_ns, torch.tensor([stays_ns])])
@@ -167,8 +172,29 @@ def stopped(track: ActorTrack, at_ns: int, log: LogTimes, *, over_s: float) -> A
 def standing(track: ActorTrack, at_ns: int, log: LogTimes) -> ActorTrack:
     """An actor that stands where it is at a time, as long as the log goes on."""
     pose = track.pose_at(at_ns)
-    times_ns = torch.tensor([log.start_ns - AFTER_NS, log.end_ns + AFTER_NS])
+    times_ns = torch.tensor(log.around_ns)
     return with_poses(track, times_ns, pose.double().expand(2, 4, 4).clone())
+
+
+def continued(track: ActorTrack, log: LogTimes, ground: GroundHeights) -> ActorTrack:
+    """Who is there from the first frame to the last is so before and after, driving on."""
+    road, ends = path_of_track(track), torch.tensor([0, len(track.timestamps_ns) - 1])
+    times_ns = torch.tensor(log.around_ns)
+    ahead_m = (times_ns - track.timestamps_ns[ends]).double() * 1e-9 * road.speed_mps[ends]
+    before = road.world_from_body[ends]
+    outside = with_poses(track, times_ns, road.moved_along(ends, ahead_m) @ before)
+    poses = on_ground(outside, before, ground).world_from_box
+    return with_poses(
+        track,
+        torch.cat([times_ns[:1], track.timestamps_ns, times_ns[1:]]),
+        torch.cat([poses[:1], road.world_from_body, poses[1:]]),
+    )
+
+
+def within(track: ActorTrack, log: LogTimes) -> ActorTrack:
+    """The same way, as far as the log goes."""
+    times_ns = track.timestamps_ns.clamp(log.start_ns, log.end_ns).unique()
+    return with_poses(track, times_ns, path_of_track(track).at(times_ns).world_from_body)
 
 
 def with_poses(

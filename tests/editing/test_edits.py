@@ -16,7 +16,7 @@ from lidarpainter_models.editing.actor_models import (
 )
 from lidarpainter_models.editing.edits import edited, encounters, refuse_walls
 from lidarpainter_models.editing.filled_scenes import filled, masked_observations
-from lidarpainter_models.editing.motions import LogTimes
+from lidarpainter_models.editing.motions import AFTER_NS, LogTimes
 from lidarpainter_models.editing.operations import ActorSource, parse_operations
 from lidarpainter_models.editing.worlds import EditedWorld
 from lidarpainter_models.errors import ConfigError, SceneError
@@ -210,14 +210,45 @@ def test_lamps_are_switched_from_a_time_on(world):
     after = done(world, {"op": "lamps", "actor": "car", "state": "brake", "from_s": 0.1})
     (change,) = after.lamps
     assert (change.actor_id, change.state) == ("car", "brake")
-    assert (change.first_ns, change.last_ns) == (FRAME_NS, int(TIMES_NS[-1]))
+    assert (change.first_ns, change.last_ns) == (FRAME_NS, int(TIMES_NS[-1]) + AFTER_NS)
     assert after.scene is world.scene
+
+
+def test_edits_hold_for_images_taken_before_the_first_frame_and_after_the_last(world):
+    (change,) = done(world, {"op": "lamps", "actor": "car", "state": "off"}).lamps
+    guest = {"op": "insert", "name": "guest", "source": {"actor": "car"}, "speed_mps": 10}
+    after = done(world, guest, guest | {"name": "second", "trajectory": "lateral:-3"})
+    early_ns, late_ns = -FRAME_NS, int(TIMES_NS[-1]) + FRAME_NS
+    assert change.first_ns <= early_ns
+    assert change.last_ns >= late_ns
+    for track in after.moving[1:]:
+        assert track.is_present(early_ns)
+        assert track.is_present(late_ns)
+        x_m = [float(track.pose_at(time_ns)[0, 3]) for time_ns in (early_ns, 0, late_ns)]
+        assert [x_m[0] - x_m[1], x_m[2] - x_m[1]] == pytest.approx([-1, 4], abs=1e-3)
+
+
+def test_a_guest_that_is_slower_begins_where_it_began(world):
+    guest = {"op": "insert", "name": "guest", "source": {"actor": "car"}, "speed_mps": 10}
+    slower = {"op": "retime", "actor": "guest", "speed": 0.5}
+    fast, slow = (places(done(world, *ops), "guest") for ops in ((guest,), (guest, slower)))
+    assert slow[[0, 2], 0].tolist() == pytest.approx(fast[[0, 1], 0].tolist(), abs=1e-3)
+
+
+def test_what_lies_behind_the_end_of_the_log_is_not_run_into(world):
+    """The wall is 8 m ahead; in a second more the guest would be there."""
+    guest = {"op": "insert", "name": "guest", "source": {"actor": "car"}}
+    after = done(world, guest | {"ahead_m": 2.8, "left_m": 4, "speed_mps": 4})
+    thick = MapPoints.concatenate([after.lidar_map.street] * 9)
+    walled = replace(after, lidar_map=LidarMap(street=thick, actors={}))
+    assert not [one for one in encounters(walled) if one.collision.is_wall]
 
 
 def test_a_parked_car_whose_lamps_are_switched_has_none_before(standing):
     operation = {"op": "lamps", "actor": "parked", "state": "on", "from_s": 0.1, "until_s": 0.2}
     after = done(standing, operation)
-    assert [(one.state, one.first_ns) for one in after.lamps] == [("off", 0), ("on", FRAME_NS)]
+    changes = [(one.state, one.first_ns) for one in after.lamps]
+    assert changes == [("off", -AFTER_NS), ("on", FRAME_NS)]
     assert after.parked == ()
     assert torch.allclose(places(after, "parked"), PARKED_POSE[:3, 3].expand(4, 3))
     own = len(standing.rows_of(standing.parked[0]))
