@@ -4,11 +4,13 @@ from typing import Any
 
 from catalog.store import Store
 from flows.dress import STYLE
+from flows.edit import EDIT
 from flows.parameters import view_parameters
 from lidarpainter_models.errors import ConfigError
 from tasks.assets.enter import enter_published
 from tasks.assets.publish import publish_assets
-from tasks.runs import open_run
+from tasks.editing.edit import PARKED
+from tasks.runs import FinishedRun, lineage, open_run
 
 
 def publish_run(store: Store, run: str) -> dict[str, Any]:
@@ -23,10 +25,11 @@ def publish_run(store: Store, run: str) -> dict[str, Any]:
         ConfigError: the run was edited: what it shows is not what was recorded.
     """
     finished = open_run(store, run)
-    if finished.change is not None and finished.change["kind"] != STYLE:
+    if (kind := _other_change(store, finished)) is not None:
+        first = lineage(store, finished)[-1]
         raise ConfigError(
-            f"run {finished.run_id} was changed ({finished.change['kind']}), "
-            f"expected a recorded or styled one: publish {finished.derived_from}"
+            f"run {finished.run_id} was changed ({kind}), "
+            f"expected a recorded or styled one: publish {first.derived_from or first.run_id}"
         )
     style = None if finished.change is None else finished.change["parameters"]["prompt"]
     parameters = view_parameters(finished)
@@ -45,3 +48,11 @@ def publish_run(store: Store, run: str) -> dict[str, Any]:
         "cpu_seconds": published.cpu_seconds,
         "is_new": published.is_new,
     }
+
+
+def _other_change(store: Store, finished: FinishedRun) -> str | None:
+    """What else than styles a run went through; edits show in what may be seen of it."""
+    kinds = [one.change["kind"] for one in lineage(store, finished) if one.change is not None]
+    if store.artefacts.manifest(finished.final.observations).summary.get(PARKED) is not None:
+        kinds.append(EDIT)
+    return next((kind for kind in kinds if kind != STYLE), None)

@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-from catalog.errors import UnknownRecordError
 from catalog.store import Store
 from flows.derive import Change, derive_run
+from flows.dress import STYLE
 from flows.parameters import view_parameters
 from flows.views import PathRequest, render_run
 from lidarpainter_models.conditioning.settings import SequenceConfig
@@ -25,7 +26,7 @@ from tasks.editing.edit import (
     observations_build,
     opened_world,
 )
-from tasks.runs import FinishedRun, open_run
+from tasks.runs import FinishedRun, lineage, open_run
 from tasks.views.files import ViewKinds
 
 EDIT = "edit"
@@ -47,8 +48,8 @@ class EditRequest:
 def edit_run(store: Store, request: EditRequest) -> dict[str, Any]:
     """Make an edited run of a finished one.
 
-    An edited run is edited anew from where it came from, with both lists one after the other:
-    what was uncovered is filled once, from what was recorded.
+    An edited run, styled since or not, is edited anew from where it came from, with both lists
+    one after the other: what was uncovered is filled once, from what was recorded.
 
     Returns:
         As `derive_run`, with `trajectory`: where the script drives, `recorded` if it does not say.
@@ -137,12 +138,28 @@ def _distance_m(world_from_ego: Any, track: ActorTrack) -> float:  # noqa: ANN40
 
 
 def _origin(store: Store, run: FinishedRun) -> tuple[FinishedRun, Sequence[Operation]]:
-    """The run that edits begin from, and those that were made of it already."""
-    if run.change is None or run.change["kind"] != EDIT or run.derived_from is None:
-        return run, ()
-    try:
-        origin = open_run(store, run.derived_from)
-    except UnknownRecordError:
-        return run, ()  # it is gone: what was edited is all there is
-    found = run.change["parameters"]["operations"]
-    return origin, parse_operations(found, f"the edits of run {run.run_id}")
+    """The run that edits begin from, and what was done to it already, styles too.
+
+    Where that run is gone, edits begin from the earliest one that is there.
+    """
+    chain = lineage(store, run)
+    done = list(takewhile(lambda one: _kind(one) in (EDIT, STYLE), chain))
+    edits = [number for number, one in enumerate(done) if _kind(one) == EDIT]
+    first = min(edits[-1] + 1, len(chain) - 1) if edits else 0
+    operations = [one for changed in reversed(chain[:first]) for one in _operations_of(changed)]
+    return chain[first], operations
+
+
+def _kind(run: FinishedRun) -> str | None:
+    return None if run.change is None else run.change["kind"]
+
+
+def _operations_of(run: FinishedRun) -> Sequence[Operation]:
+    """How an edited or styled run was changed."""
+    told: dict[str, Any] = {} if run.change is None else run.change["parameters"]
+    if _kind(run) == EDIT:
+        return parse_operations(told["operations"], f"the edits of run {run.run_id}")
+    style = {"op": "style", "prompt": told["prompt"], "seed": told["seed"]}
+    if "foggy" in told["prompt"]:
+        style["visibility_m"] = told["visibility_m"]
+    return parse_operations([style], f"the style of run {run.run_id}")

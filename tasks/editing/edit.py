@@ -47,6 +47,8 @@ from tasks.stored import load_observations, load_scene, save_observations, save_
 
 FILLED_FILE = "filled.safetensors"
 """Confidence of the last Gaussians of the scene, which were filled in."""
+PARKED = "parked"
+"""What the summary of edited observations calls those that are still part of the street."""
 CATEGORY = "car"
 """Of what comes from a file, which does not say."""
 
@@ -92,8 +94,9 @@ class Edits:
 
     def _require_night(self) -> None:
         worn = load_scene(self.store, self.source.final.gaussians).style
-        mix = self.style.mix if self.style else worn.mix if worn else None
-        if mix is None or "night" not in {share.prompt for share in mix.shares}:
+        mixes = [one.mix for one in self.operations if isinstance(one, Style)]
+        mixes += [] if worn is None else [worn.mix]
+        if "night" not in {share.prompt for mix in mixes for share in mix.shares}:
             raise ConfigError(
                 "lamps are seen at night alone: expected a style with night, among the operations "
                 "or in the run"
@@ -191,13 +194,17 @@ def opened_world(store: Store, run: FinishedRun) -> EditedWorld:
     # what is mended is mended by day
     fitted = replace(load_scene(store, run.final.gaussians), style=None)
     bodies = {track.actor_id for track in fitted.actors.recorded_tracks}
+    parked = [track for track in scene.tracks if not track.is_moving]
+    left = store.artefacts.manifest(run.final.observations).summary.get(PARKED)
     return EditedWorld(
         scene=fitted,
         fitted=fitted,
         lidar_map=seen.lidar_map,
         views=seen.views,
         parked=tuple(
-            track for track in scene.tracks if not track.is_moving and track.actor_id not in bodies
+            track
+            for track in parked
+            if track.actor_id not in bodies and (left is None or track.actor_id in left)
         ),
         log=LogTimes(ego=driven_road(scene)),
     )
@@ -268,7 +275,11 @@ def _build_observations(place: Workplace, _progress: Progress, *, edits: Edits) 
     seen = masked_observations(world)
     save_observations(place.output, seen)
     hidden = [float(view.hidden.float().mean()) for view in seen.views if view.hidden is not None]
-    return {"num_views": len(seen.views), "hidden_share": sum(hidden) / max(len(hidden), 1)}
+    return {
+        "num_views": len(seen.views),
+        "hidden_share": sum(hidden) / max(len(hidden), 1),
+        PARKED: [track.actor_id for track in world.parked],
+    }
 
 
 def _digests(part: str, donor: FinishedRun | LibraryActor | str | None) -> dict[str, str]:

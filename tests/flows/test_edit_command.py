@@ -63,6 +63,32 @@ def test_edits_of_an_edited_run_are_added_to_its_list(own_run, ahead):
     assert [one["op"] for one in told] == ["scale", "freeze"]
 
 
+def actors(store, run):
+    return succeed("edit", run, "actors", "--json", store=store).json["actors"]
+
+
+def test_edits_are_known_once_the_run_is_styled(own_run, ahead):
+    store = own_run.store
+    parked = [row["actor_id"] for row in actors(store, own_run.run_id) if not row["is_moving"]]
+    removed = succeed("edit", own_run.run_id, "remove", parked[0], "--json", store=store).json
+    words = ("stylize", removed["run_id"], "--prompt", "foggy:0.5", "--visibility", "80")
+    styled = succeed(*words, "--in-scene", "--json", store=store).json["run_id"]
+    left = [row["actor_id"] for row in actors(store, styled)]
+    assert parked[0] not in left
+    assert set(parked[1:]) < set(left)
+    refused = call("assets", "publish", styled, store=store)
+    assert refused.code == 2
+    assert f"was changed (edit), expected a recorded or styled one: publish {own_run.run_id}" in (
+        refused.err
+    )
+    again = succeed("edit", styled, "scale", ahead, "factor=1.3", "--json", store=store).json
+    assert again["derived_from"] == own_run.run_id
+    told = again["change"]["parameters"]["operations"]
+    assert [one["op"] for one in told] == ["remove", "style", "scale"]
+    assert told[1] == {"op": "style", "prompt": "foggy:0.5", "visibility_m": 80.0}
+    assert again["summary"]["style"] == "foggy:0.5"
+
+
 def test_edits_are_done_once_for_check_images_and_scene(own_run, ahead, monkeypatch):
     done = []
     monkeypatch.setattr(
