@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.cameras import Camera
@@ -45,7 +47,8 @@ class MovedCameras:
         """
         if self.trajectory.is_recorded:
             return tuple(cameras)
-        road, moments, place = self.road, self._moments(views), self.trajectory.placed
+        road, place = self._road_of(views), self.trajectory.placed
+        moments = self._moments(views, road)
         poses = torch.stack([camera.world_from_camera.double() for camera in cameras])
         if self.as_rig:
             egos = road.world_from_body[moments.rows]
@@ -63,7 +66,7 @@ class MovedCameras:
             return []
         body = MovingBody.camera(
             torch.stack([camera.world_from_camera.double() for camera in cameras]),
-            torch.tensor([view.timestamp_ns for view in views]),
+            _times_ns(views),
         )
         start_ns = int(self.road.timestamps_ns[0])
         return find_collisions(body, street, self.tracks, start_ns=start_ns)
@@ -80,14 +83,29 @@ class MovedCameras:
                 "within half a metre; --allow-collisions goes through"
             )
 
-    def _moments(self, views: Sequence[RecordedView]) -> Moments:
-        frames = [self.recorded.frame_position(view.frame_index) for view in views]
-        times_ns = torch.tensor([view.timestamp_ns for view in views])
+    def _road_of(self, views: Sequence[RecordedView]) -> DrivenPath:
+        """The way that a trajectory leads off.
+
+        Where another path takes its place it has a pose at every exposure: frames have other times,
+        and a camera rides where it was when it was exposed.
+        """
+        if self.trajectory.other is None:
+            return self.road
+        times_ns = torch.cat([self.road.timestamps_ns, _times_ns(views)]).unique()
+        return self.road.driven_on(times_ns)
+
+    def _moments(self, views: Sequence[RecordedView], road: DrivenPath) -> Moments:
+        times_ns = _times_ns(views)
+        if self.trajectory.other is None:
+            frames = [self.recorded.frame_position(view.frame_index) for view in views]
+            rows = torch.tensor(frames)
+        else:
+            rows = torch.searchsorted(road.timestamps_ns, times_ns)
         start_ns, end_ns = (int(self.road.timestamps_ns[row]) for row in (0, -1))
         return Moments(
-            rows=torch.tensor(frames),
+            rows=rows,
             seconds=(times_ns - start_ns).double() * 1e-9,
-            progress=torch.arange(len(frames)).double() / max(len(frames) - 1, 1),
+            progress=torch.arange(len(views)).double() / max(len(views) - 1, 1),
             log_s=(end_ns - start_ns) * 1e-9,
         )
 
@@ -95,3 +113,7 @@ class MovedCameras:
         shown = {track.actor_id: track for track in self.tracks}
         known = {track.actor_id: track for track in self.recorded.tracks} | shown
         return path_of_track(named_actor([*known.values()], name, self.road))
+
+
+def _times_ns(views: Sequence[RecordedView]) -> Int[Tensor, " views"]:
+    return torch.tensor([view.timestamp_ns for view in views])

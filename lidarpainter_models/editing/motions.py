@@ -178,17 +178,10 @@ def standing(track: ActorTrack, at_ns: int, log: LogTimes) -> ActorTrack:
 
 def continued(track: ActorTrack, log: LogTimes, ground: GroundHeights) -> ActorTrack:
     """Who is there from the first frame to the last is so before and after, driving on."""
-    road, ends = path_of_track(track), torch.tensor([0, len(track.timestamps_ns) - 1])
-    times_ns = torch.tensor(log.around_ns)
-    ahead_m = (times_ns - track.timestamps_ns[ends]).double() * 1e-9 * road.speed_mps[ends]
-    before = road.world_from_body[ends]
-    outside = with_poses(track, times_ns, road.moved_along(ends, ahead_m) @ before)
-    poses = on_ground(outside, before, ground).world_from_box
-    return with_poses(
-        track,
-        torch.cat([times_ns[:1], track.timestamps_ns, times_ns[1:]]),
-        torch.cat([poses[:1], road.world_from_body, poses[1:]]),
-    )
+    before_ns, after_ns = (torch.tensor([one]) for one in log.around_ns)
+    times_ns, way = torch.cat([before_ns, track.timestamps_ns, after_ns]), path_of_track(track)
+    longer = with_poses(track, times_ns, way.driven_on(times_ns).world_from_body)
+    return on_ground(longer, way.at(times_ns).world_from_body, ground)
 
 
 def within(track: ActorTrack, log: LogTimes) -> ActorTrack:

@@ -60,6 +60,15 @@ class DrivenPath:
         )
         return DrivenPath(timestamps_ns=times_ns, world_from_body=poses)
 
+    def driven_on(self, times_ns: Int[Tensor, " queries"]) -> "DrivenPath":
+        """The poses at other times; beyond its ends the body goes straight on as fast as there."""
+        last = len(self) - 1
+        ends = torch.where(times_ns < self.timestamps_ns[0], 0, last)
+        inside_ns = times_ns.clamp(int(self.timestamps_ns[0]), int(self.timestamps_ns[-1]))
+        ahead_m = (times_ns - inside_ns).double() * 1e-9 * self.speed_mps[ends]
+        poses = self.moved_along(ends, ahead_m) @ self.at(times_ns).world_from_body
+        return DrivenPath(timestamps_ns=times_ns, world_from_body=poses)
+
     def beyond_m(self, rows: Int[Tensor, " steps"], ahead_m: Float[Tensor, " steps"]) -> float:
         """How far out of the path's ends the farthest of some steps ahead or back leads."""
         wanted_m = self.travelled_m[rows] + ahead_m
