@@ -1,8 +1,8 @@
 """A scene as USD with `ParticleField3DGaussianSplat` (OpenUSD 26.03 on), its actors in motion.
 
 The stage is z up, in metres, in the frame of the scene's world. Every actor is an Xform whose
-translation, orientation and visibility are sampled over time, its Gaussians below it in the frame
-of its box. Needs usd-core (extra `export`).
+translation, orientation and visibility are sampled over time, and those of one moment given without
+a time code; its Gaussians are below it in the frame of its box. Needs usd-core (extra `export`).
 """
 
 import re
@@ -28,8 +28,10 @@ TIME_CODES_PER_SECOND = 1000.0
 """Time codes are milliseconds since the first frame."""
 
 
-def write_usd(path: Path, contents: SceneContents) -> None:
+def write_usd(path: Path, contents: SceneContents, *, time: int = 0) -> None:
     """Write a scene and how it moves, aside and renamed whole.
+
+    `time` is which of its times readers show that ask for none.
 
     Raises:
         ConfigError: the name does not end as USD files do.
@@ -51,7 +53,7 @@ def write_usd(path: Path, contents: SceneContents) -> None:
     ):
         layer = Path(folder) / f"scene{'.usdc' if path.suffix == '.usdz' else path.suffix}"
         stage = Usd.Stage.CreateNew(str(layer))
-        _fill(stage, contents)
+        _fill(stage, contents, time)
         stage.GetRootLayer().Save()
         del stage
         if path.suffix != ".usdz":
@@ -78,7 +80,7 @@ def _usd_errors(path: Path) -> Iterator[None]:
         raise WriteError(f"{path}: cannot be written: {reason}") from None
 
 
-def _fill(stage: Any, contents: SceneContents) -> None:  # noqa: ANN401 - pxr has no types
+def _fill(stage: Any, contents: SceneContents, time: int) -> None:  # noqa: ANN401 - pxr has no types
     from pxr import Sdf, UsdGeom
 
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
@@ -104,8 +106,8 @@ def _fill(stage: Any, contents: SceneContents) -> None:  # noqa: ANN401 - pxr ha
         xform = UsdGeom.Xform.Define(stage, Sdf.Path(place))
         _describe(xform.GetPrim(), actor)
         translations = poses[:, index, :3, 3].tolist()
-        _move(xform, codes, translations, rotations_wxyz[:, index].tolist())
-        _show(xform, codes, contents.is_present[:, index].tolist())
+        _move(xform, codes, translations, rotations_wxyz[:, index].tolist(), time)
+        _show(xform, codes, contents.is_present[:, index].tolist(), time)
         _define_gaussians(stage, f"{place}/Gaussians", actor.gaussians)
 
 
@@ -119,21 +121,30 @@ def _move(
     codes: list[float],
     translations: list[list[float]],
     rotations_wxyz: list[list[float]],
+    time: int,
 ) -> None:
-    from pxr import Gf, UsdGeom
+    from pxr import Gf, Usd, UsdGeom
 
     translate = xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble)
     orient = xform.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
-    for code, metres, (w, x, y, z) in zip(codes, translations, rotations_wxyz, strict=True):
+    samples = [*zip(codes, translations, rotations_wxyz, strict=True)]
+    shown = (Usd.TimeCode.Default(), *samples[time][1:])
+    for code, metres, (w, x, y, z) in (shown, *samples):
         translate.Set(Gf.Vec3d(*metres), code)
         orient.Set(Gf.Quatd(w, x, y, z), code)
 
 
-def _show(xform: Any, codes: list[float], is_present: list[bool]) -> None:  # noqa: ANN401
+def _show(
+    xform: Any,  # noqa: ANN401
+    codes: list[float],
+    is_present: list[bool],
+    time: int,
+) -> None:
     from pxr import UsdGeom
 
     visibility = xform.CreateVisibilityAttr()
     words = [UsdGeom.Tokens.inherited if one else UsdGeom.Tokens.invisible for one in is_present]
+    visibility.Set(words[time])
     for number, (code, word) in enumerate(zip(codes, words, strict=True)):
         if number == 0 or word != words[number - 1]:  # tokens hold until the next sample
             visibility.Set(word, code)

@@ -153,7 +153,7 @@ def _write(request: SceneRequest, contents: SceneContents, shown: int, out: Path
         case "gltf":
             write_gltf(out, contents, time=shown)
         case "usd":
-            write_usd(out, contents)
+            write_usd(out, contents, time=shown)
     return [out]
 
 

@@ -277,6 +277,23 @@ def test_usd_holds_every_number_and_moves_the_actors(world, tmp_path, ending):
             assert (seen == "inherited") == bool(present[row])
 
 
+@pytest.mark.parametrize("time", [0, 3])
+def test_usd_shows_one_moment_to_whoever_asks_for_none(world, tmp_path, time):
+    from pxr import Usd, UsdGeom
+
+    scene, _, times_ns, contents = world
+    write_usd(tmp_path / "a.usdc", contents, time=time)
+    stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
+    likely, present = scene.actors.likely_poses(times_ns[time])
+    for row, prim in enumerate(stage.GetPrimAtPath("/World/Actors").GetChildren()):
+        pose = UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())
+        torch.testing.assert_close(
+            torch.from_numpy(np.array(pose)).T, likely[row], atol=1e-5, rtol=0
+        )
+        seen = UsdGeom.Imageable(prim).ComputeVisibility(Usd.TimeCode.Default())
+        assert (seen == "inherited") == bool(present[row])
+
+
 def test_usd_names_its_endings_and_what_it_needs(world, tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match=r"a\.ply: expected a name in \.usdz, \.usdc, \.usda"):
         write_usd(tmp_path / "a.ply", world[3])
