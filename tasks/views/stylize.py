@@ -63,8 +63,15 @@ def stylize(run: RunSpec, fitted: FittedRef, request: StylizeRequest, out: Path)
 
     Raises:
         SceneError: the run did not train on that camera, or no frame is left.
+        ConfigError: what the scene shows is in a style already.
     """
     path = followed_path(run, fitted, request.view)
+    style = path.builder.scene.style
+    if style is not None and request.images != RECORDED:
+        raise ConfigError(
+            f"the run is in the style {style.mix.text}, and styles are put on clear days: stylize "
+            "the run that it was derived from, or --images recorded"
+        )
     listener().started(STAGE)
     times_ns = path.recorded.frame_timestamps_ns
     first_ns, span_ns = int(times_ns[0]), max(int(times_ns[-1] - times_ns[0]), 1)

@@ -27,6 +27,11 @@ def test_a_run_in_a_style_is_shown_in_it_and_leads_back(own_run, tmp_path):
     refused = call("render", result["run_id"], *PATH, *painted, store=own_run.store)
     assert refused.code == 2
     assert "painters know clear days" in refused.err
+    twice = ("--prompt", "night", "--frames", "2:3", "--out", tmp_path / "twice")
+    refused = call("stylize", result["run_id"], *twice, store=own_run.store)
+    assert refused.code == 2
+    assert "the run is in the style night:1, and styles are put on clear days" in refused.err
+    assert not (tmp_path / "twice").exists()
 
 
 @pytest.mark.parametrize("wanted", ["colmap", "nerfstudio", "lidar", "lidar-bin"])
