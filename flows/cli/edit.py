@@ -13,13 +13,14 @@ from lidarpainter_models.errors import ConfigError
 ACTORS = "actors"
 MANY = ("remove",)
 """Operations on any number of actors."""
-NOBODY = ("freeze", "crop")
+NOBODY = ("freeze", "crop", "style", "drive")
 """Operations on nobody in particular."""
 NAMED = {"insert": "name", "join": "run"}
 """What the name of an operation is, where it is not an actor that is there."""
 MOST_SCRIPT_BYTES = 10_000_000
-_NUMBER = re.compile(r"factor|speed|.*_(m|s|deg|mps)")
+_NUMBER = re.compile(r"factor|speed|strength|.*_(m|s|deg|mps)")
 """Fields whose name says that they are numbers."""
+_WHOLE_NUMBER = "seed"
 
 
 def edit(
@@ -137,12 +138,14 @@ def _operation(words: list[str]) -> dict[str, Any]:
 
 
 def _value(field: str, text: str) -> str | float:
-    if not _NUMBER.fullmatch(field):
+    is_whole = field == _WHOLE_NUMBER
+    if not (is_whole or _NUMBER.fullmatch(field)):
         return text
     try:
-        return float(text)
+        return int(text) if is_whole else float(text)
     except ValueError:
-        raise ConfigError(f"edit: {field}={text}: expected a number") from None
+        kind = "whole number" if is_whole else "number"
+        raise ConfigError(f"edit: {field}={text}: expected a {kind}") from None
 
 
 def _read_script(path: Path) -> list[Any]:

@@ -89,6 +89,21 @@ def test_edits_are_known_once_the_run_is_styled(own_run, ahead):
     assert again["summary"]["style"] == "foggy:0.5"
 
 
+def test_a_style_and_a_drive_can_be_said_as_words(own_run):
+    words = ("style", "prompt=foggy", "strength=0.5", "seed=3", "visibility_m=80")
+    styled = succeed("edit", own_run.run_id, *words, "--json", store=own_run.store).json
+    (told,) = styled["change"]["parameters"]["operations"]
+    assert told == {
+        "op": "style",
+        "prompt": "foggy",
+        "strength": 0.5,
+        "seed": 3,
+        "visibility_m": 80.0,
+    }
+    words = ("edit", styled["run_id"], "drive", "trajectory=lateral:1", "--json")
+    assert succeed(*words, store=own_run.store).json["trajectory"] == "lateral:1"
+
+
 def test_edits_are_done_once_for_check_images_and_scene(own_run, ahead, monkeypatch):
     done = []
     monkeypatch.setattr(
@@ -113,6 +128,11 @@ def test_edits_are_done_once_for_check_images_and_scene(own_run, ahead, monkeypa
         (("insert", "new", "source.ply=nowhere.ply"), "no file nowhere.ply"),
         (("insert", "new", "source.run=nobody", "source.actor=a"), "no run_id 'nobody'"),
         (("join", "nobody"), "no run_id 'nobody'"),
+        (("style", "prompt=snow"), "no style 'snow', expected clear, foggy"),
+        (("style", "prompt=foggy", "strength=2"), "strength: Input should be less than"),
+        (("style", "prompt=foggy", "seed=0.5"), "seed=0.5: expected a whole number"),
+        (("style", AHEAD, "prompt=foggy"), "style takes no name, got nearest-ahead"),
+        (("drive", "trajectory=latral:2"), "trajectory 'latral:2': expected one of"),
         (("join",), "join takes one name, got none"),
         (("join", "latest"), "that run has seen nothing much better than this one"),
         ((), "expected at least one operation"),
