@@ -92,6 +92,12 @@ def attempt_id(lease: Lease) -> str:
     return f"{lease.name}-{lease.fence}"
 
 
+def split_attempt_id(name: str) -> tuple[str, int]:
+    """The sequence and the number of its lease, of what `attempt_id` gives."""
+    sequence_id, _, fence = name.rpartition("-")
+    return sequence_id, int(fence)
+
+
 def attempt_row(lease: Lease, ending: Ending) -> dict[str, Any]:
     """The row of an attempt; what it was and what was predicted stands in its lease."""
     started_at = datetime.fromtimestamp(lease.taken_at, UTC)

@@ -8,13 +8,13 @@ cannot undo each other. Where a manifest has moved a sequence, only that is writ
 on it goes on.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from typing import Any
 
-from catalog.attempts import FIRST_PAUSE_S, Ending, attempt_row, row_after
+from catalog.attempts import FIRST_PAUSE_S, Ending, attempt_row, row_after, split_attempt_id
 from catalog.digests import canonical_json, digest_text
 from catalog.errors import UnknownRecordError
 from catalog.leases import Lease, Leases
@@ -103,8 +103,9 @@ class FleetLedger:
     def ask(self, wishes: Sequence[Wish], *, accept_stale: bool = False) -> None:
         """Enter what a manifest asks for; what is done as asked stays done.
 
-        What is no longer among the wishes is forgotten, but not its attempts; `accept_stale` leaves
-        what was done by other code as it is.
+        What is no longer among the wishes is forgotten, but not its attempts: where it is asked for
+        again, their numbers are not used again. `accept_stale` leaves what was done by other code
+        as it is.
         """
         fleet = wishes[0].fleet
         known = {r["sequence_id"]: r for r in self.store.tables.rows(TABLE) if r["fleet"] == fleet}
@@ -118,7 +119,8 @@ class FleetLedger:
             elif any(new[name] != old[name] for name in PLACE):
                 moved.append(new)
         dropped = sorted(known.keys() - wanted.keys())
-        added = [row for sequence_id, row in wanted.items() if sequence_id not in known]
+        fences = self._last_fences(wanted.keys() - known.keys())
+        added = [{**wanted[name], "fence": fence} for name, fence in fences.items()]
         tables = self.store.tables
         tables.add_absent(TABLE, added)
         tables.replace_older(TABLE, changed, "fence")
@@ -206,6 +208,18 @@ class FleetLedger:
                 ending = Ending(cause="cancelled", seconds=lease.beat_at - lease.taken_at)
                 self.store.tables.add_absent(ATTEMPTS, [attempt_row(lease, ending)])
         return [row["scene_id"] for row in left]
+
+    def _last_fences(self, sequence_ids: Set[str]) -> dict[str, int]:
+        """The highest number under which each of some sequences was ever worked on, or 0."""
+        found = dict.fromkeys(sequence_ids, 0)
+        where = {"sequence_id": sequence_ids}
+        ended = self.store.tables.arrow(ATTEMPTS, columns=["attempt_id"], where=where)
+        used = [split_attempt_id(one) for one in ended["attempt_id"].to_pylist()]
+        used += [(lease.name, lease.fence) for lease in self.leases.held() if sequence_ids]
+        for name, fence in used:
+            if name in found:
+                found[name] = max(found[name], fence)
+        return found
 
     def _lost(self, lease: Lease, why: Ending | None) -> Ending:
         """How an attempt ended whose worker cannot tell."""

@@ -149,6 +149,21 @@ def test_what_is_no_longer_asked_for_is_forgotten_but_not_its_attempts(ledger):
     assert causes(ledger) == ["done"]
 
 
+def test_what_comes_back_counts_on_and_its_late_worker_is_refused(ledger):
+    both, other = [wish(), wish("x/two")], [wish("x/two")]
+    ledger.ask(both)
+    attempted(ledger, Ending(cause="interrupted"))
+    late = ledger.take(one(ledger), {})
+    ledger.ask(other)
+    ledger.ask(both)
+    assert not ledger.end(late, DONE)
+    assert one(ledger)["state"] == "waiting"
+    ledger.ask(other)
+    ledger.ask(both)
+    attempted(ledger, DONE)
+    assert causes(ledger) == ["interrupted", "done", "done"]
+
+
 def test_running_is_what_a_live_lease_says(ledger, clock):
     ledger.ask([wish()])
     assert ledger.take(one(ledger), {}) is not None
