@@ -35,7 +35,7 @@ class IdentityError(CatalogError, TypeError):
 
 
 class ConflictError(CatalogError, RuntimeError):
-    """Another writer kept winning: a table could not be committed within the retries."""
+    """Others were in the way: they won every commit to a table, or asked otherwise meanwhile."""
 
 
 REASONS = {

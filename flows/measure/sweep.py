@@ -8,9 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from catalog.errors import CatalogError
+from catalog.errors import CatalogError, ConflictError
 from catalog.fleets import TABLE as SEQUENCES
-from catalog.fleets import FleetLedger
+from catalog.fleets import FleetLedger, Wish
 from catalog.points import Point, points_of
 from catalog.store import Store
 from catalog.tables import Row
@@ -86,20 +86,41 @@ def make_points(
 
     Raises:
         SceneError: a stored scene is not there.
+        ConflictError: meanwhile another command has asked for other points under this name.
     """
     for scene_id in (one for source in manifest.source for one in source.scenes or ()):
         open_scene(store, scene_id)
     ledger = FleetLedger(store)
     for line in ledger.reconcile():
         say(line)
-    ledger.ask(wishes(manifest, Path()), accept_stale=accept_stale)
+    wanted = wishes(manifest, Path())
+    ledger.ask(wanted, accept_stale=accept_stale)
     rows = ledger.rows(manifest.name)
     counts = counts_of(rows)
     if still := counts["waiting"] + counts["running"]:
         say(f"{manifest.name}: {_cost(store, rows)}")
         start = starter(store.address, manifest.name, threads=THREADS)
         run_workers(ledger, manifest.name, start, min(workers, still), say)
-    return points_of(store, manifest.name)
+    made = points_of(store, manifest.name)
+    _require_asked(wanted, ledger)
+    return made
+
+
+def _require_asked(wanted: Sequence[Wish], ledger: FleetLedger) -> None:
+    """See that a fleet is still asked for as it was.
+
+    Raises:
+        ConflictError: it is not.
+    """
+    fleet, store = wanted[0].fleet, ledger.store
+    asked = {(wish.sequence_id, wish.asked_digest) for wish in wanted}
+    found = {(row["sequence_id"], row["asked_digest"]) for row in ledger.rows(fleet)}
+    if asked != found:
+        raise ConflictError(
+            f"{fleet} in {store.name}: another command has asked for other points under this name "
+            f"meanwhile, {len(asked & found)} of {len(asked)} are left, expected one command at a "
+            "time; the same one again makes what is missing"
+        )
 
 
 def undone(points: Sequence[Point], missing: Sequence[Row]) -> str:

@@ -6,9 +6,12 @@ from pathlib import Path
 
 import cv2
 import pytest
+from toy_store import TOY_SCENE, write_toy_scene
 
+from catalog.errors import CatalogError, ConflictError
 from catalog.points import Point
 from catalog.store import open_store
+from flows.fleet.asked import wishes
 from flows.measure.chart import chart_of, sizes_of
 from flows.measure.configurations import chart_ways, size_factors
 from flows.measure.figures import LANES, qualities
@@ -143,6 +146,34 @@ def test_points_of_a_scene_that_is_not_there_are_not_asked_for(tmp_path):
     with pytest.raises(SceneError, match="pandaset/404"):
         run_sweep(sweep, store, workers=1, accept_stale=False, say=print)
     assert not was_asked("chart", store)
+
+
+@pytest.mark.parametrize(
+    ("other", "left"),
+    [({"seeds": (0, 7)}, "1 of 2"), ({"settings": ("fit.steps=9",)}, "0 of 2"), ({}, None)],
+)
+def test_a_sweep_that_another_took_over_is_refused(tmp_path, monkeypatch, other, left):
+    write_toy_scene(tmp_path)
+    store = open_store(tmp_path)
+    ways = tuple(way for way in chart_ways(preview(TOY_SCENE)) if way.name == "no-painter")
+    sweep = Sweep(
+        name="chart",
+        scenes=(TOY_SCENE,),
+        cameras=None,
+        preset="preview",
+        settings=(),
+        configurations=ways,
+        seeds=(0, 1),
+    )
+
+    def another_asks(ledger, *_):
+        ledger.ask(wishes(replace(sweep, **other).manifest, Path()))
+
+    monkeypatch.setattr("flows.measure.sweep.run_workers", another_asks)
+    problem = CatalogError if left is None else ConflictError
+    said = "2 of 2 points are not done" if left is None else f"chart in .*: another .*, {left} are"
+    with pytest.raises(problem, match=said):
+        run_sweep(sweep, store, workers=1, accept_stale=False, say=print)
 
 
 def test_stress_says_where_painting_hurts(tmp_path):
