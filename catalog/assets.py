@@ -102,6 +102,11 @@ def find_asset(store: Store, name: str) -> Row:
     )
 
 
+def how_well(sighting: Row) -> tuple[float, str]:
+    """Sorts sightings by how well they serve, the best last."""
+    return sighting["score"] or 0.0, sighting["sighting_id"]
+
+
 class _Groups:
     """Names that belong together (disjoint sets)."""
 
@@ -190,7 +195,7 @@ def _write(store: Store, before: Sequence[Row], entered: Sequence[Row]) -> None:
 
 def _asset_row(members: Sequence[Row], base_of: dict[str, str]) -> Row:
     """The row of an asset; the sighting of the best score serves."""
-    best = max(members, key=lambda row: (row["score"] or 0.0, row["sighting_id"]))
+    best = max(members, key=how_well)
     bases = sorted({base_of[row["base_id"]] for row in members if row["base_id"] in base_of})
     taken = {column.name: best.get(column.name) for column in ASSETS.columns}
     return taken | {

@@ -1,20 +1,24 @@
 """Who needs whom in a store: the one notion that deleting, collecting and exporting share.
 
 A run needs its scene, the artefacts that it lists, and the run that it was changed from. An
-artefact needs what it was made from. A sequence of a fleet needs its scene and its run, a painter
-the artefact with its weights, an asset its run and its files.
+artefact needs what it was made from. A sequence of a fleet needs its scene, its run and the styles
+of that which it asks for, a painter the artefact with its weights. An asset needs run and files of
+a sighting, the best, in each scene that shows it: its id follows from all of them.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
 
 from catalog.artefacts import ArtefactRef
+from catalog.assets import how_well
 from catalog.records import json_of
-from catalog.schemas import TABLES
 from catalog.store import Store
 from catalog.tables import Row
+
+SCENE_KIND, STYLE = "gaussians", "style"
+"""Of an artefact, and of a change."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,8 +53,11 @@ class Needs:
         return self._store.rows("sequences")
 
     @cached_property
-    def _assets(self) -> list[Row]:
-        return self._store.rows("assets") if "assets" in TABLES else []
+    def _sightings(self) -> Collection[Row]:
+        """Of everything that was sighted in a scene, the best sighting."""
+        columns = ["sighting_id", "occurrence_id", "score", "run_id", "artefact_id"]
+        rows = self._store.tables.arrow("sightings", columns=columns).to_pylist()
+        return {row["occurrence_id"]: row for row in sorted(rows, key=how_well)}.values()
 
     def listed(self, runs: Iterable[str]) -> set[str]:
         """The artefacts that some runs list."""
@@ -107,7 +114,7 @@ class Needs:
     def kept_since(self, since: datetime) -> Kept:
         """What is needed of all that is older than a time, and all that is not.
 
-        Needed are runs that run or ended since then, of wanted sequences and of assets, with all
+        Needed are runs that run or ended since then, of wanted sequences and of sightings, with all
         that they need; trained painters; and what is made of a scene that somebody works on now,
         who may take it up any moment. What was made from needed artefacts stays with them, unless
         a run lists it that nobody needs.
@@ -136,13 +143,40 @@ class Needs:
             if row["status"] == "running"
             or any(at and at >= since for at in (row["started_at"], row["finished_at"]))
         }
-        return found | {row["run_id"] for row in (*self.wanted, *self._assets) if row["run_id"]}
+        found |= {row["run_id"] for row in (*self.wanted, *self._sightings) if row["run_id"]}
+        return found | self._wanted_styles()
+
+    def _wanted_styles(self) -> set[str]:
+        """The runs in styles that sequences ask for, of what their own runs have made.
+
+        A style is known by the scene it was given: who made that scene may be an older run.
+        """
+        made = {row["run_id"]: row["artefacts"] or () for row in self.runs}
+        wanted = {
+            (name.partition("/")[2], variant)
+            for row in self.wanted
+            for variant in row["variants"] or ()
+            for name in made.get(row["run_id"], ())
+            if ArtefactRef.of_id(name).kind == SCENE_KIND
+        }
+        if not wanted:
+            return set()
+        found = set()
+        for row in self.runs:
+            change = json_of(row, "change") if row["change"] else {}
+            if change.get("kind") == STYLE:
+                # whole styles are asked for, by their names
+                style = change["parameters"]["prompt"].removesuffix(":1")
+                given = {one for name in made[row["run_id"]] for one in self._inputs.get(name, ())}
+                if any((digest, style) in wanted for digest in given):
+                    found.add(row["run_id"])
+        return found
 
     def _needed_by_others(self, since: datetime) -> set[str]:
-        """Artefacts that are young, hold a painter, or files of an asset."""
+        """Artefacts that are young, hold a painter, or files of a sighting."""
         weights = [row["path"].split("/") for row in self._painters]
         found = {"/".join(parts[1:3]) for parts in weights if parts[0] == "artefacts"}
-        found |= {row["artefact_id"] for row in self._assets if row["artefact_id"]}
+        found |= {row["artefact_id"] for row in self._sightings if row["artefact_id"]}
         young = {
             row["artefact_id"]
             for row in self.artefacts

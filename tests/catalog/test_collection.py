@@ -1,6 +1,7 @@
 """What somebody needs stays, what nobody needs is found, whoever was killed in the middle."""
 
 import fcntl
+import json
 import os
 import time
 from datetime import UTC, datetime, timedelta
@@ -11,6 +12,7 @@ from shop import Shop
 from catalog.collection import plan_collection
 from catalog.deletion import delete
 from catalog.locks import held_lock
+from lidarpainter_models.weather.mix import StyleMix
 
 NOW = datetime.now(UTC)
 LONG_AGO = NOW - timedelta(days=90)
@@ -114,6 +116,40 @@ def test_what_was_made_from_a_needed_artefact_stays_though_no_run_lists_it(shop)
 def test_a_changed_run_keeps_the_run_that_it_was_changed_from(shop):
     shop.change("runs", "r2", finished_at=NOW, derived_from="r1")
     assert going(shop) == set()
+
+
+@pytest.mark.parametrize(
+    ("variants", "prompt", "is_kept"),
+    [(["night"], "night", True), (["foggy"], "night", False), (["night"], "night:0.5", False)],
+)
+def test_a_wanted_style_stays_whichever_run_it_was_made_of(shop, variants, prompt, is_kept):
+    scene = shop.made("gaussians", fit=shop.fit.digest)
+    dressed = shop.made("dressed", source=scene.digest)
+    shop.run("main", scene)
+    shop.run("styled", dressed)
+    parameters = {"prompt": StyleMix.parse(prompt).text}
+    change = json.dumps({"kind": "style", "parameters": parameters})
+    shop.change("runs", "styled", change=change, derived_from="r1")
+    for ref in (scene, dressed):
+        shop.change("artefacts", ref.artefact_id, created_at=LONG_AGO)
+    wanted = {"sequence_id": "s1", "scene_id": "toy/street", "run_id": "main", "state": "done"}
+    shop.store.tables.merge("sequences", [{**wanted, "variants": variants}])
+    assert (("runs", "styled") not in going(shop)) == is_kept
+    assert (("runs", "r1") not in going(shop)) == is_kept
+    assert ("runs", "main") not in going(shop)
+
+
+def test_an_asset_keeps_the_best_run_of_each_scene_that_shows_it(shop):
+    for run in ("r3", "r4"):
+        shop.run(run)
+    seen = {"asset_id": "a", "kind": "actor", "score": 0.5}
+    rows = [("s1", "a", "r1", 0.4), ("s2", "b", "r2", 0.9), ("s3", "a", "r3", 0.3)]
+    names = ("sighting_id", "occurrence_id", "run_id", "score")
+    shop.store.tables.merge(
+        "sightings", [seen | dict(zip(names, row, strict=True)) for row in rows]
+    )
+    shop.store.tables.merge("assets", [{**seen, "run_id": "r2"}])
+    assert {name for table, name in going(shop) if table == "runs"} == {"r3", "r4"}
 
 
 def test_what_killed_processes_left_is_found_and_what_is_locked_is_not(shop):
