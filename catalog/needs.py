@@ -6,6 +6,7 @@ of that which it asks for, a painter the artefact with its weights. An asset nee
 a sighting, the best, in each scene that shows it: its id follows from all of them.
 """
 
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -59,6 +60,15 @@ class Needs:
         rows = self._store.tables.arrow("sightings", columns=columns).to_pylist()
         return {row["occurrence_id"]: row for row in sorted(rows, key=how_well)}.values()
 
+    @cached_property
+    def _users(self) -> Mapping[str, set[str]]:
+        """The artefacts that have a digest among their inputs, by the digest."""
+        found: dict[str, set[str]] = defaultdict(set)
+        for name, inputs in self._inputs.items():
+            for digest in inputs:
+                found[digest].add(name)
+        return dict(found)
+
     def listed(self, runs: Iterable[str]) -> set[str]:
         """The artefacts that some runs list."""
         names = set(runs)
@@ -76,7 +86,7 @@ class Needs:
 
     def made_of(self, digest: str) -> set[str]:
         """The artefacts with this digest among their inputs, however far back."""
-        first = {name for name, inputs in self._inputs.items() if digest in inputs}
+        first = self._users.get(digest, set())
         return first | self.made_from(first)
 
     def made_from(self, artefacts: set[str]) -> set[str]:
@@ -84,8 +94,8 @@ class Needs:
         found: set[str] = set()
         new = artefacts
         while new:
-            digests = {ArtefactRef.of_id(name).digest for name in new}
-            new = {name for name, inputs in self._inputs.items() if inputs & digests}
+            digests = (ArtefactRef.of_id(name).digest for name in new)
+            new = {user for digest in digests for user in self._users.get(digest, ())}
             new -= found | artefacts
             found |= new
         return found
