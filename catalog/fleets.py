@@ -78,10 +78,10 @@ class FleetLedger:
         Raises:
             UnknownRecordError: there is none.
         """
-        rows = self.store.tables.rows(TABLE)
-        if not rows:
+        found = _latest_of(self.store.tables.rows(TABLE))
+        if found is None:
             raise UnknownRecordError(f"no fleet in {self.store.name}: `fleet run` makes one")
-        return max(rows, key=lambda row: row["asked_at"])["fleet"]
+        return found
 
     def rows(self, fleet: str) -> list[Row]:
         """The sequences of a fleet, in the order of its manifest, those in hand as running.
@@ -108,7 +108,8 @@ class FleetLedger:
         as it is.
         """
         fleet = wishes[0].fleet
-        known = {r["sequence_id"]: r for r in self.store.tables.rows(TABLE) if r["fleet"] == fleet}
+        rows = self.store.tables.rows(TABLE)
+        known = {row["sequence_id"]: row for row in rows if row["fleet"] == fleet}
         wanted = {wish.sequence_id: wish.row() for wish in wishes}
         standing = _StandingRuns(self.store)
         changed, moved = [], []
@@ -127,6 +128,8 @@ class FleetLedger:
         tables.replace_columns(TABLE, moved, PLACE)
         if dropped:
             tables.delete(TABLE, "sequence_id", dropped)
+        if not added and not changed and _latest_of(rows) != fleet:
+            tables.replace_columns(TABLE, list(wanted.values()), ["asked_at"])
 
     def take(self, row: Row, facts: Mapping[str, Any]) -> Lease | None:
         """Begin to work on a sequence that waits, or None if somebody else does or has."""
@@ -261,6 +264,11 @@ class _StandingRuns:
             and there.issuperset(row["artefacts"])
             and now.get(row["scene_id"], row["scene_digest"]) == row["scene_digest"]
         }
+
+
+def _latest_of(rows: Sequence[Row]) -> str | None:
+    """The fleet that was asked for last; None where there is none."""
+    return max(rows, key=lambda row: row["asked_at"])["fleet"] if rows else None
 
 
 def _is_to_redo(new: Row, old: Row, standing: _StandingRuns, *, accept_stale: bool) -> bool:

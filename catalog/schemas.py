@@ -218,7 +218,7 @@ SEQUENCES = TableSchema(
         Column("attempts", "integer", "all attempts"),
         Column("seconds", "number", "wall time of all attempts", "s"),
         Column("not_before", "time", "earliest time of the next attempt"),
-        Column("asked_at", "time", "when it was asked for"),
+        Column("asked_at", "time", "when it was asked for; the last one tells the latest fleet"),
         Column("changed_at", "time", "when this row was written"),
         Column("fence", "integer", "number of this writing; a lower one is refused"),
     ),

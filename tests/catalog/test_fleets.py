@@ -249,6 +249,21 @@ def test_cancelling_ends_leases_and_asking_again_goes_on(ledger):
     assert [row["state"] for row in ledger.rows("night")] == ["waiting"] * 2
 
 
+def test_the_latest_fleet_is_the_one_that_was_asked_for_last(ledger):
+    ledger.ask([wish()])
+    complete(ledger)
+    before = attempted(ledger, DONE)
+    ledger.ask([wish(fleet="day")])
+    assert ledger.latest() == "day"
+    ledger.ask([wish()])
+    assert ledger.latest() == "night"
+    after = one(ledger)
+    assert before == {**after, "asked_at": before["asked_at"]}
+    version = ledger.store.tables.delta("sequences").version()
+    ledger.ask([wish()])
+    assert ledger.store.tables.delta("sequences").version() == version
+
+
 def test_one_scene_with_two_choices_of_cameras_is_two_sequences():
     choices = [None, ("front",), ("front", "left"), ("left", "front")]
     assert len({wish(cameras=cameras).sequence_id for cameras in choices}) == 3
