@@ -2,7 +2,7 @@
 
 Bad input is set aside at once and never tried again. What can pass is tried again, later each time
 and a bounded number of times. A full disk, a bucket or a dispatcher that does not answer and an
-interruption are nobody's fault and do not count.
+interruption are nobody's fault and do not count; after a full disk it is later each time too.
 """
 
 from collections.abc import Iterable, Mapping
@@ -65,13 +65,15 @@ def row_after(row: Row, ending: Ending, lease: Lease, *, first_pause_s: float) -
     """The row of a sequence as an attempt leaves it."""
     tries = row["tries"] + (ending.cause in CAN_PASS)
     state: State = FINAL.get(ending.cause, "waiting")
-    reason, not_before = ending.reason, None
+    reason, now = ending.reason, datetime.now(UTC)
+    pause_s: float | None = None
     if ending.cause in CAN_PASS:
         if tries >= MAX_TRIES:
             state, reason = "failed", f"{reason} ({tries} attempts)"
         else:
             pause_s = min(LONGEST_PAUSE_S, first_pause_s * 2 ** (tries - 1))
-            not_before = datetime.now(UTC) + timedelta(seconds=pause_s)
+    elif ending.cause == "disk-full":
+        pause_s = min(LONGEST_PAUSE_S, max(first_pause_s, 2 * _pause_s(row)))
     return {
         **row,
         "state": state,
@@ -81,10 +83,17 @@ def row_after(row: Row, ending: Ending, lease: Lease, *, first_pause_s: float) -
         "tries": tries,
         "attempts": row["attempts"] + 1,
         "seconds": (row["seconds"] or 0.0) + ending.seconds,
-        "not_before": not_before,
-        "changed_at": datetime.now(UTC),
+        "not_before": None if pause_s is None else now + timedelta(seconds=pause_s),
+        "changed_at": now,
         "fence": lease.fence,
     }
+
+
+def _pause_s(row: Row) -> float:
+    """How long a sequence has paused after a full disk, if that is how its last attempt ended."""
+    if row["cause"] != "disk-full" or row["not_before"] is None:
+        return 0.0
+    return (row["not_before"] - row["changed_at"]).total_seconds()
 
 
 def attempt_id(lease: Lease) -> str:

@@ -224,6 +224,18 @@ def test_a_full_disk_and_an_interruption_do_not_count(ledger):
     assert (row["state"], row["tries"], row["attempts"]) == ("waiting", 0, 2 * MAX_TRIES + 2)
 
 
+def test_after_a_full_disk_it_is_tried_later_each_time(ledger):
+    slow = FleetLedger(ledger.store, leases=ledger.leases, first_pause_s=20.0)
+    slow.ask([wish()])
+    pauses = []
+    for cause in ["disk-full"] * 9 + ["interrupted", "disk-full"]:
+        row = attempted(slow, Ending(cause=cause))
+        if cause == "disk-full":
+            pauses.append((row["not_before"] - row["changed_at"]).total_seconds())
+    assert pauses == [20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0, 1800.0, 1800.0, 20.0]
+    assert (row["state"], row["tries"]) == ("waiting", 0)
+
+
 def test_a_worker_that_died_right_after_it_told_is_entered_as_it_told(ledger, clock, monkeypatch):
     ledger.ask([wish()])
     lease = ledger.take(one(ledger), {})
