@@ -39,15 +39,21 @@ def admits(leases: Leases, lease: Lease, budget: Budget) -> bool:
 
     The one that was taken first always may: it would never begin otherwise.
     """
-    others = [
-        one
-        for one in leases.held()
-        if one.name != lease.name and leases.is_near(one) and not leases.has_expired(one)
-    ]
+    others = [one for one in work_here(leases) if one.name != lease.name]
     if all((lease.taken_at, lease.name) < (one.taken_at, one.name) for one in others):
         return True
+    return fits_beside(others, _planned_bytes(lease), budget)
+
+
+def work_here(leases: Leases) -> list[Lease]:
+    """What this machine works on."""
+    return [one for one in leases.held() if leases.is_near(one) and not leases.has_expired(one)]
+
+
+def fits_beside(others: Sequence[Lease], num_bytes: float, budget: Budget) -> bool:
+    """Whether there is memory for a sequence beside others; alone it always fits."""
     limit = budget.memory_gb * 1e9 if budget.memory_gb else MEMORY_SHARE * machine_memory_bytes()
-    return sum(_planned_bytes(one) for one in [lease, *others]) <= limit
+    return not others or num_bytes + sum(map(_planned_bytes, others)) <= limit
 
 
 def _planned_bytes(lease: Lease) -> float:

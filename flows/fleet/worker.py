@@ -24,7 +24,7 @@ from flows.fleet.asked import Asked
 from flows.fleet.causes import cause_of, is_storage_away
 from flows.fleet.flow_runs import api_lost
 from flows.fleet.heartbeat import Heartbeat
-from flows.fleet.limits import admits, lacks_disk, over_budget
+from flows.fleet.limits import admits, fits_beside, lacks_disk, over_budget, work_here
 from flows.fleet.manifest import Budget
 from flows.fleet.planner import Planner
 from flows.fleet.work import Work
@@ -34,6 +34,8 @@ from tasks.progress import working_on
 POLL_S = 2.0
 REPLAN_S = 30.0
 """How long the planner goes by what it read last."""
+MOST_HELD_BACK = 8
+"""Sequences for which there is no memory now, before no further ones are looked at."""
 ENDED_ITSELF = 3
 """Exit code of a worker that had to leave its work; another one takes its place."""
 
@@ -89,20 +91,26 @@ class Worker:
         """The next sequence that may begin, in hand; None if there is none now."""
         now = datetime.now(UTC)
         due = [r for r in rows if r["state"] == "waiting" and (r["not_before"] or now) <= now]
-        planner = self._planner()
+        planner, others, held_back = self._planner(), work_here(self.ledger.leases), 0
         for row in sorted(due, key=lambda row: (-row["priority"], row["position"])):
+            if held_back == MOST_HELD_BACK:
+                return None
             prediction = planner.predict(Asked.model_validate_json(row["asked"]))
             budget = Budget.model_validate_json(row["budget"])
             if lacking := lacks_disk(self.ledger, budget, prediction.num_bytes or 0.0):
                 self._pause(lacking, sleeps=False)
                 return None
+            if not fits_beside(others, prediction.memory_bytes or 0.0, budget):
+                held_back += 1
+                continue
             lease = self.ledger.take(row, prediction.facts())
             if lease is None:
                 continue
-            if admits(self.ledger.leases, lease, budget):
+            if admits(self.ledger.leases, lease, budget):  # others may have begun meanwhile
                 self._told = ""
                 return row, lease
             self.ledger.leases.give_back(lease)
+            held_back += 1
         return None
 
     def _attempt(self, row: Row, lease: Lease) -> None:

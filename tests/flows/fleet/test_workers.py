@@ -22,14 +22,16 @@ from toy_store import write_toy_scene
 
 from catalog.attempts import Ending
 from catalog.errors import DamagedArtefactError, StorageError
+from catalog.fleets import FleetLedger
 from catalog.leases import FolderObjects, Leases
 from catalog.store import open_store
 from flows.fleet.asked import wishes
 from flows.fleet.causes import cause_of
 from flows.fleet.limits import admits
 from flows.fleet.manifest import Budget, read_manifest
+from flows.fleet.planner import Prediction
 from flows.fleet.work import make_sequence
-from flows.fleet.worker import Worker
+from flows.fleet.worker import MOST_HELD_BACK, Worker
 from lidarpainter_models.errors import BackendError, SceneError, WriteError
 from tasks.opened import open_scene
 
@@ -194,6 +196,31 @@ def test_what_does_not_fit_into_memory_together_waits(tmp_path):
     leases.give_back(first)
     assert admits(leases, second, budget)
     assert admits(leases, third, budget)
+
+
+def test_who_is_held_back_by_memory_takes_nothing_in_hand(store, tmp_path, monkeypatch):
+    path = write_stub_manifest(tmp_path, sequences=2 * MOST_HELD_BACK, more="memory_gb = 8\n")
+    ledger = FleetLedger(store)
+    ledger.ask(wishes(read_manifest(path), path.parent))
+    other = ledger.leases.take("other", above=0, facts={"predicted_memory_bytes": 6e9})
+    predicted, taken, seen = [], [], []
+    take = ledger.take
+
+    def predict(asked):
+        predicted.append(asked.scene_id)
+        return Prediction(memory_bytes=3e9)
+
+    def waits(_seconds):
+        seen.append((len(predicted), len(taken)))
+        ledger.leases.give_back(other)
+
+    planner = SimpleNamespace(effort=lambda _: None, predict=predict)
+    monkeypatch.setattr("flows.fleet.worker.Planner", SimpleNamespace(of=lambda _: planner))
+    monkeypatch.setattr("flows.fleet.worker.time.sleep", waits)
+    monkeypatch.setattr(ledger, "take", lambda *given: taken.append(given) or take(*given))
+    Worker(ledger=ledger, fleet="stub", work=stub_work, say=print).run()
+    assert seen == [(MOST_HELD_BACK, 0)]
+    assert states(ledger) == ["done"] * 2 * MOST_HELD_BACK
 
 
 @pytest.mark.parametrize(
