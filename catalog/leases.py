@@ -234,14 +234,20 @@ class Leases:
             yield
 
     @contextmanager
-    def alone(self, name: str) -> Iterator[None]:
-        """Hold a lease while the block runs; wait for as long as anybody else holds it."""
+    def alone(self, name: str, *, on_wait: Callable[[str], None] | None = None) -> Iterator[None]:
+        """Hold a lease while the block runs; wait for as long as anybody else holds it.
+
+        `on_wait` is told who does, once.
+        """
         while (lease := self.take(name, above=0, facts={})) is None:
             found = self._objects.read(name)
             if found is not None and self.has_expired(other := _parsed(name, *found)):
                 self.give_back(other)
-            else:
-                time.sleep(POLL_S)
+                continue
+            if found is not None and on_wait is not None:
+                on_wait(other.holder.name)
+                on_wait = None
+            time.sleep(POLL_S)
         with self._beating(lease):
             yield
 

@@ -201,11 +201,16 @@ class Store:
             return shared_lock(self._run_lock(run_id))
         return self._run_leases.kept(f"{run_id}.{secrets.token_hex(4)}")
 
-    def alone(self, what: str) -> AbstractContextManager[object]:
-        """Held by one process at a time, of all that see this store; others wait."""
+    def alone(
+        self, what: str, *, on_wait: Callable[[str], None] | None = None
+    ) -> AbstractContextManager[object]:
+        """Held by one process at a time, of all that see this store; others wait.
+
+        `on_wait` is told who holds it, once.
+        """
         if self.mirror is None:
-            return held_lock(self.root / "locks" / f"{what}.lock")
-        return Leases(self.objects("locks")).alone(what)
+            return held_lock(self.root / "locks" / f"{what}.lock", on_wait=on_wait)
+        return Leases(self.objects("locks")).alone(what, on_wait=on_wait)
 
     def rows(self, table: str) -> "list[Row]":
         """All rows of a table, by id; a run that was killed does not count as running."""

@@ -23,7 +23,7 @@ from lidarpainter_models.evaluation.judging import known_street
 from lidarpainter_models.weather.mix import StyleMix
 from tasks.evaluation.shown import forget_shown
 from tasks.ingest.ingest import has_street, ingest_street
-from tasks.ingest.jobs import IngestRequest, ingest_or_recall
+from tasks.ingest.jobs import IngestRequest, ingest_or_recall, sole_reader
 from tasks.opened import forget_opened, open_scene
 from tasks.stored import forget_stored
 
@@ -116,5 +116,8 @@ def _bring_in(asked: Asked, store: Store) -> None:
         request = IngestRequest(store.address, asked.dataset, root, frames, asked.read_cameras)
         ingest_or_recall(request, asked.sequence, again=False)
         return
-    if not has_street(store, asked.street):
-        ingest_street(store.address, asked.street)
+    if has_street(store, asked.street):
+        return
+    with sole_reader(store, asked.scene_id):
+        if not has_street(store, asked.street):
+            ingest_street(store.address, asked.street)

@@ -11,16 +11,19 @@ was interrupted leaves nothing behind and starts again at its first frame.
 import json
 import multiprocessing
 import signal
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import lidarpainter_models
 from catalog.errors import CatalogError
-from catalog.store import open_store, split_scene_id
+from catalog.leases import ConditionalObjects
+from catalog.store import Store, open_store, split_scene_id
 from lidarpainter_models.errors import ConfigError, LidarPainterError
 from tasks.ingest.bucket_roots import normal_root
 from tasks.ingest.ingest import STAGE as ONE_SEQUENCE
@@ -30,6 +33,8 @@ from tasks.opened import open_scene
 from tasks.progress import listener
 
 STAGE = "sequences"
+WAIT = "wait"
+"""In place of a stage: another process brings the scene in."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,26 +108,60 @@ def ingest_or_recall(request: IngestRequest, name: str, again: bool) -> dict[str
         UnknownRecordError: the name would lead out of the store.
         ConfigError: the scene is in the store, read with another choice than this.
     """
-    split_scene_id(f"{request.dataset}/{name}")
-    notes = open_store(request.store_path).objects(f"ingested/{request.dataset}")
-    noted = notes.read(f"{name}.json")
-    if not again and (row := _known(noted and noted[0], request, name)) is not None:
-        listener().started(ONE_SEQUENCE)
-        listener().finished(ONE_SEQUENCE, 0.0, is_new=False)
-        return row
+    scene_id = f"{request.dataset}/{name}"
+    split_scene_id(scene_id)
+    if again:
+        return _read(request, name)
+    row = _known(request, name)
+    if row is None:
+        with sole_reader(open_store(request.store_path), scene_id):
+            row = _known(request, name)
+            if row is None:
+                return _read(request, name)
+    listener().started(ONE_SEQUENCE)
+    listener().finished(ONE_SEQUENCE, 0.0, is_new=False)
+    return row
+
+
+@contextmanager
+def sole_reader(store: Store, scene_id: str) -> Iterator[None]:
+    """Bring a scene in alone, of all that share the store; look first whether another just has."""
+    began, waited = time.perf_counter(), False
+
+    def wait(holder: str) -> None:
+        nonlocal waited
+        waited = True
+        listener().started(WAIT)
+        listener().waiting(WAIT, holder)
+
+    store.make()
+    with store.alone(f"ingest-{scene_id.replace('/', '-')}", on_wait=wait):
+        if waited:
+            listener().finished(WAIT, time.perf_counter() - began, is_new=True)
+        yield
+
+
+def _read(request: IngestRequest, name: str) -> dict[str, Any]:
+    """Read a sequence and note it; returns its row."""
     row = ingest_sequence.fn(
         request.store_path, request.dataset, request.root, name, request.frames, request.cameras
     )
-    note = json.dumps({"request": request.key(), "row": row}).encode()
+    notes, note = _notes(request), json.dumps({"request": request.key(), "row": row}).encode()
+    noted = notes.read(f"{name}.json")
     notes.write(f"{name}.json", note, replacing=noted and noted[1])
     return row
 
 
-def _known(note: bytes | None, request: IngestRequest, name: str) -> dict[str, Any] | None:
+def _notes(request: IngestRequest) -> ConditionalObjects:
+    return open_store(request.store_path).objects(f"ingested/{request.dataset}")
+
+
+def _known(request: IngestRequest, name: str) -> dict[str, Any] | None:
     """The row of the scene if it is there as asked for; None where it has to be read."""
+    found = _notes(request).read(f"{name}.json")
     asked, row, earlier = request.key(), {}, {}
     try:
-        noted = json.loads(note or b"")
+        noted = json.loads(found[0] if found else b"")
         row, earlier = dict(noted["row"]), dict(noted["request"])
         scene_id, digest = row["scene_id"], row["content_digest"]
     except (ValueError, KeyError, TypeError):  # no note, or one that cannot be read

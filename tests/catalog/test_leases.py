@@ -139,3 +139,16 @@ def test_a_lease_that_its_holder_left_behind_is_not_waited_for(leases, clock):
         with pytest.raises(LeaseLostError):
             leases.renew(lost, {})
     assert leases.held() == []
+
+
+def test_who_waits_for_a_lease_is_told_once_who_holds_it(leases, monkeypatch):
+    held, waits, told = leases.take("table", above=0, facts={}), [], []
+
+    def sleep(_seconds):
+        waits.append("a while")
+        if len(waits) == 3:
+            leases.give_back(held)
+
+    monkeypatch.setattr("catalog.leases.time.sleep", sleep)
+    with leases.alone("table", on_wait=told.append):
+        assert told == [held.holder.name]

@@ -2,6 +2,8 @@
 
 import os
 import shutil
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
@@ -13,6 +15,7 @@ from lidarpainter_models.scenes.stored import stored_digest
 from tasks.ingest import jobs as ingest_jobs
 from tasks.ingest.jobs import IngestRequest, ingest_or_recall, ingest_sequences
 from tasks.ingest.sequences import find_sequences
+from tasks.progress import Silence, listening
 
 
 @pytest.fixture
@@ -59,6 +62,31 @@ def test_what_is_done_is_not_done_again(request_of, monkeypatch):
     assert read == ["a"]
     assert ingest_or_recall(request_of, "a", True) == first
     assert read == ["a", "a"]
+
+
+def test_who_waited_for_another_reader_reads_nothing(request_of, monkeypatch):
+    read, begun, waits = count_reads(monkeypatch), threading.Event(), threading.Event()
+    counted = ingest_jobs.ingest_sequence.fn
+
+    class Waiter(Silence):
+        def waiting(self, _stage, _holder):
+            waits.set()
+
+    def slow(*arguments):
+        begun.set()
+        waits.wait(10)
+        return counted(*arguments)
+
+    def second():
+        with listening(Waiter()):
+            return ingest_or_recall(request_of, "a", False)
+
+    monkeypatch.setattr(ingest_jobs.ingest_sequence, "fn", slow)
+    with ThreadPoolExecutor(2) as pool:
+        first = pool.submit(ingest_or_recall, request_of, "a", False)
+        assert begun.wait(10)
+        assert pool.submit(second).result() == first.result()
+    assert read == ["a"]
 
 
 def test_a_scene_that_is_gone_is_read_anew(request_of, monkeypatch):
