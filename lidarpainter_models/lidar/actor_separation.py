@@ -6,7 +6,8 @@ z up, origin at the centre; metres.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -50,6 +51,10 @@ class NearActors:
     bottom_m: Float[Tensor, " near"]
     """World z of the bottom of the box."""
 
+    def keep(self, kept: Tensor) -> "NearActors":
+        """The points listed."""
+        return NearActors(**{part.name: getattr(self, part.name)[kept] for part in fields(self)})
+
 
 def near_actors(
     xyz_m: Float[Tensor, "points 3"],
@@ -57,37 +62,21 @@ def near_actors(
     tracks: Sequence[ActorTrack],
 ) -> NearActors:
     """Find the points that moving actors keep out of the street."""
-    parts = []
-    if len(xyz_m):
-        across = xyz_m[:, 0].sort()
-        middle_ns = (int(timestamp_ns.min()) + int(timestamp_ns.max())) // 2
-        margin_ns = round(_LONGEST_EXTRAPOLATION_S * 1e9)
-        parts = [
-            part
-            for index, track in enumerate(tracks)
-            if track.is_present(middle_ns, margin_ns=margin_ns)
-            and (part := _near_one(xyz_m, timestamp_ns, middle_ns, across, index, track))
-        ]
-    if not parts:
+    candidates = _candidates(xyz_m, timestamp_ns, tracks)
+    if not candidates:
         none, zero = torch.zeros(0, dtype=torch.int64), torch.zeros(0)
         return NearActors(
             rows=none, track=none, xyz_box_m=torch.zeros(0, 3), outside_m=zero, bottom_m=zero
         )
-    rows = torch.cat([part.rows for part in parts])
-    outside_m = torch.cat([part.outside_m for part in parts])
+    near = _near(xyz_m, tracks, candidates)
+    rows, outside_m = near.rows, near.outside_m
     # a point beside two boxes goes to the one it is deeper in: that row comes first
     order = torch.argsort(outside_m, stable=True)
     order = order[torch.argsort(rows[order], stable=True)]
     is_first = torch.ones_like(rows, dtype=torch.bool)
     is_first[1:] = rows[order][1:] != rows[order][:-1]
     chosen = order[is_first]
-    return NearActors(
-        rows=rows[chosen],
-        track=torch.cat([part.track for part in parts])[chosen],
-        xyz_box_m=torch.cat([part.xyz_box_m for part in parts])[chosen],
-        outside_m=outside_m[chosen],
-        bottom_m=torch.cat([part.bottom_m for part in parts])[chosen],
-    )
+    return near.keep(chosen)
 
 
 def height_above_ground(
@@ -108,10 +97,18 @@ def poses_at(
     """
     if len(track.timestamps_ns) == 1:
         return track.world_from_box.expand(len(timestamp_ns), 4, 4)
+    return interpolate_rigid(*_ends(track, timestamp_ns))
+
+
+def _ends(
+    track: ActorTrack, timestamp_ns: Int[Tensor, " times"]
+) -> tuple[Float[Tensor, "times 4 4"], Float[Tensor, "times 4 4"], Float[Tensor, " times"]]:
+    """The boxes about each time, and which part of the way from one to the other it is."""
+    if len(track.timestamps_ns) == 1:
+        pose = track.world_from_box.expand(len(timestamp_ns), 4, 4)
+        return pose, pose, torch.zeros(len(timestamp_ns), dtype=torch.float64)
     before, fraction = _between(track, timestamp_ns)
-    return interpolate_rigid(
-        track.world_from_box[before], track.world_from_box[before + 1], fraction
-    )
+    return track.world_from_box[before], track.world_from_box[before + 1], fraction
 
 
 def _centres_at(track: ActorTrack, timestamp_ns: Int[Tensor, " times"]) -> Float[Tensor, "times 3"]:
@@ -136,45 +133,80 @@ def _between(
     return before, (wanted_ns - times_ns[before]).double() / span_ns
 
 
-def _near_one(
+class _Candidates(NamedTuple):
+    """The points about one actor, and between which of its boxes each was measured."""
+
+    number: int
+    """Of the track."""
+    rows: Int[Tensor, " points"]
+    own_time: Int[Tensor, " points"]
+    """Position among the times."""
+    earlier: Float[Tensor, "times 4 4"]
+    later: Float[Tensor, "times 4 4"]
+    fraction: Float[Tensor, " times"]
+    margin_m: Float[Tensor, "3"]
+
+
+def _candidates(
     xyz_m: Float[Tensor, "points 3"],
     timestamp_ns: Int[Tensor, " points"],
-    middle_ns: int,
-    across: tuple[Float[Tensor, " points"], Int[Tensor, " points"]],
-    index: int,
-    track: ActorTrack,
-) -> NearActors | None:
-    """The points in or beside one actor that is there, None where there are none.
+    tracks: Sequence[ActorTrack],
+) -> list[_Candidates]:
+    """What may be in or beside each actor that is there."""
+    if not len(xyz_m):
+        return []
+    # in order of x: of a sweep, an actor has few
+    across, rows_across = xyz_m[:, 0].sort()
+    middle_ns = (int(timestamp_ns.min()) + int(timestamp_ns.max())) // 2
+    margin_ns = round(_LONGEST_EXTRAPOLATION_S * 1e9)
+    around_ns = middle_ns + torch.tensor([-_HALF_SWEEP_NS, 0, _HALF_SWEEP_NS])
+    found = []
+    for number, track in enumerate(tracks):
+        if not track.is_present(middle_ns, margin_ns=margin_ns):
+            continue
+        earlier, centre, later = _centres_at(track, around_ns)
+        speed_mps = float((later - earlier).norm()) * 1e9 / (2 * _HALF_SWEEP_NS)
+        margin_m = torch.full((3,), STREET_MARGIN_M)
+        margin_m[0] += LAG_S * speed_mps
+        reach_m = float((track.size_m / 2 + margin_m).norm()) + _LONGEST_EXTRAPOLATION_S * speed_mps
+        centre = centre.to(xyz_m)
+        ends_m = centre[0] + (reach_m + _ROUNDING_M) * torch.tensor([-1.0, 1.0])
+        first, last = torch.searchsorted(across, ends_m).tolist()
+        rows = rows_across[first:last]
+        rows = rows[((xyz_m[rows] - centre).abs() <= reach_m).all(dim=-1)].sort().values
+        if len(rows):
+            times_ns, own_time = torch.unique(timestamp_ns[rows] // _TICK_NS, return_inverse=True)
+            ends = _ends(track, times_ns * _TICK_NS + _TICK_NS // 2)
+            found.append(_Candidates(number, rows, own_time, *ends, margin_m))
+    return found
 
-    `middle_ns` is the middle of their times; `across` is their x in ascending order and their rows:
-    of a sweep, an actor has few.
-    """
-    around_ns = torch.tensor([-_HALF_SWEEP_NS, 0, _HALF_SWEEP_NS])
-    earlier, centre, later = _centres_at(track, middle_ns + around_ns)
-    speed_mps = float((later - earlier).norm()) * 1e9 / (2 * _HALF_SWEEP_NS)
-    margin_m = torch.full((3,), STREET_MARGIN_M)
-    margin_m[0] += LAG_S * speed_mps
-    half_m = track.size_m / 2
-    reach_m = float((half_m + margin_m).norm()) + _LONGEST_EXTRAPOLATION_S * speed_mps
-    centre = centre.to(xyz_m)
-    ends_m = centre[0] + (reach_m + _ROUNDING_M) * torch.tensor([-1.0, 1.0])
-    first, last = torch.searchsorted(across[0], ends_m).tolist()
-    rows = across[1][first:last]
-    rows = rows[((xyz_m[rows] - centre).abs() <= reach_m).all(dim=-1)].sort().values
-    if len(rows) == 0:
-        return None
-    times_ns, own_time = torch.unique(timestamp_ns[rows] // _TICK_NS, return_inverse=True)
-    world_from_box = poses_at(track, times_ns * _TICK_NS + _TICK_NS // 2)[own_time]
+
+def _near(
+    xyz_m: Float[Tensor, "points 3"],
+    tracks: Sequence[ActorTrack],
+    candidates: Sequence[_Candidates],
+) -> NearActors:
+    """Those of the candidates that are in or beside their actor, of all actors at once."""
+    counts = torch.tensor([len(one.rows) for one in candidates])
+    times = torch.tensor([len(one.fraction) for one in candidates])
+    whose = torch.arange(len(candidates)).repeat_interleave(counts)
+    own_time = torch.cat([one.own_time for one in candidates]) + (times.cumsum(0) - times)[whose]
+    rows = torch.cat([one.rows for one in candidates])
+    world_from_box = interpolate_rigid(
+        torch.cat([one.earlier for one in candidates]),
+        torch.cat([one.later for one in candidates]),
+        torch.cat([one.fraction for one in candidates]),
+    )[own_time]
     away = xyz_m[rows].double() - world_from_box[:, :3, 3]
     xyz_box_m = torch.einsum("nij,ni->nj", world_from_box[:, :3, :3], away).float()
-    beyond_m = xyz_box_m.abs() - half_m
-    is_near = (beyond_m <= margin_m).all(dim=-1)
-    if not bool(is_near.any()):
-        return None
-    return NearActors(
-        rows=rows[is_near],
-        track=torch.full((int(is_near.sum()),), index),
-        xyz_box_m=xyz_box_m[is_near],
-        outside_m=beyond_m[is_near].amax(dim=-1),
-        bottom_m=(world_from_box[is_near, 2, 3] - half_m[2]).float(),
+    half_m = torch.stack([tracks[one.number].size_m / 2 for one in candidates])
+    beyond_m = xyz_box_m.abs() - half_m[whose]
+    margin_m = torch.stack([one.margin_m for one in candidates])
+    near = NearActors(
+        rows=rows,
+        track=torch.tensor([one.number for one in candidates])[whose],
+        xyz_box_m=xyz_box_m,
+        outside_m=beyond_m.amax(dim=-1),
+        bottom_m=(world_from_box[:, 2, 3] - half_m[whose, 2]).float(),
     )
+    return near.keep((beyond_m <= margin_m[whose]).all(dim=-1))
