@@ -1,4 +1,6 @@
-"""Where the judging cameras stand."""
+"""Where the judging cameras stand, and when actors are where they look for them."""
+
+from dataclasses import replace
 
 import pytest
 import torch
@@ -7,6 +9,7 @@ from toy_street import ToyStreet
 
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.strip_views import StripJudgement, strip_views
+from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.splits import split_views
@@ -18,6 +21,14 @@ MOTION = torch.tensor([0.0, 0.02, 0.01, 0.1, 0.0, 0.05], dtype=torch.float64)
 @pytest.fixture
 def street():
     return ToyStreet(num_frames=3, camera_gains=SIDE)
+
+
+def with_shutter(street, **about):
+    shutter = Shutter(twist_per_s=torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 15.0]), **about)
+    street.views = tuple(
+        replace(view, camera=replace(view.camera, shutter=shutter)) for view in street.views
+    )
+    return street
 
 
 def held_out(street):
@@ -57,3 +68,25 @@ def test_judging_camera_rides_on_the_rig_that_the_fit_moved(street):
     world_motion = moved @ torch.linalg.inv(front.camera.world_from_camera)
     for pose in side_poses(street, fitted, (0, 1, 2)):
         assert torch.allclose(pose, world_motion @ side.camera.world_from_camera, atol=1e-6)
+
+
+def test_judging_camera_reads_its_rows_as_its_image_was_read(street):
+    rolling = with_shutter(street, across_s=(0.0, 0.03))
+    (view,) = strip_views(
+        held_out(rolling),
+        fitted_to(rolling),
+        judging_camera="side",
+        fitted_camera="front",
+        frames=(1,),
+    )
+    assert view.camera.shutter.across_s == (0.0, 0.03)
+
+
+def test_actors_are_judged_where_a_late_image_shows_them(street):
+    def columns(recorded):
+        views = held_out(recorded).recorded_views(fitted_to(recorded), "interpolated")
+        return (views[0].actor_index >= 0).nonzero()[:, 1].float()
+
+    told = columns(street)
+    late = columns(with_shutter(street, late_s=0.1))  # 1 m to the left, 10 m ahead: 16 pixels
+    assert float((told.mean() - late.mean()).abs()) == pytest.approx(16, abs=3)
