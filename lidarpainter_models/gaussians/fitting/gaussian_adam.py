@@ -6,6 +6,8 @@ all the steps they missed at once (`sparse_adam`). Whatever else reads the whole
 `catch_up` first. Centres move in units of their Gaussian's own size.
 """
 
+import math
+
 import torch
 from jaxtyping import Int
 from torch import Tensor
@@ -13,7 +15,9 @@ from torch import Tensor
 from lidarpainter_models.gaussians.fitting.settings import LearningRates
 from lidarpainter_models.gaussians.model.gaussian_set import PARAMETERS, SH_CONSTANT, GaussianSet
 from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
+from lidarpainter_models.kernels.frustum_culling import MOST_SIGMAS
 from lidarpainter_models.kernels.sparse_adam import (
+    MOST_UNITS,
     AdamState,
     Parameters,
     catch_up,
@@ -28,6 +32,12 @@ and from the next lane it is in full view. Shapes do not need it; there it costs
 """
 LEAST_SHAPE_GRADIENT = 1e-15
 COLOURS = ("sh_dc", "sh_rest")
+
+
+def most_sigmas(rates: LearningRates) -> float:
+    """How far a Gaussian that is not stepped reaches at most, in its deviations when it was."""
+    growth = math.exp(MOST_UNITS * max(rates.log_scale))
+    return 1.001 * growth * (MOST_SIGMAS + MOST_UNITS * max(rates.means))
 
 
 class GaussianAdam:

@@ -19,13 +19,13 @@ from lidarpainter_models.gaussians.fitting.checkpoint import (
 )
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.densification import GradientTally, SetChange
-from lidarpainter_models.gaussians.fitting.gaussian_adam import GaussianAdam
+from lidarpainter_models.gaussians.fitting.gaussian_adam import GaussianAdam, most_sigmas
 from lidarpainter_models.gaussians.fitting.hidden_gaussians import HiddenGaussians
 from lidarpainter_models.gaussians.fitting.refinement import Refinement
-from lidarpainter_models.gaussians.fitting.spatial_blocks import SpatialBlocks, View
 from lidarpainter_models.gaussians.model.bending import REACH_M
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
+from lidarpainter_models.gaussians.model.spatial_blocks import SpatialBlocks, View
 from lidarpainter_models.gaussians.model.stored_scene import (
     copy_scene,
     scene_from_arrays,
@@ -67,7 +67,7 @@ class FitState:
         return cls(
             scene=scene,
             gaussian_adam=GaussianAdam(scene.gaussians, config.learning_rates, pixels_per_view),
-            blocks=SpatialBlocks.of(scene.gaussians, config.learning_rates),
+            blocks=SpatialBlocks.of(scene.gaussians, most_sigmas(config.learning_rates)),
             hidden=HiddenGaussians.none_yet(scene.num_gaussians, scene.device),
             refinement=Refinement.begin(scene, config),
             tally=GradientTally.zeros(scene.num_gaussians, scene.device),
@@ -118,7 +118,7 @@ class FitState:
         """Take over a changed set of Gaussians, made from `caught_up`; tallies start again."""
         self.scene = self.scene.with_gaussians(change.gaussians.as_leaves())
         self.gaussian_adam.rebuild(change.kept, change.num_added)
-        self.blocks = SpatialBlocks.of(self.scene.gaussians, self.gaussian_adam.rates)
+        self.blocks = SpatialBlocks.of(self.scene.gaussians, self.blocks.reach_sigmas)
         self.hidden.follow(change.kept, change.num_added)
         self.tally = GradientTally.zeros(len(change.gaussians), self.scene.device)
 
@@ -174,7 +174,9 @@ class FitState:
         for name, adam in state.refinement.adams.items():
             adam.load(ungroup_tensors(tensors, name))
         state.blocks = SpatialBlocks.with_rows_in(
-            tensors["blocks/block_of_row"].to(device), state.scene.gaussians, config.learning_rates
+            tensors["blocks/block_of_row"].to(device),
+            state.scene.gaussians,
+            state.blocks.reach_sigmas,
         )
         kept_hidden = ungroup_tensors(tensors, "hidden")
         state.hidden = HiddenGaussians.from_tensors(kept_hidden, state.scene.device)

@@ -17,7 +17,6 @@ from torch import Tensor
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.hidden_gaussians import probed
 from lidarpainter_models.gaussians.fitting.images import FitImage
-from lidarpainter_models.gaussians.fitting.spatial_blocks import View
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.model.rolling_shutter import as_read, bodies_while_read
 from lidarpainter_models.gaussians.model.scene_rendering import (
@@ -31,6 +30,7 @@ from lidarpainter_models.gaussians.model.sky import (
     LEARNING_RATE,
     MIN_TRANSMITTANCE,
 )
+from lidarpainter_models.gaussians.model.spatial_blocks import View
 from lidarpainter_models.geometry.box_masks import project_boxes
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.gaussian_raster import SplatImage

@@ -114,6 +114,12 @@ class Bending:
         known = zip(weights, self.offset_m[near], strict=True)
         return torch.stack([weight * offset_m for weight, offset_m in known]).sum(dim=0)
 
+    def reach_m(self, timestamp_ns: int) -> float:
+        """The farthest that any node is taken at a time."""
+        if not len(self.bodies):
+            return 0.0
+        return float(self.offset_at(timestamp_ns).norm(dim=-1).amax())
+
     def bent(self, gaussians: AnyGaussians, timestamp_ns: int) -> AnyGaussians:
         """The Gaussians where they are at a time; differentiable in centres and offsets."""
         if not len(self.bodies):

@@ -12,17 +12,23 @@ from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.blinking import Blinking
 from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.gaussians.model.rolling_shutter import as_read
+from lidarpainter_models.gaussians.model.rolling_shutter import (
+    MOST_GROWTH,
+    as_read,
+    bodies_while_read,
+)
 from lidarpainter_models.gaussians.model.scene_rendering import (
     SceneRender,
     camera_from_body,
     draw_over_sky,
 )
 from lidarpainter_models.gaussians.model.sky import SkyTexture
+from lidarpainter_models.gaussians.model.spatial_blocks import SpatialBlocks
 from lidarpainter_models.gaussians.model.styling.dressed import DressedScene
 from lidarpainter_models.gaussians.model.styling.scene_style import SceneStyle
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.backends import Backend
+from lidarpainter_models.kernels.frustum_culling import MOST_SIGMAS
 from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.scenes.driving_scene import ActorTrack
 from lidarpainter_models.scenes.records import RecordedView, ViewKey
@@ -82,11 +88,30 @@ class GaussianScene:
             else:
                 poses = self.actors.likely_poses(timestamp_ns)
                 bodies = camera_from_body(camera.world_from_camera, *poses)
-                lit = self.blinking.lit(self.gaussians, timestamp_ns)
+                gaussians = self._in_view(camera, bodies, timestamp_ns)
+                lit = self.blinking.lit(gaussians, timestamp_ns)
                 bent = self.actors.bending.bent(lit, timestamp_ns)
                 read = as_read(bent, bodies, camera, self.actors, timestamp_ns)
                 drawn = draw_over_sky(read, bodies, self.sky, camera, backend=backend)
             return replace(drawn, rgb=self.exposure.apply(drawn.rgb, camera_name, timestamp_ns))
+
+    def _in_view(
+        self, camera: Camera, bodies: Float[Tensor, "bodies 4 4"], timestamp_ns: int
+    ) -> GaussianSet:
+        """The Gaussians that an image can show, and some more; of a running fit all."""
+        if self.gaussians.means.requires_grad:
+            return self.gaussians
+        moments = [bodies, *bodies_while_read(camera, self.actors, timestamp_ns)]
+        is_seen = self._blocks.in_view(
+            [(camera, moment) for moment in moments],
+            actor_slack_m=self.actors.bending.reach_m(timestamp_ns),
+        )
+        return self.gaussians.select(is_seen.nonzero()[:, 0])
+
+    @cached_property
+    def _blocks(self) -> SpatialBlocks:
+        """Of Gaussians that stay as they are, but for what a rolling shutter makes of them."""
+        return SpatialBlocks.of(self.gaussians, 1.001 * MOST_GROWTH * MOST_SIGMAS)
 
     def corrected_camera(
         self,

@@ -29,7 +29,7 @@ _STEP_NS = 5_000_000
 """Over which velocities are taken, to both sides."""
 _ROUNDS = 2  # a second guess of where a centre is read moves it by less than 0.01 px
 _NEAR_M = 0.05
-_MOST_GROWTH = 2.0
+MOST_GROWTH = 2.0
 """By which an axis is made longer at most, or shorter: what passes right before a camera."""
 _FAR_AWAY_M = -1e5  # absent actors are put further behind the camera than anything is
 
@@ -79,7 +79,7 @@ def _growth(
         for ends in (seen[:, None] - reach, seen[:, None] + reach)
     )
     apart_m = (after - before) / 2 * (velocity[:, None] @ axes)[:, 0]
-    return (1 + apart_m / gaussians.scale_m).clamp(1 / _MOST_GROWTH, _MOST_GROWTH)
+    return (1 + apart_m / gaussians.scale_m).clamp(1 / MOST_GROWTH, MOST_GROWTH)
 
 
 def bodies_while_read(

@@ -1,16 +1,27 @@
 """What is left out by blocks is what the rasteriser would have left out."""
 
+from dataclasses import replace
+
 import pytest
 import torch
-from gaussian_world import camera_at, car_track, round_gaussians, scene_of
+from gaussian_world import FRAME_NS, camera_at, car_track, round_gaussians, scene_of
 
+from lidarpainter_models.gaussians.fitting.gaussian_adam import most_sigmas
 from lidarpainter_models.gaussians.fitting.settings import LearningRates
-from lidarpainter_models.gaussians.fitting.spatial_blocks import SpatialBlocks
-from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body, draw_gaussians
+from lidarpainter_models.gaussians.model import gaussian_scene
+from lidarpainter_models.gaussians.model.actors import Actors
+from lidarpainter_models.gaussians.model.scene_rendering import (
+    camera_from_body,
+    draw_gaussians,
+    draw_over_sky,
+)
+from lidarpainter_models.gaussians.model.spatial_blocks import SpatialBlocks
+from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.kernels.sparse_adam import MOST_UNITS
 
 RATES = LearningRates()
+REACH_SIGMAS = most_sigmas(RATES)
 
 
 def scattered(count, seed):
@@ -37,7 +48,7 @@ def view_at(scene, seed):
 @pytest.mark.parametrize("seed", range(8))
 def test_every_gaussian_that_is_drawn_is_in_view(seed):
     scene = scene_of(scattered(2000, seed), [camera_at(0.0)], [car_track(2)])
-    blocks = SpatialBlocks.of(scene.gaussians, RATES)
+    blocks = SpatialBlocks.of(scene.gaussians, REACH_SIGMAS)
     camera, bodies = view_at(scene, seed)
     drawn = draw_gaussians(scene.gaussians, bodies, camera).visible
     is_in_view = blocks.in_view([(camera, bodies)])
@@ -50,7 +61,7 @@ def test_bounds_hold_what_momentum_can_do(seed):
     """The farthest that any row can drift and grow, towards the camera."""
     scene = scene_of(scattered(2000, seed), [camera_at(0.0)])
     scene.gaussians.body_index.zero_()
-    blocks = SpatialBlocks.of(scene.gaussians, RATES)
+    blocks = SpatialBlocks.of(scene.gaussians, REACH_SIGMAS)
     camera, bodies = view_at(scene, seed)
     is_in_view = blocks.in_view([(camera, bodies)])
     ahead = camera.world_from_camera[:3, :3].float() @ torch.tensor([0.0, 0.0, 10.0])
@@ -76,7 +87,7 @@ def test_most_units_bound_what_moments_can_still_do():
 
 def test_several_views_see_the_union():
     scene = scene_of(scattered(2000, 3), [camera_at(0.0)], [car_track(2)])
-    blocks = SpatialBlocks.of(scene.gaussians, RATES)
+    blocks = SpatialBlocks.of(scene.gaussians, REACH_SIGMAS)
     views = [view_at(scene, seed) for seed in (1, 2)]
     both = blocks.in_view(views[:1]) | blocks.in_view(views[1:])
     assert torch.equal(blocks.in_view(views), both)
@@ -85,7 +96,7 @@ def test_several_views_see_the_union():
 def test_moved_gaussian_is_found_after_a_refresh():
     gaussians = round_gaussians(torch.tensor([[-30.0, 0.0, 1.0]]), torch.rand(1, 3), sigma_m=0.1)
     scene = scene_of(gaussians, [camera_at(0.0)])
-    blocks = SpatialBlocks.of(scene.gaussians, RATES)
+    blocks = SpatialBlocks.of(scene.gaussians, REACH_SIGMAS)
     view = (
         camera_at(0.0),
         camera_from_body(camera_at(0.0).world_from_camera, *scene.actors.likely_poses(0)),
@@ -101,7 +112,7 @@ def test_gaussians_that_are_not_finite_spoil_no_block():
     gaussians.means[3], gaussians.log_scale[4] = torch.nan, torch.inf
     gaussians.means[5] = torch.inf
     scene = scene_of(gaussians, [camera_at(0.0)], [car_track(2)])
-    blocks = SpatialBlocks.of(gaussians, RATES)
+    blocks = SpatialBlocks.of(gaussians, REACH_SIGMAS)
     view = view_at(scene, 1)
     camera, bodies = view
     drawn = draw_gaussians(scene.gaussians, bodies, camera).visible
@@ -113,13 +124,13 @@ def test_absent_actor_is_out_of_view():
     camera = camera_at(0.0)
     poses, present = scene.actors.likely_poses(0)
     bodies = camera_from_body(camera.world_from_camera, poses, torch.zeros_like(present))
-    is_in_view = SpatialBlocks.of(scene.gaussians, RATES).in_view([(camera, bodies)])
+    is_in_view = SpatialBlocks.of(scene.gaussians, REACH_SIGMAS).in_view([(camera, bodies)])
     assert bool((scene.gaussians.body_index[is_in_view] == 0).all())
 
 
 def test_slack_takes_in_an_actor_that_may_move_into_view():
     scene = scene_of(scattered(500, 7), [camera_at(0.0)], [car_track(2)])
-    blocks, camera = SpatialBlocks.of(scene.gaussians, RATES), camera_at(0.0)
+    blocks, camera = SpatialBlocks.of(scene.gaussians, REACH_SIGMAS), camera_at(0.0)
     poses, present = scene.actors.likely_poses(0)
     poses[0, 1, 3] = 40.0  # far to the left
     view = (camera, camera_from_body(camera.world_from_camera, poses, present))
@@ -128,3 +139,43 @@ def test_slack_takes_in_an_actor_that_may_move_into_view():
         for slack_m in (0.0, 40.0)
     ]
     assert of_actor == [0, 50]
+
+
+def same_image(one, other):
+    return all(torch.equal(getattr(one, name), value) for name, value in vars(other).items())
+
+
+@pytest.mark.parametrize("across_s", [(0.0, 0.0), (0.0, 0.03), (0.02, 0.0)])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_view_is_drawn_from_what_it_can_show_alone(across_s, seed, monkeypatch):
+    scene = scene_of(scattered(2000, seed), [camera_at(0.0)], [car_track(3)])
+    twist = torch.tensor([0.02, 0.3, -0.1, 0.5, 0.0, 15.0], dtype=torch.float64)
+    shutter = Shutter(across_s=across_s, twist_per_s=twist)
+    camera = replace(view_at(scene, seed)[0], shutter=shutter)
+    drawn = []
+
+    def draw(gaussians, *rest, **named):
+        drawn.append(len(gaussians))
+        return draw_over_sky(gaussians, *rest, **named)
+
+    monkeypatch.setattr(gaussian_scene, "draw_over_sky", draw)
+    of_a_fit = scene.with_gaussians(scene.gaussians.as_leaves())
+    assert same_image(scene.render(camera, FRAME_NS), of_a_fit.render(camera, FRAME_NS))
+    assert drawn[0] < 0.8 * 2000
+    assert drawn[1] == 2000
+
+
+def test_limbs_that_reach_into_a_view_are_drawn():
+    scene = scene_of(scattered(500, 7), [camera_at(0.0)])
+    track = car_track(2)
+    poses = track.world_from_box.clone()
+    poses[:, 1, 3] = 15.0  # to the left of all that the camera sees
+    tracks = [replace(track, world_from_box=poses)]
+    times_ns = torch.arange(2) * FRAME_NS
+    scene = replace(scene, actors=Actors.uncorrected(tracks, times_ns, bent=[0]))
+    assert float(scene.render(camera_at(0.0), 0).actor_alpha.max()) == 0
+    scene.actors.bending.offset_m[..., 0] = -12.0  # along the car: to the right
+    bent = scene.render(camera_at(0.0), 0)
+    assert float(bent.actor_alpha.max()) > 0
+    of_a_fit = scene.with_gaussians(scene.gaussians.as_leaves())
+    assert same_image(bent, of_a_fit.render(camera_at(0.0), 0))

@@ -1,12 +1,11 @@
-"""Blocks of neighbouring Gaussians with bounds, so that a step looks only at those in view.
+"""Blocks of neighbouring Gaussians with bounds, so that a view looks only at those it can show.
 
 A block holds the street's Gaussians of one cell of a grid, whose cells grow with the Gaussians in
 them, or all Gaussians of an actor in its box frame. Its bounds hold whatever its Gaussians can
-become without a gradient, so that a block out of view need not be looked at: what is left out here
-is left out by the rasteriser too. Lengths are metres.
+become before they are refreshed, so that a block out of view need not be looked at: what is left
+out here is left out by the rasteriser too. Lengths are metres.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,16 +13,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lidarpainter_models.gaussians.fitting.settings import LearningRates
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.kernels.frustum_culling import (
-    MOST_SIGMAS,
-    Blocks,
-    mark_seen,
-    refresh_bounds,
-)
-from lidarpainter_models.kernels.sparse_adam import MOST_UNITS
+from lidarpainter_models.kernels.frustum_culling import Blocks, mark_seen, refresh_bounds
 
 View = tuple[Camera, Float[Tensor, "bodies 4 4"]]
 """A camera and where it has the bodies of the scene."""
@@ -39,16 +31,17 @@ class SpatialBlocks:
     block_of_row: Int[Tensor, " gaussians"]
     blocks: Blocks
     reach_sigmas: float
+    """How far a Gaussian may reach until it is refreshed, in its longest deviation then."""
 
     @classmethod
-    def of(cls, gaussians: GaussianSet, rates: LearningRates) -> "SpatialBlocks":
-        """Blocks of a set whose Gaussians move at these rates at most."""
-        block_of_row = _numbered(_cell_keys(gaussians, _reach_sigmas(rates)))
-        return cls.with_rows_in(block_of_row, gaussians, rates)
+    def of(cls, gaussians: GaussianSet, reach_sigmas: float) -> "SpatialBlocks":
+        """Blocks of a set."""
+        block_of_row = _numbered(_cell_keys(gaussians, reach_sigmas))
+        return cls.with_rows_in(block_of_row, gaussians, reach_sigmas)
 
     @classmethod
     def with_rows_in(
-        cls, block_of_row: Int[Tensor, " gaussians"], gaussians: GaussianSet, rates: LearningRates
+        cls, block_of_row: Int[Tensor, " gaussians"], gaussians: GaussianSet, reach_sigmas: float
     ) -> "SpatialBlocks":
         """Blocks of these rows: numbers from 0 on, none of them left out."""
         ordered, order = block_of_row.sort(stable=True)
@@ -63,7 +56,7 @@ class SpatialBlocks:
             high=high,
             reach=torch.empty(count, dtype=torch.float64, device=ordered.device),
         )
-        made = cls(block_of_row=block_of_row, blocks=blocks, reach_sigmas=_reach_sigmas(rates))
+        made = cls(block_of_row=block_of_row, blocks=blocks, reach_sigmas=reach_sigmas)
         made.refresh(gaussians)
         return made
 
@@ -91,12 +84,6 @@ class SpatialBlocks:
         is_seen = torch.zeros_like(self.block_of_row, dtype=torch.bool)
         mark_seen(self.blocks, views, is_seen, actor_slack_m=actor_slack_m)
         return is_seen
-
-
-def _reach_sigmas(rates: LearningRates) -> float:
-    """How far a Gaussian that is not stepped reaches at most, in its deviations when it was."""
-    growth = math.exp(MOST_UNITS * max(rates.log_scale))
-    return 1.001 * growth * (MOST_SIGMAS + MOST_UNITS * max(rates.means))
 
 
 def _cell_keys(gaussians: GaussianSet, reach_sigmas: float) -> Int[Tensor, "gaussians 5"]:
