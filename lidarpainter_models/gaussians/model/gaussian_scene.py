@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.blinking import Blinking
 from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
@@ -38,7 +39,8 @@ from lidarpainter_models.scenes.records import RecordedView, ViewKey
 class GaussianScene:
     """Everything needed to draw the scene at any pose and time of the log.
 
-    A fit changes tensors of its own copy in place; elsewhere a scene stays as it is.
+    A fit changes tensors of its own copy in place, leaves of autograd; elsewhere a scene stays as
+    it is, and what was found out when it was rendered holds from then on.
     """
 
     gaussians: GaussianSet
@@ -110,7 +112,18 @@ class GaussianScene:
 
     @cached_property
     def _blocks(self) -> SpatialBlocks:
-        """Of Gaussians that stay as they are, but for what a rolling shutter makes of them."""
+        """Of Gaussians that stay as they are, but for what a rolling shutter makes of them.
+
+        Raises:
+            ShapeError: Gaussians belong to bodies that the scene does not have.
+        """
+        bodies, body_index = 1 + len(self.actors.recorded_tracks), self.gaussians.body_index
+        lowest, highest = torch.cat([body_index, body_index.new_zeros(1)]).aminmax()
+        if int(lowest) < 0 or int(highest) >= bodies:
+            raise ShapeError(
+                f"Gaussians of a scene with {bodies - 1} actors belong to bodies {int(lowest)} to "
+                f"{int(highest)}"
+            )
         return SpatialBlocks.of(self.gaussians, 1.001 * MOST_GROWTH * MOST_SIGMAS)
 
     def corrected_camera(

@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import pytest
 import torch
 from gaussian_world import (
     CAR_SIZE_M,
@@ -11,6 +12,7 @@ from gaussian_world import (
     scene_of,
 )
 
+from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.stored_scene import (
@@ -50,6 +52,13 @@ def test_scene_without_gaussians_shows_the_sky():
     render = scene_of(GaussianSet.empty(), [camera]).render(camera, 0)
     assert torch.allclose(render.rgb, SKY_RGB.expand_as(render.rgb), atol=1e-5)
     assert float(render.alpha.max()) == 0
+
+
+@pytest.mark.parametrize("body", [-1, 2])
+def test_gaussians_of_a_body_that_is_not_there_are_refused(body):
+    scene = scene_of(one_gaussian(body=body), [camera_at(0.0)], [car_track(2)])
+    with pytest.raises(ShapeError, match="with 1 actors belong to bodies"):
+        scene.render(camera_at(0.0), 0)
 
 
 def test_actor_follows_its_pose():
