@@ -1,12 +1,13 @@
 """What a sequence will take, by what sequences have taken before.
 
-CPU seconds, memory and bytes are sums of what grows with the effort: views read, pixels drawn,
-steps and views at their width. The weights are found from the attempts in the catalog by
-non-negative least squares on relative errors, so a short sequence counts as much as a long one, and
-a recent one more than an old one. Where few attempts cannot tell the amounts apart, each keeps a
-share of the cost. Compiling kernels is paid once a machine and is taken out. Wall time is CPU time
-by the ratio that the machine had lately: what else runs there is not the sequence's own. Where
-nothing is known, nothing is said, and nothing is held back.
+CPU seconds and bytes are sums of what grows with the effort: views read, pixels drawn, steps and
+views at their width; memory of a process and its views alone. The weights are found from the
+attempts in the catalog by non-negative least squares on relative errors, so a short sequence counts
+as much as a long one, and a recent one more than an old one. Where few attempts cannot tell the
+amounts apart, each keeps a share of the cost, or of memory what is known of it. Compiling kernels
+is paid once a machine and is taken out. Wall time is CPU time by the ratio that the machine had
+lately: what else runs there is not the sequence's own. Where nothing is known, nothing is said, and
+nothing is held back.
 """
 
 import json
@@ -34,6 +35,9 @@ RECENT = 10
 SIZES = ("peak_memory_bytes", "num_bytes")
 EQUAL_SHARES = 0.05
 """How much it counts, in attempts, that all amounts have a share of the cost."""
+KNOWN_MEMORY = {"constant": 0.8e9, "views": 40.0}
+"""Bytes of a process, and of each view for its width squared: what memory is made of, and about how
+much. Attempts at one width cannot tell the two apart."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,16 +61,16 @@ class Effort:
         return json.dumps(asdict(self))
 
     @property
-    def amounts(self) -> list[float]:
+    def amounts(self) -> dict[str, float]:
         """What costs are sums of."""
-        return [
-            1.0,
-            self.steps * self.view_pixels,
-            self.views * self.view_pixels,
-            self.painted_views * self.view_pixels,
-            self.read_views,
-            self.drawn_pixels,
-        ]
+        return {
+            "constant": 1.0,
+            "steps": self.steps * self.view_pixels,
+            "views": self.views * self.view_pixels,
+            "painted_views": self.painted_views * self.view_pixels,
+            "read_views": self.read_views,
+            "drawn_pixels": self.drawn_pixels,
+        }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,7 +110,7 @@ class Planner:
         effort = self.effort(asked)
         if effort is None or not self._past:
             return Prediction()
-        amounts = np.asarray(effort.amounts)
+        amounts = np.asarray(list(effort.amounts.values()))
         cpu_seconds, memory, num_bytes = (float(amounts @ weights) for weights in self._weights)
         return Prediction(
             seconds=cpu_seconds * self._wall_ratio,
@@ -156,12 +160,16 @@ class Planner:
     @cached_property
     def _weights(self) -> list[Float[np.ndarray, " amounts"]]:
         """Of CPU seconds, memory and bytes."""
-        efforts = np.asarray([Effort(**json.loads(row["effort"])).amounts for row in self._past])
-        costs = [
-            [own_cpu_seconds(row) for row in self._past],
-            *([row[name] or 0.0 for row in self._past] for name in SIZES),
+        past = [Effort(**json.loads(row["effort"])).amounts for row in self._past]
+        efforts = np.asarray([list(amounts.values()) for amounts in past])
+        known_memory = np.asarray([KNOWN_MEMORY.get(name, 0.0) for name in past[0]])
+        costs = [[own_cpu_seconds(row) for row in self._past]]
+        costs += [[row[name] or 0.0 for row in self._past] for name in SIZES]
+        known = (None, known_memory, None)
+        return [
+            _fitted(efforts, np.asarray(cost, float), weights)
+            for cost, weights in zip(costs, known, strict=True)
         ]
-        return [_fitted(efforts, np.asarray(cost, float)) for cost in costs]
 
     @cached_property
     def _wall_ratio(self) -> float:
@@ -191,25 +199,32 @@ def planner_error(attempts: Iterable[Mapping[str, Any]]) -> float | None:
 
 
 def _fitted(
-    amounts: Float[np.ndarray, "attempts amounts"], costs: Float[np.ndarray, " attempts"]
+    amounts: Float[np.ndarray, "attempts amounts"],
+    costs: Float[np.ndarray, " attempts"],
+    known: Float[np.ndarray, " amounts"] | None,
 ) -> Float[np.ndarray, " amounts"]:
     """Non-negative weights whose sums come nearest to the costs, in relative terms.
 
-    Attempts are oldest first; a cost that is not known is 0 or less.
+    Attempts are oldest first; a cost that is not known is 0 or less. What attempts leave open comes
+    near equal shares, or near weights that are known, as a share of each; amounts of no known
+    weight have none.
     """
     from scipy.optimize import nnls
 
     is_known = costs > 0
     if not is_known.any():
         return np.zeros(amounts.shape[1])
+    if known is not None:
+        amounts = amounts * (known > 0)
     relative = amounts[is_known] / costs[is_known, None]
     scale = np.maximum(relative.mean(axis=0), np.finfo(float).tiny)
     ages = np.arange(len(relative))[::-1]
     counts = np.sqrt(0.5 ** (ages / HALF_LIFE))
     seen = (relative > 0).any(axis=0)
-    shares = np.sqrt(EQUAL_SHARES) * np.diag(seen.astype(float))
+    expected = seen / seen.sum() if known is None else np.where(seen, known * scale, 1.0)
+    pull = np.sqrt(EQUAL_SHARES) * seen / (1.0 if known is None else expected)
     weights, _residual = nnls(
-        np.vstack([relative / scale * counts[:, None], shares]),
-        np.concatenate([counts, shares.sum(axis=0) / seen.sum()]),
+        np.vstack([relative / scale * counts[:, None], np.diag(pull)]),
+        np.concatenate([counts, pull * expected]),
     )
     return weights / scale

@@ -26,7 +26,7 @@ def street(seed=1, *, frames=12, steps=400, width_px=320):
 def attempt(asked, number):
     """What it would take if costs were exactly sums of efforts."""
     effort = Planner([], []).effort(asked)
-    _, steps, views, painted, _, drawn = effort.amounts
+    _, steps, views, painted, _, drawn = effort.amounts.values()
     cpu_seconds = 5 + 2e-7 * steps + 1e-6 * views + 3e-6 * painted + 2e-6 * drawn
     return {
         "cause": "done",
@@ -71,6 +71,14 @@ def test_a_sequence_like_none_before_is_predicted(past):
 def test_one_attempt_predicts_its_like(past):
     prediction = Planner(past[:1], []).predict(street(frames=6, steps=200, width_px=160))
     assert prediction.cpu_seconds == pytest.approx(past[0]["cpu_seconds"], rel=0.01)
+
+
+def test_small_images_do_not_say_that_large_ones_take_tens_of_gigabytes():
+    """Four attempts at 160 pixels, whose memory is nearly all the process's."""
+    small = [attempt(street(frames=20, width_px=160), number) for number in range(4)]
+    past = [{**row, "peak_memory_bytes": 0.9e9 + 1e7 * number} for number, row in enumerate(small)]
+    large = Planner(past, []).predict(street(frames=28, width_px=960))
+    assert 1e9 < large.memory_bytes < 4e9
 
 
 def test_a_scene_that_is_stored_is_not_drawn_again():
