@@ -34,7 +34,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from lidarpainter_models.conditioning.warping import SKY_DEPTH_M
-from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.cameras import Camera, outside_all
 from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.kernels.backends import may_run_on_host
 from lidarpainter_models.painter.protocol import Painting, PaintingConditions
@@ -92,13 +92,8 @@ def is_seen(
     points_world = camera.unproject(torch.where(depth_m > 0, depth_m, SKY_DEPTH_M)).reshape(-1, 3)
     if not may_run_on_host(depth_m.device):
         return _in_any(points_world, list(recorded_cameras)).reshape(depth_m.shape)
-    unseen = torch.arange(len(points_world))
-    for recorded in recorded_cameras:
-        unseen = unseen[~recorded.contains(*recorded.project(points_world[unseen]))]
-        if not len(unseen):
-            break
     seen = torch.ones_like(depth_m, dtype=torch.bool).reshape(-1)
-    seen[unseen] = False
+    seen[outside_all(points_world, recorded_cameras)] = False
     return seen.reshape(depth_m.shape)
 
 

@@ -4,11 +4,12 @@ Camera frame: x right, y down, z forward. The top-left pixel has its centre at (
 point projects to u = fx x / z + cx with cx measured from the image's left edge.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from math import isfinite
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError
@@ -182,6 +183,18 @@ class Camera:
         world_from_camera = self.world_from_camera.to(torch.float32)
         world_from_camera = world_from_camera.to(depth_m.device, non_blocking=True)
         return points_camera @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
+
+
+def outside_all(
+    points_world: Float[Tensor, "points 3"], cameras: Iterable[Camera]
+) -> Int[Tensor, " outside"]:
+    """Rows of the points that fall into no camera's image, whether anything hides them or not."""
+    outside = torch.arange(len(points_world), device=points_world.device)
+    for camera in cameras:
+        outside = outside[~camera.contains(*camera.project(points_world[outside]))]
+        if not len(outside):
+            break
+    return outside
 
 
 def _velocity(shutter: Shutter, points: Float[Tensor, "points 3"]) -> Float[Tensor, "points 3"]:

@@ -91,6 +91,11 @@ class GuidanceView:
         """Sparse LiDAR depth in this view, 0 where there is none."""
         return self.lidar_depth_f16.float()
 
+    @property
+    def shows_surface(self) -> Bool[Tensor, "height width"]:
+        """Where LiDAR hit something: of the rest nobody knows."""
+        return self.lidar_depth_f16 > 0
+
     def to(self, device: torch.device) -> "GuidanceView":
         """The same view on another device, as far as it is not there."""
         if self.rgb_u8.device == device:

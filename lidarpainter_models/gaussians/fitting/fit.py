@@ -26,6 +26,7 @@ from lidarpainter_models.gaussians.fitting.seen_surface import (
     SeenSurface,
     planned_fit,
     seen_surface,
+    with_shown_beside,
 )
 from lidarpainter_models.gaussians.fitting.shape_limits import (
     LIMITS_EVERY,
@@ -125,7 +126,7 @@ def fit_gaussians(  # noqa: PLR0913 - what was recorded, and one option each
     street = observations.lidar_map.street.xyz_m if observations.is_estimated else None
     surface = seen_surface(observations.views, street)
     pixels = fmean(view.camera.width_px * view.camera.height_px for view in observations.views)
-    config = planned_fit(config, surface)
+    config = planned_fit(config, with_shown_beside(surface, observations.views, guidance))
     looks = config.steps / max(surface.whole_views, 1.0)
     config = replace(config, learning_rates=config.learning_rates.over(looks))
     if device.type == "cpu":

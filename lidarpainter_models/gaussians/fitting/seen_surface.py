@@ -5,7 +5,8 @@ A / f^2 pixels. A view that sees it after others at footprint g adds (1 - (f / g
 pixels, or none where g <= f. Depth is the LiDAR's, that of all points of the street where it tells
 too little. So views from one place count once, views of a moving car add up to
 the finest of them, and cameras that overlap share. Occlusion is not looked at: what traffic
-uncovers before a standing car counts as seen. Metres; the world frame.
+uncovers before a standing car counts as seen. Painted views add what lies in no recorded image.
+Metres; the world frame.
 
 Gaussians are planned by detail. Where n of them leave s^2 / n of an image's variance s^2 in a cell,
 one more is worth the same everywhere if n follows s: the contrast of cells of a few pixels, summed
@@ -23,9 +24,9 @@ from torch import Tensor
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.images import shrink_depth
 from lidarpainter_models.gaussians.initialisation.unreached import FARTHEST_M, depth_from_below
-from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.cameras import Camera, outside_all
 from lidarpainter_models.lidar.sparse_depth import sparse_lidar_depth
-from lidarpainter_models.observations.views import TrainingView
+from lidarpainter_models.observations.views import GuidanceView, TrainingView
 
 CELL_PX = 12
 """A cell of pixels is judged by one point: LiDAR leaves few of them empty."""
@@ -74,7 +75,7 @@ def seen_surface(
     kept: list[Camera] = []
     for index in order:
         view = views[index]
-        new = _new_shares(view, street, _nearest(kept, view.camera))
+        new = _new_shares(*_cells(view, street), _nearest(kept, view.camera))
         share = float(new.mean()) if len(new) else 0.0
         of_camera = groups.setdefault(view.key[1], [])
         if of_camera and share < LEAST_NEW:
@@ -93,6 +94,36 @@ def seen_surface(
     )
 
 
+def with_shown_beside(
+    surface: SeenSurface, views: Sequence[TrainingView], guidance: Sequence[GuidanceView]
+) -> SeenSurface:
+    """The same with what painted views show and no recorded one does, as detailed as the rest.
+
+    It takes Gaussians; looks are at recorded views, as without it.
+    """
+    painted = sorted(guidance, key=lambda view: view.timestamp_ns)
+    cells = [_cells(view, None) for view in painted]
+    if not cells or surface.num_pixels == 0:
+        return surface
+    points_world = torch.cat([points for points, _ in cells])
+    is_unseen = torch.zeros_like(points_world[:, 0], dtype=torch.bool)
+    is_unseen[outside_all(points_world, [view.camera for view in views])] = True
+    unseen_cells = is_unseen.split([len(points) for points, _ in cells])
+    num_pixels = 0.0
+    earlier: list[Camera] = []
+    for view, cell, unseen in zip(painted, cells, unseen_cells, strict=True):
+        if unseen.any():
+            new = _new_shares(*cell, _nearest(earlier, view.camera)) * unseen
+            num_pixels += float(new.mean()) * int(view.shows_surface.sum())
+        earlier.append(view.camera)
+    more = 1 + num_pixels / surface.num_pixels
+    return replace(
+        surface,
+        num_pixels=surface.num_pixels * more,
+        num_detailed=surface.num_detailed * more,
+    )
+
+
 def _detail(view: TrainingView) -> float:
     """Pixels of a typical street with the detail that a view shows of surface."""
     cells = partial(torch.nn.functional.avg_pool2d, kernel_size=CONTRAST_CELL_PX)
@@ -103,10 +134,11 @@ def _detail(view: TrainingView) -> float:
 
 
 def _new_shares(
-    view: TrainingView, street: Float[Tensor, "points 3"] | None, earlier: Sequence[Camera]
+    points_world: Float[Tensor, "cells 3"],
+    footprint_m: Float[Tensor, " cells"],
+    earlier: Sequence[Camera],
 ) -> Float[Tensor, " cells"]:
     """Of each cell that is not sky: which part of its pixels no earlier camera saw as finely."""
-    points_world, footprint_m = _cells(view, street)
     known = torch.zeros_like(footprint_m)
     for camera in earlier:
         pixels_uv, depth_m = camera.project(points_world)
@@ -116,7 +148,7 @@ def _new_shares(
 
 
 def _cells(
-    view: TrainingView, street: Float[Tensor, "points 3"] | None
+    view: TrainingView | GuidanceView, street: Float[Tensor, "points 3"] | None
 ) -> tuple[Float[Tensor, "cells 3"], Float[Tensor, " cells"]]:
     """A point for each cell of pixels that shows surface, and the footprint of a pixel there."""
     grid = {

@@ -80,7 +80,7 @@ def fit_step(
     recorded = image.camera.refined(pose.detach())
     actors = state.scene.actors.corrected_poses(image.timestamp_ns)
     view = (recorded, camera_from_body(pose, *actors))
-    read = bodies_while_read(recorded, state.scene.actors, image.timestamp_ns)
+    read = bodies_while_read(view[1].detach(), recorded, state.scene.actors, image.timestamp_ns)
     looks = {row: [view, *((recorded, bodies) for bodies in read)]}
     if guidance is not None:
         place, painted = guidance

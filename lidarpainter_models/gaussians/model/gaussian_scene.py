@@ -103,7 +103,7 @@ class GaussianScene:
         """The Gaussians that an image can show, and some more; of a running fit all."""
         if self.gaussians.means.requires_grad:
             return self.gaussians
-        moments = [bodies, *bodies_while_read(camera, self.actors, timestamp_ns)]
+        moments = [bodies, *bodies_while_read(bodies, camera, self.actors, timestamp_ns)]
         is_seen = self._blocks.in_view(
             [(camera, moment) for moment in moments],
             actor_slack_m=self.actors.bending.reach_m(timestamp_ns),

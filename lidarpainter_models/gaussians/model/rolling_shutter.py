@@ -83,20 +83,19 @@ def _growth(
 
 
 def bodies_while_read(
-    camera: Camera, actors: Actors, timestamp_ns: int
+    bodies: Float[Tensor, "bodies 4 4"], camera: Camera, actors: Actors, timestamp_ns: int
 ) -> list[Float[Tensor, "bodies 4 4"]]:
     """Where bodies stand before the camera when its first pixel is read, and when its last one is.
 
-    None for an image that is read at once. Tracks move as recorded.
+    None for an image that is read at once. As `as_read` moves what stands so in its middle.
     """
     shutter = camera.shutter
     if shutter is None or not shutter.is_rolling:
         return []
-    half_ns = round(sum(map(abs, shutter.across_s)) / 2 * 1e9)
-    return [
-        _bodies_after(camera, shutter, actors, timestamp_ns, step_ns)
-        for step_ns in (-half_ns, half_ns)
-    ]
+    half_s = sum(map(abs, shutter.across_s)) / 2
+    rates = _body_rates(camera, shutter, actors, timestamp_ns).to(bodies)
+    way = torch.nn.functional.pad(half_s * rates, (0, 0, 0, 1))
+    return [bodies - bodies @ way, bodies + bodies @ way]
 
 
 def _bodies_after(

@@ -8,9 +8,10 @@ from lidarpainter_models.gaussians.fitting.seen_surface import (
     LEAST_DETAIL,
     TYPICAL_CONTRAST,
     seen_surface,
+    with_shown_beside,
 )
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.observations.views import TrainingView
+from lidarpainter_models.observations.views import GuidanceView, TrainingView
 
 WIDTH_PX, HEIGHT_PX, FOCAL_PX = 240, 120, 200.0
 PIXELS = WIDTH_PX * HEIGHT_PX
@@ -145,3 +146,37 @@ def test_sky_is_no_surface():
     surface = seen_surface([view_at(0.0, sky=True)])
     assert (surface.num_pixels, surface.whole_views) == (0.0, 0.0)
     assert surface.groups == ((0,),)
+
+
+def painted_at(forward_m, frame=0, **turned):
+    view = view_at(forward_m, frame, **turned)
+    return GuidanceView.of(
+        view.camera,
+        view.timestamp_ns,
+        rgb=view.rgb,
+        weight=torch.ones(HEIGHT_PX, WIDTH_PX),
+        lidar_depth_m=view.lidar_depth_m,
+    )
+
+
+def test_painted_views_add_what_no_recorded_image_shows_and_count_it_once():
+    recorded = [view_at(0.0), view_at(2.0, 1)]
+    surface = seen_surface(recorded)
+    aside = painted_at(0.0, 0, yaw_rad=1.6)
+    more = with_shown_beside(surface, recorded, [aside])
+    assert more.num_pixels == pytest.approx(surface.num_pixels + PIXELS, rel=0.02)
+    assert more.num_detailed / surface.num_detailed == pytest.approx(
+        more.num_pixels / surface.num_pixels
+    )
+    assert (more.whole_views, more.groups) == (surface.whole_views, surface.groups)
+    twice = with_shown_beside(surface, recorded, [aside, painted_at(0.0, 1, yaw_rad=1.6)])
+    assert twice.num_pixels == pytest.approx(more.num_pixels, rel=0.02)
+
+
+@pytest.mark.parametrize("forward_m", [0.0, 5.0])
+def test_painted_views_of_what_was_recorded_add_nothing_however_near_they_come(forward_m):
+    recorded = [view_at(0.0)]
+    surface = seen_surface(recorded)
+    more = with_shown_beside(surface, recorded, [painted_at(forward_m)])
+    assert vars(more) == vars(surface)
+    assert with_shown_beside(surface, recorded, []) is surface

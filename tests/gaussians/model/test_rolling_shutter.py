@@ -79,12 +79,19 @@ def test_an_actor_is_where_it_drove_until_its_row_was_read():
 
 
 def test_bodies_are_known_from_the_first_pixel_to_the_last():
+    """From where they stand in the middle, which may be corrected: here half a metre ahead."""
     camera = rolling((0.0, -0.03), velocity=(0.0, 0.0, 15.0))
-    first, last = bodies_while_read(camera, ACTORS, MIDDLE_NS)
-    assert float(first[0, 2, 3] - last[0, 2, 3]) == pytest.approx(15.0 * 0.03)
+    poses, present = ACTORS.recorded_poses(MIDDLE_NS)
+    corrected = poses.clone()
+    corrected[:, 0, 3] += 0.5
+    bodies = camera_from_body(camera.world_from_camera, corrected, present)
+    first, last = bodies_while_read(bodies, camera, ACTORS, MIDDLE_NS)
+    assert float(first[0, 2, 3] - last[0, 2, 3]) == pytest.approx(15.0 * 0.03, rel=1e-5)
     car = torch.stack([first[1], last[1]])[:, :3, 3]
     assert float(car[0, 0] - car[1, 0]) == pytest.approx(0.3, abs=0.01)  # 10 m/s to the left
-    assert bodies_while_read(camera.at(camera.world_from_camera), ACTORS, MIDDLE_NS) == []
+    assert torch.allclose(car.mean(dim=0), bodies[1, :3, 3], atol=1e-5)
+    at_once = camera.at(camera.world_from_camera)
+    assert bodies_while_read(bodies, at_once, ACTORS, MIDDLE_NS) == []
 
 
 def test_gradients_reach_centres_and_sizes():
