@@ -22,6 +22,7 @@ from lidarpainter_models.checks.actors import (
 )
 from lidarpainter_models.checks.box_places import check_box_places
 from lidarpainter_models.checks.calibration import check_calibration
+from lidarpainter_models.checks.clear_air import check_clear_air
 from lidarpainter_models.checks.depth_edges import SceneEdges
 from lidarpainter_models.checks.lidar_reach import reaches_of
 from lidarpainter_models.checks.overlay import draw_overlay
@@ -86,6 +87,7 @@ def check_scene(scene: DrivingScene) -> list[Check]:
         ("camera rig", check_camera_rig),
         ("ground", check_ground),
         ("sweeps agree", check_sweeps_agree),
+        ("clear air", check_clear_air),
         ("points in images", check_coverage),
         ("camera calibration", lambda _: check_calibration(edges)),
         ("cameras in their place", lambda _: check_swapped_images(edges)),
@@ -237,10 +239,8 @@ def check_sweeps_agree(scene: DrivingScene) -> tuple[Verdict, str]:
         return "warn", "a single sweep: nothing to compare"
     offsets_m = []
     for position in sampled_positions(len(frames) - 1):
-        first, second = (
-            _points_near_ego(scene, frame) for frame in frames[position : position + 2]
-        )
-        offset_m = sweep_offset_m(first, second)
+        first, second = frames[position : position + 2]
+        offset_m = sweep_offset_m(_points_near_ego(scene, first), _points_near_ego(scene, second))
         if offset_m is not None:
             offsets_m.append(offset_m)
     if not offsets_m:
@@ -340,6 +340,7 @@ _BY_POINTS = {
     "camera sync",
     "ground",
     "sweeps agree",
+    "clear air",
     "points in images",
     "camera calibration",
     "cameras in their place",

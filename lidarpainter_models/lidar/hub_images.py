@@ -18,6 +18,7 @@ from lidarpainter_models.kernels.point_contrasts import NEAR_M
 from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.actor_separation import near_actors
 from lidarpainter_models.lidar.contrast_images import ContrastImage
+from lidarpainter_models.lidar.lone_returns import confirmed_returns
 from lidarpainter_models.lidar.sparse_depth import sparse_lidar_depth
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
@@ -70,9 +71,9 @@ def returns_of(scene: DrivingScene, frames: Sequence[int]) -> dict[int, FrameRet
     def read(frame_index: int) -> FrameReturns:
         clouds, standing = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
         for sweep in scene.sweeps_of(frame_index):
-            xyz_m = scene.read_column(sweep, "xyz_m")
+            xyz_m, measured_ns = confirmed_returns(scene, sweep)
             stands = torch.ones(len(xyz_m), dtype=torch.bool)
-            stands[near_actors(xyz_m, scene.measured_ns(sweep), moving).rows] = False
+            stands[near_actors(xyz_m, measured_ns, moving).rows] = False
             clouds.append(xyz_m)
             standing.append(xyz_m[stands])
         return FrameReturns(xyz_m=torch.cat(clouds), standing=torch.cat(standing))

@@ -27,6 +27,7 @@ from lidarpainter_models.lidar.actor_separation import (
 from lidarpainter_models.lidar.colouring import MapColouring
 from lidarpainter_models.lidar.ground_heights import GroundHeights
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
+from lidarpainter_models.lidar.lone_returns import confirmed_returns
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView, Sweep
 from lidarpainter_models.scenes.splits import Keyed
@@ -148,14 +149,14 @@ class _PlacedSweep:
 
 
 def _place_sweep(scene: DrivingScene, sweep: Sweep, tracks: Sequence[ActorTrack]) -> _PlacedSweep:
-    """Read a sweep, drop what is out of range, and find what lies near actors."""
-    xyz_m = scene.read_column(sweep, "xyz_m")
+    """Read a sweep, drop what is out of range or a drop, and find what lies near actors."""
+    xyz_m, timestamp_ns = confirmed_returns(scene, sweep)
     away = xyz_m - sweep.world_from_lidar[:3, 3].to(xyz_m)
     range_m = away.norm(dim=-1)
     left = scene.world_from_ego[scene.frame_position(sweep.frame_index), :3, 1].to(away)
     is_ego = (range_m < EGO_RANGE_M) & ((away @ left).abs() < EGO_HALF_WIDTH_M)
     used = (range_m >= MIN_RANGE_M) & (range_m <= MAX_RANGE_M) & ~is_ego
-    timestamp_ns = scene.measured_ns(sweep)[used]
+    timestamp_ns = timestamp_ns[used]
     points = MapPoints.uncoloured(
         xyz_m=xyz_m[used],
         frame_index=torch.full_like(timestamp_ns, sweep.frame_index),

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.actor_separation import ACTOR_MARGIN_M, near_actors
+from lidarpainter_models.lidar.lone_returns import confirmed_returns
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView, Sweep
 from lidarpainter_models.scenes.tracks import TrackPoses
@@ -59,7 +60,10 @@ class _Swept:
 
 
 class FramePoints:
-    """The LiDAR points of the frame asked for last, read once for all that its cameras ask."""
+    """The LiDAR points of the frame asked for last, read once for all that its cameras ask.
+
+    Without returns that nothing confirms (`lone_returns`).
+    """
 
     def __init__(self, scene: DrivingScene) -> None:
         """Take the scene; nothing is read yet."""
@@ -86,8 +90,8 @@ class FramePoints:
         return self._sweeps
 
     def _read(self, sweep: Sweep) -> _Swept:
-        xyz_m = self._scene.read_column(sweep, "xyz_m")
-        near = near_actors(xyz_m, self._scene.measured_ns(sweep), self._moving)
+        xyz_m, measured_ns = confirmed_returns(self._scene, sweep)
+        near = near_actors(xyz_m, measured_ns, self._moving)
         held = near.outside_m <= ACTOR_MARGIN_M
         return _Swept(xyz_m, near.rows[held], near.track[held], near.xyz_box_m[held])
 

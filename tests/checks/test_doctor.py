@@ -36,7 +36,7 @@ def finding(scene, name):
 def test_sound_scene_passes_every_check(small_scene):
     checks = check_scene(small_scene)
     assert [check for check in checks if check.verdict != "ok"] == []
-    assert len({check.name for check in checks}) == 15
+    assert len({check.name for check in checks}) == 16
 
 
 @pytest.fixture

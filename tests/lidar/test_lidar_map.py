@@ -77,11 +77,22 @@ def test_the_ego_vehicle_itself_leaves_no_points():
     street = ToyStreet(num_frames=1)
     bonnet, beside = [1.8, 0.3, 1.0], [0.2, 1.9, 1.0]
     read = street.read_sweep(street.sweeps[0])
-    added = torch.cat([torch.tensor([bonnet, beside]), read.xyz_m[2:]])
+    twice = torch.tensor([bonnet, bonnet, beside, beside])  # what returns alone is a drop
+    added = torch.cat([twice, read.xyz_m[4:]])
     street.read_sweep = lambda _: replace(read, xyz_m=added)
     xyz_m = build_lidar_map(street, split_frames=(0,), colour_views=()).street.xyz_m
     assert not (xyz_m == torch.tensor(bonnet)).all(-1).any()
     assert (xyz_m == torch.tensor(beside)).all(-1).any()
+
+
+def test_a_drop_in_the_air_leaves_no_point():
+    street = ToyStreet(num_frames=1)
+    dry = build_lidar_map(street, split_frames=(0,), colour_views=()).street.xyz_m
+    read, drop = street.read_sweep(street.sweeps[0]), torch.tensor([[4.0, 0.5, 2.5]])
+    street.read_sweep = lambda _: replace(read, xyz_m=torch.cat([drop, read.xyz_m[1:]]))
+    found = build_lidar_map(street, split_frames=(0,), colour_views=()).street.xyz_m
+    assert not (found == drop).all(-1).any()
+    assert len(found) in (len(dry) - 1, len(dry))
 
 
 def test_no_points_is_an_error(street):

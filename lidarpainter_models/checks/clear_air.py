@@ -1,0 +1,27 @@
+"""Whether LiDAR met drops in the air."""
+
+from typing import Literal
+
+from lidarpainter_models.lidar.lone_returns import WEATHER_REACH_M, is_confirmed
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+
+MOST_LONE = 0.01
+"""Of the returns from where drops return; in dry air 0.002 to 0.004 stand alone at some edge."""
+NUM_FRAMES = 8
+
+
+def check_clear_air(scene: DrivingScene) -> tuple[Literal["ok", "warn"], str]:
+    """Whether few returns stand alone; a fit leaves these out."""
+    step = len(scene.frame_indices) // NUM_FRAMES | 1  # odd, as every other frame may be unlike
+    num_lone = num_near = 0
+    for frame_index in scene.frame_indices[::step]:
+        for sweep in scene.sweeps_of(frame_index):
+            xyz_m = scene.read_column(sweep, "xyz_m")
+            offset_m = xyz_m - sweep.world_from_lidar[:3, 3].to(xyz_m)
+            num_near += int((offset_m.norm(dim=1) <= WEATHER_REACH_M).sum())
+            num_lone += int((~is_confirmed(offset_m)).sum())
+    share = num_lone / max(num_near, 1)
+    found = f"{share:.1%} of the returns within {WEATHER_REACH_M:g} m stand alone"
+    if share > MOST_LONE:
+        return "warn", f"{found}, as of rain, snow or spray: they are left out"
+    return "ok", found

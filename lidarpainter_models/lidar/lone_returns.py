@@ -1,0 +1,76 @@
+"""Returns that nothing around them confirms: rain, snow and spray in the air.
+
+From where a LiDAR stands the beams around a return meet the same surface, pole or wire: a part of
+them ends at about its range. Drops stop each beam at a range of its own. Charron et al. (2018,
+"De-noising of Lidar Point Clouds Corrupted by Snowfall") count neighbours within a radius that
+grows with range; here they are counted as a share of the returns in the directions around, which
+depends neither on how many beams a LiDAR has nor on how many of them return.
+"""
+
+import math
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.records import Sweep
+
+WEATHER_REACH_M = 40.0
+"""No drop returns enough light from further away, where what is thin stands alone."""
+CELL_RAD = math.radians(1.0)
+"""Directions and ranges fall into cells; what lies in a cell and those beside it is around."""
+CELL_RANGE = 0.03
+"""As a share of the range."""
+LEAST_SHARE = 0.03
+"""Of the other returns around, those that must end at about the same range; one at the least."""
+MOST_ALONE = 0.3
+"""Of the returns within reach; a turn of which more stand alone is too sparse to tell drops by."""
+
+_COLUMNS, _ROWS = round(2 * math.pi / CELL_RAD), round(math.pi / CELL_RAD) + 2
+_BESIDE = (-1, 0, 1)
+
+
+def confirmed_returns(
+    scene: DrivingScene, sweep: Sweep
+) -> tuple[Float[Tensor, "points 3"], Int[Tensor, " points"]]:
+    """What a sweep met, in the world, and when; without drops."""
+    xyz_m = scene.read_column(sweep, "xyz_m")
+    kept = is_confirmed(xyz_m - sweep.world_from_lidar[:3, 3].to(xyz_m))
+    return xyz_m[kept], scene.measured_ns(sweep)[kept]
+
+
+def is_confirmed(offset_m: Float[Tensor, "points 3"]) -> Bool[Tensor, " points"]:
+    """Which returns of a turn are no drops, by where they lie from the LiDAR (z up)."""
+    range_m = offset_m.norm(dim=1).clamp(min=1e-3)
+    if not len(range_m):
+        return range_m > 0
+    turn = torch.atan2(offset_m[:, 1], offset_m[:, 0]) + math.pi
+    rise = torch.asin((offset_m[:, 2] / range_m).clamp(-1, 1)) + math.pi / 2
+    direction = (turn / CELL_RAD).long() % _COLUMNS * _ROWS + (rise / CELL_RAD).long() + 1
+    layer = ((range_m / range_m.min()).log() / CELL_RANGE).long() + 1
+    layers = int(layer.max()) + 2
+    cells, of_point, count = torch.unique(
+        direction * layers + layer, return_inverse=True, return_counts=True
+    )
+    directions, of_cell = torch.unique(cells // layers, return_inverse=True)
+    count_in = torch.zeros_like(directions).index_add_(0, of_cell, count)
+    near, around = -torch.ones_like(count), -torch.ones_like(count)  # but for the return itself
+    for step in (right * _ROWS + up for right in _BESIDE for up in _BESIDE):
+        looked_at = (directions + step) % (_COLUMNS * _ROWS)
+        around += _counted(directions, count_in, looked_at)[of_cell]
+        there = looked_at[of_cell] * layers + cells % layers
+        for further in _BESIDE:
+            near += _counted(cells, count, there + further)
+    is_alone = ((near < 1) | (near < LEAST_SHARE * around))[of_point]
+    is_alone &= range_m <= WEATHER_REACH_M
+    can_tell = is_alone.sum() <= MOST_ALONE * (range_m <= WEATHER_REACH_M).sum()
+    return ~(is_alone & can_tell)
+
+
+def _counted(
+    cells: Int[Tensor, " cells"], count: Int[Tensor, " cells"], wanted: Int[Tensor, " wanted"]
+) -> Int[Tensor, " wanted"]:
+    """How many lie in each cell that is asked for; those that have any are sorted."""
+    place = torch.searchsorted(cells, wanted).clamp(max=len(cells) - 1)
+    return torch.where(cells[place] == wanted, count[place], 0)

@@ -1,0 +1,36 @@
+"""Rain before a LiDAR is named, dry air is not."""
+
+import torch
+from drawn_streets import drawn_street
+
+from lidarpainter_models.checks.clear_air import check_clear_air
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.synthetic import SyntheticStreetConfig, record_street
+from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
+
+
+def test_rain_is_named_and_dry_air_is_not(tmp_path):
+    config = SyntheticStreetConfig(
+        seed=7, num_frames=3, width_px=64, height_px=36, cameras=DEFAULT_CAMERAS[:1]
+    )
+    scene = DrivingScene.open(record_street(drawn_street(config), tmp_path))
+    verdict, detail = check_clear_air(scene)
+    assert verdict == "ok"
+    assert detail.endswith("of the returns within 40 m stand alone")
+    assert 0 < float(detail.partition("%")[0]) < 0.6
+
+    whole, generator = scene.read_column, torch.Generator().manual_seed(0)
+
+    def rained(sweep, name):
+        column = whole(sweep, name)
+        if name != "xyz_m":
+            return column
+        origin = sweep.world_from_lidar[:3, 3].to(column)
+        stops = torch.rand(len(column), 1, generator=generator)
+        is_drop = torch.rand(len(column), 1, generator=generator) < 0.03
+        return torch.where(is_drop, origin + stops * (column - origin), column)
+
+    scene.read_column = rained
+    verdict, detail = check_clear_air(scene)
+    assert verdict == "warn"
+    assert detail.endswith("rain, snow or spray: they are left out")
