@@ -2,11 +2,13 @@
 
 from typing import Literal
 
-from lidarpainter_models.lidar.lone_returns import WEATHER_REACH_M, is_confirmed
 from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.lone_returns import WEATHER_REACH_M, is_confirmed
 
 MOST_LONE = 0.01
 """Of the returns from where drops return; in dry air 0.002 to 0.004 stand alone at some edge."""
+NEAREST_M = 3.0
+"""Nearer returns may be of the car itself."""
 NUM_FRAMES = 8
 
 
@@ -18,10 +20,12 @@ def check_clear_air(scene: DrivingScene) -> tuple[Literal["ok", "warn"], str]:
         for sweep in scene.sweeps_of(frame_index):
             xyz_m = scene.read_column(sweep, "xyz_m")
             offset_m = xyz_m - sweep.world_from_lidar[:3, 3].to(xyz_m)
-            num_near += int((offset_m.norm(dim=1) <= WEATHER_REACH_M).sum())
-            num_lone += int((~is_confirmed(offset_m)).sum())
+            range_m = offset_m.norm(dim=1)
+            is_near = (range_m >= NEAREST_M) & (range_m <= WEATHER_REACH_M)
+            num_near += int(is_near.sum())
+            num_lone += int((is_near & ~is_confirmed(offset_m)).sum())
     share = num_lone / max(num_near, 1)
-    found = f"{share:.1%} of the returns within {WEATHER_REACH_M:g} m stand alone"
+    found = f"{share:.1%} of the returns {NEAREST_M:g} to {WEATHER_REACH_M:g} m away stand alone"
     if share > MOST_LONE:
         return "warn", f"{found}, as of rain, snow or spray: they are left out"
     return "ok", found

@@ -18,9 +18,9 @@ from lidarpainter_models.kernels.point_contrasts import NEAR_M
 from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.actor_separation import near_actors
 from lidarpainter_models.lidar.contrast_images import ContrastImage
-from lidarpainter_models.lidar.lone_returns import confirmed_returns
 from lidarpainter_models.lidar.sparse_depth import sparse_lidar_depth
 from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.lone_returns import confirmed_returns
 from lidarpainter_models.scenes.records import RecordedView
 
 WIDTH_PX = 480

@@ -27,8 +27,8 @@ from lidarpainter_models.lidar.actor_separation import (
 from lidarpainter_models.lidar.colouring import MapColouring
 from lidarpainter_models.lidar.ground_heights import GroundHeights
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
-from lidarpainter_models.lidar.lone_returns import confirmed_returns
 from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.lone_returns import confirmed_returns
 from lidarpainter_models.scenes.records import RecordedView, Sweep
 from lidarpainter_models.scenes.splits import Keyed
 from lidarpainter_models.scenes.tracks import ActorTrack

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.actor_separation import ACTOR_MARGIN_M, near_actors
-from lidarpainter_models.lidar.lone_returns import confirmed_returns
 from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.lone_returns import confirmed_returns
 from lidarpainter_models.scenes.records import RecordedView, Sweep
 from lidarpainter_models.scenes.tracks import TrackPoses
 

@@ -16,7 +16,7 @@ def test_rain_is_named_and_dry_air_is_not(tmp_path):
     scene = DrivingScene.open(record_street(drawn_street(config), tmp_path))
     verdict, detail = check_clear_air(scene)
     assert verdict == "ok"
-    assert detail.endswith("of the returns within 40 m stand alone")
+    assert detail.endswith("of the returns 3 to 40 m away stand alone")
     assert 0 < float(detail.partition("%")[0]) < 0.6
 
     whole, generator = scene.read_column, torch.Generator().manual_seed(0)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from lidarpainter_models.lidar.lone_returns import WEATHER_REACH_M, is_confirmed
+from lidarpainter_models.scenes.lone_returns import WEATHER_REACH_M, is_confirmed
 
 HEIGHT_M = 2.0
 
@@ -52,12 +52,14 @@ def test_a_pole_stays_and_a_lone_return_goes_unless_it_is_far_away():
 
 def test_a_turn_too_sparse_to_tell_keeps_all():
     directions, range_m = turn_of()
-    few = torch.randperm(len(range_m), generator=torch.Generator().manual_seed(0))[:150]
+    few = torch.randperm(len(range_m), generator=torch.Generator().manual_seed(0))[:300]
     assert is_confirmed((directions * range_m[:, None])[few]).all()
 
 
 def test_neighbours_are_found_across_the_ends_of_a_turn():
-    turn = math.pi + torch.tensor([-0.004, -0.002, 0.002, 0.004])
-    points = 10.0 * torch.stack([turn.cos(), turn.sin(), torch.zeros(4)], dim=1)
-    assert is_confirmed(points).all()
+    directions, range_m = turn_of()
+    behind = 8.0 * torch.tensor([[-1.0, -0.002, 0.4], [-1.0, 0.002, 0.4]])
+    points = torch.cat([directions * range_m[:, None], behind])
+    assert is_confirmed(points)[-2:].all()
+    assert not is_confirmed(points[:-1])[-1]
     assert is_confirmed(torch.zeros(0, 3)).shape == (0,)

@@ -24,8 +24,8 @@ CELL_RANGE = 0.03
 """As a share of the range."""
 LEAST_SHARE = 0.03
 """Of the other returns around, those that must end at about the same range; one at the least."""
-MOST_ALONE = 0.3
-"""Of the returns within reach; a turn of which more stand alone is too sparse to tell drops by."""
+LEAST_RETURNS, MOST_ALONE = 200, 0.5
+"""A turn of fewer returns, or of which a greater part stands alone, is too sparse to tell drops."""
 
 _COLUMNS, _ROWS = round(2 * math.pi / CELL_RAD), round(math.pi / CELL_RAD) + 2
 _BESIDE = (-1, 0, 1)
@@ -43,8 +43,8 @@ def confirmed_returns(
 def is_confirmed(offset_m: Float[Tensor, "points 3"]) -> Bool[Tensor, " points"]:
     """Which returns of a turn are no drops, by where they lie from the LiDAR (z up)."""
     range_m = offset_m.norm(dim=1).clamp(min=1e-3)
-    if not len(range_m):
-        return range_m > 0
+    if len(range_m) < LEAST_RETURNS:
+        return torch.ones_like(range_m, dtype=torch.bool)
     turn = torch.atan2(offset_m[:, 1], offset_m[:, 0]) + math.pi
     rise = torch.asin((offset_m[:, 2] / range_m).clamp(-1, 1)) + math.pi / 2
     direction = (turn / CELL_RAD).long() % _COLUMNS * _ROWS + (rise / CELL_RAD).long() + 1
