@@ -99,10 +99,11 @@ def with_shown_beside(
 ) -> SeenSurface:
     """The same with what painted views show and no recorded one does, as detailed as the rest.
 
-    It takes Gaussians; looks are at recorded views, as without it.
+    There a cell with any return of LiDAR shows surface. It takes Gaussians; looks are at recorded
+    views, as without it.
     """
     painted = sorted(guidance, key=lambda view: view.timestamp_ns)
-    cells = [_cells(view, None) for view in painted]
+    cells = [_cells(view, None, least_shown=0.0) for view in painted]
     if not cells or surface.num_pixels == 0:
         return surface
     points_world = torch.cat([points for points, _ in cells])
@@ -114,7 +115,7 @@ def with_shown_beside(
     for view, cell, unseen in zip(painted, cells, unseen_cells, strict=True):
         if unseen.any():
             new = _new_shares(*cell, _nearest(earlier, view.camera)) * unseen
-            num_pixels += float(new.mean()) * int(view.shows_surface.sum())
+            num_pixels += float(new.sum()) * CELL_PX**2
         earlier.append(view.camera)
     more = 1 + num_pixels / surface.num_pixels
     return replace(
@@ -148,9 +149,15 @@ def _new_shares(
 
 
 def _cells(
-    view: TrainingView | GuidanceView, street: Float[Tensor, "points 3"] | None
+    view: TrainingView | GuidanceView,
+    street: Float[Tensor, "points 3"] | None,
+    *,
+    least_shown: float = 0.5,
 ) -> tuple[Float[Tensor, "cells 3"], Float[Tensor, " cells"]]:
-    """A point for each cell of pixels that shows surface, and the footprint of a pixel there."""
+    """A point for each cell of pixels that shows surface, and the footprint of a pixel there.
+
+    Of such a cell more than `least_shown` shows surface, as a share.
+    """
     grid = {
         "width_px": max(view.camera.width_px // CELL_PX, 1),
         "height_px": max(view.camera.height_px // CELL_PX, 1),
@@ -162,7 +169,7 @@ def _cells(
     depth_m = depth_from_below(depth_m, fallback_m=FARTHEST_M)
     size = (grid["height_px"], grid["width_px"])
     shown = torch.nn.functional.adaptive_avg_pool2d(view.shows_surface.float()[None], size)[0]
-    is_solid = shown > 0.5
+    is_solid = shown > least_shown
     points_world = small.unproject(depth_m)[is_solid]
     return points_world, depth_m[is_solid] / view.camera.fx_px
 

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from lidarpainter_models.gaussians.fitting.seen_surface import (
+    CELL_PX,
     LEAST_DETAIL,
     TYPICAL_CONTRAST,
     seen_surface,
@@ -180,3 +181,14 @@ def test_painted_views_of_what_was_recorded_add_nothing_however_near_they_come(f
     more = with_shown_beside(surface, recorded, [painted_at(forward_m)])
     assert vars(more) == vars(surface)
     assert with_shown_beside(surface, recorded, []) is surface
+
+
+def test_a_cell_with_any_return_shows_surface_in_a_painted_view():
+    recorded = [view_at(0.0)]
+    surface = seen_surface(recorded)
+    dense = painted_at(0.0, yaw_rad=1.6)
+    few = torch.zeros_like(dense.lidar_depth_f16)
+    few[::CELL_PX, ::CELL_PX] = dense.lidar_depth_f16[::CELL_PX, ::CELL_PX]
+    sparse = replace(dense, lidar_depth_f16=few)
+    more = with_shown_beside(surface, recorded, [sparse])
+    assert more.num_pixels == pytest.approx(surface.num_pixels + PIXELS, rel=0.02)
