@@ -5,8 +5,9 @@ from typing import Literal
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.lone_returns import WEATHER_REACH_M, is_confirmed
 
-MOST_LONE = 0.01
-"""Of the returns from where drops return; in dry air 0.002 to 0.004 stand alone at some edge."""
+MOST_LONE = 0.025
+"""Of the returns from where drops return; in dry air 0.002 to 0.004 stand alone at some edge, and
+0.023 where a LiDAR fires once a degree."""
 NEAREST_M = 3.0
 """Nearer returns may be of the car itself."""
 NUM_FRAMES = 8
