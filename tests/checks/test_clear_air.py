@@ -27,7 +27,7 @@ def test_rain_is_named_and_dry_air_is_not(tmp_path):
             return column
         origin = sweep.world_from_lidar[:3, 3].to(column)
         stops = torch.rand(len(column), 1, generator=generator)
-        is_drop = torch.rand(len(column), 1, generator=generator) < 0.03
+        is_drop = torch.rand(len(column), 1, generator=generator) < 0.06
         return torch.where(is_drop, origin + stops * (column - origin), column)
 
     scene.read_column = rained
