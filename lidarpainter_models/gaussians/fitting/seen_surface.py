@@ -18,8 +18,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d
 
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.images import shrink_depth
@@ -75,7 +76,7 @@ def seen_surface(
     kept: list[Camera] = []
     for index in order:
         view = views[index]
-        new = _new_shares(*_cells(view, street), _nearest(kept, view.camera))
+        new = _new_shares(*_cells(view, street)[1:], _nearest(kept, view.camera))
         share = float(new.mean()) if len(new) else 0.0
         of_camera = groups.setdefault(view.key[1], [])
         if of_camera and share < LEAST_NEW:
@@ -97,41 +98,49 @@ def seen_surface(
 def with_shown_beside(
     surface: SeenSurface, views: Sequence[TrainingView], guidance: Sequence[GuidanceView]
 ) -> SeenSurface:
-    """The same with what painted views show and no recorded one does, as detailed as the rest.
+    """The same with what painted views show and no recorded one does, by their own contrast.
 
     There a cell with any return of LiDAR shows surface. It takes Gaussians; looks are at recorded
     views, as without it.
     """
     painted = sorted(guidance, key=lambda view: view.timestamp_ns)
     cells = [_cells(view, None, least_shown=0.0) for view in painted]
-    if not cells or surface.num_pixels == 0:
+    if not cells:
         return surface
-    points_world = torch.cat([points for points, _ in cells])
+    points_world = torch.cat([points for _, points, _ in cells])
     is_unseen = torch.zeros_like(points_world[:, 0], dtype=torch.bool)
     is_unseen[outside_all(points_world, [view.camera for view in views])] = True
-    unseen_cells = is_unseen.split([len(points) for points, _ in cells])
-    num_pixels = 0.0
+    unseen_cells = is_unseen.split([len(points) for _, points, _ in cells])
+    num_pixels = num_detailed = 0.0
     earlier: list[Camera] = []
-    for view, cell, unseen in zip(painted, cells, unseen_cells, strict=True):
+    for view, (is_solid, points, footprint_m), unseen in zip(
+        painted, cells, unseen_cells, strict=True
+    ):
         if unseen.any():
-            new = _new_shares(*cell, _nearest(earlier, view.camera)) * unseen
+            new = _new_shares(points, footprint_m, _nearest(earlier, view.camera)) * unseen
+            rows, columns = is_solid.shape
+            contrast = adaptive_avg_pool2d(_contrast(view)[None], (rows, columns))[0][is_solid]
             num_pixels += float(new.sum()) * CELL_PX**2
+            num_detailed += float((new * contrast).sum()) * CELL_PX**2 / TYPICAL_CONTRAST
         earlier.append(view.camera)
-    more = 1 + num_pixels / surface.num_pixels
     return replace(
         surface,
-        num_pixels=surface.num_pixels * more,
-        num_detailed=surface.num_detailed * more,
+        num_pixels=surface.num_pixels + num_pixels,
+        num_detailed=surface.num_detailed + max(num_detailed, LEAST_DETAIL * num_pixels),
     )
 
 
 def _detail(view: TrainingView) -> float:
     """Pixels of a typical street with the detail that a view shows of surface."""
-    cells = partial(torch.nn.functional.avg_pool2d, kernel_size=CONTRAST_CELL_PX)
-    grey, shown = view.rgb.mean(dim=-1)[None], view.shows_surface.float()[None]
-    contrast = (cells(grey.square()) - cells(grey).square()).clamp(min=0).sqrt()
-    detail = (contrast * cells(shown)).sum() * CONTRAST_CELL_PX**2 / TYPICAL_CONTRAST
-    return float(detail)
+    shown = avg_pool2d(view.shows_surface.float()[None], CONTRAST_CELL_PX)[0]
+    return float((_contrast(view) * shown).sum()) * CONTRAST_CELL_PX**2 / TYPICAL_CONTRAST
+
+
+def _contrast(view: TrainingView | GuidanceView) -> Float[Tensor, "rows columns"]:
+    """Standard deviation of grey in each cell of a few pixels."""
+    cells = partial(avg_pool2d, kernel_size=CONTRAST_CELL_PX)
+    grey = view.rgb.mean(dim=-1)[None]
+    return (cells(grey.square()) - cells(grey).square()).clamp(min=0).sqrt()[0]
 
 
 def _new_shares(
@@ -153,8 +162,8 @@ def _cells(
     street: Float[Tensor, "points 3"] | None,
     *,
     least_shown: float = 0.5,
-) -> tuple[Float[Tensor, "cells 3"], Float[Tensor, " cells"]]:
-    """A point for each cell of pixels that shows surface, and the footprint of a pixel there.
+) -> tuple[Bool[Tensor, "rows columns"], Float[Tensor, "cells 3"], Float[Tensor, " cells"]]:
+    """Which cells of pixels show surface, a point for each such, and a pixel's footprint there.
 
     Of such a cell more than `least_shown` shows surface, as a share.
     """
@@ -168,10 +177,10 @@ def _cells(
         depth_m = sparse_lidar_depth(street, small)
     depth_m = depth_from_below(depth_m, fallback_m=FARTHEST_M)
     size = (grid["height_px"], grid["width_px"])
-    shown = torch.nn.functional.adaptive_avg_pool2d(view.shows_surface.float()[None], size)[0]
+    shown = adaptive_avg_pool2d(view.shows_surface.float()[None], size)[0]
     is_solid = shown > least_shown
     points_world = small.unproject(depth_m)[is_solid]
-    return points_world, depth_m[is_solid] / view.camera.fx_px
+    return is_solid, points_world, depth_m[is_solid] / view.camera.fx_px
 
 
 def _nearest(cameras: Sequence[Camera], to: Camera) -> list[Camera]:

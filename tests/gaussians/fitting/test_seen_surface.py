@@ -149,8 +149,8 @@ def test_sky_is_no_surface():
     assert surface.groups == ((0,),)
 
 
-def painted_at(forward_m, frame=0, **turned):
-    view = view_at(forward_m, frame, **turned)
+def painted_at(forward_m, frame=0, *, contrast=0.0, **turned):
+    view = striped(view_at(forward_m, frame, **turned), contrast)
     return GuidanceView.of(
         view.camera,
         view.timestamp_ns,
@@ -166,12 +166,21 @@ def test_painted_views_add_what_no_recorded_image_shows_and_count_it_once():
     aside = painted_at(0.0, 0, yaw_rad=1.6)
     more = with_shown_beside(surface, recorded, [aside])
     assert more.num_pixels == pytest.approx(surface.num_pixels + PIXELS, rel=0.02)
-    assert more.num_detailed / surface.num_detailed == pytest.approx(
-        more.num_pixels / surface.num_pixels
-    )
     assert (more.whole_views, more.groups) == (surface.whole_views, surface.groups)
     twice = with_shown_beside(surface, recorded, [aside, painted_at(0.0, 1, yaw_rad=1.6)])
     assert twice.num_pixels == pytest.approx(more.num_pixels, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("contrast", "a_pixel"), [(0.0, LEAST_DETAIL), (TYPICAL_CONTRAST, 1), (3 * TYPICAL_CONTRAST, 3)]
+)
+def test_what_painted_views_show_beside_counts_by_their_own_contrast(contrast, a_pixel):
+    recorded = [striped(view_at(0.0), 2 * TYPICAL_CONTRAST)]
+    surface = seen_surface(recorded)
+    aside = painted_at(0.0, yaw_rad=1.6, contrast=contrast)
+    more = with_shown_beside(surface, recorded, [aside])
+    added = (more.num_detailed - surface.num_detailed) / (more.num_pixels - surface.num_pixels)
+    assert added == pytest.approx(a_pixel, rel=0.06)
 
 
 @pytest.mark.parametrize("forward_m", [0.0, 5.0])
