@@ -95,15 +95,18 @@ def stress_of(points: Sequence[Point], trials: Sequence[Trial], out: Path) -> di
     The points are of all trials, and of the scenes as recorded.
 
     Returns:
-        What `stress --json` prints: `points`, `pictures`, the `curves` in them, and what they say.
+        What `stress --json` prints: `points`, `pictures`, the `curves` in them, what they say, and
+        where the `table` of all curves lies.
     """
     figures = {(group.scene, group.configuration): group.trials for group in groups_of(points)}
     causes = dict.fromkeys(trial.cause for trial in trials)
     pictures, drawn, says = [], [], []
-    for quality in QUALITIES:
-        curves = [one for cause in causes for one in _curves(trials, cause, figures, quality)]
-        if not curves:
-            continue
+    by_quality = {
+        quality: [one for cause in causes for one in _curves(trials, cause, figures, quality)]
+        for quality in QUALITIES
+    }
+    by_quality = {quality: curves for quality, curves in by_quality.items() if curves}
+    for quality, curves in by_quality.items():
         for what, label, lines_of, are_gains in (
             (quality, LABELS[quality], _as_it_falls, False),
             (f"gain-{quality}", f"{LABELS[quality]}: what painting gains", _as_it_gains, True),
@@ -117,10 +120,14 @@ def stress_of(points: Sequence[Point], trials: Sequence[Trial], out: Path) -> di
             pictures += draw_lines(panels, label, out / f"stress-{what}", are_gains=are_gains)
         drawn += [_row(curve, quality) for curve in curves]
         says += _told(curves, quality)
+    table = out / "stress.md"
+    out.mkdir(parents=True, exist_ok=True)
+    table.write_text(_table(by_quality))
     return {
         "points": rows_of(points),
         "pictures": list(map(str, pictures)),
         "curves": drawn,
+        "table": str(table),
         "says": _noticed(points, trials) + says,
     }
 
@@ -221,6 +228,24 @@ def _row(curve: _Curve, quality: str) -> dict[str, Any]:
         PAINTED: [value.mean for value in curve.painted],
         UNPAINTED: [value.mean for value in curve.unpainted],
     }
+
+
+def _table(by_quality: Mapping[str, Sequence[_Curve]]) -> str:
+    """In Markdown, a row for each cause: the painted figure at the gravest level, and the gains."""
+    cells: dict[str, dict[str, str]] = {}
+    for quality, curves in by_quality.items():
+        for curve in curves:
+            column, unit = f"{curve.scene}: {LABELS[quality]}", CAUSES[curve.cause].unit
+            row = f"{curve.cause}, {' '.join(curve.levels[1:])} {unit}"
+            gains = [f"{gain.mean:+.2f}" for gain in curve.gains]
+            cells.setdefault("as recorded", {})[column] = f"{curve.painted[0].mean:.1f}, {gains[0]}"
+            if len(gains) > 1:
+                shown = f"{curve.painted[-1].mean:.1f}, {' '.join(gains[1:])}"
+                cells.setdefault(row, {})[column] = shown
+    columns = list(dict.fromkeys(column for row in cells.values() for column in row))
+    rows = [["cause, levels", *columns], ["---"] * (1 + len(columns))]
+    rows += [[name, *(row.get(column, "") for column in columns)] for name, row in cells.items()]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
 
 
 def _as_it_falls(curve: _Curve) -> list[Line]:

@@ -203,6 +203,12 @@ def test_stress_says_where_painting_hurts(tmp_path):
     assert curve["unpainted"] == pytest.approx([25, 25, 25, 25], abs=1)
     assert curve["painted"][-1] - curve["unpainted"][-1] == pytest.approx(-0.4)
     assert all(Path(path).stat().st_size > 5_000 for path in result["pictures"])
+    lines = Path(result["table"]).read_text().splitlines()
+    head, _, as_recorded, beams = ([cell.strip() for cell in line.split("|")] for line in lines)
+    column = head.index(f"{scene}: PSNR of held-out views, dB")
+    assert (as_recorded[1], as_recorded[column]) == ("as recorded", "27.0, +2.00")
+    assert beams[1] == "beams, 32 16 8 beams"
+    assert beams[column] == "24.6, +1.50 +0.80 -0.40"
 
 
 def test_levels_at_which_painting_seems_to_hurt_are_given_more_seeds():
