@@ -26,6 +26,10 @@ LEAST_SHARE = 0.03
 """Of the other returns around, those that must end at about the same range; one at the least."""
 LEAST_RETURNS, MOST_ALONE = 200, 0.5
 """A turn of fewer returns, or of which a greater part stands alone, is too sparse to tell drops."""
+LEAST_ALONE = 0.01
+"""In a turn of which less stands alone the air is clear, and all of it is real: 0.2 to 0.5 % of
+four recordings in clear air, 2.2 to 2.4 % of three with 2 % of their returns made drops. Left out
+they cost PandaSet 1.1 dB on the road ahead of its frames (three seeds)."""
 
 _COLUMNS, _ROWS = round(2 * math.pi / CELL_RAD), round(math.pi / CELL_RAD) + 2
 _BESIDE = (-1, 0, 1)
@@ -36,7 +40,11 @@ def confirmed_returns(
 ) -> tuple[Float[Tensor, "points 3"], Int[Tensor, " points"]]:
     """What a sweep met, in the world, and when; without drops."""
     xyz_m = scene.read_column(sweep, "xyz_m")
-    kept = is_confirmed(xyz_m - sweep.world_from_lidar[:3, 3].to(xyz_m))
+    offset_m = xyz_m - sweep.world_from_lidar[:3, 3].to(xyz_m)
+    kept = is_confirmed(offset_m)
+    is_near = offset_m.norm(dim=1) <= WEATHER_REACH_M
+    if (~kept).sum() < LEAST_ALONE * is_near.sum():
+        kept = torch.ones_like(kept)
     return xyz_m[kept], scene.measured_ns(sweep)[kept]
 
 
