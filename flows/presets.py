@@ -39,7 +39,7 @@ def preview(scene: str) -> ReconstructParameters:
 
 
 def brief(scene: str) -> ReconstructParameters:
-    """Half the steps of `preview` and two thirds of its Gaussians: what the demo shows."""
+    """Half the steps of `preview` and an eighth fewer Gaussians: what the demo shows."""
     fit = FitConfig(effort=EffortConfig(looks=150.0, gaussians_per_pixel=0.2))
     refine = continuation(fit, looks=SHORT_REFINE_LOOKS / 2, guidance=GuidanceConfig())
     return preview(scene).model_copy(update={"preset": "brief", "fit": fit, "refine": refine})

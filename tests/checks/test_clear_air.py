@@ -1,5 +1,6 @@
 """Rain before a LiDAR is named, dry air is not."""
 
+import pytest
 import torch
 from drawn_streets import drawn_street
 
@@ -9,7 +10,8 @@ from lidarpainter_models.synthetic import SyntheticStreetConfig, record_street
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
 
 
-def test_rain_is_named_and_dry_air_is_not(tmp_path):
+@pytest.mark.parametrize("share", [0.02, 0.06])
+def test_rain_is_named_and_dry_air_is_not(tmp_path, share):
     config = SyntheticStreetConfig(
         seed=7, num_frames=3, width_px=64, height_px=36, cameras=DEFAULT_CAMERAS[:1]
     )
@@ -27,10 +29,10 @@ def test_rain_is_named_and_dry_air_is_not(tmp_path):
             return column
         origin = sweep.world_from_lidar[:3, 3].to(column)
         stops = torch.rand(len(column), 1, generator=generator)
-        is_drop = torch.rand(len(column), 1, generator=generator) < 0.06
+        is_drop = torch.rand(len(column), 1, generator=generator) < share
         return torch.where(is_drop, origin + stops * (column - origin), column)
 
     scene.read_column = rained
     verdict, detail = check_clear_air(scene)
     assert verdict == "warn"
-    assert detail.endswith("rain, snow or spray: they are left out")
+    assert detail.endswith("beams a degree apart: they are left out")

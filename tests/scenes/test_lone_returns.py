@@ -5,7 +5,11 @@ import math
 import pytest
 import torch
 
-from lidarpainter_models.scenes.lone_returns import WEATHER_REACH_M, is_confirmed
+from lidarpainter_models.scenes.lone_returns import (
+    WEATHER_REACH_M,
+    is_confirmed,
+    stands_alone,
+)
 
 HEIGHT_M = 2.0
 
@@ -28,7 +32,7 @@ def test_drops_go_and_the_street_stays(share):
     stop_m = 12.0 * torch.rand(len(range_m), generator=generator)
     is_drop = torch.rand(len(range_m), generator=generator) < share
     is_drop &= stop_m < 0.9 * range_m
-    kept = is_confirmed(directions * torch.where(is_drop, stop_m, range_m)[:, None])
+    kept = ~stands_alone(directions * torch.where(is_drop, stop_m, range_m)[:, None])
     assert kept[~is_drop].float().mean() > 0.995
     assert kept[is_drop].float().mean() < 0.07
 
@@ -36,7 +40,7 @@ def test_drops_go_and_the_street_stays(share):
 @pytest.mark.parametrize(("beams", "columns"), [(1, 900), (4, 900), (64, 300)])
 def test_few_beams_confirm_each_other(beams, columns):
     directions, range_m = turn_of(beams, columns)
-    assert is_confirmed(directions * range_m[:, None]).float().mean() > 0.97
+    assert stands_alone(directions * range_m[:, None]).float().mean() < 0.03
 
 
 def test_a_pole_stays_and_a_lone_return_goes_unless_it_is_far_away():
@@ -44,10 +48,10 @@ def test_a_pole_stays_and_a_lone_return_goes_unless_it_is_far_away():
     is_pole = (directions[:, 1] / directions[:, 0]).abs().lt(0.004) & (directions[:, 0] > 0)
     pole_m = 8.0 / directions[:, 0].clamp(min=0.1)
     offset_m = directions * torch.where(is_pole, torch.minimum(pole_m, range_m), range_m)[:, None]
-    assert is_confirmed(offset_m)[is_pole].all()
+    assert not stands_alone(offset_m)[is_pole].any()
     sky = torch.tensor([[5.0, 0.0, 8.0], [0.0, 30.0, 40.0]])
     assert float(sky[1].norm()) > WEATHER_REACH_M
-    assert is_confirmed(torch.cat([offset_m, sky]))[-2:].tolist() == [False, True]
+    assert stands_alone(torch.cat([offset_m, sky]))[-2:].tolist() == [True, False]
 
 
 def test_a_turn_too_sparse_to_tell_keeps_all():
@@ -60,6 +64,16 @@ def test_neighbours_are_found_across_the_ends_of_a_turn():
     directions, range_m = turn_of()
     behind = 8.0 * torch.tensor([[-1.0, -0.002, 0.4], [-1.0, 0.002, 0.4]])
     points = torch.cat([directions * range_m[:, None], behind])
-    assert is_confirmed(points)[-2:].all()
-    assert not is_confirmed(points[:-1])[-1]
-    assert is_confirmed(torch.zeros(0, 3)).shape == (0,)
+    assert not stands_alone(points)[-2:].any()
+    assert stands_alone(points[:-1])[-1]
+    assert stands_alone(torch.zeros(0, 3)).shape == (0,)
+
+
+@pytest.mark.parametrize(("share", "kept_share"), [(0.002, 1.0), (0.05, 0.95)])
+def test_as_few_lone_returns_as_in_clear_air_stay(share, kept_share):
+    directions, range_m = turn_of()
+    chance, stop = torch.rand(2, len(range_m), generator=torch.Generator().manual_seed(0))
+    is_drop = chance < share
+    kept = is_confirmed(directions * torch.where(is_drop, 0.9 * stop * range_m, range_m)[:, None])
+    assert kept.float().mean() == pytest.approx(kept_share, abs=0.01)
+    assert kept.all() == (kept_share == 1)

@@ -60,9 +60,9 @@ class EffortConfig:
     looks: float = 300.0
     """Steps for every view's worth of new surface. More of them sharpen the recorded views and cost
     the neighbouring lanes (docs/benchmarks.md)."""
-    gaussians_per_pixel: float = 0.3
-    """Most Gaussians for a pixel of surface with the detail of a typical street (`SeenSurface`): at
-    the knee of their curve for one camera, a little beyond it for six (docs/measuring.md)."""
+    gaussians_per_pixel: float = 0.23
+    """Most Gaussians for a pixel of surface with the detail of a typical street (`SeenSurface`):
+    more sharpen one camera by a little, and six cameras not at all (docs/measuring.md)."""
 
     def __post_init__(self) -> None:
         """Refuse an effort that comes to nothing."""
