@@ -5,13 +5,15 @@ from typing import Literal
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.lone_returns import WEATHER_REACH_M, is_confirmed, stands_alone
 
+MOST_LEFT_OUT = 0.001
+"""Of the returns from where drops return; single turns that are sparse may look like rain."""
 NEAREST_M = 3.0
 """Nearer returns may be of the car itself."""
 NUM_FRAMES = 8
 
 
 def check_clear_air(scene: DrivingScene) -> tuple[Literal["ok", "warn"], str]:
-    """Whether a fit keeps all returns, or leaves out those that stand alone."""
+    """Whether a fit keeps the returns, or leaves out many that stand alone."""
     step = len(scene.frame_indices) // NUM_FRAMES | 1  # odd, as every other frame may be unlike
     num_near = num_lone = num_left_out = 0
     for frame_index in scene.frame_indices[::step]:
@@ -24,8 +26,8 @@ def check_clear_air(scene: DrivingScene) -> tuple[Literal["ok", "warn"], str]:
             num_lone += int((is_near & stands_alone(offset_m)).sum())
             num_left_out += int((is_near & ~is_confirmed(offset_m)).sum())
     reach = f"of the returns {NEAREST_M:g} to {WEATHER_REACH_M:g} m away"
-    if num_left_out:
-        share = num_left_out / num_near
+    share = num_left_out / max(num_near, 1)
+    if share > MOST_LEFT_OUT:
         cause = "rain, snow, spray or beams a degree apart"
         return "warn", f"{share:.1%} {reach} stand alone, as of {cause}: they are left out"
     return "ok", f"{num_lone / max(num_near, 1):.1%} {reach} stand alone"

@@ -10,8 +10,8 @@ from lidarpainter_models.synthetic import SyntheticStreetConfig, record_street
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
 
 
-@pytest.mark.parametrize("share", [0.02, 0.06])
-def test_rain_is_named_and_dry_air_is_not(tmp_path, share):
+@pytest.mark.parametrize(("share", "is_rain"), [(0.003, False), (0.02, True), (0.06, True)])
+def test_rain_is_named_and_dry_air_is_not(tmp_path, share, is_rain):
     config = SyntheticStreetConfig(
         seed=7, num_frames=3, width_px=64, height_px=36, cameras=DEFAULT_CAMERAS[:1]
     )
@@ -34,5 +34,5 @@ def test_rain_is_named_and_dry_air_is_not(tmp_path, share):
 
     scene.read_column = rained
     verdict, detail = check_clear_air(scene)
-    assert verdict == "warn"
-    assert detail.endswith("beams a degree apart: they are left out")
+    assert verdict == ("warn" if is_rain else "ok")
+    assert detail.endswith("they are left out") == is_rain
