@@ -5,8 +5,8 @@ from typing import Literal
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.lone_returns import WEATHER_REACH_M, is_confirmed, stands_alone
 
-MOST_LEFT_OUT = 0.001
-"""Of the returns from where drops return; single turns that are sparse may look like rain."""
+MOST_LEFT_OUT = 0.025
+"""Of the returns from where drops return; in dry air 0.023 where a LiDAR fires once a degree."""
 NEAREST_M = 3.0
 """Nearer returns may be of the car itself."""
 NUM_FRAMES = 8
@@ -26,8 +26,7 @@ def check_clear_air(scene: DrivingScene) -> tuple[Literal["ok", "warn"], str]:
             num_lone += int((is_near & stands_alone(offset_m)).sum())
             num_left_out += int((is_near & ~is_confirmed(offset_m)).sum())
     reach = f"of the returns {NEAREST_M:g} to {WEATHER_REACH_M:g} m away"
-    share = num_left_out / max(num_near, 1)
-    if share > MOST_LEFT_OUT:
-        cause = "rain, snow, spray or beams a degree apart"
-        return "warn", f"{share:.1%} {reach} stand alone, as of {cause}: they are left out"
-    return "ok", f"{num_lone / max(num_near, 1):.1%} {reach} stand alone"
+    found = f"{num_lone / max(num_near, 1):.1%} {reach} stand alone"
+    if num_left_out > MOST_LEFT_OUT * num_near:
+        return "warn", f"{found}, as of rain, snow or spray: they are left out"
+    return "ok", f"{found}: they are left out where they are many" if num_left_out else found

@@ -129,9 +129,9 @@ import sys, time
 from flows import interruption
 interruption.LATE_S = 0.3
 interruption.watch()
-with interruption.at_interruption(lambda: time.sleep(60)):
+with interruption.at_interruption(lambda: time.sleep(3600)):
     sys.stderr.write("begun")
-    time.sleep(60)
+    time.sleep(3600)  # longer than a machine that is held up may take to send the signal
 """
 
 

@@ -9,6 +9,7 @@ from functools import cached_property
 import cv2
 
 from flows.cli.main import main
+from flows.cli.output import set_loudness
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,10 @@ def call(*words, store=None):
     out, err = io.StringIO(), io.StringIO()
     place = [] if store is None else ["--store", str(store.root)]
     with redirect_stdout(out), redirect_stderr(err):
-        code = main([*place, *map(str, words)])
+        try:
+            code = main([*place, *map(str, words)])
+        finally:
+            set_loudness("usual")  # of the process, and other tests run in it
     return Answer(code, out.getvalue(), err.getvalue())
 
 
