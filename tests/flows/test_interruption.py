@@ -130,8 +130,8 @@ from flows import interruption
 interruption.LATE_S = 0.3
 interruption.watch()
 with interruption.at_interruption(lambda: time.sleep(3600)):
-    sys.stderr.write("begun")
-    time.sleep(3600)  # longer than a machine that is held up may take to send the signal
+    print("begun", file=sys.stderr, flush=True)
+    time.sleep(3600)
 """
 
 
