@@ -5,6 +5,7 @@ tables are in memory, images and points are read when asked for.
 """
 
 from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from torch import Tensor
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.geometry.driven_paths import DrivenPath
+from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.scenes.records import (
     Distortion,
     ImageRecord,
@@ -134,7 +136,7 @@ class DrivingScene:
         camera, distortion = self._lenses[view.index]
         return ImageRecord(
             camera_name=view.camera_name,
-            timestamp_ns=view.timestamp_ns,
+            timestamp_ns=self._stated_ns[view.index],
             camera=camera,
             distortion=distortion,
             rolling_shutter=self._shutters[view.index],
@@ -209,15 +211,18 @@ class DrivingScene:
             for row, pose, shutter in zip(rows, poses, shutters, strict=True)
         ]
         self._shutters = [_shutter(row) for row in rows]
+        self._stated_ns = [row["timestamp_ns"] for row in rows]
         self.views: tuple[RecordedView, ...] = tuple(
             RecordedView(
                 frame_index=row["frame_index"],
                 camera_name=row["camera"],
-                timestamp_ns=row["timestamp_ns"],
-                camera=pinhole_of(*self._lenses[index]),
+                timestamp_ns=stated_ns + (round(1e9 * shutter.middle_s) if shutter else 0),
+                camera=pinhole_of(_at_middle_row(lens, shutter), distortion),
                 index=index,
             )
-            for index, row in enumerate(rows)
+            for index, (row, stated_ns, (lens, distortion), shutter) in enumerate(
+                zip(rows, self._stated_ns, self._lenses, self._shutters, strict=True)
+            )
         )
         sweeps = self._stored.table("sweeps")
         poses = _poses(sweeps, "world_from_lidar")
@@ -260,8 +265,19 @@ def _lens(row: dict[str, Any], world_from_camera: Float[Tensor, "4 4"], shutter:
 def _shutter(row: dict[str, Any]) -> RollingShutter | None:
     if row["rolling_shutter_s"] is None:
         return None
-    direction = row["rolling_shutter_direction"]
-    return RollingShutter(duration_s=row["rolling_shutter_s"], direction=direction)
+    return RollingShutter(
+        duration_s=row["rolling_shutter_s"],
+        direction=row["rolling_shutter_direction"],
+        first_row_s=row["rolling_shutter_first_row_s"],
+    )
+
+
+def _at_middle_row(lens: Camera, stored: RollingShutter | None) -> Camera:
+    """The camera where it was when the middle row of its image was read."""
+    if stored is None or stored.middle_s == 0 or lens.shutter is None:
+        return lens
+    moved = rigid_from_tangent(stored.middle_s * lens.shutter.twist_per_s)
+    return replace(lens, world_from_camera=lens.world_from_camera @ moved)
 
 
 def driven_road(scene: DrivingScene) -> DrivenPath:

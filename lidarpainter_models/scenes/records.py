@@ -47,8 +47,16 @@ class RollingShutter:
     """How a sensor reads its rows."""
 
     duration_s: float
-    """From the first to the last row."""
+    """From the first row read to the last."""
     direction: Literal["down", "up", "left", "right"]
+    first_row_s: float | None = None
+    """When the first row is read, after the image's timestamp; None where the timestamp is that of
+    the middle row."""
+
+    @property
+    def middle_s(self) -> float:
+        """When the middle row is read, after the image's timestamp."""
+        return 0.0 if self.first_row_s is None else self.first_row_s + self.duration_s / 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,7 +66,7 @@ class ImageRecord:
     camera_name: str
     timestamp_ns: int
     camera: Camera
-    """At exposure, on the grid of the stored image (distortion not yet undone)."""
+    """At the timestamp, on the grid of the stored image (distortion not yet undone)."""
     distortion: Distortion = field(default_factory=Distortion)
     rolling_shutter: RollingShutter | None = None
 
@@ -84,8 +92,9 @@ class RecordedView:
     frame_index: int
     camera_name: str
     timestamp_ns: int
+    """When the middle row was read."""
     camera: Camera
-    """At exposure and full size; where the lens is distorted, that of the undistorted image."""
+    """At that time and full size; where the lens is distorted, that of the undistorted image."""
     index: int
     """Row in the table of images."""
 

@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-SCHEMA_VERSION = 1
-"""Raised when a reader of the last version could misread the new one."""
+SCHEMA_VERSION = 2
+"""Raised when a reader of the last version could misread the new one; 2 brought
+`rolling_shutter_first_row_s`."""
+READABLE_VERSIONS = (1, 2)
 MANIFEST_NAME = "manifest.json"
 ARRAYS_NAME = "scene.zarr"
 GLOBAL_FRAME = "global_frame"
@@ -38,6 +40,8 @@ class Column:
     description: str
     is_optional: bool = False
     """Whether a row may leave it empty."""
+    since: int = 1
+    """The first schema version that has it; tables of an older one read as if it were empty."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +68,8 @@ FRAMES = (
 CAMERAS = (
     _FRAME_INDEX,
     Column("camera", pa.string(), "", "name of the camera"),
-    Column("timestamp_ns", pa.int64(), "ns", f"middle of the exposure, {_TIMESTAMP}"),
-    Column("world_from_camera", POSE_TYPE, "m", "at exposure; x right, y down, z forward"),
+    Column("timestamp_ns", pa.int64(), "ns", f"when the pose holds, {_TIMESTAMP}"),
+    Column("world_from_camera", POSE_TYPE, "m", "at the timestamp; x right, y down, z forward"),
     Column("fx_px", pa.float64(), "px", "focal length along x"),
     Column("fy_px", pa.float64(), "px", "focal length along y"),
     Column("cx_px", pa.float64(), "px", "principal point; the first pixel's centre is 0.5"),
@@ -76,6 +80,14 @@ CAMERAS = (
     Column("height_px", pa.int64(), "px", "height of the stored image"),
     Column("rolling_shutter_s", pa.float64(), "s", "first to last row read", is_optional=True),
     Column("rolling_shutter_direction", pa.string(), "", "down, up, left, right", is_optional=True),
+    Column(
+        "rolling_shutter_first_row_s",
+        pa.float64(),
+        "s",
+        "first row read this long after the timestamp; empty: the middle row is read then",
+        is_optional=True,
+        since=2,
+    ),
     Column("offset", pa.int64(), "byte", "start of the JPEG in image_bytes"),
     Column("num_bytes", pa.int64(), "byte", "length of the JPEG"),
 )
@@ -143,7 +155,7 @@ ARRAYS: dict[str, ArrayLayout] = {
 POINT_ARRAYS = tuple(name for name in ARRAYS if name.startswith("point_"))
 
 
-def arrow_schema(table: str) -> pa.Schema:
+def arrow_schema(table: str, version: int = SCHEMA_VERSION) -> pa.Schema:
     """The Arrow schema of a table, with units and descriptions as field metadata."""
     return pa.schema(
         [
@@ -154,8 +166,17 @@ def arrow_schema(table: str) -> pa.Schema:
                 metadata={"unit": column.unit, "description": column.description},
             )
             for column in TABLES[table]
+            if column.since <= version
         ]
     )
+
+
+def as_current(table: pa.Table, name: str) -> pa.Table:
+    """A table of any readable version with all of today's columns, empty where it had none."""
+    for place, column in enumerate(arrow_schema(name)):
+        if column.name not in table.schema.names:
+            table = table.add_column(place, column, pa.nulls(len(table), column.type))
+    return table
 
 
 def zarr_metadata(layout: ArrayLayout, num_rows: int) -> dict[str, Any]:

@@ -59,10 +59,10 @@ def read_manifest(path: Path, *, is_all_here: bool = True) -> dict[str, Any]:
         raise SceneError(f"{file}: cannot be read ({shown(str(error))})") from None
     if not isinstance(manifest, dict) or manifest.get("is_complete") is not True:
         raise SceneError(f"{path}: the scene is not complete; ingest it again")
-    if manifest.get("schema_version") != schema.SCHEMA_VERSION:
+    if manifest.get("schema_version") not in schema.READABLE_VERSIONS:
         raise SceneError(
             f"{path}: the scene has schema version {manifest.get('schema_version')}, "
-            f"expected {schema.SCHEMA_VERSION}; ingest it again"
+            f"expected {schema.SCHEMA_VERSION} or an older one; ingest it again"
         )
     for name, kind in _ENTRIES.items():
         if not isinstance(manifest.get(name), kind):
@@ -94,14 +94,18 @@ class StoredScene:
         self._arrays: dict[str, zarr.Array] = {}
 
     def table(self, name: str) -> pa.Table:
-        """One of the tables of the schema, whole; its columns are checked."""
+        """One of the tables of the schema, whole, with the columns of today's schema."""
+        return schema.as_current(self._stored_table(name), name)
+
+    def _stored_table(self, name: str) -> pa.Table:
+        """A table as it was written; its columns are those of the version that wrote it."""
         file = self.path / f"{name}.parquet"
         self._fetch([file.name])
         try:
             table = pq.read_table(file)
         except (OSError, pa.ArrowException) as error:
             raise SceneError(f"{file}: cannot be read ({shown(str(error))})") from None
-        expected = schema.arrow_schema(name)
+        expected = schema.arrow_schema(name, self.manifest["schema_version"])
         if not table.schema.equals(expected):
             raise SceneError(
                 f"{file}: columns {', '.join(table.schema.names)}, "
@@ -160,7 +164,7 @@ class StoredScene:
             SceneError: a table or array is not what was written.
         """
         for name, entry in self.manifest["tables"].items():
-            if content_digest(self.table(name).to_pylist()) != entry["sha256"]:
+            if content_digest(self._stored_table(name).to_pylist()) != entry["sha256"]:
                 raise SceneError(f"{self.path}: table {name} is not what was written")
         for name, entry in self.manifest["arrays"].items():
             digest = hashlib.sha256()

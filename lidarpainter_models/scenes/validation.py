@@ -140,6 +140,11 @@ def require_shutter(shutter: RollingShutter | None, where: str) -> None:
             f"{shutter.duration_s} s, expected {', '.join(SHUTTER_DIRECTIONS)} and at most "
             f"{MAX_SHUTTER_S} s"
         )
+    if not abs(shutter.middle_s) <= MAX_SHUTTER_S:
+        raise DataError(
+            f"{where}: the first row is read {shutter.first_row_s} s after the timestamp, expected "
+            f"at most {MAX_SHUTTER_S} s before or after"
+        )
 
 
 def require_points(xyz_m: np.ndarray, where: str) -> None:

@@ -177,6 +177,7 @@ class SceneWriter:
                 "height_px": camera.height_px,
                 "rolling_shutter_s": shutter.duration_s if shutter else None,
                 "rolling_shutter_direction": shutter.direction if shutter else None,
+                "rolling_shutter_first_row_s": shutter.first_row_s if shutter else None,
                 "offset": offset,
                 "num_bytes": len(jpeg),
             }

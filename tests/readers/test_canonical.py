@@ -86,17 +86,30 @@ def test_lens_and_shutter_survive(foreign, tmp_path):
         "distortion_terms": [-0.1, 0.01, 0.001, 0.0, 0.0],
         "rolling_shutter_s": 0.03,
         "rolling_shutter_direction": "left",
+        "rolling_shutter_first_row_s": -0.02,
     }
     rewrite_table(foreign, "cameras", lambda found: changed_rows(found, **lens))
     row = pq.read_table(ingested(foreign, tmp_path / "s") / "cameras.parquet").to_pylist()[1]
     assert {key: row[key] for key in lens} == lens
 
 
+def test_a_scene_of_the_first_version_still_opens_and_comes_in(foreign, tmp_path):
+    rewrite_table(foreign, "cameras", lambda table: table.drop(["rolling_shutter_first_row_s"]))
+    edit_manifest(foreign, lambda manifest: manifest.update(schema_version=1))
+    old = DrivingScene.open(foreign)
+    old.verify_content()
+    new = DrivingScene.open(ingested(foreign, tmp_path / "store"))
+    assert new.manifest["schema_version"] == schema.SCHEMA_VERSION
+    for before, after in zip(old.views, new.views, strict=True):
+        assert before.timestamp_ns == after.timestamp_ns
+        assert before.camera.centre_world.tolist() == after.camera.centre_world.tolist()
+
+
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
         (lambda m: m.update(is_complete=False), "is_complete is not true"),
-        (lambda m: m.update(schema_version=2), "schema_version is 2, expected 1"),
+        (lambda m: m.update(schema_version=3), "schema_version is 3, expected 2"),
         (lambda m: m.update(sequence="../x"), "name '../x' cannot be used"),
         (lambda m: m.update(dataset="x" * 129), "cannot be used: expected at most 128"),
         (lambda m: m.update(camera_names=["a/b"]), "name 'a/b' cannot be used"),
@@ -201,7 +214,7 @@ def changed_rows(table, **columns):
         ("cameras", {"num_bytes": 2**40}, "cameras.parquet: 19791209299968 num_bytes in all"),
         ("cameras", {"num_bytes": -1}, "an image of -1 bytes"),
         ("cameras", {"distortion_model": "magic"}, "'magic' is not known"),
-        ("cameras", {"rolling_shutter_s": 1.0}, "reads in no known direction"),
+        ("cameras", {"rolling_shutter_direction": None}, "reads in no known direction"),
         ("sweeps", {"num_points": -1}, "a sweep of -1 points"),
         ("sweeps", {"lidar": "../x"}, "cannot be used"),
         ("boxes", {"actor_id": "../x"}, "cannot be used"),

@@ -35,12 +35,22 @@ def test_cameras_look_where_they_are_mounted(small_scene):
     assert torch.allclose(forward["back"], torch.tensor([-1.0, 0, 0]).double(), atol=1e-9)
 
 
-def test_camera_stands_where_it_was_at_exposure(small_scene):
+def test_camera_is_stored_where_the_log_says(small_scene):
     view = small_scene.view(2, "front_camera")
+    stated = small_scene.image_record(view)
     expected = torch.tensor([2.0 - 0.5, 0.0, 1.8]).double()
-    assert torch.allclose(view.camera.centre_world, expected, atol=1e-5)
-    assert abs(view.timestamp_ns - int(small_scene.frame_timestamps_ns[2]) + 50_000_000) < 1000
+    assert torch.allclose(stated.camera.centre_world, expected, atol=1e-5)
+    assert abs(stated.timestamp_ns - int(small_scene.frame_timestamps_ns[2]) + 50_000_000) < 1000
     assert (view.camera.width_px, view.camera.height_px) == (64, 48)
+
+
+def test_rows_are_read_from_30_ms_before_the_stated_time_to_10_ms_after(small_scene):
+    view = small_scene.view(1, "front_camera")
+    stated = small_scene.image_record(view)
+    assert view.timestamp_ns == stated.timestamp_ns - 10_000_000
+    assert view.camera.shutter.across_s == (0.0, 0.04)
+    moved = view.camera.centre_world - stated.camera.centre_world
+    assert moved.tolist() == pytest.approx([-0.1, 0.0, 0.0], abs=1e-4)  # at 10 m/s
 
 
 def test_image_comes_back_as_the_bytes_of_the_log(small_scene, sound_pandaset):
@@ -79,7 +89,7 @@ def test_box_holds_when_its_lidar_saw_the_actor(small_scene):
     track = next(track for track in small_scene.tracks if track.is_moving)
     for view in small_scene.views_of("front_camera")[1:]:
         pose = track.pose_at(view.timestamp_ns)
-        along_m = 12.0 + 8.0 * (0.1 * view.frame_index - 0.05)
+        along_m = 12.0 + 8.0 * (0.1 * view.frame_index - 0.06)
         assert float(pose[0, 3]) == pytest.approx(along_m, abs=1e-4)
 
 

@@ -108,7 +108,7 @@ def test_changed_table_is_noticed_by_the_digest(copied_scene):
     ("change", "message"),
     [
         ({"is_complete": False}, "not complete"),
-        ({"schema_version": 99}, "schema version 99, expected 1"),
+        ({"schema_version": 99}, "schema version 99, expected 2"),
     ],
 )
 def test_unfinished_or_foreign_manifest_is_refused(copied_scene, change, message):

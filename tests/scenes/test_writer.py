@@ -1,6 +1,7 @@
 """What is written comes back, whole, from one writer at a time."""
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from scene_parts import (
     some_record,
 )
 
+from lidarpainter_models.errors import DataError
 from lidarpainter_models.scenes import array_writer, schema
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import Distortion, RollingShutter, SweepPoints
@@ -89,6 +91,45 @@ def test_two_writers_at_once_do_not_meet(tmp_path):
             add_frame(quick, num_points=30)
         assert DrivingScene.open(quick.path).sweeps[0].num_points == 30
     assert DrivingScene.open(slow.path).sweeps[0].num_points == 20
+
+
+def _driving_at_10_mps(store, rolling_shutter):
+    """Three images 100 ms apart of a camera that drives 1 m along its z from each to the next."""
+    with SceneWriter(store, "rig", "a", HEADER) as writer:
+        for frame in range(3):
+            pose = IDENTITY.clone()
+            pose[2, 3] = frame
+            camera = replace(some_record().camera, world_from_camera=pose)
+            time_ns = 100_000_000 * frame
+            writer.add_frame(frame, timestamp_ns=time_ns, world_from_ego=IDENTITY)
+            record = {"timestamp_ns": time_ns, "camera": camera, "rolling_shutter": rolling_shutter}
+            writer.add_image(some_record(**record), some_jpeg())
+    return DrivingScene.open(writer.path)
+
+
+def test_a_view_has_the_time_and_place_of_its_middle_row(tmp_path):
+    told = RollingShutter(duration_s=0.04, direction="down", first_row_s=-0.03)
+    scene = _driving_at_10_mps(tmp_path, told)
+    view = scene.views[1]
+    assert view.timestamp_ns == 90_000_000
+    assert view.camera.centre_world.tolist() == pytest.approx([0.0, 0.0, 0.9])
+    assert view.camera.shutter.across_s == (0.0, 0.04)
+    stated = scene.image_record(view)
+    assert (stated.timestamp_ns, stated.rolling_shutter) == (100_000_000, told)
+    assert stated.camera.centre_world.tolist() == [0.0, 0.0, 1.0]
+
+
+def test_a_readout_of_which_no_first_row_is_told_is_centred(tmp_path):
+    view = _driving_at_10_mps(tmp_path, RollingShutter(duration_s=0.04, direction="up")).views[1]
+    assert view.timestamp_ns == 100_000_000
+    assert view.camera.centre_world.tolist() == [0.0, 0.0, 1.0]
+    assert view.camera.shutter.across_s == (0.0, -0.04)
+
+
+def test_a_first_row_read_at_no_possible_time_is_refused(tmp_path):
+    late = RollingShutter(duration_s=0.04, direction="down", first_row_s=11.0)
+    with pytest.raises(DataError, match="first row is read 11"):
+        _driving_at_10_mps(tmp_path, late)
 
 
 @pytest.mark.parametrize(

@@ -55,8 +55,8 @@ def _compare_views(found, truth, read, true_frame, read_frame, camera_names):
     for view in views:
         true_view = expected[camera_names.get(view.camera_name, view.camera_name)]
         apart_m, apart_deg = _poses_apart(
-            truth.global_from_world @ true_view.camera.world_from_camera,
-            read.global_from_world @ view.camera.world_from_camera,
+            truth.global_from_world @ truth.image_record(true_view).camera.world_from_camera,
+            read.global_from_world @ read.image_record(view).camera.world_from_camera,
         )
         found.camera_centre_m = max(found.camera_centre_m, apart_m)
         found.camera_rotation_deg = max(found.camera_rotation_deg, apart_deg)

@@ -45,10 +45,11 @@ def read_foreign_manifest(folder: Path) -> dict[str, Any]:
     manifest = read_small_json(file, MAX_MANIFEST_BYTES)
     if manifest.get("is_complete") is not True:
         raise DataError(f"{file}: is_complete is not true: the scene was not written to its end")
-    if manifest.get("schema_version") != schema.SCHEMA_VERSION:
+    version = manifest.get("schema_version")
+    if not isinstance(version, int) or version not in schema.READABLE_VERSIONS:
         raise DataError(
-            f"{file}: schema_version is {manifest.get('schema_version')!r:.40}, "
-            f"expected {schema.SCHEMA_VERSION}"
+            f"{file}: schema_version is {version!r:.40}, expected {schema.SCHEMA_VERSION} or an "
+            "older one"
         )
     _require_texts(manifest, str(file))
     pose = manifest.get("global_from_world")
@@ -57,7 +58,7 @@ def read_foreign_manifest(folder: Path) -> dict[str, Any]:
     _require_files(manifest.get("files"), folder)
     _require_entries(manifest, str(file))
     for name in schema.TABLES:
-        _require_table(folder / f"{name}.parquet")
+        _require_table(folder / f"{name}.parquet", version)
     _require_group(folder / schema.ARRAYS_NAME)
     for name, entry in manifest["arrays"].items():
         _require_array(folder / schema.ARRAYS_NAME / name, schema.ARRAYS[name], entry["shape"][0])
@@ -150,15 +151,16 @@ def _stated_rows(name: str, entry: dict[str, Any], where: str) -> int:
     return shape[0]
 
 
-def _require_table(file: Path) -> None:
+def _require_table(file: Path, version: int) -> None:
     """Types, rows and sizes as footer and pages say before any is unpacked, then the rest."""
     name = file.stem
     try:
         _require_footer(pq.read_metadata(file), file)
-        if not pq.read_schema(file).equals(schema.arrow_schema(name)):
+        columns = [column for column in schema.TABLES[name] if column.since <= version]
+        if not pq.read_schema(file).equals(schema.arrow_schema(name, version)):
             raise DataError(f"{file}: the columns or their types are not those of the format")
         # as a dictionary, a text that all rows repeat is unpacked once
-        texts = [column.name for column in schema.TABLES[name] if column.type == pa.string()]
+        texts = [column.name for column in columns if column.type == pa.string()]
         table = pq.read_table(file, read_dictionary=texts)
         table.validate(full=True)
     except (OSError, ValueError, IndexError, MemoryError, pa.ArrowException) as error:
@@ -168,7 +170,7 @@ def _require_table(file: Path) -> None:
     for text in texts:
         if _text_bytes(table[text]) > MAX_TEXT_BYTES:
             raise DataError(f"{file}: column {text} has more than {MAX_TEXT_BYTES} bytes of texts")
-    for column in schema.TABLES[name]:
+    for column in columns:
         if not column.is_optional and table[column.name].null_count:
             raise DataError(f"{file}: column {column.name} has empty cells")
 

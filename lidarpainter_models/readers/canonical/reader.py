@@ -172,7 +172,9 @@ class ForeignScene:
             if row["rolling_shutter_direction"] not in SHUTTER_DIRECTIONS:
                 raise DataError(f"{where}: the rolling shutter reads in no known direction")
             shutter = RollingShutter(
-                duration_s=row["rolling_shutter_s"], direction=row["rolling_shutter_direction"]
+                duration_s=row["rolling_shutter_s"],
+                direction=row["rolling_shutter_direction"],
+                first_row_s=row["rolling_shutter_first_row_s"],
             )
         lens = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
         camera = Camera(

@@ -50,7 +50,7 @@ from lidarpainter_models.readers.source_logs.frame_content import (
 )
 from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames
 from lidarpainter_models.readers.source_logs.swept_boxes import SweepTimes, moving_actors
-from lidarpainter_models.scenes.records import BoxRecord, ImageRecord
+from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, RollingShutter
 from lidarpainter_models.scenes.validation import jpeg_header_size, require_classes
 from lidarpainter_models.scenes.writer import SceneHeader
 
@@ -67,6 +67,13 @@ _EGO_FROM_LIDAR_M = ((0.81, 0.0, 1.85), (1.42, 0.0, 1.55))
 From the published calibration relative to the front camera; the elevations of the 64 beams fit the
 sensor's data sheet best around (0.79, 0.00, 1.865), and the forward LiDAR's rays cross near (1.4,
 0.0, 1.6).
+"""
+
+_SHUTTER = RollingShutter(duration_s=0.04, direction="down", first_row_s=-0.03)
+"""Every camera reads its rows from 30 ms before the time and pose of its image to 10 ms after.
+
+The data set does not say so; neurad-studio's reader of it has these times (Tonderski et al.,
+NeuRAD, 2024), and a fit to sequence 002 is sharpest with them (docs/datasets.md).
 """
 
 
@@ -156,7 +163,10 @@ class PandasetLog:
             height_px=height_px,
         )
         record = ImageRecord(
-            camera_name=name, timestamp_ns=recorded.timestamps_ns[frame_index], camera=camera
+            camera_name=name,
+            timestamp_ns=recorded.timestamps_ns[frame_index],
+            camera=camera,
+            rolling_shutter=_SHUTTER,
         )
         return SourceImage(record=record, jpeg=jpeg, source=where)
 
