@@ -16,6 +16,7 @@ from catalog.store import Store, open_store
 from lidarpainter_models.devices import chosen_device
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.evaluation.held_out import HeldOut
+from lidarpainter_models.kernels.backends import check_choice
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.painter.selection import PainterChoice
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -106,6 +107,7 @@ def _scene(folder: Path, files: Fetch | None, _inode: int, _changed_ns: int) -> 
 @lru_cache(maxsize=1)
 def _opened(spec: RunSpec, scene: DrivingScene) -> OpenedRun:
     device = chosen_device(spec.device)
+    check_choice(spec.kernels)
     if device.type == "cuda":
         torch.cuda.set_device(device)  # kernels are launched on the current one
     return OpenedRun(

@@ -6,7 +6,7 @@ nothing is compiled at import. A run may ask for plain torch on the CPU too (`ke
 path of a GPU.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
@@ -18,12 +18,12 @@ import torch
 from torch import Tensor
 
 from lidarpainter_models.devices import KernelChoice
-from lidarpainter_models.errors import BackendError
+from lidarpainter_models.errors import BackendError, ConfigError
 from lidarpainter_models.kernels.gpu_packages import why_no_gsplat, why_no_triton
 
 Backend = Literal["auto", "reference", "cpu", "cuda", "triton"]
-FASTEST = {"cpu": ("cpu",), "cuda": ("cuda", "triton")}
-"""By device, what `auto` tries before the plain reference."""
+FASTEST = {"cpu": "cpu", "cuda": "triton"}
+"""By device, what `auto` takes where it can run; gsplat is taken where it is asked for alone."""
 RASTERISER = "gaussian_raster"
 """Its reference is for tests alone, far too slow to fit with."""
 
@@ -69,7 +69,8 @@ def implementation(
 ) -> Callable[..., Any]:
     """The function of a kernel's backend.
 
-    `auto` takes numba on the CPU; on a GPU gsplat, else Triton; otherwise the plain reference.
+    `auto` takes numba on a CPU and our Triton kernels on a GPU, else the plain reference, unless
+    the run asks for gsplat or plain torch (`kernels_chosen`).
 
     Raises:
         BackendError: the backend does not exist for this kernel or cannot run here.
@@ -77,9 +78,7 @@ def implementation(
     found = available_backends(kernel)
     chosen: str = backend
     if backend == "auto":
-        is_plain = _choice.get() == "torch" and kernel != RASTERISER
-        fast = [] if is_plain else [name for name in FASTEST.get(device.type, ()) if name in found]
-        chosen = fast[0] if fast else "reference"
+        chosen = _automatic(kernel, device, found)
     if chosen not in found:
         raise BackendError(
             f"kernel {kernel!r} has no {chosen!r} backend here: {why_missing(kernel, chosen)} "
@@ -88,6 +87,26 @@ def implementation(
     if chosen == "cpu" and device.type != "cpu":
         raise BackendError(f"the numba {kernel} runs on the CPU, got a tensor on {device}")
     return getattr(import_module(f"lidarpainter_models.kernels.{kernel}.{chosen}"), function)
+
+
+def _automatic(kernel: str, device: torch.device, found: Sequence[str]) -> str:
+    """What `auto` stands for: the fastest of ours that was found, or what the run asked for."""
+    choice = _choice.get()
+    if choice == "gsplat" and kernel == RASTERISER:
+        return "cuda"
+    fastest = FASTEST.get(device.type)
+    is_plain = choice == "torch" and kernel != RASTERISER
+    return fastest if fastest in found and not is_plain else "reference"
+
+
+def check_choice(choice: KernelChoice) -> None:
+    """Refuse kernels that cannot run here before anything else is done.
+
+    Raises:
+        ConfigError: gsplat was asked for and cannot draw here.
+    """
+    if choice == "gsplat" and (reason := why_no_gsplat()):
+        raise ConfigError(f"kernels=gsplat: {reason}; expected auto (our own kernels) or torch")
 
 
 def may_run_on_host(device: torch.device) -> bool:

@@ -35,8 +35,6 @@ from lidarpainter_models.scenes.undistortion import pinhole_of, undistort
 
 __all__ = ["ActorTrack", "DrivingScene", "RecordedView", "Sweep", "SweepPoints"]
 
-# the lens belongs to the pixels as they lie in the file, whatever way up a viewer should show them
-_AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 _POINT_COLUMNS = {
     "xyz_m": "point_xyz_m",
     "intensity": "point_intensity",
@@ -119,10 +117,7 @@ class DrivingScene:
     def read_image(self, view: RecordedView) -> UInt8[Tensor, "height width 3"]:
         """The recorded image as RGB bytes; a distorted lens is undone."""
         jpeg = self.read_jpeg(view)
-        image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), _AS_STORED)
-        if image is None:
-            raise SceneError(f"{self.path}: the image {view.key} cannot be decoded")
-        image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+        image = cv2.cvtColor(decoded_bgr(jpeg, f"{self.path}: {view.key}"), cv2.COLOR_BGR2RGB)
         lens, distortion = self._lenses[view.index]
         return torch.from_numpy(undistort(image, lens, distortion, view.camera))
 
@@ -242,6 +237,21 @@ class DrivingScene:
         self.tracks: tuple[ActorTrack, ...] = tracks_from_boxes(
             columns, _poses(boxes, "world_from_box")
         )
+
+
+def decoded_bgr(jpeg: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
+    """The pixels of a stored image as they lie in the file, whatever way up a viewer shows them.
+
+    The lens belongs to these pixels, so a tag of orientation (EXIF) turns nothing.
+
+    Raises:
+        SceneError: the bytes cannot be decoded; `where` names the image.
+    """
+    as_stored = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), as_stored)
+    if image is None:
+        raise SceneError(f"{where}: the image cannot be decoded")
+    return image
 
 
 def _poses(table: pa.Table, column: str) -> Float[Tensor, "rows 4 4"]:
