@@ -1,9 +1,12 @@
 """The suite's own parts: what it counts, compares and writes."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
+import suite
+import torch
 from bench_machine import fma_peak_flops
 from bench_raster import Stages, doublings
 from bench_records import Figure, baseline_of, compared, kept_to, write_figures
@@ -11,6 +14,21 @@ from bench_scenes import street_like_points, street_like_splats
 from bench_work import count_lanes
 
 from lidarpainter_models.kernels.gaussian_raster.projection import IS_VISIBLE
+
+
+def test_every_part_of_the_suite_runs_in_its_smallest_form(tmp_path, monkeypatch):
+    out = tmp_path / "benchmarks.json"
+    threads = torch.get_num_threads()
+    monkeypatch.setattr(sys, "argv", ["suite.py", "--quick", "--out", str(out)])
+    try:
+        suite.main()
+    finally:
+        torch.set_num_threads(threads)
+    measured = {figure["name"] for figure in json.loads(out.read_text("utf-8"))}
+    baseline = json.loads(suite.BASELINE.read_text("utf-8"))
+    # growth is measured at other sizes, whose names say so
+    missing = {name for name in baseline if not name.startswith("growth.")} - measured
+    assert missing == set()
 
 
 def figure(**changes):
