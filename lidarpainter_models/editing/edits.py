@@ -42,7 +42,7 @@ from lidarpainter_models.gaussians.model.styling.scene_style import LampChange
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.lidar.collisions import Collision, MovingBody, find_collisions
 from lidarpainter_models.lidar.lidar_map import LidarMap
-from lidarpainter_models.scenes.tracks import ActorTrack
+from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses
 
 Models = Mapping[ActorSource, ActorModel]
 """What actors of other runs and of files look like."""
@@ -161,12 +161,14 @@ def _otherwise(
 
 
 def _at_every_frame(track: ActorTrack, log: LogTimes) -> ActorTrack:
-    """The same way, with a pose at every frame of the log that lies within its times."""
+    """The same way, with a pose at every frame of the log at which it is there."""
     frames_ns = log.ego.timestamps_ns
-    inside = (frames_ns > track.timestamps_ns[0]) & (frames_ns < track.timestamps_ns[-1])
+    inside = TrackPoses.of([track]).present(frames_ns[:, None], 0)[:, 0]
     times_ns = torch.cat([track.timestamps_ns, frames_ns[inside]]).unique()
     poses = torch.stack([track.pose_at(time) for time in times_ns.tolist()])
-    return with_poses(track, times_ns, poses)
+    before = torch.searchsorted(track.timestamps_ns, times_ns, right=True) - 1
+    # with the frame of the box before each, it is away where it was
+    return replace(with_poses(track, times_ns, poses), frame_indices=track.frame_indices[before])
 
 
 def _inserted(world: EditedWorld, operation: Insert, model: ActorModel) -> EditedWorld:

@@ -166,7 +166,8 @@ def stopped(track: ActorTrack, at_ns: int, log: LogTimes, *, over_s: float) -> A
         return braked
     times_ns = torch.cat([braked.timestamps_ns, torch.tensor([stays_ns])])
     poses = torch.cat([braked.world_from_box, braked.world_from_box[-1:]])
-    return with_poses(braked, times_ns, poses)
+    frames = torch.cat([braked.frame_indices, braked.frame_indices[-1:]])
+    return replace(with_poses(braked, times_ns, poses), frame_indices=frames)
 
 
 def standing(track: ActorTrack, at_ns: int, log: LogTimes) -> ActorTrack:

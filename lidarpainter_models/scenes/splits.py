@@ -1,15 +1,18 @@
 """Which recorded images a fit may see and which judge it.
 
 A spec is one of
-- `alternate`: frames at even positions train, those at odd positions test (the paper's protocol);
+- `alternate`: every second frame trains, the others test (the paper's protocol);
 - `forward:N:M`: every second of the first N frames trains, the last M frames test, farther along;
 - `all`: every frame trains, nothing is held out.
 
 Frames are split and not images, so what a held-out image shows was never seen by a neighbouring
-camera at the same moment, and the LiDAR sweeps of test frames stay out as well.
+camera at the same moment, and the LiDAR sweeps of test frames stay out as well. Every second frame
+is meant of each camera's own images: where cameras take turns or one has images in every second
+frame alone, each still has as many on either side.
 """
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -50,7 +53,7 @@ def split_views(
     """Split a scene's views, of some cameras or all, by a spec.
 
     Raises:
-        ConfigError: the spec is not understood or leaves no frame to train on.
+        ConfigError: the spec is not understood or leaves no image to train on.
         SceneError: a camera is not in the scene.
     """
     for name in cameras or ():
@@ -58,8 +61,11 @@ def split_views(
             raise SceneError(
                 f"{scene.path}: no camera {name!r}; it has {', '.join(scene.camera_names)}"
             )
-    train_frames, test_frames = split_frames(scene.frame_indices, spec)
     chosen = [view for view in scene.views if cameras is None or view.camera_name in cameras]
+    seen_by: dict[int, list[str]] = {}
+    for view in chosen:
+        seen_by.setdefault(view.frame_index, []).append(view.camera_name)
+    train_frames, test_frames = split_frames(scene.frame_indices, spec, seen_by)
     return ViewSplit(
         train=tuple(view for view in chosen if view.frame_index in set(train_frames)),
         test=tuple(view for view in chosen if view.frame_index in set(test_frames)),
@@ -104,30 +110,63 @@ def evenly_taken(items: Sequence[Item], most: int) -> list[Item]:
 
 
 def split_frames(
-    frame_indices: Sequence[int], spec: str
+    frame_indices: Sequence[int], spec: str, seen_by: Mapping[int, Sequence[str]] | None = None
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Training and test frames; positions count, whatever the frames are called."""
+    """Training and test frames; positions count, whatever the frames are called.
+
+    Args:
+        frame_indices: the frames in order.
+        spec: one of `SPECS`.
+        seen_by: the cameras that have an image in each frame; None where all have one in all.
+
+    Raises:
+        ConfigError: the spec is not understood or leaves no frame, or no image, to train on.
+    """
     frames = tuple(frame_indices)
+    if seen_by is None:
+        seen_by = dict.fromkeys(frames, ("all",))
     kind, *numbers = spec.split(":")
     if kind == "alternate" and not numbers:
-        train, test = frames[0::2], frames[1::2]
+        train, test = _every_second(frames, seen_by)
     elif kind == "all" and not numbers:
         train, test = frames, ()
     elif kind == "forward" and len(numbers) == 2 and all(part.isdigit() for part in numbers):
-        train, test = _forward(frames, *(int(part) for part in numbers))
+        first, test = _forward(frames, *(int(part) for part in numbers))
+        train, _ = _every_second(first, seen_by)
     else:
         raise ConfigError(f"split {spec!r} is not understood, expected {SPECS}")
-    if not train:
-        raise ConfigError(f"split {spec!r} leaves no frame to train on ({len(frames)} frames)")
+    if not any(seen_by.get(frame) for frame in train):
+        raise ConfigError(
+            f"split {spec!r} leaves no frame with an image to train on ({len(frames)} frames)"
+        )
     return train, test
+
+
+def _every_second(
+    frames: tuple[int, ...], seen_by: Mapping[int, Sequence[str]]
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Frames that train and that test, so that every camera has as many images on either side.
+
+    A frame tests where its cameras, taken together, have trained more often than tested by more
+    than half of their number. One without an image trains.
+    """
+    sides: tuple[list[int], list[int]] = ([], [])
+    ahead: Counter[str] = Counter()
+    for frame in frames:
+        cameras = seen_by.get(frame, ())
+        does_test = sum(ahead[name] for name in cameras) > len(cameras) / 2
+        sides[does_test].append(frame)
+        ahead.update(dict.fromkeys(cameras, -1 if does_test else 1))
+    return tuple(sides[0]), tuple(sides[1])
 
 
 def _forward(
     frames: tuple[int, ...], num_first: int, num_last: int
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """The first frames and the last."""
     if num_first < 1 or num_last < 1 or num_first + num_last > len(frames):
         raise ConfigError(
             f"split forward:{num_first}:{num_last} needs at least one frame on each side and no "
             f"overlap, the scene has {len(frames)} frames"
         )
-    return frames[:num_first:2], frames[-num_last:]
+    return frames[:num_first], frames[-num_last:]

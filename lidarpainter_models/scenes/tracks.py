@@ -16,6 +16,12 @@ from lidarpainter_models.geometry.transforms import interpolate_rigid, interpola
 PRESENCE_MARGIN_NS = 50_000_000
 """An actor is there for half a 10 Hz frame before its first and after its last box."""
 
+LONGEST_GAP_NS = 1_050_000_000
+"""Frames without a box of an actor are bridged for a second; in longer gaps it is away.
+
+Data sets give an actor that was out of sight and came back its old id (nuScenes does); who was
+behind something for a moment is still there."""
+
 MOVING_M = 1.0
 """An actor that gets so far from its first box moves; a parked car's boxes jitter by less."""
 
@@ -37,7 +43,7 @@ class ActorTrack:
     """Length, width, height: the medians over its boxes."""
     frame_indices: Int[Tensor, " times"]
     timestamps_ns: Int[Tensor, " times"]
-    """Ascending; when each box holds, which is when the LiDAR saw the actor."""
+    """Ascending, each once; when each box holds, which is when the LiDAR saw the actor."""
     world_from_box: Float[Tensor, "times 4 4"]
     num_points: Int[Tensor, " times"]
     """LiDAR points in the box, frame by frame."""
@@ -47,9 +53,8 @@ class ActorTrack:
         return interpolate_rigid_track(self.timestamps_ns, self.world_from_box, timestamp_ns)
 
     def is_present(self, timestamp_ns: int, margin_ns: int = PRESENCE_MARGIN_NS) -> bool:
-        """Whether a time lies between the first and the last box, give or take a margin."""
-        first_ns, last_ns = int(self.timestamps_ns[0]), int(self.timestamps_ns[-1])
-        return first_ns - margin_ns <= timestamp_ns <= last_ns + margin_ns
+        """Whether the actor is there at a time; see `TrackPoses.present`."""
+        return bool(TrackPoses.of([self]).present(timestamp_ns, margin_ns)[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +65,8 @@ class TrackPoses:
     """Ascending; a shorter track repeats its last time."""
     world_from_box: Float[Tensor, "tracks times 4 4"]
     """float64."""
+    is_bridged: Bool[Tensor, "tracks gaps"]
+    """Whether the actor is there between a box and the next one."""
     _at: dict[int, Float[Tensor, "tracks 4 4"]] = field(
         default_factory=dict, init=False, repr=False
     )
@@ -70,13 +77,17 @@ class TrackPoses:
         """Take the tracks as they are."""
         if not tracks:
             none = torch.zeros(0, 1, dtype=torch.int64)
-            return cls(none, torch.zeros(0, 1, 4, 4, dtype=torch.float64))
+            poses = torch.zeros(0, 1, 4, 4, dtype=torch.float64)
+            return cls(none, poses, torch.zeros(0, 0, dtype=torch.bool))
         times_ns = pad_sequence([track.timestamps_ns for track in tracks], batch_first=True)
         poses = pad_sequence([track.world_from_box.double() for track in tracks], batch_first=True)
         counts = torch.tensor([len(track.timestamps_ns) for track in tracks])
         last = torch.minimum(torch.arange(times_ns.shape[1]), counts[:, None] - 1)
         rows = torch.arange(len(tracks))[:, None]
-        return cls(times_ns[rows, last], poses[rows, last])
+        frames = pad_sequence([track.frame_indices for track in tracks], batch_first=True)
+        times_ns, skipped = times_ns[rows, last], frames[rows, last].diff() > 1
+        is_bridged = ~(skipped & (times_ns.diff() > LONGEST_GAP_NS))
+        return cls(times_ns, poses[rows, last], is_bridged)
 
     def __len__(self) -> int:
         return self.timestamps_ns.shape[0]
@@ -84,9 +95,20 @@ class TrackPoses:
     def present(
         self, timestamp_ns: int | Tensor, margin_ns: int = PRESENCE_MARGIN_NS
     ) -> Bool[Tensor, " *tracks"]:
-        """Whether each track is there at a time; times (queries, 1) give (queries, tracks)."""
+        """Whether each track is there at a time; times (queries, 1) give (queries, tracks).
+
+        An actor is there from a box to the next, unless frames without one lie between them for
+        longer than a second, and for a margin before and after a box.
+        """
         first_ns, last_ns = self.timestamps_ns[:, 0], self.timestamps_ns[:, -1]
-        return (first_ns - margin_ns <= timestamp_ns) & (timestamp_ns <= last_ns + margin_ns)
+        there = (first_ns - margin_ns <= timestamp_ns) & (timestamp_ns <= last_ns + margin_ns)
+        if bool(self.is_bridged.all()):
+            return there
+        for row, gap in (~self.is_bridged).nonzero().tolist():
+            left_ns, back_ns = self.timestamps_ns[row, gap : gap + 2].tolist()
+            is_away = (left_ns + margin_ns < timestamp_ns) & (timestamp_ns < back_ns - margin_ns)
+            there[..., row : row + 1] &= ~torch.as_tensor(is_away)
+        return there
 
     def at(
         self, rows: Int[Tensor, " queries"], times_ns: Int[Tensor, " queries"]
@@ -130,7 +152,10 @@ def tracks_from_boxes(
     tracks = []
     for actor_id, found in rows_of.items():
         rows = torch.tensor(found)
-        rows = rows[torch.argsort(timestamps_ns[rows])]
+        rows = rows[torch.argsort(timestamps_ns[rows], stable=True)]
+        is_last = torch.ones(len(rows), dtype=torch.bool)  # of several boxes of one time
+        is_last[:-1] = timestamps_ns[rows].diff() > 0
+        rows = rows[is_last]
         tracks.append(
             ActorTrack(
                 actor_id=actor_id,

@@ -18,6 +18,41 @@ def test_forward_split_trains_behind_and_tests_ahead():
     assert test == tuple(range(20, 28))
 
 
+@pytest.mark.parametrize("spec", ["alternate", "forward:24:8"])
+@pytest.mark.parametrize(
+    "has_image",
+    [
+        lambda frame, camera: (frame + camera) % 2 == 0,  # two cameras take turns
+        lambda frame, camera: camera == 0 or frame % 2 == 0,  # one runs at half the rate
+        lambda frame, _camera: frame % 2 == 0,  # images in every second frame alone
+        lambda frame, camera: (frame + camera) % 3 == 0,
+    ],
+)
+def test_every_camera_trains_on_half_of_its_images_and_is_tested_on_others(spec, has_image):
+    seen_by = {
+        frame: [str(camera) for camera in range(3) if has_image(frame, camera)]
+        for frame in range(48)
+    }
+    train, test = split_frames(range(48), spec, seen_by)
+    assert not set(train) & set(test)
+    for camera in {name for names in seen_by.values() for name in names}:
+        trained = sum(camera in seen_by[frame] for frame in train)
+        own = sum(camera in seen_by[frame] for frame in range(48 if spec == "alternate" else 24))
+        assert abs(trained - own / 2) <= 2
+        assert any(camera in seen_by[frame] for frame in test)
+
+
+def test_a_camera_that_misses_an_image_changes_nothing_for_the_others():
+    cameras = [str(camera) for camera in range(6)]
+    seen_by = {frame: cameras[1:] if frame == 3 else cameras for frame in range(28)}
+    assert split_frames(range(28), "alternate", seen_by) == split_frames(range(28), "alternate")
+
+
+def test_a_split_that_leaves_no_image_to_train_on_is_refused():
+    with pytest.raises(ConfigError, match="leaves no frame with an image to train on"):
+        split_frames(range(4), "alternate", {})
+
+
 def test_all_holds_nothing_out():
     assert split_frames(range(3), "all") == ((0, 1, 2), ())
 

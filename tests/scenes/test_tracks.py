@@ -1,8 +1,11 @@
+from dataclasses import replace
+from itertools import pairwise
+
 import pytest
 import torch
 
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
-from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses, does_move
+from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses, does_move, tracks_from_boxes
 
 
 def track(actor_id, times_ns):
@@ -34,6 +37,45 @@ def test_all_tracks_at_once_stand_where_each_alone_does():
         assert torch.allclose(poses.all_at(time_ns), alone, atol=1e-12), time_ns
         there = [one.is_present(time_ns) for one in TRACKS]
         assert poses.present(time_ns).tolist() == there, time_ns
+
+
+SECONDS = 1_000_000_000
+
+
+def test_an_actor_that_was_out_of_sight_for_seconds_is_away_meanwhile():
+    frames = torch.tensor([0, 1, 2, 40, 41])
+    gone = replace(track("gone", (frames * SECONDS // 10).tolist()), frame_indices=frames)
+    asked = [-0.06, 0.0, 0.2, 0.24, 0.26, 2.0, 3.94, 3.96, 4.1, 4.16]
+    expected = [False, True, True, True, False, False, False, True, True, False]
+    times_ns = (torch.tensor(asked, dtype=torch.float64) * SECONDS).round().long()
+    poses = TrackPoses.of([*TRACKS, gone])
+    assert poses.present(times_ns[:, None])[:, -1].tolist() == expected
+    assert [bool(poses.present(int(at))[-1]) for at in times_ns] == expected
+    assert [gone.is_present(int(at)) for at in times_ns] == expected
+
+
+@pytest.mark.parametrize(
+    ("frames", "step_s"),
+    [
+        ([0, 1, 9, 10], 0.1),  # hidden for a moment
+        ([0, 1, 2, 3], 2.0),  # labelled in frames that lie so far apart
+        ([0, 0, 0, 0], 5.0),  # an edit's: of no frame
+    ],
+)
+def test_an_actor_stays_between_boxes_that_lie_as_close_as_can_be(frames, step_s):
+    times_ns = [round(step_s * SECONDS * max(at, place)) for place, at in enumerate(frames)]
+    there = replace(track("there", times_ns), frame_indices=torch.tensor(frames))
+    middles = [(before + after) // 2 for before, after in pairwise(times_ns)]
+    assert [there.is_present(at) for at in middles] == [True] * 3
+
+
+def test_of_two_boxes_of_one_time_the_later_given_is_kept():
+    boxes = {"actor_id": ["a"] * 3, "category": ["car"] * 3, "is_moving": [True] * 3}
+    boxes |= {name: [1.0] * 3 for name in ("length_m", "width_m", "height_m")}
+    boxes |= {"timestamp_ns": [5, 9, 5], "frame_index": [0, 1, 2], "num_points": [1, 2, 3]}
+    (found,) = tracks_from_boxes(boxes, torch.eye(4, dtype=torch.float64).repeat(3, 1, 1))
+    assert found.timestamps_ns.tolist() == [5, 9]
+    assert found.num_points.tolist() == [3, 2]
 
 
 def test_each_query_has_its_own_track_and_time():

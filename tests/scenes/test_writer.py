@@ -29,7 +29,7 @@ def test_what_is_written_is_what_is_read(tmp_path):
     with SceneWriter(tmp_path, "rig", "a", HEADER) as writer:
         for frame_index in (3, 4):
             add_frame(writer, frame_index)
-            writer.add_box(some_box())
+            writer.add_box(some_box(timestamp_ns=100 * frame_index))
     scene = DrivingScene.open(writer.path)
     assert scene.frame_indices == (3, 4)
     expected = some_points(seed=4)
