@@ -17,7 +17,12 @@ from lidarpainter_models.geometry.cameras import Camera
 ViewKey = tuple[int, str]
 """Frame index and camera name."""
 
-_TERM_COUNTS: dict[str, tuple[int, ...]] = {"none": (0,), "brown": (4, 5, 8), "fisheye": (4,)}
+_TERM_COUNTS: dict[str, tuple[int, ...]] = {
+    "none": (0,),
+    "brown": (4, 5, 8),
+    "fisheye": (4,),
+    "mei": (5,),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,9 +30,9 @@ class Distortion:
     """How a lens departs from a pinhole; models and terms as OpenCV defines them."""
 
     model: str = "none"
-    """none, brown or fisheye."""
+    """none, brown, fisheye or mei."""
     terms: tuple[float, ...] = ()
-    """brown: k1 k2 p1 p2 [k3 [k4 k5 k6]]; fisheye: k1 k2 k3 k4."""
+    """brown: k1 k2 p1 p2 [k3 [k4 k5 k6]]; fisheye: k1 k2 k3 k4; mei: xi k1 k2 p1 p2."""
 
     def __post_init__(self) -> None:
         if self.model not in _TERM_COUNTS:
