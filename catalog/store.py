@@ -33,6 +33,8 @@ STORE_ENVIRONMENT = "LIDARPAINTER_STORE"
 DEFAULT_STORE = "lidarpainter-store"
 LATEST = "latest"
 
+_UNSTORABLE = re.compile(r"%[0-9A-Fa-f]{2}|[\x00-\x1f\x7f\\]")
+"""What Delta Lake misreads in the path of a table, however it is written (deltalake 1.6)."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
@@ -267,13 +269,19 @@ def open_store(path: Path | str | None = None) -> Store:
     made before something is written.
 
     Raises:
-        CatalogError: something that is not a folder is in the way, or the address is none.
+        CatalogError: something that is not a folder is in the way, the path cannot hold tables, or
+            the address is none.
     """
     text = str(path or os.environ.get(STORE_ENVIRONMENT) or DEFAULT_STORE)
     if text.startswith("s3:/"):
         mirror = _mirror(text, os.environ.get("LIDARPAINTER_CACHE"))
         return Store(mirror.root, mirror)
     root = Path(text).expanduser().absolute()
+    if found := _UNSTORABLE.search(str(root)):
+        raise CatalogError(
+            f"the store {str(root)!r} has {found[0]!r} in its path, which Delta tables cannot "
+            "have: choose another folder"
+        )
     if root.exists() and not root.is_dir():
         raise CatalogError(f"the store {root} is a file, expected a folder")
     return Store(root)

@@ -38,6 +38,7 @@ from lidarpainter_models.scenes.validation import (
     require_size,
     require_start,
     require_time,
+    shown,
 )
 from lidarpainter_models.storage.whole_files import storage_errors
 from lidarpainter_models.storage.whole_folders import AsideFolder
@@ -328,10 +329,16 @@ class SceneWriter:
         return manifest["content_digest"]
 
     def _write_table(self, folder: Path, name: str) -> dict[str, Any]:
-        rows = self._rows[name]
-        table = pa.Table.from_pylist(rows, schema=schema.arrow_schema(name))
+        try:
+            table = pa.Table.from_pylist(self._rows[name], schema=schema.arrow_schema(name))
+        except (pa.ArrowException, TypeError, ValueError, OverflowError) as error:
+            raise DataError(
+                f"{self._name}: the table of {name} holds a value of another kind than the format "
+                f"says ({shown(str(error))})"
+            ) from None
         pq.write_table(table, folder / f"{name}.parquet", compression="zstd")
-        return {"num_rows": len(rows), "sha256": content_digest(rows)}
+        # of what is stored, which an int among floats is not
+        return {"num_rows": len(table), "sha256": content_digest(table.to_pylist())}
 
     def _counts(self) -> dict[str, int]:
         return {

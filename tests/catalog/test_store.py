@@ -40,6 +40,20 @@ def test_a_file_in_the_place_of_the_store_is_named(tmp_path):
         open_store(tmp_path / "file")
 
 
+@pytest.mark.parametrize("name", ["a%2Fb", "a%20b", "tab\tin", "new\nline", "back\\slash"])
+def test_a_path_that_tables_cannot_have_is_refused_before_anything_is_written(tmp_path, name):
+    with pytest.raises(CatalogError, match="which Delta tables cannot have"):
+        open_store(tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["my drives", "100%", "a#b", "what?", "köln-通り", "br[0]{x}*"])
+def test_a_path_of_other_odd_letters_holds_tables(tmp_path, name):
+    store = open_store(tmp_path / name)
+    store.tables.merge("runs", [run_record().row()])
+    assert open_store(tmp_path / name).run("r1")["scene_id"] == "synthetic/street-0001"
+
+
 def test_looking_into_a_store_that_is_not_there_makes_nothing(tmp_path):
     store = open_store(tmp_path / "store")
     assert store.tables.rows("scenes") == []

@@ -7,6 +7,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
+from small_pandaset import PandasetFolder
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.boxes import is_inside_box
@@ -58,6 +59,19 @@ def test_image_comes_back_as_the_bytes_of_the_log(small_scene, sound_pandaset):
     file = sound_pandaset.path / "camera/left_camera/01.jpg"
     assert small_scene.read_jpeg(view) == file.read_bytes()
     assert small_scene.read_image(view).shape == (48, 64, 3)
+
+
+@pytest.mark.parametrize("is_renamed", [False, True])
+def test_tables_that_a_mirror_has_unpacked_are_read_alike(tmp_path, is_renamed):
+    packed, unpacked = (PandasetFolder(tmp_path / name) for name in ("packed", "unpacked"))
+    for log in (packed, unpacked):
+        log.write_log()
+    for file in unpacked.root.rglob("*.pkl.gz"):
+        content = gzip.decompress(file.read_bytes())
+        file.unlink()
+        (file.with_suffix("") if is_renamed else file).write_bytes(content)
+    first, second = (stored_digest(log.ingest(log.root / "s")) for log in (packed, unpacked))
+    assert first == second
 
 
 def test_points_keep_their_lidar_time_and_class(small_scene):

@@ -1,5 +1,8 @@
 """What is written comes back, whole, from one writer at a time."""
 
+import os
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -19,6 +22,7 @@ from scene_parts import (
 )
 
 from lidarpainter_models.errors import DataError
+from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes import array_writer, schema
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import Distortion, RollingShutter, SweepPoints
@@ -39,6 +43,54 @@ def test_what_is_written_is_what_is_read(tmp_path):
     assert scene.read_jpeg(scene.views[1]) == some_jpeg()
     assert scene.tracks[0].size_m.tolist() == [4.0, 2.0, 1.5]
     scene.verify_content()
+
+
+_OTHER_KINDS = """
+import sys
+from pathlib import Path
+import numpy as np
+from scene_parts import HEADER, IDENTITY, add_sweep, some_box, some_jpeg, some_points, some_record
+from lidarpainter_models.scenes.records import Distortion
+from lidarpainter_models.scenes.writer import SceneWriter
+
+lens = Distortion("brown", (0, np.float32(0.25), 0, 0))
+with SceneWriter(Path(sys.argv[1]), "rig", "a", HEADER) as writer:
+    writer.add_frame(np.int64(3), timestamp_ns=np.int64(0), world_from_ego=IDENTITY)
+    writer.add_image(some_record(timestamp_ns=np.int64(5), distortion=lens), some_jpeg())
+    add_sweep(writer, some_points())
+    size_m, yes = (4, np.float32(2), 1.5), np.bool_(True)
+    count = eval(sys.argv[2])
+    writer.add_box(some_box(size_m=size_m, is_moving=yes, num_points=count))
+"""
+
+
+def _written_by_a_user(store, count):
+    """A scene of ints among floats and of numpy's numbers; tests themselves check all types."""
+    path = os.pathsep.join(["tests/support", *sys.path])
+    return subprocess.run(
+        [sys.executable, "-c", _OTHER_KINDS, store, count],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_numbers_of_other_kinds_are_stored_as_the_format_says(tmp_path):
+    told = _written_by_a_user(tmp_path, "np.int32(3)")
+    assert told.returncode == 0, told.stderr
+    folder = tmp_path / "scenes/rig/a"
+    DrivingScene.open(folder).verify_content()
+    again = DrivingScene.open(ingest_scene("canonical", folder, "a", tmp_path / "store"))
+    assert again.tracks[0].size_m.tolist() == [4.0, 2.0, 1.5]
+    assert again.tracks[0].num_points.tolist() == [3]
+
+
+def test_a_value_of_another_kind_is_refused_in_one_line(tmp_path):
+    told = _written_by_a_user(tmp_path, "'many'")
+    last = told.stderr.strip().splitlines()[-1]
+    assert "DataError: rig/a: the table of boxes holds a value of another kind" in last
+    assert not (tmp_path / "scenes/rig/a").exists()
 
 
 def test_rows_that_fill_many_chunks_keep_their_order(tmp_path):

@@ -203,3 +203,16 @@ def test_a_level_that_so_few_cameras_do_not_have_is_left_out():
     assert CAUSES["missing-cameras"].levels_of(3) == (1, 2)
     assert CAUSES["missing-cameras"].levels_of(1) == ()
     assert CAUSES["beams"].levels_of(1) == CAUSES["beams"].levels
+
+
+def test_a_tag_of_orientation_turns_no_image_that_is_spoilt(clean):
+    shot = frame_of(clean, 1).shots[0]
+    # EXIF (TIFF, little-endian) with one entry: orientation 3, the image upside down
+    entry = bytes.fromhex("1201 0300 01000000 03000000")
+    exif = b"Exif\0\0II*\0" + bytes.fromhex("08000000 0100") + entry + bytes(4)
+    tag = b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif
+    turned = replace(shot, jpeg=shot.jpeg[:2] + tag + shot.jpeg[2:])
+    as_seen = []
+    for one in (shot, turned):
+        one.with_pixels(lambda bgr: as_seen.append(bgr) or bgr)
+    assert np.array_equal(*as_seen)

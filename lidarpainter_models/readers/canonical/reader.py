@@ -124,7 +124,7 @@ class ForeignScene:
     def provenance(self) -> dict[str, object]:
         """Where the scene lay, and the digest of its content."""
         digest = str(self.manifest.get("content_digest"))[:64]
-        return {"root": self.place, "content_digest": digest}
+        return {"root": self.folder.name, "content_digest": digest}
 
     def read_frame(self, frame_index: int) -> FrameContent:
         """Everything of one frame, as the writer takes it."""

@@ -121,7 +121,7 @@ class NuscenesLog:
     def provenance(self) -> dict[str, object]:
         """The version, and digests of its tables and of the files that were read."""
         return {
-            "root": str(self.source.root),
+            "root": self.source.root.name,
             "version": self._tables.folder.name,
             "tables_sha256": self._tables.digests(),
             **self.source.provenance(),

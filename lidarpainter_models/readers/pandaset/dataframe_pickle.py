@@ -67,6 +67,7 @@ ALLOWED_NAMES = frozenset(
     | {_NEW_INDEX, _ENCODE, _DTYPE, Named("numpy", "ndarray")}
 )
 _NUMBER_CODE = re.compile(r"b1|[iu][1248]|f[248]")
+_GZIP_MAGIC = b"\x1f\x8b"
 _BYTE_ORDERS = ("<", ">", "=", "|")
 
 
@@ -77,20 +78,28 @@ def read_table_bytes(
     max_bytes: int = MAX_TABLE_BYTES,
     max_rows: int = MAX_TABLE_ROWS,
 ) -> Table:
-    """The columns of one pickled pandas table, gzipped if the name of its `path` says so.
+    """The columns of one pickled pandas table, gzipped or, as some mirrors have it, unpacked.
 
     Raises:
         DataError: the content is cut off, too large or no table.
         UnsafePickleError: the pickle names a class that no table needs.
     """
     try:
-        if path.suffix == ".gz":
-            content = _unzip(content, max_bytes)
+        content = _unpacked(content, max_bytes)
         return _table(read_pickle_tree(content, ALLOWED_NAMES), max_rows)
     except UnsafePickleError as error:
         raise UnsafePickleError(f"{path}: {error}") from None
     except DataError as error:
         raise DataError(f"{path}: {error}") from None
+
+
+def _unpacked(content: bytes, max_bytes: int) -> bytes:
+    """The content of a file that may be gzipped; no more than `max_bytes`."""
+    if content.startswith(_GZIP_MAGIC):
+        return _unzip(content, max_bytes)
+    if len(content) > max_bytes:
+        raise DataError(f"has more than {max_bytes} bytes, expected a table")
+    return content
 
 
 def _unzip(content: bytes, max_bytes: int) -> bytes:

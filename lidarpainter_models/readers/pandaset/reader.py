@@ -129,7 +129,7 @@ class PandasetLog:
 
     def provenance(self) -> dict[str, object]:
         """Where the log lies and what was read of it."""
-        return {"root": str(self.source.root.parent), **self.source.provenance()}
+        return {"root": self.source.root.parent.name, **self.source.provenance()}
 
     def read_frame(self, frame_index: int) -> FrameContent:
         """Everything of one frame, as the writer takes it."""

@@ -20,13 +20,15 @@ def read_table(
     texts: tuple[str, ...] = (),
     max_rows: int = MAX_TABLE_ROWS,
 ) -> Table:
-    """The named columns of one table.
+    """The named columns of one table, gzipped under this name or unpacked under it without `.gz`.
 
     Columns of numbers and flags come as float64 or int64, columns of texts as they are.
 
     Raises:
         DataError: the file cannot be read, or lacks a column.
     """
+    if not (source.root / name).exists() and (source.root / name).with_suffix("").exists():
+        name = name.removesuffix(".gz")
     path = source.root / name
     table = read_table_bytes(source.read_bytes(name), path, max_rows=max_rows)
     missing = [column for column in (*numbers, *texts) if column not in table]

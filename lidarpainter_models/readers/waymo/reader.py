@@ -119,7 +119,7 @@ class WaymoLog:
 
     def provenance(self) -> dict[str, object]:
         """The release, and digests of what was read."""
-        return {"root": str(self._root), **self._segment.provenance()}
+        return {"root": self._root.name, **self._segment.provenance()}
 
     def read_frame(self, frame_index: int) -> FrameContent:
         """Everything of one frame, as the writer takes it."""
