@@ -6,7 +6,8 @@
 and image_02. Images are PNG: they are stored as JPEG of quality 98. A sweep is compensated: each
 point by the pose at its own time, which follows from its azimuth. Boxes come from the drive's
 tracklet_labels.xml, each at the time at which the LiDAR looked at it. Without that file there are
-none, and moving cars would become part of the street: choose a quiet drive.
+none, and moving cars would become part of the street: choose a quiet drive. A frame whose turn of
+the LiDAR is missing (drive 0009 lacks four) or empty has its image alone.
 
 The ego frame is the LiDAR's, 1.7 m above the road.
 """
@@ -203,7 +204,11 @@ def write(date_folder: Path, drive: str, store: Path) -> Path:
             jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes()
             record = ImageRecord(camera_name="image_02", timestamp_ns=time_ns, camera=camera)
             writer.add_image(record, jpeg)
-            scan = np.fromfile(folder / f"velodyne_points/data/{index:010d}.bin", "<f4")
+            file = folder / f"velodyne_points/data/{index:010d}.bin"
+            scan = np.fromfile(file, "<f4") if file.is_file() else np.empty(0, "<f4")
+            if not len(scan):
+                writer.add_boxes(boxes.get(index, []))
+                continue
             scan = scan.reshape(-1, 4).astype(np.float64)
             points = SweepPoints.of(
                 turns[index].compensated(scan),

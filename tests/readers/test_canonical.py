@@ -61,6 +61,19 @@ def test_scene_from_elsewhere_keeps_its_name_and_every_byte_of_content(foreign, 
     assert all((path / file).read_bytes() == (foreign / file).read_bytes() for file in arrays)
 
 
+def test_times_in_another_unit_are_told_by_the_speed_that_they_make(foreign, tmp_path):
+    for name in ("frames", "cameras", "sweeps", "boxes"):
+        rewrite_table(
+            foreign,
+            name,
+            lambda table: type(table).from_pylist(
+                [{**row, "timestamp_ns": row["timestamp_ns"] // 1000} for row in table.to_pylist()],
+                schema=table.schema,
+            ),
+        )
+    assert "500 m/s at most: are the times in nanoseconds?" in refusal(foreign, tmp_path)
+
+
 def test_entries_that_the_format_does_not_know_stay_behind(foreign, tmp_path):
     known = {"global_frame": "map", "generator": {"name": "a street"}, "stress": {"level": 1}}
     edit_manifest(foreign, lambda manifest: manifest.update(known, invented=[1]))

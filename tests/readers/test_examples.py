@@ -174,3 +174,46 @@ def test_nerfstudio_folder_becomes_a_scene_with_all_its_points(tmp_path):
     assert torch.allclose(forward, torch.tensor([0.0, 1.0, 0.0]).double())
     assert torch.allclose(scene.world_from_ego[2, :3, 0], forward)
     assert torch.allclose(scene.world_from_ego[2, :3, 3], torch.tensor([0.0, 2.0, 0.0]).double())
+
+
+def test_nerfstudio_lenses_may_differ_by_frame_and_fisheyes_keep_their_terms(tmp_path):
+    folder = tmp_path / "rig"
+    points = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n"
+    frames = []
+    for index, camera in enumerate(("left", "right", "left", "right")):
+        pose = np.eye(4)
+        pose[:3, :3] = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+        pose[:3, 3] = (index % 2, 2.0 + index // 2, 1.5)
+        file = f"images/{camera}/{index // 2:04d}.png"
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(folder / file), np.full((48, 64, 3), 90, np.uint8))
+        lens = {"fl_x": 30.0 + index % 2, "fl_y": 30.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48}
+        frames.append({"file_path": file, "transform_matrix": pose.tolist(), **lens})
+        # cameras of a rig are not triggered at the very same time
+        frames[-1]["timestamp_ns"] = 1_000_000_000 + 100_000_000 * (index // 2) + index % 2
+        if camera == "right":
+            frames[-1] |= {"camera_model": "OPENCV_FISHEYE", "k1": 0.05, "k2": 0.01}
+    (folder / "points.ply").write_text(points + "property float z\nend_header\n0 5 0\n1 6 0\n")
+    transforms = {"camera_model": "OPENCV", "ply_file_path": "points.ply", "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(transforms))
+    path = example("nerfstudio").write(folder, tmp_path / "out", "CC0")
+    scene = DrivingScene.open(ingest_scene("canonical", path.parent, "rig", tmp_path / "store"))
+    assert [view.key for view in scene.views] == [
+        (0, "left"),
+        (0, "right"),
+        (1, "left"),
+        (1, "right"),
+    ]
+    assert scene.frame_timestamps_ns.tolist() == [1_000_000_000, 1_100_000_000]
+    lenses = [scene.image_record(view) for view in scene.views[:2]]
+    assert [lens.camera.fx_px for lens in lenses] == [30.0, 31.0]
+    assert [lens.distortion.terms for lens in lenses] == [(), (0.05, 0.01, 0.0, 0.0)]
+
+
+def test_kitti_frame_without_a_turn_has_its_image_alone(tmp_path):
+    drive = write_kitti(tmp_path / "raw", num_frames=4)
+    (tmp_path / "raw" / drive / "velodyne_points/data/0000000001.bin").unlink()
+    (tmp_path / "raw" / drive / "velodyne_points/data/0000000002.bin").write_bytes(b"")
+    scene = DrivingScene.open(example("kitti_raw").write(tmp_path / "raw", drive, tmp_path / "out"))
+    assert [len(scene.sweeps_of(frame)) for frame in range(4)] == [1, 0, 0, 1]
+    assert len(scene.views) == 4

@@ -7,6 +7,8 @@ same rules, and nothing that the format does not know is carried over. The scene
 and sequence of its own manifest.
 """
 
+from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,8 @@ from lidarpainter_models.scenes.stored import StoredScene
 from lidarpainter_models.scenes.validation import SHUTTER_DIRECTIONS, require_name, require_pose
 from lidarpainter_models.scenes.writer import SceneHeader
 
+MAX_SPEED_MPS = 500.0
+"""Of any vehicle: eight times what the doctor takes for a car."""
 _MAX_JPEG_BYTES = 64_000_000
 _MAX_SWEEP_POINTS = 10_000_000
 _FURTHER_ENTRIES = (schema.GLOBAL_FRAME, "generator", "stress")
@@ -62,6 +66,20 @@ def own_scene_id(root: Path, sequence: str) -> str:
     manifest = read_small_json(file, MAX_MANIFEST_BYTES)
     names = (str(manifest.get(key, "")) for key in ("dataset", "sequence"))
     return "/".join(require_name(name, f"{file}: dataset or sequence") for name in names)
+
+
+def _require_possible_speeds(frames: Sequence[dict[str, Any]], folder: Path) -> None:
+    """Refuse times in another unit, which make a car faster than a rocket."""
+    for before, after in pairwise(frames):
+        way = _pose(after["world_from_ego"])[:3, 3] - _pose(before["world_from_ego"])[:3, 3]
+        moved_m = float(way.norm())
+        seconds = (after["timestamp_ns"] - before["timestamp_ns"]) * 1e-9
+        if moved_m > MAX_SPEED_MPS * seconds > 0:
+            raise DataError(
+                f"{folder / 'frames.parquet'}: from frame {before['frame_index']} to "
+                f"{after['frame_index']} the ego moves {moved_m:.2f} m in {seconds:.3g} s, "
+                f"expected {MAX_SPEED_MPS:.0f} m/s at most: are the times in nanoseconds?"
+            )
 
 
 def _scene_folder(root: Path, sequence: str) -> Path:
@@ -107,6 +125,7 @@ class ForeignScene:
             frame: [row for row in rows if row["camera"] in used]
             for frame, rows in self._rows["cameras"].items()
         }
+        _require_possible_speeds(all_frames, folder)
         chosen = [all_frames[i] for i in chosen_frames(len(all_frames), frames, folder)]
         self.frames = {row["frame_index"]: row for row in chosen}
         self.frame_indices = list(self.frames)
