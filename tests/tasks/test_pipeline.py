@@ -22,6 +22,7 @@ from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.score_tables import flicker_by_image, metric_values
 from lidarpainter_models.evaluation.settings import ScoringConfig
 from lidarpainter_models.export.moving_picture import PANEL_WIDTH_PX
+from lidarpainter_models.gaussians.fitting.plan import in_thousands
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.metrics import lpips
 from lidarpainter_models.metrics.backbones import SQUEEZENET
@@ -31,11 +32,10 @@ from tasks.evaluation.views import evaluate, load_scores
 from tasks.opened import open_scene
 from tasks.painter.judge import judge_painters
 from tasks.painter.judged_fits import JudgedFit
-from tasks.reconstruction.fit import fit, in_thousands
+from tasks.reconstruction.fit import fit, refine
 from tasks.reconstruction.painted_views import load_guidance
 from tasks.reconstruction.prepare import prepare
 from tasks.reconstruction.publish import begin_run, end_run
-from tasks.reconstruction.refine import refine
 from tasks.runs import open_run
 from tasks.specs import FittedRef
 from tasks.stored import load_history, load_scene

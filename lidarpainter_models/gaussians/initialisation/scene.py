@@ -87,7 +87,7 @@ def initialise_scene(
         ConfigError: no LiDAR point lies where a training camera could see it, or no start size.
     """
     if config.num_gaussians == 0:
-        raise ConfigError("the start needs num_gaussians, which `planned_fit` takes from the views")
+        raise ConfigError("the start needs num_gaussians, which `plan_fit` takes from the views")
     views = observations.views
     for_unreached = int(config.num_gaussians * MOST_SHARE)
     on_surfaces = max(config.num_gaussians - for_unreached, 1)
