@@ -226,7 +226,7 @@ def _judged(
 
 
 def _result(course: Course, scores: dict[str, Scores], final: FittedRef) -> dict[str, Any]:
-    """What `reconstruct --json` prints, but for the report."""
+    """Return what `reconstruct --json` prints, but for the report."""
     parameters, stages = course.parameters, course.stages
     last_fit = next(stage for stage in stages.values() if stage.ref == final.gaussians)
     return {

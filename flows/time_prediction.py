@@ -2,7 +2,7 @@
 
 What a stage takes on a known machine follows from the size of the run (`reference_seconds`). Past
 runs of the store tell how much longer each kind of stage takes on this one (`expected_seconds`),
-and the run that goes on corrects both by how fast it is (`Clock`). What the first run on a machine
+and the present run corrects both by how fast it is (`Clock`). What the first run on a machine
 compiles comes on top; how much that is its first stage tells.
 """
 
@@ -170,7 +170,7 @@ class Clock:
         return left if left > 0 else None
 
     def run_left(self, stage: str) -> float | None:
-        """Return what is left of the whole run, of which this stage goes on; None as in `left`."""
+        """Return what is left of the whole run in which this stage is; None as in `left`."""
         if stage not in self.expected:
             return None
         coming = [name for name in self.expected if name not in self._over and name != stage]

@@ -27,7 +27,7 @@ MOST_SHOWN = 0.99
 
 
 def how_far(clock: "Clock", stage: str, done: float, total: float | None, note: str = "") -> str:
-    """Return what is known of a stage that goes on, such as `stage 4 of 11, 41 %, 0:31 gone, ...`.
+    """Return what is known of a stage under way, such as `stage 4 of 11, 41 %, 0:31 gone, ...`.
 
     What is left goes unsaid where a stage, or the last of a run, takes longer than was thought.
 

@@ -25,7 +25,7 @@ FITS = ("fit", "refine")
 FILE_KEYS = {"preset": str, "painter": str, "set": list}
 """Keys of a file for --config, as in the manifest of a fleet, and what each holds."""
 FIRST_FIT_SHARE = 0.6
-"""Of a time limit; the rounds after it share the rest, as they do the steps of a preset."""
+"""Part of a time limit for the first fit; its rounds share the rest, as the steps of a preset."""
 Sideways = Annotated[
     str | None, typer.Option(help="Metres to both sides to paint at, such as 2,3; at most 8.")
 ]
@@ -109,7 +109,7 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     Unpainted, for comparison: lidarpainter reconstruct pandaset/002 --painter none
 
     A run that was stopped continues with the same command. Finished stages lie in
-    STORE/artefacts, checkpoints of the fit that goes on in STORE/work, until it is done.
+    STORE/artefacts, checkpoints of a running fit in STORE/work, until it is done.
     """
     from catalog.store import existing_store
     from flows.cli.running import run_reconstruction
@@ -173,13 +173,13 @@ def check_tensorboard() -> None:
     Raises:
         ConfigError: the package that writes them is not installed.
     """
-    from importlib.util import find_spec
-
-    if find_spec("tensorboard") is None:
+    try:
+        import tensorboard  # noqa: F401
+    except ImportError:
         raise ConfigError(
             "--tensorboard needs the package tensorboard, which is not installed: "
             "pip install tensorboard"
-        )
+        ) from None
 
 
 def write_events(store: "Store", result: dict[str, Any], folder: Path) -> None:

@@ -32,7 +32,7 @@ def examine(run: RunSpec) -> StageResult:
 
 
 def suspicions(examined: StageResult) -> list[str]:
-    """What does not look sound, in sentences."""
+    """Return what does not look sound, in sentences."""
     return list(examined.summary["suspicions"])
 
 

@@ -122,7 +122,7 @@ def _sources(
     lpips: LpipsFiles | None,
     inputs: Mapping[str, ArtefactRef | None],
 ) -> _Sources:
-    """What a fit is made from, of stored inputs by the part they play."""
+    """Return what a fit is made from, of stored inputs by the part they play."""
     weighed = lpips if config.weighs_perceptual else None
     there = {name: ref for name, ref in inputs.items() if ref is not None}
     digests = {name: ref.digest for name, ref in there.items()}
@@ -218,7 +218,7 @@ def _run(
 
 
 def _summary(result: FitResult) -> dict[str, Any]:
-    """What a manifest says of a fit: its plan and what came of it."""
+    """Return what a manifest says of a fit: its plan and what came of it."""
     last = result.history[-1]
     return {
         **describe(result.scene),
@@ -231,7 +231,7 @@ def _summary(result: FitResult) -> dict[str, Any]:
 
 
 def _in_words(entry: Mapping[str, float]) -> str:
-    """Such as `step 2,400, 28.61 dB, 210k Gaussians`."""
+    """Return such as `step 2,400, 28.61 dB, 210k Gaussians`."""
     return (
         f"step {entry['step']:,.0f}, {entry['psnr']:.2f} dB, "
         f"{in_thousands(entry['num_gaussians'])} Gaussians"

@@ -1,6 +1,7 @@
 """The stages of a reconstruction, one after the other, without a server."""
 
 import base64
+import csv
 import json
 import re
 import shutil
@@ -81,6 +82,13 @@ def test_a_stage_asked_again_is_not_computed_again(store, parameters, stages):
 def test_a_fit_keeps_its_course_and_no_scratch(store, stages):
     history = load_history(store, stages["fit"].ref)
     assert [entry["step"] for entry in history] == [5, 10, 12]
+    with (store.artefacts.folder(stages["fit"].ref) / "history.csv").open() as table:
+        rows = [
+            {name: float(value) for name, value in row.items()} for row in csv.DictReader(table)
+        ]
+    assert rows == history
+    plan = store.artefacts.manifest(stages["fit"].ref).summary["plan"]
+    assert (plan["steps"], plan["most_gaussians"], plan["first_gaussians"]) == (12, 1000, 800)
     assert list((store.root / "work").iterdir()) == []
     scene = load_scene(store, stages["fit"].ref)
     assert scene.num_gaussians == stages["fit"].summary["num_gaussians"]

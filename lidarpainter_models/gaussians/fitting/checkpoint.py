@@ -1,4 +1,4 @@
-"""Keep a running fit on disk, so that a killed run goes on bit for bit.
+"""Keep a running fit on disk, so that a killed run continues bit for bit.
 
 One safetensors file holds every tensor; its header carries the numbers, as JSON. It is written
 beside the old one and renamed over it, so that there is always one whole checkpoint or none.

@@ -16,29 +16,29 @@ class LearningRates:
     """The first and the last step size of every kind; each falls exponentially in between."""
 
     means: tuple[float, float] = (0.03, 0.002)
-    """In standard deviations of the Gaussian (mean of its two longer axes)."""
+    """Centres, in standard deviations of the Gaussian (mean of its two longer axes)."""
     rotation_wxyz: tuple[float, float] = (8e-3, 1.6e-3)
-    """Quaternion units."""
+    """Orientations, in units of the quaternion."""
     log_scale: tuple[float, float] = (4e-2, 8e-3)
-    """Logarithm of metres. Shapes are what a fit waits for: at a quarter of these rates it takes
-    nearly twice the steps (docs/benchmarks.md)."""
+    """Sizes, in logarithms of metres. Shapes are what a fit waits for: at a quarter of these rates
+    it takes nearly twice the steps (docs/benchmarks.md)."""
     opacity_logit: tuple[float, float] = (6e-2, 2e-2)
-    """Logits."""
+    """Opacities, in logits."""
     sh_dc: tuple[float, float] = (6e-3, 1e-3)
-    """Harmonics; a colour changes by 0.28 of it. In fits of more than `COLOUR_LOOKS` less. Twice as
-    fast, recorded views gain 0.07 dB and the next lane's lose 0.3 (docs/benchmarks.md)."""
+    """Constant harmonics; a colour changes by 0.28 of it. In fits of more than `COLOUR_LOOKS` less.
+    Twice as fast, recorded views gain 0.07 dB and the next lane's lose 0.3 (docs/benchmarks.md)."""
     sh_rest: tuple[float, float] = (6e-4, 2e-4)
     """Harmonics of degree 1 and more."""
     camera_rotation_rad: tuple[float, float] = (6e-4, 6e-5)
-    """A pixel of a 480-pixel image is about 2e-3 rad."""
+    """Camera angles; a pixel of a 480-pixel image is about 2e-3 rad."""
     camera_translation_m: tuple[float, float] = (6e-3, 6e-4)
-    """Recorded positions are good to centimetres."""
+    """Camera positions, recorded to centimetres."""
     actor_rotation_rad: tuple[float, float] = (2e-3, 2e-4)
-    """Boxes are drawn by hand: a degree off is common."""
+    """Actors' angles; boxes are drawn by hand, and a degree off is common."""
     actor_translation_m: tuple[float, float] = (1e-2, 1e-3)
-    """Boxes are drawn by hand: a decimetre off is common."""
+    """Actors' positions; a decimetre off is common."""
     bending_m: tuple[float, float] = (1e-2, 1e-3)
-    """Of the lattice of somebody who walks."""
+    """Nodes of the lattice that bends somebody who walks."""
     exposure: tuple[float, float] = (6e-3, 6e-4)
     """Entries of a camera's colour matrix."""
 

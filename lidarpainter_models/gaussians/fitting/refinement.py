@@ -1,4 +1,4 @@
-"""What a fit corrects about the recording while it goes on: camera poses, actors, exposure."""
+"""Refined poses and colours: what a fit corrects of cameras, actors and exposure as it runs."""
 
 from dataclasses import dataclass
 
@@ -17,12 +17,12 @@ ACTOR_NOISE = {"rotation_rad": 0.03, "translation_m": 0.2}
 CAMERA_PRIOR = 1e-4
 """Weight of squared camera corrections in units of the expected noise."""
 ACTOR_PRIOR = 1e-6
-"""Of squared actor corrections, likewise: an actor fills a small part of the image."""
+"""Weight of squared actor corrections, likewise: an actor fills a small part of the image."""
 ACTOR_SMOOTHNESS = 1e-5
-"""Of squared jumps between an actor's neighbouring corrections, likewise."""
+"""Weight of squared jumps between an actor's neighbouring corrections, likewise."""
 
 BEND_PRIOR = 3e-6
-"""Of the squared strain of lattices (`Bending.strain`), likewise."""
+"""Weight of the squared strain of lattices (`Bending.strain`), likewise."""
 BEND_NOISE_M = 0.1
 """Expected way of a node."""
 
@@ -253,7 +253,7 @@ def pose_prior(
 
 
 def _gradient(table: Tensor) -> Tensor:
-    """What the backward pass left."""
+    """Return the gradient that the backward pass left."""
     if table.grad is None:
         raise RuntimeError(f"no gradient reached a table of shape {tuple(table.shape)}")
     return table.grad

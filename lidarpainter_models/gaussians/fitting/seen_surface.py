@@ -48,11 +48,11 @@ class SeenSurface:
     """What a set of training views shows."""
 
     num_pixels: float
-    """Of surface, each at the finest it was seen."""
+    """Pixels of surface, each at the finest it was seen."""
     num_detailed: float
-    """The same, each by its contrast: as many of a typical street hold this detail."""
+    """Pixels by their contrast: as many of a typical street hold this detail."""
     whole_views: float
-    """The same in views: the first one counts 1, each other by what is new in it."""
+    """Surface in views: the first one counts 1, each other by what is new in it."""
     groups: tuple[tuple[int, ...], ...]
     """Positions of the views: one that shows something new, and those after it of its camera that
     add nothing to it."""
@@ -95,7 +95,7 @@ def seen_surface(
 def with_shown_beside(
     surface: SeenSurface, views: Sequence[TrainingView], guidance: Sequence[GuidanceView]
 ) -> SeenSurface:
-    """The same with what painted views show and no recorded one does, by their own contrast.
+    """Return the surface with what painted views show and no recorded one does, by its contrast.
 
     There a cell with any return of LiDAR shows surface. It takes Gaussians; looks are at recorded
     views, as without it.
@@ -145,7 +145,7 @@ def _new_shares(
     footprint_m: Float[Tensor, " cells"],
     earlier: Sequence[Camera],
 ) -> Float[Tensor, " cells"]:
-    """Of each cell that is not sky: which part of its pixels no earlier camera saw as finely."""
+    """Return which part of each cell that is not sky no earlier camera saw as finely."""
     known = torch.zeros_like(footprint_m)
     for camera in earlier:
         pixels_uv, depth_m = camera.project(points_world)

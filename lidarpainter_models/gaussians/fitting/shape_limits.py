@@ -27,7 +27,7 @@ this length of the mean unit ray the stricter limit is off."""
 MOST_ELONGATION = 12.0
 """Longest over middle axis: poles and wires need needles."""
 MOST_ELONGATION_ALONG_RAY = 2.0
-"""The same for an axis within 45 degrees of the viewing ray."""
+"""Longest over middle axis where that lies within 45 degrees of the viewing ray."""
 MOST_SIGMA = 0.1
 """Longest axis in units of the distance to the nearest camera."""
 LEAST_SIGMA_M = 0.003
@@ -41,7 +41,7 @@ class ViewingRays:
     mean_direction: Float[Tensor, "gaussians 3"]
     """Mean of the unit rays: short where they differ."""
     distance_m: Float[Tensor, " gaussians"]
-    """To the nearest camera."""
+    """Distance to the nearest camera."""
 
 
 def viewing_rays(scene: GaussianScene) -> ViewingRays:

@@ -47,7 +47,7 @@ class FitState:
     tally: GradientTally
     generator: torch.Generator
     steps: int
-    """Of the fit in all, as planned; a limit of time lowers it."""
+    """Steps of the fit in all, as planned; a limit of time lowers them."""
     waiting: list[int] = field(default_factory=list)
     """Groups of views still to be drawn from in this pass."""
     step: int = 0

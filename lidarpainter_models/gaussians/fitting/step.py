@@ -160,7 +160,7 @@ def _recorded_gradients(  # noqa: PLR0913 - what a step is made of
 
 
 def _guidance_bodies(state: FitState, view: GuidanceView) -> Float[Tensor, "bodies 4 4"]:
-    """Where a painted view has the bodies; no gradient."""
+    """Return where a painted view has the bodies, without gradient."""
     with torch.no_grad():
         actors = state.scene.actors.corrected_poses(view.timestamp_ns)
         return camera_from_body(view.camera.world_from_camera, *actors)
