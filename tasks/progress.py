@@ -8,11 +8,13 @@ not hear each other.
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Protocol
 
 
-class ProgressListener(Protocol):
-    """Hears about stages; a stage is named by the word used in `seconds` of the results."""
+class ProgressListener:
+    """Hears about stages, and says nothing unless a method is written anew.
+
+    A stage is named by the word used in `seconds` of the results.
+    """
 
     def started(self, stage: str) -> None:
         """A stage begins."""
@@ -27,11 +29,7 @@ class ProgressListener(Protocol):
         """A stage is over; `is_new` tells whether it was computed now."""
 
 
-class Silence(ProgressListener):
-    """Listens to nothing."""
-
-
-_SILENCE = Silence()
+_SILENCE = ProgressListener()
 _listener: ContextVar[ProgressListener | None] = ContextVar("progress_listener", default=None)
 
 

@@ -12,7 +12,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, Tex
 from rich.text import Text
 
 from flows.cli.output import clear_status, loudness
-from tasks.progress import ProgressListener, Silence, listening
+from tasks.progress import ProgressListener, listening
 
 if TYPE_CHECKING:
     from flows.time_prediction import Clock
@@ -72,7 +72,7 @@ class HowFar(ProgressColumn):
         return Text(how_far(self._clock, task.description, done, total, task.fields["note"]))
 
 
-class Bars:
+class Bars(ProgressListener):
     """One bar per stage on a terminal."""
 
     def __init__(self, progress: Progress, clock: "Clock") -> None:
@@ -109,7 +109,7 @@ class Bars:
         self._progress.update(self._tasks[stage], completed=1, total=1, said=said)
 
 
-class Lines:
+class Lines(ProgressListener):
     """A line per event, and one every half minute within a stage."""
 
     def __init__(self, clock: "Clock") -> None:
@@ -182,7 +182,7 @@ def shown_progress(
 
     clear_status()
     if loudness() == "quiet":
-        yield Silence()  # nobody listens
+        yield ProgressListener()  # nobody listens
         return
     log, lines = logging.getLogger("lidarpainter"), SaidLines()
     if loudness() == "verbose":
