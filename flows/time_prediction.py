@@ -7,6 +7,7 @@ compiles comes on top; how much that is its first stage tells.
 """
 
 import json
+import math
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -29,7 +30,7 @@ COMPILING_S = {
 LEAST_SHARE = 0.02
 """Part of a stage after which its own speed is believed."""
 TRUSTED_SHARE = 0.2
-"""Part of a stage after which nothing but its own speed is believed."""
+"""Part of a fit after which nothing but its own speed is believed."""
 PRIOR_SHARE = 0.03
 """Part of a run that must be over before its own pace counts as much as what was expected."""
 FIRST_SHARE = 0.2
@@ -64,7 +65,7 @@ def reference_seconds(parameters: "ReconstructParameters", num_views: float) -> 
         "refine": steps("refine") * (0.012 + 6e-7 * pixels) * (1.6 if paints else 1.0)
         + (4.0 if paints else 0.0),
         "examine": 2.0 + num_views,
-        "evaluate": test * (0.6 + 5e-6 * pixels),
+        "evaluate": test * (0.7 + 5e-6 * pixels),
         "envelope": 3.0 + 0.25 * test,
         "report": 3.0,
     }
@@ -123,10 +124,8 @@ class Clock:
     """How long kernels have been compiled so far: what is left of a stage needs no more of it."""
     _began: dict[str, float] = field(default_factory=dict)
     _compiled_before: dict[str, float] = field(default_factory=dict)
-    _first: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """By stage, how much was done when its parts began, and after how much work that was."""
-    _last: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """By stage, how much is done, and after how much work that was so."""
+    _course: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    """By stage, how much was done after how much work; what only made ready for it is left out."""
     _took: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Work and compiling of stages that were computed."""
     _over: set[str] = field(default_factory=set)
@@ -143,15 +142,18 @@ class Clock:
 
     def advanced(self, stage: str, share: float) -> None:
         """So much of a stage is done, 0 to 1; told again, it has only made ready for its parts."""
-        self._last[stage] = (share, self._work(stage))
-        if self._first.setdefault(stage, self._last[stage])[0] == share:
-            self._first[stage] = self._last[stage]
+        course = self._course.setdefault(stage, [])
+        if len(course) == 1 and course[0][0] == share:
+            course.clear()
+        course.append((share, self._work(stage)))
 
     def finished(self, stage: str, *, is_new: bool) -> None:
         """A stage is over."""
         self._over.add(stage)
         if is_new:
-            self._took[stage] = (self._work(stage), self._compiled(stage))
+            steady = self._speed(stage) if _is_fit(stage) else None
+            work = min(self._work(stage), steady or math.inf)
+            self._took[stage] = (work, self._compiled(stage))
 
     def place(self, stage: str) -> str:
         """Return such as `stage 4 of 11`; nothing where the stages to come are not known."""
@@ -179,13 +181,13 @@ class Clock:
         return None if left <= 0 or (is_early and not self.is_told_by_past) else left
 
     def _left(self, stage: str) -> float:
-        compiling = max(self._coldness * COMPILING_S.get(stage, 0.0) - self._compiled(stage), 0.0)
         own, total = self._own(stage), self.expected.get(stage, 0.0) * self._pace(stage)
-        if own is not None:
-            # an expectation knows that steps grow slower; it gives way as the stage shows itself
-            share = self._trust(stage) if total else 1.0
-            total = share * own + (1 - share) * total
-        return max(total - self._work(stage), 0.0) + compiling
+        if own is None:
+            compiling = self._coldness * COMPILING_S.get(stage, 0.0) - self._compiled(stage)
+            return max(total - self._work(stage), 0.0) + max(compiling, 0.0)
+        # an expectation knows that steps grow slower; it gives way as the stage shows itself
+        share = self._trust(stage) if total else 1.0
+        return max(share * own + (1 - share) * total - self._work(stage), 0.0)
 
     def _foretold(self, stage: str) -> float:
         """What a stage that has not begun will take."""
@@ -195,16 +197,18 @@ class Clock:
     def _pace(self, like: str) -> float:
         """Seconds of work for an expected one, in stages like this one.
 
-        Fits are apart from the rest: how many steps they have is found out by the first.
+        Rounds tell of rounds, and evaluations of evaluations. Fits are apart from the rest: how
+        many steps they have is found out by the first.
         """
-        alike = [name for name in self.expected if _is_fit(name) == _is_fit(like)]
-        took = known = PRIOR_SHARE * sum(self.expected.values())
+        same = [name for name in self._took if _kind(name) == _kind(like) and name in self.expected]
+        alike = same or [name for name in self.expected if _group(name) == _group(like)]
+        took = known = 0.0 if same else PRIOR_SHARE * sum(self.expected.values())
         for name in alike:
             if name in self._took:
                 took, known = took + self._took[name][0], known + self.expected[name]
-            elif name not in self._over and (own := self._own(name)) is not None:
+            elif name not in self._over and (speed := self._speed(name)) is not None:
                 share = self._trust(name)
-                took, known = took + share * own, known + share * self.expected[name]
+                took, known = took + share * speed, known + share * self.expected[name]
         return took / known if known else 1.0
 
     @property
@@ -215,16 +219,29 @@ class Clock:
         return sum(self._took[name][1] for name in over) / all_of_it if over else 0.0
 
     def _trust(self, stage: str) -> float:
-        return min(self._last[stage][0] / TRUSTED_SHARE, 1.0)
+        """How much a stage's own speed counts: parts of a fit are many and alike."""
+        share = self._course[stage][-1][0]
+        return min(share / TRUSTED_SHARE, 1.0) if _is_fit(stage) else share
 
     def _own(self, stage: str) -> float | None:
         """What work a stage is in all, by the parts it has done; None before it has done any."""
-        if stage not in self._last:
+        speed = self._speed(stage)
+        if speed is None:
             return None
-        (first, began), (share, done) = self._first[stage], self._last[stage]
+        share, done = self._course[stage][-1]
+        return done + speed * (1 - share)
+
+    def _speed(self, stage: str) -> float | None:
+        """Seconds of work that all of a stage takes as it goes now; None before it has begun."""
+        course = self._course.get(stage)
+        if not course or course[-1][0] - course[0][0] < LEAST_SHARE:
+            return None
+        share, done = course[-1]
+        # what first steps compile and fetch does not come again: the latter half tells
+        first, began = next(part for part in course if part[0] >= (share + course[0][0]) / 2)
         if share - first < LEAST_SHARE:
-            return None
-        return done + (done - began) / (share - first) * (1 - share)
+            first, began = course[0]
+        return (done - began) / (share - first)
 
     def _work(self, stage: str) -> float:
         """How long a stage has gone on without compiling kernels."""
@@ -237,6 +254,11 @@ class Clock:
 
 def _is_fit(stage: str) -> bool:
     return _kind(stage) in ("fit", "refine")
+
+
+def _group(stage: str) -> str:
+    """Stages that tell of one another's pace; to examine takes as long as a recording is large."""
+    return "fit" if _is_fit(stage) else "examine" if stage == "examine" else "rest"
 
 
 def as_clock(seconds: float) -> str:
