@@ -33,6 +33,8 @@ TRUSTED_SHARE = 0.2
 """Part of a fit after which nothing but its own speed is believed."""
 PRIOR_SHARE = 0.03
 """Part of a run that must be over before its own pace counts as much as what was expected."""
+MOST_COMPILED_S = 0.5
+"""Compiling in one part of a stage, from which on that part says nothing about the speed."""
 FIRST_SHARE = 0.2
 """Part of a run after which its end is foretold where no past run tells."""
 
@@ -55,6 +57,7 @@ def reference_seconds(parameters: "ReconstructParameters", num_views: float) -> 
     def steps(name: str) -> float:
         return getattr(parameters, name).most_steps(whole_views)
 
+    has_truth = parameters.scene.startswith("synthetic/")  # views beside the path are drawn too
     paints = any(name.startswith("paint-") for name in parameters.stages)
     of_round = len(parameters.novel.shifts) / max(parameters.rounds, 1) + 0.5
     painted = ceil(train / parameters.novel.every_nth) * of_round
@@ -64,9 +67,9 @@ def reference_seconds(parameters: "ReconstructParameters", num_views: float) -> 
         "paint": painted * (0.35 + 1e-5 * pixels),
         "refine": steps("refine") * (0.012 + 6e-7 * pixels) * (1.6 if paints else 1.0)
         + (4.0 if paints else 0.0),
-        "examine": 2.0 + num_views,
-        "evaluate": test * (0.7 + 5e-6 * pixels),
-        "envelope": 3.0 + 0.25 * test,
+        "examine": 2.0 + 1.2 * num_views,
+        "evaluate": test * (0.5 + 5e-6 * pixels) * (2.0 if has_truth else 1.0),
+        "envelope": 3.5 + 0.3 * test,
         "report": 3.0,
     }
     return {name: kinds[_kind(name)] for name in parameters.stages}
@@ -126,6 +129,8 @@ class Clock:
     _compiled_before: dict[str, float] = field(default_factory=dict)
     _course: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     """By stage, how much was done after how much work; what only made ready for it is left out."""
+    _compiled_at: dict[str, float] = field(default_factory=dict)
+    """By stage, how much had been compiled when a part of it was told last."""
     _took: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Work and compiling of stages that were computed."""
     _over: set[str] = field(default_factory=set)
@@ -142,16 +147,19 @@ class Clock:
 
     def advanced(self, stage: str, share: float) -> None:
         """So much of a stage is done, 0 to 1; told again, it has only made ready for its parts."""
-        course = self._course.setdefault(stage, [])
-        if len(course) == 1 and course[0][0] == share:
-            course.clear()
+        course, compiled = self._course.setdefault(stage, []), self._compiled(stage)
+        is_ready = not (len(course) == 1 and course[0][0] == share)
+        if not is_ready or compiled > self._compiled_at.get(stage, 0.0) + MOST_COMPILED_S:
+            course.clear()  # nor does a part in which kernels were compiled tell of the speed
+        self._compiled_at[stage] = compiled
         course.append((share, self._work(stage)))
 
     def finished(self, stage: str, *, is_new: bool) -> None:
         """A stage is over."""
         self._over.add(stage)
         if is_new:
-            steady = self._speed(stage) if _is_fit(stage) else None
+            # what a first fit compiles without being counted is not what a round takes
+            steady = self._speed(stage) if stage == "fit" else None
             work = min(self._work(stage), steady or math.inf)
             self._took[stage] = (work, self._compiled(stage))
 
@@ -183,7 +191,9 @@ class Clock:
     def _left(self, stage: str) -> float:
         own, total = self._own(stage), self.expected.get(stage, 0.0) * self._pace(stage)
         if own is None:
-            compiling = self._coldness * COMPILING_S.get(stage, 0.0) - self._compiled(stage)
+            has_parts = any(share for share, _ in self._course.get(stage, ()))
+            compiling = 0.0 if has_parts else self._coldness * COMPILING_S.get(stage, 0.0)
+            compiling -= self._compiled(stage)
             return max(total - self._work(stage), 0.0) + max(compiling, 0.0)
         # an expectation knows that steps grow slower; it gives way as the stage shows itself
         share = self._trust(stage) if total else 1.0
@@ -221,7 +231,7 @@ class Clock:
     def _trust(self, stage: str) -> float:
         """How much a stage's own speed counts: parts of a fit are many and alike."""
         share = self._course[stage][-1][0]
-        return min(share / TRUSTED_SHARE, 1.0) if _is_fit(stage) else share
+        return min(share / TRUSTED_SHARE, 1.0) if _is_fit(stage) else share**2
 
     def _own(self, stage: str) -> float | None:
         """What work a stage is in all, by the parts it has done; None before it has done any."""

@@ -20,7 +20,7 @@ from flows.time_prediction import (
 from tasks.progress import listener
 
 RECORDINGS = sorted(Path(__file__).with_name("recorded_runs").glob("*.json"))
-"""What the stages of first runs said, thinned out: second, seconds of compiling, event, stage."""
+"""What the stages of first runs said: second, seconds of compiling so far, event, stage, share."""
 STEPS = {"fit": 1500, "refine": 500}
 RECORDED_S = {
     "prepare": 6.7,
@@ -260,7 +260,7 @@ def test_a_real_first_run_is_told_right_from_its_first_fifth_on(path):
     """Replayed from what stages said; times are those of the machine that it was recorded on."""
     recorded = json.loads(path.read_text("ascii"))
     events = recorded["events"]
-    settings = with_overrides(preset(recorded["preset"], "a/b"), recorded["settings"])
+    settings = with_overrides(preset(recorded["preset"], recorded["scene"]), recorded["settings"])
     expected, _ = expected_seconds(settings, recorded["num_views"], [])
     at = [0.0, 0.0]
     clock = Clock(expected=expected, now=lambda: at[0], compiled=lambda: at[1])
