@@ -207,11 +207,12 @@ class Clock:
     def _pace(self, like: str) -> float:
         """Seconds of work for an expected one, in stages like this one.
 
-        Rounds tell of rounds, and evaluations of evaluations. Fits are apart from the rest: how
-        many steps they have is found out by the first.
+        Rounds tell of rounds, and evaluations of evaluations. Without a past run fits are apart
+        from the rest: how many steps they have is found out by the first.
         """
         same = [name for name in self._took if _kind(name) == _kind(like) and name in self.expected]
-        alike = same or [name for name in self.expected if _group(name) == _group(like)]
+        every = [n for n in self.expected if self.is_told_by_past or _group(n) == _group(like)]
+        alike = same or every
         took = known = 0.0 if same else PRIOR_SHARE * sum(self.expected.values())
         for name in alike:
             if name in self._took:

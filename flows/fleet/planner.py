@@ -94,11 +94,11 @@ class Planner:
         effort = self.effort(asked)
         if effort is None or not self._past:
             return Prediction()
-        cpu, memory, size = self._factors
+        cpu, more_memory, size = self._corrections
         return Prediction(
             seconds=effort.cpu_seconds * cpu * self._wall_ratio,
             cpu_seconds=effort.cpu_seconds * cpu,
-            memory_bytes=effort.memory_bytes * memory,
+            memory_bytes=max(effort.memory_bytes + more_memory, 0.0),
             num_bytes=effort.num_bytes * size,
         )
 
@@ -137,13 +137,18 @@ class Planner:
         return float((asked.frames[1] - asked.frames[0]) * len(asked.cameras))
 
     @cached_property
-    def _factors(self) -> tuple[float, float, float]:
-        """What sequences took for what they take on the reference machine."""
-        return (
-            _mean_ratio([own_cpu_seconds(row) / e.cpu_seconds for row, e in self._past]),
-            _mean_ratio([(r["peak_memory_bytes"] or 0.0) / e.memory_bytes for r, e in self._past]),
-            _mean_ratio([(row["num_bytes"] or 0.0) / e.num_bytes for row, e in self._past]),
-        )
+    def _corrections(self) -> tuple[float, float, float]:
+        """By which factor CPU seconds and stored bytes were more, and by how much memory was."""
+        cpu = [
+            math.log(own_cpu_seconds(r) / e.cpu_seconds)
+            for r, e in self._past
+            if own_cpu_seconds(r) > 0
+        ]
+        memory = [
+            r["peak_memory_bytes"] - e.memory_bytes for r, e in self._past if r["peak_memory_bytes"]
+        ]
+        size = [math.log(r["num_bytes"] / e.num_bytes) for r, e in self._past if r["num_bytes"]]
+        return math.exp(_recent_mean(cpu)), _recent_mean(memory), math.exp(_recent_mean(size))
 
     @cached_property
     def _wall_ratio(self) -> float:
@@ -173,8 +178,7 @@ def planner_error(attempts: Iterable[Mapping[str, Any]]) -> float | None:
     return median(shares[-RECENT:]) if shares else None
 
 
-def _mean_ratio(ratios: Sequence[float]) -> float:
-    """The geometric mean, oldest first, of which later ones count more; 1 where none is known."""
-    known = [(0.5 ** (age / HALF_LIFE), r) for age, r in enumerate(reversed(ratios)) if r > 0]
-    total = sum(count for count, _ in known)
-    return math.exp(sum(count * math.log(r) for count, r in known) / total) if known else 1.0
+def _recent_mean(values: Sequence[float]) -> float:
+    """The mean of values, oldest first, of which later ones count more; 0 of none."""
+    counts = [0.5 ** (age / HALF_LIFE) for age in reversed(range(len(values)))]
+    return sum(c * value for c, value in zip(counts, values, strict=True)) / (sum(counts) or 1.0)
