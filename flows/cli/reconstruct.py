@@ -75,7 +75,7 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     scene: Annotated[str, typer.Argument(help="dataset/sequence, as ingested.")],
     preset: Annotated[
         str | None,
-        typer.Option(help="brief, preview, balanced or paper.", show_default="preview"),
+        typer.Option(help="brief, preview, balanced or paper; preview if absent."),
     ] = None,
     painter: Painter = None,
     device: DeviceName = "auto",

@@ -37,6 +37,7 @@ def suspicions(examined: StageResult) -> list[str]:
 
 
 def _build(place: Workplace, progress: Progress, *, scene: DrivingScene) -> dict[str, Any]:
+    progress(0, 1, "clocks, cameras, boxes, exposure, own body")
     findings = findings_about(scene, progress)
     rows = [asdict(finding) for finding in findings]
     (place.output / FILE).write_text(json.dumps(rows, indent=2) + "\n", "utf-8")
