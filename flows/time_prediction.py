@@ -9,6 +9,7 @@ compiles comes on top; how much that is its first stage tells.
 import json
 import math
 import time
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from math import ceil
@@ -249,7 +250,7 @@ class Clock:
             return None
         share, done = course[-1]
         # what first steps compile and fetch does not come again: the latter half tells
-        first, began = next(part for part in course if part[0] >= (share + course[0][0]) / 2)
+        first, began = course[bisect_left(course, ((share + course[0][0]) / 2,))]
         if share - first < LEAST_SHARE:
             first, began = course[0]
         return (done - began) / (share - first)
