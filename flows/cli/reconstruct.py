@@ -26,6 +26,19 @@ FILE_KEYS = {"preset": str, "painter": str, "set": list}
 """Keys of a file for --config, as in the manifest of a fleet, and what each holds."""
 FIRST_FIT_SHARE = 0.6
 """Part of a time limit for the first fit; its rounds share the rest, as the steps of a preset."""
+Preset = Annotated[
+    str | None, typer.Option(help="brief, preview, balanced or paper; preview if absent.")
+]
+TrainCameras = Annotated[
+    str | None, typer.Option(help="Cameras to train on, with commas between; all if absent.")
+]
+Seed = Annotated[
+    int | None, typer.Option(min=0, help="Decides in which order the fit sees its views.")
+]
+Evaluate = Annotated[
+    bool, typer.Option("--evaluate/--no-evaluate", help="Evaluate the scene, or later.")
+]
+Report = Annotated[bool, typer.Option("--report/--no-report", help="Write the page about the run.")]
 Sideways = Annotated[
     str | None, typer.Option(help="Metres to both sides to paint at, such as 2,3; at most 8.")
 ]
@@ -73,30 +86,19 @@ TensorBoard = Annotated[
 
 def reconstruct(  # noqa: PLR0913 - the options of a command
     scene: Annotated[str, typer.Argument(help="dataset/sequence, as ingested.")],
-    preset: Annotated[
-        str | None,
-        typer.Option(help="brief, preview, balanced or paper; preview if absent."),
-    ] = None,
+    preset: Preset = None,
     painter: Painter = None,
     device: DeviceName = "auto",
     shift: Sideways = None,
     up: Upwards = None,
     rounds: Rounds = None,
     split: Split = None,
-    train_cameras: Annotated[
-        str | None, typer.Option(help="Cameras to train on, with commas between; all if absent.")
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Decides in which order the fit sees its views.")
-    ] = None,
+    train_cameras: TrainCameras = None,
+    seed: Seed = None,
     memory: Memory = None,
     time_limit: TimeLimit = None,
-    evaluate: Annotated[
-        bool, typer.Option("--evaluate/--no-evaluate", help="Evaluate the scene, or later.")
-    ] = True,
-    report: Annotated[
-        bool, typer.Option("--report/--no-report", help="Write the page about the run.")
-    ] = True,
+    evaluate: Evaluate = True,
+    report: Report = True,
     settings: Settings = None,
     config: ConfigFile = None,
     tensorboard: TensorBoard = None,
@@ -116,8 +118,7 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     from flows.overrides import with_changes, with_overrides
     from flows.presets import preset as preset_named
 
-    if tensorboard is not None:
-        check_tensorboard()
+    check_tensorboard(tensorboard)
     asked = {} if config is None else read_config(config)
     parameters = preset_named(preset or asked.get("preset", "preview"), scene)
     changes: dict[str, Any] = {
@@ -141,10 +142,7 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     result = run_reconstruction(parameters, store)
     if tensorboard is not None:
         write_events(store, result, tensorboard)
-    if as_json:
-        print_json(result)
-    else:
-        show(result)
+    (print_json if as_json else show)(result)
 
 
 def read_config(path: Path) -> dict[str, Any]:
@@ -167,12 +165,14 @@ def read_config(path: Path) -> dict[str, Any]:
     return values
 
 
-def check_tensorboard() -> None:
-    """Find out whether event files can be written.
+def check_tensorboard(folder: Path | None) -> None:
+    """Find out whether event files can be written, if a folder is given for them.
 
     Raises:
         ConfigError: the package that writes them is not installed.
     """
+    if folder is None:
+        return
     try:
         import tensorboard  # noqa: F401
     except ImportError:
