@@ -69,7 +69,7 @@ def test_example_of_the_readme_ends_with_an_image(tmp_path, monkeypatch, capsys)
     exec(compile(example, "README.md", "exec"), {})  # noqa: S102 - our own page
     assert "psnr" in capsys.readouterr().out
     image = cv2.imread(str(tmp_path / "lidarpainter-example" / "aside.png"))
-    assert image.shape == (96, 320, 3)
+    assert image.shape == (180, 640, 3)
     render, painted = np.split(image.astype(float), 2, axis=1)
     assert render.std() > 20
     assert painted.std() > 20

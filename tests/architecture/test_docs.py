@@ -69,3 +69,28 @@ def test_ten_questions_are_answered_where_the_page_says():
         tree = ast.parse(path_of(file).read_text("utf-8"))
         defined = {node.name for node in tree.body if hasattr(node, "name")}
         assert name in defined, question
+
+
+def said_in_code() -> str:
+    """Every piece of text in the product's code; parts of an f-string are pieces of their own."""
+    trees = [
+        ast.parse(path.read_text("utf-8"))
+        for package in ("flows", "tasks", "catalog", LIBRARY)
+        for path in (ROOT / package).rglob("*.py")
+    ]
+    texts = [
+        node.value
+        for tree in trees
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    ]
+    return "\0".join([*texts, (ROOT / "pyproject.toml").read_text("utf-8")])
+
+
+def test_what_troubleshooting_quotes_is_what_the_code_prints():
+    page = (ROOT / "docs" / "troubleshooting.md").read_text("utf-8")
+    quoted = re.findall(r"^> `(.*)`$", page, re.MULTILINE)
+    assert len(quoted) >= 20
+    code = said_in_code()
+    pieces = [piece for line in quoted for piece in line.split("…") if piece]
+    assert [piece for piece in pieces if piece not in code] == []
