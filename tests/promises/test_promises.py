@@ -1,7 +1,7 @@
-"""What the product promises holds: on a street with exact truth, and on a real log where there is one.
+"""What the product promises holds: on a street with exact truth, and on a real log if there is one.
 
-Each bound lies below what three seeds reached by twice what they differ. Nothing else is asked here,
-so that a failure says that scenes got worse, not which part did it.
+Each bound lies below what three seeds reached by twice what they differ. Nothing else is asked
+here, so that a failure says that scenes got worse, not which part did it.
 """
 
 import pytest
