@@ -36,7 +36,7 @@ def real_log(shared_folder, tmp_path_factory):
 def test_painting_gains_beside_the_path_and_costs_nothing_on_it(street):
     painted, unpainted = street.scores(street.painted), street.scores(street.unpainted)
     # seeds 0, 1, 2: 0.68, 0.75, 0.84 dB; .042, .042, .039; +0.03, +0.04, +0.10 dB
-    assert beside(painted) - beside(unpainted) > 0.5
+    assert beside(painted) - beside(unpainted) > 0.45
     assert depth_beside(painted) - depth_beside(unpainted) > 0.03
     assert painted["recorded"]["psnr"] - unpainted["recorded"]["psnr"] > -0.1
     # 31.36, 31.29, 31.35 dB and 24.87, 24.92, 25.00 dB
@@ -49,13 +49,14 @@ def test_painting_at_view_time_gains_where_another_camera_looks(street):
     painted = street.strips(street.painted, is_painted=True)
     # 27.95, 27.89, 27.95 dB; gains 0.83, 0.86, 0.79 dB
     assert plain["side_camera"] > 27.7
-    assert painted["side_camera"] - plain["side_camera"] > 0.6
+    assert painted["side_camera"] - plain["side_camera"] > 0.65
 
 
 def test_a_real_log_is_shown_as_well_as_ever(real_log):
     scores = real_log.scores(real_log.painted)
     recorded = scores["recorded"]
-    assert recorded["psnr"] > 30.9
-    assert recorded["actors_psnr"] > 29.8
-    assert recorded["depth_within_5_percent"] > 0.95
-    assert depth_beside(scores) > 0.90
+    # seeds 0, 1, 2: 31.17, 31.28, 31.23 dB; 30.22, 30.12, 30.18 dB; .960; .928, .932, .930
+    assert recorded["psnr"] > 31.0
+    assert recorded["actors_psnr"] > 29.9
+    assert recorded["depth_within_5_percent"] > 0.955
+    assert depth_beside(scores) > 0.92
