@@ -3,7 +3,7 @@
 python docs/examples/plain_log.py LOG OUT NAME && lidarpainter ingest canonical OUT/scenes/my-car
 
 LOG holds rig.json (the lens and the licence), frames.csv (poses of the car), images.csv (poses of
-the camera at exposure), boxes.csv, images/FRAME.jpg and lidar/FRAME.npy. Poses are position and
+the camera at exposure), boxes.csv, images/FRAME.jpg and sweeps/FRAME.npy. Poses are position and
 unit quaternion in one fixed map: car and boxes x forward, y left, z up; the camera x right, y down,
 z forward. LiDAR points are x, y, z and intensity in the map, each moved to where it was hit.
 """
@@ -64,7 +64,7 @@ def write(log: Path, store: Path, name: str) -> Path:
                 camera_name="front", timestamp_ns=int(image["time_ns"]), camera=camera
             )
             writer.add_image(record, (log / f"images/{number}.jpg").read_bytes())
-            points = np.load(log / f"lidar/{number}.npy").astype(np.float32)
+            points = np.load(log / f"sweeps/{number}.npy").astype(np.float32)
             offset = world_from_map[:3, 3].float()
             xyz_m = torch.from_numpy(points[:, :3]) + offset
             sweep = SweepPoints.of(xyz_m, intensity=torch.from_numpy(points[:, 3].copy()))

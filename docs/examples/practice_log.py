@@ -52,7 +52,7 @@ def write(log: Path, num_frames: int = 20, width_px: int = 480) -> None:
 
 def _write_files(scene: DrivingScene, log: Path) -> None:
     (camera,) = scene.camera_names
-    for name in ("images", "lidar"):
+    for name in ("images", "sweeps"):
         (log / name).mkdir(parents=True, exist_ok=True)
     frames, images, boxes = [], [], []
     for place, frame in enumerate(scene.frame_indices):
@@ -66,7 +66,7 @@ def _write_files(scene: DrivingScene, log: Path) -> None:
         (log / f"images/{number}.jpg").write_bytes(scene.read_jpeg(view))
         points = scene.read_sweep(sweep)
         columns = [*points.xyz_m.T, points.intensity.float()]
-        np.save(log / f"lidar/{number}.npy", torch.stack(columns, dim=1).numpy())
+        np.save(log / f"sweeps/{number}.npy", torch.stack(columns, dim=1).numpy())
     for track in scene.tracks:
         size = dict(zip(("length_m", "width_m", "height_m"), track.size_m.tolist(), strict=True))
         for frame, pose in zip(track.frame_indices.tolist(), track.world_from_box, strict=True):
