@@ -5,13 +5,14 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 SYSTEM := $(VENV)/.system-libraries
+DOCUMENTERS := $(VENV)/.documenters
 FIGURES := $(BIN)/lidarpainter --store figures-store
 
 # spinning OpenMP threads turn shared cores into many times the CPU time
 export OMP_WAIT_POLICY := passive
 export NUMBA_CACHE_DIR := $(CURDIR)/$(VENV)/numba-cache
 
-.PHONY: demo test lint nightly bench figures gpu-check clean
+.PHONY: demo test lint nightly bench docs figures gpu-check clean
 
 demo: $(INSTALLED) $(SYSTEM)
 	$(BIN)/lidarpainter demo --out demo
@@ -33,6 +34,10 @@ lint: $(INSTALLED) $(SYSTEM)
 bench: $(INSTALLED)
 	PYTHONPATH=tests/support $(BIN)/python tests/benchmarks/suite.py
 
+# the site of the documentation: docs/_site/index.html; a warning is an error, links are checked
+docs: $(DOCUMENTERS)
+	$(BIN)/sphinx-build --fail-on-warning --keep-going --fresh-env -q docs docs/_site
+
 # the tables of README and docs from runs of this code, hours where there are none yet. PANDASET is
 # the data set as downloaded, WEIGHTS SqueezeNet's; without them their tables stay as they are
 figures: $(INSTALLED) $(SYSTEM)
@@ -48,10 +53,14 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
 	touch $@
 
+$(DOCUMENTERS): $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[docs]"
+	touch $@
+
 # open3d loads these shared libraries; apt is used where it may be
 $(SYSTEM): $(INSTALLED)
 	@sh scripts/system_libraries.sh $(BIN)/python
 	touch $@
 
 clean:
-	rm -rf $(VENV) demo
+	rm -rf $(VENV) demo docs/_site

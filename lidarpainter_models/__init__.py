@@ -6,7 +6,7 @@ when the first of them is used.
 
 from typing import Any
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 __all__ = [
     "ConditionBuilder",
     "FitConfig",

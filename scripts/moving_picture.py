@@ -20,7 +20,10 @@ SUFFIXES = (".png", ".jpg")
 
 def panel(file: Path, label: str) -> np.ndarray:
     """An image at the size of a panel, with its name on it."""
-    small = cv2.resize(cv2.imread(str(file)), PANEL_PX, interpolation=cv2.INTER_AREA)
+    image = cv2.imread(str(file))
+    if image is None:
+        sys.exit(f"{file}: expected an image")
+    small = cv2.resize(image, PANEL_PX, interpolation=cv2.INTER_AREA)
     place, font = (8, PANEL_PX[1] - 10), cv2.FONT_HERSHEY_SIMPLEX
     return cv2.putText(small, label, place, font, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
 
@@ -34,7 +37,7 @@ def main(out: Path, *named: str) -> None:
         columns.append([panel(file, label) for file in files])
     animation = cv2.Animation()
     animation.frames = [np.hstack(moment) for moment in zip(*columns, strict=True)]
-    animation.durations = np.full(len(animation.frames), FRAME_MS)
+    animation.durations = [FRAME_MS] * len(animation.frames)
     cv2.imwriteanimation(str(out), animation, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
 
 

@@ -36,10 +36,12 @@ def sheet(images: list[np.ndarray], num_columns: int) -> np.ndarray:
 
 def main(out: Path, num_columns: int, paths: list[Path]) -> None:
     """Read, arrange, write."""
-    images = [cv2.imread(str(path)) for path in paths]
-    for path, image in zip(paths, images, strict=True):
-        if image is None or image.shape != images[0].shape:
+    images: list[np.ndarray] = []
+    for path in paths:
+        image = cv2.imread(str(path))
+        if image is None or (images and image.shape != images[0].shape):
             sys.exit(f"{path}: expected an image of the size of {paths[0]}")
+        images.append(image)
     cv2.imwrite(str(out), sheet(images, num_columns), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
 
 

@@ -59,7 +59,8 @@ REFUSE_EXCESS = 0.05  # a view that exceeds the render by this mean difference i
 DEPARTURE_WINDOW_PX = 5  # side of the square over which painting and render are compared; odd
 DEPARTURE_RANGE = (0.01, 0.04)
 """Mean differences from which on a painted pixel counts, and at which it counts fully. A tenth of
-the weight is left, which gives up 0.1 to 0.2 dB beside the path (docs/benchmarks.md)."""
+the weight is left, which gives up 0.1 to 0.2 dB beside the path
+(docs/decisions/what-guides-a-fit.md)."""
 MIN_EVIDENCE = 0.02  # share of pixels with evidence under which no view is gated as a whole
 
 

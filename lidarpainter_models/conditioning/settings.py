@@ -79,7 +79,8 @@ class NovelGuidanceConfig:
         """What is painted in one of so many rounds, of which the first is 1.
 
         Each distance to the side is painted in one of them, the nearest first: all of them in each
-        took longer and gave nothing more (docs/benchmarks.md). What is not aside is painted in all.
+        took longer and gave nothing more (docs/decisions/what-guides-a-fit.md). What is not aside
+        is painted in all.
 
         Raises:
             ConfigError: that is farther away than a scene shows anything.

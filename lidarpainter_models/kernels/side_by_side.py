@@ -2,7 +2,7 @@
 
 Work on one view is hundreds of small steps, and few of them have enough to do for many threads: two
 threads paint one view no sooner than one does, but two views in little more than the time of one
-(docs/benchmarks.md). Compiled kernels and torch let other Python threads run.
+(docs/decisions/views-side-by-side.md). Compiled kernels and torch let other Python threads run.
 """
 
 import contextvars

@@ -10,9 +10,11 @@ ROOT = Path(__file__).resolve().parents[2]
 LIBRARY = "lidarpainter_models"
 PACKAGES = ("flows", "tasks", "catalog", LIBRARY, "tests", "docs", "scripts")
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
-HISTORY = "CHANGELOG.md"
-"""Names what was there."""
+HISTORY = {ROOT / "CHANGELOG.md", *(ROOT / "docs" / "log").glob("*.md")}
+"""These pages name what was there."""
 LINK = re.compile(r"\]\((?!https?://)([^)#\s]+)(?:#[^)\s]*)?\)")
+ANCHOR = re.compile(r"\]\((?!https?://)([^)#\s]*)#([^)\s]+)\)")
+HEADING = re.compile(r"^#+ (.*)$", re.MULTILINE)
 NAMED = re.compile(r"`([\w./-]+)`")
 MADE_BY_A_RUN = {"nano.json", "trajectory.json"}
 QUESTION = re.compile(r"^\| (.+\?) \| `([\w./]+)` \| `(\w+)` \|$", re.MULTILINE)
@@ -34,7 +36,21 @@ def test_every_link_leads_somewhere(page):
     assert [link for link in links if not (page.parent / link).exists()] == []
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page.name != HISTORY], ids=relative)
+def anchors_of(page: Path) -> set[str]:
+    """What GitHub and the site call the headings of a page."""
+    headings = HEADING.findall(page.read_text("utf-8"))
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=relative)
+def test_every_anchor_is_a_heading(page):
+    found = ANCHOR.findall(page.read_text("utf-8"))
+    targets = [(page.parent / name if name else page, anchor) for name, anchor in found]
+    pages = [(target, anchor) for target, anchor in targets if target.suffix == ".md"]
+    assert [a for target, a in pages if a not in anchors_of(target)] == []
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page not in HISTORY], ids=relative)
 def test_every_source_file_that_is_named_is_there(page):
     rooms = {path.name for path in (ROOT / LIBRARY).iterdir() if path.is_dir()}
     named = [
@@ -53,3 +69,28 @@ def test_ten_questions_are_answered_where_the_page_says():
         tree = ast.parse(path_of(file).read_text("utf-8"))
         defined = {node.name for node in tree.body if hasattr(node, "name")}
         assert name in defined, question
+
+
+def said_in_code() -> str:
+    """Every piece of text in the product's code; parts of an f-string are pieces of their own."""
+    trees = [
+        ast.parse(path.read_text("utf-8"))
+        for package in ("flows", "tasks", "catalog", LIBRARY)
+        for path in (ROOT / package).rglob("*.py")
+    ]
+    texts = [
+        node.value
+        for tree in trees
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    ]
+    return "\0".join([*texts, (ROOT / "pyproject.toml").read_text("utf-8")])
+
+
+def test_what_troubleshooting_quotes_is_what_the_code_prints():
+    page = (ROOT / "docs" / "troubleshooting.md").read_text("utf-8")
+    quoted = re.findall(r"^> `(.*)`$", page, re.MULTILINE)
+    assert len(quoted) >= 20
+    code = said_in_code()
+    pieces = [piece for line in quoted for piece in line.split("…") if piece]
+    assert [piece for piece in pieces if piece not in code] == []

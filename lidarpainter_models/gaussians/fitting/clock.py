@@ -6,7 +6,7 @@ from lidarpainter_models.gaussians.fitting.config import FitConfig
 
 HALF_STEP = 0.6
 """What a step at half the image size costs of one at full size: 0.46 in images 960 pixels wide, in
-smaller ones 0.72, as Gaussians cost more than pixels there (docs/benchmarks.md)."""
+smaller ones 0.72, as Gaussians cost more than pixels there (docs/decisions/length-of-a-fit.md)."""
 
 
 def work_of(step: int, config: FitConfig, steps: int | None = None) -> float:

@@ -47,10 +47,10 @@ class GuidanceConfig:
     probability: float = 1.0
     """Probability of adding one painted view to a step (the paper's p_novel, 0.4). Against 0.5 the
     neighbouring lanes of streets gain 0.1 dB, recorded views lose 0.05 to 0.1
-    (docs/benchmarks.md)."""
+    (docs/decisions/what-guides-a-fit.md)."""
     until: float = 0.7
     """Part of the steps that painted views take part in. The last ones fit recorded views alone,
-    which halves what painting costs these (docs/benchmarks.md)."""
+    which halves what painting costs these (docs/decisions/what-guides-a-fit.md)."""
     weight: float = 1.0
     """Weight of a painted view's loss (the paper's lambda_novel, 0.2, changed nothing on short
     schedules)."""
@@ -70,7 +70,7 @@ class EffortConfig:
 
     looks: float = 300.0
     """Steps for every view's worth of new surface. More of them sharpen the recorded views and cost
-    the neighbouring lanes (docs/benchmarks.md)."""
+    the neighbouring lanes (docs/decisions/length-of-a-fit.md)."""
     gaussians_per_pixel: float = 0.23
     """Most Gaussians for a pixel of surface with the detail of a typical street (`SeenSurface`):
     more sharpen one camera by a little, and six cameras not at all (docs/measuring.md)."""
@@ -149,7 +149,7 @@ def continuation(
     Full images and actors free to move from the first step; growth and rates as in the first fit.
     Rates started lower held nothing better and took in a fifth less of what was painted. Cameras
     stay where the first fit has them: what they still move is noise, which painted views, seen from
-    where they were, pay for (docs/benchmarks.md).
+    where they were, pay for (docs/decisions/rates-of-learning.md).
     """
     return replace(
         config,

@@ -40,7 +40,7 @@ LEAST_CHANGE = 0.12
 """Least change of a lamp from off to on, in the channel that changes most; images are 0 to 1."""
 LEAST_EXPLAINED = 0.97
 """Share of a lamp's change over time that two levels explain. On PandaSet 002 a signal that
-flashes has 0.99, what is next 0.966 (docs/benchmarks.md)."""
+flashes has 0.99, what is next 0.966 (docs/decisions/lamps.md)."""
 CANDIDATE_CHANGE, CANDIDATE_EXPLAINED = 0.1, 0.85
 """Least change, and share explained, of a single cube that may be part of a lamp."""
 AROUND_CELLS, MOST_AROUND = 3, 0.4

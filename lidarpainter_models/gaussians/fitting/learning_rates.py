@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 COLOUR_LOOKS = 300.0
 """Colours move no further in a longer fit than in one of so many looks. Those that recorded views
 hardly show move as fast as Adam lets them, and what they end up as stands in full view of the next
-lane: the longer the fit, the further off (docs/benchmarks.md)."""
+lane: the longer the fit, the further off (docs/decisions/rates-of-learning.md)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,12 +21,13 @@ class LearningRates:
     """Orientations, in units of the quaternion."""
     log_scale: tuple[float, float] = (4e-2, 8e-3)
     """Sizes, in logarithms of metres. Shapes are what a fit waits for: at a quarter of these rates
-    it takes nearly twice the steps (docs/benchmarks.md)."""
+    it takes nearly twice the steps (docs/decisions/rates-of-learning.md)."""
     opacity_logit: tuple[float, float] = (6e-2, 2e-2)
     """Opacities, in logits."""
     sh_dc: tuple[float, float] = (6e-3, 1e-3)
     """Constant harmonics; a colour changes by 0.28 of it. In fits of more than `COLOUR_LOOKS` less.
-    Twice as fast, recorded views gain 0.07 dB and the next lane's lose 0.3 (docs/benchmarks.md)."""
+    Twice as fast, recorded views gain 0.07 dB and the next lane's lose 0.3
+    (docs/decisions/rates-of-learning.md)."""
     sh_rest: tuple[float, float] = (6e-4, 2e-4)
     """Harmonics of degree 1 and more."""
     camera_rotation_rad: tuple[float, float] = (6e-4, 6e-5)
