@@ -18,6 +18,7 @@ from torch import Tensor
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.geometry.driven_paths import DrivenPath
+from lidarpainter_models.scenes.image_bytes import decode_image
 from lidarpainter_models.scenes.records import (
     Distortion,
     ImageRecord,
@@ -33,8 +34,6 @@ from lidarpainter_models.scenes.undistortion import pinhole_of, undistort
 
 __all__ = ["ActorTrack", "DrivingScene", "RecordedView", "Sweep", "SweepPoints"]
 
-# the lens belongs to the pixels as they lie in the file, whatever way up a viewer should show them
-_AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 _POINT_COLUMNS = {
     "xyz_m": "point_xyz_m",
     "intensity": "point_intensity",
@@ -116,8 +115,7 @@ class DrivingScene:
 
     def read_image(self, view: RecordedView) -> UInt8[Tensor, "height width 3"]:
         """The recorded image as RGB bytes; a distorted lens is undone."""
-        jpeg = self.read_jpeg(view)
-        image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), _AS_STORED)
+        image = decode_image(self.read_jpeg(view))
         if image is None:
             raise SceneError(f"{self.path}: the image {view.key} cannot be decoded")
         image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)

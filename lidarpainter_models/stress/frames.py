@@ -12,6 +12,7 @@ from torch import Tensor
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.transforms import interpolate_rigid_track, transform_points
 from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.image_bytes import decode_image
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, Sweep, SweepPoints
 
 JPEG_QUALITY = 95
@@ -26,7 +27,7 @@ class Shot:
 
     def with_pixels(self, change: Callable[[np.ndarray], np.ndarray]) -> "Shot":
         """The same with its pixels changed: BGR in [0, 255], float32 (height, width, 3)."""
-        bgr = cv2.imdecode(np.frombuffer(self.jpeg, np.uint8), cv2.IMREAD_COLOR)
+        bgr = decode_image(self.jpeg)
         if bgr is None:
             raise SceneError(f"an image of camera {self.record.camera_name} cannot be decoded")
         spoilt = change(bgr.astype(np.float32)).round().clip(0, 255).astype(np.uint8)
