@@ -36,7 +36,8 @@ class ViewParameters(BaseModel):
     device: str = "auto"
     """Where fits, painters and judges run: `cpu`, `cuda`, `cuda:1`; `auto` takes a GPU if any."""
     kernels: KernelChoice = "auto"
-    """`torch` takes plain torch for all but the rasteriser, as a GPU does, to be tried on a CPU."""
+    """`torch` takes plain torch for all but the rasteriser, as a GPU does, to be tried on a CPU;
+    `gsplat` lets gsplat instead of our own Triton kernels draw on an NVIDIA GPU."""
     conditions: ConditionConfig
     scoring: ScoringConfig
     feature_weights: Path | None = None

@@ -19,7 +19,7 @@ from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.gaussians.fitting.settings import DensificationConfig
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
-from lidarpainter_models.kernels import backends, gaussian_raster, gpu_packages
+from lidarpainter_models.kernels import gaussian_raster, gpu_packages
 
 IMAGE_ERROR = 1e-6
 GRADIENT_ERROR = 1e-5
@@ -123,20 +123,6 @@ def test_every_kernel_compiles_to_machine_code_without_spilling():
 @pytest.mark.parametrize(("coefficients", "features"), [(16, 0), (4, 1), (4, 2)])
 def test_every_kernel_compiles_for_every_degree(architecture, coefficients, features):
     assert_fits(machine_code("triton_compilation.py", architecture, coefficients, features))
-
-
-@pytest.mark.parametrize(
-    ("found", "expected"),
-    [
-        (("reference", "cpu", "cuda", "triton"), "cuda"),
-        (("reference", "cpu", "triton"), "triton"),
-        (("reference", "cpu"), "reference"),
-    ],
-)
-def test_a_gpu_gets_gsplat_then_triton_then_the_reference(monkeypatch, found, expected):
-    monkeypatch.setattr(backends, "available_backends", lambda _kernel: found)
-    draw = backends.implementation("gaussian_raster", "draw_views", "auto", torch.device("cuda"))
-    assert draw.__module__ == f"lidarpainter_models.kernels.gaussian_raster.{expected}"
 
 
 def test_a_machine_without_triton_is_told_so(monkeypatch):
