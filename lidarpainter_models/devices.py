@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 
 Device = str
 """`auto`, `cpu`, `cuda` or `cuda:N`; see `check_device`."""
-KernelChoice = Literal["auto", "gsplat", "torch"]
-"""Our own kernels; gsplat as the rasteriser of a GPU; or plain torch for all but the rasteriser:
-the path of a GPU, which can be tried on a CPU."""
+KernelChoice = Literal["auto", "torch", "gsplat"]
+"""Which kernels run. `auto` takes this project's own fast kernels, `torch` plain torch for all but
+the rasteriser (a GPU's way, tried on a CPU), and `gsplat` lets gsplat draw on an NVIDIA GPU."""
 Made = TypeVar("Made")
 _DEVICES = re.compile(r"auto|cpu|cuda(:\d+)?")
 

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError, WriteError
+from lidarpainter_models.scenes.image_bytes import decode_image
 
 JPEG_QUALITY = 90
 WEBP_QUALITY = 80
@@ -44,7 +45,10 @@ def read_image(path: Path) -> Float[Tensor, "height width 3"]:
     Raises:
         DataError: it is not there, or no image.
     """
-    bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    try:
+        bgr = decode_image(path.read_bytes())
+    except OSError:
+        bgr = None
     if bgr is None:
         raise DataError(f"{path}: expected an image")
     return torch.from_numpy(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)).float() / 255

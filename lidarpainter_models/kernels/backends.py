@@ -1,12 +1,12 @@
 """Choose which implementation of a kernel runs.
 
 Every kernel package holds `reference.py` (plain torch, the law), `cpu.py` (numba) and, where it
-pays, `cuda.py` (gsplat) and `triton.py`. Implementations are imported when first asked for, so
-nothing is compiled at import. A run may ask for plain torch on the CPU too (`kernels_chosen`), the
-path of a GPU.
+pays, `triton.py` for a GPU; the rasteriser also has `cuda.py`, an adapter to gsplat.
+Implementations are imported when first asked for, so nothing is compiled at import. A run may ask
+for plain torch on the CPU too, the path of a GPU, or for gsplat (`kernels_chosen`).
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
@@ -22,8 +22,8 @@ from lidarpainter_models.errors import BackendError, ConfigError
 from lidarpainter_models.kernels.gpu_packages import why_no_gsplat, why_no_triton
 
 Backend = Literal["auto", "reference", "cpu", "cuda", "triton"]
-FASTEST = {"cpu": "cpu", "cuda": "triton"}
-"""By device, what `auto` takes where it can run; gsplat is taken where it is asked for alone."""
+FASTEST = {"cpu": ("cpu",), "cuda": ("triton",)}
+"""The backends that `auto` tries on each device before the plain reference."""
 RASTERISER = "gaussian_raster"
 """Its reference is for tests alone, far too slow to fit with."""
 
@@ -32,7 +32,7 @@ _choice: ContextVar[KernelChoice] = ContextVar("kernel choice", default="auto")
 
 @contextmanager
 def kernels_chosen(choice: KernelChoice) -> Iterator[None]:
-    """Let kernels that are asked for nothing else be of a choice while this lasts."""
+    """While this lasts, `auto` follows the choice in every kernel."""
     before = _choice.set(choice)
     try:
         yield
@@ -69,16 +69,16 @@ def implementation(
 ) -> Callable[..., Any]:
     """The function of a kernel's backend.
 
-    `auto` takes numba on a CPU and our Triton kernels on a GPU, else the plain reference, unless
-    the run asks for gsplat or plain torch (`kernels_chosen`).
+    `auto` takes numba on the CPU and Triton on a GPU, otherwise the plain reference. Where
+    `kernels_chosen` asks for `torch`, it takes the reference for all but the rasteriser; where it
+    asks for `gsplat`, that draws and everything else stays as it is.
 
     Raises:
-        BackendError: the backend does not exist for this kernel or cannot run here.
+        BackendError: the backend does not exist for this kernel or cannot run here, or a GPU has
+            no rasteriser.
     """
     found = available_backends(kernel)
-    chosen: str = backend
-    if backend == "auto":
-        chosen = _automatic(kernel, device, found)
+    chosen: str = _automatic(kernel, device, found) if backend == "auto" else backend
     if chosen not in found:
         raise BackendError(
             f"kernel {kernel!r} has no {chosen!r} backend here: {why_missing(kernel, chosen)} "
@@ -89,14 +89,22 @@ def implementation(
     return getattr(import_module(f"lidarpainter_models.kernels.{kernel}.{chosen}"), function)
 
 
-def _automatic(kernel: str, device: torch.device, found: Sequence[str]) -> str:
-    """What `auto` stands for: the fastest of ours that was found, or what the run asked for."""
+def _automatic(kernel: str, device: torch.device, found: tuple[str, ...]) -> str:
+    """The backend that `auto` stands for, given what can run here."""
     choice = _choice.get()
-    if choice == "gsplat" and kernel == RASTERISER:
+    if kernel == RASTERISER and choice == "gsplat":
+        reason = why_missing(kernel, "cuda")
+        if reason is not None:
+            raise BackendError(f"kernels=gsplat: gsplat cannot draw here: {reason}")
         return "cuda"
-    fastest = FASTEST.get(device.type)
-    is_plain = choice == "torch" and kernel != RASTERISER
-    return fastest if fastest in found and not is_plain else "reference"
+    if kernel == RASTERISER and device.type == "cuda" and "triton" not in found:
+        raise BackendError(
+            f"drawing on {device} needs Triton ({why_missing(kernel, 'triton')}), or gsplat with "
+            "--set kernels=gsplat"
+        )
+    if kernel != RASTERISER and choice == "torch":
+        return "reference"
+    return next((name for name in FASTEST.get(device.type, ()) if name in found), "reference")
 
 
 def check_choice(choice: KernelChoice) -> None:
@@ -111,7 +119,7 @@ def check_choice(choice: KernelChoice) -> None:
 
 def may_run_on_host(device: torch.device) -> bool:
     """Whether numbers of a device may be given to code of the CPU that is no kernel (OpenCV)."""
-    return device.type == "cpu" and _choice.get() == "auto"
+    return device.type == "cpu" and _choice.get() != "torch"
 
 
 def float32_backend(kernel: str, backend: Backend, like: Tensor) -> Backend:

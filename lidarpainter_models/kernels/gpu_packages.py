@@ -1,13 +1,15 @@
-"""The packages that draw on an NVIDIA GPU, and why one cannot be used here."""
+"""What kernels for an NVIDIA GPU need: the packages, why one is missing, tensors without gaps."""
 
 import subprocess
 import sys
-from contextlib import redirect_stdout
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
 from functools import cache
 from importlib import import_module
 from types import ModuleType
 
 import torch
+from torch import Tensor
 
 from lidarpainter_models.errors import BackendError
 
@@ -82,6 +84,16 @@ def import_gsplat() -> ModuleType:
             f"{torch.__version__} or a CUDA toolkit (CUDA_HOME)"
         )
     return gsplat
+
+
+@contextmanager
+def dense_in_place(tensors: Sequence[Tensor]) -> Iterator[list[Tensor]]:
+    """The tensors for a kernel that changes them; what had to be copied is copied back."""
+    dense = [tensor.contiguous() for tensor in tensors]
+    yield dense
+    for tensor, changed in zip(tensors, dense, strict=True):
+        if tensor is not changed:
+            tensor.copy_(changed)
 
 
 def _first_line(error: Exception) -> str:

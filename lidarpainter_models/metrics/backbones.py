@@ -76,7 +76,7 @@ class Backbone:
     name: str
     build: Callable[[], FeatureStack]
     channels: tuple[int, ...]
-    """Of the compared layers, by which heads are matched to a backbone."""
+    """Channels of the compared layers, by which heads are matched to a backbone."""
     published: tuple[str, ...]
     """First eight digits of the SHA-256 of torchvision's files, as they stand in their names."""
 

@@ -42,7 +42,7 @@ class EdgeScores:
     recall: float
     """Share of the clear image's edges that are kept."""
     judged_share: float
-    """Of the image's pixels."""
+    """Share of the image's pixels near enough to a LiDAR hit to be compared."""
 
 
 def edge_agreement(

@@ -76,7 +76,7 @@ class Lpips(nn.Module):
 
     @property
     def channels(self) -> tuple[int, ...]:
-        """Of the backbone's features at every compared depth."""
+        """Numbers of channels of the backbone at every compared depth."""
         heads = [self.get_buffer(f"head_{index}") for index in range(self.num_heads)]
         return tuple(len(head) for head in heads)
 

@@ -15,7 +15,7 @@ from lidarpainter_models.metrics.squeezenet import load_squeezenet_distance
 ImageDistance = Callable[
     [Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]], Float[Tensor, ""]
 ]
-"""Of an image to the truth, such as `SqueezeNetDistance` or `Lpips`."""
+"""A distance of an image to the truth, such as `SqueezeNetDistance` or `Lpips`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

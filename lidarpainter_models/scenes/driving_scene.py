@@ -20,6 +20,7 @@ from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
+from lidarpainter_models.scenes.image_bytes import decode_image
 from lidarpainter_models.scenes.records import (
     Distortion,
     ImageRecord,
@@ -116,8 +117,10 @@ class DrivingScene:
 
     def read_image(self, view: RecordedView) -> UInt8[Tensor, "height width 3"]:
         """The recorded image as RGB bytes; a distorted lens is undone."""
-        jpeg = self.read_jpeg(view)
-        image = cv2.cvtColor(decoded_bgr(jpeg, f"{self.path}: {view.key}"), cv2.COLOR_BGR2RGB)
+        image = decode_image(self.read_jpeg(view))
+        if image is None:
+            raise SceneError(f"{self.path}: the image {view.key} cannot be decoded")
+        image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
         lens, distortion = self._lenses[view.index]
         return torch.from_numpy(undistort(image, lens, distortion, view.camera))
 
@@ -237,21 +240,6 @@ class DrivingScene:
         self.tracks: tuple[ActorTrack, ...] = tracks_from_boxes(
             columns, _poses(boxes, "world_from_box")
         )
-
-
-def decoded_bgr(jpeg: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
-    """The pixels of a stored image as they lie in the file, whatever way up a viewer shows them.
-
-    The lens belongs to these pixels, so a tag of orientation (EXIF) turns nothing.
-
-    Raises:
-        SceneError: the bytes cannot be decoded; `where` names the image.
-    """
-    as_stored = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), as_stored)
-    if image is None:
-        raise SceneError(f"{where}: the image cannot be decoded")
-    return image
 
 
 def _poses(table: pa.Table, column: str) -> Float[Tensor, "rows 4 4"]:

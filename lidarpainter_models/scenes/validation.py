@@ -16,6 +16,7 @@ from torch import Tensor
 from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import is_rigid
+from lidarpainter_models.scenes.image_bytes import can_decode
 from lidarpainter_models.scenes.records import Distortion, RollingShutter
 from lidarpainter_models.scenes.schema import MAX_NAME_LENGTH, is_safe_name
 from lidarpainter_models.scenes.undistortion import pinhole_of
@@ -186,8 +187,7 @@ def require_jpeg(jpeg: bytes, *, width_px: int, height_px: int, where: str) -> N
         )
     if not jpeg.rstrip(b"\x00").endswith(_JPEG_END):
         raise DataError(f"{where}: the JPEG image is cut off ({len(jpeg)} bytes, no end marker)")
-    # an eighth of the size: all entropy-coded data is read, the rest of the work is spared
-    if cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_8) is None:
+    if not can_decode(jpeg):
         raise DataError(f"{where}: the JPEG image cannot be decoded")
 
 

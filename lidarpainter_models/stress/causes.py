@@ -19,7 +19,7 @@ class Cause:
     name: str
     unit: str
     levels: tuple[float, ...]
-    """From mild to grave."""
+    """Levels of the fault from mild to grave."""
     spoil: Callable[[Frame, float, np.random.Generator], Frame]
     """A frame at a level."""
     is_of_log: bool = False

@@ -9,8 +9,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.transforms import interpolate_rigid_track, transform_points
-from lidarpainter_models.scenes.driving_scene import DrivingScene, decoded_bgr
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.image_bytes import decode_image
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, Sweep, SweepPoints
 
 JPEG_QUALITY = 95
@@ -25,7 +27,9 @@ class Shot:
 
     def with_pixels(self, change: Callable[[np.ndarray], np.ndarray]) -> "Shot":
         """The same with its pixels changed: BGR in [0, 255], float32 (height, width, 3)."""
-        bgr = decoded_bgr(self.jpeg, f"camera {self.record.camera_name}")
+        bgr = decode_image(self.jpeg)
+        if bgr is None:
+            raise SceneError(f"an image of camera {self.record.camera_name} cannot be decoded")
         spoilt = change(bgr.astype(np.float32)).round().clip(0, 255).astype(np.uint8)
         encoded = cv2.imencode(".jpg", spoilt, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
         return replace(self, jpeg=encoded.tobytes())

@@ -9,13 +9,13 @@ import numpy as np
 from lidarpainter_models.stress.frames import Frame, Shot
 
 GAMMA = 2.2
-"""Of pictures, about; light is added and scaled in linear units."""
+"""Exponent between image values and light, about; light is changed in linear units."""
 NIGHT_NOISE = 0.02
 """Standard deviation of the noise of a pixel at full darkness, of full scale."""
 GREY, DENSITY = 90, 0.9
-"""Of dirt: its level of 255, and how much of the light it takes."""
+"""The grey level of dirt (of 255), and the share of light that it takes."""
 SPOTS = 12
-"""On a dirty lens, of each camera the same in every picture."""
+"""Number of blots on a dirty lens; a camera has the same ones in every image."""
 
 
 def exposure(frame: Frame, level: float, dice: np.random.Generator) -> Frame:

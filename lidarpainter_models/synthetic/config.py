@@ -15,7 +15,7 @@ class RigCamera:
     focal_per_width: float
     """Focal length over the width of the image."""
     yaw_rad: float = 0.0
-    """To the left of the driving direction."""
+    """Angle from the driving direction to the left."""
     forward_m: float = 0.4
     left_m: float = 0.0
     up_m: float = 1.6
@@ -25,7 +25,7 @@ class RigCamera:
     gain_drift: float = 0.0
     """How much more it is a second later, as a share of `gain`."""
     readout_s: float = 0.0
-    """From the first row read to the last, downwards; an image's time is the middle of it."""
+    """Time from reading the first row to the last, downwards; an image is dated to its middle."""
     delay_s: float = 0.0
     """How much later than stored its images are really taken."""
     yaw_error_rad: float = 0.0
@@ -69,7 +69,7 @@ class RigLidar:
 
     name: str = "main_pandar64"
     beams: int = 64
-    """Of the 64 inclinations, evenly chosen."""
+    """Number of beams, evenly chosen among 64 inclinations."""
     columns: int = 1800
     """Firings per turn."""
     up_m: float = 2.0
@@ -143,7 +143,7 @@ class SyntheticStreetConfig:
             raise ConfigError("two cameras of the street have the same name")
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON-able values."""
+        """Turn the settings into values that JSON can hold."""
         values = asdict(self)
         values["cameras"] = list(values["cameras"])
         values["speed_mps"] = None if self.speed_mps is None else list(self.speed_mps)

@@ -43,9 +43,9 @@ class LensState:
     actor_index: int
     """Index in `SyntheticStreet.actors`, -1 for the street."""
     centre_m: Float[Tensor, " 3"]
-    """Of the upright box around the lens, float64: in the actor's box frame, or in the world."""
+    """Centre of the upright box around the lens, float64: in the actor's box frame or the world."""
     size_m: Float[Tensor, " 3"]
-    """Of that box along its frame's axes, float64."""
+    """Size of that box along its frame's axes, float64."""
     is_lit: bool
 
 

@@ -18,7 +18,7 @@ from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import COLOUR_OFFSET
-from lidarpainter_models.kernels.gaussian_raster.reference_harmonics import harmonic_basis
+from lidarpainter_models.kernels.gaussian_raster.reference import harmonic_basis
 
 MIN_OPACITY = 0.01
 """The client draws nothing fainter."""

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation
-from lidarpainter_models.kernels.gaussian_raster.reference_harmonics import harmonic_basis
+from lidarpainter_models.kernels.gaussian_raster.reference import harmonic_basis
 
 _NUM_DIRECTIONS = 64  # any more than 16 in general position determine 16 coefficients
 

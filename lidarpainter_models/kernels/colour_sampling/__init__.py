@@ -5,6 +5,8 @@ Projection alone is asked for on any device. Pixels are
 continuous, the top-left one has its centre at (0.5, 0.5); depth is camera z.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -12,20 +14,33 @@ from torch import Tensor
 
 from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.kernels.backends import Backend, implementation
-from lidarpainter_models.kernels.colour_sampling.sample_slots import AGREEMENT, SLOTS, BestSamples
-
-__all__ = [
-    "AGREEMENT",
-    "SLOTS",
-    "BestSamples",
-    "combine_samples",
-    "insert_samples",
-    "project_inside",
-    "sample_levels",
-    "steps_inside",
-]
 
 _CPU = torch.device("cpu")
+SLOTS = 4
+"""Best samples that a point keeps."""
+AGREEMENT = 32.0
+"""Samples further than this (of 255, in any channel) from the typical one are outliers."""
+
+
+class BestSamples(NamedTuple):
+    """The best samples of every point, heaviest first."""
+
+    weight: np.ndarray
+    """(points, slots) float32, 0 where a slot is empty."""
+    rgb: np.ndarray
+    """(points, slots, 3) uint8."""
+    view: np.ndarray
+    """(points, slots) int16, or int32 of many views: number of the one each sample is from."""
+
+    @classmethod
+    def none_yet(cls, num_points: int, num_views: int) -> "BestSamples":
+        """Empty slots, for samples of so many views."""
+        number = np.result_type(np.int16, np.min_scalar_type(-num_views))
+        return cls(
+            weight=np.zeros((num_points, SLOTS), np.float32),
+            rgb=np.zeros((num_points, SLOTS, 3), np.uint8),
+            view=np.zeros((num_points, SLOTS), number),
+        )
 
 
 def project_inside(

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lidarpainter_models.kernels.colour_sampling.sample_slots import AGREEMENT, SLOTS, BestSamples
+from lidarpainter_models.kernels.colour_sampling import AGREEMENT, SLOTS, BestSamples
 
 
 def project_inside(

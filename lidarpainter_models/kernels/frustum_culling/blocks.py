@@ -31,7 +31,7 @@ class Blocks:
     """Where each block begins in `order`."""
     body: Int[Tensor, " blocks"]
     low: Float[Tensor, "blocks 3"]
-    """Of the centres, float64; the bounds are changed in place."""
+    """Lower bound of the centres, float64; the bounds are changed in place."""
     high: Float[Tensor, "blocks 3"]
     """Under `low` where no Gaussian of the block is finite."""
     reach: Float[Tensor, " blocks"]

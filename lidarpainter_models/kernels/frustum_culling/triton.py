@@ -9,13 +9,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from lidarpainter_models.kernels.dense_tensors import dense_in_place
 from lidarpainter_models.kernels.frustum_culling.blocks import Blocks, Look, plane_rows
 from lidarpainter_models.kernels.frustum_culling.triton_kernels import (
     bound_blocks,
     mark_blocks,
 )
-from lidarpainter_models.kernels.gpu_packages import check_triton_device
+from lidarpainter_models.kernels.gpu_packages import check_triton_device, dense_in_place
 
 
 def refresh_bounds(

@@ -49,7 +49,7 @@ def bound_blocks(order, first, is_stale, means, log_scale, reach_sigmas, low, hi
 
 @triton.jit
 def _column(pose, axis, facing):
-    """By how much each plane's distance changes along an axis of the body; 3: where it lies."""
+    """How much each plane's distance changes along an axis of the body; 3: where it lies."""
     return (
         facing[0] * tl.load(pose + axis)
         + facing[1] * tl.load(pose + 4 + axis)

@@ -92,8 +92,7 @@ def render_views(
     """`render_gaussians` for several cameras in one call; images may differ in size.
 
     Each image is that of a call of its own bit for bit (on a CPU), and a gradient is the sum over
-    the views in their order. The Gaussians are checked once and gradients gathered in place. On
-    CUDA all views of one size go to gsplat in one call.
+    the views in their order. The Gaussians are checked once and gradients gathered in place.
 
     Raises:
         ShapeError: the tensors do not belong together.

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import TILE_PX
-from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry
+from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry, jump_of
 from lidarpainter_models.kernels.gaussian_raster.projection import CHUNKS, DEPTH, IS_VISIBLE
 from lidarpainter_models.kernels.gaussian_raster.screen_ellipses import (
     ellipse_of,
@@ -21,7 +21,6 @@ from lidarpainter_models.kernels.gaussian_raster.screen_ellipses import (
     tile_box,
     tile_columns,
 )
-from lidarpainter_models.kernels.gaussian_raster.work_sharing import jump_of
 
 REACHES = TILE_PX * TILE_PX
 """A tile and the reach inside it are found as one number, tile times this plus reach."""

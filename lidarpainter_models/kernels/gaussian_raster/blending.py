@@ -16,7 +16,7 @@ from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
     MIN_TRANSMITTANCE,
     TILE_PX,
 )
-from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry
+from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry, jump_of
 from lidarpainter_models.kernels.gaussian_raster.lane_types import (
     choose,
     largest,
@@ -49,7 +49,6 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
     RED,
     SHEAR,
 )
-from lidarpainter_models.kernels.gaussian_raster.work_sharing import jump_of
 
 PIXELS = TILE_PX * TILE_PX
 BATCH = 16

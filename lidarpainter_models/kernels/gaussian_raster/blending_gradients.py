@@ -29,7 +29,7 @@ from lidarpainter_models.kernels.gaussian_raster.blending import (
     local_centre,
 )
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import TILE_PX
-from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry
+from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry, jump_of
 from lidarpainter_models.kernels.gaussian_raster.lane_types import (
     choose,
     largest,
@@ -59,7 +59,6 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
     RED,
     SHEAR,
 )
-from lidarpainter_models.kernels.gaussian_raster.work_sharing import jump_of
 
 # Sums over pixels of an entry, with g the gradient of the exponent, u and dy the pixel's offset
 # in the sheared frame of the footprint (`projection`).

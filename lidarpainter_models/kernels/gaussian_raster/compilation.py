@@ -6,6 +6,7 @@ here; everything they call is compiled into them.
 """
 
 import hashlib
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -32,3 +33,21 @@ def compiled_entry(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function with `prange` loops that Python calls; cache it for these sources."""
     function.__qualname__ = f"{function.__qualname__}_{SOURCES}"
     return numba.njit(cache=True, nogil=True, parallel=True, **_ENTRY)(function)
+
+
+GOLDEN_RATIO = 0.6180339887498949
+"""Multiples of it, modulo 1, fill an interval most evenly."""
+
+
+@numba.njit(**EXACT)
+def jump_of(count: int) -> int:
+    """A step near the golden ratio of `count` that visits all of `range(count)`, modulo `count`.
+
+    Places that jump through uneven work share it out evenly: sky tiles are empty and road tiles are
+    full, near Gaussians reach many tiles and far ones few, so contiguous shares would keep one
+    thread waiting for another.
+    """
+    jump = max(int(count * GOLDEN_RATIO), 1)
+    while math.gcd(jump, count) > 1:
+        jump += 1
+    return jump

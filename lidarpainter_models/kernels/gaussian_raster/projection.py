@@ -23,7 +23,7 @@ from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
     COLOUR_OFFSET,
     NEAR_M,
 )
-from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry
+from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry, jump_of
 from lidarpainter_models.kernels.gaussian_raster.gaussian_lanes import (
     EIGHT,
     Rows,
@@ -44,7 +44,6 @@ from lidarpainter_models.kernels.gaussian_raster.lane_types import (
     smallest,
 )
 from lidarpainter_models.kernels.gaussian_raster.small_vectors import Matrix, Quaternion, Vector
-from lidarpainter_models.kernels.gaussian_raster.work_sharing import jump_of
 
 RECORD_FLOATS = 16
 """A Gaussian's screen record fills one 64-byte cache line."""

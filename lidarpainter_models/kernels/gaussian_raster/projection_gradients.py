@@ -30,7 +30,7 @@ from lidarpainter_models.kernels.gaussian_raster.blending_gradients import (
     add_entries,
     prefetch_entries,
 )
-from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry
+from lidarpainter_models.kernels.gaussian_raster.compilation import EXACT, compiled_entry, jump_of
 from lidarpainter_models.kernels.gaussian_raster.footprint_gradients import (
     axes_gradient,
     centre_gradient,
@@ -67,7 +67,6 @@ from lidarpainter_models.kernels.gaussian_raster.projection import (
     view_direction,
 )
 from lidarpainter_models.kernels.gaussian_raster.small_vectors import Matrix, Vector
-from lidarpainter_models.kernels.gaussian_raster.work_sharing import jump_of
 
 
 class Gradients(NamedTuple):
@@ -93,7 +92,7 @@ class _Eight(NamedTuple):
     lanes: np.ndarray
     """0 to 7: their rows in `sums`."""
     sums: np.ndarray
-    """Of each over its entries, (8, SUMS)."""
+    """Each Gaussian's sums over its entries, (8, SUMS)."""
     features: np.ndarray
     """The same of one Gaussian's features."""
     weights: np.ndarray

@@ -24,7 +24,6 @@ from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
     TANGENT_MARGIN,
     TILE_PX,
 )
-from lidarpainter_models.kernels.gaussian_raster.reference_harmonics import harmonic_basis
 from lidarpainter_models.kernels.gaussian_raster.splats import DrawnImages, Splats
 
 
@@ -271,3 +270,35 @@ def _blended(
     light_before = torch.cat([ones, light_after], dim=1)[:, :-1]
     blended = (alpha * light_before) @ chosen.values
     return torch.cat([1.0 - torch.cat([ones, light_after], dim=1)[:, -1:], blended], dim=1)
+
+
+def harmonic_basis(
+    direction: Float[Tensor, "directions 3"], coefficients: int
+) -> Float[Tensor, "directions coefficients"]:
+    """The first 1, 4, 9 or 16 real spherical harmonics at unit directions.
+
+    Constants, order and signs are those of Kerbl et al. (2023).
+    """
+    x, y, z = direction.unbind(dim=1)
+    basis = [torch.full_like(x, 0.28209479177387814)]
+    if coefficients > 1:
+        basis += [value * 0.4886025119029199 for value in (-y, z, -x)]
+    if coefficients > 4:
+        basis += [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (2 * z * z - x * x - y * y),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (x * x - y * y),
+        ]
+    if coefficients > 9:
+        basis += [
+            -0.5900435899266435 * y * (3 * x * x - y * y),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
+            0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+            -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
+            1.445305721320277 * z * (x * x - y * y),
+            -0.5900435899266435 * x * (x * x - 3 * y * y),
+        ]
+    return torch.stack(basis, dim=1)

@@ -22,7 +22,7 @@ class PixelFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PixelRules:
-    """From where on a pixel counts."""
+    """Thresholds from which on a pixel counts."""
 
     sky_tolerance: float
     """An OPEN pixel this close to the sky's colour counts as sky."""

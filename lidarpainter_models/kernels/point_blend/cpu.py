@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 def _gaussian_terms() -> tuple[np.float32, ...]:
-    """Of the polynomial in y = d^2 / r^2 that is exp(-2 y) on [0, 1] to 3e-7."""
+    """Coefficients of the polynomial in y = d^2 / r^2 that is exp(-2 y) on [0, 1] to 3e-7."""
     fitted = np.polynomial.Chebyshev.interpolate(lambda y: np.exp(-2 * y), 8, domain=[0, 1])
     return tuple(np.float32(term) for term in fitted.convert(kind=np.polynomial.Polynomial).coef)
 

@@ -4,7 +4,7 @@ import triton
 import triton.language as tl
 
 UNITS = tl.constexpr(2.0**38)
-"""Of which a one is made."""
+"""Units that make up a one in the integer sums."""
 
 
 @triton.jit(do_not_specialize=["points", "height", "width"])

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 from numpy import ndarray
 
-from lidarpainter_models.kernels.point_contrasts.seen_parts import (
+from lidarpainter_models.kernels.point_contrasts import (
     BORDER_PX,
     GUESSES,
     HIDDEN,

@@ -289,7 +289,7 @@ def _is_in_view(point, reach_m, sides):
 
 @numba.njit(**_INNER)
 def _display(light):
-    """As `weather.light.to_display`, read off a table by the root of light."""
+    """Read `weather.light.to_display` off a table by the root of light."""
     place = math.sqrt(min(max(light, _ZERO), _ONE)) * np.float32(STEPS)
     before = min(int(place), STEPS - 1)
     return CURVE[before] + (place - np.float32(before)) * (CURVE[before + 1] - CURVE[before])

@@ -21,7 +21,7 @@ class Lamps:
     power_rgb: Float[Tensor, "lamps 3"]
     """Irradiance a metre away; of a beam where it is brightest."""
     reach_m: Float[Tensor, " lamps"]
-    """Beyond it a lamp lights nothing; its light fades to nothing there."""
+    """The distance at which a lamp's light has faded to nothing."""
     is_fixed: Bool[Tensor, " lamps"]
     """Whether the light of the street's surfaces holds this lamp's already."""
 
@@ -35,7 +35,7 @@ class Surfaces:
     reach_m: Float[Tensor, " gaussians"]
     """How far a Gaussian may be seen beyond its centre."""
     normals: Float[Tensor, "gaussians 3"]
-    """As long as the surface is flat: 1 for a disc, 0 for a ball, which faces nowhere."""
+    """Normals whose length says how flat a surface is: 1 for a disc, 0 for a ball."""
     facing: Float[Tensor, " gaussians"]
     """Share of a lamp's light that it sends back when it faces the lamp."""
     least_facing: Float[Tensor, " gaussians"]
@@ -61,7 +61,7 @@ class Appearance:
     per_base: Float[Tensor, "gaussians 3"]
     """1 over the displayed colour that those belong to, at most 1 / `LEAST_BASE`."""
     shine: Float[Tensor, " gaussians"]
-    """Of water on level ground, against a still puddle."""
+    """How much water on level ground mirrors, against a still puddle."""
     skyline: Int[Tensor, " gaussians"]
     """Row of what stands around a wet surface; -1 where it is under the open sky."""
 
@@ -75,14 +75,14 @@ class Surroundings:
     sky_light: Float[Tensor, "3"]
     """What open sky shows a wet road."""
     skylines: Float[Tensor, "places sectors 4"]
-    """By equal sectors of azimuth, from x towards y: light of what stands there, and the tangent
+    """Light of what stands in each of equal sectors of azimuth (from x towards y), and the tangent
     of its height."""
 
 
 LEAST_BASE = 0.05
 """Darker colours than this say too little of how a colour changes with the direction of view."""
 MOST_GAIN = 2.0
-"""Of what depends on the direction of view."""
+"""Most that harmonics of degree 1 and above are multiplied by."""
 SKYLINE_SOFTNESS = 0.15
 """Change of tangent over which sky takes over from what stands before it in a mirror."""
 WIDEST_BEAM = 1.2
@@ -90,7 +90,7 @@ WIDEST_BEAM = 1.2
 FAINT = 9.0
 """Widths of the soft edge of a beam beyond which stray light alone is left."""
 STRAY_REACH_M = 15.0
-"""Beyond it nothing is left of what a beam loses above its cut-off."""
+"""Distance beyond which no stray light above a beam's cut-off is left."""
 SH_CONSTANT = 0.28209479177387814  # value of the harmonic of degree 0
 
 

@@ -15,13 +15,13 @@ import torch
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.kernels.sky_texture.layout import SkyLayout, SkyRays, TexelMoments
+from lidarpainter_models.kernels.sky_texture import SkyLayout, SkyRays, TexelMoments
 
 _HALF_PI = np.float32(math.pi / 2)
 _PI = np.float32(math.pi)
 _TURN = np.float32(2 * math.pi)
 _MOST_VISITS = 1000
-"""Of a texel that count: afterwards Adam's biases are gone."""
+"""Visits of a texel that are counted: afterwards Adam's biases are gone."""
 
 
 def locate(camera: Camera, layout: SkyLayout, wanted: Tensor) -> Tensor:

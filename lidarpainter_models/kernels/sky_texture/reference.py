@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.kernels.sky_texture.layout import SkyLayout, SkyRays, TexelMoments
+from lidarpainter_models.kernels.sky_texture import SkyLayout, SkyRays, TexelMoments
 
 
 def locate(

@@ -9,9 +9,8 @@ import triton
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.kernels.dense_tensors import dense_in_place
-from lidarpainter_models.kernels.gpu_packages import check_triton_device
-from lidarpainter_models.kernels.sky_texture.layout import SkyLayout, SkyRays, TexelMoments
+from lidarpainter_models.kernels.gpu_packages import check_triton_device, dense_in_place
+from lidarpainter_models.kernels.sky_texture import SkyLayout, SkyRays, TexelMoments
 from lidarpainter_models.kernels.sky_texture.triton_kernels import (
     BLOCK,
     TURN,
@@ -25,9 +24,9 @@ from lidarpainter_models.kernels.sky_texture.triton_kernels import (
 )
 
 WARPS = 8
-"""Of a program: four lanes a thread."""
+"""Warps of a program: four lanes a thread."""
 SUM_BITS = 62
-"""Of a texel's sum, without its sign; one is left over for terms rounded otherwise."""
+"""Bits of a texel's sum without its sign; one is left over for terms rounded otherwise."""
 
 
 def locate(camera: Camera, layout: SkyLayout, wanted: Tensor) -> Tensor:

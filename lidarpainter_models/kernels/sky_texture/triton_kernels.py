@@ -21,7 +21,7 @@ NOT_FINITE = tl.constexpr(255)
 LOG_BETA_1 = tl.constexpr(math.log(0.9))
 LOG_BETA_2 = tl.constexpr(math.log(0.99))
 MOST_VISITS = tl.constexpr(1000)
-"""Of a texel that count: afterwards Adam's biases are gone."""
+"""Visits of a texel that are counted: afterwards Adam's biases are gone."""
 
 
 @triton.jit
@@ -145,13 +145,13 @@ def find_peaks(gradient, weight, places, peaks, columns, rows, count, WRAPS: tl.
 
 @triton.jit
 def _power_of_two(exponent):
-    """As float64."""
+    """Two to the power of a whole exponent, as float64."""
     return ((exponent + 1023).to(tl.int64) << 52).to(tl.float64, bitcast=True)
 
 
 @triton.jit
 def _exponent(peak):
-    """Of float32, by its bits; what is below the normal numbers has the least of them."""
+    """Exponent of a float32 from its bits; numbers below the normal ones have the least."""
     return tl.maximum(peak >> 23, 1) - 127
 
 

@@ -12,11 +12,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 KINDS = 6
-"""Of learning rates: one for each of the `Parameters`."""
+"""Number of learning rates: one for each of the `Parameters`."""
 LEAST_ROOM = 256
 """Steps that there is room for at first."""
 NODE_NUMBERS = 4
-"""Of a run of missed steps: weight and depth of its earlier node, then of its later one."""
+"""Numbers that stand for a run of missed steps: weight and depth of its earlier node, then of its
+later one."""
 
 
 @dataclass(eq=False, kw_only=True)
@@ -31,7 +32,7 @@ class DeviceRates:
     run_ends: Int[Tensor, " ends"]
     """Last step of each run, after a zero."""
     nodes: Float[Tensor, "room runs numbers kinds"]
-    """By how many steps a row missed, from one on."""
+    """Nodes for each number of steps that a row missed, from one on."""
     nodes_of: int = 0
     """Number of missed steps that the nodes were made for."""
 

@@ -23,7 +23,7 @@ class MissedSteps(NamedTuple):
     weight: Float[np.ndarray, "nodes missed kinds"]
     depth: Float[np.ndarray, "nodes missed kinds"]
     least: list[int]
-    """Of each node: missed steps from which on it counts, ascending."""
+    """The number of missed steps from which on each node counts, ascending."""
     lead: Float[np.ndarray, "nodes missed"]
     """Part of a node's move after which the Gaussian has its mean size."""
 

@@ -10,8 +10,7 @@ import torch
 import triton
 from torch import Tensor
 
-from lidarpainter_models.kernels.dense_tensors import dense_in_place
-from lidarpainter_models.kernels.gpu_packages import check_triton_device
+from lidarpainter_models.kernels.gpu_packages import check_triton_device, dense_in_place
 from lidarpainter_models.kernels.sparse_adam import triton_kernels as kernels
 from lidarpainter_models.kernels.sparse_adam.device_rates import DeviceRates
 from lidarpainter_models.kernels.sparse_adam.state import (
@@ -24,7 +23,7 @@ from lidarpainter_models.kernels.sparse_adam.state import (
 
 ROWS_AT_ONCE = 8
 NUMBERS_AT_ONCE = 64
-"""Of missed steps."""
+"""Missed steps that one program turns into nodes at once."""
 
 
 def present_rows(state: AdamState, kept: Parameters, rows: Tensor, out: Parameters) -> None:

@@ -14,7 +14,8 @@ from lidarpainter_models.kernels.gpu_packages import check_triton_device
 from lidarpainter_models.kernels.ssim.triton_kernels import compare, spread
 
 COLUMNS_AT_ONCE, ROWS_AT_ONCE = 128, 16
-"""Of an image with interleaved channels; ten rows more are read than written."""
+"""Size of the strip of an image, channels interleaved, that a program blurs at once; it reads ten
+rows more than it writes."""
 
 
 def ssim_map(first_rgb: Tensor, second_rgb: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ class CarShape:
 
     @property
     def height_m(self) -> float:
-        """Of the roof above the ground."""
+        """Height of the roof above the ground."""
         return max(z for _, z in self.roof)
 
 

@@ -75,12 +75,12 @@ class WallCanvas:
         draw_text(self.colour, words, box=box, colour=colour)
 
     def rgba(self) -> np.ndarray:
-        """As a texture; the fourth channel is gloss."""
+        """Give the wall as a texture; the fourth channel is gloss."""
         return as_rgba(self.colour, self.gloss)
 
 
 def _within(first: int, last: int, size: int) -> slice:
-    """At least one line from `first` on, cut to the image."""
+    """Select at least one line from `first` on, cut to the image."""
     return slice(min(max(first, 0), size), min(max(last, first + 1, 0), size))
 
 

@@ -21,7 +21,7 @@ PROUD_M = 0.012
 RIM_M = 0.03
 """How deep its rim reaches, back into the bodywork."""
 OUTER_SHARE = 0.76
-"""Of half the width of the car, where a lens ends: beyond, the body turns to its side."""
+"""Share of a car's half width at which a lens ends: beyond, the body turns to its side."""
 ABOVE_BELT_M = 0.01
 """Top of a lens above the foot of the rear window, where the painted lamps end too."""
 BELOW_ROOF_M = 0.1

@@ -8,7 +8,7 @@ import numpy as np
 
 from lidarpainter_models.synthetic.plan.car_kinds import CarShape
 from lidarpainter_models.synthetic.textures.cars import CarAtlas
-from lidarpainter_models.synthetic.world.meshes import Mesh, MeshBuilder
+from lidarpainter_models.synthetic.world.meshes import Mesh, MeshBuilder, cell_corners
 from lidarpainter_models.synthetic.world.solids import add_box, add_tube
 
 LOWEST_M = 0.24
@@ -85,11 +85,8 @@ def _add_shell(builder: MeshBuilder, shape: CarShape, atlas: CarAtlas, num_stati
     keep = np.concatenate([[True], np.diff(stations) > 0.02])
     rings = _closed(_rings(shape, stations[keep]))
     normals = _smooth_normals(rings)
-    quads = [rings[:-1, :-1], rings[1:, :-1], rings[1:, 1:], rings[:-1, 1:]]
-    shades = [normals[:-1, :-1], normals[1:, :-1], normals[1:, 1:], normals[:-1, 1:]]
-    for order in ((0, 1, 3), (2, 3, 1)):
-        corners = np.stack([quads[i] for i in order], axis=2).reshape(-1, 3, 3)
-        smooth = np.stack([shades[i] for i in order], axis=2).reshape(-1, 3, 3)
+    for order in ((0, 3, 1), (2, 1, 3)):
+        corners, smooth = cell_corners(rings, order), cell_corners(normals, order)
         builder.primitives(corners, atlas.uv(corners), atlas.body, normals=smooth)
     floor = np.stack([rings[:, 0], rings[:, -1]])
     builder.grid(floor, np.full((*floor.shape[:2], 2), 0.5), atlas.rubber)

@@ -15,7 +15,7 @@ BRAKING_S = (0.6, 1.2)
 BETWEEN_S = 0.4
 """Least time without braking before and after each braking."""
 FIRST_BRAKED_S = 2.1
-"""By when everybody has braked once."""
+"""Time by which every driver has braked once."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -128,20 +128,32 @@ class MeshBuilder:
         self.parts.append(Mesh(geometry, shading, surfaces))
 
     def grid(
-        self, points: np.ndarray, uv: np.ndarray, surface: int, *, is_smooth: bool = False
+        self,
+        points: np.ndarray,
+        uv: np.ndarray,
+        surface: int,
+        *,
+        normals: np.ndarray | None = None,
+        is_smooth: bool = False,
     ) -> None:
-        """A sheet through points (rows, columns, 3) with uv (rows, columns, 2), as triangles."""
-        quads = [points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]]
-        uvs = [uv[:-1, :-1], uv[:-1, 1:], uv[1:, 1:], uv[1:, :-1]]
-        normals = None
+        """Add a sheet through points as two triangles for each of its cells.
+
+        Points and `normals` are (rows, columns, 3), `uv` (rows, columns, 2). Without normals the
+        triangles are flat, or a smooth sheet's normals follow from its points.
+        """
         if is_smooth:
-            along = np.cross(np.gradient(points, axis=0), np.gradient(points, axis=1))
-            along /= np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-12)
-            normals = [along[:-1, :-1], along[:-1, 1:], along[1:, 1:], along[1:, :-1]]
+            normals = np.cross(np.gradient(points, axis=0), np.gradient(points, axis=1))
+            normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
         for order in ((0, 1, 3), (2, 3, 1)):
-            corners = np.stack([quads[i] for i in order], axis=2).reshape(-1, 3, 3)
-            place = np.stack([uvs[i] for i in order], axis=2).reshape(-1, 3, 2)
-            chosen = None
-            if normals is not None:
-                chosen = np.stack([normals[i] for i in order], axis=2).reshape(-1, 3, 3)
-            self.primitives(corners, place, surface, normals=chosen)
+            self.primitives(
+                cell_corners(points, order),
+                cell_corners(uv, order),
+                surface,
+                normals=None if normals is None else cell_corners(normals, order),
+            )
+
+
+def cell_corners(values: np.ndarray, order: tuple[int, int, int]) -> np.ndarray:
+    """Three of the four corners of every cell of a grid, counted round it: (cells, 3, numbers)."""
+    corners = values[:-1, :-1], values[:-1, 1:], values[1:, 1:], values[1:, :-1]
+    return np.stack([corners[i] for i in order], axis=2).reshape(-1, 3, values.shape[-1])

@@ -31,9 +31,9 @@ class Person:
     shoe: int
     hair: int
     stride_m: float
-    """Of each foot, before and behind the hip."""
+    """Farthest that each foot goes before and behind the hip."""
     swing_m: float
-    """Of each hand, alike."""
+    """Farthest that each hand goes before and behind the shoulder."""
     scale: float
 
     @property

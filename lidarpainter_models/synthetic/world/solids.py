@@ -70,19 +70,12 @@ def add_tube(
     low, high = start + radii[0] * ring, end + radii[1] * ring
     turn = np.linspace(0, 1, sides + 1)
     zeros, ones = np.zeros_like(turn), np.ones_like(turn)
-    uv_low, uv_high = np.stack([turn, ones], -1), np.stack([turn, zeros], -1)
-    sheets = (
-        ((low[:-1], low[1:], high[:-1]), (ring[:-1], ring[1:], ring[:-1]), (0, 1, 2)),
-        ((high[1:], high[:-1], low[1:]), (ring[1:], ring[:-1], ring[1:]), (3, 2, 1)),
+    builder.grid(
+        np.stack([low, high]),
+        np.stack([np.stack([turn, ones], -1), np.stack([turn, zeros], -1)]),
+        surface,
+        normals=np.stack([ring, ring]),
     )
-    places = (uv_low[:-1], uv_low[1:], uv_high[:-1], uv_high[1:])
-    for corners, normals, order in sheets:
-        builder.primitives(
-            np.stack(corners, axis=1),
-            np.stack([places[i] for i in order], axis=1),
-            surface,
-            normals=np.stack(normals, axis=1),
-        )
     if has_caps:
         _add_cap(builder, end, high, surface)
         _add_cap(builder, start, low, surface)
@@ -115,13 +108,4 @@ def add_ball(
     normals = unit / np.asarray(radii)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     uv = np.stack(np.broadcast_arrays(turns / (2 * np.pi), lines / np.pi), axis=-1)
-    corner = [points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]]
-    normal = [normals[:-1, :-1], normals[:-1, 1:], normals[1:, 1:], normals[1:, :-1]]
-    place = [uv[:-1, :-1], uv[:-1, 1:], uv[1:, 1:], uv[1:, :-1]]
-    for order in ((0, 1, 3), (2, 3, 1)):
-        builder.primitives(
-            np.stack([corner[i] for i in order], axis=2).reshape(-1, 3, 3),
-            np.stack([place[i] for i in order], axis=2).reshape(-1, 3, 2),
-            surface,
-            normals=np.stack([normal[i] for i in order], axis=2).reshape(-1, 3, 3),
-        )
+    builder.grid(points, uv, surface, normals=normals)

@@ -31,7 +31,7 @@ NUM_PAINTED = 14
 NEAR_M = 70.0
 NUM_POSTURES = 16
 WALKING_CYCLES_PER_S = 0.95
-"""Of two steps each, as people take them; who steps short is slow."""
+"""Walking cycles of two steps a second, as people take them; who steps short is slow."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,7 +43,7 @@ class StreetActor:
     size_m: np.ndarray
     """Tight length, width, height."""
     meshes: tuple[Mesh, ...]
-    """In the box frame: one, or the postures of a cycle of steps."""
+    """One mesh in the box frame, or one for each posture of a cycle of steps."""
     start_s_m: float
     d_m: float
     pace: Pace | None = None
@@ -54,7 +54,7 @@ class StreetActor:
     cycle_m: float = 1.0
     """The way of one cycle of steps."""
     lenses: tuple[Lens, ...] = ()
-    """Of lamps that switch, in the box frame."""
+    """Lenses of lamps that switch, in the box frame."""
 
     @property
     def is_moving(self) -> bool:

@@ -14,7 +14,7 @@ from lidarpainter_models.gaussians.model.placing import (
 )
 from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body, draw_gaussians
 from lidarpainter_models.geometry.transforms import rigid_from_rotation, rotation_from_vector
-from lidarpainter_models.kernels.gaussian_raster.reference_harmonics import harmonic_basis
+from lidarpainter_models.kernels.gaussian_raster.reference import harmonic_basis
 
 TURN = rotation_from_vector(torch.tensor([0.3, -1.1, 2.0], dtype=torch.float64))
 POSE = rigid_from_rotation(TURN, torch.tensor([3.0, -2.0, 0.5], dtype=torch.float64))

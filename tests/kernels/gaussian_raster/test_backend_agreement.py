@@ -85,13 +85,6 @@ def test_gradients_agree(splats, draw, backend):
     assert float(error) < GRADIENT_ERROR[backend] * float(expected.absolute_gradient.norm())
 
 
-@pytest.mark.parametrize("backend", FAST)
-def test_no_gaussian_draws_nothing(splats, draw, backend):
-    actual, _ = agreeing(splats, draw, backend, count=0, features=1)
-    assert float(actual.image.alpha.detach().abs().max()) == 0
-    assert float(actual.gradients["camera_from_body"].abs().max()) == 0
-
-
 def three_views(splats, device):
     """Two views of one size, apart, and a smaller one that looks at nothing."""
     scene = splats(200, features=2)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from splat_drawing import TRITON, render
 
-from lidarpainter_models.errors import BackendError, ShapeError
+from lidarpainter_models.errors import ShapeError
 
 FAST = ["cpu", TRITON]
 BACKENDS = ["reference", *FAST]
@@ -140,9 +140,3 @@ def test_input_that_does_not_belong_together_is_refused(splats):
         render(inputs | {"features": torch.ones(3, 2)})
     with pytest.raises(ShapeError, match=r"camera_from_body needs shape \(1, 3, 4, 4\)"):
         render(inputs | {"camera_from_body": torch.ones(3, 3, 4)})
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="a CUDA device is present")
-def test_cuda_backend_is_refused_in_one_line_without_a_gpu(splats):
-    with pytest.raises(BackendError, match="no 'cuda' backend here"):
-        render(splats(4), backend="cuda")

@@ -21,8 +21,7 @@ from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
     NEAR_M,
     TILE_PX,
 )
-from lidarpainter_models.kernels.gaussian_raster.reference import project_gaussians
-from lidarpainter_models.kernels.gaussian_raster.reference_harmonics import harmonic_basis
+from lidarpainter_models.kernels.gaussian_raster.reference import harmonic_basis, project_gaussians
 
 law = pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat is not installed")
 wrapper = pytest.importorskip("gsplat.cuda._wrapper", reason="gsplat is not installed")

@@ -14,12 +14,12 @@ from machine_code import assert_fits, machine_code
 from splat_drawing import TRITON, WITHOUT_TRITON, home_of, render
 from splat_errors import CASES, image_errors, relative_errors
 
-from lidarpainter_models.errors import BackendError, ConfigError
+from lidarpainter_models.errors import BackendError
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.gaussians.fitting.number_of_gaussians import DensificationConfig
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
-from lidarpainter_models.kernels import backends, gaussian_raster, gpu_packages
+from lidarpainter_models.kernels import gaussian_raster, gpu_packages
 
 IMAGE_ERROR = 1e-6
 GRADIENT_ERROR = 1e-5
@@ -123,32 +123,6 @@ def test_every_kernel_compiles_to_machine_code_without_spilling():
 @pytest.mark.parametrize(("coefficients", "features"), [(16, 0), (4, 1), (4, 2)])
 def test_every_kernel_compiles_for_every_degree(architecture, coefficients, features):
     assert_fits(machine_code("triton_compilation.py", architecture, coefficients, features))
-
-
-@pytest.mark.parametrize(
-    ("found", "expected"),
-    [
-        (("reference", "cpu", "cuda", "triton"), "triton"),
-        (("reference", "cpu", "cuda"), "reference"),
-    ],
-)
-def test_a_gpu_gets_our_own_kernels_and_gsplat_only_on_request(monkeypatch, found, expected):
-    monkeypatch.setattr(backends, "available_backends", lambda _kernel: found)
-    draw = backends.implementation("gaussian_raster", "draw_views", "auto", torch.device("cuda"))
-    assert draw.__module__ == f"lidarpainter_models.kernels.gaussian_raster.{expected}"
-    with backends.kernels_chosen("gsplat"):
-        if "cuda" in found:
-            draw = backends.implementation(
-                "gaussian_raster", "draw_views", "auto", torch.device("cuda")
-            )
-            assert draw.__module__ == "lidarpainter_models.kernels.gaussian_raster.cuda"
-
-
-def test_gsplat_is_refused_at_once_where_it_cannot_draw(monkeypatch):
-    monkeypatch.setattr(backends, "why_no_gsplat", lambda: "no CUDA device")
-    with pytest.raises(ConfigError, match="kernels=gsplat: no CUDA device; expected auto"):
-        backends.check_choice("gsplat")
-    backends.check_choice("torch")
 
 
 def test_a_machine_without_triton_is_told_so(monkeypatch):
