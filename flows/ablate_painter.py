@@ -14,7 +14,7 @@ from lidarpainter_models.devices import Device, chosen_device
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.painter_training import TrainingRequest
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
-from lidarpainter_models.painter import OverlayPainter, UnpaintedPainter, WarpPainter
+from lidarpainter_models.painter.baselines import OverlayPainter, UnpaintedPainter, WarpPainter
 from lidarpainter_models.painter.nano.ablations import REFERENCE, ablation_tables
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.painter.training_jobs import PainterTraining, job_for

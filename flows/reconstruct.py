@@ -19,7 +19,7 @@ from lidarpainter_models.evaluation.score_tables import Scores, fitted_on
 from lidarpainter_models.export.run_page import GUIDANCE_COLUMNS
 from lidarpainter_models.metrics.perceptual import load_distances
 from lidarpainter_models.observations.fit_size import require_recorded_width
-from lidarpainter_models.painter.selection import NO_PAINTER
+from lidarpainter_models.painter.known_painters import NO_PAINTER
 from tasks.evaluation.envelope import STAGE as ENVELOPE
 from tasks.evaluation.envelope import find_envelope, load_envelope
 from tasks.evaluation.views import evaluate, load_scores

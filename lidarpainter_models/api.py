@@ -25,7 +25,7 @@ from lidarpainter_models.geometry.trajectories import road_directions, shift_pos
 from lidarpainter_models.observations.preparation import prepare_observations
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.observations.views import TrainingView
-from lidarpainter_models.painter import load_painter
+from lidarpainter_models.painter.selection import load_painter
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import ViewSplit, split_views
 from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street

@@ -24,7 +24,7 @@ from jaxtyping import Float
 from catalog.store import Store
 from catalog.tables import Row
 from flows.fleet.asked import Asked
-from lidarpainter_models.painter.selection import NO_PAINTER
+from lidarpainter_models.painter.known_painters import NO_PAINTER
 
 MOST_ATTEMPTS = 500
 """The newest ones, by which is planned."""

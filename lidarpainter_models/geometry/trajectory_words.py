@@ -166,14 +166,14 @@ _NUMBER = r":(?P<number>[^@]*)"
 _NAME = r":(?P<name>.+)"
 _WORDS = (
     TrajectoryWord(RECORDED, "", "the path that was driven", "", lambda _found, _spec: None),
-    TrajectoryWord("lateral", ":METRES", "to the left", _NUMBER, _step_along("lateral_m")),
+    TrajectoryWord("lateral", ":METRES", "left is positive", _NUMBER, _step_along("lateral_m")),
     TrajectoryWord("up", ":METRES", "higher", _NUMBER, _step_along("up_m")),
     TrajectoryWord("along", ":METRES", "ahead", _NUMBER, _step_along("along_m")),
-    TrajectoryWord("yaw", ":DEGREES", "turned to the left", _NUMBER, _turn),
+    TrajectoryWord("yaw", ":DEGREES", "a turn; left is positive", _NUMBER, _turn),
     TrajectoryWord(
         "lane-change",
         "[:METRES][@STARTs+DURATIONs]",
-        "to the left in a smooth curve, at the seconds of the log if given",
+        "a smooth curve; left is positive, seconds of the log",
         r"(?::(?P<number>[^@]*))?(?:@(?P<times>.*))?",
         _lane_change,
     ),

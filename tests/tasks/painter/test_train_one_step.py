@@ -19,12 +19,12 @@ from lidarpainter_models.evaluation.painter_training import TrainingRequest
 from lidarpainter_models.metrics.backbones import SQUEEZENET
 from lidarpainter_models.metrics.lpips import Lpips
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
-from lidarpainter_models.painter import load_painter
 from lidarpainter_models.painter.losses import PaperLossWeights
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.painter.one_step.presets import fast
 from lidarpainter_models.painter.one_step.training import OneStepTrainingConfig
 from lidarpainter_models.painter.one_step.weights import read_trained
+from lidarpainter_models.painter.selection import load_painter
 from lidarpainter_models.painter.training_jobs import job_for, recipe_for
 from lidarpainter_models.training_data.pair_sets import PairSet
 from tasks.painter.judge import judge_held_back, load_painting_scores, samples_path
