@@ -152,7 +152,7 @@ def _report(course: Course, result: dict[str, Any], unpainted: FittedRef, final:
         final=final,
         stages=dict(course.stages),
     )
-    report = course.add("report", write_report(run, page, course.parameters.judge_config))
+    report = course.add("report", write_report(run, page, course.parameters.evaluation_config))
     result["artefacts"]["report"] = report.ref.artefact_id
     result["report"] = store.name_of(store.artefacts.folder(report.ref) / REPORT_FILE)
     result["seconds"]["report"] = report.seconds
@@ -230,11 +230,11 @@ def _judged(
             course.run,
             stage,
             fitted,
-            course.parameters.judge_config,
+            course.parameters.evaluation_config,
             view_time=variant == "view-time",
         )
         scores[variant] = load_scores(store, course.add(stage, found).ref)
-    walked = find_envelope(course.run, final, course.parameters.judge_config)
+    walked = find_envelope(course.run, final, course.parameters.evaluation_config)
     scores["painted"][ENVELOPE] = load_envelope(store, course.add(ENVELOPE, walked).ref)
     return scores
 
