@@ -14,12 +14,12 @@ from lidarpainter_models.devices import Device, chosen_device
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.painter_training import TrainingRequest
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
-from lidarpainter_models.painter import OverlayPainter, UnpaintedPainter, WarpPainter
+from lidarpainter_models.painter.baselines import OverlayPainter, UnpaintedPainter, WarpPainter
 from lidarpainter_models.painter.nano.ablations import REFERENCE, ablation_tables
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.painter.training_jobs import PainterTraining, job_for
 from lidarpainter_models.training_data.pair_sets import named_sets, open_sets
-from tasks.painter.judge import judge_painters
+from tasks.painter.evaluate import score_painters
 from tasks.painter.train import train, weights_path
 
 UNLEARNED = (UnpaintedPainter.name, OverlayPainter.name, WarpPainter.name)
@@ -67,7 +67,7 @@ def ablate_painter(parameters: AblationParameters, store_path: Path) -> dict[str
         trained = train(store_path, f"train {label}", request)
         painters[label] = str(weights_path(open_store(store_path), trained.ref))
         costs[label] = training_cost(trained)
-    judged = judge_painters(
+    judged = score_painters(
         painters,
         named_sets(parameters.test_folders),
         feature_weights=parameters.feature_weights,

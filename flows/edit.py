@@ -8,8 +8,8 @@ from typing import Any
 
 from catalog.store import Store
 from flows.derive import Change, derive_run
-from flows.dress import STYLE
 from flows.parameters import view_parameters
+from flows.style_run import STYLE
 from flows.views import PathRequest, render_run
 from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.devices import chosen_device

@@ -96,7 +96,7 @@ def _variants(
             run,
             f"{request.protocol}-{name}",
             fitted,
-            parameters.judge_config,
+            parameters.evaluation_config,
             view_time=name == VIEW_TIME,
         )
         scores[name] = load_scores(store, made.ref)
@@ -108,7 +108,7 @@ def _flicker(
 ) -> dict[str, Any]:
     run = parameters.run_spec(store.address, painter=request.painter)
     made = evaluate_flicker.fn(
-        run, FLICKER, finished.final, parameters.judge_config, request.previous
+        run, FLICKER, finished.final, parameters.evaluation_config, request.previous
     )
     found = load_scores(store, made.ref)[FLICKER]
     if _is_own_painter(request, parameters):

@@ -15,8 +15,8 @@ from lidarpainter_models.painter.precision import faster_type, type_name
 from lidarpainter_models.painter.selection import PainterChoice
 from lidarpainter_models.painter.speed import time_views
 from lidarpainter_models.training_data.pair_sets import named_sets
-from tasks.painter.judge import judge_painters
-from tasks.painter.judged_fits import JudgedFit
+from tasks.painter.evaluate import score_painters
+from tasks.painter.held_out_fits import HeldOutFit
 from tasks.runs import open_run
 
 PRECISIONS = (torch.float32, torch.bfloat16)
@@ -38,7 +38,7 @@ def evaluate_painters(
     """
     if not pair_folders and not runs:
         raise ConfigError("nothing to judge by: expected --pairs or --run")
-    return judge_painters.fn(
+    return score_painters.fn(
         {str(painter): str(painter) for painter in painters},
         named_sets(pair_folders),
         [_first_fit(run) for run in runs],
@@ -48,17 +48,17 @@ def evaluate_painters(
     )
 
 
-def _first_fit(run: str) -> JudgedFit:
+def _first_fit(run: str) -> HeldOutFit:
     """The first fit of a finished run, and the views that it was not fitted to."""
     store = existing_store()
     finished = open_run(store, run)
     parameters = view_parameters(finished)
-    return JudgedFit(
+    return HeldOutFit(
         store_path=store.address,
         run_id=finished.run_id,
         split=parameters.split_spec,
         fitted=finished.unpainted,
-        settings=parameters.judge_config,
+        settings=parameters.evaluation_config,
     )
 
 

@@ -24,7 +24,7 @@ def started_at(base: str | None, start: Path | None, lpips: LpipsFiles) -> dict[
     if base is not None and start is not None:
         raise ConfigError("give --base or --start, not both: weights name their model themselves")
     model = base
-    if start is not None and PainterChoice.of(start).is_one_step:
+    if start is not None and PainterChoice.of(start).kind == "one-step":
         model = str(start)
     if model is not None:
         return {"base": model, "lpips": lpips, "training": recipe_for(model)}

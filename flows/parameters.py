@@ -8,7 +8,7 @@ from lidarpainter_models.conditioning.settings import ConditionConfig, NovelGuid
 from lidarpainter_models.devices import KernelChoice, check_device
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.score_tables import fitted_on
-from lidarpainter_models.evaluation.settings import JudgeConfig, ScoringConfig
+from lidarpainter_models.evaluation.settings import EvaluationConfig, ScoringConfig
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.observations.settings import ObservationConfig
@@ -46,9 +46,9 @@ class ViewParameters(BaseModel):
     """Weights for LPIPS; without both files it is null, with the reason."""
 
     @property
-    def judge_config(self) -> JudgeConfig:
+    def evaluation_config(self) -> EvaluationConfig:
         """How scenes are judged."""
-        return JudgeConfig(
+        return EvaluationConfig(
             observation=self.observation,
             scoring=self.scoring,
             conditions=self.conditions,

@@ -24,7 +24,7 @@ START = "flows.reconstruct:reconstruct"
 def run_identity(parameters: ReconstructParameters, store: Store) -> str:
     """The id of a run: the same scene content, parameters, weights and code are the same run."""
     scene = open_scene(store, parameters.scene)
-    weights = file_digests(parameters.judge_config.weight_files)
+    weights = file_digests(parameters.evaluation_config.weight_files)
     return run_id_of(
         scene.content_digest,
         [plain(parameters), PainterChoice.of(parameters.painter).digest, weights],

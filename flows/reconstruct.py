@@ -19,7 +19,7 @@ from lidarpainter_models.evaluation.score_tables import Scores, fitted_on
 from lidarpainter_models.export.run_page import GUIDANCE_COLUMNS
 from lidarpainter_models.metrics.perceptual import load_distances
 from lidarpainter_models.observations.fit_size import require_recorded_width
-from lidarpainter_models.painter.selection import NO_PAINTER
+from lidarpainter_models.painter.known_painters import NO_PAINTER
 from tasks.evaluation.envelope import STAGE as ENVELOPE
 from tasks.evaluation.envelope import find_envelope, load_envelope
 from tasks.evaluation.views import evaluate, load_scores
@@ -195,7 +195,9 @@ def _report(
         final=final,
         stages=dict(course.stages),
     )
-    report = course.add("report", write_report(course.run, page, course.parameters.judge_config))
+    report = course.add(
+        "report", write_report(course.run, page, course.parameters.evaluation_config)
+    )
     result["artefacts"]["report"] = report.ref.artefact_id
     result["report"] = store.name_of(store.artefacts.folder(report.ref) / REPORT_FILE)
     result["seconds"]["report"] = report.seconds
@@ -216,11 +218,11 @@ def _judged(
             course.run,
             stage,
             fitted,
-            course.parameters.judge_config,
+            course.parameters.evaluation_config,
             view_time=variant == "view-time",
         )
         scores[variant] = load_scores(store, course.add(stage, found).ref)
-    walked = find_envelope(course.run, final, course.parameters.judge_config)
+    walked = find_envelope(course.run, final, course.parameters.evaluation_config)
     scores["painted"][ENVELOPE] = load_envelope(store, course.add(ENVELOPE, walked).ref)
     return scores
 

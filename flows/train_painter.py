@@ -18,19 +18,19 @@ from lidarpainter_models.evaluation.held_back import (
     first_targets,
 )
 from lidarpainter_models.evaluation.painter_training import TrainingRequest
-from lidarpainter_models.painter.selection import WEIGHTS_SUFFIX
+from lidarpainter_models.painter.known_painters import WEIGHTS_SUFFIX
 from lidarpainter_models.painter.training_jobs import job_for
 from lidarpainter_models.storage.whole_files import write_whole
 from lidarpainter_models.training_data.pair_sets import PairSet, named_sets
 from tasks.ingest.ingest import has_street
 from tasks.opened import open_split
-from tasks.painter.harvest import harvest_recorded, harvest_street, keep_street, pair_set
-from tasks.painter.judge import (
+from tasks.painter.evaluate import (
     feature_distance_of,
-    judge_held_back,
     load_painting_scores,
     samples_path,
+    score_held_back,
 )
+from tasks.painter.harvest import harvest_recorded, harvest_street, keep_street, pair_set
 from tasks.painter.train import publish_painter, train, training_record, weights_path
 from tasks.specs import SplitSpec, street_id
 from tasks.stages import StageResult
@@ -64,7 +64,7 @@ def train_painter(parameters: TrainPainterParameters, store_path: Path) -> dict[
     scores, samples = None, None
     if parameters.held_back > 0:
         weights = weights_path(store, trained.ref)
-        judged = judge_held_back(
+        judged = score_held_back(
             store_path,
             "judge",
             weights,

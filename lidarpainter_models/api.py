@@ -11,9 +11,9 @@ from pathlib import Path
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.judging import Judgement
+from lidarpainter_models.evaluation.scene_evaluation import SceneEvaluation
 from lidarpainter_models.evaluation.score_tables import Scores
-from lidarpainter_models.evaluation.settings import JUDGED_SHIFTS, JudgeConfig, ScoringConfig
+from lidarpainter_models.evaluation.settings import SCORED_SHIFTS, EvaluationConfig, ScoringConfig
 from lidarpainter_models.evaluation.shown import ShownScene
 from lidarpainter_models.export.images import write_png
 from lidarpainter_models.gaussians.fitting.config import FitConfig
@@ -25,7 +25,7 @@ from lidarpainter_models.geometry.trajectories import road_directions, shift_pos
 from lidarpainter_models.observations.preparation import prepare_observations
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.observations.views import TrainingView
-from lidarpainter_models.painter import load_painter
+from lidarpainter_models.painter.selection import load_painter
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import ViewSplit, split_views
 from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street
@@ -72,7 +72,7 @@ def evaluate(
     split: ViewSplit,
     observation: ObservationConfig,
     *,
-    shifts: Sequence[Shift] = JUDGED_SHIFTS,
+    shifts: Sequence[Shift] = SCORED_SHIFTS,
 ) -> Scores:
     """`recorded` and `novel` scores as `reconstruct --json` prints them.
 
@@ -84,11 +84,11 @@ def evaluate(
         shifts: where beside the path it is judged too: by LiDAR, and where the scene is a
             synthetic street, by exact images.
     """
-    config = JudgeConfig(
+    config = EvaluationConfig(
         observation=observation,
         scoring=ScoringConfig(shifts=tuple(shifts)),
         conditions=ConditionConfig(),
     )
     held_out = HeldOut(scene=scene, test_views=split.test, observation=observation)
-    judgement = Judgement(held_out=held_out, config=config)
-    return judgement.scores(ShownScene(scene=fitted), progress=lambda _done, _total: None)
+    evaluation = SceneEvaluation(held_out=held_out, config=config)
+    return evaluation.scores(ShownScene(scene=fitted), progress=lambda _done, _total: None)

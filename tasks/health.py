@@ -152,7 +152,8 @@ def _disk(store_path: Path) -> Finding:
 
 def _painter() -> Finding:
     from lidarpainter_models.errors import WeightsError
-    from lidarpainter_models.painter import BUNDLED_NANO, load_painter
+    from lidarpainter_models.painter.known_painters import BUNDLED_NANO
+    from lidarpainter_models.painter.selection import load_painter
 
     try:
         load_painter("nano")

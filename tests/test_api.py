@@ -12,7 +12,7 @@ from drawn_streets import drawn_street
 import lidarpainter_models as lp
 from catalog.code_closure import SourceTree
 from lidarpainter_models import api
-from lidarpainter_models.evaluation import judging
+from lidarpainter_models.evaluation import scene_evaluation
 from lidarpainter_models.metrics.images import psnr_from_error
 from lidarpainter_models.synthetic import sequence
 
@@ -61,7 +61,7 @@ def test_example_of_the_readme_ends_with_an_image(tmp_path, monkeypatch, capsys)
     # the same street, drawn once for all tests of the process
     monkeypatch.setattr(sequence, "SyntheticStreet", drawn_street)
     monkeypatch.setattr(
-        judging, "known_street", lambda scene: drawn_street(street_of(scene.manifest))
+        scene_evaluation, "known_street", lambda scene: drawn_street(street_of(scene.manifest))
     )
     monkeypatch.chdir(tmp_path)
     (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.S)

@@ -8,6 +8,8 @@ import typer
 
 from flows.cli.output import say_status
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.geometry.trajectory_words import trajectory_help
+from lidarpainter_models.painter.known_painters import painter_help
 
 if TYPE_CHECKING:
     from flows.views import PathRequest
@@ -17,7 +19,7 @@ RANGE = re.compile(r"(\d*):(\d*)")
 
 Painter = Annotated[
     str | None,
-    typer.Option(help="none, overlay, warp, nano, weights or a model; the preset's if absent."),
+    typer.Option(help=f"{painter_help()}. The preset's if absent."),
 ]
 DeviceName = Annotated[
     str,
@@ -29,14 +31,7 @@ Settings = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 RunName = Annotated[str, typer.Argument(help="A run id, a unique prefix of one, or latest.")]
-TrajectorySpec = Annotated[
-    str,
-    typer.Option(
-        help="recorded; lateral:2 and lane-change:3.5@2s+3s (metres, left is positive), up:1.5, "
-        "along:-5 (metres), yaw:15 (degrees, left is positive), at most 8 m away; or follow:ACTOR, "
-        "orbit:ACTOR, birdseye:30, waypoints:F.csv, which go anywhere; several with + between."
-    ),
-]
+TrajectorySpec = Annotated[str, typer.Option(help=trajectory_help())]
 AllowCollisions = Annotated[
     bool, typer.Option("--allow-collisions", help="Let the camera go through walls.")
 ]

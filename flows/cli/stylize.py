@@ -93,7 +93,7 @@ def stylize(  # noqa: PLR0913 - the options of a command
         width_px=width,
     )
     if out is None:
-        _dress(run, mix, seed, as_json=as_json)
+        _style(run, mix, seed, as_json=as_json)
         return
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
@@ -108,14 +108,14 @@ def stylize(  # noqa: PLR0913 - the options of a command
         print_pairs(f"{mix.text} images of {result['scene']}", result)
 
 
-def _dress(run: str, mix: StyleMix, seed: int, *, as_json: bool) -> None:
+def _style(run: str, mix: StyleMix, seed: int, *, as_json: bool) -> None:
     """Make the run in the style and say what it is."""
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
-    from flows.dress import dress_run
+    from flows.style_run import style_run
 
     with shown_progress():
-        result = dress_run(existing_store(), run, mix, seed=seed)
+        result = style_run(existing_store(), run, mix, seed=seed)
     if as_json:
         print_json(result)
         return

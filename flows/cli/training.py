@@ -18,7 +18,7 @@ from flows.train_painter import (
     train_painter,
     write_painter,
 )
-from lidarpainter_models.painter.selection import WEIGHTS_SUFFIX
+from lidarpainter_models.painter.known_painters import WEIGHTS_SUFFIX
 
 Parameters = TypeVar("Parameters")
 

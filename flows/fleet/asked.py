@@ -181,7 +181,7 @@ def _ways(manifest: Manifest) -> Iterator[tuple[dict[str, Any], tuple[str, ...]]
 
 def _weights(asked: Asked, known: dict[tuple[str, str], list[Any]]) -> list[Any]:
     """Digests of what is learned, read once for each choice of files."""
-    painter, files = asked.parameters.painter, asked.parameters.judge_config.weight_files
+    painter, files = asked.parameters.painter, asked.parameters.evaluation_config.weight_files
     key = painter, str(sorted(files.items()))
     if key not in known:
         known[key] = [PainterChoice.of(painter).digest, file_digests(files)]

@@ -15,11 +15,11 @@ from prefect.settings import PREFECT_API_URL
 from catalog.artefacts import ArtefactRef
 from catalog.store import Store, open_store
 from flows.assets import publish_run
-from flows.dress import dress_run
 from flows.fleet.asked import Asked
 from flows.fleet.flow_runs import SEQUENCE, store_tag
 from flows.reconstruct import reconstruct
-from lidarpainter_models.evaluation.judging import known_street
+from flows.style_run import style_run
+from lidarpainter_models.evaluation.scene_evaluation import known_street
 from lidarpainter_models.weather.mix import StyleMix
 from tasks.evaluation.shown import forget_shown
 from tasks.ingest.ingest import has_street, ingest_street
@@ -81,7 +81,7 @@ def _made(asked: Asked, store_path: Path) -> Made:
     results = [run]
     for variant in asked.variants:
         mix = StyleMix.parse(variant)
-        results.append(dress_run(store, run["run_id"], mix, seed=0))
+        results.append(style_run(store, run["run_id"], mix, seed=0))
     new = [result for result in results if any(result["computed_now"].values())]
     refs = [
         _ref(path)

@@ -14,7 +14,7 @@ from torch import Generator
 from lidarpainter_models.conditioning.view_evidence import ViewEvidence
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.evaluation.envelope import MovedViews
-from lidarpainter_models.evaluation.judging import known_street
+from lidarpainter_models.evaluation.scene_evaluation import known_street
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectory_words import ConstantStep
 from lidarpainter_models.metrics.images import psnr_from_error, squared_error

@@ -11,7 +11,7 @@ from lidarpainter_models.conditioning.sequences import SequencePainter
 from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.evaluation.flicker import TRUTH, FlickerFrame, FlickerTally
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.judging import known_street
+from lidarpainter_models.evaluation.scene_evaluation import known_street
 from lidarpainter_models.evaluation.shown import ViewTimePainting
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.scenes.records import RecordedView
@@ -21,7 +21,7 @@ PAINTED = "painted"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class FlickerJudgement:
+class FlickerEvaluation:
     """How neighbouring frames of a fitted scene are compared, as rendered and as painted."""
 
     held_out: HeldOut

@@ -13,7 +13,7 @@ from typing import Literal
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from lidarpainter_models.evaluation.judged_views import NOBODY, JudgedView, actors_in_view
+from lidarpainter_models.evaluation.view_scores import NOBODY, ScoredView, actors_in_view
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.shifts import Shift
@@ -79,7 +79,7 @@ class HeldOut:
         direction = self._directions[self.scene.frame_position(view.frame_index)]
         return camera.at(shift_pose(camera.world_from_camera, direction, shift))
 
-    def recorded_views(self, fitted: GaussianScene, poses: Poses) -> list[JudgedView]:
+    def recorded_views(self, fitted: GaussianScene, poses: Poses) -> list[ScoredView]:
         """The held-out images."""
         bodies = fitted.cameras.own_bodies
         images = side_by_side(self.image_of, self.test_views)
@@ -92,7 +92,7 @@ class HeldOut:
 
     def synthetic_views(
         self, fitted: GaussianScene, street: SyntheticStreet, shift: Shift
-    ) -> list[JudgedView]:
+    ) -> list[ScoredView]:
         """Exact images of the synthetic street beside the path, at the held-out times."""
         judged = []
         for view in self.test_views:
@@ -106,12 +106,12 @@ class HeldOut:
         camera: Camera,
         truth_rgb: Float[Tensor, "height width 3"],
         hidden: Bool[Tensor, "height width"] | None = None,
-    ) -> JudgedView:
+    ) -> ScoredView:
         taken_ns = camera.taken_ns(view.timestamp_ns)
         actor_ids, actor_index = actors_in_view(camera, self._moving, taken_ns)
         if hidden is not None:
             actor_index[hidden] = NOBODY
-        return JudgedView(
+        return ScoredView(
             name=f"{view.camera_name}/{view.frame_index}",
             camera=camera,
             timestamp_ns=view.timestamp_ns,

@@ -16,8 +16,8 @@ from lidarpainter_models.evaluation.held_back import (
     hold_back,
 )
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
+from lidarpainter_models.painter.known_painters import WEIGHTS_SUFFIX
 from lidarpainter_models.painter.one_step.job import NO_FILES
-from lidarpainter_models.painter.selection import WEIGHTS_SUFFIX
 from lidarpainter_models.painter.training.job import TrainingJob
 from lidarpainter_models.painter.training.loop import Told
 from lidarpainter_models.painter.training_jobs import PainterTraining, job_for

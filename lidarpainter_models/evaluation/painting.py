@@ -34,7 +34,7 @@ CONFIDENCE_BINS = 1 << 16
 
 
 @runtime_checkable
-class JudgingPairs(Protocol):
+class ScoringPairs(Protocol):
     """Pairs that are read whole, one after the other."""
 
     def __len__(self) -> int:
@@ -112,7 +112,7 @@ class PaintingScores:
 
 def score_painter(
     painter: Painter,
-    sources: Mapping[str, JudgingPairs],
+    sources: Mapping[str, ScoringPairs],
     *,
     feature_distance: ImageDistance | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -251,7 +251,7 @@ class _SourceTally:
         )
 
 
-def _pairs_of(source: JudgingPairs) -> Iterator[PaintingPair]:
+def _pairs_of(source: ScoringPairs) -> Iterator[PaintingPair]:
     for index in range(len(source)):
         yield source.read(index)
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.judged_views import Renderer, ViewScores, score_views
+from lidarpainter_models.evaluation.view_scores import Renderer, ViewScores, score_views
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.kernels.side_by_side import side_by_side

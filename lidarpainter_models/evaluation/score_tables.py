@@ -136,7 +136,7 @@ def _numbers(values: Mapping[str, Any]) -> list[tuple[str, float | None]]:
 
 def fitted_on(painter: str) -> Literal["painted", "refined"]:
     """What the scene after the last round is called: without a painter it is not painted."""
-    from lidarpainter_models.painter.selection import NO_PAINTER  # knows tensors
+    from lidarpainter_models.painter.known_painters import NO_PAINTER
 
     return "refined" if painter == NO_PAINTER else "painted"
 

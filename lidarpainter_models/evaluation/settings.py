@@ -9,7 +9,7 @@ from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.observations.settings import ObservationConfig
 
-JUDGED_SHIFTS = (
+SCORED_SHIFTS = (
     Shift(lateral_m=2.0),
     Shift(lateral_m=-2.0),
     Shift(lateral_m=3.0),
@@ -23,7 +23,7 @@ JUDGED_SHIFTS = (
 class ScoringConfig:
     """Which views and trajectories are judged."""
 
-    shifts: tuple[Shift, ...] = JUDGED_SHIFTS
+    shifts: tuple[Shift, ...] = SCORED_SHIFTS
     """Where the recorded cameras are moved to, to be judged there."""
     most_views: int = 48
     """Held-out views that are judged, evenly over cameras and time, so that judging does not grow
@@ -36,7 +36,7 @@ class ScoringConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class JudgeConfig:
+class EvaluationConfig:
     """How a fitted scene is judged."""
 
     observation: ObservationConfig

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
-from lidarpainter_models.evaluation.judged_views import Renderer
+from lidarpainter_models.evaluation.view_scores import Renderer
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.painter.selection import PainterChoice

@@ -28,7 +28,7 @@ COMPARED_FRAMES = 3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class StripJudgement:
+class StripEvaluation:
     """How fitted scenes are held against the cameras that their fit did not see."""
 
     held_out: HeldOut

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.judging import known_street
+from lidarpainter_models.evaluation.scene_evaluation import known_street
 from lidarpainter_models.evaluation.shown import ViewTimePainting
 from lidarpainter_models.export.report import Comparison
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene

@@ -82,7 +82,6 @@ def offsets_of(step: Step, moments: Moments, road: DrivenPath) -> Offsets:
 class OtherPath:
     """Another path than the recorded one."""
 
-    kind: str
     looks: bool = False
     """Whether it says where a single camera looks: along x of the poses."""
     actor: str | None = None
@@ -101,7 +100,7 @@ class OtherPath:
             return _looking(-UP, own.directions[moments.rows], places)
         other = path_of(self.actor).at(own.timestamps_ns[moments.rows])
         centres = other.world_from_body[:, :3, 3]
-        if self.kind == "follow":
+        if not self.looks:
             places = centres - FOLLOW_BEHIND_M * other.directions
             places[:, 2] = own.height_near(places[:, :2])
             return headed(places, torch.atan2(*other.directions[:, [1, 0]].unbind(1)))

@@ -27,7 +27,6 @@ from lidarpainter_models.geometry.trajectory_parts import (
 )
 from lidarpainter_models.geometry.trajectory_words import (
     ConstantStep,
-    PathWords,
     Step,
     read_trajectory_words,
 )
@@ -137,17 +136,15 @@ def parse_trajectory(spec: str, *, max_shift_m: float | None = MAX_SHIFT_M) -> T
         ConfigError: the text is no trajectory, or one that leads too far away.
     """
     words = read_trajectory_words(spec, max_shift_m=max_shift_m)
-    other = None if words.path is None else _other_path(words.path)
-    files = (Path(words.path.value),) if words.path and words.path.kind == "waypoints" else ()
+    path = words.path
+    files = (Path(path.file),) if path and path.file else ()
+    other = None
+    if path is not None:
+        waypoints = read_waypoints(files[0]) if files else None
+        other = OtherPath(
+            looks=path.looks, actor=path.actor, waypoints=waypoints, height_m=path.height_m
+        )
     return Trajectory(spec, words.steps, other, max_shift_m, files)
-
-
-def _other_path(words: PathWords) -> OtherPath:
-    if words.kind == "waypoints":
-        return OtherPath(kind=words.kind, waypoints=read_waypoints(Path(words.value)))
-    if words.kind == "birdseye":
-        return OtherPath(kind=words.kind, looks=True, height_m=words.height_m)
-    return OtherPath(kind=words.kind, actor=words.value, looks=words.kind == "orbit")
 
 
 def _moved_aside(

@@ -6,7 +6,7 @@ Steps off a path are added with `+`: `lateral:2+up:1.5`; another path may stand 
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from lidarpainter_models.errors import ConfigError
@@ -16,20 +16,6 @@ LANE_WIDTH_M = 3.5
 """A lane change without a width goes this far to the left."""
 BIRDSEYE_HEIGHT_M = 30.0
 RECORDED = "recorded"
-KINDS: Mapping[str, str] = {
-    RECORDED: "",
-    "lateral": ":METRES",
-    "up": ":METRES",
-    "along": ":METRES",
-    "yaw": ":DEGREES",
-    "lane-change": "[:METRES][@STARTs+DURATIONs]",
-    "waypoints": ":FILE.csv",
-    "follow": ":ACTOR",
-    "orbit": ":ACTOR",
-    "birdseye": "[:METRES]",
-}
-_PLUS = re.compile(rf"\+(?=\s*(?:{'|'.join(KINDS)})(?:[:@+\s]|$))")
-"""Only a plus before a kind parts them: `2s+3s` and names of files hold others."""
 _TIMES = re.compile(r"([0-9.]+)s\+([0-9.]+)s")
 
 
@@ -56,15 +42,18 @@ class LaneChange:
 Step = ConstantStep | LaneChange
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PathWords:
-    """Another path than the recorded one."""
+    """Another path than the recorded one: that of a file or of an actor, or one over the car."""
 
-    kind: str
-    value: str = ""
-    """An actor or a file."""
+    file: str | None = None
+    """A CSV file of waypoints."""
+    actor: str | None = None
+    """The actor that is followed or circled."""
     height_m: float = 0.0
-    """Of a bird's eye over the car."""
+    """How far a bird's eye is above the car."""
+    looks: bool = False
+    """Whether the path also says where a single camera looks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,17 +71,9 @@ def read_trajectory_words(spec: str, *, max_shift_m: float | None = MAX_SHIFT_M)
     Raises:
         ConfigError: the text is no trajectory, or one that leads too far away.
     """
-    steps: list[Step] = []
-    paths: list[PathWords] = []
-    for text in _PLUS.split(spec):
-        kind, has_value, value = text.strip().partition(":")
-        if kind in ("waypoints", "follow", "orbit") and value:
-            paths.append(PathWords(kind, value))
-        elif kind == "birdseye":
-            height_m = _number(value, spec) if has_value else BIRDSEYE_HEIGHT_M
-            paths.append(PathWords(kind, height_m=height_m))
-        elif (text.strip(), has_value) != (RECORDED, ""):
-            steps.append(_step(text.strip(), spec))
+    parts = [_read_part(text.strip(), spec) for text in _PLUS.split(spec)]
+    steps = [part for part in parts if isinstance(part, Step)]
+    paths = [part for part in parts if isinstance(part, PathWords)]
     if len(paths) > 1:
         raise ConfigError(f"trajectory {spec!r}: expected at most one path beside the recorded one")
     if max_shift_m is not None and not paths:
@@ -110,20 +91,15 @@ def _check_reach(steps: list[Step], spec: str) -> None:
         raise ConfigError(f"trajectory {spec!r}: {error}") from None
 
 
-def _step(text: str, spec: str) -> Step:
-    name, has_times, times = text.partition("@")
-    kind, has_value, number = name.partition(":")
-    if kind == "lane-change":
-        width_m = _number(number, spec) if has_value else LANE_WIDTH_M
-        start_s, duration_s = _times(times, spec) if has_times else (None, 0.0)
-        return LaneChange(width_m=width_m, start_s=start_s, duration_s=duration_s)
-    if has_value and not has_times and kind in ("lateral", "up", "along", "yaw"):
-        value = _number(number, spec)
-        if kind == "yaw":
-            return ConstantStep(yaw_rad=math.radians(value))
-        return ConstantStep(**{f"{kind}_m": value})
-    known = ", ".join(f"{kind}{form}" for kind, form in KINDS.items())
-    raise ConfigError(f"trajectory {spec!r}: expected one of {known}, or a sum with +")
+def _read_part(text: str, spec: str) -> Step | PathWords | None:
+    """Read one word of a trajectory; None for the recorded path."""
+    word = TRAJECTORY_WORDS.get(re.split("[:@]", text, maxsplit=1)[0])
+    rest = re.fullmatch(word.pattern, text[len(word.name) :]) if word else None
+    if word is None or rest is None:
+        known = ", ".join(f"{one.name}{one.form}" for one in TRAJECTORY_WORDS.values())
+        raise ConfigError(f"trajectory {spec!r}: expected one of {known}, or a sum with +")
+    groups = {name: value for name, value in rest.groupdict().items() if value is not None}
+    return word.read(groups, spec)
 
 
 def _times(text: str, spec: str) -> tuple[float, float]:
@@ -144,3 +120,99 @@ def _number(text: str, spec: str) -> float:
     if not math.isfinite(value):
         raise ConfigError(f"trajectory {spec!r}: {text!r} is no number")
     return value
+
+
+_Read = Callable[[Mapping[str, str], str], Step | PathWords | None]
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryWord:
+    """One word that a trajectory can be made of."""
+
+    name: str
+    form: str
+    """What follows the name, as errors and help texts show it."""
+    meaning: str
+    """What a help text says of it, units included."""
+    pattern: str
+    """What follows the name, as a regular expression with named groups."""
+    read: _Read
+    """From the groups that were found and the whole text to the step or path; None moves nothing.
+
+    It raises a ConfigError for a number or time that is none.
+    """
+
+
+def _step_along(field: str) -> _Read:
+    return lambda found, spec: ConstantStep(**{field: _number(found["number"], spec)})
+
+
+def _turn(found: Mapping[str, str], spec: str) -> ConstantStep:
+    return ConstantStep(yaw_rad=math.radians(_number(found["number"], spec)))
+
+
+def _lane_change(found: Mapping[str, str], spec: str) -> LaneChange:
+    width_m = _number(found["number"], spec) if "number" in found else LANE_WIDTH_M
+    start_s, duration_s = _times(found["times"], spec) if "times" in found else (None, 0.0)
+    return LaneChange(width_m=width_m, start_s=start_s, duration_s=duration_s)
+
+
+def _birdseye(found: Mapping[str, str], spec: str) -> PathWords:
+    height_m = _number(found["number"], spec) if "number" in found else BIRDSEYE_HEIGHT_M
+    return PathWords(height_m=height_m, looks=True)
+
+
+_NUMBER = r":(?P<number>[^@]*)"
+_NAME = r":(?P<name>.+)"
+_WORDS = (
+    TrajectoryWord(RECORDED, "", "the path that was driven", "", lambda _found, _spec: None),
+    TrajectoryWord("lateral", ":METRES", "left is positive", _NUMBER, _step_along("lateral_m")),
+    TrajectoryWord("up", ":METRES", "higher", _NUMBER, _step_along("up_m")),
+    TrajectoryWord("along", ":METRES", "ahead", _NUMBER, _step_along("along_m")),
+    TrajectoryWord("yaw", ":DEGREES", "a turn; left is positive", _NUMBER, _turn),
+    TrajectoryWord(
+        "lane-change",
+        "[:METRES][@STARTs+DURATIONs]",
+        "a smooth curve; left is positive, seconds of the log",
+        r"(?::(?P<number>[^@]*))?(?:@(?P<times>.*))?",
+        _lane_change,
+    ),
+    TrajectoryWord(
+        "waypoints",
+        ":FILE.csv",
+        "places in a file",
+        _NAME,
+        lambda found, _spec: PathWords(file=found["name"]),
+    ),
+    TrajectoryWord(
+        "follow",
+        ":ACTOR",
+        "behind an actor",
+        _NAME,
+        lambda found, _spec: PathWords(actor=found["name"]),
+    ),
+    TrajectoryWord(
+        "orbit",
+        ":ACTOR",
+        "once around an actor",
+        _NAME,
+        lambda found, _spec: PathWords(actor=found["name"], looks=True),
+    ),
+    TrajectoryWord(
+        "birdseye",
+        "[:METRES]",
+        "down on the car from above",
+        r"(?::(?P<number>.*))?",
+        _birdseye,
+    ),
+)
+TRAJECTORY_WORDS: Mapping[str, TrajectoryWord] = {word.name: word for word in _WORDS}
+"""Every word of a trajectory; help, checks and reading take their words from here."""
+_PLUS = re.compile(rf"\+(?=\s*(?:{'|'.join(TRAJECTORY_WORDS)})(?:[:@+\s]|$))")
+"""Only a plus before a word parts a trajectory: `2s+3s` and names of files hold others."""
+
+
+def trajectory_help() -> str:
+    """What the help of an option says of trajectories: every word with its form and meaning."""
+    words = "; ".join(f"{one.name}{one.form} ({one.meaning})" for one in TRAJECTORY_WORDS.values())
+    return f"{words}. Several with + between; steps lead at most {MAX_SHIFT_M:g} m away."

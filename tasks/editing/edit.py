@@ -37,7 +37,8 @@ from lidarpainter_models.gaussians.model.ply_files import read_ply
 from lidarpainter_models.gaussians.model.styling.scene_style import LampChange
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.geometry.transforms import invert_rigid
-from lidarpainter_models.painter.selection import NO_PAINTER, PainterChoice
+from lidarpainter_models.painter.known_painters import NO_PAINTER
+from lidarpainter_models.painter.selection import PainterChoice
 from lidarpainter_models.scenes.driving_scene import driven_road
 from lidarpainter_models.storage.tensor_files import write_tensors
 from tasks.opened import global_frame_of, open_scene

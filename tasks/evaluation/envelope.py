@@ -10,11 +10,11 @@ from catalog.store import Store
 from lidarpainter_models.conditioning.view_evidence import EvidenceGatherer
 from lidarpainter_models.evaluation.envelope import MovedViews, trust_envelope
 from lidarpainter_models.evaluation.score_tables import ENVELOPE, least_of
-from lidarpainter_models.evaluation.settings import JudgeConfig
+from lidarpainter_models.evaluation.settings import EvaluationConfig
 from lidarpainter_models.evaluation.view_confidence import BUNDLED
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from tasks.evaluation.views import judged_inputs
+from tasks.evaluation.views import evaluation_inputs
 from tasks.json_files import read_json, write_json
 from tasks.opened import OpenedRun, opened
 from tasks.progress import Progress
@@ -27,7 +27,7 @@ FILE = "envelope.json"
 
 
 @stage_task
-def find_envelope(run: RunSpec, fitted: FittedRef, config: JudgeConfig) -> StageResult:
+def find_envelope(run: RunSpec, fitted: FittedRef, config: EvaluationConfig) -> StageResult:
     """Walk away from the path of a fitted scene, on every stretch, as far as it can be trusted."""
     this = opened(run)
     return run_stage(
@@ -35,7 +35,7 @@ def find_envelope(run: RunSpec, fitted: FittedRef, config: JudgeConfig) -> Stage
         kernels=run.kernels,
         stage=STAGE,
         kind=ENVELOPE,
-        inputs=judged_inputs(this, fitted, view_time=False),
+        inputs=evaluation_inputs(this, fitted, view_time=False),
         config={"observation": asdict(config.observation)},
         build=partial(
             _build,

@@ -7,12 +7,12 @@ from typing import Any
 
 from catalog.artefacts import Workplace
 from lidarpainter_models.conditioning.settings import SequenceConfig
-from lidarpainter_models.evaluation.flicker_paths import FlickerJudgement
+from lidarpainter_models.evaluation.flicker_paths import FlickerEvaluation
 from lidarpainter_models.evaluation.score_tables import FLICKER
-from lidarpainter_models.evaluation.settings import JudgeConfig
+from lidarpainter_models.evaluation.settings import EvaluationConfig
 from lidarpainter_models.evaluation.shown import ViewTimePainting
 from tasks.evaluation.shown import view_time_painting
-from tasks.evaluation.views import SCORES_FILE, judged_inputs
+from tasks.evaluation.views import SCORES_FILE, evaluation_inputs
 from tasks.json_files import write_json
 from tasks.opened import opened
 from tasks.progress import Progress
@@ -25,7 +25,7 @@ def evaluate_flicker(
     run: RunSpec,
     stage: str,
     fitted: FittedRef,
-    config: JudgeConfig,
+    config: EvaluationConfig,
     previous: tuple[SequenceConfig, ...],
 ) -> StageResult:
     """Compare neighbouring frames of the first trained camera at every judged shift.
@@ -39,7 +39,7 @@ def evaluate_flicker(
         kernels=run.kernels,
         stage=stage,
         kind="evaluation",
-        inputs=judged_inputs(this, fitted, view_time=True),
+        inputs=evaluation_inputs(this, fitted, view_time=True),
         config={
             "split": run.split,
             "observation": asdict(config.observation),
@@ -49,7 +49,7 @@ def evaluate_flicker(
         },
         build=partial(
             _build,
-            judgement=FlickerJudgement(
+            evaluation=FlickerEvaluation(
                 held_out=this.held_out(config.observation),
                 camera_name=this.views.train[0].camera_name,
                 shifts=shifts,
@@ -71,8 +71,8 @@ def _build(
     place: Workplace,
     progress: Progress,
     *,
-    judgement: FlickerJudgement,
+    evaluation: FlickerEvaluation,
     painting: Callable[[], ViewTimePainting],
 ) -> dict[str, Any]:
-    write_json(place.output / SCORES_FILE, {FLICKER: judgement.scores(painting(), progress)})
-    return {"num_shifts": len(judgement.shifts)}
+    write_json(place.output / SCORES_FILE, {FLICKER: evaluation.scores(painting(), progress)})
+    return {"num_shifts": len(evaluation.shifts)}

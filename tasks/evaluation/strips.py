@@ -7,11 +7,11 @@ from typing import Any
 
 from catalog.artefacts import Workplace
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.evaluation.settings import JudgeConfig
+from lidarpainter_models.evaluation.settings import EvaluationConfig
 from lidarpainter_models.evaluation.shown import ShownScene
-from lidarpainter_models.evaluation.strip_views import StripJudgement
+from lidarpainter_models.evaluation.strip_views import StripEvaluation
 from tasks.evaluation.shown import shown_by
-from tasks.evaluation.views import SCORES_FILE, judged_inputs
+from tasks.evaluation.views import SCORES_FILE, evaluation_inputs
 from tasks.json_files import write_json
 from tasks.opened import opened
 from tasks.progress import Progress
@@ -21,7 +21,12 @@ from tasks.stages import StageResult, run_stage, stage_task
 
 @stage_task
 def evaluate_strips(
-    run: RunSpec, stage: str, fitted: FittedRef, config: JudgeConfig, *, view_time: bool = False
+    run: RunSpec,
+    stage: str,
+    fitted: FittedRef,
+    config: EvaluationConfig,
+    *,
+    view_time: bool = False,
 ) -> StageResult:
     """Score held-out frames of every camera that the fit did not see.
 
@@ -29,8 +34,8 @@ def evaluate_strips(
         ConfigError: the fit saw every camera of the scene.
     """
     this = opened(run)
-    judgement = StripJudgement(held_out=this.held_out(config.observation), views=this.views)
-    if not judgement.cameras:
+    evaluation = StripEvaluation(held_out=this.held_out(config.observation), views=this.views)
+    if not evaluation.cameras:
         raise ConfigError(
             f"the fit saw every camera of {run.split.scene_id}; leave one out with --train-cameras"
         )
@@ -39,7 +44,7 @@ def evaluate_strips(
         kernels=run.kernels,
         stage=stage,
         kind="strips",
-        inputs=judged_inputs(this, fitted, view_time=view_time),
+        inputs=evaluation_inputs(this, fitted, view_time=view_time),
         config={
             "split": run.split,
             "observation": asdict(config.observation),
@@ -47,7 +52,7 @@ def evaluate_strips(
         },
         build=partial(
             _build,
-            judgement=judgement,
+            evaluation=evaluation,
             shown=shown_by(this, fitted, config, view_time=view_time),
         ),
     )
@@ -57,8 +62,8 @@ def _build(
     place: Workplace,
     progress: Progress,
     *,
-    judgement: StripJudgement,
+    evaluation: StripEvaluation,
     shown: Callable[[], ShownScene],
 ) -> dict[str, Any]:
-    write_json(place.output / SCORES_FILE, judgement.scores(shown(), progress))
-    return {"num_cameras": len(judgement.cameras)}
+    write_json(place.output / SCORES_FILE, evaluation.scores(shown(), progress))
+    return {"num_cameras": len(evaluation.cameras)}

@@ -7,9 +7,9 @@ from typing import Any
 
 from catalog.artefacts import ArtefactRef, Workplace
 from catalog.store import Store
-from lidarpainter_models.evaluation.judging import Judgement
+from lidarpainter_models.evaluation.scene_evaluation import SceneEvaluation
 from lidarpainter_models.evaluation.score_tables import Scores
-from lidarpainter_models.evaluation.settings import JudgeConfig
+from lidarpainter_models.evaluation.settings import EvaluationConfig
 from lidarpainter_models.evaluation.shown import ShownScene
 from tasks.evaluation.shown import shown_by
 from tasks.json_files import read_json, write_json
@@ -24,7 +24,12 @@ SCORES_FILE = "scores.json"
 
 @stage_task
 def evaluate(
-    run: RunSpec, stage: str, fitted: FittedRef, config: JudgeConfig, *, view_time: bool = False
+    run: RunSpec,
+    stage: str,
+    fitted: FittedRef,
+    config: EvaluationConfig,
+    *,
+    view_time: bool = False,
 ) -> StageResult:
     """Score a scene as it is, or what it shows once the run's painter has painted it."""
     this = opened(run)
@@ -33,7 +38,8 @@ def evaluate(
         kernels=run.kernels,
         stage=stage,
         kind="evaluation",
-        inputs=judged_inputs(this, fitted, view_time=view_time) | file_digests(config.weight_files),
+        inputs=evaluation_inputs(this, fitted, view_time=view_time)
+        | file_digests(config.weight_files),
         config={
             "split": run.split,
             "observation": asdict(config.observation),
@@ -42,14 +48,14 @@ def evaluate(
         },
         build=partial(
             _build,
-            judgement=Judgement(held_out=this.held_out(config.observation), config=config),
+            evaluation=SceneEvaluation(held_out=this.held_out(config.observation), config=config),
             shown=shown_by(this, fitted, config, view_time=view_time),
         ),
     )
 
 
-def judged_inputs(this: OpenedRun, fitted: FittedRef, *, view_time: bool) -> dict[str, str]:
-    """Digests of what every judgement of a fitted scene depends on."""
+def evaluation_inputs(this: OpenedRun, fitted: FittedRef, *, view_time: bool) -> dict[str, str]:
+    """Digests of what every evaluation of a fitted scene depends on."""
     inputs = {
         "scene": this.scene.content_digest,
         "observations": fitted.observations.digest,
@@ -64,8 +70,12 @@ def load_scores(store: Store, ref: ArtefactRef) -> Scores:
 
 
 def _build(
-    place: Workplace, progress: Progress, *, judgement: Judgement, shown: Callable[[], ShownScene]
+    place: Workplace,
+    progress: Progress,
+    *,
+    evaluation: SceneEvaluation,
+    shown: Callable[[], ShownScene],
 ) -> dict[str, Any]:
-    scores = judgement.scores(shown(), progress)
+    scores = evaluation.scores(shown(), progress)
     write_json(place.output / SCORES_FILE, scores)
     return {"psnr": scores["recorded"]["psnr"], "num_views": scores["recorded"]["num_views"]}

@@ -13,7 +13,7 @@ from catalog.artefacts import ArtefactRef, Workplace
 from catalog.digests import DIGEST_LENGTH, canonical_json, digest_file
 from catalog.store import Store, open_store
 from lidarpainter_models.evaluation.painter_training import TrainingRequest
-from lidarpainter_models.painter.selection import WEIGHTS_SUFFIX
+from lidarpainter_models.painter.known_painters import WEIGHTS_SUFFIX
 from lidarpainter_models.painter.training.loop import TrainingProgress
 from tasks.json_files import finite_or_none, read_json, write_json
 from tasks.progress import Progress

@@ -12,7 +12,7 @@ import lidarpainter_models
 from catalog.artefacts import ArtefactRef, Workplace
 from catalog.store import Store
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.settings import JudgeConfig
+from lidarpainter_models.evaluation.settings import EvaluationConfig
 from lidarpainter_models.evaluation.shown import ViewTimePainting
 from lidarpainter_models.export.comparisons import Subject, comparisons
 from lidarpainter_models.export.moving_picture import recorded_beside
@@ -52,7 +52,7 @@ class ReportInputs:
 
 
 @stage_task
-def write_report(run: RunSpec, inputs: ReportInputs, config: JudgeConfig) -> StageResult:
+def write_report(run: RunSpec, inputs: ReportInputs, config: EvaluationConfig) -> StageResult:
     """Write the report of a run as an artefact."""
     this = opened(run)
     stages = inputs.stages

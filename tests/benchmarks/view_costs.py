@@ -43,7 +43,7 @@ def main():
     finished = open_run(store, options.run)
     parameters = view_parameters(finished)
     this = opened(parameters.run_spec(store.root, painter=options.painter))
-    judged = parameters.judge_config
+    judged = parameters.evaluation_config
     shown = painted_scene(store, finished.final, judged.conditions, this.painter, this.device)
     held_out = this.held_out(judged.observation, or_train=True).sampled(options.views)
     views, beside = held_out.test_views, Shift(lateral_m=2.0)

@@ -10,9 +10,9 @@ from strict_device import NAME, strict_runs
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.novel_guidance import NovelCamera, paint_novel_views
 from lidarpainter_models.conditioning.settings import NovelGuidanceConfig, SequenceConfig
-from lidarpainter_models.evaluation.judged_views import JudgedView, score_views
 from lidarpainter_models.evaluation.round_gain import round_gain
 from lidarpainter_models.evaluation.shown import ShownScene, ViewTimePainting
+from lidarpainter_models.evaluation.view_scores import ScoredView, score_views
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.geometry.trajectories import shift_pose
 from lidarpainter_models.kernels.backends import kernels_chosen
@@ -61,7 +61,7 @@ def scores(world, device, *, view_time):
     painting = ViewTimePainting(conditions=builder, painter=PainterChoice.of("warp"), device=device)
     shown = ShownScene(scene=scene, painting=painting if view_time else None)
     views = [
-        JudgedView(
+        ScoredView(
             name="test",
             camera=view.camera,
             timestamp_ns=view.timestamp_ns,

@@ -8,7 +8,9 @@ import torch
 from random_conditions import random_conditions
 from tiny_diffusion import write_model
 
-from lidarpainter_models.painter import PAINTER_NAMES, Painter, Painting, load_painter
+from lidarpainter_models.painter.known_painters import PAINTER_NAMES
+from lidarpainter_models.painter.protocol import Painter, Painting
+from lidarpainter_models.painter.selection import load_painter
 
 MODELS = {"sd-turbo": "one-step"}
 """Painters that need weights of gigabytes, and what they call themselves: a tiny model with random

@@ -13,7 +13,7 @@ from gaussian_world import scene_trained_on
 from tiny_street import FRONT, NUM_FRAMES, SIDE, SIDE_GAIN, tiny_street
 
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.strip_views import StripJudgement, strip_views
+from lidarpainter_models.evaluation.strip_views import StripEvaluation, strip_views
 from lidarpainter_models.evaluation.strips import calibrate_strip, score_strips, strip_mask
 from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_tangent
 from lidarpainter_models.observations.settings import ObservationConfig
@@ -110,6 +110,6 @@ def test_a_camera_judges_beside_the_fitted_one_that_sees_most_of_what_it_does(tm
     held_out = HeldOut(
         scene=scene, test_views=seen.test, observation=ObservationConfig(width_px=96)
     )
-    judgement = StripJudgement(held_out=held_out, views=seen)
-    assert judgement.fitted_cameras == ("back_camera", "left_camera", FRONT)
-    assert judgement.neighbour(scene_trained_on(list(seen.train)), SIDE) == FRONT
+    evaluation = StripEvaluation(held_out=held_out, views=seen)
+    assert evaluation.fitted_cameras == ("back_camera", "left_camera", FRONT)
+    assert evaluation.neighbour(scene_trained_on(list(seen.train)), SIDE) == FRONT

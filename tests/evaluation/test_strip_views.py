@@ -8,7 +8,7 @@ from gaussian_world import scene_trained_on
 from toy_street import ToyStreet
 
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.strip_views import StripJudgement, strip_views
+from lidarpainter_models.evaluation.strip_views import StripEvaluation, strip_views
 from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.observations.settings import ObservationConfig
@@ -51,7 +51,7 @@ def side_poses(street, fitted, frames):
 
 def test_only_cameras_that_no_fit_saw_judge(street):
     views = split_views(street, "alternate", ("front",))
-    assert StripJudgement(held_out=held_out(street), views=views).cameras == ("side",)
+    assert StripEvaluation(held_out=held_out(street), views=views).cameras == ("side",)
 
 
 def test_uncorrected_fit_leaves_the_judging_camera_where_the_log_says(street):

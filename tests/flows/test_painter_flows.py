@@ -8,7 +8,7 @@ from commands import settings, succeed
 from random_pairs import write_pairs
 from tiny_street import SCENE, WIDTH_PX
 
-from lidarpainter_models.painter import PAINTER_NAMES
+from lidarpainter_models.painter.known_painters import PAINTER_NAMES
 from lidarpainter_models.training_data.pairs import PairFolder
 
 PLAN = {

@@ -106,7 +106,7 @@ def test_a_comment_in_every_file_computes_nothing(project):
 
 def test_scoring_code_computes_evaluation_and_report_and_nothing_else(project):
     computed = project.computed_after(
-        "lidarpainter_models.evaluation.judging", "sum(weights)", "sum(weights[:])"
+        "lidarpainter_models.evaluation.scene_evaluation", "sum(weights)", "sum(weights[:])"
     )
     assert computed == {"evaluate-unpainted", "evaluate", "report"}
 

@@ -51,7 +51,7 @@ def test_gsplat_that_is_missing_is_told_in_one_line(machine, device):
 
 def test_a_run_that_asks_for_a_missing_gsplat_is_refused_before_its_first_stage(machine):
     machine(gsplat="no CUDA device")
-    with pytest.raises(ConfigError, match="^kernels=gsplat: no CUDA device; expected auto"):
+    with pytest.raises(ConfigError, match=r"^kernels=gsplat: no CUDA device; expected auto"):
         check_choice("gsplat")
     check_choice("torch")
 

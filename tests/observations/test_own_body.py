@@ -7,7 +7,7 @@ import torch
 from toy_street import LOOK_FORWARD, ToyStreet
 
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.judged_views import score_views
+from lidarpainter_models.evaluation.view_scores import score_views
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.geometry.cameras import Camera

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from lidarpainter_models.errors import WeightsError
-from lidarpainter_models.painter import PAINTER_NAMES, load_painter
+from lidarpainter_models.painter.known_painters import PAINTER_NAMES
+from lidarpainter_models.painter.selection import load_painter
 
 
 def test_none_gives_the_render_back(make_conditions):

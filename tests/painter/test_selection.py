@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from lidarpainter_models.errors import WeightsError
-from lidarpainter_models.painter import BUNDLED_NANO, PainterChoice
+from lidarpainter_models.painter.known_painters import BUNDLED_NANO
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.nano.weights import save_weights
+from lidarpainter_models.painter.selection import PainterChoice
 
 CPU = torch.device("cpu")
 

@@ -66,7 +66,7 @@ def stages(store, parameters, ran):  # noqa: ARG001 - it watches them being buil
     novel, conditions = parameters.novel, parameters.conditions
     painted = paint.fn(run, "paint-1", fitted, novel, conditions, start_frame=0)
     refined = refine.fn(run, "refine-1", fitted, parameters.refine, guidance=painted.ref)
-    final, config = FittedRef(seen.ref, refined.ref), parameters.judge_config
+    final, config = FittedRef(seen.ref, refined.ref), parameters.evaluation_config
     return {
         "prepare": seen,
         "fit": first,
@@ -113,7 +113,7 @@ def run(store, parameters, stages, final):
         final=final,
         stages=stages,
     )
-    report = write_report.fn(asked, page, parameters.judge_config)
+    report = write_report.fn(asked, page, parameters.evaluation_config)
     result["report"] = store.name_of(store.artefacts.folder(report.ref) / REPORT_FILE)
     refs = tuple(stage.ref for stage in stages.values())
     complete_run.fn(store.root, record, result, scores, refs)

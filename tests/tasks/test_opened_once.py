@@ -56,7 +56,7 @@ def counted(tmp_path, monkeypatch):
     opening._scene.cache_clear()
     counted = Counted(monkeypatch)
     parameters = small_parameters(painter="overlay")
-    run, config = parameters.run_spec(store.root), parameters.judge_config
+    run, config = parameters.run_spec(store.root), parameters.evaluation_config
 
     def stage(name, task, *arguments, **options):
         counted.stage = name

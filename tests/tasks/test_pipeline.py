@@ -31,8 +31,8 @@ from lidarpainter_models.storage.tensor_files import read_tensors
 from tasks.evaluation.flicker import evaluate_flicker
 from tasks.evaluation.views import evaluate, load_scores
 from tasks.opened import open_scene
-from tasks.painter.judge import judge_painters
-from tasks.painter.judged_fits import JudgedFit
+from tasks.painter.evaluate import score_painters
+from tasks.painter.held_out_fits import HeldOutFit
 from tasks.reconstruction.fit import fit, refine
 from tasks.reconstruction.painted_views import load_guidance
 from tasks.reconstruction.prepare import prepare
@@ -150,7 +150,7 @@ def test_lpips_stands_in_the_scores_where_both_files_are_given(
     }
     torch.save(heads, tmp_path / "heads.pth")
     files = lpips.LpipsFiles(backbone=tmp_path / "backbone.pth", heads=tmp_path / "heads.pth")
-    without, asked = parameters.judge_config, parameters.run_spec(store.root)
+    without, asked = parameters.evaluation_config, parameters.run_spec(store.root)
     for config, has_figure in ((without, False), (replace(without, lpips=files), True)):
         judged = evaluate.fn(asked, "evaluate", final, config)
         recorded = load_scores(store, judged.ref)["recorded"]
@@ -165,15 +165,15 @@ def test_painting_at_view_time_is_judged_apart(stages):
 
 
 def test_painters_are_judged_by_the_held_out_views_of_a_first_fit(store, run, parameters):
-    fit_of_run = JudgedFit(
+    fit_of_run = HeldOutFit(
         store_path=store.root,
         run_id=run.run_id,
         split=parameters.split_spec,
         fitted=run.unpainted,
-        settings=parameters.judge_config,
+        settings=parameters.evaluation_config,
     )
     labels = {"none": "none", "warp": "warp"}
-    found = judge_painters.fn(labels, (), fits=[fit_of_run])
+    found = score_painters.fn(labels, (), fits=[fit_of_run])
     (name,) = found["pairs"]
     assert name == f"{TOY_SCENE} recorded"
     recorded = run.result["unpainted"]["recorded"]
@@ -183,12 +183,12 @@ def test_painters_are_judged_by_the_held_out_views_of_a_first_fit(store, run, pa
     with_warps = found["painters"]["warp"]["total"]
     assert with_warps["painted"]["psnr"] == with_warps["warp_mean"]["psnr"] != unpainted
     with pytest.raises(ConfigError, match=f"one run of each scene, got two of {TOY_SCENE}"):
-        judge_painters.fn(labels, (), fits=[fit_of_run, fit_of_run])
+        score_painters.fn(labels, (), fits=[fit_of_run, fit_of_run])
 
 
 def test_neighbouring_frames_are_compared_along_every_shift(store, parameters, final):
     shifts = ScoringConfig(shifts=(Shift(lateral_m=1.0),))
-    config = replace(parameters.judge_config, scoring=shifts)
+    config = replace(parameters.evaluation_config, scoring=shifts)
     mixed = (SequenceConfig(previous="mixed"),)
     asked = parameters.run_spec(store.root)
     judged = evaluate_flicker.fn(asked, "flicker", final, config, mixed)
@@ -300,7 +300,7 @@ def looked_at(store, parameters):
     asked = parameters.run_spec(store.root)
     seen = prepare.fn(asked, parameters.observation)
     first = fit.fn(asked, "fit", seen.ref, parameters.fit)
-    judged = evaluate.fn(asked, "evaluate", run.final, parameters.judge_config)
+    judged = evaluate.fn(asked, "evaluate", run.final, parameters.evaluation_config)
     assert [stage.is_new for stage in (seen, first, judged)] == [False] * 3
     return run
 

@@ -82,7 +82,7 @@ def test_preparing_follows_the_colouring_and_no_reader_and_no_fit():
 def test_evaluation_follows_the_scores_and_no_reader():
     modules = modules_of(*builds_in("evaluation.views"))
     assert {
-        f"{LIBRARY}.evaluation.judging",
+        f"{LIBRARY}.evaluation.scene_evaluation",
         f"{LIBRARY}.evaluation.scene_scores",
         f"{LIBRARY}.metrics.images",
         f"{LIBRARY}.kernels.point_blend.cpu",
@@ -135,7 +135,7 @@ def test_a_comment_in_every_file_changes_no_stage(copied):
 
 
 def test_scoring_code_changes_what_scores_and_nothing_else(copied):
-    changed = changed_by(copied, f"{LIBRARY}.evaluation.judging", "sum(weights)", "sum(weights[:])")
+    changed = changed_by(copied, f"{LIBRARY}.evaluation.scene_evaluation", "sum(weights)", "sum(weights[:])")
     assert changed == {"tasks.evaluation.views"}
 
 

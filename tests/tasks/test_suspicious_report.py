@@ -33,6 +33,6 @@ def test_what_was_found_stands_in_the_report(store, parameters, stages, final, r
         final=final,
         stages={**stages, "examine": replace(found, summary={"suspicions": [SAID]})},
     )
-    report = write_report.fn(asked, page, parameters.judge_config)
+    report = write_report.fn(asked, page, parameters.evaluation_config)
     text = (store.artefacts.folder(report.ref) / REPORT_FILE).read_text("utf-8")
     assert SAID in text

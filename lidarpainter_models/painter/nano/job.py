@@ -7,10 +7,10 @@ from typing import Any
 import torch
 
 from lidarpainter_models.painter.examples import PairSource
+from lidarpainter_models.painter.known_painters import DIGEST_LENGTH
 from lidarpainter_models.painter.nano.painter import NanoPainter
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig, train_nano
 from lidarpainter_models.painter.nano.weights import save_weights
-from lidarpainter_models.painter.selection import DIGEST_LENGTH
 from lidarpainter_models.painter.training.checkpoints import training_digest
 from lidarpainter_models.painter.training.job import started_from
 from lidarpainter_models.painter.training.loop import Told

@@ -15,6 +15,7 @@ from lidarpainter_models.metrics.lpips import load_lpips
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.painter.adversarial import FrozenFeatures
 from lidarpainter_models.painter.examples import PairSource
+from lidarpainter_models.painter.known_painters import DIGEST_LENGTH
 from lidarpainter_models.painter.one_step.base_models import open_base
 from lidarpainter_models.painter.one_step.loading import (
     SUFFIX,
@@ -30,7 +31,7 @@ from lidarpainter_models.painter.one_step.training import (
     train_one_step,
 )
 from lidarpainter_models.painter.one_step.weights import read_trained, save_trained
-from lidarpainter_models.painter.selection import DIGEST_LENGTH, PainterChoice, file_digest
+from lidarpainter_models.painter.selection import PainterChoice, file_digest
 from lidarpainter_models.painter.training.job import started_from
 from lidarpainter_models.painter.training.loop import Told
 from lidarpainter_models.painter.training.processes import OneProcess, Processes

@@ -7,7 +7,6 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 
 from lidarpainter_models.errors import ConfigError, ShapeError
-from lidarpainter_models.painter import load_painter
 from lidarpainter_models.painter.batches import in_planes, stack_conditions
 from lidarpainter_models.painter.filters import fill_push_pull
 from lidarpainter_models.painter.input_hull import HULL_MARGIN, input_hull
@@ -15,6 +14,7 @@ from lidarpainter_models.painter.nano.candidates import build_candidates, candid
 from lidarpainter_models.painter.nano.features import painting_features
 from lidarpainter_models.painter.nano.network import CELL_PX, NanoConfig, NanoNetwork, PixelNorm
 from lidarpainter_models.painter.nano.painter import NanoPainter, without_cells
+from lidarpainter_models.painter.selection import load_painter
 
 SMALL = {"widths": (8, 8, 8), "blocks": (1, 1, 1)}
 

@@ -8,9 +8,9 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from lidarpainter_models.errors import WeightsError, WriteError
-from lidarpainter_models.painter import load_painter
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.nano.weights import load_weights, save_weights
+from lidarpainter_models.painter.selection import load_painter
 
 SMALL = NanoConfig(widths=(8, 8, 8), blocks=(1, 1, 1))
 

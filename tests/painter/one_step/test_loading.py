@@ -12,12 +12,14 @@ from safetensors.torch import load_file, save_file
 from tiny_diffusion import write_model
 
 from lidarpainter_models.errors import ConfigError, MissingPackageError, WeightsError
-from lidarpainter_models.painter import UnpaintedPainter, load_painter, selection
+from lidarpainter_models.painter import selection
+from lidarpainter_models.painter.baselines import UnpaintedPainter
 from lidarpainter_models.painter.one_step.assembly import trained_names
 from lidarpainter_models.painter.one_step.loading import load_one_step
 from lidarpainter_models.painter.one_step.presets import PRESETS
 from lidarpainter_models.painter.one_step.weights import read_header, save_trained
 from lidarpainter_models.painter.precision import faster_type
+from lidarpainter_models.painter.selection import load_painter
 from lidarpainter_models.storage.tensor_files import HEADER_KEY
 
 FLOAT = torch.float32

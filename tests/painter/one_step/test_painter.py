@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.painter import Painter
 from lidarpainter_models.painter.batches import stack_conditions
 from lidarpainter_models.painter.one_step.config import OneStepConfig
 from lidarpainter_models.painter.one_step.loading import load_one_step
 from lidarpainter_models.painter.one_step.painter import painter_inputs, support
 from lidarpainter_models.painter.one_step.presets import as_shipped, paper, with_reference
+from lidarpainter_models.painter.protocol import Painter
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,6 @@ from small_training import CONTEST
 from tiny_diffusion import TEXT_WIDTH
 
 from lidarpainter_models.errors import ConfigError, DataError, TrainingError
-from lidarpainter_models.painter import load_painter
 from lidarpainter_models.painter.adversarial import FrozenFeatures
 from lidarpainter_models.painter.augmentation import batch_pairs
 from lidarpainter_models.painter.losses import PaperLossWeights
@@ -22,6 +21,7 @@ from lidarpainter_models.painter.one_step.training import (
     train_one_step,
 )
 from lidarpainter_models.painter.one_step.weights import save_trained
+from lidarpainter_models.painter.selection import load_painter
 
 SHORT = replace(CONTEST, loss=PaperLossWeights(lpips=0, adversarial=0), learning_rate=1e-2)
 BRIEF = replace(SHORT, network=fast())

@@ -19,15 +19,15 @@ from lidarpainter_models.evaluation.painter_training import TrainingRequest
 from lidarpainter_models.metrics.backbones import SQUEEZENET
 from lidarpainter_models.metrics.lpips import Lpips
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
-from lidarpainter_models.painter import load_painter
 from lidarpainter_models.painter.losses import PaperLossWeights
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.painter.one_step.presets import fast
 from lidarpainter_models.painter.one_step.training import OneStepTrainingConfig
 from lidarpainter_models.painter.one_step.weights import read_trained
+from lidarpainter_models.painter.selection import load_painter
 from lidarpainter_models.painter.training_jobs import job_for, recipe_for
 from lidarpainter_models.training_data.pair_sets import PairSet
-from tasks.painter.judge import judge_held_back, load_painting_scores, samples_path
+from tasks.painter.evaluate import load_painting_scores, samples_path, score_held_back
 from tasks.painter.train import (
     publish_painter,
     train,
@@ -81,7 +81,7 @@ def test_a_one_step_painter_is_trained_judged_published_and_trained_on(pairs, st
     assert [entry["step"] for entry in record["history"]] == [1, 2]
     assert set(record["pairs"][0]["pairs"]) <= {f"pair-{frame}" for frame in range(4)}
 
-    judged = judge_held_back.fn(store.root, "judge", weights, pairs, 0.3)
+    judged = score_held_back.fn(store.root, "judge", weights, pairs, 0.3)
     assert load_painting_scores(store, judged.ref)["total"]["num_pairs"] == 2
     assert samples_path(store, judged.ref).stat().st_size > 1000
     row = publish_painter.fn(store.root, trained.ref, None)

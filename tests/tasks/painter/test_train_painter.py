@@ -16,7 +16,7 @@ from lidarpainter_models.painter.nano.network import NanoConfig
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.painter.nano.weights import load_weights
 from lidarpainter_models.training_data.pair_sets import PairSet
-from tasks.painter.judge import judge_held_back, judge_painters, load_painting_scores
+from tasks.painter.evaluate import load_painting_scores, score_held_back, score_painters
 from tasks.painter.train import (
     publish_painter,
     train,
@@ -87,7 +87,7 @@ def test_a_killed_training_goes_on_and_ends_bit_for_bit(pairs, store, tmp_path):
 
 def test_a_trained_painter_is_judged_and_catalogued(pairs, store):
     trained = train.fn(store.root, "train", request(pairs, CONFIG, held_back=0.3))
-    judged = judge_held_back.fn(store.root, "judge", weights_path(store, trained.ref), pairs, 0.3)
+    judged = score_held_back.fn(store.root, "judge", weights_path(store, trained.ref), pairs, 0.3)
     scores = load_painting_scores(store, judged.ref)
     assert scores["total"]["num_pairs"] == judged.summary["num_pairs"] == 2
     row = publish_painter.fn(store.root, trained.ref, scores)
@@ -99,7 +99,7 @@ def test_a_trained_painter_is_judged_and_catalogued(pairs, store):
     assert stored["num_bytes"] == weights_path(store, trained.ref).stat().st_size
     # what it learnt from judges it never, nor those it is compared with
     painters = {"none": "none", "nano": str(store.path_of(stored["path"]))}
-    found = judge_painters.fn(painters, pairs)
+    found = score_painters.fn(painters, pairs)
     assert found["pairs"]["log"]["num_left_out"] == 4
     none = found["painters"]["none"]["total"]
     assert none["painted"]["psnr"] == none["input"]["psnr"]
@@ -133,4 +133,4 @@ def test_sets_need_names_of_their_own(pairs, store, number):
 def test_judging_needs_something_held_back(pairs, store):
     trained = train.fn(store.root, "train", request(pairs, replace(CONFIG, steps=1), held_back=0.0))
     with pytest.raises(ConfigError, match="nothing to judge by"):
-        judge_held_back.fn(store.root, "judge", weights_path(store, trained.ref), pairs, 0.0)
+        score_held_back.fn(store.root, "judge", weights_path(store, trained.ref), pairs, 0.0)

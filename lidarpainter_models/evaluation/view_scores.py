@@ -35,7 +35,7 @@ NOBODY = -1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class JudgedView:
+class ScoredView:
     """A view whose true image is known and was never used for fitting."""
 
     name: str
@@ -96,7 +96,7 @@ def actors_in_view(
 
 def score_views(
     render: Renderer,
-    views: Sequence[JudgedView],
+    views: Sequence[ScoredView],
     *,
     distances: PerceptualDistances,
     device: torch.device | None = None,
@@ -145,7 +145,7 @@ class _Scored(NamedTuple):
     lpips: float | None
 
 
-def _one_scored(render: Renderer, view: JudgedView, *, distances: PerceptualDistances) -> _Scored:
+def _one_scored(render: Renderer, view: ScoredView, *, distances: PerceptualDistances) -> _Scored:
     image = render(view.camera, view.timestamp_ns).clamp(0, 1)
     truth = view.truth_rgb.to(image.device)
     is_actor = (view.actor_index != NOBODY).to(image.device)
@@ -162,7 +162,7 @@ def _one_scored(render: Renderer, view: JudgedView, *, distances: PerceptualDist
 
 
 def _actor_errors(
-    image: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"], view: JudgedView
+    image: Float[Tensor, "height width 3"], truth: Float[Tensor, "height width 3"], view: ScoredView
 ) -> dict[str, Float[Tensor, " pixels"]]:
     """Squared errors of the pixels of each actor that the view sees."""
     error = squared_error(image, truth).double().cpu()

@@ -7,7 +7,7 @@ from catalog.store import Store
 from flows.derive import Change, derive_run
 from lidarpainter_models.weather.mix import StyleMix
 from tasks.opened import open_scene
-from tasks.reconstruction.dress import dress
+from tasks.reconstruction.style import put_style
 from tasks.runs import open_run
 from tasks.stored import load_observations, load_scene
 
@@ -15,7 +15,7 @@ STYLE = "style"
 """The kind of the change."""
 
 
-def dress_run(store: Store, run: str, mix: StyleMix, *, seed: int) -> dict[str, Any]:
+def style_run(store: Store, run: str, mix: StyleMix, *, seed: int) -> dict[str, Any]:
     """Derive a run in a style, or recall the one that was; see `flows.derive`.
 
     The seed decides which windows are lit and where puddles stand.
@@ -28,7 +28,7 @@ def dress_run(store: Store, run: str, mix: StyleMix, *, seed: int) -> dict[str, 
         source,
         Change(kind=STYLE, parameters=told, inputs={"scene": recorded.content_digest}),
         build=partial(
-            dress,
+            put_style,
             scene=partial(load_scene, store, source.final.gaussians),
             observations=partial(load_observations, store, source.final.observations),
             recorded=partial(open_scene, store, source.scene_id),

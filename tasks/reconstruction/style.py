@@ -13,7 +13,7 @@ from tasks.progress import Progress
 from tasks.stored import save_scene
 
 
-def dress(
+def put_style(
     place: Workplace,
     progress: Progress,
     *,
@@ -24,7 +24,7 @@ def dress(
     seed: int,
 ) -> dict[str, Any]:
     """The build of a styled scene; see `flows.derive`."""
-    dressed = styled_scene(
+    styled = styled_scene(
         scene(),
         observations(),
         recorded(),
@@ -32,5 +32,5 @@ def dress(
         seed=seed,
         progress=lambda done, total: progress(done, total, "looking for lamps"),
     )
-    save_scene(place.output, dressed, [])
-    return describe(dressed)
+    save_scene(place.output, styled, [])
+    return describe(styled)

@@ -14,7 +14,7 @@ from lidarpainter_models.evaluation.scene_scores import (
     score_synthetic,
 )
 from lidarpainter_models.evaluation.score_tables import DEPTH, Scores
-from lidarpainter_models.evaluation.settings import JudgeConfig
+from lidarpainter_models.evaluation.settings import EvaluationConfig
 from lidarpainter_models.evaluation.shown import ShownScene
 from lidarpainter_models.metrics.images import psnr_from_error
 from lidarpainter_models.metrics.perceptual import PerceptualDistances, load_distances
@@ -28,11 +28,11 @@ NO_INCEPTION = "Inception weights are user-supplied and none were given"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Judgement:
+class SceneEvaluation:
     """How fitted scenes are held against the views that no fit saw."""
 
     held_out: HeldOut
-    config: JudgeConfig
+    config: EvaluationConfig
 
     def scores(self, shown: ShownScene, progress: Callable[[int, int], None]) -> Scores:
         """Recorded views, views beside the path, and depth at both, over a sample of the views."""

@@ -12,7 +12,7 @@ from catalog.digests import DIGEST_LENGTH, digest_file
 from catalog.store import Store, open_store
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.held_back import PairSubset, hold_back, learnt_targets
-from lidarpainter_models.evaluation.painting import JudgingPairs, score_painter
+from lidarpainter_models.evaluation.painting import ScoringPairs, score_painter
 from lidarpainter_models.evaluation.painting_samples import painting_samples
 from lidarpainter_models.export.images import write_png
 from lidarpainter_models.metrics.squeezenet import SqueezeNetDistance, load_squeezenet_distance
@@ -23,7 +23,7 @@ from lidarpainter_models.painter.selection import PainterChoice
 from lidarpainter_models.training_data.pair_sets import PairSet, open_sets
 from tasks.json_files import read_json, write_json
 from tasks.measuring import measured
-from tasks.painter.judged_fits import JudgedFit, unseen_sources
+from tasks.painter.held_out_fits import HeldOutFit, unseen_sources
 from tasks.progress import Progress, listener, progress_of
 from tasks.stages import StageResult, run_stage, stage_task
 
@@ -32,10 +32,10 @@ SAMPLES_FILE = "samples.png"
 
 
 @stage_task
-def judge_painters(
+def score_painters(
     painters: Mapping[str, str],
     sets: Sequence[PairSet],
-    fits: Sequence[JudgedFit] = (),
+    fits: Sequence[HeldOutFit] = (),
     *,
     feature_weights: Path | None = None,
     keep_below: float | None = None,
@@ -75,7 +75,7 @@ def judge_painters(
 
 
 @stage_task
-def judge_held_back(
+def score_held_back(
     store_path: Path,
     stage: str,
     weights: Path,
@@ -138,12 +138,12 @@ def _build_scores(
 
 
 def load_painting_scores(store: Store, ref: ArtefactRef) -> dict[str, Any]:
-    """Read the scores of `judge_held_back`."""
+    """Read the scores of `score_held_back`."""
     return read_json(store.artefacts.files(ref) / SCORES_FILE)
 
 
 def samples_path(store: Store, ref: ArtefactRef) -> Path:
-    """The images that `judge_held_back` has painted: render, LiDAR, painted, true."""
+    """The images that `score_held_back` has painted: render, LiDAR, painted, true."""
     return store.artefacts.files(ref) / SAMPLES_FILE
 
 
@@ -154,7 +154,7 @@ def feature_distance_of(weights: Path | None) -> SqueezeNetDistance | None:
 
 def _told_scores(
     painter: Painter,
-    sources: Mapping[str, JudgingPairs],
+    sources: Mapping[str, ScoringPairs],
     distance: SqueezeNetDistance | None,
     stage: str,
 ) -> dict[str, Any]:
@@ -168,7 +168,7 @@ def _told_scores(
 
 def _scores(
     painter: Painter,
-    sources: Mapping[str, JudgingPairs],
+    sources: Mapping[str, ScoringPairs],
     distance: SqueezeNetDistance | None,
     progress: Progress,
 ) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import torch
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.evaluation.held_back import target_view
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.judged_views import JudgedView
+from lidarpainter_models.evaluation.view_scores import ScoredView
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.painter.examples import PaintingPair
 from lidarpainter_models.scenes.records import RecordedView
@@ -24,7 +24,7 @@ RECORDED = "recorded"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class JudgedPairs:
+class HeldOutPairs:
     """The held-out views of one trajectory; conditions are gathered when a pair is read."""
 
     builder: ConditionBuilder
@@ -48,7 +48,7 @@ class JudgedPairs:
         known = everywhere if judged.hidden is None else ~judged.hidden
         return PaintingPair(conditions=conditions, target_rgb=truth, target_valid=known)
 
-    def _judged(self, view: RecordedView) -> JudgedView:
+    def _judged(self, view: RecordedView) -> ScoredView:
         alone, fitted = replace(self.held_out, test_views=[view]), self.builder.scene
         if self.beside is None:
             return alone.recorded_views(fitted, "interpolated")[0]
@@ -56,17 +56,17 @@ class JudgedPairs:
         return alone.synthetic_views(fitted, street, shift)[0]
 
 
-def judged_pairs(
+def held_out_pairs(
     builder: ConditionBuilder,
     held_out: HeldOut,
     street: SyntheticStreet | None,
     shifts: Sequence[Shift],
-) -> dict[str, JudgedPairs]:
+) -> dict[str, HeldOutPairs]:
     """The pairs of a scene by trajectory: at the shifts of a street, else as recorded."""
     if street is None:
-        return {RECORDED: JudgedPairs(builder=builder, held_out=held_out)}
+        return {RECORDED: HeldOutPairs(builder=builder, held_out=held_out)}
     return {
-        shift.name: JudgedPairs(builder=builder, held_out=held_out, beside=(street, shift))
+        shift.name: HeldOutPairs(builder=builder, held_out=held_out, beside=(street, shift))
         for shift in shifts
     }
 

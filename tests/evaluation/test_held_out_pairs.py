@@ -6,8 +6,8 @@ import torch
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.evaluation.held_back import target_view
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.judged_pairs import judged_pairs, unseen_views
-from lidarpainter_models.evaluation.judged_views import JudgedView
+from lidarpainter_models.evaluation.held_out_pairs import held_out_pairs, unseen_views
+from lidarpainter_models.evaluation.view_scores import ScoredView
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.observations.settings import ObservationConfig
@@ -79,7 +79,7 @@ def places(monkeypatch):
     def found(held_out, *place):
         looked.append(place)
         return [
-            JudgedView(
+            ScoredView(
                 name="found",
                 camera=CAMERA,
                 timestamp_ns=one.timestamp_ns,
@@ -103,7 +103,7 @@ def held_out():
 
 def test_a_log_judges_at_its_held_out_images(places):
     builder = GreyBuilder()
-    (pairs,) = judged_pairs(builder, held_out(), None, SHIFTS).values()
+    (pairs,) = held_out_pairs(builder, held_out(), None, SHIFTS).values()
     assert len(pairs) == 2
     pair = pairs.read(1)
     assert places == [("fitted", "interpolated")]
@@ -114,7 +114,7 @@ def test_a_log_judges_at_its_held_out_images(places):
 
 def test_a_street_judges_beside_the_path(places):
     builder, street = GreyBuilder(), object.__new__(SyntheticStreet)
-    found = judged_pairs(builder, held_out(), street, SHIFTS)
+    found = held_out_pairs(builder, held_out(), street, SHIFTS)
     assert list(found) == ["left-2m", "up-1.5m"]
     found["up-1.5m"].read(0)
     assert places == [("fitted", street, SHIFTS[1])]

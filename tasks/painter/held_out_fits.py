@@ -11,10 +11,10 @@ from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.evaluation.held_back import unseen_pairs
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.judged_pairs import JudgedPairs, judged_pairs, unseen_views
-from lidarpainter_models.evaluation.judging import known_street
-from lidarpainter_models.evaluation.painting import JudgingPairs
-from lidarpainter_models.evaluation.settings import JudgeConfig
+from lidarpainter_models.evaluation.held_out_pairs import HeldOutPairs, held_out_pairs, unseen_views
+from lidarpainter_models.evaluation.painting import ScoringPairs
+from lidarpainter_models.evaluation.scene_evaluation import known_street
+from lidarpainter_models.evaluation.settings import EvaluationConfig
 from lidarpainter_models.training_data.pair_sets import PairSet, open_sets
 from tasks.opened import open_split
 from tasks.specs import FittedRef, SplitSpec
@@ -22,14 +22,14 @@ from tasks.stored import load_observations, load_scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class JudgedFit:
+class HeldOutFit:
     """The first fit of a run: what a painter is shown before anything was painted."""
 
     store_path: Path
     run_id: str
     split: SplitSpec
     fitted: FittedRef
-    settings: JudgeConfig
+    settings: EvaluationConfig
 
     def open(self, trained: AbstractSet[str]) -> "OpenedFit":
         """Its pairs, by scene and trajectory, without frames that painters were trained on."""
@@ -38,7 +38,7 @@ class JudgedFit:
         unseen = unseen_views(views.test, self.split.scene_id, trained)
         seen = load_observations(store, self.fitted.observations)
         scene = load_scene(store, self.fitted.gaussians)
-        found = judged_pairs(
+        found = held_out_pairs(
             ConditionBuilder(scene, seen.lidar_map, seen.views, config=self.settings.conditions),
             HeldOut(scene=recorded, test_views=unseen, observation=self.settings.observation),
             known_street(recorded),
@@ -56,12 +56,12 @@ class OpenedFit:
     """Pairs of a run that judge."""
 
     run_id: str
-    pairs: dict[str, JudgedPairs]
+    pairs: dict[str, HeldOutPairs]
     num_left_out: int
     """Held-out views of each trajectory that a painter was trained on."""
 
 
-def open_fits(fits: Sequence[JudgedFit], trained: AbstractSet[str]) -> list[OpenedFit]:
+def open_fits(fits: Sequence[HeldOutFit], trained: AbstractSet[str]) -> list[OpenedFit]:
     """Every fit, each of a scene of its own.
 
     Raises:
@@ -75,15 +75,15 @@ def open_fits(fits: Sequence[JudgedFit], trained: AbstractSet[str]) -> list[Open
 
 
 def unseen_sources(
-    sets: Sequence[PairSet], fits: Sequence[JudgedFit], learnt: Sequence[frozenset[str]]
-) -> tuple[dict[str, JudgingPairs], dict[str, Any]]:
+    sets: Sequence[PairSet], fits: Sequence[HeldOutFit], learnt: Sequence[frozenset[str]]
+) -> tuple[dict[str, ScoringPairs], dict[str, Any]]:
     """Pairs that no painter was trained on, and how many of every set those are.
 
     Raises:
         ConfigError: neither pairs nor runs.
         DataError: a painter was trained on all of them.
     """
-    sources: dict[str, JudgingPairs] = {}
+    sources: dict[str, ScoringPairs] = {}
     counts: dict[str, Any] = {}
     if sets or not fits:
         folders = open_sets(sets)

@@ -10,15 +10,15 @@ from toy_street import ToyStreet, world_from_car
 
 from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.judged_views import (
+from lidarpainter_models.evaluation.scene_evaluation import SceneEvaluation, _mean
+from lidarpainter_models.evaluation.settings import EvaluationConfig, ScoringConfig
+from lidarpainter_models.evaluation.shown import ShownScene
+from lidarpainter_models.evaluation.view_scores import (
     NOBODY,
-    JudgedView,
+    ScoredView,
     actors_in_view,
     score_views,
 )
-from lidarpainter_models.evaluation.judging import Judgement, _mean
-from lidarpainter_models.evaluation.settings import JudgeConfig, ScoringConfig
-from lidarpainter_models.evaluation.shown import ShownScene
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
 from lidarpainter_models.metrics.perceptual import PerceptualDistances
@@ -35,16 +35,16 @@ def judged():
     street.manifest = {}
     tests = tuple(view for view in street.views if view.frame_index in JUDGED_FRAMES)
     observation = ObservationConfig(width_px=60)
-    config = JudgeConfig(
+    config = EvaluationConfig(
         observation=observation,
         scoring=ScoringConfig(shifts=(Shift(lateral_m=1.0),)),
         conditions=ConditionConfig(),
     )
     held_out = HeldOut(scene=street, test_views=tests, observation=observation)
     fitted = scene_trained_on([view for view in street.views_of(FRONT) if view not in tests])
-    judgement = Judgement(held_out=held_out, config=config)
+    evaluation = SceneEvaluation(held_out=held_out, config=config)
     told = []
-    return judgement.scores(ShownScene(scene=fitted), lambda *step: told.append(step)), told
+    return evaluation.scores(ShownScene(scene=fitted), lambda *step: told.append(step)), told
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +111,7 @@ def test_what_hides_an_actor_does_not_count_for_it(hidden):
     image = torch.zeros(*index.shape, 3)
     for number, error in wrong.items():
         image[index == number] = error
-    judged = JudgedView(
+    judged = ScoredView(
         name="front/2",
         camera=view.camera,
         timestamp_ns=view.timestamp_ns,
