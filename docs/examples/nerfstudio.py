@@ -26,7 +26,7 @@ EGO_AXES_FROM_CAMERA = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])  # forward,
 def write(folder: Path, store: Path, licence: str) -> Path:
     """Write the folder as <store>/scenes/nerfstudio/<its name>."""
     transforms = json.loads((folder / "transforms.json").read_text())
-    cloud = open3d.io.read_point_cloud(str(folder / transforms["ply_file_path"]))
+    cloud = open3d.io.read_point_cloud(folder / transforms["ply_file_path"])
     cloud_m = np.asarray(cloud.points)
     poses = []
     for frame in transforms["frames"]:
@@ -42,13 +42,13 @@ def write(folder: Path, store: Path, licence: str) -> Path:
     with SceneWriter(store, "nerfstudio", folder.resolve().name, header) as writer:
         for index, (frame, pose) in enumerate(zip(transforms["frames"], poses, strict=True)):
             pose[:3, 3] -= origin_m
-            world_from_camera = torch.from_numpy(pose)
-            world_from_ego = world_from_camera.clone()
+            placed = torch.from_numpy(pose)
+            world_from_ego = placed.clone()
             world_from_ego[:3, :3] = torch.from_numpy(pose[:3, :3] @ EGO_AXES_FROM_CAMERA)
             time_ns = PERIOD_NS * index
             writer.add_frame(index, timestamp_ns=time_ns, world_from_ego=world_from_ego)
             camera = Camera(
-                world_from_camera=world_from_camera,
+                world_from_camera=placed,
                 fx_px=float(transforms["fl_x"]),
                 fy_px=float(transforms["fl_y"]),
                 cx_px=float(transforms["cx"]),
