@@ -19,7 +19,7 @@ there against frames; `envelope` draws frames inside the envelopes and counts wh
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from statistics import fmean
@@ -259,7 +259,7 @@ def seeds_of(text: str) -> range:
     return range(int(first), int(end or int(first) + 1))
 
 
-COMMANDS = {
+COMMANDS: dict[str, Callable[..., None]] = {
     "measure": measure,
     "fit": fit,
     "judge": judge,

@@ -60,7 +60,8 @@ def main(store_path: str, run_id: str, *styles: str) -> None:
     scenes = {CLEAR: clear}
     scenes |= {name: styled_scene(clear, seen, recorded, StyleMix.parse(name)) for name in named}
     scenes |= {name + UNLIT: _without_car_lamps(scenes[name]) for name in named if "night" in name}
-    tally, edges = FlickerTally(builder.boxes.tracks), {name: [] for name in named}
+    tally = FlickerTally(builder.boxes.tracks)
+    edges: dict[str, list[float]] = {name: [] for name in named}
     for camera, now_ns in moments:
         shown = {name: scene.render(camera, now_ns) for name, scene in scenes.items()}
         images = {name: view.rgb.clamp(0, 1) for name, view in shown.items()}
@@ -100,6 +101,8 @@ def main(store_path: str, run_id: str, *styles: str) -> None:
 def _without_car_lamps(scene: GaussianScene) -> GaussianScene:
     """The scene with nobody's lamps on, so that no light moves in it."""
     tracks = tuple(replace(track, is_moving=False) for track in scene.actors.recorded_tracks)
+    if scene.style is None:
+        return scene
     place = scene.style.place
     place = replace(place, ego_lamp=place.ego_lamp + torch.tensor([0.0, 0.0, -FAR_M]))
     return replace(

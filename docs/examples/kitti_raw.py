@@ -16,6 +16,7 @@ import sys
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import cv2
@@ -106,7 +107,7 @@ class Turn:
         velodyne_from_box = np.eye(4)
         velodyne_from_box[:3, :3] = cv2.Rodrigues(np.array([0.0, 0.0, yaw]))[0]
         velodyne_from_box[:3, 3] = x_m, y_m, z_m + height_m / 2
-        share = float(self.share(x_m, y_m))
+        share = float(self.share(np.array(x_m), np.array(y_m)))
         return BoxRecord(
             actor_id="",
             category=tracklet.findtext("objectType", ""),
@@ -184,20 +185,23 @@ def write(date_folder: Path, drive: str, store: Path) -> Path:
     times_ns = [nanoseconds(t) for t in (folder / "oxts/timestamps.txt").read_text().splitlines()]
     turns = turns_of(poses, times_ns)
     boxes = boxes_of(folder / "tracklet_labels.xml", turns)
-    lens = {
-        "fx_px": projection[0, 0],
-        "fy_px": projection[1, 1],
-        "cx_px": projection[0, 2] + 0.5,  # KITTI counts from the first pixel's centre
-        "cy_px": projection[1, 2] + 0.5,
+    lens: dict[str, Any] = {
+        "fx_px": float(projection[0, 0]),
+        "fy_px": float(projection[1, 1]),
+        "cx_px": float(projection[0, 2]) + 0.5,  # KITTI counts from the first pixel's centre
+        "cy_px": float(projection[1, 2]) + 0.5,
     }
     header = SceneHeader(licence=LICENCE, global_from_world=velodyne[0])
     with SceneWriter(store, "kitti", drive, header) as writer:
         for index, (time_ns, pose) in enumerate(zip(times_ns, poses, strict=True)):
             writer.add_frame(index, timestamp_ns=time_ns, world_from_ego=pose)
-            image = cv2.imread(str(folder / f"image_02/data/{index:010d}.png"))
+            file = folder / f"image_02/data/{index:010d}.png"
+            image = cv2.imread(str(file))
+            if image is None:
+                raise FileNotFoundError(f"{file}: expected an image")
             camera = Camera(
                 world_from_camera=pose @ invert_rigid(camera_from_velo),
-                **{name: float(value) for name, value in lens.items()},
+                **lens,
                 width_px=image.shape[1],
                 height_px=image.shape[0],
             )

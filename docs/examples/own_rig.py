@@ -5,10 +5,12 @@ python docs/examples/own_rig.py OUT && lidarpainter ingest canonical OUT/scenes/
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from lidarpainter_models.geometry.boxes import count_points_in_boxes
 from lidarpainter_models.geometry.cameras import Camera
@@ -18,10 +20,10 @@ from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
 STRAIGHT = np.eye(3)
 CAMERA_AXES = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]  # columns: right, down, forward in the world
 CAR_M = (4.2, 1.8, 1.5)  # length, width, height
-LENS = {"fx_px": 300.0, "fy_px": 300.0, "cx_px": 160.0, "cy_px": 90.0}
+LENS: dict[str, Any] = {"fx_px": 300.0, "fy_px": 300.0, "cx_px": 160.0, "cy_px": 90.0}
 
 
-def pose(x_m: float, y_m: float, z_m: float, axes: object = STRAIGHT) -> torch.Tensor:
+def pose(x_m: float, y_m: float, z_m: float, axes: ArrayLike = STRAIGHT) -> torch.Tensor:
     """world_from_body, 4x4 float64: the columns of `axes` are the body's axes in the world."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = axes, (x_m, y_m, z_m)

@@ -135,7 +135,8 @@ def test_a_comment_in_every_file_changes_no_stage(copied):
 
 
 def test_scoring_code_changes_what_scores_and_nothing_else(copied):
-    changed = changed_by(copied, f"{LIBRARY}.evaluation.scene_evaluation", "sum(weights)", "sum(weights[:])")
+    module = f"{LIBRARY}.evaluation.scene_evaluation"
+    changed = changed_by(copied, module, "sum(weights)", "sum(weights[:])")
     assert changed == {"tasks.evaluation.views"}
 
 
