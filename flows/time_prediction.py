@@ -67,7 +67,7 @@ def reference_seconds(parameters: "ReconstructParameters", num_views: float) -> 
         "fit": 2.0 + 0.15 * train + steps("fit") * (0.012 + 6e-7 * pixels),
         "paint": painted * (0.35 + 1e-5 * pixels),
         "refine": steps("refine") * (0.012 + 6e-7 * pixels) * (1.6 if paints else 1.0)
-        + (4.0 if paints else 0.0),
+        + (6.0 if paints else 0.0),
         "examine": 2.0 + 1.2 * num_views,
         "evaluate": test * (0.5 + 5e-6 * pixels) * (2.0 if has_truth else 1.0),
         "envelope": 3.5 + 0.3 * test,
@@ -231,9 +231,9 @@ class Clock:
         return sum(self._took[name][1] for name in over) / all_of_it if over else 0.0
 
     def _trust(self, stage: str) -> float:
-        """How much a stage's own speed counts: parts of a fit are many and alike."""
+        """How much a stage's own speed counts: only parts of the first fit are many and alike."""
         share = self._course[stage][-1][0]
-        return min(share / TRUSTED_SHARE, 1.0) if _is_fit(stage) else share**2
+        return min(share / TRUSTED_SHARE, 1.0) if stage == "fit" else share**2
 
     def _own(self, stage: str) -> float | None:
         """What work a stage is in all, by the parts it has done; None before it has done any."""
