@@ -34,6 +34,7 @@ from lidarpainter_models.kernels.ssim import l1_ssim_loss
 from lidarpainter_models.observations.views import TrainingView
 
 SIZE = (30_000, 480, 320)
+MEMORY_SIZE = (1_000_000, 960, 640)
 BLOCK_M = 1000.0
 """Blocks of a long street lie this far behind each other, out of each other's view."""
 FLOATS_PER_GAUSSIAN = 59
@@ -126,10 +127,10 @@ class Fit:
         self.view = (self.view + 1) % len(self.images)
 
 
-def iteration_figures(machine, repeats):
+def iteration_figures(machine, repeats, *, size=SIZE):
     """A whole step, its render and loss against their kernels, and its fixed cost."""
-    count, width, height = SIZE
-    splats = street_like_splats(*SIZE)
+    count, width, height = size
+    splats = street_like_splats(*size)
     stages = Stages(splats)
     target = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(2))
     kernels_ms = sum(1e3 * best_cpu_s(getattr(stages, name), repeats) for name in STAGES)
@@ -140,7 +141,7 @@ def iteration_figures(machine, repeats):
         values * SSIM_FLOP_PER_VALUE / machine.flops,
         values * SSIM_BYTES_PER_VALUE / machine.bandwidth,
     )
-    fit, idle = Fit(*SIZE), Fit(1, 16, 16)
+    fit, idle = Fit(*size), Fit(1, 16, 16)
     iteration_ms = 1e3 * best_cpu_s(fit.step, repeats)
     idle_ms = 1e3 * best_cpu_s(idle.step, repeats)
     adam_ms = 1e3 * best_cpu_s(_adam_of(fit), repeats)
@@ -193,13 +194,13 @@ def _adam_of(fit):
     return lambda: fit.state.step_gaussians(seen, 0.5)
 
 
-def frame_growth_figures(rounds, *, blocks=(1, 4, 16)):
+def frame_growth_figures(rounds, *, blocks=(1, 4, 16), size=SIZE):
     """A street of many blocks against one: what is out of view is not to be paid for.
 
     The streets step in turns, so that a busy spell hits all. What is done between steps now and
     then (growing, limiting shapes, all Gaussians caught up) is not in it, but for the catching up.
     """
-    fits = {count: Fit(*SIZE, blocks=count) for count in blocks}
+    fits = {count: Fit(*size, blocks=count) for count in blocks}
     for fit in fits.values():
         for _ in fit.images:  # every row is left once before it is seen again
             fit.step()
@@ -231,10 +232,10 @@ def frame_growth_figures(rounds, *, blocks=(1, 4, 16)):
     ]
 
 
-def memory_figures():
-    """Peak memory of a step with a million Gaussians beyond parameters and Adam's moments."""
+def memory_figures(*, size=MEMORY_SIZE):
+    """Peak memory of a step with so many Gaussians beyond parameters and Adam's moments."""
     told = subprocess.run(
-        [sys.executable, __file__, "1000000", "960", "640"],
+        [sys.executable, __file__, *map(str, size)],
         capture_output=True,
         text=True,
         check=True,

@@ -52,17 +52,17 @@ class Timed:
         return call
 
 
-def fit_with_sky():
+def fit_with_sky(size):
     """A fit whose image has sky in its upper part."""
-    fit = Fit(*SIZE, start_step=0)
+    fit = Fit(*size, start_step=0)
     image = fit.images[0]
-    kind = image.facts.kind.clone()
+    kind = image.kind.clone()
     kind[: round(SKY_SHARE * kind.shape[0])] = SKY
-    fit.images = [replace(image, facts=replace(image.facts, kind=kind))]
+    fit.images = [replace(image, kind=kind)]
     return fit
 
 
-def step_times(choice, repeats):
+def step_times(choice, repeats, size=SIZE):
     """Least CPU milliseconds of a step by part: its kernels, `backward`, the raster's, `step`."""
     timed = Timed()
     doors = [importlib.import_module(f"lidarpainter_models.kernels.{name}") for name in KERNELS]
@@ -74,7 +74,7 @@ def step_times(choice, repeats):
         torch.autograd.backward = timed.timed("backward", kept[0])
         raster._DrawViews.backward = staticmethod(timed.timed("raster backward", kept[1]))
         with kernels_chosen(choice):
-            fit = fit_with_sky()
+            fit = fit_with_sky(size)
             step = timed.timed("step", fit.step)
             for _ in range(repeats + 3):
                 step()
@@ -90,9 +90,11 @@ def without_raster(times):
     return times["step"] - times[f"{RASTERISER}.draw_views"] - times["raster backward"]
 
 
-def twin_figures(repeats):
+def twin_figures(repeats, *, size=SIZE):
     """What the twins of all kernels but the rasteriser cost, as a multiple of numba's."""
-    numba, twins = (without_raster(step_times(choice, repeats)) for choice in ("auto", "torch"))
+    numba, twins = (
+        without_raster(step_times(choice, repeats, size)) for choice in ("auto", "torch")
+    )
     return [
         Figure(
             name="iteration.twins",
