@@ -34,6 +34,7 @@ from lidarpainter_models.kernels.ssim import l1_ssim_loss
 from lidarpainter_models.observations.views import TrainingView
 
 SIZE = (30_000, 480, 320)
+MEMORY_SIZE = (1_000_000, 960, 640)
 BLOCK_M = 1000.0
 """Blocks of a long street lie this far behind each other, out of each other's view."""
 FLOATS_PER_GAUSSIAN = 59
@@ -126,7 +127,7 @@ class Fit:
         self.view = (self.view + 1) % len(self.images)
 
 
-def iteration_figures(machine, repeats, size=SIZE):
+def iteration_figures(machine, repeats, *, size=SIZE):
     """A whole step, its render and loss against their kernels, and its fixed cost."""
     count, width, height = size
     splats = street_like_splats(*size)
@@ -193,7 +194,7 @@ def _adam_of(fit):
     return lambda: fit.state.step_gaussians(seen, 0.5)
 
 
-def frame_growth_figures(rounds, size=SIZE, *, blocks=(1, 4, 16)):
+def frame_growth_figures(rounds, *, blocks=(1, 4, 16), size=SIZE):
     """A street of many blocks against one: what is out of view is not to be paid for.
 
     The streets step in turns, so that a busy spell hits all. What is done between steps now and
@@ -231,8 +232,8 @@ def frame_growth_figures(rounds, size=SIZE, *, blocks=(1, 4, 16)):
     ]
 
 
-def memory_figures(size=(1_000_000, 960, 640)):
-    """Peak memory of a step with many Gaussians beyond parameters and Adam's moments."""
+def memory_figures(*, size=MEMORY_SIZE):
+    """Peak memory of a step with so many Gaussians beyond parameters and Adam's moments."""
     told = subprocess.run(
         [sys.executable, __file__, *map(str, size)],
         capture_output=True,

@@ -1,10 +1,11 @@
 """What a fit costs of a car that stands for long, and of a street four times as long.
 
-    PYTHONPATH=. python tests/benchmarks/bench_length.py [--width 320]
+    PYTHONPATH=. python tests/benchmarks/bench_length.py [--width 320] [--quick]
 
 Each log is a synthetic street with its front camera and LiDAR, prepared and fitted at `preview` in
 a process of its own, set up as the command sets up its own, every view used. Prints Gaussians,
-steps, time, the most memory that preparing or fitting took, and their ratios.
+steps, time, the most memory that preparing or fitting took, and their ratios. `--quick` takes a
+tenth of the frames and four steps, and means nothing but that the program works.
 """
 
 import argparse
@@ -42,9 +43,10 @@ COMPARED = (
 FIGURES = ("gaussians", "steps", "prepare_cpu_s", "fit_cpu_s", "fit_s", "peak_bytes")
 
 
-def written(name, width_px, folder):
+def written(name, width_px, folder, *, quick):
     """Write one log; its scene's folder."""
     frames, speed_mps = LOGS[name]
+    frames = frames // 10 if quick else frames
     street = SyntheticStreetConfig(
         seed=SEED,
         num_frames=frames,
@@ -57,16 +59,17 @@ def written(name, width_px, folder):
     return write_street(street, folder)
 
 
-def costs_of(folder, width_px):
+def costs_of(folder, width_px, *, quick):
     """Prepare and fit one log; its figures."""
     chosen = preview("synthetic/street")
+    fit = replace(chosen.fit, steps=4) if quick else chosen.fit
     observation = replace(chosen.observation, width_px=width_px)
     scene = DrivingScene.open(folder)
     with measured() as preparing:
         seen = prepare_observations(scene, split_views(scene, "all"), observation)
-    plan = planned_settings(chosen.fit, seen_surface(seen.views))
+    plan = planned_settings(fit, seen_surface(seen.views))
     with measured() as fitting:
-        fitted = fit_gaussians(seen, chosen.fit).scene
+        fitted = fit_gaussians(seen, fit).scene
     return {
         "gaussians": fitted.num_gaussians,
         "steps": plan.steps,
@@ -77,11 +80,12 @@ def costs_of(folder, width_px):
     }
 
 
-def in_its_own_process(name, width_px):
+def in_its_own_process(name, width_px, *, quick):
     """As `costs_of`; peaks of memory are a process's, and another one writes the log."""
     with tempfile.TemporaryDirectory() as place:
-        folder = written(name, width_px, Path(place))
+        folder = written(name, width_px, Path(place), quick=quick)
         command = [sys.executable, __file__, "--width", str(width_px), "--folder", str(folder)]
+        command += ["--quick"] * quick
         done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     return json.loads(done.stdout)
 
@@ -90,12 +94,13 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--width", type=int, default=320)
     parser.add_argument("--folder", type=Path, help="the figures of this log alone, as JSON")
+    parser.add_argument("--quick", action="store_true", help="few frames and steps")
     options = parser.parse_args()
     prepare_environment()  # memory here, and threads of the processes that this one starts
     if options.folder:
-        json.dump(costs_of(options.folder, options.width), sys.stdout)
+        json.dump(costs_of(options.folder, options.width, quick=options.quick), sys.stdout)
         return
-    costs = {name: in_its_own_process(name, options.width) for name in LOGS}
+    costs = {name: in_its_own_process(name, options.width, quick=options.quick) for name in LOGS}
     rows = [
         (name, [f"{found[figure]:,.0f}" for figure in FIGURES]) for name, found in costs.items()
     ]

@@ -217,11 +217,14 @@ def view_figures(size, repeats, *, num_views=3):
     ]
 
 
-def growth_figures(repeats, *, gaussians=GAUSSIAN_GROWTH, sizes=PIXEL_GROWTH):
-    """Time of a step at growing sizes; each as the growth per doubling of what grew."""
+def growth_figures(repeats, *, gaussians=GAUSSIAN_GROWTH, sizes=PIXEL_GROWTH, on_pixels=100_000):
+    """Time of a step at growing sizes; each as the growth per doubling of what grew.
+
+    Images grow with `on_pixels` Gaussians in them.
+    """
     by_count = {count: 1e3 * best_cpu_s(_step_of(count, 960, 640), repeats) for count in gaussians}
     by_pixels = {
-        width * height: 1e3 * best_cpu_s(_step_of(100_000, width, height), repeats)
+        width * height: 1e3 * best_cpu_s(_step_of(on_pixels, width, height), repeats)
         for width, height in sizes
     }
     figures = doublings("growth.gaussians", by_count, "Gaussians")

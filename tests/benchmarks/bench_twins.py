@@ -62,7 +62,7 @@ def fit_with_sky(size):
     return fit
 
 
-def step_times(choice, repeats, size):
+def step_times(choice, repeats, size=SIZE):
     """Least CPU milliseconds of a step by part: its kernels, `backward`, the raster's, `step`."""
     timed = Timed()
     doors = [importlib.import_module(f"lidarpainter_models.kernels.{name}") for name in KERNELS]
@@ -90,7 +90,7 @@ def without_raster(times):
     return times["step"] - times[f"{RASTERISER}.draw_views"] - times["raster backward"]
 
 
-def twin_figures(repeats, size=SIZE):
+def twin_figures(repeats, *, size=SIZE):
     """What the twins of all kernels but the rasteriser cost, as a multiple of numba's."""
     numba, twins = (
         without_raster(step_times(choice, repeats, size)) for choice in ("auto", "torch")
@@ -109,7 +109,7 @@ def twin_figures(repeats, size=SIZE):
 
 def main():
     torch.set_num_threads(1)
-    numba, twins = (step_times(choice, 15, SIZE) for choice in ("auto", "torch"))
+    numba, twins = (step_times(choice, 15) for choice in ("auto", "torch"))
     table = Table("CPU ms", "numba", "torch", title="least of 15 steps")
     for name in twins:
         table.add_row(name, f"{numba.get(name, 0):.2f}", f"{twins[name]:.2f}")

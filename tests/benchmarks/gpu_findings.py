@@ -1,7 +1,7 @@
 """What a check of the GPU found, and the page that it makes of it."""
 
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
@@ -102,6 +102,7 @@ class Findings:
         parts += ["", *(f"- {name}: {value}" for name, value in self.machine.items())]
         if self.agreements:
             parts += ["", *_table(("part", "compared", "error", "allowed", ""), self._agreed())]
+        header: tuple[str, ...]
         where = "GPU memory, GB" if self.is_gpu else "process, GB"
         if self.costs:
             header = ("stage", "first, ms", "then, ms", where)
@@ -138,6 +139,6 @@ def _cost_row(cost: Cost) -> tuple[str, ...]:
     return cost.what, f"{cost.first_ms:.0f}", f"{cost.ms:.1f}", f"{cost.peak_bytes / 1e9:.2f}"
 
 
-def _table(header: tuple[str, ...], rows: Iterator[tuple[str, ...]]) -> list[str]:
+def _table(header: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> list[str]:
     lines = [header, ("---",) * len(header), *rows]
     return [f"| {' | '.join(cells)} |" for cells in lines]

@@ -5,7 +5,8 @@
 Times are CPU milliseconds of the process, the best of several runs: on a shared machine the best is
 what the code costs and the rest is what others took. Only the speed-up of two threads is wall time;
 it means something on idle cores alone. Ratios last on other machines and are compared with
-`baseline.json` (`--save` writes it); milliseconds are not. `--quick` keeps to small scenes.
+`baseline.json` (`--save` writes it); milliseconds are not. `--quick`
+measures everything on small scenes.
 """
 
 import argparse
@@ -62,15 +63,19 @@ class Machine:
 
 
 def measure(*, quick):
-    """All figures, and as many with quick ones, which mean nothing but that the suite works."""
+    """All figures; quick ones mean nothing but that the suite works."""
     torch.set_num_threads(1)
     machine = Machine(fma_peak_flops(5 if quick else 20), copy_bandwidth(2 if quick else 10))
     if quick:
         figures = raster_figures(machine, QUICK_SCENE, 1) + reference_figures(QUICK_SCENE, 1)
-        figures += growth_figures(1, gaussians=(1000, 2000), sizes=((80, 48), (160, 96)))
         figures += thread_figures(QUICK_SCENE, 1) + view_figures(QUICK_SCENE, 1)
-        figures += iteration_figures(machine, 1, QUICK_SCENE) + twin_figures(1, QUICK_SCENE)
-        figures += frame_growth_figures(1, QUICK_SCENE) + memory_figures(QUICK_SCENE)
+        figures += iteration_figures(machine, 1, size=QUICK_SCENE)
+        figures += twin_figures(1, size=QUICK_SCENE)
+        figures += growth_figures(
+            1, gaussians=(1000, 2000), sizes=((80, 48), (160, 96)), on_pixels=1000
+        )
+        figures += frame_growth_figures(1, blocks=(1, 2), size=QUICK_SCENE)
+        figures += memory_figures(size=QUICK_SCENE)
         return machine.figures() + figures + point_figures(machine, 1, counts=(1000, 2000))
     figures = raster_figures(machine, SCENE, 15)
     figures += (
