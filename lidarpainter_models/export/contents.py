@@ -8,6 +8,7 @@ camera's exposure.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,9 +18,12 @@ from lidarpainter_models.errors import SceneError
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
 from lidarpainter_models.gaussians.model.placing import carried_gaussians, joined_gaussians
+from lidarpainter_models.gaussians.model.ply_files import write_ply
 from lidarpainter_models.gaussians.model.sky import SkyTexture
 from lidarpainter_models.kernels.sky_texture import SkyLayout
 
+FRAME = "x forward, y left, z up at the first frame; metres"
+"""The world of a scene, as files say it that have no word of their own for it."""
 SKY_RADIUS_M = 1000.0
 """Where Gaussians of the sky stand: a car that drives 100 m sees them turn by 6 degrees."""
 SKY_STEP_RAD = math.radians(0.5)
@@ -75,6 +79,16 @@ class SceneContents:
                 ),
             ]
         )
+
+
+def write_ply_scene(path: Path, contents: SceneContents, *, time: int = 0) -> None:
+    """Write everything that is there at the n-th of the times as one PLY file, in the world.
+
+    Raises:
+        WriteError: the disk refuses; nothing is left half-written.
+    """
+    said = f"{contents.name}: {FRAME}; colours before any camera's exposure"
+    write_ply(path, contents.placed(time), [said])
 
 
 def scene_contents(
