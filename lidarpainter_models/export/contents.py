@@ -7,7 +7,7 @@ camera's exposure.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -61,7 +61,7 @@ class SceneContents:
 
     @property
     def num_gaussians(self) -> int:
-        """Of the street and all actors."""
+        """How many Gaussians the street and all actors have."""
         return len(self.street) + sum(len(actor.gaussians) for actor in self.actors)
 
     def placed(self, time: int) -> GaussianSet:
@@ -114,16 +114,11 @@ def scene_contents(
     if missing := [one for one in wanted if one not in places]:
         known = ", ".join(sorted(places)[:20]) or "none that moves"
         raise SceneError(f"scene {name} has no actor {missing[0]!r}, it has {known}")
-    gaussians = scene.gaussians
-    if len(timestamps_ns) == 1:
-        gaussians = scene.blinking.lit(gaussians, timestamps_ns[0])
-        gaussians = scene.actors.bending.bent(gaussians, timestamps_ns[0])
-    else:
-        gaussians = scene.blinking.lit_on_average(gaussians)
+    gaussians = scene.gaussians_at(timestamps_ns[0] if len(timestamps_ns) == 1 else None)
     bodies = _bodies(gaussians, len(tracks) + 1)
     street = bodies[0].append(sky_gaussians(scene.sky, scene)) if with_sky else bodies[0]
     rows = [places[one] for one in wanted]
-    poses = [scene.actors.likely_poses(time_ns) for time_ns in timestamps_ns]
+    poses = [scene.actors.refined_poses(time_ns) for time_ns in timestamps_ns]
     return SceneContents(
         name=name,
         street=street,
@@ -146,8 +141,7 @@ def _bodies(gaussians: GaussianSet, count: int) -> list[GaussianSet]:
     """The Gaussians of every body, each as body 0 of its own."""
     order = torch.argsort(gaussians.body_index, stable=True)
     sizes = torch.bincount(gaussians.body_index.long(), minlength=count).tolist()
-    found = [gaussians.select(rows) for rows in order.split(sizes)]
-    return [replace(part, body_index=torch.zeros_like(part.body_index)) for part in found]
+    return [gaussians.select(rows).of_body(0) for rows in order.split(sizes)]
 
 
 def sky_gaussians(sky: SkyTexture, scene: GaussianScene) -> GaussianSet:

@@ -6,7 +6,6 @@ CPU.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -18,21 +17,15 @@ from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.hidden_gaussians import probed
 from lidarpainter_models.gaussians.fitting.images import FitImage
 from lidarpainter_models.gaussians.fitting.state import FitState
-from lidarpainter_models.gaussians.model.rolling_shutter import as_read, bodies_while_read
-from lidarpainter_models.gaussians.model.scene_rendering import (
-    OPAQUE,
-    camera_from_body,
-    draw_gaussians,
-)
+from lidarpainter_models.gaussians.model.posed_scene import PosedScene
+from lidarpainter_models.gaussians.model.scene_rendering import OPAQUE
 from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
 from lidarpainter_models.gaussians.model.sky import (
     FINAL_LEARNING_RATE,
     LEARNING_RATE,
     MIN_TRANSMITTANCE,
 )
-from lidarpainter_models.gaussians.model.spatial_blocks import View
 from lidarpainter_models.geometry.box_masks import project_boxes
-from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
 from lidarpainter_models.kernels.pixel_losses import (
     SKY,
@@ -78,25 +71,23 @@ def fit_step(
     """
     pose = state.refinement.world_from_camera(row, state.step)
     recorded = image.camera.refined(pose.detach())
-    actors = state.scene.actors.corrected_poses(image.timestamp_ns)
-    view = (recorded, camera_from_body(pose, *actors))
-    read = bodies_while_read(view[1].detach(), recorded, state.scene.actors, image.timestamp_ns)
-    looks = {row: [view, *((recorded, bodies) for bodies in read)]}
+    posed = state.scene.posed_in_fit(recorded, image.timestamp_ns, pose)
+    looks = {row: posed.looks()}
     if guidance is not None:
         place, painted = guidance
-        bodies = _guidance_bodies(state, painted)
-        looks[~place] = [(painted.camera, bodies)]
+        beside = state.scene.posed_in_fit(painted.camera, painted.timestamp_ns)
+        looks[~place] = beside.looks()
     seen = state.seen(looks)
     probes = [state.hidden.probe(name, len(seen)) for name in looks]
     of_recorded = partial(
-        _recorded_gradients, state, seen, image, row, view, config, perceptual, probes[0]
+        _recorded_gradients, state, seen, image, row, posed, config, perceptual, probes[0]
     )
     if guidance is None:
         found = of_recorded()
     else:
         twin = seen.twin()
         of_painted = partial(
-            add_guidance_gradients, state, twin, painted, bodies, config, perceptual, probes[1]
+            add_guidance_gradients, state, twin, painted, beside, config, perceptual, probes[1]
         )
         found, _ = both(of_recorded, of_painted, state.scene.device)
         seen.take_gradients_of(twin)
@@ -124,28 +115,23 @@ def _recorded_gradients(  # noqa: PLR0913 - what a step is made of
     seen: SeenGaussians,
     image: FitImage,
     row: int,
-    view: View,
+    posed: PosedScene,
     config: FitConfig,
     perceptual: Perceptual | None,
     probe: Float[Tensor, "seen 1"] | None,
 ) -> _OfRecorded:
     """Collect the gradients of a recorded view."""
-    (camera, bodies), weights, sky = view, config.losses, state.scene.sky
+    weights, sky = config.losses, state.scene.sky
     facts = image.facts()
     with_actors = _wants_actor_term(state, config)
     screen_gradient = torch.zeros(len(seen), device=seen.means.device)
-    actors = state.scene.actors
-    lit = state.scene.blinking.lit(seen, image.timestamp_ns)
-    bent = actors.bending.bent(lit, image.timestamp_ns)
-    splat = draw_gaussians(
-        as_read(bent, bodies, camera, actors, image.timestamp_ns),
-        bodies,
-        camera,
+    splat = posed.draw(
+        seen,
         with_actor_alpha=with_actors,
         channel=probe,
         screen_gradient_out=screen_gradient,
     )
-    rays = sky.rays(camera, (splat.alpha.detach() < OPAQUE) | image.is_open)
+    rays = sky.rays(posed.camera, (splat.alpha.detach() < OPAQUE) | image.is_open)
     sky_rgb = sky.sample(rays).requires_grad_(True)
     exposure = state.refinement.exposure(image)
     terms = pixel_terms(splat, sky_rgb, facts, _pixel_rules(config), exposure=exposure)
@@ -157,7 +143,7 @@ def _recorded_gradients(  # noqa: PLR0913 - what a step is made of
         loss = loss + weights.perceptual * perceptual(shown, facts.rgb)
     loss = loss + weights.sky * terms.sky + weights.depth * terms.depth
     if with_actors:
-        loss = loss + weights.actors * _actor_term(state, splat, image, camera)
+        loss = loss + weights.actors * _actor_term(splat, posed)
     loss = loss + state.refinement.bend_prior(image.timestamp_ns, state.step)
     prior = state.refinement.prior(row, image.timestamp_ns, state.step)
     # as a sum its gradient, which is the CPU's, would have to come from the device
@@ -168,18 +154,11 @@ def _recorded_gradients(  # noqa: PLR0913 - what a step is made of
     return _OfRecorded(told, splat, screen_gradient, sky_rgb, rays)
 
 
-def _guidance_bodies(state: FitState, view: GuidanceView) -> Float[Tensor, "bodies 4 4"]:
-    """Where a painted view has the bodies; no gradient."""
-    with torch.no_grad():
-        actors = state.scene.actors.corrected_poses(view.timestamp_ns)
-        return camera_from_body(view.camera.world_from_camera, *actors)
-
-
 def add_guidance_gradients(
     state: FitState,
     seen: SeenGaussians,
     view: GuidanceView,
-    camera_from_bodies: Float[Tensor, "bodies 4 4"],
+    posed: PosedScene,
     config: FitConfig,
     perceptual: Perceptual | None = None,
     probe: Float[Tensor, "seen 1"] | None = None,
@@ -190,11 +169,7 @@ def add_guidance_gradients(
     less of what is there, and wears away what recorded views do not hold.
     """
     sky, settings = state.scene.sky, config.guidance
-    bending = state.scene.actors.bending
-    held = replace(bending, offset_m=bending.offset_m.detach())
-    lit = state.scene.blinking.lit(seen, view.timestamp_ns)
-    shown_then = held.bent(lit, view.timestamp_ns)
-    splat = draw_gaussians(shown_then, camera_from_bodies, view.camera, channel=probe)
+    splat = posed.held().draw(seen, channel=probe)
     sky_rgb = sky.sample(sky.rays(view.camera, splat.alpha.detach() < OPAQUE))
     shown = splat.rgb + (1 - splat.alpha)[..., None] * sky_rgb
     loss = settings.weight * l1_ssim_loss(
@@ -238,15 +213,11 @@ def _wants_actor_term(state: FitState, config: FitConfig) -> bool:
     return is_due and config.losses.actors > 0 and bool(state.scene.actors.recorded_tracks)
 
 
-def _actor_term(
-    state: FitState, splat: SplatImage, image: FitImage, camera: Camera
-) -> Float[Tensor, ""]:
+def _actor_term(splat: SplatImage, posed: PosedScene) -> Float[Tensor, ""]:
     """Actors stay inside their projected boxes."""
-    actors = state.scene.actors
-    with torch.no_grad():
-        world_from_actors, present = actors.corrected_poses(image.timestamp_ns)
-        sizes = [track.size_m for track in actors.recorded_tracks]
-        in_boxes = project_boxes(camera, world_from_actors, sizes, present > 0)
+    world_from_actors, present = posed.poses
+    sizes = [track.size_m for track in posed.actors.recorded_tracks]
+    in_boxes = project_boxes(posed.camera, world_from_actors.detach(), sizes, present > 0)
     in_boxes = in_boxes.to(splat.alpha.device, non_blocking=True)
     return actor_boundary_loss(splat.features[..., 0], in_boxes)
 
