@@ -61,7 +61,7 @@ def camera_beside(
     fitted: GaussianScene, scene: DrivingScene, view: TrainingView, shift: Shift
 ) -> Camera:
     """The camera of a training view as the fit found it, moved aside, up or turned."""
-    camera = fitted.found_camera(view)
+    camera = fitted.refined_camera(view)
     direction = road_directions(scene.world_from_ego)[scene.frame_position(view.key[0])]
     return camera.at(shift_pose(camera.world_from_camera, direction, shift))
 

@@ -46,15 +46,7 @@ def main(store_path: str, run_id: str, *styles: str) -> None:
     first = seen.views[0]
     size = ObservationConfig(width_px=first.camera.width_px)
     views = recorded.views_of(first.key[1])
-    cameras = [
-        clear.corrected_camera(
-            fit_camera(view, size),
-            timestamp_ns=view.timestamp_ns,
-            camera_name=view.camera_name,
-            key=view.key,
-        )
-        for view in views
-    ]
+    cameras = [clear.refined_camera(view, fit_camera(view, size)) for view in views]
     moments = [(camera, view.timestamp_ns) for camera, view in zip(cameras, views, strict=True)]
     named = styles or ("foggy", "night", "rain")
     scenes = {CLEAR: clear}

@@ -37,7 +37,7 @@ class BoxView:
 
     @property
     def hidden_share(self) -> float:
-        """Of its pixels."""
+        """Share of its pixels before which something stands."""
         return float(self.is_hidden.float().mean())
 
 

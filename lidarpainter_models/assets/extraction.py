@@ -18,7 +18,6 @@ from torch import Tensor
 from lidarpainter_models.assets.asset_files import write_asset
 from lidarpainter_models.assets.sightings import Sighting
 from lidarpainter_models.assets.street_blocks import street_blocks
-from lidarpainter_models.assets.turntables import turntable
 from lidarpainter_models.editing.actor_models import (
     NEUTRAL_ROAD_RGB,
     ActorModel,
@@ -28,6 +27,9 @@ from lidarpainter_models.editing.actor_models import (
 from lidarpainter_models.editing.worlds import EditedWorld, as_moving
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.export.images import write_webp
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.model.scene_rendering import draw_gaussians
+from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.lidar.lidar_map import MapPoints
@@ -40,7 +42,12 @@ SKY_FILE, WAYPOINTS_FILE = "sky.safetensors", "waypoints.csv"
 LEAST_GAUSSIANS = 20
 """An actor of fewer is a smear."""
 SKY_ROWS = 96
-"""Of a sky's picture."""
+"""Rows of a sky's picture."""
+NUM_AZIMUTHS = 8
+"""Pictures of an asset on its turntable, side by side before plain grey."""
+WIDTH_PX, HEIGHT_PX = 128, 96
+BACKGROUND = 0.75
+_FOCAL_PX = 1.6 * WIDTH_PX
 
 Record = dict[str, Any]
 """What is known of one asset; its names are those of the catalog's table `sightings`."""
@@ -60,7 +67,7 @@ class AssetSource:
 
     @property
     def gain(self) -> Float[Tensor, "3"]:
-        """From the exposure of the scene to a neutral one."""
+        """What colours are multiplied by to go from the exposure of the scene to a neutral one."""
         road_rgb = self.world.road_rgb
         if road_rgb is None:
             return torch.ones(3)
@@ -256,3 +263,47 @@ def _placed(global_from_asset: Float[Tensor, "4 4"]) -> Record:
 
 def _size(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def turntable(
+    gaussians: GaussianSet, size_m: Float[Tensor, "3"], *, elevation_deg: float = 15.0
+) -> Float[Tensor, "height width 3"]:
+    """See Gaussians (of body 0, about the origin) from all sides, first from ahead (+x).
+
+    The azimuth grows to the left: ahead, ahead left, left, ... The camera is so far away that a
+    box of this size fits.
+    """
+    radius_m = float(size_m.norm()) / 2
+    distance_m = radius_m * math.hypot(1.0, 2 * _FOCAL_PX / HEIGHT_PX)
+    pictures = []
+    for number in range(NUM_AZIMUTHS):
+        azimuth = 2 * math.pi * number / NUM_AZIMUTHS
+        camera = _looking_in(azimuth, math.radians(elevation_deg), distance_m)
+        bodies = invert_rigid(camera.world_from_camera)[None].float()
+        with torch.no_grad():
+            image = draw_gaussians(gaussians, bodies, camera)
+        pictures.append(image.rgb.clamp(0, 1) + (1 - image.alpha)[..., None] * BACKGROUND)
+    return torch.cat(pictures, dim=1).clamp(0, 1)
+
+
+def _looking_in(azimuth_rad: float, elevation_rad: float, distance_m: float) -> Camera:
+    """A camera on a circle around the origin that looks at it."""
+    flat = math.cos(elevation_rad)
+    away = torch.tensor(
+        [flat * math.cos(azimuth_rad), flat * math.sin(azimuth_rad), math.sin(elevation_rad)],
+        dtype=torch.float64,
+    )
+    right = torch.tensor([-math.sin(azimuth_rad), math.cos(azimuth_rad), 0.0]).double()
+    down = torch.linalg.cross(-away, right)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.stack([right, down, -away], dim=1)
+    pose[:3, 3] = distance_m * away
+    return Camera(
+        world_from_camera=pose,
+        fx_px=_FOCAL_PX,
+        fy_px=_FOCAL_PX,
+        cx_px=WIDTH_PX / 2,
+        cy_px=HEIGHT_PX / 2,
+        width_px=WIDTH_PX,
+        height_px=HEIGHT_PX,
+    )

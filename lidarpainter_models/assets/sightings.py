@@ -61,9 +61,9 @@ class Sighting:
     num_judged: int = 0
     """Pixels that the error is a sum over."""
     gradient: float = 0.0
-    """Of the rendered images inside the box, summed."""
+    """Gradients of the rendered images inside the box, summed."""
     true_gradient: float = 0.0
-    """Of the recorded ones."""
+    """Gradients of the recorded images there, summed."""
 
     def add_look(self, seen: BoxView, focal_px: float) -> None:
         """Take a view, if it shows enough to say something."""

@@ -30,7 +30,7 @@ class StreetBlock:
     number: int
     """It begins so many block lengths after the first pose of the path."""
     gaussians: GaussianSet
-    """In the frame of the block."""
+    """Gaussians in the frame of the block."""
     world_from_block: Float[Tensor, "4 4"]
     size_m: Float[Tensor, "3"]
     """What its Gaussians fill, but for the outermost."""

@@ -59,7 +59,7 @@ class ConditionBuilder:
         self.config = config or ConditionConfig()
         self.boxes = MovingBoxes(scene.tracks)
         self._views = {view.key: view for view in training_views}
-        self._cameras = {view.key: scene.found_camera(view) for view in training_views}
+        self._cameras = {view.key: scene.refined_camera(view) for view in training_views}
         self._sources: OrderedDict[ViewKey, Future[SourceImage]] = OrderedDict()
         self._of_sources = Lock()
 

@@ -114,12 +114,12 @@ class FollowedPath:
         scene = self.builder.scene
         fitted = scene.cameras.camera_names
         if view.camera_name in fitted or not fitted:
-            return scene.found_camera(view, camera)
+            return scene.refined_camera(view, camera)
         other = self._fitted_views.get(view.frame_index)
         if other is None:
             return camera
         found_from_logged = (
-            scene.found_camera(other).world_from_camera @ other.camera.camera_from_world
+            scene.refined_camera(other).world_from_camera @ other.camera.camera_from_world
         )
         return camera.at(found_from_logged @ camera.world_from_camera)
 

@@ -123,7 +123,7 @@ def _stacked(rows: list[Tensor], width: int) -> Float[Tensor, "rows width"]:
 
 def _look(builder: ConditionBuilder, view: TrainingView) -> _Look:
     """Everything that one view shows of the place."""
-    camera = builder.scene.found_camera(view)
+    camera = builder.scene.refined_camera(view)
     render = builder.scene.render(camera, view.timestamp_ns)
     image = render.rgb.clamp(0, 1)
     styled_view, _ = style_view(builder, camera, view.timestamp_ns, image)

@@ -37,7 +37,7 @@ class ActorModel:
     """What somebody looks like."""
 
     gaussians: GaussianSet
-    """Of body 0."""
+    """Gaussians of body 0, in the box frame."""
     points: MapPoints
     """Its LiDAR points; none where nobody measured it."""
     size_m: Float[Tensor, "3"]
@@ -56,10 +56,8 @@ class ActorModel:
         if not len(seen):
             raise SceneError("an actor's Gaussians hold nothing opaque, expected a car")
         low, high = (seen.quantile(share, dim=0) for share in (0.005, 0.995))
-        columns = gaussians.columns()
-        columns["means"] = columns["means"] - (low + high) / 2
-        columns["body_index"] = torch.zeros_like(columns["body_index"])
-        centred = GaussianSet(**columns)
+        centred = gaussians.of_body(0)
+        centred = replace(centred, means=centred.means - (low + high) / 2)
         return cls(
             gaussians=centred,
             points=sampled_points(centred),
@@ -69,12 +67,11 @@ class ActorModel:
 
     def scaled(self, factor: float) -> "ActorModel":
         """The same, larger or smaller about the middle of its box."""
-        columns = self.gaussians.columns()
-        columns["means"] = columns["means"] * factor
-        columns["log_scale"] = columns["log_scale"] + math.log(factor)
+        own = self.gaussians
+        larger = replace(own, means=own.means * factor, log_scale=own.log_scale + math.log(factor))
         return replace(
             self,
-            gaussians=GaussianSet(**columns),
+            gaussians=larger,
             points=replace(self.points, xyz_m=self.points.xyz_m * factor),
             size_m=self.size_m * factor,
         )
@@ -119,20 +116,17 @@ def exposure_gain(
 
 def of_degree(gaussians: GaussianSet, sh_degree: int) -> GaussianSet:
     """Gaussians with harmonics of another degree: what is more is left out, what lacks is 0."""
-    columns = gaussians.columns()
     wanted = (sh_degree + 1) ** 2 - 1
     rest = torch.zeros(len(gaussians), wanted, 3)
-    kept = min(wanted, columns["sh_rest"].shape[1])
-    rest[:, :kept] = columns["sh_rest"][:, :kept]
-    return GaussianSet(**(columns | {"sh_rest": rest}))
+    kept = min(wanted, gaussians.sh_rest.shape[1])
+    rest[:, :kept] = gaussians.sh_rest[:, :kept]
+    return replace(gaussians, sh_rest=rest)
 
 
 def exposed(gaussians: GaussianSet, gain: Float[Tensor, "3"]) -> GaussianSet:
     """Gaussians of other brightness, channel by channel."""
-    columns = gaussians.columns()
-    columns["sh_dc"] = sh_from_rgb(gaussians.base_rgb * gain)
-    columns["sh_rest"] = columns["sh_rest"] * gain
-    return GaussianSet(**columns)
+    sh_dc = sh_from_rgb(gaussians.base_rgb * gain)
+    return replace(gaussians, sh_dc=sh_dc, sh_rest=gaussians.sh_rest * gain)
 
 
 def contact_shadow(size_m: Float[Tensor, "3"], *, sh_degree: int) -> GaussianSet:

@@ -23,7 +23,7 @@ class FilledScene:
 
     scene: GaussianScene
     confidence: Float[Tensor, " filled"]
-    """Of these, in their order: 1 is as good as fitted."""
+    """How far each of these can be trusted, in their order: 1 is as good as fitted."""
     num_ground: int
     """How many of them are road; the others stand behind somebody who has gone."""
 
@@ -36,9 +36,7 @@ def masked_observations(world: EditedWorld) -> SceneObservations:
 
 
 def _masked(world: EditedWorld, view: TrainingView, changed: tuple) -> TrainingView:
-    camera = world.scene.corrected_camera(
-        view.camera, timestamp_ns=view.timestamp_ns, camera_name=view.key[1], key=view.key
-    )
+    camera = world.scene.refined_camera(view)
     hidden = changed_pixels(changed, camera, view.timestamp_ns)
     if view.hidden is not None:
         hidden = hidden | view.hidden
@@ -49,24 +47,11 @@ def _masked(world: EditedWorld, view: TrainingView, changed: tuple) -> TrainingV
     )
 
 
-def _refined(world: EditedWorld) -> list[TrainingView]:
-    """The recorded views, their cameras where the fit found them to be."""
-    scene = world.scene
-    return [
-        replace(
-            view,
-            camera=scene.corrected_camera(
-                view.camera, timestamp_ns=view.timestamp_ns, camera_name=view.key[1], key=view.key
-            ),
-        )
-        for view in world.views
-    ]
-
-
 def filled(world: EditedWorld, config: ConditionConfig, painter: Painter | None) -> FilledScene:
     """The scene of an edited world, with what its edits have uncovered."""
     seen, street = masked_observations(world), world.lidar_map.street
-    scene = without_unseen(world.scene, world.fitted, _refined(world), world.left, street)
+    refined = [replace(view, camera=world.scene.refined_camera(view)) for view in world.views]
+    scene = without_unseen(world.scene, world.fitted, refined, world.left, street)
     scene, road = fill_ground(scene, street, world.ground, world.left)
     scene = with_filling(scene, road)
     builder = ConditionBuilder(scene, seen.lidar_map, seen.views, config=config)

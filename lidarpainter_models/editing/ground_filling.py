@@ -290,7 +290,7 @@ def _without_road(
 
 
 def _distance_m(patch: _Patch, known: Bool[Tensor, " cells"]) -> Float[Tensor, " cells"]:
-    """From each cell to the nearest one of which something is known."""
+    """How far it is from each cell to the nearest one of which something is known."""
     from scipy.ndimage import distance_transform_edt
 
     if not bool(known.any()):

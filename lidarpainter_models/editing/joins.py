@@ -45,7 +45,7 @@ class OtherRun:
     """What is joined to a world."""
 
     world: EditedWorld
-    """In its own frame."""
+    """The other world, in its own frame."""
     world_from_other: Float[Tensor, "4 4"]
     is_same_drive: bool
     """Whether both saw one drive: then they have one clock, and one id is one actor."""
@@ -79,8 +79,7 @@ def joined(world: EditedWorld, other: OtherRun) -> EditedWorld:
 
 
 def _joined_street(world: EditedWorld, other: OtherRun, seen: "_SeenTwice") -> EditedWorld:
-    own, their_scene = world.scene.gaussians, other.world.scene
-    theirs = their_scene.blinking.lit_on_average(their_scene.gaussians)
+    own, theirs = world.scene.gaussians, other.world.scene.gaussians_at(None)
     theirs = theirs.select((theirs.body_index == 0).nonzero()[:, 0])
     coming = carried_gaussians(theirs, other.world_from_other)
     enters = seen.whole_is_theirs(coming)
@@ -140,9 +139,7 @@ def _joined_actor(world: EditedWorld, other: OtherRun, track: ActorTrack) -> Edi
     points, blinking = dict(world.lidar_map.actors), world.scene.blinking
     if model is not None and len(model.gaussians) > FINER * int(rows.sum()):
         look = model.exposed_like(world.road_rgb).of_degree(own.sh_degree)
-        columns = look.gaussians.columns()
-        columns["body_index"] = torch.full_like(columns["body_index"], number + 1)
-        own = own.select((~rows).nonzero()[:, 0]).append(replace(look.gaussians, **columns))
+        own = own.select((~rows).nonzero()[:, 0]).append(look.gaussians.of_body(number + 1))
         points[track.actor_id] = look.points
         longer = replace(longer, bending=longer.bending.rigid(number + 1))
         blinking = blinking.of_others(number + 1)
@@ -240,7 +237,7 @@ def _looks(world: EditedWorld) -> _Looks:
     """Training views where the fit found them, and the surfaces that they show."""
     looks = []
     for view in sampled_views(world.views, MOST_VIEWS):
-        camera = world.fitted.found_camera(view)
+        camera = world.fitted.refined_camera(view)
         looks.append((camera, world.fitted.render(camera, view.timestamp_ns).depth_m))
     return looks
 

@@ -33,7 +33,7 @@ class ActorSource(_Words):
 
     actor: _Name | None = None
     run: _Name | None = None
-    """Of that actor; the run that is edited if absent."""
+    """The run of that actor; the run that is edited if absent."""
     asset: _Name | None = None
     """Id of an asset, or a unique prefix of one."""
     store: _Name | None = None
@@ -87,7 +87,7 @@ class Insert(_Words):
     name: _Name
     """What it is called from then on."""
     ahead_m: _Metres = 15.0
-    """Of the ego's place when the log begins, along its path."""
+    """How far ahead of the ego's place when the log begins, along its path."""
     left_m: _Metres = 0.0
     yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
     """Against the road."""

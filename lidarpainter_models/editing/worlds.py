@@ -16,7 +16,6 @@ from lidarpainter_models.editing.actor_models import ActorModel, road_colour
 from lidarpainter_models.editing.motions import LogTimes, standing
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.placing import carried_gaussians
 from lidarpainter_models.gaussians.model.styling.scene_style import LampChange
 from lidarpainter_models.geometry.boxes import is_inside_box
@@ -102,14 +101,12 @@ class EditedWorld:
         if self._body_of(track) is None:
             pose = invert_rigid(_parked_pose(track))
             points = _carried_points(points, pose)
-        gaussians = self.scene.blinking.lit_on_average(self.scene.gaussians).select(rows)
+        gaussians = self.scene.gaussians_at(None).select(rows)
         if not len(gaussians):
             raise SceneError(f"actor {track.actor_id!r} has no Gaussians here: nobody saw it")
         gaussians = gaussians if pose is None else carried_gaussians(gaussians, pose)
-        columns = gaussians.columns()
-        columns["body_index"] = torch.zeros_like(columns["body_index"])
         return ActorModel(
-            gaussians=GaussianSet(**columns),
+            gaussians=gaussians.of_body(0),
             points=points,
             size_m=track.size_m,
             category=track.category,
@@ -161,14 +158,11 @@ class EditedWorld:
 
     def _with_body(self, model: ActorModel, track: ActorTrack) -> "EditedWorld":
         own, actors = self.scene.gaussians, self.scene.actors
-        columns = model.gaussians.columns()
-        columns["body_index"] = torch.full_like(
-            columns["body_index"], len(actors.recorded_tracks) + 1
-        )
+        coming = model.gaussians.of_body(len(actors.recorded_tracks) + 1)
         moving = replace(track, is_moving=True, size_m=model.size_m)
         scene = replace(
             self.scene,
-            gaussians=own.append(GaussianSet(**columns)),
+            gaussians=own.append(coming),
             actors=actors.with_rigid(moving),
         )
         points = {**self.lidar_map.actors, track.actor_id: model.points}
@@ -224,11 +218,10 @@ class EditedWorld:
 
 def _without_body(scene: GaussianScene, body: int) -> GaussianScene:
     """The scene without an actor that has no Gaussians any more."""
-    columns = scene.gaussians.columns()
-    columns["body_index"] = columns["body_index"] - (columns["body_index"] > body).int()
+    own = scene.gaussians.body_index
     return replace(
         scene,
-        gaussians=GaussianSet(**columns),
+        gaussians=replace(scene.gaussians, body_index=own - (own > body).int()),
         actors=scene.actors.without(body),
         blinking=scene.blinking.without(body),
     )

@@ -99,7 +99,7 @@ class MovedViews:
     def camera(self, view: RecordedView, step: ConstantStep) -> Camera | None:
         """A view's camera as the fit found it, moved; None where it would stand in something."""
         fitted = self.gatherer.scene
-        found = fitted.found_camera(view, fit_camera(view, self.observation))
+        found = fitted.refined_camera(view, fit_camera(view, self.observation))
         if step == ConstantStep():
             return found
         # as `render --trajectory` moves it, past the end of the path as far as asked

@@ -69,9 +69,7 @@ class HeldOut:
         camera = fit_camera(view, self.observation)
         if poses == "recorded":
             return camera
-        return fitted.corrected_camera(
-            camera, timestamp_ns=view.timestamp_ns, camera_name=view.camera_name
-        )
+        return fitted.refined_camera(view, camera)
 
     def shifted_camera(self, fitted: GaussianScene, view: RecordedView, shift: Shift) -> Camera:
         """The interpolated camera moved beside the path."""

@@ -117,9 +117,7 @@ def strip_views(
             continue
         own, other = judging[frame], fitting[frame]
         logged = fit_camera(other, held_out.observation)
-        found = fitted.corrected_camera(
-            logged, timestamp_ns=other.timestamp_ns, camera_name=fitted_camera, key=other.key
-        )
+        found = fitted.refined_camera(other, logged)
         found_from_logged = found.world_from_camera @ invert_rigid(logged.world_from_camera)
         camera = fit_camera(own, held_out.observation)
         camera = camera.refined(found_from_logged @ camera.world_from_camera)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 INK, SOFT, NAMED, FRONT = "#1f2430", "#7b8494", "#c2410c", "#94a3b8"
 COLOURS = (NAMED, "#1d4ed8", "#15803d", "#7e22ce", INK)
 COLUMNS = 4
-"""Of small multiples."""
+"""How many small multiples stand side by side."""
 NAME_PT = 7.5
 NAME_OFFSETS = ((0, 6, "center"), (0, -13, "center"), (7, -3, "left"), (-7, -3, "right"))
 """Where a name may stand beside its point: points across and up, and the side that is held."""
@@ -41,7 +41,7 @@ class Chart:
 
     title: str
     panels: Mapping[str, Sequence[Mark]]
-    """By the name of the scene."""
+    """Marks by the name of their scene."""
     labels: Mapping[str, str]
     """What the axes say, by the name of a figure."""
 

@@ -19,7 +19,7 @@ class Subject:
     held_out: HeldOut
     unpainted: GaussianScene
     painting: ViewTimePainting
-    """Of the final scene."""
+    """The painter's work on views of the final scene."""
 
 
 def comparisons(

@@ -7,7 +7,8 @@ camera's exposure.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,9 +18,12 @@ from lidarpainter_models.errors import SceneError
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, sh_from_rgb
 from lidarpainter_models.gaussians.model.placing import carried_gaussians, joined_gaussians
+from lidarpainter_models.gaussians.model.ply_files import write_ply
 from lidarpainter_models.gaussians.model.sky import SkyTexture
 from lidarpainter_models.kernels.sky_texture import SkyLayout
 
+FRAME = "x forward, y left, z up at the first frame; metres"
+"""The world of a scene, as files say it that have no word of their own for it."""
 SKY_RADIUS_M = 1000.0
 """Where Gaussians of the sky stand: a car that drives 100 m sees them turn by 6 degrees."""
 SKY_STEP_RAD = math.radians(0.5)
@@ -57,7 +61,7 @@ class SceneContents:
 
     @property
     def num_gaussians(self) -> int:
-        """Of the street and all actors."""
+        """How many Gaussians the street and all actors have."""
         return len(self.street) + sum(len(actor.gaussians) for actor in self.actors)
 
     def placed(self, time: int) -> GaussianSet:
@@ -75,6 +79,16 @@ class SceneContents:
                 ),
             ]
         )
+
+
+def write_ply_scene(path: Path, contents: SceneContents, *, time: int = 0) -> None:
+    """Write everything that is there at the n-th of the times as one PLY file, in the world.
+
+    Raises:
+        WriteError: the disk refuses; nothing is left half-written.
+    """
+    said = f"{contents.name}: {FRAME}; colours before any camera's exposure"
+    write_ply(path, contents.placed(time), [said])
 
 
 def scene_contents(
@@ -100,16 +114,11 @@ def scene_contents(
     if missing := [one for one in wanted if one not in places]:
         known = ", ".join(sorted(places)[:20]) or "none that moves"
         raise SceneError(f"scene {name} has no actor {missing[0]!r}, it has {known}")
-    gaussians = scene.gaussians
-    if len(timestamps_ns) == 1:
-        gaussians = scene.blinking.lit(gaussians, timestamps_ns[0])
-        gaussians = scene.actors.bending.bent(gaussians, timestamps_ns[0])
-    else:
-        gaussians = scene.blinking.lit_on_average(gaussians)
+    gaussians = scene.gaussians_at(timestamps_ns[0] if len(timestamps_ns) == 1 else None)
     bodies = _bodies(gaussians, len(tracks) + 1)
     street = bodies[0].append(sky_gaussians(scene.sky, scene)) if with_sky else bodies[0]
     rows = [places[one] for one in wanted]
-    poses = [scene.actors.likely_poses(time_ns) for time_ns in timestamps_ns]
+    poses = [scene.actors.refined_poses(time_ns) for time_ns in timestamps_ns]
     return SceneContents(
         name=name,
         street=street,
@@ -132,8 +141,7 @@ def _bodies(gaussians: GaussianSet, count: int) -> list[GaussianSet]:
     """The Gaussians of every body, each as body 0 of its own."""
     order = torch.argsort(gaussians.body_index, stable=True)
     sizes = torch.bincount(gaussians.body_index.long(), minlength=count).tolist()
-    found = [gaussians.select(rows) for rows in order.split(sizes)]
-    return [replace(part, body_index=torch.zeros_like(part.body_index)) for part in found]
+    return [gaussians.select(rows).of_body(0) for rows in order.split(sizes)]
 
 
 def sky_gaussians(sky: SkyTexture, scene: GaussianScene) -> GaussianSet:

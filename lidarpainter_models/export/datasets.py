@@ -32,7 +32,7 @@ class PosedImage:
     """An image of a dataset; its file is written by whoever has its pixels."""
 
     name: str
-    """Of its file, below the folder of images."""
+    """Name of its file, below the folder of images."""
     camera: Camera
     timestamp_ns: int
 

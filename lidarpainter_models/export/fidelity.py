@@ -24,9 +24,9 @@ class Fidelity:
     """How close the images of an exported scene are to ours."""
 
     psnr_db: float
-    """Of all images together; infinite where they are the same."""
+    """PSNR of all images together; infinite where they are the same."""
     worst_psnr_db: float
-    """Of the worst image."""
+    """PSNR of the worst image."""
     num_views: int
 
 

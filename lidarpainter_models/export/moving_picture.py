@@ -59,7 +59,7 @@ def _panel(rgb: Float[Tensor, "height width 3"]) -> np.ndarray:
 
 
 def _durations_ms(times_ns: list[int]) -> list[int]:
-    """Of every frame; the last one stands as long as the one before."""
+    """How long every frame stands; the last one as long as the one before."""
     steps = [max(after - before, 0) // 1_000_000 for before, after in pairwise(times_ns)]
     steps = [max(step, SHORTEST_MS) for step in steps]
     return [*steps, steps[-1] if steps else 100]

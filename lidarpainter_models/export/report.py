@@ -20,8 +20,6 @@ from lidarpainter_models.export.worst_views import WorstView
 PLOT_WIDTH, PLOT_HEIGHT = 460, 240
 PLOT_MARGIN = 46
 MOST_SHOWN_FACTS = 20
-DRIVE_PAGE = "drive.html"
-"""Where `demo` puts the page that plays the drive, beside the report."""
 SERIES_COLOURS = (
     *("#0b6e99", "#d1495b", "#5c8001", "#8f5db7"),
     *("#c77700", "#555555", "#009e8e", "#7a4b2a"),
@@ -170,7 +168,6 @@ def render_report(report: Report) -> str:
         ],
         worst_title=report.worst_title,
         repeat=report.repeat,
-        drive_page=DRIVE_PAGE,
         comparisons=comparisons,
         tables=tables,
         plots=[plot_geometry(plot) for plot in report.plots],

@@ -14,21 +14,31 @@ from lidarpainter_models.evaluation.score_tables import (
     score_rows,
 )
 from lidarpainter_models.export.moving_picture import MovingPicture
-from lidarpainter_models.export.report import DRIVE_PAGE, Cell, Comparison, Plot, Report, Table
+from lidarpainter_models.export.report import Cell, Comparison, Plot, Report, Table
 from lidarpainter_models.export.verdict import verdict
 from lidarpainter_models.export.worst_views import WorstView
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 
+DRIVE_PAGE = "drive.html"
+"""What the page that plays the drive is called where a command makes it."""
 MEGABYTE = 1e6
 MOST_ACTORS = 20
 """Rows of the table of actors."""
-GUIDANCE_COLUMNS = ("num_cameras", "num_without_room", "num_refused", "num_views", "mean_weight")
-
+GUIDANCE_COLUMNS = {
+    "num_cameras": "cameras beside the path",
+    "num_without_room": "of them in a car or a wall",
+    "num_refused": "paintings refused",
+    "num_views": "painted views fitted",
+    "mean_weight": "mean weight of a pixel, 0 to 1",
+}
 GUIDANCE_NOTE = (
-    "Cameras beside the path; of them those that would stand in a car or a wall, and those whose "
-    "painting was refused; views that the fit went on with, and how much a pixel of them counts: "
-    "nothing where the painting leaves the render as it is."
+    "The weight says how much a painted pixel counts in the fit: nothing where the painting leaves "
+    "the render as it is."
 )
+HIGHER = "\u2191"
+UNITS = {"PSNR": f"PSNR, dB {HIGHER}", "SSIM": f"SSIM {HIGHER}", "depth": f"depth, 0 to 1 {HIGHER}"}
+"""Figures with their units, and which way is better."""
+HIGHER_NOTE = f"{HIGHER}: higher is better."
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,22 +173,25 @@ def _tables(result: Mapping[str, Any], costs: Sequence[StageCost]) -> list[Table
         ),
     ]
     if scores := score_rows(result):
-        columns, note = score_columns(result["painter"]), SCORE_NOTE
+        columns = [_with_unit(name) for name in score_columns(result["painter"])]
+        note = f"{SCORE_NOTE} {HIGHER_NOTE}"
         tables.insert(0, Table(title="Held-out views", columns=columns, rows=scores, note=note))
     if by_camera := result.get("recorded_by_camera"):
         rows: list[list[Cell]] = [
             [name, *(values.get(key) for key in ("psnr", "ssim", "actors_psnr", "num_views"))]
             for name, values in by_camera.items()
         ]
-        columns = ["camera", "PSNR", "SSIM", "PSNR inside actor boxes", "views"]
-        tables.insert(-1, Table(title="Held-out views by camera", columns=columns, rows=rows))
+        heads = ("PSNR", "SSIM", "inside actor boxes PSNR")
+        columns = ["camera", *map(_with_unit, heads), "views"]
+        title = "Held-out views by camera"
+        tables.insert(-1, Table(title=title, columns=columns, rows=rows, note=HIGHER_NOTE))
     if envelope := result.get(ENVELOPE):
         tables.insert(-1, _envelope(envelope))
     if guidance:
         tables.append(
             Table(
                 title="Painted views",
-                columns=["round", *map(_in_words, GUIDANCE_COLUMNS)],
+                columns=["round", *GUIDANCE_COLUMNS.values()],
                 rows=guidance,
                 note=GUIDANCE_NOTE,
             )
@@ -198,10 +211,17 @@ def _envelope(envelope: Mapping[str, Any]) -> Table:
         ]
         for row in envelope["stretches"]
     ]
-    heads = [f"{words}, {unit}" for words, unit in map(_direction, TRUSTED)]
+    heads = ["stretch, m", "frames", f"predicted there, dB {HIGHER}", "confidence, 0 to 1"]
+    heads += [f"{words}, {unit} {HIGHER}" for words, unit in map(_direction, TRUSTED)]
     return Table(
         title="Where it can be trusted",
-        columns=["stretch, m", "frames", "predicted on the path, dB", "confidence there", *heads],
+        columns=[
+            "stretch, m",
+            "frames",
+            f"predicted there, dB {HIGHER}",
+            "confidence, 0 to 1",
+            *heads,
+        ],
         rows=rows,
         note=(
             "So far off the recorded path, one way at a time, a frame has "
@@ -209,7 +229,7 @@ def _envelope(envelope: Mapping[str, Any]) -> Table:
             f"{envelope['promised']:.0%}: the least over {', '.join(envelope['cameras'])} and the "
             "ends of the stretch, predicted from what recorded images and LiDAR say of "
             f"{envelope['num_frames']} frames, without their true images. "
-            f"Calibrated on {envelope['calibration']}."
+            f"Calibrated on {envelope['calibration']}. {HIGHER_NOTE}"
         ),
     )
 
@@ -220,8 +240,10 @@ def _direction(name: str) -> tuple[str, str]:
     return words.replace("_", " "), {"deg": "degrees"}.get(unit, unit)
 
 
-def _in_words(name: str) -> str:
-    return name.removeprefix("num_").replace("_", " ")
+def _with_unit(name: str) -> str:
+    """`painted PSNR` with the unit of its last word, and which way is better."""
+    words, _, figure = name.rpartition(" ")
+    return f"{words} {UNITS.get(figure, figure)}".strip()
 
 
 def _actors(
@@ -245,10 +267,12 @@ def _actors(
     ]
     if not rows:
         return []
-    columns = ["actor", "moves", "size, m", "frames", "LiDAR points", "Gaussians", "PSNR"]
+    columns = ["actor", "moves", "size, m", "frames", "LiDAR points", "Gaussians"]
+    columns.append(UNITS["PSNR"])
     note = (
         f"{len(rows)} of {len(seen)}, most points first. What stands still is part of the street. "
-        "PSNR: inside the actor's box in held-out views, without what nearer moving boxes cover."
+        "PSNR: inside the actor's box in held-out views, without what nearer moving boxes cover. "
+        f"{HIGHER_NOTE}"
     )
     return [Table(title="Actors", columns=columns, rows=rows, note=note)]
 

@@ -10,6 +10,7 @@ from typing import Literal
 import torch
 
 from lidarpainter_models.errors import DataError, MissingPackageError
+from lidarpainter_models.export.contents import SceneContents
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.placing import carried_gaussians
 from lidarpainter_models.storage.whole_files import whole_file
@@ -49,6 +50,13 @@ def write_spz(path: Path, gaussians_world: GaussianSet, *, version: SpzVersion =
     )
     with whole_file(path) as aside:
         gsply.write_spz(aside, data, version=version, fractional_bits=FRACTIONAL_BITS)
+
+
+def write_spz_scene(
+    path: Path, contents: SceneContents, *, time: int = 0, version: SpzVersion = 3
+) -> None:
+    """Write everything that is there at the n-th of the times; raises as `write_spz` does."""
+    write_spz(path, contents.placed(time), version=version)
 
 
 def read_spz(path: Path) -> GaussianSet:

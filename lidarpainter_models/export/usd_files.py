@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from lidarpainter_models.errors import ConfigError, DataError, MissingPackageError, WriteError
-from lidarpainter_models.export.contents import ExportedActor, SceneContents
+from lidarpainter_models.export.contents import FRAME, ExportedActor, SceneContents
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation
 from lidarpainter_models.storage.whole_files import whole_file
@@ -93,8 +93,7 @@ def _fill(stage: Any, contents: SceneContents, time: int) -> None:  # noqa: ANN4
         stage.SetFramesPerSecond(1000.0 * (len(codes) - 1) / (codes[-1] - codes[0]))
     world = UsdGeom.Xform.Define(stage, "/World")
     world.GetPrim().SetDocumentation(
-        f"{contents.name}: x forward, y left, z up at the first frame; metres; colours before "
-        "any camera's exposure"
+        f"{contents.name}: {FRAME}; colours before any camera's exposure"
     )
     stage.SetDefaultPrim(world.GetPrim())
     _define_gaussians(stage, "/World/Street", contents.street)

@@ -1,6 +1,6 @@
 """What is good and what is bad about a scene, in sentences that follow from its figures."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lidarpainter_models.evaluation.score_tables import (
@@ -8,7 +8,6 @@ from lidarpainter_models.evaluation.score_tables import (
     ENVELOPE,
     TRUSTED,
     fitted_on,
-    least_of,
 )
 
 CLOSE_DB, FAIR_DB = 30.0, 26.0
@@ -23,25 +22,34 @@ TELLING = 0.005
 
 
 def verdict(result: Mapping[str, Any]) -> list[str]:
-    """Sentences about recorded views, views aside, and actors; `result` is that of a run."""
+    """Sentences about recorded views, views aside, and actors.
+
+    Args:
+        result: what `reconstruct --json` prints of a run; entries of older runs may lack.
+    """
     if (recorded := result.get("recorded")) is None:
         judged = ["Nobody judged this scene: `lidarpainter evaluate` does."]
     else:
+        envelope = result.get(ENVELOPE) or {"stretches": ()}
+        weak = [row for row in envelope["stretches"] if row["left_m"] is None]
         judged = [
-            _recorded(recorded),
+            _recorded(recorded, is_even=not weak),
             _aside(result),
-            _trusted(result.get(ENVELOPE)),
+            _trusted(envelope, weak),
             _actors(recorded),
         ]
     sentences = (*judged, _early(result), _taken_back(result.get("gains") or {}))
     return [sentence for sentence in sentences if sentence]
 
 
-def _recorded(scores: Mapping[str, Any]) -> str:
+def _recorded(scores: Mapping[str, Any], *, is_even: bool) -> str:
+    """How close held-out views are on average; `is_even` is that no stretch falls behind."""
     psnr = scores.get("psnr")
     if psnr is None:
         return "No frame was held back, so nothing says how it shows what it has not seen."
-    if psnr >= CLOSE_DB:
+    if psnr >= CLOSE_DB and not is_even:
+        words = "Uneven: along the recorded path it is close to photographs it never saw on average"
+    elif psnr >= CLOSE_DB:
         words = "Good: along the recorded path it is close to photographs it never saw"
     elif psnr >= FAIR_DB:
         words = "Fair: along the recorded path it shows what is there, fine detail is soft"
@@ -91,21 +99,25 @@ def _aside(result: Mapping[str, Any]) -> str:
     return f"{sentence}; painting {did} there ({before:.0%} before)."
 
 
-def _trusted(envelope: Mapping[str, Any] | None) -> str:
-    """How far all of it can be trusted; the page has a table of the stretches."""
-    if not envelope or not envelope["stretches"]:
+def _trusted(envelope: Mapping[str, Any], weak: Sequence[Mapping[str, Any]]) -> str:
+    """How far single frames can be trusted; the page has a table of the stretches."""
+    rows = envelope["stretches"]
+    if not rows:
         return ""
-    rows, good_db = envelope["stretches"], envelope["good_db"]
-    num_untrusted = sum(row["left_m"] is None for row in rows)
-    least = {name: far for name, far in least_of(envelope).items() if far is not None}
-    if num_untrusted or not least:
-        return (
-            f"Weak: on {num_untrusted} of {len(rows)} stretches nobody can promise {good_db:g} dB, "
-            "not even on the recorded path."
-        )
+    good_db, strong = envelope["good_db"], [row for row in rows if row not in weak]
+    doubt = (
+        f"On {len(weak)} of {len(rows)} stretches single frames may fall below {good_db:g} dB even "
+        "on the recorded path, whatever the average is"
+    )
+    if not strong:
+        return f"Weak: {doubt[0].lower()}{doubt[1:]}."
+    least = {name: min(row[name] for row in strong) for name in TRUSTED}
     metres = ", ".join(f"{least[name]:g} m {name.removesuffix('_m')}" for name in TRUSTED[:4])
     turns = min(least["yaw_left_deg"], least["yaw_right_deg"])
-    return f"To be trusted ({good_db:g} dB or more) all along: {metres}, {turns:g} degrees of yaw."
+    where = f"{doubt}; on the others every frame is" if weak else "All along, every frame is"
+    return (
+        f"{where} to be trusted ({good_db:g} dB or more) up to {metres}, {turns:g} degrees of yaw."
+    )
 
 
 def _actors(scores: Mapping[str, Any]) -> str:

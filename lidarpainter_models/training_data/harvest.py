@@ -145,7 +145,9 @@ def check_plan(plan: LeftOutPlan, split: ViewSplit) -> None:
 
 def _aligned(observations: SceneObservations, reference: GaussianScene) -> SceneObservations:
     """The observations at the reference fit's refined camera and actor poses."""
-    views = tuple(replace(view, camera=reference.found_camera(view)) for view in observations.views)
+    views = tuple(
+        replace(view, camera=reference.refined_camera(view)) for view in observations.views
+    )
     return replace(observations, views=views, tracks=reference.tracks)
 
 

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import COLOUR_OFFSET
@@ -84,10 +83,9 @@ def _seen(
     scene: GaussianScene, camera: Camera, timestamp_ns: int
 ) -> tuple[Int[Tensor, " seen"], Float[Tensor, "seen 3"]]:
     """The Gaussians whose centres lie in an image, and their colours in it."""
-    gaussians = scene.blinking.lit(scene.gaussians, timestamp_ns)
-    poses = scene.actors.likely_poses(timestamp_ns)
-    bodies = camera_from_body(camera.world_from_camera, *poses)
-    own = bodies[gaussians.body_index.long()]
+    drawable = scene.drawable(camera, timestamp_ns)
+    gaussians = drawable.gaussians
+    own = drawable.posed.bodies[gaussians.body_index.long()]
     points = torch.einsum("gij,gj->gi", own[:, :3, :3], gaussians.means) + own[:, :3, 3]
     x, y, z = points.unbind(1)
     u, v = camera.fx_px * x / z + camera.cx_px, camera.fy_px * y / z + camera.cy_px
@@ -96,4 +94,4 @@ def _seen(
     towards = torch.einsum("gji,gj->gi", own[rows, :3, :3], points[rows])  # in the body's frame
     basis = harmonic_basis(torch.nn.functional.normalize(towards, dim=1), gaussians.sh.shape[1])
     rgb = COLOUR_OFFSET + torch.einsum("gk,gkc->gc", basis, gaussians.sh[rows])
-    return rows, rgb.clamp(min=0)
+    return drawable.rows[rows], rgb.clamp(min=0)

@@ -87,6 +87,11 @@ class DriveNodes:
         return self._shown.scene
 
     @property
+    def num_splats(self) -> int:
+        """How many splats of the shown scene the browser has."""
+        return self._shown.nodes.num_splats
+
+    @property
     def tracks(self) -> TrackNodes:
         """Boxes and ways of its actors."""
         return self._shown.tracks
@@ -96,7 +101,7 @@ class DriveNodes:
         nodes = self._shown.nodes
         nodes.with_actors = self.with_actors
         nodes.place(timestamp_ns, seat.centre_world)
-        self.tracks.place(self.scene.actors.likely_poses(timestamp_ns))
+        self.tracks.place(self.scene.actors.refined_poses(timestamp_ns))
         place_node(self._world, seat_from_world(seat))
 
 

@@ -5,7 +5,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-from lidarpainter_models.export.page import PageNotes, sealed_page
+from lidarpainter_models.export.images import jpeg_data_url
+from lidarpainter_models.export.page import FirstView, PageNotes, sealed_page
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
 from lidarpainter_models.viewing.annotations import vertical_fov_rad
 from lidarpainter_models.viewing.drive_nodes import DriveNodes, ShownDrive
@@ -15,6 +16,8 @@ TITLE_M = 10.0
 """How far ahead of the seat the title of a leg stands, near the upper edge of the view."""
 LAST_S = 0.1
 """How long the last moment stands."""
+FIRST_VIEW_PX = (1296, 540)
+"""Width and height of the picture of the first view: wider than windows are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,4 +61,22 @@ def recorded_page(
                 nodes.place(view.timestamp_ns, path.camera(moment))
                 recording.insert_sleep(pause_s)
                 progress(number * len(views) + moment + 1, len(legs) * len(views))
-        return sealed_page(recording.as_html(), notes)
+        return sealed_page(recording.as_html(), notes, _first_view(drive, nodes))
+
+
+def _first_view(drive: ShownDrive, nodes: DriveNodes) -> FirstView:
+    """Our own picture of what the page shows first, seen through a lens as high but wider."""
+    width_px, height_px = FIRST_VIEW_PX
+    seat, view = drive.path.camera(0), drive.path.views[0]
+    focal_px = height_px / 2 / math.tan(vertical_fov_rad(seat) / 2)
+    wide = replace(
+        seat.at(seat.world_from_camera),
+        fx_px=focal_px,
+        fy_px=focal_px,
+        cx_px=width_px / 2,
+        cy_px=height_px / 2,
+        width_px=width_px,
+        height_px=height_px,
+    )
+    drawn = nodes.scene.render(wide, view.timestamp_ns, camera_name=view.camera_name)
+    return FirstView(data_url=jpeg_data_url(drawn.rgb), num_splats=nodes.num_splats)

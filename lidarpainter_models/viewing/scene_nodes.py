@@ -63,7 +63,9 @@ class SceneNodes:
         recorded = recorded_rgb(baked, cameras)[None]
         rgb = scene.exposure.apply(recorded, camera_name, cameras[0][1])[0]
         self._bodies: dict[int, viser.GaussianSplatHandle] = {}
+        self.num_splats = 0
         for body, splats in splats_by_body(baked.gaussians, rgb).items():
+            self.num_splats += len(splats.centres)
             if body == _STREET:
                 add_splats(api, f"{root}/street", splats)
             else:
@@ -93,7 +95,7 @@ class SceneNodes:
     def place(self, timestamp_ns: int, centre_world: Float[Tensor, "3"]) -> None:
         """Put the actors where they stand at a time, and the sky around a place."""
         self._sky.position = centre_world.numpy()
-        poses, present = self._scene.actors.likely_poses(timestamp_ns)
+        poses, present = self._scene.actors.refined_poses(timestamp_ns)
         for actor, handle in self._bodies.items():
             place_node(handle, poses[actor], visible=bool(present[actor]))
 

@@ -149,7 +149,7 @@ class LiveViewer:
         for view in path.recorded.views:
             if view.frame_index != frame_index:
                 continue
-            camera = scene.found_camera(view, fit_camera(view, size))
+            camera = scene.refined_camera(view, fit_camera(view, size))
             rgb_u8 = shrink_image(
                 path.recorded.read_image(view),
                 width_px=camera.width_px,
@@ -204,7 +204,7 @@ class LiveViewer:
         """The actor whose box a ray of the seat's frame meets first."""
         actors = self._nodes.scene.actors
         moment = self._drive.path.views[self._moment]
-        world_from_actors, present = actors.likely_poses(moment.timestamp_ns)
+        world_from_actors, present = actors.refined_poses(moment.timestamp_ns)
         there = [actors.recorded_tracks[row] for row in present.nonzero()[:, 0].tolist()]
         if not there:
             return None

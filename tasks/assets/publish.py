@@ -86,12 +86,7 @@ def _looks(
     scene = world.fitted
     looks = [
         RecordedLook(
-            camera=scene.corrected_camera(
-                view.camera,
-                timestamp_ns=view.timestamp_ns,
-                camera_name=view.key[1],
-                key=view.key,
-            ),
+            camera=scene.refined_camera(view),
             camera_name=view.key[1],
             timestamp_ns=view.timestamp_ns,
             is_seen=True,
@@ -100,11 +95,7 @@ def _looks(
         for view in world.views
     ]
     for held in this.views.test if is_judged else ():
-        camera = scene.corrected_camera(
-            fit_camera(held, observation),
-            timestamp_ns=held.timestamp_ns,
-            camera_name=held.camera_name,
-        )
+        camera = scene.refined_camera(held, fit_camera(held, observation))
         looks.append(
             RecordedLook(
                 camera=camera,

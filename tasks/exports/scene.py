@@ -184,4 +184,4 @@ def _read_back(
 def _compared_cameras(scene: GaussianScene, seen: SceneObservations) -> list[Camera]:
     last = len(seen.views) - 1
     rows = sorted({round(last * part / (_NUM_COMPARED - 1)) for part in range(_NUM_COMPARED)})
-    return [scene.found_camera(seen.views[row]) for row in rows]
+    return [scene.refined_camera(seen.views[row]) for row in rows]

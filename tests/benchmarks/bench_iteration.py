@@ -186,7 +186,9 @@ def _loss(target, *, splats):
 def _adam_of(fit):
     """The optimiser's step on everything that the fit's one view shows."""
     scene = fit.state.scene
-    bodies = camera_from_body(scene.cameras.world_from_camera(0), *scene.actors.corrected_poses(0))
+    bodies = camera_from_body(
+        scene.cameras.world_from_camera(0), *scene.actors.refined_poses_in_fit(0)
+    )
     rows = fit.state.blocks.in_view([(fit.images[0].camera, bodies)]).nonzero()[:, 0]
     seen = fit.state.gaussian_adam.seen(scene.gaussians, rows)
     for leaf in (seen.means, seen.rotation_wxyz, seen.log_scale, seen.opacity_logit, seen.sh):

@@ -79,9 +79,7 @@ def figures(street, world, truth, operation, name, came=False):
     index = [actor.actor_id for actor in street.actors(street.timestamps_ns[0])].index(name)
     sums = {}
     for view in world.views[JUDGED]:
-        camera = world.scene.corrected_camera(
-            view.camera, timestamp_ns=view.timestamp_ns, camera_name=FRONT, key=view.key
-        )
+        camera = world.scene.refined_camera(view)
         was, now = (one.render(camera, view.timestamp_ns) for one in (street, truth))
         there = was.actor_index == index
         others = now.actor_index

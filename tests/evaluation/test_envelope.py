@@ -69,7 +69,7 @@ class FadingEvidence(EvidenceGatherer):
             boxes=MovingBoxes([]),
         )
         self.scene = SimpleNamespace(
-            found_camera=lambda _view, camera: camera, device=torch.device("cpu")
+            refined_camera=lambda _view, camera: camera, device=torch.device("cpu")
         )
 
     def of(self, camera, timestamp_ns, _camera_name=None):

@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
@@ -127,7 +128,7 @@ def test_a_page_says_how_far_each_stretch_can_be_trusted():
     street.lidar_names = ()
     tables = page.report(street, Pictures(), {}, {}).tables
     (table,) = [one for one in tables if one.title == "Where it can be trusted"]
-    assert table.columns[-2:] == ["yaw left, degrees", "yaw right, degrees"]
+    assert table.columns[-2:] == ["yaw left, degrees \u2191", "yaw right, degrees \u2191"]
     assert table.rows[0][0] == "0 to 19"
     assert table.rows[0][-2:] == [20.0, None]
     assert "40 frames" in table.note
@@ -205,7 +206,7 @@ def test_actors_have_their_psnr_and_results_without_it_a_dash():
             for table in page.report(street, Pictures(), {}, {}).tables
             if table.title == "Actors"
         ]
-        cells.append(dict(zip(table.columns, table.rows[0], strict=True))["PSNR"])
+        cells.append(dict(zip(table.columns, table.rows[0], strict=True))["PSNR, dB \u2191"])
     assert cells == [25.5, None]
 
 
@@ -248,6 +249,29 @@ def test_page_loads_nothing_from_elsewhere():
     page = render_report(sample_report())
     assert "http" not in page
     assert page.count("data:image/jpeg;base64,") == 13
+
+
+def test_figures_have_units_and_say_which_way_is_better():
+    judged = {"recorded": {"psnr": 1.0, "num_views": 3}, "novel": {}}
+    by_camera = {"recorded_by_camera": {"front": {"psnr": 1.0, "ssim": 0.5, "num_views": 3}}}
+    result = {**RESULT, **judged, "unpainted": judged, **by_camera}
+    page = RunPage(result=result, costs=[], provenance={}, settings={}, has_lidar=True)
+    street = ToyStreet()
+    street.manifest = {"counts": {"frames": 4, "images": 4, "points": 1000}}
+    street.lidar_names, street.frame_timestamps_ns = ("top",), [0, 300_000_000]
+    tables = page.report(street, Pictures(), {}, {}).tables
+    judging = [table for table in tables if any("PSNR" in name for name in table.columns)]
+    assert len(judging) == 3
+    for table in judging:
+        assert "higher is better" in table.note
+        assert all("dB \u2191" in name for name in table.columns if "PSNR" in name)
+
+
+def test_links_lead_to_what_is_there():
+    page = render_report(replace(sample_report(), repeat=["lidarpainter view latest"]))
+    targets = re.findall(r'href="([^"]*)"', page)
+    assert targets
+    assert all(target.startswith("#") and f'id="{target[1:]}"' in page for target in targets)
 
 
 def test_hostile_names_are_escaped():

@@ -206,7 +206,7 @@ def test_gltf_actors_stand_where_they_should(world, tmp_path, time):
         assert seconds[time] == pytest.approx(times_ns[time] * 1e-9)
         values = gltf_column(file, sampler.output)
         found.setdefault(channel.target.node, {})[channel.target.path] = values[time]
-    likely, present = scene.actors.likely_poses(times_ns[time])
+    likely, present = scene.actors.refined_poses(times_ns[time])
     for row, node in enumerate((2, 3)):
         rotation = rotation_from_quaternion(found[node]["rotation"].roll(1))
         pose = rigid_from_rotation(rotation, found[node]["translation"]).double()
@@ -267,7 +267,7 @@ def test_usd_holds_every_number_and_moves_the_actors(world, tmp_path, ending):
         for name in PARAMETERS:
             torch.testing.assert_close(getattr(found, name), getattr(ours, name), atol=1e-5, rtol=0)
     for time in (0, 2, 4):
-        likely, present = scene.actors.likely_poses(times_ns[time])
+        likely, present = scene.actors.refined_poses(times_ns[time])
         code = Usd.TimeCode(times_ns[time] * 1e-9 * TIME_CODES_PER_SECOND)
         for row, prim in enumerate(actors):
             xform = UsdGeom.Xformable(prim)
@@ -284,7 +284,7 @@ def test_usd_shows_one_moment_to_whoever_asks_for_none(world, tmp_path, time):
     scene, _, times_ns, contents = world
     write_usd(tmp_path / "a.usdc", contents, time=time)
     stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
-    likely, present = scene.actors.likely_poses(times_ns[time])
+    likely, present = scene.actors.refined_poses(times_ns[time])
     for row, prim in enumerate(stage.GetPrimAtPath("/World/Actors").GetChildren()):
         pose = UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())
         torch.testing.assert_close(

@@ -46,13 +46,20 @@ def envelope(**changes):
 
 def test_the_worst_stretch_says_how_far_all_of_it_can_be_trusted():
     sentence = verdict(run(envelope=envelope(right_m=1.5)))[2]
-    assert "25 dB or more) all along: 3 m left, 1.5 m right, 3 m up" in sentence
+    assert sentence.startswith("All along, every frame is to be trusted (25 dB or more)")
+    assert "up to 3 m left, 1.5 m right, 3 m up" in sentence
     assert "15 degrees" in sentence
 
 
-def test_a_stretch_that_nobody_can_promise_is_no_number():
-    sentence = verdict(run(envelope=envelope(left_m=None)))[2]
-    assert sentence.startswith("Weak: on 1 of 2 stretches nobody can promise 25 dB")
+def test_a_stretch_that_nobody_can_promise_is_no_number_and_takes_from_the_praise():
+    nothing = dict.fromkeys(envelope()["stretches"][0])
+    average, _, sentence, _ = verdict(run(envelope=envelope(**nothing)))
+    assert average.startswith("Uneven: ")
+    assert "on average (30.5 dB over 14 held-out views)" in average
+    assert sentence.startswith("On 1 of 2 stretches single frames may fall below 25 dB even on the")
+    assert "on the others every frame is to be trusted (25 dB or more) up to 3 m left" in sentence
+    everywhere = {"good_db": 25.0, "stretches": [nothing]}
+    assert verdict(run(envelope=everywhere))[2].startswith("Weak: on 1 of 1 stretches")
 
 
 def test_worst_of_several_ways_is_named():

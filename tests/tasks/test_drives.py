@@ -113,7 +113,7 @@ def test_free_seat_stays_while_actors_go_on(server, viewer, drive):
         before, stood = seat_camera(server), pose(car)
         with chosen(viewer, moment=3):
             assert torch.equal(seat_camera(server), before)
-            expected = drive.path.builder.scene.actors.likely_poses(
+            expected = drive.path.builder.scene.actors.refined_poses(
                 drive.path.views[3].timestamp_ns
             )
             assert torch.allclose(pose(car), expected[0][0], atol=1e-6)

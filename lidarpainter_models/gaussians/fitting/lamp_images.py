@@ -10,8 +10,7 @@ from torch import Tensor
 from lidarpainter_models.gaussians.fitting.images import FitImage
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import SH_CONSTANT
-from lidarpainter_models.gaussians.model.rolling_shutter import as_read
-from lidarpainter_models.gaussians.model.scene_rendering import OPAQUE, camera_from_body
+from lidarpainter_models.gaussians.model.scene_rendering import OPAQUE
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.gaussian_raster import Splats, render_gaussians
 
@@ -89,10 +88,8 @@ def lacking(
     """
     image, camera = look.image.to(scene.device), look.camera
     with torch.no_grad():
-        poses = scene.actors.likely_poses(image.timestamp_ns)
-        bodies = camera_from_body(camera.world_from_camera, *poses)
-        bent = scene.actors.bending.bent(scene.gaussians, image.timestamp_ns)
-        gaussians = as_read(bent, bodies, camera, scene.actors, image.timestamp_ns)
+        posed = scene.posed(camera, image.timestamp_ns)
+        gaussians = posed.shown(scene.gaussians)
     harmonics = gaussians.sh.clone().requires_grad_(True)
     ones = torch.ones(len(gaussians), 1, device=scene.device, requires_grad=True)
     with torch.enable_grad():
@@ -105,7 +102,7 @@ def lacking(
                 sh=harmonics,
                 body_index=gaussians.body_index,
             ),
-            bodies.to(scene.device),
+            posed.bodies.to(scene.device),
             camera,
             features=ones,
         )

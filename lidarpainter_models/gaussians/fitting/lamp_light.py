@@ -17,7 +17,6 @@ from lidarpainter_models.gaussians.fitting.lamp_images import (
 )
 from lidarpainter_models.gaussians.model.blinking import NUM_NODES, Blinking, with_added_colour
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
 
 NEAREST_M = 0.2
 """Depth below which a lamp does not count as before a camera."""
@@ -67,8 +66,7 @@ def with_measured_lamps(
 
 def _may_show(scene: GaussianScene, lamps: Blinking, look: Look) -> bool:
     """Whether the middle of a lamp is in an image, or beside it by less than the lamp is wide."""
-    poses = scene.actors.likely_poses(look.image.timestamp_ns)
-    bodies = camera_from_body(look.camera.world_from_camera, *poses)[lamps.bodies.cpu()]
+    bodies = scene.posed(look.camera, look.image.timestamp_ns).bodies[lamps.bodies.cpu()]
     x, y, z = (bodies[:, :3, :3] @ lamps.centre_m.cpu()[..., None] + bodies[:, :3, 3:])[..., 0].T
     camera, depth_m = look.camera, z.clamp(min=NEAREST_M)
     wide_px = lamps.size_m.cpu().amax(dim=1) * camera.fx_px / depth_m

@@ -14,10 +14,9 @@ from torch import Tensor
 
 from lidarpainter_models.gaussians.fitting.config import FitConfig, FitLossWeights
 from lidarpainter_models.gaussians.fitting.images import FitImage
-from lidarpainter_models.gaussians.model.actors import Actors
+from lidarpainter_models.gaussians.model.posed_scene import PosedScene
 from lidarpainter_models.gaussians.model.sky import MIN_TRANSMITTANCE
 from lidarpainter_models.geometry.box_masks import project_boxes
-from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
 from lidarpainter_models.kernels.pixel_losses import (
     PixelFacts,
@@ -116,14 +115,11 @@ def painted_loss(
     return loss + config.losses.sky * clear_sky_loss(splat.alpha, torch.zeros_like(is_hit), is_hit)
 
 
-def actor_loss(
-    splat: SplatImage, actors: Actors, camera: Camera, timestamp_ns: int
-) -> Float[Tensor, ""]:
+def actor_loss(splat: SplatImage, posed: PosedScene) -> Float[Tensor, ""]:
     """Return how far actors show outside their projected boxes; the splat has their channel."""
-    with torch.no_grad():
-        world_from_actors, present = actors.corrected_poses(timestamp_ns)
-        sizes = [track.size_m for track in actors.recorded_tracks]
-        in_boxes = project_boxes(camera, world_from_actors, sizes, present > 0)
+    world_from_actors, present = posed.poses
+    sizes = [track.size_m for track in posed.actors.recorded_tracks]
+    in_boxes = project_boxes(posed.camera, world_from_actors.detach(), sizes, present > 0)
     in_boxes = in_boxes.to(splat.alpha.device, non_blocking=True)
     return actor_boundary_loss(splat.features[..., 0], in_boxes)
 

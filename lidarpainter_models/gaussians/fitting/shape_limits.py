@@ -55,7 +55,7 @@ def viewing_rays(scene: GaussianScene) -> ViewingRays:
     with torch.no_grad():
         for row in rows:
             timestamp_ns = int(scene.cameras.timestamps_ns[row])
-            actors = scene.actors.corrected_poses(timestamp_ns)
+            actors = scene.actors.refined_poses_in_fit(timestamp_ns)
             body_from_camera = invert_rigid(
                 camera_from_body(scene.cameras.world_from_camera(row), *actors)
             ).to(means.device, non_blocking=True)

@@ -5,7 +5,6 @@ lie on the device of the scene; poses (float64) and exposure, a few small matric
 CPU.
 """
 
-from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -24,19 +23,14 @@ from lidarpainter_models.gaussians.fitting.loss import (
     recorded_loss,
 )
 from lidarpainter_models.gaussians.fitting.state import FitState
-from lidarpainter_models.gaussians.model.rolling_shutter import as_read, bodies_while_read
-from lidarpainter_models.gaussians.model.scene_rendering import (
-    OPAQUE,
-    camera_from_body,
-    draw_gaussians,
-)
+from lidarpainter_models.gaussians.model.posed_scene import PosedScene
+from lidarpainter_models.gaussians.model.scene_rendering import OPAQUE
 from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
 from lidarpainter_models.gaussians.model.sky import (
     FINAL_LEARNING_RATE,
     LEARNING_RATE,
     MIN_TRANSMITTANCE,
 )
-from lidarpainter_models.gaussians.model.spatial_blocks import View
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
 from lidarpainter_models.kernels.pixel_losses import SKY
 from lidarpainter_models.kernels.side_by_side import both
@@ -74,25 +68,23 @@ def fit_step(
     """
     pose = state.refinement.world_from_camera(row, state.step)
     recorded = image.camera.refined(pose.detach())
-    actors = state.scene.actors.corrected_poses(image.timestamp_ns)
-    view = (recorded, camera_from_body(pose, *actors))
-    read = bodies_while_read(view[1].detach(), recorded, state.scene.actors, image.timestamp_ns)
-    looks = {row: [view, *((recorded, bodies) for bodies in read)]}
+    posed = state.scene.posed_in_fit(recorded, image.timestamp_ns, pose)
+    looks = {row: posed.looks()}
     if guidance is not None:
         place, painted = guidance
-        bodies = _guidance_bodies(state, painted)
-        looks[~place] = [(painted.camera, bodies)]
+        beside = state.scene.posed_in_fit(painted.camera, painted.timestamp_ns)
+        looks[~place] = beside.looks()
     seen = state.seen(looks)
     probes = [state.hidden.probe(name, len(seen)) for name in looks]
     of_recorded = partial(
-        _recorded_gradients, state, seen, image, row, view, config, perceptual, probes[0]
+        _recorded_gradients, state, seen, image, row, posed, config, perceptual, probes[0]
     )
     if guidance is None:
         found = of_recorded()
     else:
         twin = seen.twin()
         of_painted = partial(
-            add_guidance_gradients, state, twin, painted, bodies, config, perceptual, probes[1]
+            add_guidance_gradients, state, twin, painted, beside, config, perceptual, probes[1]
         )
         found, _ = both(of_recorded, of_painted, state.scene.device)
         seen.take_gradients_of(twin)
@@ -120,35 +112,30 @@ def _recorded_gradients(  # noqa: PLR0913 - what a step is made of
     seen: SeenGaussians,
     image: FitImage,
     row: int,
-    view: View,
+    posed: PosedScene,
     config: FitConfig,
     perceptual: Perceptual | None,
     probe: Float[Tensor, "seen 1"] | None,
 ) -> _OfRecorded:
     """Collect the gradients of a recorded view."""
-    (camera, bodies), weights, sky = view, config.losses, state.scene.sky
+    weights, sky = config.losses, state.scene.sky
     facts = image.facts()
     with_actors = _wants_actor_term(state, config)
     screen_gradient = torch.zeros(len(seen), device=seen.means.device)
-    actors = state.scene.actors
-    lit = state.scene.blinking.lit(seen, image.timestamp_ns)
-    bent = actors.bending.bent(lit, image.timestamp_ns)
-    splat = draw_gaussians(
-        as_read(bent, bodies, camera, actors, image.timestamp_ns),
-        bodies,
-        camera,
+    splat = posed.draw(
+        seen,
         with_actor_alpha=with_actors,
         channel=probe,
         screen_gradient_out=screen_gradient,
     )
-    rays = sky.rays(camera, (splat.alpha.detach() < OPAQUE) | image.is_open)
+    rays = sky.rays(posed.camera, (splat.alpha.detach() < OPAQUE) | image.is_open)
     sky_rgb = sky.sample(rays).requires_grad_(True)
     exposure = state.refinement.exposure(image)
     loss, shown = recorded_loss(
         splat, sky_rgb, image, facts, weights, exposure=exposure, perceptual=perceptual
     )
     if with_actors:
-        loss = loss + weights.actors * actor_loss(splat, actors, camera, image.timestamp_ns)
+        loss = loss + weights.actors * actor_loss(splat, posed)
     loss = loss + state.refinement.bend_prior(image.timestamp_ns, state.step)
     prior = state.refinement.prior(row, image.timestamp_ns, state.step)
     # as a sum its gradient, which is the CPU's, would have to come from the device
@@ -159,29 +146,18 @@ def _recorded_gradients(  # noqa: PLR0913 - what a step is made of
     return _OfRecorded(told, splat, screen_gradient, sky_rgb, rays)
 
 
-def _guidance_bodies(state: FitState, view: GuidanceView) -> Float[Tensor, "bodies 4 4"]:
-    """Return where a painted view has the bodies, without gradient."""
-    with torch.no_grad():
-        actors = state.scene.actors.corrected_poses(view.timestamp_ns)
-        return camera_from_body(view.camera.world_from_camera, *actors)
-
-
 def add_guidance_gradients(
     state: FitState,
     seen: SeenGaussians,
     view: GuidanceView,
-    camera_from_bodies: Float[Tensor, "bodies 4 4"],
+    posed: PosedScene,
     config: FitConfig,
     perceptual: Perceptual | None = None,
     probe: Float[Tensor, "seen 1"] | None = None,
 ) -> None:
     """Add one painted view's gradients to the Gaussians; nothing else is changed by it."""
     sky = state.scene.sky
-    bending = state.scene.actors.bending
-    held = replace(bending, offset_m=bending.offset_m.detach())
-    lit = state.scene.blinking.lit(seen, view.timestamp_ns)
-    shown_then = held.bent(lit, view.timestamp_ns)
-    splat = draw_gaussians(shown_then, camera_from_bodies, view.camera, channel=probe)
+    splat = posed.held().draw(seen, channel=probe)
     sky_rgb = sky.sample(sky.rays(view.camera, splat.alpha.detach() < OPAQUE))
     loss = painted_loss(splat, sky_rgb, view, config, perceptual)
     if probe is not None:

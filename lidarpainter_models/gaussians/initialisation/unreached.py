@@ -161,7 +161,7 @@ def _moving(scene: GaussianScene, view: TrainingView) -> Bool[Tensor, "height wi
     if not scene.actors.recorded_tracks:
         return torch.zeros_like(view.sky_mask)
     with torch.no_grad():
-        poses, present = scene.actors.corrected_poses(view.camera.taken_ns(view.timestamp_ns))
+        poses, present = scene.actors.refined_poses_in_fit(view.camera.taken_ns(view.timestamp_ns))
     sizes = [track.size_m for track in scene.actors.recorded_tracks]
     return project_boxes(view.camera, poses, sizes, present > 0)
 

@@ -1,4 +1,4 @@
-"""The actors: where they were recorded, and what was corrected about it.
+"""The actors: where they were recorded, and what the fit refined about it.
 
 An actor's correction is a small motion in its box frame, linear in time between knots at the
 training times. Box frame: x along the length, y left, z up, origin at the centre. Tangents are
@@ -32,8 +32,8 @@ class _Motions:
     tangent: Float[Tensor, "actors knots 6"]
     refined: RefinedTracks
     """Poses at the training times of the actors that are present at one, in their order."""
-    likely_at: dict[int, Float[Tensor, "actors 4 4"]] = field(default_factory=dict)
-    """By time: all views of a time, and all shifts of a view, show the actors alike."""
+    refined_at: dict[int, Float[Tensor, "actors 4 4"]] = field(default_factory=dict)
+    """Poses by time: all views of a time, and all shifts of a view, show the actors alike."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,10 +45,10 @@ class Actors:
     tangent: Float[Tensor, "actors knots 6"]
     """Changed in place by a fit."""
     bending: Bending = field(default_factory=Bending.none)
-    """Of those that are not rigid; its offsets lie where the Gaussians do."""
+    """How those bend that are not rigid; its offsets lie where the Gaussians do."""
     _recorded_at: dict[int, ActorPoses] = field(default_factory=dict, init=False, repr=False)
     _made: list[_Motions] = field(default_factory=list, init=False, repr=False)
-    """At most one."""
+    """What was made of the corrections last; at most one."""
 
     @classmethod
     def uncorrected(
@@ -113,33 +113,33 @@ class Actors:
         before, after, weight = self.neighbours(timestamp_ns)
         return (1 - weight) * self.tangent[:, before] + weight * self.tangent[:, after]
 
-    def corrected_poses(self, timestamp_ns: int) -> ActorPoses:
-        """Recorded poses at a time with the correction of that time; differentiable."""
+    def refined_poses_in_fit(self, timestamp_ns: int) -> ActorPoses:
+        """Recorded poses with their corrections at a training time; differentiable in these."""
         recorded, present = self.recorded_poses(timestamp_ns)
         return recorded @ rigid_from_tangent(self.tangent_at(timestamp_ns)), present
 
-    def likely_poses(self, timestamp_ns: int) -> ActorPoses:
-        """Most likely poses at any time.
+    def refined_poses(self, timestamp_ns: int) -> ActorPoses:
+        """Refined poses at any time, without gradient.
 
-        At training times these are the refined poses; in between see `pose_blending`.
+        At training times they are those of `refined_poses_in_fit`; in between see `pose_blending`.
         """
         recorded, present = self.recorded_poses(timestamp_ns)
-        known = self._motions().likely_at
+        known = self._motions().refined_at
         if timestamp_ns not in known:
             actors = present.nonzero()[:, 0]
             poses = recorded.clone()
             times_ns = torch.full_like(actors, timestamp_ns)
-            poses[actors] = self._likely(actors, times_ns, recorded[actors])
+            poses[actors] = self._refined_at(actors, times_ns, recorded[actors])
             known[timestamp_ns] = poses
         return known[timestamp_ns], present
 
     def refined_tracks(self) -> tuple[ActorTrack, ...]:
-        """The tracks with the most likely poses at their own times."""
+        """The tracks with refined poses at their own times."""
         tracks = self.recorded_tracks
         if not tracks:
             return ()
         counts = [len(track.timestamps_ns) for track in tracks]
-        poses = self._likely(
+        poses = self._refined_at(
             torch.arange(len(tracks)).repeat_interleave(torch.tensor(counts)),
             torch.cat([track.timestamps_ns for track in tracks]),
             torch.cat([track.world_from_box.double() for track in tracks]),
@@ -164,7 +164,7 @@ class Actors:
     def _present_at_knots(self) -> Bool[Tensor, "actors knots"]:
         return self._recorded.present(self.knots_ns[:, None], PRESENCE_MARGIN_NS).T
 
-    def _likely(
+    def _refined_at(
         self,
         actors: Int[Tensor, " queries"],
         times_ns: Int[Tensor, " queries"],

@@ -8,14 +8,12 @@ and colours stay. Box frame: x along the length, y left, z up, metres.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, ShownGaussians
-from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
+from lidarpainter_models.gaussians.model.seen_gaussians import AnyGaussians
 from lidarpainter_models.geometry.lattices import lattice_values
 
 NODES = (3, 3, 5)
@@ -26,8 +24,6 @@ REST = 0.1
 """How much a node's own way counts beside what parts it from a neighbour."""
 NUM_NODES = NODES[0] * NODES[1] * NODES[2]
 
-AnyGaussians = TypeVar("AnyGaussians", GaussianSet, SeenGaussians, ShownGaussians)
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Bending:
@@ -36,7 +32,7 @@ class Bending:
     bodies: Int[Tensor, " bent"]
     """Their body indices, ascending."""
     size_m: Float[Tensor, "bent 3"]
-    """Of their boxes."""
+    """Length, width and height of their boxes."""
     knots_ns: Int[Tensor, " knots"]
     """Ascending; on the CPU."""
     offset_m: Float[Tensor, "knots bent nodes 3"]
@@ -135,7 +131,7 @@ class Bending:
 
 
 def _cubic_weights(times_s: Sequence[float], after: int, now_s: float) -> list[float]:
-    """Of the knots around an interval, for its cubic with the slopes of their neighbours."""
+    """Weights of the knots around an interval: its cubic has the slopes of their neighbours."""
     before, last = after - 1, len(times_s) - 1
     span_s = times_s[after] - times_s[before]
     u = (now_s - times_s[before]) / span_s

@@ -9,24 +9,17 @@ the lamp off.
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lidarpainter_models.gaussians.model.gaussian_set import (
-    SH_CONSTANT,
-    GaussianSet,
-    ShownGaussians,
-)
-from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
+from lidarpainter_models.gaussians.model.gaussian_set import SH_CONSTANT, GaussianSet
+from lidarpainter_models.gaussians.model.seen_gaussians import AnyGaussians
 from lidarpainter_models.geometry.lattices import lattice_values
 
 NODES = (5, 5, 5)
 NUM_NODES = NODES[0] * NODES[1] * NODES[2]
-
-AnyGaussians = TypeVar("AnyGaussians", GaussianSet, SeenGaussians, ShownGaussians)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -34,10 +27,10 @@ class Blinking:
     """All lamps that go on and off."""
 
     bodies: Int[Tensor, " lamps"]
-    """Which body each is part of."""
+    """Which body each lamp is part of."""
     centre_m: Float[Tensor, "lamps 3"]
     size_m: Float[Tensor, "lamps 3"]
-    """Of its box, in the frame of its body."""
+    """Sides of its box, in the frame of its body."""
     lit_rgb: Float[Tensor, "lamps nodes 3"]
     """What being on adds to the colour at each node."""
     knots_ns: Int[Tensor, " knots"]

@@ -1,4 +1,4 @@
-"""What is corrected about the recorded cameras: poses and exposure. A fit changes it in place.
+"""What a fit refines about the recorded cameras: poses and exposure. It changes them in place.
 
 A camera's correction is a small rigid motion in the camera's own frame: a constant per camera
 (extrinsic calibration) plus a part per training view. The views' parts of a camera sum to zero
@@ -96,11 +96,13 @@ class CameraCorrections:
         times_s = self.timestamps_ns[rows].double() * 1e-9
         return RefinedTracks.of([times_s], [self.recorded_world_from_camera[rows]], [refined])
 
-    def corrected(
-        self, camera: Camera, *, key: ViewKey | None, timestamp_ns: int, camera_name: str
-    ) -> Camera:
-        """The camera at its most likely pose; a camera never trained on stays as recorded."""
-        row = None if key is None else self.row_of(key)
+    def refined(self, camera: Camera, key: ViewKey, timestamp_ns: int) -> Camera:
+        """The camera of a recorded view at its refined pose.
+
+        A training view has a pose of its own; at any other time it is blended from those of the
+        same camera (see `pose_blending`). A camera never trained on stays as it was recorded.
+        """
+        row, camera_name = self.row_of(key), key[1]
         if camera_name in self.faults:
             camera = self.faults[camera_name].corrected(camera)
         if row is not None:

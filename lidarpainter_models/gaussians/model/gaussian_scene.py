@@ -1,11 +1,11 @@
-"""A dynamic scene: street, actors and sky, and what was corrected about the cameras."""
+"""A dynamic scene: street, actors and sky, and what was refined about the cameras."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarpainter_models.errors import ShapeError
@@ -13,20 +13,17 @@ from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.blinking import Blinking
 from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.gaussians.model.rolling_shutter import (
-    MOST_GROWTH,
-    as_read,
-    bodies_while_read,
+from lidarpainter_models.gaussians.model.posed_scene import (
+    DrawableScene,
+    PosedScene,
+    gaussians_at,
 )
-from lidarpainter_models.gaussians.model.scene_rendering import (
-    SceneRender,
-    camera_from_body,
-    draw_over_sky,
-)
+from lidarpainter_models.gaussians.model.rolling_shutter import MOST_GROWTH
+from lidarpainter_models.gaussians.model.scene_rendering import SceneRender
 from lidarpainter_models.gaussians.model.sky import SkyTexture
 from lidarpainter_models.gaussians.model.spatial_blocks import SpatialBlocks
-from lidarpainter_models.gaussians.model.styling.dressed import DressedScene
 from lidarpainter_models.gaussians.model.styling.scene_style import SceneStyle
+from lidarpainter_models.gaussians.model.styling.styled_gaussians import StyledGaussians
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.backends import Backend
 from lidarpainter_models.kernels.frustum_culling import MOST_SIGMAS
@@ -74,41 +71,85 @@ class GaussianScene:
     ) -> SceneRender:
         """Draw the view of `camera`, taken as it stands, at a time.
 
-        With `view_key` (a training view) the camera is first moved to its refined pose; with
-        `camera_name` the colours are exposed as that camera's. A recorded camera's image is drawn
-        as its shutter reads it; a scene in a style is drawn all at once.
+        Args:
+            camera: where it is drawn from; an image of a rolling shutter is drawn as it is read.
+            timestamp_ns: of the image, as recorded.
+            camera_name: whose exposure colours get; None leaves them as they are in the scene.
+            view_key: a training view, whose refined pose the camera is first moved to.
+            backend: of the rasteriser.
+        """
+        row = None if view_key is None else self.cameras.row_of(view_key)
+        if row is not None:
+            with torch.no_grad():
+                camera = camera.refined(self.cameras.world_from_camera(row))
+        drawable = self.drawable(camera, timestamp_ns)
+        return drawable.render(camera_name=camera_name, backend=backend)
+
+    def drawable(self, camera: Camera, timestamp_ns: int) -> DrawableScene:
+        """What the image of a camera is made of; without gradient.
+
+        Args:
+            camera: as it stands.
+            timestamp_ns: of the image, as recorded.
+
+        Raises:
+            ShapeError: Gaussians belong to bodies that the scene does not have.
         """
         with torch.no_grad():
-            row = None if view_key is None else self.cameras.row_of(view_key)
-            if row is not None:
-                camera = camera.refined(self.cameras.world_from_camera(row))
-            timestamp_ns = camera.taken_ns(timestamp_ns)
-            dressed = self._dressed
-            strengths = {} if dressed is None else dressed.style.strengths(timestamp_ns)
-            if dressed is not None and strengths:
-                drawn = dressed.render(camera, timestamp_ns, strengths, backend=backend)
-            else:
-                poses = self.actors.likely_poses(timestamp_ns)
-                bodies = camera_from_body(camera.world_from_camera, *poses)
-                gaussians = self._in_view(camera, bodies, timestamp_ns)
-                lit = self.blinking.lit(gaussians, timestamp_ns)
-                bent = self.actors.bending.bent(lit, timestamp_ns)
-                read = as_read(bent, bodies, camera, self.actors, timestamp_ns)
-                drawn = draw_over_sky(read, bodies, self.sky, camera, backend=backend)
-            return replace(drawn, rgb=self.exposure.apply(drawn.rgb, camera_name, timestamp_ns))
+            posed = self.posed(camera, camera.taken_ns(timestamp_ns))
+            styled, strengths = self._styled_at(posed.taken_ns)
+            if styled is not None:
+                return styled.drawable(posed, strengths, self.exposure)
+            rows = self._in_view(posed)
+            seen = self.gaussians if rows is None else self.gaussians.select(rows)
+            if rows is None:
+                rows = torch.arange(len(seen), device=self.device)
+            return DrawableScene(
+                posed=posed,
+                gaussians=posed.shown(seen),
+                rows=rows,
+                sky=self.sky,
+                exposure=self.exposure,
+            )
 
-    def _in_view(
-        self, camera: Camera, bodies: Float[Tensor, "bodies 4 4"], timestamp_ns: int
-    ) -> GaussianSet:
-        """The Gaussians that an image can show, and some more; of a running fit all."""
-        if self.gaussians.means.requires_grad:
-            return self.gaussians
-        moments = [bodies, *bodies_while_read(bodies, camera, self.actors, timestamp_ns)]
-        is_seen = self._blocks.in_view(
-            [(camera, moment) for moment in moments],
-            actor_slack_m=self.actors.bending.reach_m(timestamp_ns),
+    def posed(self, camera: Camera, taken_ns: int) -> PosedScene:
+        """The scene before a camera at any time; see `Actors.refined_poses`."""
+        poses = self.actors.refined_poses(taken_ns)
+        return PosedScene.of(self.actors, self.blinking, camera, taken_ns, poses=poses)
+
+    def posed_in_fit(
+        self,
+        camera: Camera,
+        taken_ns: int,
+        world_from_camera: Float[Tensor, "4 4"] | None = None,
+    ) -> PosedScene:
+        """The scene before a camera at a training time; differentiable in poses and bending.
+
+        `world_from_camera` is the camera's pose with its gradient; None lets none reach it.
+        """
+        return PosedScene.of(
+            self.actors,
+            self.blinking,
+            camera,
+            taken_ns,
+            poses=self.actors.refined_poses_in_fit(taken_ns),
+            world_from_camera=world_from_camera,
         )
-        return self.gaussians.select(is_seen.nonzero()[:, 0])
+
+    def gaussians_at(self, timestamp_ns: int | None) -> GaussianSet:
+        """All Gaussians at a time, in the frames of their bodies; None is on average of all."""
+        return gaussians_at(self.gaussians, self.actors, self.blinking, timestamp_ns)
+
+    def _in_view(self, posed: PosedScene) -> Int[Tensor, " seen"] | None:
+        """Rows of the Gaussians that an image can show, and some more; None is all.
+
+        Of a running fit, whose Gaussians move, those are all.
+        """
+        if self.gaussians.means.requires_grad:
+            return None
+        reach_m = self.actors.bending.reach_m(posed.taken_ns)
+        is_seen = self._blocks.in_view(posed.looks(), actor_slack_m=reach_m)
+        return is_seen.nonzero()[:, 0]
 
     @cached_property
     def _blocks(self) -> SpatialBlocks:
@@ -126,33 +167,20 @@ class GaussianScene:
             )
         return SpatialBlocks.of(self.gaussians, 1.001 * MOST_GROWTH * MOST_SIGMAS)
 
-    def corrected_camera(
-        self,
-        camera: Camera,
-        *,
-        timestamp_ns: int,
-        camera_name: str,
-        key: ViewKey | None = None,
-    ) -> Camera:
-        """A recorded camera at its refined pose.
-
-        A training view gets its own correction, any other time one interpolated from the training
-        views of the same camera (see `pose_blending`); a camera never trained on stays as it is.
-        """
-        return self.cameras.corrected(
-            camera, key=key, timestamp_ns=timestamp_ns, camera_name=camera_name
-        )
-
-    def found_camera(
+    def refined_camera(
         self, view: TrainingView | RecordedView, camera: Camera | None = None
     ) -> Camera:
-        """A view's camera, or the same at another size, as the fit found it."""
-        return self.corrected_camera(
-            view.camera if camera is None else camera,
-            timestamp_ns=view.timestamp_ns,
-            camera_name=view.key[1],
-            key=view.key,
-        )
+        """The camera of a recorded view at its refined pose.
+
+        A training view has a pose of its own; at any other time it is blended from those of the
+        same camera (see `pose_blending`). A camera never trained on stays as it was recorded.
+
+        Args:
+            view: which view.
+            camera: its camera at another size; None takes the view's own.
+        """
+        taken = view.camera if camera is None else camera
+        return self.cameras.refined(taken, view.key, view.timestamp_ns)
 
     @property
     def device(self) -> torch.device:
@@ -180,24 +208,24 @@ class GaussianScene:
         Air and wet roads look as from `eye_world`; None takes where the car was that recorded.
         Lamps light what they light, but do not shine into the camera themselves.
         """
-        dressed = self._dressed
-        strengths = {} if dressed is None else dressed.style.strengths(timestamp_ns)
-        if dressed is None or not strengths:
+        styled, strengths = self._styled_at(timestamp_ns)
+        if styled is None:
             return replace(self, style=None)
-        gaussians, sky = dressed.baked(timestamp_ns, strengths, eye_world)
+        gaussians, sky = styled.baked(timestamp_ns, strengths, eye_world)
         return replace(self, style=None, gaussians=gaussians, sky=sky)
 
+    def _styled_at(self, timestamp_ns: int) -> tuple[StyledGaussians | None, dict[str, float]]:
+        """The Gaussians in their style, and how strong it is; None where it changes nothing."""
+        strengths = {} if self.style is None else self.style.strengths(timestamp_ns)
+        return (self._styled, strengths) if strengths else (None, {})
+
     @cached_property
-    def _dressed(self) -> DressedScene | None:
-        """Of a scene in a style, which stays as it is."""
+    def _styled(self) -> StyledGaussians | None:
+        """What a style makes of the Gaussians, which stay as they are; None without a style."""
         if self.style is None:
             return None
-        return DressedScene(
-            gaussians=self.gaussians,
-            actors=self.actors,
-            blinking=self.blinking,
-            sky=self.sky,
-            style=self.style,
+        return StyledGaussians(
+            gaussians=self.gaussians, actors=self.actors, sky=self.sky, style=self.style
         )
 
     def with_gaussians(self, gaussians: GaussianSet) -> "GaussianScene":

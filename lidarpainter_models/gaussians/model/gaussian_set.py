@@ -58,7 +58,7 @@ class GaussianSet:
 
     @property
     def opacity(self) -> Float[Tensor, " gaussians"]:
-        """In (0, 1)."""
+        """Opacities in (0, 1)."""
         return self.opacity_logit.sigmoid()
 
     @property
@@ -82,6 +82,12 @@ class GaussianSet:
     def select(self, rows: Int[Tensor, " kept"]) -> "GaussianSet":
         """The given rows, detached."""
         return type(self)(**{name: value[rows] for name, value in self.columns().items()})
+
+    def of_body(self, body: int) -> "GaussianSet":
+        """The same rows as parts of one body, in whose frame they are taken to stand; detached."""
+        columns = self.columns()
+        columns["body_index"] = torch.full_like(columns["body_index"], body)
+        return type(self)(**columns)
 
     def append(self, other: "GaussianSet") -> "GaussianSet":
         """These rows followed by the other's, detached.
@@ -124,18 +130,3 @@ class GaussianSet:
             sh_rest=torch.zeros(0, (sh_degree + 1) ** 2 - 1, 3),
             body_index=torch.zeros(0, dtype=torch.int32),
         )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ShownGaussians:
-    """Gaussians ready to be drawn, with colours for one view."""
-
-    means: Float[Tensor, "gaussians 3"]
-    rotation_wxyz: Float[Tensor, "gaussians 4"]
-    scale_m: Float[Tensor, "gaussians 3"]
-    opacity: Float[Tensor, " gaussians"]
-    sh: Float[Tensor, "gaussians coefficients 3"]
-    body_index: Int[Tensor, " gaussians"]
-
-    def __len__(self) -> int:
-        return self.means.shape[0]

@@ -89,7 +89,7 @@ class RefinedTracks:
     def pose_at(
         self, body: int, query_s: float, recorded: Float[Tensor, "4 4"]
     ) -> Float[Tensor, "4 4"]:
-        """The most likely pose of one body at a time; see `poses_at`."""
+        """The refined pose of one body at a time; see `poses_at`."""
         time_s = torch.tensor([query_s], dtype=torch.float64)
         return self.poses_at(torch.tensor([body]), time_s, recorded[None])[0]
 
@@ -99,7 +99,7 @@ class RefinedTracks:
         query_s: Float[Tensor, " queries"],
         recorded: Float[Tensor, "queries 4 4"],
     ) -> Float[Tensor, "queries 4 4"]:
-        """The most likely poses of bodies at times with the given recorded poses."""
+        """The refined poses of bodies at any times, given the poses recorded there."""
         known_s, count = self.times_s[bodies], self._counts[bodies]
         after = torch.searchsorted(known_s, query_s[:, None])[:, 0]
         line = _samples(known_s, count, after, query_s, _LINE)

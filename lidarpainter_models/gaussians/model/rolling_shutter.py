@@ -9,16 +9,14 @@ rasteriser knows nothing of it, and gradients reach centres and sizes.
 """
 
 from dataclasses import replace
-from typing import TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.gaussians.model.actors import Actors
-from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
-from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
+from lidarpainter_models.gaussians.model.seen_gaussians import AnyGaussians
 from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.geometry.transforms import (
     rigid_from_tangent,
@@ -32,8 +30,6 @@ _NEAR_M = 0.05
 MOST_GROWTH = 2.0
 """By which an axis is made longer at most, or shorter: what passes right before a camera."""
 _FAR_AWAY_M = -1e5  # absent actors are put further behind the camera than anything is
-
-AnyGaussians = TypeVar("AnyGaussians", GaussianSet, SeenGaussians)
 
 
 def as_read(

@@ -11,8 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, ShownGaussians
-from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
+from lidarpainter_models.gaussians.model.seen_gaussians import DrawableGaussians
 from lidarpainter_models.gaussians.model.sky import SkyTexture
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid
@@ -22,10 +21,6 @@ from lidarpainter_models.kernels.gaussian_raster import SplatImage, Splats, rend
 OPAQUE = 1 - 1 / 512
 """From this opacity on the sky is not looked up: it would change no byte by more than half."""
 _FAR_BEHIND_M = -1e6
-
-
-DrawableGaussians = GaussianSet | SeenGaussians | ShownGaussians
-"""Gaussians in their bodies, as they are drawn."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,16 +62,16 @@ def draw_gaussians(
     camera: Camera,
     *,
     with_actor_alpha: bool = False,
-    channel: Float[Tensor, "gaussians 1"] | None = None,
+    channels: Float[Tensor, "gaussians channels"] | None = None,
     screen_gradient_out: Float[Tensor, " gaussians"] | None = None,
     backend: Backend = "auto",
 ) -> SplatImage:
     """Blend Gaussians whose bodies stand before the camera like this, without sky.
 
-    The image's features are the actors' alpha if it is wanted, then the `channel` if it is given.
+    The image's features are the actors' alpha if it is wanted, then the `channels` if given.
     """
     features = [(gaussians.body_index > 0).float()[:, None]] if with_actor_alpha else []
-    features += [] if channel is None else [channel]
+    features += [] if channels is None else [channels]
     splats = Splats(
         means=gaussians.means,
         rotation_wxyz=gaussians.rotation_wxyz,

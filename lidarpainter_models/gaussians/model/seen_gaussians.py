@@ -1,7 +1,12 @@
-"""The Gaussians that one step of a fit may see, as leaves that collect its gradients."""
+"""Gaussians with all their harmonics in one tensor.
+
+Such are those that a step of a fit may see, as leaves that collect its gradients, and those that a
+style has given other colours.
+"""
 
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -14,7 +19,7 @@ LEAVES = ("means", "rotation_wxyz", "log_scale", "opacity_logit", "sh")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SeenGaussians:
-    """Some rows of a Gaussian set, in order; all harmonics in one leaf, constant first."""
+    """Some rows of a Gaussian set, in order; all harmonics in one tensor, constant first."""
 
     rows: Int[Tensor, " seen"]
     """Where they stand in the set."""
@@ -40,6 +45,20 @@ class SeenGaussians:
             body_index=gaussians.body_index[rows],
         )
 
+    @classmethod
+    def of(
+        cls, gaussians: GaussianSet, sh: Float[Tensor, "gaussians coefficients 3"]
+    ) -> "SeenGaussians":
+        """All rows of a set, without gradient, in other colours."""
+        columns = gaussians.columns()
+        return cls(
+            rows=torch.arange(len(gaussians), device=sh.device),
+            **{name: columns[name] for name in ("means", "rotation_wxyz", "log_scale")},
+            opacity_logit=columns["opacity_logit"],
+            sh=sh,
+            body_index=columns["body_index"],
+        )
+
     def __len__(self) -> int:
         return self.rows.shape[0]
 
@@ -50,7 +69,7 @@ class SeenGaussians:
 
     @property
     def opacity(self) -> Float[Tensor, " seen"]:
-        """In (0, 1)."""
+        """Opacities in (0, 1)."""
         return self.opacity_logit.sigmoid()
 
     def twin(self) -> "SeenGaussians":
@@ -80,3 +99,8 @@ class SeenGaussians:
             name: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
             for name, leaf in leaves.items()
         }
+
+
+AnyGaussians = TypeVar("AnyGaussians", GaussianSet, SeenGaussians)
+DrawableGaussians = GaussianSet | SeenGaussians
+"""Gaussians in their bodies, as they are drawn."""

@@ -56,7 +56,7 @@ class SkyTexture:
     weight: Float[Tensor, "rows columns"]
     """How much clear image each texel has seen; 0 where the colour is a guess."""
     moments: TexelMoments
-    """Of the optimiser: a fit that goes on from this sky needs them."""
+    """Moments of the optimiser: a fit that goes on from this sky needs them."""
 
     @classmethod
     def constant(cls, layout: SkyLayout, rgb: Float[Tensor, "3"]) -> "SkyTexture":

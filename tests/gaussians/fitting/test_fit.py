@@ -102,7 +102,7 @@ def test_a_step_sees_what_only_the_first_row_shows(world):
     )
     view = replace(view, camera=camera)
     bodies = camera_from_body(
-        view.camera.world_from_camera, *actors.corrected_poses(view.timestamp_ns)
+        view.camera.world_from_camera, *actors.refined_poses_in_fit(view.timestamp_ns)
     )
     read = as_read(world.scene.gaussians, bodies, view.camera, actors, view.timestamp_ns)
     shown = draw_gaussians(read, bodies, view.camera).visible
@@ -186,9 +186,7 @@ def test_pose_refinement_recovers_a_known_rotation(world):
         ),
     )
     fitted = fit_gaussians(observations, config, start=start).scene
-    corrected = fitted.corrected_camera(
-        views[2].camera, timestamp_ns=2 * FRAME_NS, camera_name="front", key=(2, "front")
-    )
+    corrected = fitted.refined_camera(views[2])
     true = world.observations.views[2].camera.world_from_camera
     left_over = true[:3, :3].T @ corrected.world_from_camera[:3, :3]
     angle_rad = float((left_over - torch.eye(3).double()).norm()) / 2**0.5
@@ -198,10 +196,9 @@ def test_pose_refinement_recovers_a_known_rotation(world):
 def with_guidance_gradients(world, view, config, perceptual=None):
     """A state and its leaves after the gradients of one painted view."""
     state = FitState.begin(world.scene, config, WIDTH_PX * HEIGHT_PX)
-    poses = state.scene.actors.corrected_poses(view.timestamp_ns)
-    bodies = camera_from_body(view.camera.world_from_camera, *poses)
-    seen = state.seen({~0: [(view.camera, bodies)]})
-    add_guidance_gradients(state, seen, view, bodies, config, perceptual)
+    posed = state.scene.posed_in_fit(view.camera, view.timestamp_ns)
+    seen = state.seen({~0: posed.looks()})
+    add_guidance_gradients(state, seen, view, posed, config, perceptual)
     return state, seen
 
 

@@ -132,7 +132,7 @@ def wall_and_what_is_behind():
     gaussians.opacity_logit[:2] = 12.0
     camera = camera_at(0.0)
     scene = scene_of(gaussians, [camera])
-    return scene, camera, camera_from_body(camera.world_from_camera, *scene.actors.likely_poses(0))
+    return scene, camera, camera_from_body(camera.world_from_camera, *scene.actors.refined_poses(0))
 
 
 def test_a_probe_measures_the_pixels_that_each_gaussian_fills():

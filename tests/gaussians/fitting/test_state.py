@@ -33,7 +33,7 @@ def test_a_step_sees_its_own_part_of_the_street():
     scene, blocks = fit.state.scene, fit.state.blocks
     for row, image in enumerate(fit.images):
         pose = scene.cameras.world_from_camera(row).detach()
-        bodies = camera_from_body(pose, *scene.actors.corrected_poses(0))
+        bodies = camera_from_body(pose, *scene.actors.refined_poses_in_fit(0))
         rows = blocks.in_view([(image.camera.at(pose), bodies)]).nonzero()[:, 0]
         assert set((rows // 400).tolist()) == {row}
 

@@ -14,7 +14,6 @@ from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import add_guidance_gradients
 from lidarpainter_models.gaussians.initialisation import scene as first_scene
 from lidarpainter_models.gaussians.model.actors import Actors
-from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
 from lidarpainter_models.gaussians.model.stored_scene import copy_scene
 from lidarpainter_models.observations.preparation import prepare_observations
 from lidarpainter_models.observations.settings import ObservationConfig
@@ -54,10 +53,9 @@ def test_painted_views_leave_no_gradient_to_how_somebody_moves(world):
     )
     config = FitConfig(steps=4)
     state = FitState.begin(with_lattice(world.scene), config, painted.weight_u8.numel())
-    poses = state.scene.actors.corrected_poses(FRAME_NS)
-    bodies = camera_from_body(view.camera.world_from_camera, *poses)
-    seen = state.seen({~0: [(view.camera, bodies)]})
-    add_guidance_gradients(state, seen, painted, bodies, config)
+    posed = state.scene.posed_in_fit(view.camera, FRAME_NS)
+    seen = state.seen({~0: posed.looks()})
+    add_guidance_gradients(state, seen, painted, posed, config)
     assert state.scene.actors.bending.offset_m.grad is None
 
 

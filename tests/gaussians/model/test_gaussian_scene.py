@@ -102,9 +102,7 @@ def test_training_view_is_rendered_at_its_refined_pose(world):
     camera = world.observations.views[1].camera
     as_recorded = scene.render(camera, FRAME_NS).rgb
     refined = scene.render(camera, FRAME_NS, view_key=(1, "front")).rgb
-    moved = scene.corrected_camera(
-        camera, timestamp_ns=FRAME_NS, camera_name="front", key=(1, "front")
-    )
+    moved = scene.refined_camera(world.observations.views[1])
     assert torch.equal(scene.render(moved, FRAME_NS).rgb, refined)
     assert (as_recorded - refined).abs().max() > 0.05
 

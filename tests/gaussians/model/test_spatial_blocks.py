@@ -41,7 +41,7 @@ def view_at(scene, seed):
     twist = torch.randn(6, generator=torch.Generator().manual_seed(seed)).double()
     camera = camera_at(0.0)
     camera = camera.at(camera.world_from_camera @ rigid_from_tangent(twist))
-    bodies = camera_from_body(camera.world_from_camera, *scene.actors.likely_poses(0))
+    bodies = camera_from_body(camera.world_from_camera, *scene.actors.refined_poses(0))
     return camera, bodies
 
 
@@ -99,7 +99,7 @@ def test_moved_gaussian_is_found_after_a_refresh():
     blocks = SpatialBlocks.of(scene.gaussians, REACH_SIGMAS)
     view = (
         camera_at(0.0),
-        camera_from_body(camera_at(0.0).world_from_camera, *scene.actors.likely_poses(0)),
+        camera_from_body(camera_at(0.0).world_from_camera, *scene.actors.refined_poses(0)),
     )
     assert blocks.in_view([view]).tolist() == [False]
     gaussians.means[0, 0] = 30.0
@@ -122,7 +122,7 @@ def test_gaussians_that_are_not_finite_spoil_no_block():
 def test_absent_actor_is_out_of_view():
     scene = scene_of(scattered(500, 6), [camera_at(0.0)], [car_track(2)])
     camera = camera_at(0.0)
-    poses, present = scene.actors.likely_poses(0)
+    poses, present = scene.actors.refined_poses(0)
     bodies = camera_from_body(camera.world_from_camera, poses, torch.zeros_like(present))
     is_in_view = SpatialBlocks.of(scene.gaussians, REACH_SIGMAS).in_view([(camera, bodies)])
     assert bool((scene.gaussians.body_index[is_in_view] == 0).all())
@@ -131,7 +131,7 @@ def test_absent_actor_is_out_of_view():
 def test_slack_takes_in_an_actor_that_may_move_into_view():
     scene = scene_of(scattered(500, 7), [camera_at(0.0)], [car_track(2)])
     blocks, camera = SpatialBlocks.of(scene.gaussians, REACH_SIGMAS), camera_at(0.0)
-    poses, present = scene.actors.likely_poses(0)
+    poses, present = scene.actors.refined_poses(0)
     poses[0, 1, 3] = 40.0  # far to the left
     view = (camera, camera_from_body(camera.world_from_camera, poses, present))
     of_actor = [

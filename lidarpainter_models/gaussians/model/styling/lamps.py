@@ -58,7 +58,7 @@ class CarLamps:
     """1, or -1 for a box that drives backwards."""
     size_m: Float[Tensor, "cars 3"]
     changes: tuple[tuple[LampChange, ...], ...]
-    """Of each car."""
+    """What was switched of each car's lamps."""
 
     @classmethod
     def of(cls, actors: Actors, changes: Sequence[LampChange] = ()) -> "CarLamps":
@@ -82,7 +82,7 @@ class CarLamps:
         )
 
     def brightness(self, timestamp_ns: int) -> Float[Tensor, "cars 2"]:
-        """Of headlamps and of tail lamps at a time: 0 off, 1 on."""
+        """How bright headlamps and tail lamps are at a time: 0 off, 1 on."""
         shining = {"off": (0.0, 0.0), "on": (1.0, 1.0), "brake": (1.0, BRAKE)}
         told = [
             [one.state for one in own if one.first_ns <= timestamp_ns <= one.last_ns]
@@ -142,7 +142,7 @@ def fixed_lamps(place: StyledPlace) -> Lamps:
 
 
 def no_lamps(place: StyledPlace) -> Lamps:
-    """By day."""
+    """No lamps, as by day."""
     nothing = place.lamp_rgb.new_zeros(0, 3)
     return Lamps(
         position_world=nothing,

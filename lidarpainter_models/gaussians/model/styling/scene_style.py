@@ -44,7 +44,7 @@ class StyledPlace:
     white: Float[Tensor, ""]
     """Daylight of sunlit surfaces."""
     horizon_light: Float[Tensor, "3"]
-    """Of the clear sky, just above the horizon."""
+    """Light of the clear sky, just above the horizon."""
     lamp_position: Float[Tensor, "lamps 3"]
     """Street lamps and signals."""
     lamp_rgb: Float[Tensor, "lamps 3"]
@@ -52,11 +52,11 @@ class StyledPlace:
     """Irradiance a metre away."""
     lamp_radiance: Float[Tensor, " lamps"]
     window_centre: Float[Tensor, "windows 3"]
-    """Of lit windows."""
+    """Middles of lit windows."""
     window_along: Float[Tensor, "windows 3"]
     """Level unit vectors along their sills."""
     window_half_m: Float[Tensor, "windows 2"]
-    """Half of width and height."""
+    """Half the width and half the height of each window."""
     ego_times_ns: Int[Tensor, " frames"]
     """Ascending: the frames of the log."""
     ego_lamp: Float[Tensor, "frames 3"]
@@ -87,7 +87,7 @@ class SceneStyle:
     """Decides where puddles stand."""
     place: StyledPlace
     lamps: tuple[LampChange, ...] = ()
-    """Of actors; where two speak of one time the later one holds."""
+    """Lamps of actors that were switched; where two speak of one time the later one holds."""
 
     def strengths(self, timestamp_ns: int) -> dict[str, float]:
         """The strength of every style that changes anything at a time."""

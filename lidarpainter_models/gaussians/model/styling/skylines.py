@@ -19,7 +19,7 @@ CHUNK = 64
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Skylines:
-    """By place and equal sectors of azimuth, from x towards y."""
+    """What stands around places, by equal sectors of azimuth from x towards y."""
 
     of_surface: Int[Tensor, " gaussians"]
     """The place next to each wet surface; -1 for what is not wet."""

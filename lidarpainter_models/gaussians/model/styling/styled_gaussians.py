@@ -1,4 +1,4 @@
-"""A scene in its style at any time: Gaussians as a camera sees them, sky and lamps.
+"""Gaussians in a style at any time: the colours in which a camera sees them, their sky, lamps.
 
 What does not change from view to view is kept: surfaces, and the light of the strengths asked for
 last. A view costs a pass over the Gaussians in it.
@@ -6,20 +6,18 @@ last. A view costs a pass over the Gaussians in it.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.gaussians.model.actors import ActorPoses, Actors
-from lidarpainter_models.gaussians.model.blinking import Blinking
-from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, ShownGaussians
-from lidarpainter_models.gaussians.model.scene_rendering import (
-    SceneRender,
-    camera_from_body,
-    draw_over_sky,
-)
+from lidarpainter_models.gaussians.model.corrections import ExposureCorrections
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.model.posed_scene import DrawableScene, PosedScene
+from lidarpainter_models.gaussians.model.scene_rendering import SceneRender, camera_from_body
+from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
 from lidarpainter_models.gaussians.model.sky import SkyTexture
 from lidarpainter_models.gaussians.model.styling.glare import add_glare
 from lidarpainter_models.gaussians.model.styling.lamps import (
@@ -38,53 +36,49 @@ from lidarpainter_models.gaussians.model.styling.light import (
 from lidarpainter_models.gaussians.model.styling.scene_style import SceneStyle
 from lidarpainter_models.gaussians.model.styling.traits import SurfaceTraits, surface_traits
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.kernels.backends import Backend
 from lidarpainter_models.kernels.scene_light import Lamps, seen_harmonics
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class DressedScene:
-    """The parts of a scene and the style that they wear."""
+class StyledGaussians:
+    """The parts of a scene that a style changes, and the style."""
 
     gaussians: GaussianSet
     actors: Actors
-    blinking: Blinking
     sky: SkyTexture
     style: SceneStyle
     _lit: dict[tuple[tuple[str, float], ...], StyledLight] = field(
         default_factory=dict, init=False, repr=False
     )
-    """At most one, by strengths."""
+    """The light made last, by strengths; at most one."""
 
-    def render(
-        self,
-        camera: Camera,
-        timestamp_ns: int,
-        strengths: Mapping[str, float],
-        *,
-        backend: Backend = "auto",
-    ) -> SceneRender:
-        """The view of a camera with styles of these strengths."""
-        with torch.no_grad():
-            poses = self.actors.likely_poses(timestamp_ns)
-            bodies = camera_from_body(camera.world_from_camera, *poses)
-            light = self.light(strengths)
-            shown = self._shown(light, camera, bodies, poses, timestamp_ns)
-            shown = self.blinking.lit(shown, timestamp_ns)
-            shown = self.actors.bending.bent(shown, timestamp_ns)
-            drawn = draw_over_sky(shown, bodies, light.sky, camera, backend=backend)
-            night = strengths.get("night", 0.0)
-            if night == 0:
-                return drawn
-            rgb = add_glare(
-                drawn.rgb,
-                drawn.depth_m,
-                camera,
-                heads_at(self.style.place, self._cars, *poses, timestamp_ns),
-                strength=night,
-                extinction_per_m=light.surroundings.extinction_per_m,
-            )
-            return replace(drawn, rgb=rgb)
+    def drawable(
+        self, posed: PosedScene, strengths: Mapping[str, float], exposure: ExposureCorrections
+    ) -> DrawableScene:
+        """What the image of a posed scene is made of, with styles of these strengths."""
+        light = self.light(strengths)
+        sh = self._seen_sh(light, posed.camera, posed.bodies, posed.poses, posed.taken_ns)
+        styled = SeenGaussians.of(self.gaussians, sh)
+        return DrawableScene(
+            posed=posed,
+            gaussians=posed.shown(styled),
+            rows=styled.rows,
+            sky=light.sky,
+            exposure=exposure,
+            lens=partial(self._with_glare, posed, light) if "night" in strengths else None,
+        )
+
+    def _with_glare(self, posed: PosedScene, light: StyledLight, drawn: SceneRender) -> SceneRender:
+        """An image of the night with the lamps that shine into its camera."""
+        rgb = add_glare(
+            drawn.rgb,
+            drawn.depth_m,
+            posed.camera,
+            heads_at(self.style.place, self._cars, *posed.poses, posed.taken_ns),
+            strength=light.strengths["night"],
+            extinction_per_m=light.surroundings.extinction_per_m,
+        )
+        return replace(drawn, rgb=rgb)
 
     def baked(
         self,
@@ -98,14 +92,14 @@ class DressedScene:
         are, by default. What shines into a lens is left out.
         """
         with torch.no_grad():
-            poses = self.actors.likely_poses(timestamp_ns)
+            poses = self.actors.refined_poses(timestamp_ns)
             if eye_world is None:
                 eye_world = ego_beam(self.style.place, timestamp_ns)[0]
             world_from_eye = torch.eye(4, dtype=torch.float64)
             world_from_eye[:3, 3] = eye_world.double().cpu()
             light = self.light(strengths)
             bodies = camera_from_body(world_from_eye, *poses)
-            sh = self._shown(light, None, bodies, poses, timestamp_ns).sh
+            sh = self._seen_sh(light, None, bodies, poses, timestamp_ns)
             columns = self.gaussians.columns()
             columns |= {"sh_dc": sh[:, :1].contiguous(), "sh_rest": sh[:, 1:].contiguous()}
             return GaussianSet(**columns), light.sky
@@ -125,21 +119,22 @@ class DressedScene:
             )
         return self._lit[key]
 
-    def _shown(
+    def _seen_sh(
         self,
         light: StyledLight,
         camera: Camera | None,
         bodies: Float[Tensor, "bodies 4 4"],
         poses: ActorPoses,
         timestamp_ns: int,
-    ) -> ShownGaussians:
+    ) -> Float[Tensor, "gaussians coefficients 3"]:
+        """Harmonics of every Gaussian as a camera sees it; of None, as from where it stands."""
         like = self.gaussians.means
         lamps = no_lamps(self.style.place)
         if "night" in light.strengths:
             fixed = self._fixed_lamps
             lamps = lamps_at(self.style.place, fixed, self._cars, *poses, timestamp_ns)
         street = torch.eye(4, dtype=torch.float64, device=poses[0].device)[None]
-        sh = seen_harmonics(
+        return seen_harmonics(
             self._traits.surfaces,
             light.appearance,
             light.surroundings,
@@ -147,19 +142,6 @@ class DressedScene:
             camera,
             torch.cat([street, poses[0]]).to(like.device),
             bodies.to(like.device),
-        )
-        return replace(self._undressed, sh=sh)
-
-    @cached_property
-    def _undressed(self) -> ShownGaussians:
-        columns = self.gaussians.columns()
-        return ShownGaussians(
-            means=columns["means"],
-            rotation_wxyz=columns["rotation_wxyz"],
-            scale_m=columns["log_scale"].exp(),
-            opacity=columns["opacity_logit"].sigmoid(),
-            sh=columns["sh_dc"],
-            body_index=columns["body_index"],
         )
 
     @cached_property
