@@ -4,10 +4,11 @@ What the user has set stays as it is.
 """
 
 import ctypes
-import math
 import os
 import tempfile
 from pathlib import Path
+
+from tasks.job_limits import usable_cores
 
 PREFECT = {
     "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "120",
@@ -24,8 +25,6 @@ THREADS = {
 KEPT_BYTES = 32 << 20
 """Largest freed block that the C library keeps for the next use: as far as glibc goes by itself."""
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8  # of malloc.h
-CPU_LIMIT = Path("/sys/fs/cgroup/cpu.max")
-"""Quota and period in microseconds, where a container has one."""
 
 
 def prepare_environment(*, log_level: str | None = "CRITICAL") -> None:
@@ -57,18 +56,6 @@ def _keep_freed_memory() -> None:
         adjust(M_MMAP_THRESHOLD, KEPT_BYTES)
         adjust(M_TRIM_THRESHOLD, 2 * KEPT_BYTES)
         adjust(M_ARENA_MAX, 1)
-
-
-def usable_cores(cpu_limit: Path = CPU_LIMIT) -> int:
-    """Cores that this process may run on: its affinity, and a container's quota rounded up."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    try:
-        quota, period = cpu_limit.read_text("ascii").split()
-    except (OSError, ValueError):
-        quota, period = "max", "1"
-    if quota != "max":
-        cores = min(cores or 1, math.ceil(int(quota) / int(period)))
-    return max(cores or 1, 1)
 
 
 def _has_cache_folder() -> bool:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from catalog.folders import nearest_existing
-from tasks.machine import machine_memory_bytes
+from tasks.job_limits import usable_memory_bytes
 
 Verdict = Literal["ok", "warn", "fail"]
 PYTHON_RANGE = ((3, 11), (3, 14))
@@ -136,7 +136,7 @@ def _rasteriser() -> Finding:
 
 
 def _memory() -> Finding:
-    total = machine_memory_bytes()
+    total = usable_memory_bytes()
     verdict: Verdict = "ok" if total >= MIN_MEMORY_BYTES else "warn"
     return Finding("memory", verdict, f"{total / 1e9:.1f} GB")
 

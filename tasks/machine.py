@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import lidarpainter_models
+from tasks.job_limits import usable_cores, usable_memory_bytes
 
 if TYPE_CHECKING:
     import torch
 
 PACKAGES = ("torch", "numba", "numpy")
 _CPU_FACTS = Path("/proc/cpuinfo")
-MEMORY_LIMIT = Path("/sys/fs/cgroup/memory.max")
-"""Bytes, where a container has a limit."""
 
 
 def machine(device: "torch.device") -> dict[str, str]:
@@ -26,8 +25,8 @@ def machine(device: "torch.device") -> dict[str, str]:
     return {
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "processor": _processor(),
-        "cores": f"{_usable_cores()} to be used of {os.cpu_count()}",
-        "memory": f"{machine_memory_bytes() / 1e9:.1f} GB",
+        "cores": f"{usable_cores()} to be used of {os.cpu_count()}",
+        "memory": f"{usable_memory_bytes() / 1e9:.1f} GB",
         "device": f"{device.type}, {torch.cuda.get_device_name(device)}" if is_gpu else device.type,
         "system": platform.platform(),
         "versions": ", ".join(
@@ -40,16 +39,6 @@ def machine(device: "torch.device") -> dict[str, str]:
     }
 
 
-def machine_memory_bytes(limit: Path = MEMORY_LIMIT) -> float:
-    """Memory of this machine, or of its container."""
-    memory = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    try:
-        allowed = limit.read_text("ascii").strip()
-    except OSError:
-        return memory
-    return memory if allowed == "max" else min(memory, float(allowed))
-
-
 def _processor() -> str:
     """The model, which only the system's own table names on Linux."""
     try:
@@ -58,13 +47,6 @@ def _processor() -> str:
         lines = []
     models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     return next(iter(models), "") or platform.processor() or platform.machine()
-
-
-def _usable_cores() -> int:
-    """Cores that this process may run on."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _version(name: str) -> str:

@@ -6,7 +6,7 @@ from catalog.fleets import FleetLedger
 from catalog.leases import Lease, Leases
 from catalog.tables import Row
 from flows.fleet.manifest import Budget
-from tasks.machine import machine_memory_bytes
+from tasks.job_limits import usable_memory_bytes
 
 GIGABYTE = 1e9
 MEMORY_SHARE = 0.9
@@ -52,7 +52,7 @@ def work_here(leases: Leases) -> list[Lease]:
 
 def fits_beside(others: Sequence[Lease], num_bytes: float, budget: Budget) -> bool:
     """Whether there is memory for a sequence beside others; alone it always fits."""
-    limit = budget.memory_gb * 1e9 if budget.memory_gb else MEMORY_SHARE * machine_memory_bytes()
+    limit = budget.memory_gb * 1e9 if budget.memory_gb else MEMORY_SHARE * usable_memory_bytes()
     return not others or num_bytes + sum(map(_planned_bytes, others)) <= limit
 
 

@@ -2,7 +2,8 @@ import os
 
 import pytest
 
-from flows.environment import prepare_environment, usable_cores
+from flows.environment import prepare_environment
+from tasks.job_limits import usable_cores
 
 
 @pytest.fixture
@@ -25,13 +26,3 @@ def test_thread_count_of_the_user_stays():
     os.environ["NUMBA_NUM_THREADS"] = "7"
     prepare_environment()
     assert os.environ["NUMBA_NUM_THREADS"] == "7"
-
-
-@pytest.mark.parametrize(
-    ("limit", "cores"), [("50000 100000", 1), ("100000 100000", 1), ("max 100000", None)]
-)
-def test_quota_of_a_container_counts_as_cores(tmp_path, limit, cores):
-    path = tmp_path / "cpu.max"
-    path.write_text(limit)
-    unlimited = usable_cores(tmp_path / "absent")
-    assert usable_cores(path) == (unlimited if cores is None else cores)
