@@ -42,7 +42,7 @@ def demo(
     if first_image is not None:
         write_png(_first_view(street), first_image)
     keep_street(store_path, street)
-    return reconstruct.fn(parameters, store_path)  # its tasks, without the cost of a subflow
+    return reconstruct(parameters, store_path)  # its tasks, without the cost of a subflow
 
 
 def _first_view(config: SyntheticStreetConfig) -> Float[Tensor, "height width 3"]:

@@ -31,8 +31,8 @@ class ViewParameters(BaseModel):
     """Cameras to train on and to judge; None takes all."""
     observation: ObservationConfig
     painter: str
-    """Name of a painter, path of its weights or model, or `none`: then the fit goes on as long
-    without painted views, which is the control for the painted one."""
+    """Name of a painter, path of its weights or model, or `none`: then the fit is continued
+    as long without painted views, which is the control for the painted one."""
     device: str = "auto"
     """Where fits, painters and judges run: `cpu`, `cuda`, `cuda:1`; `auto` takes a GPU if any."""
     kernels: KernelChoice = "auto"
@@ -61,7 +61,7 @@ class ViewParameters(BaseModel):
         return SplitSpec(scene_id=self.scene, spec=self.split, cameras=self.train_cameras)
 
     def run_spec(self, store_path: Path, *, painter: str | None = None) -> RunSpec:
-        """What a run works on; another painter may stand in at view time."""
+        """Return what a run works on; another painter may stand in at view time."""
         return RunSpec(
             store_path=store_path,
             split=self.split_spec,
@@ -80,9 +80,9 @@ class ReconstructParameters(ViewParameters):
     """The fit to what was recorded."""
     novel: NovelGuidanceConfig
     rounds: int = Field(ge=0)
-    """How often views are painted and the fit goes on."""
+    """How many rounds there are: views are painted, and the fit is continued with them."""
     refine: FitConfig
-    """The fit of one round."""
+    """The continued fit of one round."""
     judge: bool = True
     """Judge the scene; one that is not judged has no scores, and `evaluate` can judge it later."""
     examine: bool = False
@@ -93,19 +93,20 @@ class ReconstructParameters(ViewParameters):
     """Also judge what the final scene shows when it is painted at view time."""
 
     @property
-    def stages(self) -> dict[str, int | None]:
-        """What a run goes through, in order: the steps of fits that are set, None for all else."""
+    def stages(self) -> tuple[str, ...]:
+        """Names of the stages that a run goes through, in order."""
         paints = fitted_on(self.painter) == "painted"
-        stages: dict[str, int | None] = {"prepare": None, "fit": self.fit.steps or None}
-        for number in range(1, self.rounds + 1):
-            stages |= {f"paint-{number}": None} if paints else {}
-            stages[f"refine-{number}"] = self.refine.steps or None
+        rounds = [
+            name
+            for number in range(1, self.rounds + 1)
+            for name in (*([f"paint-{number}"] if paints else []), f"refine-{number}")
+        ]
         judged = ["evaluate-unpainted", "evaluate"]
         judged += ["evaluate-view-time"] if self.judge_view_time and paints else []
-        judged += ["envelope"]
         first = ["examine"] if self.examines else []
         last = ["report"] if self.report else []
-        return stages | dict.fromkeys([*first, *(judged if self.judge else ()), *last])
+        after = [*first, *([*judged, "envelope"] if self.judge else []), *last]
+        return ("prepare", "fit", *rounds, *after)
 
     @property
     def examines(self) -> bool:

@@ -1,4 +1,4 @@
-"""One sequence, from stored scene to a fitted, painted, judged and reported one."""
+"""One sequence, from stored scene to a fitted, painted, evaluated and reported one."""
 
 import time
 from dataclasses import dataclass, field
@@ -27,11 +27,10 @@ from tasks.opened import opened
 from tasks.progress import working_on
 from tasks.reconstruction.examine import STAGE as EXAMINE
 from tasks.reconstruction.examine import examine, suspicions
-from tasks.reconstruction.fit import fit
+from tasks.reconstruction.fit import fit, refine
 from tasks.reconstruction.paint import paint
 from tasks.reconstruction.prepare import prepare
 from tasks.reconstruction.publish import begin_run, complete_run
-from tasks.reconstruction.refine import refine
 from tasks.reconstruction.report import REPORT_FILE, ReportInputs, write_report
 from tasks.source import code_behind
 from tasks.specs import FittedRef, RunSpec
@@ -60,22 +59,36 @@ class Course:
         return result
 
 
-@flow(name="reconstruct")
 def reconstruct(parameters: ReconstructParameters, store_path: Path) -> dict[str, Any]:
-    """Fit a scene, paint shifted views of it, go on fitting with them, judge and report.
+    """Fit a scene, paint shifted views of it, continue the fit with them, evaluate and report.
 
     A run that is complete and unchanged is recalled: nothing is computed or written.
+
+    Args:
+        parameters: of the run.
+        store_path: folder or address of the store.
+
+    Returns:
+        What `lidarpainter reconstruct --json` prints.
+
+    Raises:
+        LidarPainterError: see `check_inputs`.
     """
     if (known := recalled(parameters, store_path)) is not None:
         return known
     check_inputs(parameters, store_path)
-    run = parameters.run_spec(store_path)
-    store = open_store(store_path)
+    return reconstruct_flow.fn(parameters, store_path)
+
+
+@flow(name="reconstruct")
+def reconstruct_flow(parameters: ReconstructParameters, store_path: Path) -> dict[str, Any]:
+    """Make a run whose inputs are checked, see `reconstruct`; Prefect shows its stages."""
+    run, store = parameters.run_spec(store_path), open_store(store_path)
     run_id, source_digest = run_identity(parameters, store), code_behind(START).digest
     with store.run_lock(run_id), working_on(scene=parameters.scene, run=run_id):
         record = begin_run(run, run_id, source_digest, parameters.preset, parameters)
         with early_end_recorded(store_path, record):
-            return _run(Course(parameters=parameters, run=run, record=record))
+            return _run(Course(parameters=parameters, run=run, record=record), store)
 
 
 def check_inputs(parameters: ReconstructParameters, store_path: Path) -> None:
@@ -114,24 +127,23 @@ def reconstruct_scene(
         store: folder of the store; by default what `LIDARPAINTER_STORE` says on the worker.
     """
     parameters = with_overrides(preset_named(preset, scene), settings)
-    return reconstruct.fn(parameters, open_store(store).address)
+    return reconstruct(parameters, open_store(store).address)
 
 
-def _run(course: Course) -> dict[str, Any]:
+def _run(course: Course, store: Store) -> dict[str, Any]:
     started = time.perf_counter()
     parameters, run = course.parameters, course.run
     seen = course.add("prepare", prepare(run, parameters.observation))
-    lpips = parameters.lpips
-    first = course.add("fit", fit(run, "fit", seen.ref, parameters.fit, lpips=lpips))
-    fitted = FittedRef(seen.ref, first.ref)
-    final = _rounds(course, fitted)
-    store = open_store(run.store_path)
+    first = fit(run, "fit", seen.ref, parameters.fit, lpips=parameters.lpips)
+    fitted = final = FittedRef(seen.ref, course.add("fit", first).ref)
+    for number in range(1, parameters.rounds + 1):
+        final = _round(course, final, number)
     if parameters.examines:
         course.add(EXAMINE, examine(run))
     scores = _judged(course, store, fitted, final) if parameters.judge else {}
     result = _result(course, scores, final)
     if parameters.report:
-        _report(course, result, fitted, final)
+        _report(course, store, result, fitted, final)
     result["seconds"]["total"] = time.perf_counter() - started
     refs = tuple(stage.ref for stage in course.stages.values())
     # the catalog calls it what it is
@@ -139,12 +151,43 @@ def _run(course: Course) -> dict[str, Any]:
         fitted_on(parameters.painter) if name == "painted" else name: found
         for name, found in scores.items()
     }
-    return located(complete_run(run.store_path, course.record, result, scores, refs), store)
+    return located(complete_run(store.address, course.record, result, scores, refs), store)
 
 
-def _report(course: Course, result: dict[str, Any], unpainted: FittedRef, final: FittedRef) -> None:
+def _round(course: Course, fitted: FittedRef, number: int) -> FittedRef:
+    """Paint views of a fitted scene and continue its fit with them.
+
+    Without a painter the fit is continued alone, just as long. A round that made views worse is
+    taken back and made again like that, so that painting costs time there and nothing else.
+    """
+    parameters, run, stage = course.parameters, course.run, f"refine-{number}"
+    if parameters.painter != NO_PAINTER:
+        novel = parameters.novel.in_round(number, parameters.rounds)
+        conditions, name = parameters.conditions, f"paint-{number}"
+        painted = paint(run, name, fitted, novel, conditions, start_frame=number - 1)
+        guidance = course.add(name, painted).ref
+        config, lpips = parameters.refine, parameters.lpips
+        refined = refine(run, stage, fitted, config, guidance=guidance, lpips=lpips)
+        course.add(stage, refined)
+        gain = refined.summary["gain"]
+        if gain is None or not gain["is_taken_back"]:
+            return FittedRef(fitted.observations, refined.ref)
+        stage = f"{stage}-unpainted"
+    alone = fit(
+        run,
+        stage,
+        fitted.observations,
+        parameters.refine,
+        start=fitted.gaussians,
+        lpips=parameters.lpips,
+    )
+    return FittedRef(fitted.observations, course.add(stage, alone).ref)
+
+
+def _report(
+    course: Course, store: Store, result: dict[str, Any], unpainted: FittedRef, final: FittedRef
+) -> None:
     """Write the page about a run, and enter it into the result."""
-    run, store = course.run, open_store(course.run.store_path)
     page = ReportInputs(
         result=result,
         source_digest=course.record.source_digest,
@@ -152,69 +195,12 @@ def _report(course: Course, result: dict[str, Any], unpainted: FittedRef, final:
         final=final,
         stages=dict(course.stages),
     )
-    report = course.add("report", write_report(run, page, course.parameters.judge_config))
+    report = course.add("report", write_report(course.run, page, course.parameters.judge_config))
     result["artefacts"]["report"] = report.ref.artefact_id
     result["report"] = store.name_of(store.artefacts.folder(report.ref) / REPORT_FILE)
     result["seconds"]["report"] = report.seconds
     result["cpu_seconds"]["report"] = report.cpu_seconds
     result["computed_now"]["report"] = report.is_new
-
-
-def _rounds(course: Course, fitted: FittedRef) -> FittedRef:
-    """Paint and go on fitting; without a painter the fit goes on alone, just as long."""
-    is_unpainted = course.parameters.painter == NO_PAINTER
-    for number in range(1, course.parameters.rounds + 1):
-        stage = f"refine-{number}"
-        if is_unpainted:
-            refined = _unpainted(course, fitted, stage)
-        else:
-            refined = _painted(course, fitted, stage, number)
-        fitted = FittedRef(fitted.observations, refined.ref)
-    return fitted
-
-
-def _unpainted(course: Course, fitted: FittedRef, stage: str) -> StageResult:
-    """The control of a painted round."""
-    parameters = course.parameters
-    found = fit(
-        course.run,
-        stage,
-        fitted.observations,
-        parameters.refine,
-        start=fitted.gaussians,
-        lpips=parameters.lpips,
-    )
-    return course.add(stage, found)
-
-
-def _painted(course: Course, fitted: FittedRef, stage: str, number: int) -> StageResult:
-    """Paint views of a fitted scene, and go on fitting with them.
-
-    A round that made views worse is taken back and made again as its control is, so that painting
-    costs time there and nothing else.
-    """
-    parameters = course.parameters
-    painted = paint(
-        course.run,
-        f"paint-{number}",
-        fitted,
-        parameters.novel.in_round(number, parameters.rounds),
-        parameters.conditions,
-        start_frame=number - 1,
-    )
-    found = refine(
-        course.run,
-        stage,
-        fitted,
-        parameters.refine,
-        guidance=course.add(f"paint-{number}", painted).ref,
-        lpips=parameters.lpips,
-    )
-    refined = course.add(stage, found)
-    gain = refined.summary["gain"]
-    if gain is not None and gain["is_taken_back"]:
-        return _unpainted(course, fitted, f"{stage}-unpainted")
-    return refined
 
 
 def _judged(
@@ -240,7 +226,7 @@ def _judged(
 
 
 def _result(course: Course, scores: dict[str, Scores], final: FittedRef) -> dict[str, Any]:
-    """What `reconstruct --json` prints, but for the report."""
+    """Return what `reconstruct --json` prints, but for the report."""
     parameters, stages = course.parameters, course.stages
     last_fit = next(stage for stage in stages.values() if stage.ref == final.gaussians)
     return {

@@ -91,7 +91,7 @@ def fits_of(store: Store, seed: int) -> Iterator[tuple[str, MovedViews]]:
     """The first fit and the last one of a street, made where they are not there."""
     if street_id(seed) not in store.scene_ids():
         ingest_street.fn(store.address, street_of(seed))
-    result = reconstruct.fn(parameters_of(seed), store.address)
+    result = reconstruct(parameters_of(seed), store.address)
     run = open_run(store, result["run_id"])
     for name, fitted in (("first", run.unpainted), ("last", run.final)):
         observation = view_parameters(run).observation

@@ -8,46 +8,28 @@ not hear each other.
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Protocol
 
 
-class ProgressListener(Protocol):
-    """Hears about stages; a stage is named by the word used in `seconds` of the results."""
+class ProgressListener:
+    """Hears about stages, and says nothing unless a method is written anew.
+
+    A stage is named by the word used in `seconds` of the results.
+    """
 
     def started(self, stage: str) -> None:
         """A stage begins."""
-        ...
 
     def advanced(self, stage: str, done: float, total: float, note: str) -> None:
         """A part of a stage is done; `note` is a short figure worth showing, or empty."""
-        ...
 
     def waiting(self, stage: str, process_id: str) -> None:
         """Another process computes the same; this one waits for its result."""
-        ...
 
     def finished(self, stage: str, seconds: float, *, is_new: bool) -> None:
         """A stage is over; `is_new` tells whether it was computed now."""
-        ...
 
 
-class Silence:
-    """Listens to nothing."""
-
-    def started(self, stage: str) -> None:
-        """Ignore it."""
-
-    def advanced(self, stage: str, done: float, total: float, note: str) -> None:
-        """Ignore it."""
-
-    def waiting(self, stage: str, process_id: str) -> None:
-        """Ignore it."""
-
-    def finished(self, stage: str, seconds: float, *, is_new: bool) -> None:
-        """Ignore it."""
-
-
-_SILENCE = Silence()
+_SILENCE = ProgressListener()
 _listener: ContextVar[ProgressListener | None] = ContextVar("progress_listener", default=None)
 
 
@@ -60,7 +42,7 @@ _subject: ContextVar[Mapping[str, str] | None] = ContextVar("progress_subject", 
 
 
 def subject() -> Mapping[str, str]:
-    """What is worked on in this context: `scene` and `run`, as far as they are known."""
+    """Return what is worked on in this context: `scene` and `run`, as far as they are known."""
     return _subject.get() or {}
 
 
@@ -79,7 +61,7 @@ Progress = Callable[..., None]
 
 
 def progress_of(stage: str) -> Progress:
-    """What a stage calls with how much is done of how much, and perhaps a short figure."""
+    """Return what a stage calls with how much is done of how much, and perhaps a short figure."""
 
     def advanced(done: float, total: float, note: str = "") -> None:
         listener().advanced(stage, done, total, note)

@@ -18,7 +18,7 @@ class FinishedRun:
     run_id: str
     scene_id: str
     parameters: dict[str, Any]
-    """As JSON; the flow's model reads them."""
+    """Parameters as JSON; the flow's model reads them."""
     result: dict[str, Any]
     unpainted: FittedRef
     """After the first fit."""

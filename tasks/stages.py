@@ -29,7 +29,7 @@ from tasks.progress import Progress, listener, progress_of
 from tasks.source import project_source
 
 SHOWN_DIGITS = 8
-"""Of a digest, where people read it."""
+"""Digits of a digest, where people read it."""
 _LOG = logging.getLogger("lidarpainter")
 RETRIES = 2
 RETRY_DELAY_S = 3

@@ -3,6 +3,7 @@
 Each kind has one file of tensors (`FILES`); reading one checks every byte first.
 """
 
+import csv
 from functools import lru_cache
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from tasks.json_files import read_json, write_json
 
 OBSERVATIONS_FILE = "observations.safetensors"
 SCENE_FILE = "scene.safetensors"
-HISTORY_FILE = "history.json"
+HISTORY_FILE, HISTORY_TABLE = "history.json", "history.csv"
 
 
 History = list[dict[str, float]]
@@ -44,9 +45,14 @@ def _observations(store: Store, ref: ArtefactRef, path: Path, *_as_it_is: int) -
 
 
 def save_scene(folder: Path, scene: GaussianScene, history: History) -> None:
-    """Write a fitted scene and the course of its fit into a folder."""
+    """Write a fitted scene and the course of its fit, as JSON and as a table, into a folder."""
     write_tensors(folder / SCENE_FILE, *scene_to_arrays(scene))
     write_json(folder / HISTORY_FILE, history)
+    if history:
+        with (folder / HISTORY_TABLE).open("w", encoding="ascii", newline="") as file:
+            table = csv.DictWriter(file, history[0].keys())
+            table.writeheader()
+            table.writerows(history)
 
 
 def load_scene(store: Store, ref: ArtefactRef) -> GaussianScene:

@@ -12,65 +12,90 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TaskID, Tex
 from rich.text import Text
 
 from flows.cli.output import clear_status, loudness
-from flows.cli.stage_times import Clock, as_clock
-from tasks.progress import ProgressListener, Silence, listening
+from tasks.progress import ProgressListener, listening
 
 if TYPE_CHECKING:
+    from flows.time_prediction import Clock
     from lidarpainter_models.kernels.compile_clock import CompileClock
 
 LINE_EVERY_S = 30.0
 """How often a stage says how far it is where no bar can be drawn."""
 
 
-def how_far(clock: Clock, stage: str, done: float, total: float | None, note: str = "") -> str:
-    """What is known of a stage that goes on: `620/1500 41 %, 0:31 gone, 0:48 left; run ...`.
+MOST_SHOWN = 0.99
+"""Part of a stage that is shown at most until it is over: what it made is still to be written."""
+
+
+def how_far(clock: "Clock", stage: str, done: float, total: float | None, note: str = "") -> str:
+    """Return what is known of a stage under way, such as `stage 4 of 11, 41 %, 0:31 gone, ...`.
 
     What is left goes unsaid where a stage, or the last of a run, takes longer than was thought.
+
+    Args:
+        clock: that follows the run.
+        stage: its name.
+        done: how much of it is done.
+        total: of how much; None or 0 where that is not known.
+        note: a figure worth showing.
     """
-    share = f"{100 * done / max(total, 1e-9):.0f} %" if total else ""
+    share = f"{100 * min(done / total, MOST_SHOWN):.0f} %" if total else ""
     if total and total > 1:
         share = f"{done:.0f}/{total:.0f} {share}"
     times = _times(clock.elapsed(stage), clock.left(stage))
     if stage in clock.expected:
-        times += f"; run {_times(clock.elapsed(), clock.run_left(stage))}"
-    return ", ".join(part for part in (share, times, note) if part)
+        times += f"; {_of_run(clock, stage)}"
+    return ", ".join(part for part in (clock.place(stage), share, times, note) if part)
+
+
+def _of_run(clock: "Clock", stage: str) -> str:
+    return f"run {_times(clock.elapsed(), clock.run_left(stage))}"
 
 
 def _times(gone: float, left: float | None) -> str:
+    from flows.time_prediction import as_clock
+
     return f"{as_clock(gone)} gone" + (f", {as_clock(left)} left" if left else "")
 
 
 class HowFar(ProgressColumn):
     """The figures of a stage, as they are whenever the bar is drawn."""
 
-    def __init__(self, clock: Clock) -> None:
+    def __init__(self, clock: "Clock") -> None:
         super().__init__()
         self._clock = clock
 
     def render(self, task: Task) -> Text:
-        """The text beside a bar."""
+        """Return the text beside a bar."""
         if said := task.fields["said"]:
             return Text(said)
-        note = task.fields["note"]
-        return Text(how_far(self._clock, task.description, task.completed, task.total, note))
+        done, total = task.fields["done"], task.total
+        return Text(how_far(self._clock, task.description, done, total, task.fields["note"]))
 
 
-class Bars:
+class Bars(ProgressListener):
     """One bar per stage on a terminal."""
 
-    def __init__(self, progress: Progress, clock: Clock) -> None:
+    def __init__(self, progress: Progress, clock: "Clock") -> None:
         self._progress, self._clock = progress, clock
         self._tasks: dict[str, TaskID] = {}
 
     def started(self, stage: str) -> None:
         """Draw an empty bar."""
         self._clock.started(stage)
-        self._tasks[stage] = self._progress.add_task(stage, total=None, note="", said="")
+        self._tasks[stage] = self._progress.add_task(stage, total=None, note="", said="", done=0.0)
 
     def advanced(self, stage: str, done: float, total: float, note: str) -> None:
-        """Fill the bar."""
-        self._clock.advanced(stage, done / max(total, 1e-9))
-        self._progress.update(self._tasks[stage], completed=done, total=total, note=note, said="")
+        """Fill the bar, but for its end."""
+        share = done / max(total, 1e-9)
+        self._clock.advanced(stage, share)
+        self._progress.update(
+            self._tasks[stage],
+            completed=min(share, MOST_SHOWN) * total,
+            total=total,
+            note=note,
+            said="",
+            done=done,
+        )
 
     def waiting(self, stage: str, process_id: str) -> None:
         """Say whom the stage waits for."""
@@ -84,17 +109,19 @@ class Bars:
         self._progress.update(self._tasks[stage], completed=1, total=1, said=said)
 
 
-class Lines:
+class Lines(ProgressListener):
     """A line per event, and one every half minute within a stage."""
 
-    def __init__(self, clock: Clock) -> None:
+    def __init__(self, clock: "Clock") -> None:
         self._clock = clock
         self._said_s: dict[str, float] = {}
 
     def started(self, stage: str) -> None:
-        """Start the clock of the stage."""
+        """Start the clock of the stage; say which of a run's it is."""
         self._clock.started(stage)
         self._said_s[stage] = time.monotonic()
+        if place := self._clock.place(stage):
+            sys.stderr.write(f"{stage}: {place} begins; {_of_run(self._clock, stage)}\n")
 
     def advanced(self, stage: str, done: float, total: float, note: str) -> None:
         """Say how far the stage is, not too often."""
@@ -142,22 +169,28 @@ class _Compiling:
 
 
 @contextmanager
-def shown_progress(expected: Mapping[str, float] | None = None) -> Iterator[ProgressListener]:
+def shown_progress(
+    expected: Mapping[str, float] | None = None, *, is_told_by_past: bool = True
+) -> Iterator[ProgressListener]:
     """Show the progress of every stage that runs inside the block, as loud as was chosen.
 
     Args:
-        expected: seconds that every stage will take, in order, see `stage_times`.
+        expected: seconds that every stage will take, in order, see `flows.time_prediction`.
+        is_told_by_past: whether past runs tell of them.
     """
+    from flows.time_prediction import Clock
+
     clear_status()
     if loudness() == "quiet":
-        yield Silence()  # nobody listens
+        yield ProgressListener()  # nobody listens
         return
     log, lines = logging.getLogger("lidarpainter"), SaidLines()
     if loudness() == "verbose":
         log.setLevel(logging.INFO)
         log.addHandler(lines)
     compiling = _Compiling()
-    clock = Clock(expected=expected or {}, compiled=compiling)
+    told = bool(expected) and is_told_by_past
+    clock = Clock(expected=expected or {}, is_told_by_past=told, compiled=compiling)
     try:
         with _listener(clock) as listener, listening(listener):
             yield listener
@@ -167,7 +200,7 @@ def shown_progress(expected: Mapping[str, float] | None = None) -> Iterator[Prog
 
 
 @contextmanager
-def _listener(clock: Clock) -> Iterator[ProgressListener]:
+def _listener(clock: "Clock") -> Iterator[ProgressListener]:
     console = Console(stderr=True)
     if not console.is_terminal:
         yield Lines(clock)

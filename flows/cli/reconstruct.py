@@ -1,7 +1,8 @@
 """`lidarpainter reconstruct`: fit, paint, judge and report one scene."""
 
 from dataclasses import replace
-from typing import Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -17,35 +18,65 @@ from flows.cli.shared_options import (
 )
 from lidarpainter_models.errors import ConfigError
 
+if TYPE_CHECKING:
+    from catalog.store import Store
+
 FITS = ("fit", "refine")
+FILE_KEYS = {"preset": str, "painter": str, "set": list}
+"""Keys of a file for --config, as in the manifest of a fleet, and what each holds."""
 FIRST_FIT_SHARE = 0.6
-"""Of a time limit; the rounds after it share the rest, as they do the steps of a preset."""
+"""Part of a time limit for the first fit; its rounds share the rest, as the steps of a preset."""
 Sideways = Annotated[
     str | None, typer.Option(help="Metres to both sides to paint at, such as 2,3; at most 8.")
 ]
 Upwards = Annotated[str | None, typer.Option(help="Metres up to paint at, such as 1.5; at most 8.")]
 Rounds = Annotated[
     int | None,
-    typer.Option(help="How often to paint and go on, 0 or more; the preset's if absent."),
+    typer.Option(help="Rounds of painting and continued fit, 0 or more; the preset's if absent."),
 ]
 Memory = Annotated[
     str | None,
-    typer.Option(help="Most of a fit's process on a CPU, such as 6GB: fewer Gaussians if need be."),
+    typer.Option(
+        help="The most memory that a fit may take on a CPU, such as 6GB: it has fewer Gaussians "
+        "if need be."
+    ),
 ]
 TimeLimit = Annotated[
-    str | None, typer.Option(help="Of all fits together, such as 10min: fewer steps if need be.")
+    str | None,
+    typer.Option(
+        help="The most time of all fits together, such as 10min: they have fewer steps if need be."
+    ),
 ]
 Split = Annotated[
     str | None,
     typer.Option(
-        help="alternate (every second frame judges), forward:17:8 (so many fit: judge), all."
+        help="Which frames are fitted and which evaluate: alternate (every second one), "
+        "forward:17:8 (the first 17 and the 8 after them), or all (fit all, evaluate none)."
+    ),
+]
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--config",
+        help="TOML file with preset, painter and set, as a fleet's manifest has them; options "
+        "given here count more.",
+    ),
+]
+TensorBoard = Annotated[
+    Path | None,
+    typer.Option(
+        help="Folder for TensorBoard event files with the losses of all fits; each fit's artefact "
+        "has them as history.csv anyway."
     ),
 ]
 
 
 def reconstruct(  # noqa: PLR0913 - the options of a command
     scene: Annotated[str, typer.Argument(help="dataset/sequence, as ingested.")],
-    preset: Annotated[str, typer.Option(help="brief, preview, balanced or paper.")] = "preview",
+    preset: Annotated[
+        str | None,
+        typer.Option(help="brief, preview, balanced or paper; preview if absent."),
+    ] = None,
     painter: Painter = None,
     device: DeviceName = "auto",
     shift: Sideways = None,
@@ -61,28 +92,36 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     memory: Memory = None,
     time_limit: TimeLimit = None,
     evaluate: Annotated[
-        bool, typer.Option("--evaluate/--no-evaluate", help="Judge the scene, or later.")
+        bool, typer.Option("--evaluate/--no-evaluate", help="Evaluate the scene, or later.")
     ] = True,
     report: Annotated[
         bool, typer.Option("--report/--no-report", help="Write the page about the run.")
     ] = True,
     settings: Settings = None,
+    config: ConfigFile = None,
+    tensorboard: TensorBoard = None,
     as_json: AsJson = False,
 ) -> None:
-    """Turn a stored scene into a fitted, painted, judged and reported one.
+    """Turn a stored scene into a fitted, painted, evaluated and reported one.
 
     Example: lidarpainter reconstruct pandaset/002 --train-cameras front_camera
 
     Unpainted, for comparison: lidarpainter reconstruct pandaset/002 --painter none
+
+    A run that was stopped continues with the same command. Finished stages lie in
+    STORE/artefacts, checkpoints of a running fit in STORE/work, until it is done.
     """
     from catalog.store import existing_store
     from flows.cli.running import run_reconstruction
     from flows.overrides import with_changes, with_overrides
     from flows.presets import preset as preset_named
 
-    parameters = preset_named(preset, scene)
+    if tensorboard is not None:
+        check_tensorboard()
+    asked = {} if config is None else read_config(config)
+    parameters = preset_named(preset or asked.get("preset", "preview"), scene)
     changes: dict[str, Any] = {
-        "painter": painter,
+        "painter": painter or asked.get("painter"),
         "device": device,
         "rounds": rounds,
         "split": split,
@@ -93,14 +132,71 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
     changes = {name: value for name, value in changes.items() if value is not None}
     if shift is not None or up is not None:
         changes["novel"] = shifted(parameters.novel, shift, up)
-    parameters = with_overrides(with_changes(parameters, changes), settings or [])
+    parameters = with_overrides(
+        with_changes(parameters, changes), [*asked.get("set", []), *(settings or [])]
+    )
     parameters = with_changes(parameters, of_fits(parameters, seed, memory, time_limit))
     say_status(f"opening {scene}")
-    result = run_reconstruction(parameters, existing_store())
+    store = existing_store()
+    result = run_reconstruction(parameters, store)
+    if tensorboard is not None:
+        write_events(store, result, tensorboard)
     if as_json:
         print_json(result)
     else:
         show(result)
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """Read what a file for `--config` asks for, by its keys.
+
+    Raises:
+        ConfigError: it cannot be read, is no TOML, or holds what such a file does not.
+    """
+    from flows.fleet.manifest import read_toml
+
+    values = read_toml(path)
+    for name, value in values.items():
+        if name not in FILE_KEYS:
+            known = ", ".join(FILE_KEYS)
+            raise ConfigError(f"{path}: unknown key {name!r}, expected one of {known}")
+        is_known = isinstance(value, FILE_KEYS[name])
+        if not is_known or (name == "set" and not all(isinstance(one, str) for one in value)):
+            what = "an array of 'key=value'" if name == "set" else "a string"
+            raise ConfigError(f"{path}: {name}: expected {what}, got {value!r}")
+    return values
+
+
+def check_tensorboard() -> None:
+    """Find out whether event files can be written.
+
+    Raises:
+        ConfigError: the package that writes them is not installed.
+    """
+    try:
+        import tensorboard  # noqa: F401
+    except ImportError:
+        raise ConfigError(
+            "--tensorboard needs the package tensorboard, which is not installed: "
+            "pip install tensorboard"
+        ) from None
+
+
+def write_events(store: "Store", result: dict[str, Any], folder: Path) -> None:
+    """Write the losses of every fit of a run as event files, in a folder for each fit."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    from catalog.artefacts import ArtefactRef
+    from tasks.stored import load_history
+
+    for stage, place in result["artefacts"].items():
+        ref = ArtefactRef(Path(place).parent.name, Path(place).name)
+        if ref.kind != "gaussians":
+            continue
+        with SummaryWriter(str(folder / result["run_id"] / stage)) as writer:
+            for entry in load_history(store, ref):
+                for name in entry.keys() - {"step"}:
+                    writer.add_scalar(name, entry[name], int(entry["step"]))
 
 
 def shifted(novel: Any, shift: str | None, up: str | None) -> Any:  # noqa: ANN401 - imported late

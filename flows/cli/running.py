@@ -1,4 +1,4 @@
-"""Run a flow from a command: with a Prefect server, and progress on stderr."""
+"""Run a reconstruction from a command: with a Prefect server, and progress on stderr."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any
 from catalog.store import Store
 from flows.cli.output import say_status
 from flows.cli.progress import shown_progress
-from flows.cli.stage_times import PlannedStage, expected_seconds
 from flows.server import prefect_server
+from flows.time_prediction import expected_seconds
 
 if TYPE_CHECKING:
     from flows.parameters import ReconstructParameters
+
+SERVER = "starting Prefect's server, which orders and records the stages (a few seconds)"
 
 
 def run_reconstruction(parameters: "ReconstructParameters", store: Store) -> dict[str, Any]:
@@ -22,11 +24,12 @@ def run_reconstruction(parameters: "ReconstructParameters", store: Store) -> dic
 
     if (known := recalled(parameters, store.address)) is not None:
         return known
-    from flows.reconstruct import check_inputs, reconstruct
+    from flows.reconstruct import check_inputs, reconstruct_flow
 
     check_inputs(parameters, store.address)  # before a server is started for nothing
-    with _running(store, parameters):
-        return reconstruct(parameters, store.address)
+    scene = next((r for r in store.rows("scenes") if r["scene_id"] == parameters.scene), None)
+    with _running(store, parameters, _num_views(scene, parameters.train_cameras)):
+        return reconstruct_flow(parameters, store.address)
 
 
 def run_demo(
@@ -35,36 +38,32 @@ def run_demo(
     """Make the street of a seed in the store and reconstruct it."""
     from flows.demo import demo, demo_street
 
-    with _running(store, parameters):
-        return demo(demo_street(seed), parameters, store.address, first_image)
+    street = demo_street(seed)
+    with _running(store, parameters, street.num_frames * len(street.cameras)):
+        return demo(street, parameters, store.address, first_image)
 
 
 @contextmanager
-def _running(store: Store, parameters: "ReconstructParameters") -> Iterator[None]:
+def _running(store: Store, parameters: "ReconstructParameters", num_views: float) -> Iterator[None]:
+    """Start a server, and show the stages of a run whose scene has so many views."""
     store.make()
-    expected = _expected(store, parameters)
-    say_status("starting Prefect's server")
-    with prefect_server(store.root / "logs" / "prefect.log"), shown_progress(expected):
+    scenes = {row["scene_id"]: row for row in store.rows("scenes")}
+    past = [
+        {**row, "num_views": _num_views(scenes.get(row["scene_id"]), _cameras(row))}
+        for row in store.rows("runs")
+    ]
+    expected, is_told = expected_seconds(parameters, num_views, past)
+    say_status(SERVER)
+    log = store.root / "logs" / "prefect.log"
+    with prefect_server(log), shown_progress(expected, is_told_by_past=is_told):
         yield
 
 
-def _expected(store: Store, parameters: "ReconstructParameters") -> dict[str, float] | None:
-    """Seconds of the run's stages by past runs of the store; None where none tells."""
-    scenes = {row["scene_id"]: row for row in store.rows("scenes")}
+def _cameras(row: dict[str, Any]) -> Sequence[str] | None:
+    """The cameras that a run was given; None where it took all."""
+    return json.loads(row["parameters"] or "{}").get("train_cameras")
 
-    def num_views(scene_id: str, cameras: Sequence[str] | None) -> float:
-        row = scenes.get(scene_id)
-        return row["num_views"] * len(cameras or row["cameras"]) / len(row["cameras"]) if row else 0
 
-    past = []
-    for row in store.rows("runs"):
-        cameras = json.loads(row["parameters"] or "{}").get("train_cameras")
-        past.append({**row, "num_views": num_views(row["scene_id"], cameras)})
-    views = num_views(parameters.scene, parameters.train_cameras)
-    if not views:  # the scene is not drawn yet
-        return None
-    stages = [
-        PlannedStage(name=name, amount=steps or views, has_steps=steps is not None)
-        for name, steps in parameters.stages.items()
-    ]
-    return expected_seconds(stages, parameters.preset, past)
+def _num_views(row: dict[str, Any] | None, cameras: Sequence[str] | None) -> float:
+    """How many images some cameras of a scene have taken, by its row; 0 without one."""
+    return row["num_views"] * len(cameras or row["cameras"]) / len(row["cameras"]) if row else 0.0

@@ -10,12 +10,12 @@ from datetime import UTC, datetime
 from typing import Literal
 
 from catalog.leases import Holder
-from tasks.progress import subject
+from tasks.progress import ProgressListener, subject
 
 Event = Literal["said", "stage-began", "stage-waits", "stage-ended"]
 
 
-class EventLog:
+class EventLog(ProgressListener):
     """Takes what a worker says, and listens to its stages."""
 
     def __init__(self, fleet: str, write: Callable[[str], object]) -> None:

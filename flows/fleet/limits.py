@@ -10,7 +10,7 @@ from tasks.job_limits import usable_memory_bytes
 
 GIGABYTE = 1e9
 MEMORY_SHARE = 0.9
-"""Of the machine's memory that sequences may be planned into."""
+"""Part of the machine's memory that sequences may be planned into."""
 
 
 def lacks_disk(ledger: FleetLedger, budget: Budget, num_bytes: float = 0.0) -> str | None:

@@ -1,76 +1,58 @@
 """What a sequence will take, by what sequences have taken before.
 
-CPU seconds and bytes are sums of what grows with the effort: views read, pixels drawn, steps and
-views at their width; memory of a process and its views alone. The weights are found from the
-attempts in the catalog by non-negative least squares on relative errors, so a short sequence counts
-as much as a long one, and a recent one more than an old one. Where few attempts cannot tell the
-amounts apart, each keeps a share of the cost, or of memory what is known of it. Compiling kernels
-is paid once a machine and is taken out. Wall time is CPU time by the ratio that the machine had
-lately: what else runs there is not the sequence's own. Where nothing is known, nothing is said, and
-nothing is held back.
+What it takes on the reference machine follows from its size (`flows.time_prediction`); attempts in
+the catalog tell by which factor this store's machines differ, a recent one more than an old one.
+Compiling kernels is paid once a machine and is taken out. Wall time is CPU time by the ratio that
+the machine had lately: what else runs there is not the sequence's own. Where nothing is known,
+nothing is said, and nothing is held back.
 """
 
 import json
+import math
 import platform
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from statistics import median
 from typing import Any, Self
 
-import numpy as np
-from jaxtyping import Float
-
 from catalog.store import Store
 from catalog.tables import Row
 from flows.fleet.asked import Asked
-from lidarpainter_models.painter.selection import NO_PAINTER
+from flows.time_prediction import reference_seconds
 
 MOST_ATTEMPTS = 500
-"""The newest ones, by which is planned."""
+"""The newest attempts, by which is planned."""
 HALF_LIFE = 10
 """Attempts after which one counts half as much."""
 RECENT = 10
 """Attempts by which the ratio of wall to CPU time is known, and the error of the planner."""
-SIZES = ("peak_memory_bytes", "num_bytes")
-EQUAL_SHARES = 0.05
-"""How much it counts, in attempts, that all amounts have a share of the cost."""
-KNOWN_MEMORY = {"constant": 0.8e9, "views": 40.0}
-"""Bytes of a process, and of each view for its width squared: what memory is made of, and about how
-much. Attempts at one width cannot tell the two apart."""
+READ_VIEW_S, DRAWN_PIXEL_S = 0.25, 2e-6
+"""CPU seconds of reading a view of a dataset, and of drawing a pixel of a street."""
+PROCESS_BYTES, VIEW_BYTES = 0.8e9, 40.0
+"""Memory of a process, and of each view for its width squared."""
+KEPT_BYTES, KEPT_VIEW_BYTES = 2e6, 12.0
+"""What is stored of a sequence, and of each view for its width squared."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Effort:
-    """What the cost of a sequence grows with."""
+    """What a sequence takes on the reference machine."""
 
-    views: float
-    """Trained on and judged."""
-    view_pixels: float
-    """Square of the width they are seen at."""
-    steps: float
-    """Of all fits."""
-    painted_views: float
-    read_views: float
-    """To be read from a dataset first; none where the scene is in the store."""
-    drawn_pixels: float
-    """Likewise of a street, all views together."""
+    cpu_seconds: float
+    memory_bytes: float
+    num_bytes: float
 
     def to_json(self) -> str:
-        """As the catalog keeps it."""
+        """Return it as the catalog keeps it."""
         return json.dumps(asdict(self))
 
-    @property
-    def amounts(self) -> dict[str, float]:
-        """What costs are sums of."""
-        return {
-            "constant": 1.0,
-            "steps": self.steps * self.view_pixels,
-            "views": self.views * self.view_pixels,
-            "painted_views": self.painted_views * self.view_pixels,
-            "read_views": self.read_views,
-            "drawn_pixels": self.drawn_pixels,
-        }
+    @classmethod
+    def from_json(cls, text: str) -> Self | None:
+        """Read what the catalog kept; None where another version of this program wrote it."""
+        values = json.loads(text)
+        names = {field.name for field in fields(cls)}
+        return cls(**values) if values.keys() == names else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,7 +66,7 @@ class Prediction:
     num_bytes: float | None = None
 
     def facts(self) -> dict[str, Any]:
-        """As a lease carries it to the catalog."""
+        """Return it as a lease carries it to the catalog."""
         sizes = {"memory_bytes": self.memory_bytes, "num_bytes": self.num_bytes}
         rounded = {name: None if size is None else round(size) for name, size in sizes.items()}
         facts = {"seconds": self.seconds, "cpu_seconds": self.cpu_seconds, **rounded}
@@ -98,51 +80,48 @@ class Planner:
         """Learn from rows of the tables, of scenes whose views are known."""
         self._scenes = {row["scene_id"]: row for row in scenes}
         done = [row for row in attempts if row["cause"] == "done" and row["effort"]]
-        self._past = sorted(done, key=lambda row: row["ended_at"])[-MOST_ATTEMPTS:]
+        newest = sorted(done, key=lambda row: row["ended_at"])[-MOST_ATTEMPTS:]
+        efforts = ((row, Effort.from_json(row["effort"])) for row in newest)
+        self._past = [(row, effort) for row, effort in efforts if effort is not None]
 
     @classmethod
     def of(cls, store: Store) -> Self:
-        """By what a store holds now."""
+        """Learn from what a store holds now."""
         return cls(store.tables.rows("attempts"), store.tables.rows("scenes"))
 
     def predict(self, asked: Asked) -> Prediction:
-        """What a sequence will take."""
+        """Return what a sequence will take."""
         effort = self.effort(asked)
         if effort is None or not self._past:
             return Prediction()
-        amounts = np.asarray(list(effort.amounts.values()))
-        cpu_seconds, memory, num_bytes = (float(amounts @ weights) for weights in self._weights)
+        cpu, more_memory, size = self._corrections
         return Prediction(
-            seconds=cpu_seconds * self._wall_ratio,
-            cpu_seconds=cpu_seconds,
-            memory_bytes=memory,
-            num_bytes=num_bytes,
+            seconds=effort.cpu_seconds * cpu * self._wall_ratio,
+            cpu_seconds=effort.cpu_seconds * cpu,
+            memory_bytes=max(effort.memory_bytes + more_memory, 0.0),
+            num_bytes=effort.num_bytes * size,
         )
 
     def effort(self, asked: Asked) -> Effort | None:
-        """What the cost of a sequence grows with; None where its views cannot be counted."""
+        """Return what a sequence takes elsewhere; None where its views cannot be counted."""
         views = self._num_views(asked)
         if views is None:
             return None
-        parameters, is_stored = asked.parameters, asked.scene_id in self._scenes
-        paints = parameters.painter != NO_PAINTER
-        drawn_pixels = read_views = 0.0
-        if not is_stored and asked.seed is not None:
-            street = asked.street
-            drawn_pixels = street.num_frames * len(street.cameras) * float(street.width_px) ** 2
-        elif not is_stored:
-            read_views = views
-        width_px = parameters.observation.width_px
+        parameters, making_s = asked.parameters, 0.0
         if asked.seed is not None:
-            width_px = min(width_px, asked.street.width_px)  # images are never enlarged
+            seen = parameters.observation  # images are never enlarged
+            seen = replace(seen, width_px=min(seen.width_px, asked.street.width_px))
+            parameters = parameters.model_copy(update={"observation": seen})
+        if asked.scene_id not in self._scenes:
+            making_s = views * READ_VIEW_S
+            if asked.seed is not None:
+                drawn = asked.street.num_frames * len(asked.street.cameras)
+                making_s = drawn * float(asked.street.width_px) ** 2 * DRAWN_PIXEL_S
+        squared = views * float(parameters.observation.width_px) ** 2
         return Effort(
-            views=views,
-            view_pixels=float(width_px) ** 2,
-            steps=parameters.fit.most_steps(views)
-            + parameters.rounds * parameters.refine.most_steps(views),
-            painted_views=views * parameters.rounds if paints else 0.0,
-            read_views=read_views,
-            drawn_pixels=drawn_pixels,
+            cpu_seconds=making_s + sum(reference_seconds(parameters, views).values()),
+            memory_bytes=PROCESS_BYTES + VIEW_BYTES * squared,
+            num_bytes=KEPT_BYTES + KEPT_VIEW_BYTES * squared,
         )
 
     def _num_views(self, asked: Asked) -> float | None:
@@ -158,37 +137,38 @@ class Planner:
         return float((asked.frames[1] - asked.frames[0]) * len(asked.cameras))
 
     @cached_property
-    def _weights(self) -> list[Float[np.ndarray, " amounts"]]:
-        """Of CPU seconds, memory and bytes."""
-        past = [Effort(**json.loads(row["effort"])).amounts for row in self._past]
-        efforts = np.asarray([list(amounts.values()) for amounts in past])
-        known_memory = np.asarray([KNOWN_MEMORY.get(name, 0.0) for name in past[0]])
-        costs = [[own_cpu_seconds(row) for row in self._past]]
-        costs += [[row[name] or 0.0 for row in self._past] for name in SIZES]
-        known = (None, known_memory, None)
-        return [
-            _fitted(efforts, np.asarray(cost, float), weights)
-            for cost, weights in zip(costs, known, strict=True)
+    def _corrections(self) -> tuple[float, float, float]:
+        """By which factor CPU seconds and stored bytes were more, and by how much memory was."""
+        cpu = [
+            math.log(own_cpu_seconds(r) / e.cpu_seconds)
+            for r, e in self._past
+            if own_cpu_seconds(r) > 0
         ]
+        memory = [
+            r["peak_memory_bytes"] - e.memory_bytes for r, e in self._past if r["peak_memory_bytes"]
+        ]
+        size = [math.log(r["num_bytes"] / e.num_bytes) for r, e in self._past if r["num_bytes"]]
+        return math.exp(_recent_mean(cpu)), _recent_mean(memory), math.exp(_recent_mean(size))
 
     @cached_property
     def _wall_ratio(self) -> float:
-        """Of wall to CPU time in the newest attempts, those of this machine if there are any."""
-        here = [row for row in self._past if row["worker"].rpartition(":")[0] == platform.node()]
-        newest = (here or self._past)[-RECENT:]
+        """Wall to CPU time of the newest attempts, those of this machine if there are any."""
+        rows = [row for row, _ in self._past]
+        here = [row for row in rows if row["worker"].rpartition(":")[0] == platform.node()]
+        newest = (here or rows)[-RECENT:]
         return median(row["seconds"] / max(row["cpu_seconds"] or 0.0, 1e-3) for row in newest)
 
 
 def own_cpu_seconds(attempt: Mapping[str, Any]) -> float:
-    """What a sequence took by itself: without compiling kernels for it and all after it."""
+    """Return what a sequence took by itself: without compiling kernels for it and all after it."""
     return (attempt["cpu_seconds"] or 0.0) - (attempt["compile_seconds"] or 0.0)
 
 
 def planner_error(attempts: Iterable[Mapping[str, Any]]) -> float | None:
-    """How far off the predicted CPU seconds were, as a share of the true ones.
+    """Return how far off the predicted CPU seconds were, as a share of the true ones.
 
-    It is the median of the newest attempts that were predicted; those that were recalled or went on
-    with what others had begun do not count. None where there is none.
+    It is the median of the newest attempts that were predicted; those that were recalled or
+    continued what others had begun do not count. None where there is none.
     """
     shares = [
         abs(row["predicted_cpu_seconds"] - own_cpu_seconds(row)) / own_cpu_seconds(row)
@@ -198,33 +178,7 @@ def planner_error(attempts: Iterable[Mapping[str, Any]]) -> float | None:
     return median(shares[-RECENT:]) if shares else None
 
 
-def _fitted(
-    amounts: Float[np.ndarray, "attempts amounts"],
-    costs: Float[np.ndarray, " attempts"],
-    known: Float[np.ndarray, " amounts"] | None,
-) -> Float[np.ndarray, " amounts"]:
-    """Non-negative weights whose sums come nearest to the costs, in relative terms.
-
-    Attempts are oldest first; a cost that is not known is 0 or less. What attempts leave open comes
-    near equal shares, or near weights that are known, as a share of each; amounts of no known
-    weight have none.
-    """
-    from scipy.optimize import nnls
-
-    is_known = costs > 0
-    if not is_known.any():
-        return np.zeros(amounts.shape[1])
-    if known is not None:
-        amounts = amounts * (known > 0)
-    relative = amounts[is_known] / costs[is_known, None]
-    scale = np.maximum(relative.mean(axis=0), np.finfo(float).tiny)
-    ages = np.arange(len(relative))[::-1]
-    counts = np.sqrt(0.5 ** (ages / HALF_LIFE))
-    seen = (relative > 0).any(axis=0)
-    expected = seen / seen.sum() if known is None else np.where(seen, known * scale, 1.0)
-    pull = np.sqrt(EQUAL_SHARES) * seen / (1.0 if known is None else expected)
-    weights, _residual = nnls(
-        np.vstack([relative / scale * counts[:, None], np.diag(pull)]),
-        np.concatenate([counts, pull * expected]),
-    )
-    return weights / scale
+def _recent_mean(values: Sequence[float]) -> float:
+    """The mean of values, oldest first, of which later ones count more; 0 of none."""
+    counts = [0.5 ** (age / HALF_LIFE) for age in reversed(range(len(values)))]
+    return sum(c * value for c, value in zip(counts, values, strict=True)) / (sum(counts) or 1.0)

@@ -77,7 +77,7 @@ def _made(asked: Asked, store_path: Path) -> Made:
         forget()  # what stages kept of the sequence before
     store = open_store(store_path)
     _bring_in(asked, store)
-    run = reconstruct.fn(asked.parameters, store.address)
+    run = reconstruct(asked.parameters, store.address)
     results = [run]
     for variant in asked.variants:
         mix = StyleMix.parse(variant)

@@ -32,11 +32,12 @@ def examine(run: RunSpec) -> StageResult:
 
 
 def suspicions(examined: StageResult) -> list[str]:
-    """What does not look sound, in sentences."""
+    """Return what does not look sound, in sentences."""
     return list(examined.summary["suspicions"])
 
 
 def _build(place: Workplace, progress: Progress, *, scene: DrivingScene) -> dict[str, Any]:
+    progress(0, 1, "clocks, cameras, boxes, exposure, own body")
     findings = findings_about(scene, progress)
     rows = [asdict(finding) for finding in findings]
     (place.output / FILE).write_text(json.dumps(rows, indent=2) + "\n", "utf-8")

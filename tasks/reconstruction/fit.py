@@ -1,8 +1,12 @@
-"""Fit Gaussians to observations, from scratch or on from a fitted scene."""
+"""Fit Gaussians to observations: from scratch, or continued from a fitted scene in a round.
+
+A running fit is kept below `STORE/work/`, in a folder of its stage's key, until its artefact is
+whole: checkpoints (`fit.safetensors`) and the first look (`first-look.png`).
+"""
 
 import logging
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
@@ -10,18 +14,21 @@ import cv2
 import torch
 
 from catalog.artefacts import ArtefactRef, Workplace
+from lidarpainter_models.evaluation.round_gain import round_gain
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import FitConfig
-from lidarpainter_models.gaussians.fitting.fit import FitResult, fit_gaussians
-from lidarpainter_models.gaussians.fitting.step import Perceptual
+from lidarpainter_models.gaussians.fitting.fit import FitProgress, FitResult, fit_gaussians
+from lidarpainter_models.gaussians.fitting.loss import Perceptual
+from lidarpainter_models.gaussians.fitting.plan import in_thousands
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene, describe
 from lidarpainter_models.gaussians.model.stored_scene import copy_scene
 from lidarpainter_models.metrics.lpips import load_lpips
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.observations.views import GuidanceView, SceneObservations
-from tasks.opened import opened
+from tasks.opened import OpenedRun, opened
 from tasks.progress import Progress
-from tasks.specs import RunSpec
+from tasks.reconstruction.painted_views import load_guidance
+from tasks.specs import FittedRef, RunSpec
 from tasks.stages import StageResult, run_stage, stage_task
 from tasks.stored import load_observations, load_scene, save_scene
 from tasks.weights import file_digests
@@ -31,6 +38,22 @@ CHECKPOINT_EVERY_S = 10.0
 """A killed fit repeats at most this much."""
 LOOK_FILE = "first-look.png"
 """The scene after a tenth of its first fit, where the checkpoints lie, until the fit is done."""
+FIT_OF_ROUND = 0.7
+"""Part of a painted round's time that its steps take; the rest tells whether views became worse."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Sources:
+    """What a fit is made from, read when its stage is built."""
+
+    digests: Mapping[str, str]
+    """Digests of the inputs, by the part they play."""
+    observations: Callable[[], SceneObservations]
+    start: Callable[[], GaussianScene | None]
+    guidance: Callable[[], tuple[GuidanceView, ...]]
+    perceptual: Callable[[], Perceptual | None] | None
+    config: FitConfig
+    device: torch.device
 
 
 @stage_task
@@ -45,64 +68,108 @@ def fit(
 ) -> StageResult:
     """Fit a scene to what was recorded.
 
-    Without a `start` it begins with the LiDAR map; one that goes on is the control of one that does
-    so with painted views (`refine`).
+    Without a `start` it begins with the LiDAR map; one that is continued is the control of one that
+    is continued with painted views (`refine`).
     """
     this = opened(run)
-    weighed = lpips if config.weighs_perceptual else None
-    inputs = {"observations": observations, "start": start}
+    sources = _sources(this, config, lpips, {"observations": observations, "start": start})
     return run_stage(
         this.store,
         kernels=run.kernels,
         stage=stage,
         kind="gaussians",
-        inputs={name: ref.digest for name, ref in inputs.items() if ref is not None}
-        | (file_digests(weighed.named) if weighed is not None else {}),
+        inputs=sources.digests,
         config=asdict(config),
-        build=partial(
-            _build,
-            observations=partial(load_observations, this.store, observations),
-            start=partial(load_scene, this.store, start) if start is not None else None,
-            perceptual=partial(load_lpips, weighed, this.device) if weighed is not None else None,
-            config=config,
-            device=this.device,
-        ),
+        build=partial(_build, sources=sources),
     )
 
 
-def _build(
-    place: Workplace,
-    progress: Progress,
-    *,
-    observations: Callable[[], SceneObservations],
-    start: Callable[[], GaussianScene] | None,
-    perceptual: Callable[[], Perceptual | None] | None,
+@stage_task
+def refine(
+    run: RunSpec,
+    stage: str,
+    fitted: FittedRef,
     config: FitConfig,
-    device: torch.device,
-) -> dict[str, Any]:
-    result = run_fit(
-        place,
-        progress,
-        observations(),
-        config,
-        start=start() if start else None,
-        perceptual=perceptual() if perceptual else None,
-        device=device,
+    *,
+    guidance: ArtefactRef,
+    lpips: LpipsFiles | None = None,
+) -> StageResult:
+    """Continue the fit of a scene with views that were painted of it.
+
+    The summary's `gain` says whether the round is to be taken back; it is kept here all the same.
+    """
+    this = opened(run)
+    inputs = {
+        "observations": fitted.observations,
+        "start": fitted.gaussians,
+        "guidance": guidance,
+    }
+    sources = _sources(this, config, lpips, inputs)
+    return run_stage(
+        this.store,
+        kernels=run.kernels,
+        stage=stage,
+        kind="gaussians",
+        inputs=sources.digests,
+        config=asdict(config),
+        build=partial(_build_round, sources=sources),
     )
+
+
+def _sources(
+    this: OpenedRun,
+    config: FitConfig,
+    lpips: LpipsFiles | None,
+    inputs: Mapping[str, ArtefactRef | None],
+) -> _Sources:
+    """Return what a fit is made from, of stored inputs by the part they play."""
+    weighed = lpips if config.weighs_perceptual else None
+    there = {name: ref for name, ref in inputs.items() if ref is not None}
+    digests = {name: ref.digest for name, ref in there.items()}
+
+    def read(load: Callable[..., Any], name: str, absent: Any) -> Callable[[], Any]:  # noqa: ANN401
+        return partial(load, this.store, there[name]) if name in there else lambda: absent
+
+    return _Sources(
+        digests=digests | (file_digests(weighed.named) if weighed is not None else {}),
+        observations=partial(load_observations, this.store, there["observations"]),
+        start=read(load_scene, "start", None),
+        guidance=read(load_guidance, "guidance", ()),
+        perceptual=partial(load_lpips, weighed, this.device) if weighed is not None else None,
+        config=config,
+        device=this.device,
+    )
+
+
+def _build(place: Workplace, progress: Progress, *, sources: _Sources) -> dict[str, Any]:
+    result = _run(place, progress, sources, sources.observations(), sources.start())
     save_scene(place.output, result.scene, result.history)
-    return fit_summary(result)
+    return _summary(result)
 
 
-def run_fit(  # noqa: PLR0913 - as `fit_gaussians`
+def _build_round(place: Workplace, progress: Progress, *, sources: _Sources) -> dict[str, Any]:
+    seen, before, painted = sources.observations(), sources.start(), sources.guidance()
+
+    def told(done: float, total: float, note: str = "") -> None:
+        progress(done * (FIT_OF_ROUND if painted else 1.0), total, note)
+
+    result = _run(place, told, sources, seen, before, painted)
+    gain = None
+    if painted and before is not None:
+        progress(FIT_OF_ROUND, 1.0, "whether views became better")
+        found = round_gain(before.to(sources.device), result.scene, seen, painted)
+        gain = {**asdict(found), "is_taken_back": found.is_worse}
+    save_scene(place.output, result.scene, result.history)
+    return {**_summary(result), "gain": gain}
+
+
+def _run(
     place: Workplace,
     progress: Progress,
+    sources: _Sources,
     seen: SceneObservations,
-    config: FitConfig,
-    *,
     start: GaussianScene | None,
     guidance: Sequence[GuidanceView] = (),
-    perceptual: Perceptual | None,
-    device: torch.device,
 ) -> FitResult:
     """Fit where a stage is built: resumed from what a killed one left, and telling how far it is.
 
@@ -121,23 +188,23 @@ def run_fit(  # noqa: PLR0913 - as `fit_gaussians`
         # by OpenCV alone: how files are exported is no part of a fit's key
         cv2.imwrite(str(path), cv2.cvtColor(rgb_u8, cv2.COLOR_RGB2BGR))
         shown = f", first look: {path}"
-        _LOG.info("a fit of %d steps%s", config.steps, shown)
+        _LOG.info("a fit%s", shown)
 
-    def told(step: int, steps: int, entry: dict[str, float]) -> None:
+    def told(now: FitProgress) -> None:
         nonlocal plan
-        if "planned_bytes" in entry:
-            note = plan = _told_plan(steps, entry, device)
-            _LOG.info("a fit: %s", plan)
-        elif "initialised" in entry:
-            note = f"placing Gaussians, {100 * entry['initialised']:.0f} %"
-        else:
-            note = f"{_told_step(entry)}; {plan}{shown}"
-        planned = replace(config, steps=steps)
-        progress(planned.work(step) / planned.work(steps), 1.0, note)
+        note = f"{plan}{shown}"
+        if now.placed is not None:
+            note = f"placing Gaussians, {100 * now.placed:.0f} %"
+        elif now.entry is not None:
+            note = f"{_in_words(now.entry)}; {note}"
+        elif now.step == 0:
+            note = plan = now.plan.in_words()
+            _LOG.info("a fit: %s; checkpoints in %s", plan, place.scratch)
+        progress(now.share, 1.0, note)
 
     return fit_gaussians(
         seen,
-        config,
+        sources.config,
         start=copy_scene(start) if start else None,
         guidance=guidance,
         checkpoints=CheckpointFolder(
@@ -145,16 +212,17 @@ def run_fit(  # noqa: PLR0913 - as `fit_gaussians`
         ),
         progress=told,
         first_look=None if start else look,
-        perceptual=perceptual,
-        device=device,
+        perceptual=sources.perceptual() if sources.perceptual else None,
+        device=sources.device,
     )
 
 
-def fit_summary(result: FitResult) -> dict[str, Any]:
-    """What a manifest says of a fit."""
+def _summary(result: FitResult) -> dict[str, Any]:
+    """Return what a manifest says of a fit: its plan and what came of it."""
     last = result.history[-1]
     return {
         **describe(result.scene),
+        "plan": result.plan.numbers(),
         "train_psnr": last["psnr"],
         "cpu_s": last["cpu_s"],
         "steps": int(last["step"]),
@@ -162,25 +230,9 @@ def fit_summary(result: FitResult) -> dict[str, Any]:
     }
 
 
-def _told_step(entry: dict[str, float]) -> str:
-    """Such as `step 2,400, 28.61 dB, 210k Gaussians`."""
+def _in_words(entry: Mapping[str, float]) -> str:
+    """Return such as `step 2,400, 28.61 dB, 210k Gaussians`."""
     return (
         f"step {entry['step']:,.0f}, {entry['psnr']:.2f} dB, "
         f"{in_thousands(entry['num_gaussians'])} Gaussians"
     )
-
-
-def _told_plan(steps: int, entry: dict[str, float], device: torch.device) -> str:
-    """Such as `84 views, 0.9 Mpx of surface, at most 210k Gaussians, 4,800 steps, 1 GB on cpu`."""
-    return (
-        f"{entry['num_views']:.0f} views, {entry['surface_pixels'] / 1e6:.2g} Mpx of surface, "
-        f"at most {in_thousands(entry['most_gaussians'])} Gaussians, {steps:,} steps, "
-        f"{entry['planned_bytes'] / 1e9:.2g} GB on {device}"
-    )
-
-
-def in_thousands(count: float) -> str:
-    """Such as `850`, `9.8k`, `210k` or `3,050k`."""
-    if count < 1000:
-        return f"{count:.0f}"
-    return f"{count / 1000:,.{1 if count < 10_000 else 0}f}k"

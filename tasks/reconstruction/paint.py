@@ -85,7 +85,7 @@ def _build(
         config=novel,
         progress=progress,
     )
-    shown.conditions.forget_sources()  # the fit that goes on has no use for a gigabyte of them
+    shown.conditions.forget_sources()  # the fit that is continued has no use for a gigabyte of them
     save_guidance(place.output, paintings)
     return _summary(paintings, len(cameras))
 

@@ -43,9 +43,9 @@ class ReportInputs:
     """What the page is about."""
 
     result: Mapping[str, Any]
-    """What the command prints."""
+    """What the command prints, by its keys."""
     source_digest: str
-    """Of the code behind the run."""
+    """Digest of the code behind the run."""
     unpainted: FittedRef
     final: FittedRef
     stages: Mapping[str, StageResult]

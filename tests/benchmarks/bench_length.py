@@ -18,7 +18,8 @@ from pathlib import Path
 from flows.environment import prepare_environment
 from flows.presets import preview
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
-from lidarpainter_models.gaussians.fitting.seen_surface import planned_fit, seen_surface
+from lidarpainter_models.gaussians.fitting.plan import planned_settings
+from lidarpainter_models.gaussians.fitting.seen_surface import seen_surface
 from lidarpainter_models.observations.preparation import prepare_observations
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import split_views
@@ -63,7 +64,7 @@ def costs_of(folder, width_px):
     scene = DrivingScene.open(folder)
     with measured() as preparing:
         seen = prepare_observations(scene, split_views(scene, "all"), observation)
-    plan = planned_fit(chosen.fit, seen_surface(seen.views))
+    plan = planned_settings(chosen.fit, seen_surface(seen.views))
     with measured() as fitting:
         fitted = fit_gaussians(seen, chosen.fit).scene
     return {

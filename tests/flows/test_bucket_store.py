@@ -29,7 +29,7 @@ def store(address):
 
 def test_a_run_in_a_bucket_is_anybodys(store, tmp_path, monkeypatch, stand_in):
     parameters = small_parameters()
-    made = reconstruct.fn(parameters, store.address)
+    made = reconstruct(parameters, store.address)
     assert made["artefacts"]["prepare"].startswith(f"{store.name}/artefacts/observations/")
     told = json.dumps([store.rows(table) for table in TABLES], default=str)
     bucket = store.mirror.bucket

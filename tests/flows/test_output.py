@@ -9,7 +9,7 @@ from rich.progress import Progress
 
 from flows.cli.output import format_bytes, format_cell, print_json, print_pairs, print_table
 from flows.cli.progress import Bars, Lines, shown_progress
-from flows.cli.stage_times import Clock
+from flows.time_prediction import Clock
 from tasks.progress import listener
 
 
@@ -67,6 +67,23 @@ def test_a_stage_that_takes_long_says_so_now_and_then(capsys, monkeypatch):
     lines.started("fit")
     lines.advanced("fit", 1, 4, "30 dB")
     assert capsys.readouterr().err == "fit: 1/4 25 %, 0:01 gone, 30 dB\n"
+
+
+def test_nothing_is_whole_before_its_end(capsys, monkeypatch):
+    monkeypatch.setattr("flows.cli.progress.LINE_EVERY_S", 0.0)
+    lines = Lines(Clock(expected={"fit": 9.0, "report": 1.0}))
+    lines.started("fit")
+    lines.advanced("fit", 1, 1, "30 dB")
+    began, told = capsys.readouterr().err.splitlines()
+    assert began.startswith("fit: stage 1 of 2 begins; run 0:01 gone")
+    assert told.startswith("fit: stage 1 of 2, 99 %, 0:01 gone")
+    with Progress("{task.percentage:.0f}", console=Console(force_terminal=True)) as progress:
+        bars = Bars(progress, Clock())
+        bars.started("fit")
+        bars.advanced("fit", 500, 500, "")
+        assert progress.tasks[0].percentage == 99
+        bars.finished("fit", 3.0, is_new=True)
+        assert progress.tasks[0].percentage == 100
 
 
 def test_bars_follow_every_stage(capsys):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,6 +16,8 @@ from toy_store import SMALL, TOY_SCENE, write_toy_scene
 from catalog.artefacts import ArtefactRef
 from catalog.store import open_store
 from flows.cli.main import main
+from flows.cli.reconstruct import read_config
+from lidarpainter_models.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[2]
 LONG_FIT = ("fit.steps=1500", "fit.half_resolution=0")
@@ -157,15 +160,53 @@ def test_two_runs_at_once_share_every_computation(store):
         ([TOY_SCENE, "--painter", "picasso"], "no painter 'picasso'"),
         ([TOY_SCENE, "--painter", "missing.safetensors"], "no painter weights at"),
         ([TOY_SCENE, "--rounds", "-1"], "rounds"),
+        ([TOY_SCENE, "--config", "absent.toml"], "no manifest absent.toml"),
+        ([TOY_SCENE, "--tensorboard", "events"], "needs the package tensorboard"),
+        ([TOY_SCENE, "--set", "fit.shapes.most_sigma=1"], "no setting 'fit.shapes.most_sigma'"),
     ],
 )
 def test_what_cannot_be_reconstructed_is_one_line_and_nothing_is_started(
     store, monkeypatch, capsys, words, expected
 ):
     monkeypatch.setattr("flows.cli.running.prefect_server", pytest.fail)
+    monkeypatch.setitem(sys.modules, "tensorboard", None)  # as where it is not installed
     assert main(["--store", str(store.root), "reconstruct", *words]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.count("\n") == 1
     assert expected in captured.err
     assert not (store.root / "artefacts").exists()
+
+
+def test_a_file_says_what_options_do_and_options_count_more(tmp_path, store, monkeypatch, capsys):
+    path, asked = tmp_path / "run.toml", []
+    path.write_text('preset = "brief"\npainter = "none"\nset = ["fit.steps=7", "rounds=1"]\n')
+
+    def known(parameters, _store):
+        asked.append(parameters)
+        return {"run_id": "abc"}
+
+    monkeypatch.setattr("flows.cli.running.run_reconstruction", known)
+    words = [TOY_SCENE, "--config", str(path), "--set", "fit.steps=9", "--json"]
+    assert main(["--store", str(store.root), "reconstruct", *words]) == 0
+    assert json.loads(capsys.readouterr().out) == {"run_id": "abc"}
+    (found,) = asked
+    assert (found.preset, found.painter, found.rounds, found.fit.steps) == ("brief", "none", 1, 9)
+    assert main(["--store", str(store.root), "reconstruct", *words, "--preset", "preview"]) == 0
+    assert asked[1].preset == "preview"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ('presets = "brief"', "unknown key 'presets', expected one of preset, painter, set"),
+        ("preset = 3", "preset: expected a string, got 3"),
+        ("set = [1]", "set: expected an array of 'key=value', got [1]"),
+        ("preset = ", "expected TOML"),
+    ],
+)
+def test_a_file_with_something_else_is_refused_in_one_line(tmp_path, text, expected):
+    path = tmp_path / "run.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=re.escape(expected)):
+        read_config(path)

@@ -27,7 +27,7 @@ def test_every_setting_has_a_type_and_a_reason_and_can_be_set_to_its_default(nam
 def test_a_setting_says_what_its_class_says():
     (budget,) = known_settings(preset("balanced", "a/b"), "fit.densification.budget")
     assert (budget.type, budget.default) == ("int", 0)
-    assert budget.reason.startswith("Never more Gaussians than this")
+    assert budget.reason.startswith("The most Gaussians of a fit")
     (device,) = known_settings(preset("preview", "a/b"), "device")
     assert device.type == "str"
 

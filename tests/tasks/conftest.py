@@ -9,11 +9,10 @@ from catalog.artefacts import ArtefactStore
 from catalog.store import open_store
 from tasks.evaluation.views import evaluate, load_scores
 from tasks.ingest.ingest import record_scene
-from tasks.reconstruction.fit import fit
+from tasks.reconstruction.fit import fit, refine
 from tasks.reconstruction.paint import paint
 from tasks.reconstruction.prepare import prepare
 from tasks.reconstruction.publish import begin_run, complete_run
-from tasks.reconstruction.refine import refine
 from tasks.reconstruction.report import REPORT_FILE, ReportInputs, write_report
 from tasks.runs import open_run
 from tasks.specs import FittedRef

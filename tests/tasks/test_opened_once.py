@@ -11,11 +11,10 @@ from lidarpainter_models.scenes.driving_scene import DrivingScene
 from tasks import opened as opening
 from tasks.evaluation.views import evaluate, load_scores
 from tasks.ingest.ingest import record_scene
-from tasks.reconstruction.fit import fit
+from tasks.reconstruction.fit import fit, refine
 from tasks.reconstruction.paint import paint
 from tasks.reconstruction.prepare import prepare
 from tasks.reconstruction.publish import begin_run
-from tasks.reconstruction.refine import refine
 from tasks.reconstruction.report import ReportInputs, write_report
 from tasks.specs import FittedRef
 

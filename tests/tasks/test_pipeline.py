@@ -1,6 +1,7 @@
 """The stages of a reconstruction, one after the other, without a server."""
 
 import base64
+import csv
 import json
 import re
 import shutil
@@ -22,6 +23,7 @@ from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.score_tables import flicker_by_image, metric_values
 from lidarpainter_models.evaluation.settings import ScoringConfig
 from lidarpainter_models.export.moving_picture import PANEL_WIDTH_PX
+from lidarpainter_models.gaussians.fitting.plan import in_thousands
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.metrics import lpips
 from lidarpainter_models.metrics.backbones import SQUEEZENET
@@ -31,11 +33,10 @@ from tasks.evaluation.views import evaluate, load_scores
 from tasks.opened import open_scene
 from tasks.painter.judge import judge_painters
 from tasks.painter.judged_fits import JudgedFit
-from tasks.reconstruction.fit import fit, in_thousands
+from tasks.reconstruction.fit import fit, refine
 from tasks.reconstruction.painted_views import load_guidance
 from tasks.reconstruction.prepare import prepare
 from tasks.reconstruction.publish import begin_run, end_run
-from tasks.reconstruction.refine import refine
 from tasks.runs import open_run
 from tasks.specs import FittedRef
 from tasks.stored import load_history, load_scene
@@ -81,6 +82,13 @@ def test_a_stage_asked_again_is_not_computed_again(store, parameters, stages):
 def test_a_fit_keeps_its_course_and_no_scratch(store, stages):
     history = load_history(store, stages["fit"].ref)
     assert [entry["step"] for entry in history] == [5, 10, 12]
+    with (store.artefacts.folder(stages["fit"].ref) / "history.csv").open() as table:
+        rows = [
+            {name: float(value) for name, value in row.items()} for row in csv.DictReader(table)
+        ]
+    assert rows == history
+    plan = store.artefacts.manifest(stages["fit"].ref).summary["plan"]
+    assert (plan["steps"], plan["most_gaussians"], plan["first_gaussians"]) == (12, 1000, 800)
     assert list((store.root / "work").iterdir()) == []
     scene = load_scene(store, stages["fit"].ref)
     assert scene.num_gaussians == stages["fit"].summary["num_gaussians"]

@@ -54,7 +54,7 @@ def test_there_are_the_stages_of_a_run_and_of_a_training():
 
 
 def test_a_fit_follows_the_rasteriser_and_nothing_that_comes_after_it():
-    modules = modules_of(*builds_in("reconstruction.fit"))
+    modules = modules_of("tasks.reconstruction.fit:_build")
     assert {
         f"{LIBRARY}.kernels.gaussian_raster.cpu",
         f"{LIBRARY}.kernels.gaussian_raster.reference",
@@ -66,7 +66,7 @@ def test_a_fit_follows_the_rasteriser_and_nothing_that_comes_after_it():
 
 
 def test_a_painted_round_follows_what_takes_it_back_and_no_painter():
-    modules = modules_of(*builds_in("reconstruction.refine"))
+    modules = modules_of("tasks.reconstruction.fit:_build_round")
     after = {f"{LIBRARY}.evaluation.round_gain", f"{LIBRARY}.gaussians.fitting.fit"}
     assert after <= modules.keys()
     assert holds(modules, f"{LIBRARY}.readers.", f"{LIBRARY}.painter.nano.") == []

@@ -1,4 +1,4 @@
-"""Keep a running fit on disk, so that a killed run goes on bit for bit.
+"""Keep a running fit on disk, so that a killed run continues bit for bit.
 
 One safetensors file holds every tensor; its header carries the numbers, as JSON. It is written
 beside the old one and renamed over it, so that there is always one whole checkpoint or none.
@@ -38,7 +38,7 @@ class CheckpointFolder:
             raise ConfigError(f"every_steps must be positive, got {self.every_steps}")
 
     def is_due(self, step: int) -> bool:
-        """Whether a checkpoint should be written after this many steps."""
+        """Return whether a checkpoint should be written after this many steps."""
         if self.every_steps is not None and step % self.every_steps == 0:
             return True
         is_late = self.every_seconds is not None
@@ -55,7 +55,7 @@ class CheckpointFolder:
         self._last_time = time.monotonic()
 
     def load(self) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
-        """The kept state, or None if there is none.
+        """Return the kept state, or None if there is none.
 
         Raises:
             SceneError: the checkpoint belongs to another fit or is damaged.
@@ -70,13 +70,9 @@ class CheckpointFolder:
             )
         return tensors, header["numbers"]
 
-    def clear(self) -> None:
-        """Remove the checkpoint, if there is one."""
-        (self.path / FILE_NAME).unlink(missing_ok=True)
-
 
 def group_tensors(groups: dict[str, dict[str, Tensor]]) -> dict[str, Tensor]:
-    """One flat dictionary, names joined by a slash; every tensor gets memory of its own."""
+    """Return one flat dictionary, names joined by a slash; every tensor gets memory of its own."""
     return {
         f"{group}/{name}": value.detach().clone()
         for group, tensors in groups.items()
@@ -85,7 +81,7 @@ def group_tensors(groups: dict[str, dict[str, Tensor]]) -> dict[str, Tensor]:
 
 
 def ungroup_tensors(tensors: dict[str, Tensor], group: str) -> dict[str, Tensor]:
-    """The tensors of one group by their own names."""
+    """Return the tensors of one group by their own names."""
     prefix = f"{group}/"
     return {
         name.removeprefix(prefix): value
@@ -95,7 +91,7 @@ def ungroup_tensors(tensors: dict[str, Tensor], group: str) -> dict[str, Tensor]
 
 
 def generator_from(state: Tensor) -> torch.Generator:
-    """A random generator in a kept state."""
+    """Return a random generator in a kept state."""
     generator = torch.Generator()
     generator.set_state(state)
     return generator

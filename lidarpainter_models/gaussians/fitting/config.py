@@ -1,19 +1,11 @@
-"""Every setting of a fit, each with its reason."""
+"""Every setting of a fit, each with its reason; read without tensors."""
 
 from dataclasses import dataclass, field, replace
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.gaussians.fitting.settings import (
-    DensificationConfig,
-    FitLossWeights,
-    LearningRates,
-    ShapeLimits,
-)
+from lidarpainter_models.gaussians.fitting.learning_rates import LearningRates
+from lidarpainter_models.gaussians.fitting.number_of_gaussians import DensificationConfig
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
-
-HALF_STEP = 0.6
-"""What a step at half the image size costs of one at full size: 0.46 in images 960 pixels wide, in
-smaller ones 0.72, as Gaussians cost more than pixels there (docs/benchmarks.md)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,29 +25,48 @@ class RefinementConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FitLossWeights:
+    """How much each part of the loss of a fit counts; see `loss`."""
+
+    ssim: float = 0.2
+    """Weight of 1 - SSIM beside the mean absolute difference."""
+    perceptual: float = 0.0
+    """Weight of the perceptual distance, where one is given to the fit."""
+    sky: float = 0.05
+    """Weight of the clear-sky term, on painted views of its part where LiDAR hit something."""
+    actors: float = 0.1
+    """Weight of the term that keeps actors inside their boxes."""
+    depth: float = 0.05
+    """Weight of the LiDAR depth term."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GuidanceConfig:
     """How painted views take part."""
 
     probability: float = 1.0
-    """Of adding one painted view to a step (the paper's p_novel, 0.4). Against 0.5 the neighbouring
-    lanes of streets gain 0.1 dB, recorded views lose 0.05 to 0.1 (docs/benchmarks.md)."""
+    """Probability of adding one painted view to a step (the paper's p_novel, 0.4). Against 0.5 the
+    neighbouring lanes of streets gain 0.1 dB, recorded views lose 0.05 to 0.1
+    (docs/benchmarks.md)."""
     until: float = 0.7
     """Part of the steps that painted views take part in. The last ones fit recorded views alone,
     which halves what painting costs these (docs/benchmarks.md)."""
     weight: float = 1.0
-    """Of its loss (the paper's lambda_novel, 0.2, changed nothing on short schedules)."""
+    """Weight of a painted view's loss (the paper's lambda_novel, 0.2, changed nothing on short
+    schedules)."""
     ssim: float = 0.1
-    """Of 1 - SSIM in its loss, as in the paper."""
+    """Weight of 1 - SSIM in a painted view's loss, as in the paper."""
     perceptual: float = 0.0
-    """Of the perceptual distance in its loss, where one is given to the fit (1 in the paper)."""
+    """Weight of the perceptual distance in a painted view's loss, where one is given to the fit
+    (1 in the paper)."""
     depth: float = 0.01
-    """Of the LiDAR depth term on painted views: a painted guess in a hole would otherwise pull
-    surfaces off their LiDAR depth."""
+    """Weight of the LiDAR depth term on painted views: a painted guess in a hole would otherwise
+    pull surfaces off their LiDAR depth."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EffortConfig:
-    """How much a fit spends on what the views show; see `planned_fit`."""
+    """How much a fit spends on what the views show; see `plan`."""
 
     looks: float = 300.0
     """Steps for every view's worth of new surface. More of them sharpen the recorded views and cost
@@ -83,41 +94,25 @@ class FitConfig:
     half_resolution: float = 0.3
     """First part of the steps at half the image size: a quarter of the pixels."""
     seed: int = 0
-    """Of the order of views."""
+    """Seed of the order in which the fit sees its views."""
     initialisation: InitialisationConfig = field(default_factory=InitialisationConfig)
     densification: DensificationConfig = field(default_factory=DensificationConfig)
     learning_rates: LearningRates = field(default_factory=LearningRates)
     losses: FitLossWeights = field(default_factory=FitLossWeights)
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
-    shapes: ShapeLimits = field(default_factory=ShapeLimits)
     guidance: GuidanceConfig = field(default_factory=GuidanceConfig)
     log_every: int = 50
     """Steps between two entries of the history."""
     memory_bytes: int | None = None
-    """Of the whole process, on a CPU: fewer Gaussians are made where more would be taken. None
-    sets no limit."""
+    """Most memory of the whole process, on a CPU: fewer Gaussians are made where more would be
+    taken. None sets no limit."""
     time_limit_s: float | None = None
-    """Of the steps, by the clock: as many are made as there is time for, and the schedules are
+    """Most wall time of the steps: as many are made as there is time for, and the schedules are
     those of so many. None sets no limit."""
 
     def most_steps(self, num_views: float) -> float:
-        """Steps that are set, or those that follow if every view is new all over."""
+        """Return the steps that are set, or those that follow if every view is new all over."""
         return self.steps or self.effort.looks * num_views
-
-    def work(self, step: int) -> float:
-        """What the first steps cost, in steps at full image size."""
-        return step - (1 - HALF_STEP) * min(step, self.half_resolution * self.steps)
-
-    def steps_within(self, work: float, step: int) -> int:
-        """How many steps there may be in all, so that those after `step` cost so much `work`.
-
-        `steps` at most; of fewer steps, the part at half size is shorter too.
-        """
-        half = self.half_resolution
-        steps = (work + HALF_STEP * step) / (HALF_STEP * half + 1 - half)
-        if steps * half < step:
-            steps = step + max(work, 0.0)
-        return min(self.steps, int(steps))
 
     @property
     def weighs_perceptual(self) -> bool:
@@ -149,7 +144,7 @@ def continuation(
     looks: float | None = None,
     guidance: GuidanceConfig | None = None,
 ) -> FitConfig:
-    """How a fit goes on from a fitted scene, for so many steps or looks.
+    """Return how a fit is continued from a fitted scene, for so many steps or looks.
 
     Full images and actors free to move from the first step; growth and rates as in the first fit.
     Rates started lower held nothing better and took in a fifth less of what was painted. Cameras

@@ -68,13 +68,12 @@ def densify(
     box_sizes_m: Sequence[Float[Tensor, "3"]],
     *,
     target: int,
-    threshold: float = 0.0,
 ) -> SetChange:
-    """Drop the useless, then split the most wanted above a threshold until there are `target`."""
+    """Drop the useless, then split those with the largest gradients until there are `target`."""
     stays = keeps_its_place(gaussians, box_sizes_m)
     room = target - int(stays.sum())
     score = torch.where(stays & (tally.visits > 0), tally.mean, torch.zeros_like(tally.mean))
-    num_split = max(min(room, int((score > threshold).sum())), 0)
+    num_split = max(min(room, int((score > 0).sum())), 0)
     # a stable sort, so that equal scores never depend on the machine
     chosen = torch.argsort(score, descending=True, stable=True)[:num_split]
     is_split = torch.zeros_like(stays)

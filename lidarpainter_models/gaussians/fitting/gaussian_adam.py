@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from lidarpainter_models.gaussians.fitting.settings import LearningRates
+from lidarpainter_models.gaussians.fitting.learning_rates import LearningRates
 from lidarpainter_models.gaussians.model.gaussian_set import PARAMETERS, SH_CONSTANT, GaussianSet
 from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
 from lidarpainter_models.kernels.frustum_culling import MOST_SIGMAS

@@ -32,19 +32,19 @@ class HiddenGaussians:
     """What each view leaves out. The n-th recorded view is called n, the n-th painted one ~n."""
 
     number: Int[Tensor, " gaussians"]
-    """Of each Gaussian, int32; never given again."""
+    """Number of each Gaussian, int32; no number is given twice."""
     row_of_number: Int[Tensor, " numbers"]
-    """Where each number stands in the set; one past its end where the Gaussian is gone."""
+    """Row at which each number stands in the set; one past its end where the Gaussian is gone."""
     left_out: dict[int, Int[Tensor, " hidden"]] = field(default_factory=dict)
-    """By view the numbers of those left out."""
+    """Numbers of the Gaussians that each view leaves out."""
     looks: dict[int, int] = field(default_factory=dict)
-    """By view the looks so far."""
+    """Looks of each view so far."""
     _in_view: dict[int, Bool[Tensor, " gaussians"]] = field(default_factory=dict, repr=False)
-    """By view that looks at everything in this step, what its frustum holds."""
+    """What the frustum holds of each view that looks at everything in this step."""
 
     @classmethod
     def none_yet(cls, num_gaussians: int, device: torch.device) -> "HiddenGaussians":
-        """Of so many Gaussians, which no view has looked at."""
+        """Return the start: so many Gaussians, which no view has looked at."""
         number = torch.arange(num_gaussians, dtype=torch.int32, device=device)
         return cls(number=number, row_of_number=number.long())
 
@@ -54,7 +54,7 @@ class HiddenGaussians:
         return looks in FIRST_LOOKS or looks % LOOKS_BETWEEN == FIRST_LOOKS[-1]
 
     def without(self, in_view: Bool[Tensor, " gaussians"], view: int) -> Bool[Tensor, " gaussians"]:
-        """Of what a view's frustum holds, what it looks at this time."""
+        """Return which Gaussians a view looks at this time, of those that its frustum holds."""
         if self.is_due(view):
             self._in_view[view] = in_view
             return in_view

@@ -24,19 +24,19 @@ class FitImage:
     """One training view at one size."""
 
     camera: Camera
-    """As recorded."""
+    """The camera, posed as recorded."""
     timestamp_ns: int
     """When it was really taken."""
     camera_name: str
     rgb_u8: UInt8[Tensor, "height width 3"]
     kind: UInt8[Tensor, "height width"]
-    """As in `PixelFacts`."""
+    """What each pixel shows, coded as in `PixelFacts`."""
     lidar_depth_m: Float[Tensor, "height width"]
     hidden: Bool[Tensor, "height width"] | None = None
     """Pixels that nothing is learnt from."""
 
     def to(self, device: torch.device) -> "FitImage":
-        """The same image on another device, as far as it is not there."""
+        """Return the image on another device; itself if it is there."""
         if self.rgb_u8.device == device:
             return self
         return replace(
@@ -48,7 +48,7 @@ class FitImage:
         )
 
     def facts(self) -> PixelFacts:
-        """What a step reads: made anew each time, as floats take four times the memory."""
+        """Return what a step reads, made anew each time: floats take four times the memory."""
         return PixelFacts(
             rgb=self.rgb_u8.float() / 255, kind=self.kind, lidar_depth_m=self.lidar_depth_m
         )

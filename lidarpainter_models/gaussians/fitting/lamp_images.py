@@ -31,7 +31,7 @@ class Look:
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Of some places, what two levels explain of their changes."""
+    """What two levels of brightness explain of the changes of some places."""
 
     explained: Float[Tensor, " places"]
     change: Float[Tensor, " places"]

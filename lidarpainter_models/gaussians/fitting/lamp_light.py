@@ -20,11 +20,11 @@ from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
 
 NEAREST_M = 0.2
-"""What is nearer to a camera than this is not before it."""
+"""Depth below which a lamp does not count as before a camera."""
 STEADINESS = 0.3
 """Pixels with no change that each node of a lattice starts with."""
 ROUNDS = 10
-"""In which a lattice is fitted to its Gaussians."""
+"""Iterations in which a lattice is fitted to its Gaussians."""
 
 
 def with_measured_lamps(

@@ -37,12 +37,12 @@ MOST_SIDE_M = 1.2
 LEAST_MEAN_PX = 2.0
 """On average over the images that see it, a lamp has this many."""
 LEAST_CHANGE = 0.12
-"""From off to on, in the channel that changes most; images are 0 to 1."""
+"""Least change of a lamp from off to on, in the channel that changes most; images are 0 to 1."""
 LEAST_EXPLAINED = 0.97
 """Share of a lamp's change over time that two levels explain. On PandaSet 002 a signal that
 flashes has 0.99, what is next 0.966 (docs/benchmarks.md)."""
 CANDIDATE_CHANGE, CANDIDATE_EXPLAINED = 0.1, 0.85
-"""The same of a single cube that may be part of a lamp."""
+"""Least change, and share explained, of a single cube that may be part of a lamp."""
 AROUND_CELLS, MOST_AROUND = 3, 0.4
 """What is around a lamp, within so many cells of it, changes by less than this share of its change:
 shadows and people that pass are wide."""

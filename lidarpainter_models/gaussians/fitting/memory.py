@@ -1,10 +1,11 @@
-"""What memory a fit takes, told before it begins, and how many Gaussians fit into a limit.
+"""Memory that a fit takes, told before it begins, and how many Gaussians fit into a limit.
 
 Bytes of what is kept are counted; those of a step are what its parts were seen to take, rounded up.
 """
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 from torch import Tensor
 
@@ -19,15 +20,16 @@ from lidarpainter_models.observations.views import GuidanceView, SceneObservatio
 FLOAT = 4
 """Bytes of a number."""
 IMAGE_BYTES, GUIDANCE_BYTES = 8, 6
-"""Of a pixel: colour, depth and kind of a recorded image; colour, weight and depth of a painted."""
+"""Bytes of a pixel: colour, depth and kind of a recorded image; colour, weight and depth of a
+painted one."""
 PROGRAM_BYTES = 700_000_000
-"""Of the process before it holds anything: the interpreter, torch, numba's kernels, arrow."""
+"""Bytes of the process before it holds anything: the interpreter, torch, numba's kernels, arrow."""
 HALF_IMAGES = 0.25
-"""Of a full image's pixels."""
+"""Part of a full image's pixels that a half-size one has."""
 TEXEL_BYTES = 44
-"""Of the sky: colour, weight, moments and visits."""
+"""Bytes of a texel of the sky: colour, weight, moments and visits."""
 STEP_FLOATS_PER_PIXEL = 60
-"""Of images, terms and their gradients that live at once, most of them SSIM's."""
+"""Numbers of images, terms and their gradients that live at once, most of them SSIM's."""
 STEP_FLOATS_PER_TEXEL = 16
 """Gradients of the sky, and what its Adam works with."""
 RASTER_BYTES_PER_GAUSSIAN = 512
@@ -35,9 +37,9 @@ RASTER_BYTES_PER_GAUSSIAN = 512
 LEAST_SHARE = 10
 """A limit that leaves less than one in so many of the Gaussians wanted is refused."""
 ROW_BYTES = 68
-"""Of a Gaussian: its body, block, place among blocks, tallies, last step, number and its place."""
+"""Bytes of a Gaussian: body, block, place among blocks, tallies, last step, number, its place."""
 HIDDEN_BYTES = 1.0
-"""Of a Gaussian and a view: the numbers of those that the view leaves out."""
+"""Bytes of a Gaussian and a view: the numbers of those that the view leaves out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,19 +59,13 @@ class FitMemory:
 
     @property
     def total(self) -> int:
-        """All of it on the device."""
+        """Bytes of everything on the device."""
         return self.gaussians + self.sky + self.images + self.step + self.rasteriser
 
     @property
     def of_process(self) -> int:
-        """Of the whole process where the device is the CPU."""
+        """Bytes of the whole process where the device is the CPU."""
         return self.total + self.observed + PROGRAM_BYTES
-
-    def told(self) -> str:
-        """In words, such as `2.1 GB (Gaussians 0.9, images 0.5, ...)`."""
-        parts = ("gaussians", "sky", "images", "step", "rasteriser")
-        shares = ", ".join(f"{name} {getattr(self, name) / 1e9:.2f}" for name in parts)
-        return f"{self.total / 1e9:.2f} GB ({shares})"
 
 
 def planned_memory(
@@ -79,16 +75,25 @@ def planned_memory(
     *,
     start: GaussianSet | None = None,
     guidance: Sequence[GuidanceView] = (),
+    most_gaussians: int | None = None,
     keeps_images: bool = True,
 ) -> FitMemory:
-    """What a fit takes when it has as many Gaussians as it may have and all are in view.
+    """Return what a fit takes when it has as many Gaussians as it may have and all are in view.
 
-    Gaussians of the `start` may be more than the budget; `keeps_images` says whether images lie on
-    the device, or are sent there one by one.
+    Args:
+        observations: what was recorded.
+        config: planned settings.
+        sky: layout of the sky's texture.
+        start: Gaussians that are continued; they may be more than the budget.
+        guidance: painted views.
+        most_gaussians: there may be, at first and later, if they are fewer than planned.
+        keeps_images: whether images lie on the device, or are sent there one by one.
     """
-    at_first = config.initialisation.num_gaussians if start is None else len(start)
+    most = math.inf if most_gaussians is None else most_gaussians
+    first = min(config.initialisation.num_gaussians, most)
+    at_first = first if start is None else len(start)
     degree = config.initialisation.sh_degree if start is None else start.sh_degree
-    count = max(at_first, config.densification.budget)
+    count = int(max(at_first, min(config.densification.budget, most)))
     columns = 11 + 3 * (degree + 1) ** 2
     padded = columns + -columns % VECTOR
     pixels = [view.camera.width_px * view.camera.height_px for view in observations.views]
@@ -112,50 +117,40 @@ def planned_memory(
     )
 
 
-def within_limit(
+def gaussians_within_limit(
     observations: SceneObservations,
     config: FitConfig,
     sky: SkyLayout,
     *,
     start: GaussianSet | None = None,
     guidance: Sequence[GuidanceView] = (),
-) -> FitConfig:
-    """The config with at most as many Gaussians as its `memory_bytes` have room for on a CPU.
+) -> int:
+    """Return how many Gaussians the `memory_bytes` of planned settings have room for on a CPU.
 
     Raises:
-        ConfigError: not even a tenth of them fits, or the start does not.
+        ConfigError: not even a tenth of those planned fits, or the start does not.
     """
-    if config.memory_bytes is None:
-        return config
 
     def taken(count: int) -> int:
-        part = _with_at_most(count, config)
-        return planned_memory(observations, part, sky, start=start, guidance=guidance).of_process
+        memory = planned_memory(
+            observations, config, sky, most_gaussians=count, start=start, guidance=guidance
+        )
+        return memory.of_process
 
+    limit = config.memory_bytes or math.inf
     at_first = config.initialisation.num_gaussians if start is None else len(start)
     wanted = max(config.densification.budget, at_first)
-    if taken(wanted) <= config.memory_bytes:
-        return config
+    if taken(wanted) <= limit:
+        return wanted
     least = max(wanted // LEAST_SHARE, 1 if start is None else at_first)
-    room = config.memory_bytes - taken(least)
+    room = limit - taken(least)
     if room < 0:
         raise ConfigError(
-            f"memory {config.memory_bytes / 1e9:.1f} GB: this fit takes at least "
-            f"{taken(least) / 1e9:.1f} GB; fewer cameras, frames or pixels "
-            "(observation.width_px) take less"
+            f"memory {limit / 1e9:.1f} GB: this fit takes at least {taken(least) / 1e9:.1f} GB; "
+            "fewer cameras, frames or pixels (observation.width_px) take less"
         )
     each = (taken(wanted) - taken(least)) / (wanted - least)  # equal ones were refused above
-    return _with_at_most(least + int(room / each), config)
-
-
-def _with_at_most(count: int, config: FitConfig) -> FitConfig:
-    """The config with at most so many Gaussians, at first and later."""
-    growth, first = config.densification, config.initialisation
-    return replace(
-        config,
-        densification=replace(growth, budget=min(growth.budget, count)),
-        initialisation=replace(first, num_gaussians=min(first.num_gaussians, count)),
-    )
+    return least + int(room / each)
 
 
 def _observed_bytes(observations: SceneObservations) -> int:

@@ -1,4 +1,4 @@
-"""What a fit corrects about the recording while it goes on: camera poses, actors, exposure."""
+"""Refined poses and colours: what a fit corrects of cameras, actors and exposure as it runs."""
 
 from dataclasses import dataclass
 
@@ -17,12 +17,12 @@ ACTOR_NOISE = {"rotation_rad": 0.03, "translation_m": 0.2}
 CAMERA_PRIOR = 1e-4
 """Weight of squared camera corrections in units of the expected noise."""
 ACTOR_PRIOR = 1e-6
-"""Of squared actor corrections, likewise: an actor fills a small part of the image."""
+"""Weight of squared actor corrections, likewise: an actor fills a small part of the image."""
 ACTOR_SMOOTHNESS = 1e-5
-"""Of squared jumps between an actor's neighbouring corrections, likewise."""
+"""Weight of squared jumps between an actor's neighbouring corrections, likewise."""
 
 BEND_PRIOR = 3e-6
-"""Of the squared strain of lattices (`Bending.strain`), likewise."""
+"""Weight of the squared strain of lattices (`Bending.strain`), likewise."""
 BEND_NOISE_M = 0.1
 """Expected way of a node."""
 
@@ -155,22 +155,28 @@ class Refinement:
             return 0.0
         return BEND_PRIOR / BEND_NOISE_M**2 * self.scene.actors.bending.strain(timestamp_ns)
 
-    def step(self, step: int, image: FitImage) -> None:
-        """Move the corrections that are refined by the gradients they received; drop these."""
+    def step(self, step: int, fraction: float, image: FitImage) -> None:
+        """Move the corrections that are refined by the gradients they received; drop these.
+
+        Args:
+            step: how many steps were made before.
+            fraction: which part of the fit these are, 0 to 1.
+            image: the recorded view of this step.
+        """
         if self.refines_cameras(step):
             table = self.scene.cameras.view_tangent
-            self.adams["camera_adam"].step(table, _gradient(table), self._rate("camera", step))
+            self.adams["camera_adam"].step(table, _gradient(table), self._rate("camera", fraction))
             self.scene.cameras.recentre()
         if self.refines_actors(step):
             tangent = self.scene.actors.tangent
             with torch.no_grad():
                 gradient = _gradient(tangent).view(-1, 6)
-                rate = self._rate("actor", step)
+                rate = self._rate("actor", fraction)
                 self.adams["actor_adam"].step(tangent.view(-1, 6), gradient, rate)
             if self._bends:
-                self._step_bending(step, image)
+                self._step_bending(fraction, image)
         if self.refines_exposure:
-            self._step_exposure(step, image)
+            self._step_exposure(fraction, image)
         for table in self._tables():
             table.grad = None
 
@@ -178,20 +184,20 @@ class Refinement:
     def _bends(self) -> bool:
         return len(self.scene.actors.bending.bodies) > 0
 
-    def _step_bending(self, step: int, image: FitImage) -> None:
+    def _step_bending(self, fraction: float, image: FitImage) -> None:
         bending = self.scene.actors.bending
         near, _ = bending.weights_at(image.timestamp_ns)
-        rate = self.config.learning_rates.at("bending_m", step / self.config.steps)
+        rate = self.config.learning_rates.at("bending_m", fraction)
         with torch.no_grad():
             table = bending.offset_m.view(len(bending.knots_ns), -1)
             gradient = _gradient(bending.offset_m).view(table.shape)
             self.adams["bend_adam"].step(table, gradient, table.new_full((1,), rate), near)
 
-    def _step_exposure(self, step: int, image: FitImage) -> None:
+    def _step_exposure(self, fraction: float, image: FitImage) -> None:
         exposure = self.scene.exposure
         names, matrix = exposure.camera_names, exposure.matrix
         row = names.index(image.camera_name)
-        rate = self.config.learning_rates.at("exposure", step / self.config.steps)
+        rate = self.config.learning_rates.at("exposure", fraction)
         self._step_gain(row, image.timestamp_ns, rate)
         if row == 0 and len(names) > 1:
             return  # the reference: all cameras together would be free to drift
@@ -220,9 +226,9 @@ class Refinement:
             )
             log_gain[row] -= log_gain[row].mean()
 
-    def _rate(self, kind: str, step: int) -> Float[Tensor, "6"]:
+    def _rate(self, kind: str, fraction: float) -> Float[Tensor, "6"]:
         """Step sizes of a tangent's columns."""
-        rates, fraction = self.config.learning_rates, step / self.config.steps
+        rates = self.config.learning_rates
         rotation_rad = rates.at(f"{kind}_rotation_rad", fraction)
         translation_m = rates.at(f"{kind}_translation_m", fraction)
         return torch.tensor([rotation_rad] * 3 + [translation_m] * 3, dtype=torch.float64)
@@ -247,7 +253,7 @@ def pose_prior(
 
 
 def _gradient(table: Tensor) -> Tensor:
-    """What the backward pass left."""
+    """Return the gradient that the backward pass left."""
     if table.grad is None:
         raise RuntimeError(f"no gradient reached a table of shape {tuple(table.shape)}")
     return table.grad

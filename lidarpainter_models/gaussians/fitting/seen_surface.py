@@ -1,4 +1,4 @@
-"""How much the training views show, which show something new, and what a fit makes of it.
+"""How much surface the training views show, and which of them show something new.
 
 A surface counts at the finest it was seen: A square metres at a pixel's footprint of f metres are
 A / f^2 pixels. A view that sees it after others at footprint g adds (1 - (f / g)^2) of its own
@@ -22,7 +22,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d
 
-from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.images import shrink_depth
 from lidarpainter_models.gaussians.initialisation.unreached import FARTHEST_M, depth_from_below
 from lidarpainter_models.geometry.cameras import Camera, outside_all
@@ -42,8 +41,6 @@ TYPICAL_CONTRAST = 0.04
 0.055 in images 96 to 960 pixels wide of PandaSet 002 and two synthetic streets."""
 LEAST_DETAIL = 0.25
 """Detail of a pixel of surface at the least: by night LiDAR still sees it."""
-START_SHARE = 0.6875
-"""Of the budget; the rest is grown where images are wrong (a real log lost 0.3 dB without)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,11 +48,11 @@ class SeenSurface:
     """What a set of training views shows."""
 
     num_pixels: float
-    """Of surface, each at the finest it was seen."""
+    """Pixels of surface, each at the finest it was seen."""
     num_detailed: float
-    """The same, each by its contrast: as many of a typical street hold this detail."""
+    """Pixels by their contrast: as many of a typical street hold this detail."""
     whole_views: float
-    """The same in views: the first one counts 1, each other by what is new in it."""
+    """Surface in views: the first one counts 1, each other by what is new in it."""
     groups: tuple[tuple[int, ...], ...]
     """Positions of the views: one that shows something new, and those after it of its camera that
     add nothing to it."""
@@ -98,7 +95,7 @@ def seen_surface(
 def with_shown_beside(
     surface: SeenSurface, views: Sequence[TrainingView], guidance: Sequence[GuidanceView]
 ) -> SeenSurface:
-    """The same with what painted views show and no recorded one does, by their own contrast.
+    """Return the surface with what painted views show and no recorded one does, by its contrast.
 
     There a cell with any return of LiDAR shows surface. It takes Gaussians; looks are at recorded
     views, as without it.
@@ -148,7 +145,7 @@ def _new_shares(
     footprint_m: Float[Tensor, " cells"],
     earlier: Sequence[Camera],
 ) -> Float[Tensor, " cells"]:
-    """Of each cell that is not sky: which part of its pixels no earlier camera saw as finely."""
+    """Return which part of each cell that is not sky no earlier camera saw as finely."""
     known = torch.zeros_like(footprint_m)
     for camera in earlier:
         pixels_uv, depth_m = camera.project(points_world)
@@ -191,16 +188,3 @@ def _nearest(cameras: Sequence[Camera], to: Camera) -> list[Camera]:
     distance_m = (centres - to.centre_world).norm(dim=1)
     nearest = distance_m.argsort(stable=True)[:COMPARED_VIEWS]
     return [cameras[int(row)] for row in nearest.sort().values]
-
-
-def planned_fit(config: FitConfig, surface: SeenSurface) -> FitConfig:
-    """The same settings with every number that was left open; what is set stays."""
-    effort, growth, start = config.effort, config.densification, config.initialisation
-    budget = growth.budget or max(round(effort.gaussians_per_pixel * surface.num_detailed), 1)
-    num_gaussians = start.num_gaussians or max(round(START_SHARE * budget), 1)
-    return replace(
-        config,
-        steps=config.steps or max(round(effort.looks * surface.whole_views), 1),
-        densification=replace(growth, budget=budget),
-        initialisation=replace(start, num_gaussians=num_gaussians),
-    )

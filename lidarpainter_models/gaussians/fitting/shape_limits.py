@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidarpainter_models.gaussians.fitting.settings import ShapeLimits
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
@@ -25,6 +24,12 @@ LIMITS_EVERY = 50
 STEADY_RAY = 0.985
 """Rays that differ more than about 10 degrees over the log pin a Gaussian's depth themselves: below
 this length of the mean unit ray the stricter limit is off."""
+MOST_ELONGATION = 12.0
+"""Longest over middle axis: poles and wires need needles."""
+MOST_ELONGATION_ALONG_RAY = 2.0
+"""Longest over middle axis where that lies within 45 degrees of the viewing ray."""
+MOST_SIGMA = 0.1
+"""Longest axis in units of the distance to the nearest camera."""
 LEAST_SIGMA_M = 0.003
 """Thinnest axis; the low-pass of a pixel is wider anyway."""
 
@@ -36,7 +41,7 @@ class ViewingRays:
     mean_direction: Float[Tensor, "gaussians 3"]
     """Mean of the unit rays: short where they differ."""
     distance_m: Float[Tensor, " gaussians"]
-    """To the nearest camera."""
+    """Distance to the nearest camera."""
 
 
 def viewing_rays(scene: GaussianScene) -> ViewingRays:
@@ -67,7 +72,7 @@ def viewing_rays(scene: GaussianScene) -> ViewingRays:
     )
 
 
-def limit_shapes(gaussians: GaussianSet, rays: ViewingRays, limits: ShapeLimits) -> None:
+def limit_shapes(gaussians: GaussianSet, rays: ViewingRays) -> None:
     """Shorten needles, thicken films and shrink giants, in place (`log_scale`)."""
     with torch.no_grad():
         ordered, order = gaussians.log_scale.sort(dim=1)
@@ -75,9 +80,9 @@ def limit_shapes(gaussians: GaussianSet, rays: ViewingRays, limits: ShapeLimits)
         length = rays.mean_direction.norm(dim=1)
         along = (direction * rays.mean_direction).sum(dim=1).abs() / length.clamp(min=1e-3)
         is_needle = (along > _ALONG) & (length > STEADY_RAY)
-        most = torch.where(is_needle, limits.most_elongation_along_ray, limits.most_elongation)
+        most = torch.where(is_needle, MOST_ELONGATION_ALONG_RAY, MOST_ELONGATION)
         limit = ordered[:, 1] + most.log()
-        limit = torch.minimum(limit, (rays.distance_m * limits.most_sigma).log())
+        limit = torch.minimum(limit, (rays.distance_m * MOST_SIGMA).log())
         capped = torch.minimum(gaussians.log_scale, limit[:, None])
         gaussians.log_scale.copy_(capped.clamp(min=math.log(LEAST_SIGMA_M)))
 

@@ -4,6 +4,7 @@ Gaussians out of view lag behind (`gaussian_adam`). They are kept as they lag, t
 blocks: catching up for a checkpoint would split their way differently from an undisturbed run's.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -45,6 +46,8 @@ class FitState:
     refinement: Refinement
     tally: GradientTally
     generator: torch.Generator
+    steps: int
+    """Steps of the fit in all, as planned; a limit of time lowers them."""
     waiting: list[int] = field(default_factory=list)
     """Groups of views still to be drawn from in this pass."""
     step: int = 0
@@ -72,7 +75,13 @@ class FitState:
             refinement=Refinement.begin(scene, config),
             tally=GradientTally.zeros(scene.num_gaussians, scene.device),
             generator=generator,
+            steps=config.steps,
         )
+
+    @property
+    def fraction(self) -> float:
+        """Part of the fit that is done, 0 to 1."""
+        return self.step / self.steps
 
     def next_view(self, groups: Sequence[Sequence[int]]) -> int:
         """Any view of the next group, of a random order that has each group once before any twice.
@@ -104,9 +113,9 @@ class FitState:
         rows = torch.stack(seen).any(dim=0).nonzero()[:, 0]
         return self.gaussian_adam.seen(self.scene.gaussians, rows)
 
-    def step_gaussians(self, seen: SeenGaussians, fraction: float) -> None:
-        """Move the Gaussians that collected gradients, after a fraction of the fit."""
-        self.gaussian_adam.step(self.scene.gaussians, seen, fraction)
+    def step_gaussians(self, seen: SeenGaussians) -> None:
+        """Move the Gaussians that collected gradients."""
+        self.gaussian_adam.step(self.scene.gaussians, seen, self.fraction)
         self.blocks.refresh(self.scene.gaussians, seen.rows)
 
     def caught_up(self) -> GaussianScene:
@@ -128,6 +137,20 @@ class FitState:
             self.scene.gaussians.sh_dc.copy_(scene.gaussians.sh_dc)
         self.scene = replace(self.scene, blinking=scene.blinking)
         self.sought_lamps = True
+
+    def log(self) -> None:
+        """Add an entry to the history: means since the one before."""
+        losses, errors = zip(*(self.recent_numbers() or [[0.0, 1.0]]), strict=True)
+        self.history.append(
+            {
+                "step": float(self.step),
+                "loss": sum(losses) / len(losses),
+                "psnr": sum(-10 * math.log10(max(error, 1e-10)) for error in errors) / len(errors),
+                "num_gaussians": float(self.scene.num_gaussians),
+                "cpu_s": self.cpu_s,
+            }
+        )
+        self.recent = []
 
     def keep(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Tensors and JSON-able numbers of the whole state."""

@@ -5,18 +5,24 @@ lie on the device of the scene; poses (float64) and exposure, a few small matric
 CPU.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.hidden_gaussians import probed
 from lidarpainter_models.gaussians.fitting.images import FitImage
+from lidarpainter_models.gaussians.fitting.loss import (
+    ACTOR_TERM_EVERY,
+    Perceptual,
+    actor_loss,
+    painted_loss,
+    recorded_loss,
+)
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.model.rolling_shutter import as_read, bodies_while_read
 from lidarpainter_models.gaussians.model.scene_rendering import (
@@ -31,35 +37,18 @@ from lidarpainter_models.gaussians.model.sky import (
     MIN_TRANSMITTANCE,
 )
 from lidarpainter_models.gaussians.model.spatial_blocks import View
-from lidarpainter_models.geometry.box_masks import project_boxes
-from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
-from lidarpainter_models.kernels.pixel_losses import (
-    SKY,
-    PixelRules,
-    clear_sky_loss,
-    depth_loss,
-    pixel_terms,
-)
+from lidarpainter_models.kernels.pixel_losses import SKY
 from lidarpainter_models.kernels.side_by_side import both
 from lidarpainter_models.kernels.sky_texture import SkyRays
-from lidarpainter_models.kernels.ssim import l1_ssim_loss
 from lidarpainter_models.observations.views import GuidanceView
 
-ACTOR_TERM_EVERY = 10
-"""Steps between two actor terms: it needs one more blended channel."""
-_EDGE = 1e-4  # keeps logarithms finite
 WAITS = 4
 """The most of the host for the device in a step, without the rasteriser's own: how many Gaussians
 are in view, how many of them lag and by how much (plain torch alone asks), and the gradients of the
 bodies' poses and of the exposure. Where somebody bends, one more for each view: which Gaussians
 do; where lamps blink, two more for each: which are in one; for each that looks at everything, one:
 which of it shows nothing."""
-
-Perceptual = Callable[
-    [Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]], Float[Tensor, ""]
-]
-"""Distance of a rendered and a true image, differentiable in the first."""
 
 
 def fit_step(
@@ -70,11 +59,18 @@ def fit_step(
     config: FitConfig,
     perceptual: Perceptual | None,
 ) -> Float[Tensor, "2"]:
-    """Step everything by one recorded view, the `row`-th, and a painted one if it is given.
+    """Step everything by one recorded view and a painted one if it is given.
 
-    A painted view comes with its place among all of them.
+    Args:
+        state: the running fit.
+        image: the recorded view.
+        row: its place among all of them.
+        guidance: a painted view and its place among all of them.
+        config: settings of the fit.
+        perceptual: distance of images, where one has a weight.
 
-    Returns the loss and the mean squared error of the recorded image, where the scene lies.
+    Returns:
+        The loss and the mean squared error of the recorded image, where the scene lies.
     """
     pose = state.refinement.world_from_camera(row, state.step)
     recorded = image.camera.refined(pose.detach())
@@ -103,9 +99,9 @@ def fit_step(
     for name, probe in zip(looks, probes, strict=True):
         state.hidden.learn(name, seen.rows, probe)
     state.tally.add(seen.rows, found.screen_gradient, found.splat.visible)
-    state.refinement.step(state.step, image)
-    _step_sky(state, found, config, image)
-    state.step_gaussians(seen, state.step / config.steps)
+    state.refinement.step(state.step, state.fraction, image)
+    _step_sky(state, found, image)
+    state.step_gaussians(seen)
     return found.told
 
 
@@ -148,16 +144,11 @@ def _recorded_gradients(  # noqa: PLR0913 - what a step is made of
     rays = sky.rays(camera, (splat.alpha.detach() < OPAQUE) | image.is_open)
     sky_rgb = sky.sample(rays).requires_grad_(True)
     exposure = state.refinement.exposure(image)
-    terms = pixel_terms(splat, sky_rgb, facts, _pixel_rules(config), exposure=exposure)
-    shown = terms.shown
-    if image.hidden is not None:
-        shown = torch.where(image.hidden[..., None], facts.rgb, shown)
-    loss = l1_ssim_loss(shown, facts.rgb, ssim_weight=weights.ssim)
-    if perceptual is not None and weights.perceptual > 0:
-        loss = loss + weights.perceptual * perceptual(shown, facts.rgb)
-    loss = loss + weights.sky * terms.sky + weights.depth * terms.depth
+    loss, shown = recorded_loss(
+        splat, sky_rgb, image, facts, weights, exposure=exposure, perceptual=perceptual
+    )
     if with_actors:
-        loss = loss + weights.actors * _actor_term(state, splat, image, camera)
+        loss = loss + weights.actors * actor_loss(splat, actors, camera, image.timestamp_ns)
     loss = loss + state.refinement.bend_prior(image.timestamp_ns, state.step)
     prior = state.refinement.prior(row, image.timestamp_ns, state.step)
     # as a sum its gradient, which is the CPU's, would have to come from the device
@@ -169,7 +160,7 @@ def _recorded_gradients(  # noqa: PLR0913 - what a step is made of
 
 
 def _guidance_bodies(state: FitState, view: GuidanceView) -> Float[Tensor, "bodies 4 4"]:
-    """Where a painted view has the bodies; no gradient."""
+    """Return where a painted view has the bodies, without gradient."""
     with torch.no_grad():
         actors = state.scene.actors.corrected_poses(view.timestamp_ns)
         return camera_from_body(view.camera.world_from_camera, *actors)
@@ -184,53 +175,18 @@ def add_guidance_gradients(
     perceptual: Perceptual | None = None,
     probe: Float[Tensor, "seen 1"] | None = None,
 ) -> None:
-    """Add one painted view's gradients to the Gaussians; nothing else is changed by it.
-
-    What LiDAR hit is opaque there as on recorded views. The depth term alone is content with ever
-    less of what is there, and wears away what recorded views do not hold.
-    """
-    sky, settings = state.scene.sky, config.guidance
+    """Add one painted view's gradients to the Gaussians; nothing else is changed by it."""
+    sky = state.scene.sky
     bending = state.scene.actors.bending
     held = replace(bending, offset_m=bending.offset_m.detach())
     lit = state.scene.blinking.lit(seen, view.timestamp_ns)
     shown_then = held.bent(lit, view.timestamp_ns)
     splat = draw_gaussians(shown_then, camera_from_bodies, view.camera, channel=probe)
     sky_rgb = sky.sample(sky.rays(view.camera, splat.alpha.detach() < OPAQUE))
-    shown = splat.rgb + (1 - splat.alpha)[..., None] * sky_rgb
-    loss = settings.weight * l1_ssim_loss(
-        shown, view.rgb, ssim_weight=settings.ssim, pixel_weight=view.weight
-    )
-    if perceptual is not None and settings.perceptual > 0:
-        trusted = torch.where(view.weight[..., None] > 0, shown, view.rgb)
-        distance = view.weight.mean() * perceptual(trusted, view.rgb)
-        loss = loss + settings.weight * settings.perceptual * distance
-    if settings.depth > 0:
-        loss = loss + settings.depth * depth_loss(
-            splat.depth_m, splat.alpha, view.lidar_depth_m, tolerance=config.losses.depth_tolerance
-        )
-    is_hit = view.lidar_depth_m > 0
-    loss = loss + config.losses.sky * clear_sky_loss(splat.alpha, torch.zeros_like(is_hit), is_hit)
+    loss = painted_loss(splat, sky_rgb, view, config, perceptual)
     if probe is not None:
         loss = loss + probed(splat)
     loss.backward()
-
-
-def actor_boundary_loss(
-    actor_alpha: Float[Tensor, "height width"], in_boxes: Bool[Tensor, "height width"]
-) -> Float[Tensor, ""]:
-    """Mean of -log(1 - actor_alpha) outside the projected boxes, of its entropy inside."""
-    inside = actor_alpha.clamp(_EDGE, 1 - _EDGE)
-    log_clear = torch.log1p(-inside)
-    entropy = -(inside * inside.log() + (1 - inside) * log_clear)
-    return torch.where(in_boxes, entropy, -log_clear).mean()
-
-
-def _pixel_rules(config: FitConfig) -> PixelRules:
-    return PixelRules(
-        sky_tolerance=config.losses.sky_tolerance,
-        depth_tolerance=config.losses.depth_tolerance,
-        min_transmittance=MIN_TRANSMITTANCE,
-    )
 
 
 def _wants_actor_term(state: FitState, config: FitConfig) -> bool:
@@ -238,20 +194,7 @@ def _wants_actor_term(state: FitState, config: FitConfig) -> bool:
     return is_due and config.losses.actors > 0 and bool(state.scene.actors.recorded_tracks)
 
 
-def _actor_term(
-    state: FitState, splat: SplatImage, image: FitImage, camera: Camera
-) -> Float[Tensor, ""]:
-    """Actors stay inside their projected boxes."""
-    actors = state.scene.actors
-    with torch.no_grad():
-        world_from_actors, present = actors.corrected_poses(image.timestamp_ns)
-        sizes = [track.size_m for track in actors.recorded_tracks]
-        in_boxes = project_boxes(camera, world_from_actors, sizes, present > 0)
-    in_boxes = in_boxes.to(splat.alpha.device, non_blocking=True)
-    return actor_boundary_loss(splat.features[..., 0], in_boxes)
-
-
-def _step_sky(state: FitState, found: _OfRecorded, config: FitConfig, image: FitImage) -> None:
+def _step_sky(state: FitState, found: _OfRecorded, image: FitImage) -> None:
     """Move the texels that were seen clearly enough, inside the sky mask alone.
 
     What is far but solid (towers beyond the LiDAR's reach) is left to the Gaussians.
@@ -265,5 +208,5 @@ def _step_sky(state: FitState, found: _OfRecorded, config: FitConfig, image: Fit
         found.sky_rgb.grad,
         torch.where(learns, clear, 0.0),
         found.sky_rays,
-        LEARNING_RATE * ratio ** (state.step / config.steps),
+        LEARNING_RATE * ratio**state.fraction,
     )

@@ -63,7 +63,7 @@ class Cloud:
     has_colour: Bool[Tensor, " points"]
     """Which of the colours mean anything."""
     spacing_m: Float[Tensor, " points"]
-    """What is asked for at each point, up to a factor for all."""
+    """Spacing that is asked for at each point, up to a factor for all."""
     least_m: float = 0.03
     """Smallest edge of a voxel."""
 

@@ -63,10 +63,10 @@ every point for every view would take the square of a log's length."""
 OUTLINE_VIEWS_PER_CAMERA = 8
 """Views that tell what stands against the sky."""
 MOST_STREET_POINTS, POINTS_PER_GAUSSIAN = 5_000_000, 100
-"""Of the street's points so many are looked at, evenly, in all and for each Gaussian: the sweeps of
+"""Points of the street that are looked at, evenly, in all and for each Gaussian: the sweeps of
 a car that stands are of one place."""
 MOST_ACTOR_POINTS = 60_000
-"""The same of an actor: many sweeps show one side of it alike."""
+"""Points of an actor that are looked at: many sweeps show one side of it alike."""
 POINTS_AT_ONCE = 32_768
 """Points that are asked for by one view after the other: what is kept of them fits a cache."""
 _MOST_VIEWS_PER_ACTOR = 24
@@ -87,7 +87,7 @@ def initialise_scene(
         ConfigError: no LiDAR point lies where a training camera could see it, or no start size.
     """
     if config.num_gaussians == 0:
-        raise ConfigError("the start needs num_gaussians, which `planned_fit` takes from the views")
+        raise ConfigError("the start needs num_gaussians, which `plan_fit` takes from the views")
     views = observations.views
     for_unreached = int(config.num_gaussians * MOST_SHARE)
     on_surfaces = max(config.num_gaussians - for_unreached, 1)
@@ -218,7 +218,7 @@ def _part_footprint(
 
 
 def _spread_cameras(views: Sequence[TrainingView]) -> tuple[list[Camera], list[int]]:
-    """At most so many places of each camera, evenly over the log, and the images taken there."""
+    """Return a few places of each camera, evenly over the log, and the images taken there."""
     places: dict[str, list[tuple[Camera, int]]] = {}
     for view in views:
         own = places.setdefault(view.key[1], [])
@@ -298,7 +298,7 @@ def _street(
 
 
 def _spread(points: MapPoints, most: int) -> MapPoints:
-    """At most so many of the points, evenly over the log; nothing is copied."""
+    """Return at most so many of the points, evenly over the log; nothing is copied."""
     return points.keep(slice(None, None, max(math.ceil(len(points) / most), 1)))
 
 

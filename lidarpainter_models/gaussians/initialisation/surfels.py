@@ -31,7 +31,7 @@ SPACING_NEIGHBOURS = 4
 OUTLINE_SIGMA = 0.5
 """Largest standard deviation, in units of the distance to the nearest sky of an image."""
 LEAST_OUTLINE_PX = 0.7
-"""What is as thin as that may be seen as sky altogether."""
+"""Size below which something may be seen as sky altogether."""
 
 
 def fill_colours(
@@ -115,7 +115,7 @@ def surfels_from_points(
 
 
 def within_outlines(gaussians: GaussianSet, views: Iterable[TrainingView]) -> GaussianSet:
-    """The same Gaussians of the street, small enough not to reach into the sky of some views.
+    """Return Gaussians of the street, made small enough not to reach into the sky of some views.
 
     The neighbours of a wire's points are far: discs that span them would hide the sky, and with it
     the far towers that nothing but images shows (`unreached_gaussians`).

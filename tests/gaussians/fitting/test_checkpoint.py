@@ -41,10 +41,3 @@ def test_checkpoints_are_due_by_steps_or_seconds(tmp_path):
     assert at_once.is_due(1)
     with pytest.raises(ConfigError):
         CheckpointFolder(path=tmp_path, every_steps=0)
-
-
-def test_cleared_folder_is_empty(tmp_path):
-    folder = CheckpointFolder(path=tmp_path)
-    folder.save({"x": torch.zeros(1)}, {})
-    folder.clear()
-    assert folder.load() is None

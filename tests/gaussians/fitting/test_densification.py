@@ -9,7 +9,7 @@ from lidarpainter_models.gaussians.fitting.densification import (
     prune,
     split_along_longest_axis,
 )
-from lidarpainter_models.gaussians.fitting.settings import DensificationConfig
+from lidarpainter_models.gaussians.fitting.number_of_gaussians import DensificationConfig
 
 
 def ten(*, body=0):
@@ -37,14 +37,6 @@ def test_nothing_is_split_without_gradient():
     change = densify(ten(), GradientTally.zeros(10), [], target=12)
     assert len(change.gaussians) == 10
     assert change.num_added == 0
-
-
-def test_a_threshold_leaves_what_pulls_less():
-    tally = tally_of(*[float(score) for score in range(10)])
-    change = densify(ten(), tally, [], target=100, threshold=6.0)
-    assert change.kept.tolist() == [0, 1, 2, 3, 4, 5, 6]
-    assert change.num_added == 6
-    assert len(densify(ten(), tally, [], target=11, threshold=6.0).gaussians) == 11
 
 
 def test_gradients_count_only_where_visible():

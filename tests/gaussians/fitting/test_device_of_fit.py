@@ -18,7 +18,7 @@ from lidarpainter_models.gaussians.fitting.config import (
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.gaussians.fitting.images import full_image
 from lidarpainter_models.gaussians.fitting.memory import planned_memory
-from lidarpainter_models.gaussians.fitting.settings import DensificationConfig
+from lidarpainter_models.gaussians.fitting.number_of_gaussians import DensificationConfig
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import WAITS, fit_step
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
@@ -66,8 +66,8 @@ def test_a_fit_runs_on_its_device_and_is_that_of_the_cpu(world, device):
 def test_a_fit_is_taken_up_on_another_device_than_it_was_left_on(world, device, tmp_path):
     folder = CheckpointFolder(path=tmp_path, every_steps=5, every_seconds=None)
 
-    def stop(done, _total, _entry):
-        if done == 6:
+    def stop(now):
+        if now.step == 6:
             raise InterruptedError
 
     with pytest.raises(InterruptedError):
@@ -113,8 +113,8 @@ def out_of_memory(times):
 def test_a_fit_without_room_leaves_its_images_on_the_cpu(world, device, monkeypatch):
     plans = []
 
-    def told(_done, _total, entry):
-        plans.extend(entry[name] for name in ("planned_bytes",) if name in entry)
+    def told(now):
+        plans.extend([now.plan.planned_bytes] if now.step == 0 and now.placed is None else [])
 
     expected = fit_gaussians(world.observations, CONFIG, device=device)
     monkeypatch.setattr(fit_module, "fit_step", out_of_memory(1))
@@ -137,4 +137,4 @@ def test_a_fit_takes_about_the_memory_that_was_planned(world, device):
     with most_held() as peak:
         fit_gaussians(world.observations, CONFIG, device=device, guidance=(painted_view(world),))
     expected = plan.total - plan.rasteriser  # numba's takes its memory elsewhere
-    assert 0.5 * expected < peak.bytes < 1.2 * expected, (plan.told(), peak.bytes)
+    assert 0.5 * expected < peak.bytes < 1.2 * expected, (plan, peak.bytes)

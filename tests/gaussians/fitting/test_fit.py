@@ -7,7 +7,7 @@ from gaussian_world import FRAME_NS, HEIGHT_PX, WIDTH_PX, scene_of
 
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.gaussians.fitting import fit as fit_module
-from lidarpainter_models.gaussians.fitting import settings, step
+from lidarpainter_models.gaussians.fitting import learning_rates, step
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import (
     FitConfig,
@@ -17,8 +17,9 @@ from lidarpainter_models.gaussians.fitting.config import (
 )
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.gaussians.fitting.images import full_image
+from lidarpainter_models.gaussians.fitting.learning_rates import LearningRates
+from lidarpainter_models.gaussians.fitting.number_of_gaussians import DensificationConfig
 from lidarpainter_models.gaussians.fitting.seen_surface import seen_surface
-from lidarpainter_models.gaussians.fitting.settings import DensificationConfig, LearningRates
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import add_guidance_gradients, fit_step
 from lidarpainter_models.gaussians.initialisation.scene import initialise_scene
@@ -70,8 +71,8 @@ class KilledError(Exception):
 
 
 def kill_at(step):
-    def progress(done, _total, _entry):
-        if done == step:
+    def progress(now):
+        if now.step == step:
             raise KilledError
 
     return progress
@@ -121,7 +122,7 @@ def test_colours_of_a_longer_fit_move_slower(world, undisturbed, monkeypatch):
     slower = short_fit(learning_rates=LearningRates(sh_dc=(first / 4, last / 4)))
     expected = fit_gaussians(world.observations, slower).scene
     looks = STEPS / max(seen_surface(world.observations.views).whole_views, 1.0)
-    monkeypatch.setattr(settings, "COLOUR_LOOKS", looks / 4)
+    monkeypatch.setattr(learning_rates, "COLOUR_LOOKS", looks / 4)
     longer = fit_gaussians(world.observations, short_fit()).scene
     assert_same_scene(longer, expected)
     assert not torch.equal(longer.gaussians.sh_dc, undisturbed.scene.gaussians.sh_dc)
@@ -348,7 +349,21 @@ def test_all_schedules_are_those_of_as_many_steps_as_the_time_allows(world, monk
     ends, end = [], fit_module._finished
     monkeypatch.setattr(fit_module, "_finished", lambda state: ends.append(state) or end(state))
     fit_gaussians(world.observations, short_fit(log_every=4, time_limit_s=1e-9))
-    assert ends[0].refinement.config.steps == ends[0].step == 4
+    assert ends[0].steps == ends[0].step == 4
+
+
+def test_the_plan_is_told_first_and_the_share_never_falls(world, undisturbed):
+    told = []
+    found = fit_gaussians(world.observations, short_fit(), progress=told.append)
+    assert told[0].step == told[0].share == 0.0
+    assert {now.plan for now in told} == {found.plan}
+    assert found.plan.numbers()["most_gaussians"] == 900
+    steps = [now for now in told if now.step]
+    assert [now.step for now in steps] == list(range(1, STEPS + 1))
+    shares = [now.share for now in steps]
+    assert shares == sorted(shares)
+    assert max(shares[:-1]) < shares[-1] == 1.0
+    assert_same_scene(found.scene, undisturbed.scene)
 
 
 def test_a_limit_that_is_not_reached_changes_nothing(world, undisturbed):
@@ -361,7 +376,7 @@ def test_the_first_look_comes_once_after_a_tenth_of_the_steps(world, undisturbed
     found = fit_gaussians(
         world.observations,
         short_fit(),
-        progress=lambda done, _total, _entry: steps.append(done),
+        progress=lambda now: steps.append(now.step),
         first_look=lambda scene: looks.append((steps[-1], scene.num_gaussians)),
     )
     assert looks == [(STEPS // 10, looks[0][1])]

@@ -10,7 +10,7 @@ from lidarpainter_models.gaussians.fitting.gaussian_adam import (
     LEAST_SHAPE_GRADIENT,
     GaussianAdam,
 )
-from lidarpainter_models.gaussians.fitting.settings import LearningRates
+from lidarpainter_models.gaussians.fitting.learning_rates import LearningRates
 from lidarpainter_models.gaussians.model.gaussian_set import PARAMETERS, SH_CONSTANT, GaussianSet
 from lidarpainter_models.gaussians.model.seen_gaussians import LEAVES
 

@@ -3,11 +3,13 @@
 from dataclasses import replace
 
 import pytest
+import torch
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.fitting.config import FitConfig
-from lidarpainter_models.gaussians.fitting.memory import planned_memory, within_limit
-from lidarpainter_models.gaussians.fitting.settings import DensificationConfig
+from lidarpainter_models.gaussians.fitting.memory import planned_memory
+from lidarpainter_models.gaussians.fitting.number_of_gaussians import DensificationConfig
+from lidarpainter_models.gaussians.fitting.plan import plan_fit
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 
@@ -22,14 +24,16 @@ def planned(world, config):
     return planned_memory(world.observations, config, world.scene.sky.layout).of_process
 
 
-def limited(world, memory_bytes, **start):
-    config = replace(CONFIG, memory_bytes=memory_bytes)
-    return within_limit(world.observations, config, world.scene.sky.layout, **start)
+def limited(world, memory_bytes, config=CONFIG, **start):
+    """The settings of a plan within so much memory."""
+    config, cpu = replace(config, memory_bytes=memory_bytes), torch.device("cpu")
+    return plan_fit(world.observations, config, device=cpu, **start).settings
 
 
 def test_what_fits_stays_as_it_is(world):
     enough = planned(world, CONFIG)
-    assert limited(world, enough) == replace(CONFIG, memory_bytes=enough)
+    expected = plan_fit(world.observations, CONFIG, device=torch.device("cpu")).settings
+    assert limited(world, enough) == replace(expected, memory_bytes=enough)
 
 
 @pytest.mark.parametrize("share", [0.9, 0.5])
@@ -46,8 +50,7 @@ def test_less_memory_gives_fewer_gaussians_that_fit_into_it(world, share):
 def test_a_start_above_the_budget_is_planned_too(world):
     many = replace(CONFIG, initialisation=InitialisationConfig(num_gaussians=160_000))
     allowed = (planned(world, CONFIG) + planned(world, many)) // 2
-    layout = world.scene.sky.layout
-    config = within_limit(world.observations, replace(many, memory_bytes=allowed), layout)
+    config = limited(world, allowed, many)
     assert config.densification.budget == CONFIG.densification.budget
     assert 115_000 < config.initialisation.num_gaussians <= 120_000
     assert planned(world, config) <= allowed
@@ -59,11 +62,10 @@ def test_a_fit_of_one_gaussian_fits_or_is_refused(world):
         initialisation=InitialisationConfig(num_gaussians=1),
         densification=DensificationConfig(budget=1),
     )
-    layout, enough = world.scene.sky.layout, planned(world, one)
-    fits = replace(one, memory_bytes=enough)
-    assert within_limit(world.observations, fits, layout) == fits
+    enough = planned(world, one)
+    assert limited(world, enough, one).densification.budget == 1
     with pytest.raises(ConfigError, match="takes at least"):
-        within_limit(world.observations, replace(one, memory_bytes=enough - 1), layout)
+        limited(world, enough - 1, one)
 
 
 def test_a_limit_that_holds_no_fit_is_refused_with_what_it_takes(world):
@@ -76,6 +78,6 @@ def test_a_start_is_not_made_smaller(world):
     columns = {
         name: value.new_zeros(100_000, *value.shape[1:]) for name, value in start.columns().items()
     }
-    start = GaussianSet(**columns)
+    start = world.scene.with_gaussians(GaussianSet(**columns))
     with pytest.raises(ConfigError, match="takes at least"):
         limited(world, planned(world, CONFIG) - 10_000_000, start=start)

@@ -1,7 +1,7 @@
 import torch
 
+from lidarpainter_models.gaussians.fitting.learning_rates import LearningRates
 from lidarpainter_models.gaussians.fitting.refinement import RowAdam
-from lidarpainter_models.gaussians.fitting.settings import LearningRates
 
 
 def test_rates_fall_exponentially_from_first_to_last():

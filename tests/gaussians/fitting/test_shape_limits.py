@@ -1,21 +1,20 @@
 import torch
 from gaussian_world import camera_at, car_track, round_gaussians, scene_of
 
-from lidarpainter_models.gaussians.fitting.settings import ShapeLimits
 from lidarpainter_models.gaussians.fitting.shape_limits import (
     LEAST_SIGMA_M,
+    MOST_ELONGATION,
+    MOST_SIGMA,
     limit_shapes,
     viewing_rays,
 )
-
-LIMITS = ShapeLimits(most_elongation=8.0, most_elongation_along_ray=2.0)
 
 
 def limited(scales_m, *, x_m=10.0, num_cameras=2, step_m=0.1):
     gaussian = round_gaussians(torch.tensor([[x_m, 0.0, 1.0]]), torch.rand(1, 3), sigma_m=1.0)
     gaussian.log_scale[0] = torch.tensor(scales_m).log()
     scene = scene_of(gaussian, [camera_at(step_m * frame) for frame in range(num_cameras)])
-    limit_shapes(scene.gaussians, viewing_rays(scene), LIMITS)
+    limit_shapes(scene.gaussians, viewing_rays(scene))
     return scene.gaussians.scale_m[0].tolist()
 
 
@@ -27,8 +26,8 @@ def test_needle_along_the_ray_is_shortened():
 
 
 def test_needle_across_the_ray_may_be_longer():
-    found = limited([0.02, 0.5, 0.05])
-    assert abs(found[1] - 0.4) < 1e-6
+    found = limited([0.02, 0.9, 0.05])
+    assert abs(found[1] - MOST_ELONGATION * 0.05) < 1e-6
 
 
 def test_rays_from_all_sides_pin_the_depth_themselves():
@@ -38,14 +37,14 @@ def test_rays_from_all_sides_pin_the_depth_themselves():
     aside = round_gaussians(torch.tensor([[9.0, 3.0, 1.0]]), torch.rand(1, 3), sigma_m=1.0)
     aside.log_scale[0] = torch.tensor([0.3, 0.05, 0.02]).log()
     scene = scene_of(aside, [camera_at(x) for x in (0.0, 4.0, 8.0)])
-    limit_shapes(scene.gaussians, viewing_rays(scene), LIMITS)
+    limit_shapes(scene.gaussians, viewing_rays(scene))
     assert float(scene.gaussians.scale_m[0, 0]) > 0.29
 
 
 def test_film_is_thickened_and_giant_shrunk():
     found = limited([2.0, 2.0, 1e-5])
     assert abs(found[2] - LEAST_SIGMA_M) < 1e-6
-    assert max(found) < 10.0 * LIMITS.most_sigma + 1e-4
+    assert max(found) < 10.0 * MOST_SIGMA + 1e-4
 
 
 def test_rays_of_an_actor_are_taken_in_its_box_frame():

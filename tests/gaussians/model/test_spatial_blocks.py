@@ -7,7 +7,7 @@ import torch
 from gaussian_world import FRAME_NS, camera_at, car_track, round_gaussians, scene_of
 
 from lidarpainter_models.gaussians.fitting.gaussian_adam import most_sigmas
-from lidarpainter_models.gaussians.fitting.settings import LearningRates
+from lidarpainter_models.gaussians.fitting.learning_rates import LearningRates
 from lidarpainter_models.gaussians.model import gaussian_scene
 from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.scene_rendering import (

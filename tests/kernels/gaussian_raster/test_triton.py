@@ -17,7 +17,7 @@ from splat_errors import CASES, image_errors, relative_errors
 from lidarpainter_models.errors import BackendError
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
-from lidarpainter_models.gaussians.fitting.settings import DensificationConfig
+from lidarpainter_models.gaussians.fitting.number_of_gaussians import DensificationConfig
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.kernels import backends, gaussian_raster, gpu_packages
 

@@ -15,7 +15,7 @@ from lidarpainter_models.scenes.stored import stored_digest
 from tasks.ingest import jobs as ingest_jobs
 from tasks.ingest.jobs import IngestRequest, ingest_or_recall, ingest_sequences
 from tasks.ingest.sequences import find_sequences
-from tasks.progress import Silence, listening
+from tasks.progress import ProgressListener, listening
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def test_who_waited_for_another_reader_reads_nothing(request_of, monkeypatch):
     read, begun, waits = count_reads(monkeypatch), threading.Event(), threading.Event()
     counted = ingest_jobs.ingest_sequence.fn
 
-    class Waiter(Silence):
+    class Waiter(ProgressListener):
         def waiting(self, _stage, _holder):
             waits.set()
 
