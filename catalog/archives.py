@@ -29,7 +29,7 @@ ARCHIVE_MANIFEST = "lidarpainter-archive.json"
 ARCHIVE_VERSION = 1
 MAX_MANIFEST_BYTES = 256 << 20
 TABLES_IN_ORDER = ("scenes", "artefacts", "painters", "metrics", "runs")
-"""As they are entered: a run comes last, when all that it needs is there."""
+"""Tables in the order of entering: a run comes last, when all that it needs is there."""
 
 
 @dataclass(frozen=True, kw_only=True)

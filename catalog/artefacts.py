@@ -60,7 +60,7 @@ class ArtefactRef:
 
     @property
     def entry(self) -> str:
-        """Its folder, from that of the store."""
+        """Folder of the artefact, from that of the store."""
         return f"artefacts/{self.artefact_id}"
 
 
@@ -156,7 +156,7 @@ class ArtefactStore:
         return self.root / ref.entry
 
     def files(self, ref: ArtefactRef, names: Collection[str] | None = None) -> Path:  # noqa: ARG002
-        """Its folder, for whoever reads all its files, or some by name: a mirror fetches them."""
+        """Folder of an artefact with its files, all or the named ones; mirrors fetch them."""
         return self.folder(ref)
 
     def ids(self) -> set[str]:

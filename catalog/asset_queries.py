@@ -10,7 +10,6 @@ from typing import Any, Literal
 
 from catalog.errors import UnknownRecordError
 from catalog.sql import Answer, CatalogSql
-from catalog.tables import Row
 
 Sort = Literal["score", "coverage", "psnr_db", "length_m", "num_views", "num_points", "created_at"]
 SIDES = ("front", "rear", "left", "right", "top")
@@ -70,11 +69,6 @@ _CONDITIONS = {
     "max_lpips": "(lpips IS NULL OR lpips < $max_lpips)",
 }
 
-_NAMED = (
-    "starts_with(asset_id, $name)",
-    "asset_id IN (SELECT asset_id FROM sightings WHERE starts_with(occurrence_id, $name))",
-)
-
 
 def find_assets(sql: CatalogSql, wanted: AssetFilter, *, sort: Sort, most: int) -> Answer:
     """The assets that are wanted, the highest of a column first.
@@ -99,32 +93,6 @@ def find_assets(sql: CatalogSql, wanted: AssetFilter, *, sort: Sort, most: int) 
         values,
         most_rows=most,
     )
-
-
-def find_asset(sql: CatalogSql, id_or_prefix: str) -> Row:
-    """The one asset with this id, or whose id starts with it, or once did: see `catalog.assets`.
-
-    Raises:
-        UnknownRecordError: none matches, or more than one.
-    """
-    found: list[Row] = []
-    for condition in _NAMED if id_or_prefix else ():
-        text = f"FROM assets WHERE {condition} ORDER BY asset_id = $name DESC"
-        found = found or sql.ask(text, {"name": id_or_prefix}, most_rows=5).rows
-    if not found:
-        raise UnknownRecordError(f"no asset {id_or_prefix!r}, see `lidarpainter assets list`")
-    if len(found) > 1 and found[0]["asset_id"] != id_or_prefix:
-        ids = ", ".join(row["asset_id"] for row in found)
-        raise UnknownRecordError(f"asset {id_or_prefix!r} is not unique: {ids}")
-    return found[0]
-
-
-def sightings_of(sql: CatalogSql, asset_id: str) -> list[Row]:
-    """Every time that the asset was seen, the best first."""
-    return sql.ask(
-        "SELECT * FROM sightings WHERE asset_id = $name ORDER BY score DESC NULLS LAST, run_id",
-        {"name": asset_id},
-    ).rows
 
 
 def _of_category(sql: CatalogSql, asked: str, values: dict[str, Any]) -> Iterator[str]:

@@ -91,15 +91,20 @@ def find_asset(store: Store, name: str) -> Row:
     sightings = store.tables.arrow(SIGHTINGS.name, columns=columns)
     for column in columns:
         begins = pc.starts_with(sightings[column], pattern=name)
-        found = set(sightings.filter(begins)["asset_id"].to_pylist())
+        found = set(sightings.filter(begins)["asset_id"].to_pylist()) if name else set()
         if len(found) == 1:
             return store.tables.row(ASSETS.name, found.pop())
         if found:
             some = ", ".join(sorted(found)[:5])
             raise UnknownRecordError(f"asset {name!r} is not unique: {some}")
     raise UnknownRecordError(
-        f"no asset {name!r} in {store.root}: `assets list` names them, `assets publish` makes them"
+        f"no asset {name!r} in {store.name}: `assets list` names them, `assets publish` makes them"
     )
+
+
+def sightings_of(store: Store, asset_id: str) -> list[Row]:
+    """Every time that the asset was seen, the best first."""
+    return sorted(_stored(store, "asset_id", [asset_id]), key=how_well, reverse=True)
 
 
 def how_well(sighting: Row) -> tuple[float, str]:

@@ -37,7 +37,7 @@ FINAL: Mapping[Cause, State] = {
     "cancelled": "failed",
 }
 UNKNOWN = "unknown"
-"""Of an attempt of whose end older code entered no cause."""
+"""Cause of an attempt of whose end older code entered none."""
 CAN_PASS: tuple[Cause, ...] = ("killed", "memory", "timeout", "system")
 MAX_TRIES = 3
 """Attempts that may fail of what can pass, before the sequence counts as failed."""
@@ -97,7 +97,7 @@ def _pause_s(row: Row) -> float:
 
 
 def attempt_id(lease: Lease) -> str:
-    """Of the attempt under a lease: what tells it from all others, in tables and flow runs."""
+    """The id of the attempt under a lease, in tables and flow runs."""
     return f"{lease.name}-{lease.fence}"
 
 

@@ -17,7 +17,7 @@ import os
 import re
 import secrets
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 from functools import cached_property
 from pathlib import Path
@@ -34,6 +34,7 @@ from obstore.exceptions import (
 from obstore.store import S3Store
 
 from catalog.errors import CatalogError, StorageError, UnreachableError, reason_of
+from catalog.folders import expanded
 
 if TYPE_CHECKING:
     from obstore import ObjectMeta, PutMode
@@ -251,7 +252,8 @@ def _from_files() -> Any:  # noqa: ANN401 - a typed dictionary of each of its tw
         return {}
     profile, found = os.environ.get("AWS_PROFILE", "default"), configparser.RawConfigParser()
     for variable, place in _AMAZON_FILES.items():
-        found.read(Path(os.environ.get(variable, place)).expanduser(), "utf-8")
+        with suppress(CatalogError):  # there is no home folder, and so no such file
+            found.read(expanded(os.environ.get(variable, place)), "utf-8")
     said: dict[str, str] = {}
     for section in (f"profile {profile}", profile):
         if found.has_section(section):

@@ -36,11 +36,11 @@ LEFTOVERS = "leftovers"
 SETTLED_AFTER = timedelta(hours=1)
 """Older folders that nobody has locked belong to nobody."""
 ABANDONED_AFTER = timedelta(days=1)
-"""Of a bucket: no file takes so long to come up, no heartbeat so long to follow."""
+"""Age of what nobody owns in a bucket: no upload and no heartbeat takes so long."""
 OWN_NAMES = ("running", "flow-runs")
 """Folders of leases whose names are used once."""
 ENTRY_PARTS = 3
-"""Of the name of an entry; the place of a publication follows it."""
+"""Parts of the name of an entry; the place of a publication follows them."""
 
 
 def plan_collection(store: Store, since: datetime) -> list[Doomed]:

@@ -34,10 +34,10 @@ class Doomed:
     table: str
     row_id: str
     folder: Path | None
-    """Its files; a run has none of its own."""
+    """Folder of its files; a run has none of its own."""
     num_bytes: int
     objects: tuple[str, ...] = ()
-    """Of a bucket, where they are no entry with a folder."""
+    """Objects of a bucket that go, where they are no entry with a folder."""
 
 
 @dataclass(frozen=True, kw_only=True)

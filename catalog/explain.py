@@ -23,6 +23,8 @@ from catalog.tables import Row
 
 CodeToday = Callable[[Iterable[str]], Code]
 """The code that is reached today from symbols, each `module:name`."""
+FOLLOWS = "is stale"
+"""In a reason that only follows from another one."""
 SCENE = "scene"
 """The part that a scene plays among the inputs of an artefact."""
 
@@ -41,6 +43,21 @@ class Explanation:
     """The newest one made for the same purpose, and where that one differs."""
     inputs: dict[str, "Explanation"] = field(default_factory=dict)
     """What it was made from, by the part it plays; of a run, the artefacts."""
+
+    @property
+    def verdict(self) -> str:
+        """One sentence: that it is up to date, or what of it is stale and why."""
+        if not self.stale:
+            return f"{self.name} is up to date: today's code would make it again as it is."
+        parts = [part for part, made in self.inputs.items() if made.stale]
+        what = f" in {', '.join(_kinds(parts))}" if parts else ""
+        return f"{self.name} is stale{what}: {'; '.join(dict.fromkeys(self._causes()))}."
+
+    def _causes(self) -> Iterator[str]:
+        """Why it and what it was made from are stale, but for what only follows from that."""
+        yield from (reason for reason in self.stale if FOLLOWS not in reason)
+        for made in self.inputs.values():
+            yield from made._causes()
 
     def to_dict(self) -> dict[str, Any]:
         """All of it as JSON types."""
@@ -68,7 +85,7 @@ class Explainer:
         facts = ("scene_id", "status", "started_at", "seconds", "host", "software_version")
         others = [
             other
-            for other in self._store.tables.rows("runs")
+            for other in self._runs
             if other["scene_id"] == row["scene_id"]
             and other["status"] == "complete"
             and other["derived_from"] == row["derived_from"]
@@ -85,7 +102,7 @@ class Explainer:
                 "derived_from": row["derived_from"],
                 "change": json_of(row, "change") if row["change"] else None,
             },
-            stale=tuple(f"{name} is stale" for name, one in made.items() if one.stale),
+            stale=tuple(f"{name} {FOLLOWS}" for name, one in made.items() if one.stale),
             newest=None
             if newest["run_id"] == row["run_id"]
             else {"name": newest["run_id"], "settings": settings},
@@ -124,6 +141,15 @@ class Explainer:
     def _artefacts(self) -> list[Row]:
         return self._store.tables.rows("artefacts")
 
+    def _made_beside(self, artefact_id: str) -> set[str]:
+        """The other artefacts of all runs that list one."""
+        lists = [set(row["artefacts"] or ()) for row in self._runs]
+        return set().union(*(made for made in lists if artefact_id in made)) - {artefact_id}
+
+    @cached_property
+    def _runs(self) -> list[Row]:
+        return self._store.tables.rows("runs")
+
     @cached_property
     def _scenes(self) -> dict[str, str]:
         rows = self._store.tables.rows("scenes")
@@ -161,8 +187,16 @@ class Explainer:
             yield f"code changed: {', '.join(changed)}"
 
     def _newest(self, ref: ArtefactRef, manifest: Manifest) -> dict[str, Any] | None:
-        """The newest artefact of the same kind and parts that shares an input with this one."""
-        rows = [row for row in self._artefacts if row["kind"] == ref.kind]
+        """The newest artefact of the same kind and parts that shares an input with this one.
+
+        What a run made beside this one, such as the paintings of its next round, is another thing.
+        """
+        beside = self._made_beside(ref.artefact_id)
+        rows = [
+            row
+            for row in self._artefacts
+            if row["kind"] == ref.kind and row["artefact_id"] not in beside
+        ]
         alike = [row for row in rows if _share_an_input(json_of(row, "inputs"), manifest.inputs)]
         newest = max(alike, key=lambda row: row["created_at"], default=None)
         if newest is None or newest["digest"] == ref.digest:
@@ -176,10 +210,15 @@ class Explainer:
         }
 
 
+def _kinds(parts: Iterable[str]) -> list[str]:
+    """Parts by what they are, each kind once: of a run the kinds of its artefacts."""
+    return list(dict.fromkeys(part.partition("/")[0] for part in parts))
+
+
 def _stale_inputs(inputs: Mapping[str, Explanation]) -> Iterator[str]:
     for part, made in inputs.items():
         if made.stale:
-            yield f"input changed: {part} ({made.name} is stale)"
+            yield f"input changed: {part} ({made.name} {FOLLOWS})"
         elif part == SCENE and not made.facts:
             yield f"input changed: no scene has the content {made.name[:DIGEST_LENGTH]} any more"
 

@@ -69,7 +69,7 @@ class FleetLedger:
         self.flow_runs = Leases(
             store.objects("flow-runs"), time_to_live_s=self.leases.time_to_live_s
         )
-        """Of those who dispatch: who is alive, beside who works on what."""
+        """Leases of flow runs that dispatch: who is alive, beside who works on what."""
         self._first_pause_s = first_pause_s
 
     def latest(self) -> str:
@@ -99,6 +99,11 @@ class FleetLedger:
             if row["state"] == "waiting" and row["sequence_id"] in live:
                 row["state"] = "running"
         return sorted(found, key=lambda row: row["position"])
+
+    def attempts(self, fleet: str) -> list[Row]:
+        """All attempts at sequences of a fleet, by the time of their end."""
+        found = self.store.tables.arrow(ATTEMPTS, where={"fleet": [fleet]}).to_pylist()
+        return sorted(found, key=lambda row: row["ended_at"])
 
     def ask(self, wishes: Sequence[Wish], *, accept_stale: bool = False) -> None:
         """Enter what a manifest asks for; what is done as asked stays done.

@@ -40,7 +40,7 @@ MAX_NAME = 512
 SHOWN = 80
 """Characters of a name in an error."""
 LEAST_PARTS = 4
-"""Of a name: artefacts/KIND/DIGEST/FILE, or scenes/DATASET/SEQUENCE/FILE."""
+"""Parts of a name at least: artefacts/KIND/DIGEST/FILE, or scenes/DATASET/SEQUENCE/FILE."""
 BLOCK_BYTES = 1 << 20
 MALFORMED = (ValueError, TypeError, KeyError, AttributeError, RecursionError, UnknownRecordError)
 """What JSON of another shape ends in."""

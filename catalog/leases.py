@@ -35,7 +35,7 @@ TIME_TO_LIVE_S = 120.0
 BEATS = 12
 """Heartbeats in a time to live."""
 POLL_S = 0.2
-"""Between two looks at a lease that somebody else holds."""
+"""Seconds between two looks at a lease that somebody else holds."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,159}")
 _PROC = Path("/proc")
 _STARTED, _STATE = 19, 0
@@ -176,7 +176,7 @@ class Lease:
     version: str = ""
 
     def content(self) -> bytes:
-        """As it is stored."""
+        """The lease as it is stored, in JSON."""
         values = {name: value for name, value in asdict(self).items() if name != "version"}
         return json.dumps({**values, "nonce": secrets.token_hex(4)}).encode()
 
@@ -209,7 +209,7 @@ class Leases:
         return None if version is None else replace(lease, version=version)
 
     def renew(self, lease: Lease, facts: dict[str, Any]) -> Lease:
-        """One heartbeat.
+        """Give a sign of life: write the lease anew with the time of now.
 
         Raises:
             LeaseLostError: the lease is no longer this holder's.

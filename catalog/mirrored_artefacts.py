@@ -29,7 +29,7 @@ class MirroredArtefacts(ArtefactStore):
         self._mirror = mirror
 
     def files(self, ref: ArtefactRef, names: Collection[str] | None = None) -> Path:
-        """Its folder, with all its files or the named ones, checked as they arrived; in use then.
+        """Folder of an artefact with all its files or the named ones, checked as they came; in use.
 
         Raises:
             UnknownRecordError: the bucket has no such artefact.

@@ -28,10 +28,9 @@ from typing import Any
 from catalog.buckets import SCHEME, Bucket
 from catalog.digests import digest_file
 from catalog.errors import CatalogError, DamagedArtefactError, UnknownRecordError, storage_errors
+from catalog.folders import cache_folder
 from catalog.locks import held_lock
 
-CACHE_ENVIRONMENT = "LIDARPAINTER_CACHE"
-DEFAULT_CACHE = "~/.cache/lidarpainter"
 LIMIT_ENVIRONMENT = "LIDARPAINTER_CACHE_GB"
 DEFAULT_LIMIT_GB = 20.0
 AT_ONCE = 8
@@ -55,11 +54,6 @@ class Listing:
     def sizes(self) -> dict[str, int]:
         """Bytes of each file."""
         return {name: known["num_bytes"] for name, known in self.files.items()}
-
-
-def cache_folder() -> Path:
-    """Where all mirrors of this machine lie."""
-    return Path(os.environ.get(CACHE_ENVIRONMENT) or DEFAULT_CACHE).expanduser().absolute()
 
 
 class Mirror:

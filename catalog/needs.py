@@ -19,7 +19,7 @@ from catalog.store import Store
 from catalog.tables import Row
 
 SCENE_KIND, STYLE = "gaussians", "style"
-"""Of an artefact, and of a change."""
+"""The kind of an artefact that is a fitted scene, and the kind of a change that is a style."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,7 +55,7 @@ class Needs:
 
     @cached_property
     def _sightings(self) -> Collection[Row]:
-        """Of everything that was sighted in a scene, the best sighting."""
+        """The best sighting of everything that was seen in a scene."""
         columns = ["sighting_id", "occurrence_id", "score", "run_id", "artefact_id"]
         rows = self._store.tables.arrow("sightings", columns=columns).to_pylist()
         return {row["occurrence_id"]: row for row in sorted(rows, key=how_well)}.values()

@@ -4,9 +4,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import pyarrow as pa
-import pyarrow.compute as pc
-
 from catalog.artefacts import ArtefactRef
 from catalog.fleets import FleetLedger
 from catalog.records import json_of
@@ -33,12 +30,12 @@ class Point:
     seed: int
     run_id: str
     cost: dict[str, float]
-    """Of the stages that make the scene, each as computed, also where it was recalled: seconds,
+    """Cost of the stages that make the scene, as computed, also where it was recalled: seconds,
     cpu_seconds, peak_memory_bytes; num_gaussians and scene_bytes of what they made."""
     metrics: dict[MetricName, float]
-    """Of the scene at the end."""
+    """Numbers of the scene at the end."""
     by_variant: dict[str, dict[MetricName, float]] = field(default_factory=dict)
-    """Of every variant that was judged, by its name in the catalog."""
+    """Numbers of every variant that was scored, by its name in the catalog."""
     suspicions: tuple[str, ...] | None = None
     """What is wrong about the recording, in sentences; None where nobody looked."""
 
@@ -52,12 +49,12 @@ def points_of(store: Store, fleet: str) -> tuple[list[Point], list[Row]]:
     """
     sequences = FleetLedger(store).rows(fleet)
     done = {row["run_id"]: row for row in sequences if row["state"] == "done"}
-    runs = {row["run_id"]: row for row in _chosen(store, "runs", run_id=done)}
+    runs = {row["run_id"]: row for row in _chosen(store, "runs", "run_id", done)}
     scenes = {run_id: _last_scene(run) for run_id, run in runs.items()}
-    made = _chosen(store, "artefacts", artefact_id=scenes.values())
+    made = _chosen(store, "artefacts", "artefact_id", scenes.values())
     sizes = {row["artefact_id"]: row["num_bytes"] for row in made}
     judged: dict[str, dict[str, dict[MetricName, float]]] = {run_id: {} for run_id in runs}
-    for row in _chosen(store, "metrics", run_id=runs):
+    for row in _chosen(store, "metrics", "run_id", runs):
         if row["value"] is not None:
             name = row["protocol"], row["trajectory"], row["name"]
             judged[row["run_id"]].setdefault(row["variant"], {})[name] = row["value"]
@@ -84,12 +81,9 @@ def points_of(store: Store, fleet: str) -> tuple[list[Point], list[Row]]:
     return points, [row for row in sequences if row["sequence_id"] not in names]
 
 
-def _chosen(store: Store, table: str, **wanted: Iterable[str]) -> list[Row]:
-    """The rows of a table whose columns hold one of some values each."""
-    found = store.tables.arrow(table)
-    for column, values in wanted.items():
-        found = found.filter(pc.is_in(found[column], pa.array(list(values), pa.string())))
-    return found.to_pylist()
+def _chosen(store: Store, table: str, column: str, values: Iterable[str]) -> list[Row]:
+    """The rows of a table with one of some values in a column."""
+    return store.tables.arrow(table, where={column: set(values)}).to_pylist()
 
 
 def _scenes(run: Row) -> list[str]:

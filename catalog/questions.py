@@ -10,8 +10,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-import pyarrow.compute as pc
-
 from catalog.artefacts import ArtefactRef, Manifest
 from catalog.attempts import by_cause
 from catalog.errors import CatalogError, IdentityError, UnknownRecordError
@@ -124,7 +122,7 @@ def _changed(store: Store, rows: Sequence[Row], today: CodeToday) -> dict[str, t
 
 
 def _manifest(store: Store, name: str) -> Manifest | None:
-    """Of an artefact, if it can be read: `verify` tells of damage."""
+    """The manifest of an artefact, if it can be read: `verify` tells of damage."""
     with suppress(CatalogError):
         return store.artefacts.manifest(ArtefactRef.of_id(name))
     return None
@@ -149,7 +147,7 @@ def _with_heirs(
 
 
 def _newest(runs: Iterable[Row]) -> Iterable[Row]:
-    """Of the complete runs of one scene with the same parameters and history, the newest."""
+    """The newest of the complete runs of each scene with the same parameters and history."""
     by_id = {row["run_id"]: row for row in runs}
     newest: dict[tuple[str, str, tuple[str, ...]], Row] = {}
     for row in by_id.values():
@@ -174,8 +172,7 @@ def _history(run: Row, by_id: Mapping[str, Row]) -> tuple[str, ...]:
 
 
 def _of_scene(store: Store, table: str, scene_id: str) -> list[Row]:
-    arrow = store.tables.arrow(table)
-    return arrow.filter(pc.equal(arrow["scene_id"], scene_id)).to_pylist()
+    return store.tables.arrow(table, where={"scene_id": [scene_id]}).to_pylist()
 
 
 def _prices(store: Store) -> dict[str, float]:

@@ -22,7 +22,7 @@ from catalog.tables import CatalogTables, Row
 LONGEST_S = 60.0
 MOST_MEMORY = "1GB"
 MOST_ROWS = 100_000
-"""Of an answer; those beyond are cut off, and that is said."""
+"""Rows of an answer at most; those beyond are cut off, and that is said."""
 
 _TYPES: dict[ColumnType, str] = {
     "text": "VARCHAR",

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 from catalog.artefacts import MANIFEST_NAME, ArtefactStore
 from catalog.errors import CatalogError, UnknownRecordError
-from catalog.folders import changed_at, make_writable, nearest_existing
+from catalog.folders import CACHE_ENVIRONMENT, changed_at, expanded, make_writable, nearest_existing
 from catalog.leases import ConditionalObjects, FolderObjects, Leases
 from catalog.locks import held_lock, is_held, shared_lock
 
@@ -43,7 +43,7 @@ class Store:
     """A LidarPainter store."""
 
     root: Path
-    """Of this machine: the store, or what mirrors its bucket."""
+    """Folder on this machine: the store, or what mirrors its bucket."""
     mirror: "Mirror | None" = field(default=None, compare=False)
 
     @property
@@ -53,7 +53,7 @@ class Store:
 
     @property
     def name(self) -> str:
-        """Its address, for people: a folder or `s3://BUCKET/PREFIX`."""
+        """The address of the store, for people: a folder or `s3://BUCKET/PREFIX`."""
         return str(self.root) if self.mirror is None else self.mirror.bucket.address
 
     @cached_property
@@ -248,17 +248,28 @@ class Store:
     def _run_lock(self, run_id: str) -> Path:
         return self.root / "locks" / f"run-{run_id}.lock"
 
-    def run(self, run_id: str) -> "Row":
-        """The row of a run by id, unique prefix, or `latest` (the last that completed).
+    def run(self, name: str) -> "Row":
+        """The row of a run.
+
+        Args:
+            name: id of the run, a unique prefix of one, a scene (its newest complete run), or
+                `latest` (the newest complete run of all).
 
         Raises:
             UnknownRecordError: there is no such run.
         """
-        if run_id != LATEST:
-            return self.row("runs", run_id)
-        complete = [row for row in self.tables.rows("runs") if row["status"] == "complete"]
+        if name != LATEST and "/" not in name:
+            return self.row("runs", name)
+        scene = None if name == LATEST else "/".join(split_scene_id(name))
+        complete = [
+            row
+            for row in self.tables.rows("runs")
+            if row["status"] == "complete" and scene in (None, row["scene_id"])
+        ]
         if not complete:
-            raise UnknownRecordError(f"no complete run in {self.name}")
+            raise UnknownRecordError(
+                f"no complete run {f'of {scene} ' if scene else ''}in {self.name}"
+            )
         return max(complete, key=lambda row: row["finished_at"])
 
 
@@ -274,9 +285,9 @@ def open_store(path: Path | str | None = None) -> Store:
     """
     text = str(path or os.environ.get(STORE_ENVIRONMENT) or DEFAULT_STORE)
     if text.startswith("s3:/"):
-        mirror = _mirror(text, os.environ.get("LIDARPAINTER_CACHE"))
+        mirror = _mirror(text, os.environ.get(CACHE_ENVIRONMENT))
         return Store(mirror.root, mirror)
-    root = Path(text).expanduser().absolute()
+    root = expanded(text)
     if found := _UNSTORABLE.search(str(root)):
         raise CatalogError(
             f"the store {str(root)!r} has {found[0]!r} in its path, which Delta tables cannot "

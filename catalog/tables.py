@@ -36,7 +36,7 @@ from catalog.stored_rows import read_rows
 
 COMMIT_ATTEMPTS = 25
 PAUSE_S = 0.05
-"""Between attempts, against writers that take no turns."""
+"""Longest pause between two attempts, against writers that take no turns."""
 MOST_FILES = 24
 """Small ones of a table, before they are written together: each merge and query opens all files."""
 

@@ -9,7 +9,7 @@ from flows.style_run import STYLE
 from lidarpainter_models.errors import ConfigError
 from tasks.assets.enter import enter_published
 from tasks.assets.publish import publish_assets
-from tasks.editing.edit import PARKED
+from tasks.editing.donors import PARKED
 from tasks.runs import FinishedRun, lineage, open_run
 
 

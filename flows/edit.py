@@ -9,25 +9,22 @@ from typing import Any
 from catalog.store import Store
 from flows.derive import Change, derive_run
 from flows.parameters import view_parameters
-from flows.style_run import STYLE
-from flows.views import PathRequest, render_run
-from lidarpainter_models.conditioning.settings import SequenceConfig
+from flows.views import render_run
 from lidarpainter_models.devices import chosen_device
 from lidarpainter_models.editing.edits import refuse_walls
 from lidarpainter_models.editing.operations import Drive, Operation, parse_operations
+from lidarpainter_models.export.view_requests import ViewRequest
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
-from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
 from lidarpainter_models.painter.selection import PainterChoice
 from lidarpainter_models.scenes.tracks import ActorTrack
+from tasks.editing.donors import opened_world
 from tasks.editing.edit import (
     Edits,
     checked_encounters,
     edit_build,
     observations_build,
-    opened_world,
 )
 from tasks.runs import FinishedRun, lineage, open_run
-from tasks.views.files import ViewKinds
 
 EDIT = "edit"
 
@@ -95,16 +92,13 @@ def shown_edit(
     store: Store, request: EditRequest, result: dict[str, Any], out: Path
 ) -> dict[str, Any]:
     """Images of an edited run where its script drives; painted by clear day."""
-    path = PathRequest(
-        run=result["run_id"],
+    shown = ViewRequest(
         trajectory=parse_trajectory(result["trajectory"]),
         is_painted=result["summary"]["style"] is None,  # painters know clear days
         painter=request.painter,
         allows_collisions=request.allows_collisions,
     )
-    return render_run(
-        store, path, out, prompt=DEFAULT_PROMPT, sequence=SequenceConfig(), kinds=ViewKinds()
-    )
+    return render_run(store, result["run_id"], shown, out)
 
 
 def list_actors(store: Store, run: str) -> list[dict[str, Any]]:

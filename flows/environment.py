@@ -6,8 +6,11 @@ What the user has set stays as it is.
 import ctypes
 import os
 import tempfile
+import warnings
+from contextlib import suppress
 from pathlib import Path
 
+from catalog.folders import cache_folder, expanded, home_folder
 from tasks.job_limits import usable_cores
 
 PREFECT = {
@@ -24,7 +27,13 @@ THREADS = {
 }
 KEPT_BYTES = 32 << 20
 """Largest freed block that the C library keeps for the next use: as far as glibc goes by itself."""
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+"""This machine: servers of our own listen there, and a proxy would look for them on its own one."""
+PREFECT_HOME = "PREFECT_HOME"
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8  # of malloc.h
+
+_chosen_homes: set[str] = set()
+"""Folders for Prefect that were chosen here, not by the user."""
 
 
 def prepare_environment(*, log_level: str | None = "CRITICAL") -> None:
@@ -37,10 +46,45 @@ def prepare_environment(*, log_level: str | None = "CRITICAL") -> None:
     level = {} if log_level is None else {"PREFECT_LOGGING_LEVEL": log_level}
     for name, value in {**PREFECT, **THREADS, **counts, **level}.items():
         os.environ.setdefault(name, value)
+    _reach_own_servers()
     _keep_freed_memory()
     if not _has_cache_folder():
         # a fresh private folder: compiled code is unpickled, nobody else may put it there
         os.environ.setdefault("NUMBA_CACHE_DIR", tempfile.mkdtemp(prefix="lidarpainter-numba-"))
+
+
+def keep_prefect_in(store: str) -> None:
+    """Let Prefect keep its database in a store where it cannot keep it in the home folder.
+
+    Making a database takes longer than starting a server, so one in the home folder serves all
+    stores. Where there is no home folder, or it cannot be written, the database lies in the store,
+    or for a bucket in the cache in front of it. A folder that the user has chosen by `PREFECT_HOME`
+    stays, and so do profiles. Nothing is made before a server is started.
+
+    Args:
+        store: folder of the store, or its address `s3://BUCKET/PREFIX`.
+    """
+    if os.environ.get(PREFECT_HOME, "") not in {"", *_chosen_homes}:
+        return
+    home = home_folder()
+    if home is not None and os.access(home, os.W_OK):
+        os.environ.pop(PREFECT_HOME, None)
+        return
+    place = cache_folder() if store.startswith("s3:/") else expanded(store)
+    os.environ[PREFECT_HOME] = str(place / "prefect")
+    _chosen_homes.add(os.environ[PREFECT_HOME])
+    profiles = (home or place) / ".prefect" / "profiles.toml"
+    if _is_file(profiles):
+        os.environ.setdefault("PREFECT_PROFILES_PATH", str(profiles))
+    # Prefect would make the folder when it is imported, be there a store or not
+    warnings.filterwarnings("ignore", message="Failed to create the Prefect home directory")
+
+
+def _reach_own_servers() -> None:
+    """Have clients reach servers on this machine past any proxy that the environment names."""
+    known = (os.environ.get("no_proxy") or os.environ.get("NO_PROXY") or "").split(",")
+    hosts = dict.fromkeys(filter(None, (*map(str.strip, known), *LOOPBACK)))
+    os.environ["no_proxy"] = os.environ["NO_PROXY"] = ",".join(hosts)
 
 
 def _keep_freed_memory() -> None:
@@ -61,8 +105,15 @@ def _keep_freed_memory() -> None:
 def _has_cache_folder() -> bool:
     """Whether numba can keep compiled code beside the sources or in the user's cache."""
     package = Path(__file__).resolve().parents[1] / "lidarpainter_models" / "kernels"
-    user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "numba"
-    return _can_write(package / "__pycache__") or _can_write(user)
+    home, chosen = home_folder(), os.environ.get("XDG_CACHE_HOME")
+    user = Path(chosen) if chosen else home and home / ".cache"
+    return _can_write(package / "__pycache__") or (user is not None and _can_write(user / "numba"))
+
+
+def _is_file(path: Path) -> bool:
+    with suppress(OSError):  # the home folder is another user's
+        return path.is_file()
+    return False
 
 
 def _can_write(folder: Path) -> bool:

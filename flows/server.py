@@ -10,14 +10,24 @@ import os
 import signal
 import socket
 import subprocess
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from catalog.locks import held_lock
-from flows.children import start_child
 
+# prctl(PR_SET_PDEATHSIG): the kernel ends the child when its parent dies, even of SIGKILL
+LAUNCHER = """
+import ctypes, os, signal, sys
+parent = int(sys.argv[1])
+if sys.platform == "linux":
+    ctypes.CDLL(None).prctl(1, signal.SIGTERM)
+    if os.getppid() != parent:
+        sys.exit(1)
+os.execv(sys.executable, [sys.executable, *sys.argv[2:]])
+"""
 STARTUP_TIMEOUT_S = 120.0
 STOP_TIMEOUT_S = 5.0
 APPLICATION = "prefect.server.api.server:create_app"
@@ -35,7 +45,7 @@ SERVICES = (
     "TASK_RUN_RECORDER",
     "TRIGGERS",
 )
-"""Of the server, for schedules, workers and its web page: one command has none of them."""
+"""Services of the server for schedules, workers and its web page: one command has none of them."""
 
 
 @contextmanager
@@ -135,3 +145,20 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
+
+
+def start_child(
+    arguments: Sequence[str], *, log: int, environment: Mapping[str, str]
+) -> subprocess.Popen[bytes]:
+    """Start the interpreter with some arguments, for as long as this process lives.
+
+    `log` is the descriptor of a file for what it has to say; `environment` is all of its own.
+    """
+    return subprocess.Popen(  # noqa: S603 - our own interpreter and arguments
+        [sys.executable, "-c", LAUNCHER, str(os.getpid()), *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=log,
+        stderr=log,
+        env=dict(environment),
+        start_new_session=True,  # Ctrl-C is for the command, which ends its children itself
+    )

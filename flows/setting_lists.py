@@ -27,7 +27,7 @@ class Setting:
     """With dots between, as `--set` takes it."""
     type: str
     default: Any
-    """As JSON types."""
+    """The default value, as JSON types."""
     reason: str
 
 

@@ -1,107 +1,102 @@
-"""Show a finished run along a trajectory, as it is, painted or styled; queries without a server."""
+"""Show a finished run: along a trajectory, painted or styled, or in a browser; without a server."""
 
-from dataclasses import dataclass, replace
+import threading
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from catalog.store import Store
 from flows.parameters import view_parameters
-from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.geometry.trajectory_specs import Trajectory
+from lidarpainter_models.export.styled_views import StyleRequest
+from lidarpainter_models.export.view_requests import RECORDING, UNPAINTED, ViewRequest
 from lidarpainter_models.observations.fit_size import require_recorded_width
-from lidarpainter_models.weather.mix import StyleMix
 from tasks.opened import open_scene
-from tasks.runs import FinishedRun, open_run
+from tasks.runs import FinishedRun, is_of_its_scene, open_run
 from tasks.specs import FittedRef
-from tasks.views.files import ViewKinds
-from tasks.views.render import RenderRequest, render
-from tasks.views.stylize import Images, StylizeRequest, stylize
+from tasks.views.drive import SHOWN, view_live
+from tasks.views.render import ViewedRun, render
+from tasks.views.stylize import stylize
+
+BEFORE_PAINTING = "before painting"
+"""What the viewer calls the scene of a run after its first fit."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PathRequest:
-    """Which run is followed, and where."""
+def render_run(store: Store, run: str, request: ViewRequest, out: Path) -> dict[str, Any]:
+    """Render a finished run where nobody drove.
 
-    run: str
-    """A run id, a unique prefix of one, or `latest`."""
-    trajectory: Trajectory
-    camera: str | None = None
-    frames: slice | None = None
-    is_painted: bool = False
-    """Whether a painter paints every image."""
-    painter: str | None = None
-    """Who; None takes the run's own."""
-    allows_collisions: bool = False
-    """Whether the camera may go through walls."""
-    width_px: int | None = None
-    """Of the images, at most as recorded; None takes that of the fit."""
-    beside: str | None = None
-    """What is shown to the left: `recorded`, `unpainted`, or another run of the same scene."""
+    Args:
+        store: where the run is.
+        run: its id, a unique prefix of one, its scene, or `latest`.
+        request: where to look from, and what is written.
+        out: folder for the files.
 
+    Returns:
+        What `render --json` prints.
 
-def render_run(
-    store: Store,
-    path: PathRequest,
-    out: Path,
-    *,
-    prompt: str,
-    sequence: SequenceConfig,
-    kinds: ViewKinds,
-) -> dict[str, Any]:
-    """Render a finished run where nobody drove."""
-    finished = open_run(store, path.run)
-    run = view_parameters(finished).run_spec(store.address, painter=path.painter)
-    request = render_request(store, finished, path, kinds)
-    request = replace(request, prompt=prompt, sequence=sequence)
-    made = render.fn(run, finished.final, request, out)
+    Raises:
+        ConfigError: see `viewed_run`, or the path leads into a wall.
+        SceneError: the scene has no such camera, or no frame is left.
+    """
+    finished = open_run(store, run)
+    viewed = viewed_run(store, finished, request)
+    made = render.fn(viewed, request, out)
     return {
         "run_id": finished.run_id,
         "scene": finished.scene_id,
-        "trajectory": path.trajectory.spec,
-        "painter": run.painter if request.is_painted else None,
-        "prompt": prompt,
-        "previous": sequence.previous,
+        "trajectory": request.trajectory.spec,
+        "painter": viewed.run.painter if request.is_painted else None,
+        "prompt": request.prompt,
+        "previous": request.sequence.previous,
         **made,
     }
 
 
-def render_request(
-    store: Store, finished: FinishedRun, path: PathRequest, kinds: ViewKinds
-) -> RenderRequest:
-    """What the stage is asked for.
+def stylize_run(
+    store: Store, run: str, request: ViewRequest, style: StyleRequest, out: Path
+) -> dict[str, Any]:
+    """Show a finished run in another weather or at night, and how well its edges are kept.
+
+    Returns:
+        What `stylize --json` prints.
+
+    Raises:
+        ConfigError: see `viewed_run`, or what is asked for cannot be put in a style.
+    """
+    finished = open_run(store, run)
+    made = stylize.fn(viewed_run(store, finished, request), request, style, out)
+    return {
+        "run_id": finished.run_id,
+        "scene": finished.scene_id,
+        "prompt": style.mix.text,
+        "trajectory": request.trajectory.spec,
+        **made,
+    }
+
+
+def viewed_run(store: Store, finished: FinishedRun, request: ViewRequest) -> ViewedRun:
+    """A finished run as the stages that show it are given it.
 
     Raises:
         ConfigError: images wider than recorded, or a run beside that shows another scene.
     """
     parameters = view_parameters(finished)
-    observation = parameters.observation
-    if path.width_px is not None:
-        observation = replace(observation, width_px=path.width_px)
+    if request.width_px is not None:
         views = open_scene(store, finished.scene_id).views
-        require_recorded_width(path.width_px, views, "--width")
-    return RenderRequest(
-        trajectory=path.trajectory,
-        camera=path.camera,
-        frames=path.frames,
-        is_painted=path.is_painted,
-        observation=observation,
+        require_recorded_width(request.width_px, views, "--width")
+    return ViewedRun(
+        run=parameters.run_spec(store.address, painter=request.painter),
+        fitted=finished.final,
+        observation=parameters.observation,
         conditions=parameters.conditions,
-        allows_collisions=path.allows_collisions,
-        kinds=kinds,
-        beside=_beside(store, finished, path.beside),
+        beside=_beside(store, finished, request.beside),
     )
 
 
-def _beside(
-    store: Store, finished: FinishedRun, beside: str | None
-) -> Literal["recorded", "unpainted"] | FittedRef | None:
-    if beside is None:
+def _beside(store: Store, finished: FinishedRun, beside: str | None) -> FittedRef | None:
+    """The scene of another run that is shown to the left."""
+    if beside in (None, RECORDING, UNPAINTED):
         return None
-    if beside == "recorded":
-        return "recorded"
-    if beside == "unpainted":
-        return "unpainted"
     other = open_run(store, beside)
     if other.scene_id != finished.scene_id:
         raise ConfigError(
@@ -110,31 +105,40 @@ def _beside(
     return other.final
 
 
-def stylize_run(
+def view_run(
     store: Store,
-    path: PathRequest,
-    out: Path,
+    run: str,
+    request: ViewRequest,
     *,
-    mix: StyleMix,
-    images: Images,
-    seed: int,
-) -> dict[str, Any]:
-    """Show a finished run in another weather or at night, and how well its edges are kept.
+    port: int | None,
+    opened_at: Callable[[str], None],
+    stopped: threading.Event,
+) -> None:
+    """Show a run in a browser on this machine until stopped.
 
-    The seed decides lit windows, drops and noise.
-
-    Raises:
-        ConfigError: images wider than recorded.
+    Args:
+        store: where the run is.
+        run: its id, a unique prefix of one, its scene, or `latest`.
+        request: the camera and the frames that are followed.
+        port: where to listen; None takes a free one.
+        opened_at: told the address.
+        stopped: ends the viewer when it is set.
     """
-    finished = open_run(store, path.run)
-    view = render_request(store, finished, path, ViewKinds())
-    request = StylizeRequest(mix=mix, view=view, images=images, seed=seed)
-    run = view_parameters(finished).run_spec(store.address, painter=path.painter)
-    made = stylize.fn(run, finished.final, request, out)
-    return {
-        "run_id": finished.run_id,
-        "scene": finished.scene_id,
-        "prompt": mix.text,
-        "trajectory": path.trajectory.spec,
-        **made,
-    }
+    finished = open_run(store, run)
+    viewed = viewed_run(store, finished, request)
+    scenes = {SHOWN: finished.final} | _other_scenes(store, finished)
+    view_live(viewed, request, scenes, port=port, opened_at=opened_at, stopped=stopped)
+
+
+def _other_scenes(store: Store, finished: FinishedRun) -> dict[str, FittedRef]:
+    """The run before painting, and the runs that were derived from it."""
+    scenes = {}
+    if finished.unpainted != finished.final:
+        scenes[BEFORE_PAINTING] = finished.unpainted
+    for row in store.rows("runs"):
+        is_derived = row["derived_from"] == finished.run_id and row["status"] == "complete"
+        if is_derived and is_of_its_scene(store, row):
+            derived = open_run(store, row["run_id"])
+            kind = derived.change["kind"] if derived.change else "derived"
+            scenes[f"{kind} {derived.run_id[:8]}"] = derived.final
+    return scenes

@@ -8,7 +8,7 @@ import typer
 
 from flows.cli.catalog import opened_row, row_cell, told_explanation
 from flows.cli.output import print_json, print_pairs, print_table, say_status
-from flows.cli.shared_options import AsJson, parse_names
+from flows.cli.shared_options import AsJson, named_run, parse_names
 
 if TYPE_CHECKING:
     from catalog.sql import CatalogSql
@@ -16,14 +16,20 @@ if TYPE_CHECKING:
     from catalog.tables import Row
 
 ID_LENGTH = 12
-"""Of an id in a table, enough to name the asset by."""
+"""Characters of an asset's id in a table, which name it to `assets show` too."""
 MOST_SHOWN = 1000
 """Rows of a query's answer."""
 AssetName = Annotated[
-    str, typer.Argument(help="An asset id, or the beginning of one.", show_default=False)
+    str, typer.Argument(help="The asset: its id, or the beginning of it.", show_default=False)
 ]
-Category = Annotated[str | None, typer.Option(help="car, truck, pedestrian, ...; or sedan.")]
-MinScore = Annotated[float | None, typer.Option(help="Least score, 0 to 1.")]
+Category = Annotated[
+    str | None,
+    typer.Option(
+        help="Category of the assets, as the data sets call it: car, truck, pedestrian, ...; or "
+        "sedan, a car of a sedan's size. All if absent."
+    ),
+]
+MinScore = Annotated[float | None, typer.Option(help="The minimum score, from 0 to 1.")]
 SortName = Literal[  # `catalog.asset_queries.Sort`, known before anything is imported
     "score", "coverage", "psnr_db", "length_m", "num_views", "num_points", "created_at"
 ]
@@ -35,7 +41,11 @@ app = typer.Typer(help="Actors, streets and skies for use elsewhere.", no_args_i
 def publish(
     runs: Annotated[
         list[str],
-        typer.Argument(help="Run ids, unique prefixes of them, or latest.", show_default=False),
+        typer.Argument(
+            help="Runs, each by its id or the beginning of it, a scene such as pandaset/002 (its "
+            "newest run), or latest (the newest run of all).",
+            show_default=False,
+        ),
     ],
     as_json: AsJson = False,
 ) -> None:
@@ -44,17 +54,13 @@ def publish(
     Example: lidarpainter assets publish latest
     """
     from catalog.store import existing_store
-    from tasks.runs import open_run
 
-    store = existing_store()
-    for run in runs:
-        open_run(store, run)
-    say_status(f"opening {', '.join(runs)}")
+    store, chosen = existing_store(), [named_run(run) for run in runs]
     from flows.assets import publish_run
     from flows.cli.progress import shown_progress
 
     with shown_progress():
-        results = [publish_run(store, run) for run in runs]
+        results = [publish_run(store, run) for run in chosen]
     if as_json:
         print_json({"published": results})
         return
@@ -64,29 +70,57 @@ def publish(
 
 @app.command("list")
 def list_assets(  # noqa: PLR0913 - the options of a command
-    kind: Annotated[str | None, typer.Option(help="actor, street, sky or trajectory.")] = None,
-    category: Category = None,
-    dataset: Annotated[str | None, typer.Option(help="Where the log comes from.")] = None,
-    licence: Annotated[str | None, typer.Option(help="A part of its name, as CC BY.")] = None,
-    style: Annotated[
-        str | None, typer.Option(help="A word of it, as night; or recorded for none.")
+    kind: Annotated[
+        str | None,
+        typer.Option(help="Kind of the assets: actor, street, sky or trajectory; all if absent."),
     ] = None,
-    scene: Annotated[str | None, typer.Option(help="dataset/sequence it was seen in.")] = None,
+    category: Category = None,
+    dataset: Annotated[
+        str | None,
+        typer.Option(help="Dataset that the log comes from, such as pandaset; all if absent."),
+    ] = None,
+    licence: Annotated[
+        str | None,
+        typer.Option(help="Part of the name of the licence, such as CC BY; all if absent."),
+    ] = None,
+    style: Annotated[
+        str | None,
+        typer.Option(
+            help="Word of the style that the asset was seen in, such as night, or recorded for "
+            "none; all if absent."
+        ),
+    ] = None,
+    scene: Annotated[
+        str | None,
+        typer.Option(help="Scene that the asset was seen in, as dataset/sequence; all if absent."),
+    ] = None,
     sides: Annotated[
         str | None,
-        typer.Option(help="All seen, with commas between: front, rear, left, right, top."),
+        typer.Option(
+            help="Sides that must all have been seen, with commas between: front, rear, left, "
+            "right or top."
+        ),
     ] = None,
-    min_sides: Annotated[int | None, typer.Option(help="Least number of sides seen.")] = None,
-    min_length: Annotated[float | None, typer.Option(help="Least length in metres.")] = None,
+    min_sides: Annotated[
+        int | None, typer.Option(help="The minimum number of sides that were seen, up to 5.")
+    ] = None,
+    min_length: Annotated[float | None, typer.Option(help="The minimum length in metres.")] = None,
     min_score: MinScore = None,
     min_coverage: Annotated[
-        float | None, typer.Option(help="Least share of directions seen, 0 to 1.")
+        float | None,
+        typer.Option(help="The minimum share of directions that were seen, from 0 to 1."),
     ] = None,
     max_lpips: Annotated[
-        float | None, typer.Option(help="Highest LPIPS, where it was measured.")
+        float | None, typer.Option(help="The maximum LPIPS, where it was measured.")
     ] = None,
-    sort: Annotated[SortName, typer.Option(help="Column whose highest come first.")] = "score",
-    limit: Annotated[int, typer.Option(min=1, help="Rows at most.")] = 50,
+    sort: Annotated[
+        SortName,
+        typer.Option(
+            help="Column whose highest values come first: score, coverage, psnr_db, length_m, "
+            "num_views, num_points or created_at."
+        ),
+    ] = "score",
+    limit: Annotated[int, typer.Option(min=1, help="The maximum number of rows.")] = 50,
     as_json: AsJson = False,
 ) -> None:
     """List assets: all filters that are given must hold.
@@ -102,7 +136,7 @@ def list_assets(  # noqa: PLR0913 - the options of a command
         licence=licence,
         style=style,
         scene=scene,
-        sides=parse_names(sides) or (),
+        sides=parse_names(sides, "--sides") or (),
         min_sides=min_sides,
         min_length_m=min_length,
         min_score=min_score,
@@ -126,13 +160,14 @@ def show(name: AssetName, as_json: AsJson = False) -> None:
     Example: lidarpainter assets show 3f2a
     """
     from catalog.artefacts import ArtefactRef
-    from catalog.asset_queries import find_asset, sightings_of
+    from catalog.assets import find_asset, sightings_of
     from catalog.explain import Explainer
+    from catalog.store import existing_store
     from tasks.stages import project_source
 
-    store, sql = _library()
-    asset = find_asset(sql, name)
-    sightings = sightings_of(sql, asset["asset_id"])
+    store = existing_store()
+    asset = find_asset(store, name)
+    sightings = sightings_of(store, asset["asset_id"])
     explainer = Explainer(store, project_source().code_from)
     made = explainer.artefact(ArtefactRef.of_id(asset["artefact_id"]))
     if as_json:
@@ -148,7 +183,12 @@ def show(name: AssetName, as_json: AsJson = False) -> None:
 
 @app.command()
 def query(
-    sql: Annotated[str, typer.Argument(help="One SELECT in DuckDB's words.", show_default=False)],
+    sql: Annotated[
+        str,
+        typer.Argument(
+            help="One SELECT over the tables of the catalog, in DuckDB's SQL.", show_default=False
+        ),
+    ],
     as_json: AsJson = False,
 ) -> None:
     """Ask all tables of the catalog by SQL, which can read them and nothing else.
@@ -170,19 +210,20 @@ def query(
 def export(
     name: AssetName,
     format_: Annotated[
-        Literal["ply", "spz", "gltf"], typer.Option("--format", help="ply, spz or gltf (.glb).")
+        str, typer.Option("--format", help="Format of the file: ply, spz or gltf (a .glb file).")
     ],
-    out: Annotated[Path, typer.Option(help="The file.")],
+    out: Annotated[Path, typer.Option(help="File that the asset is written to.")],
     as_json: AsJson = False,
 ) -> None:
     """Write an actor or a block of street for other programs, in its own frame.
 
     Example: lidarpainter assets export 3f2a --format gltf --out car.glb
     """
-    from catalog.asset_queries import find_asset
+    from catalog.assets import find_asset
+    from catalog.store import existing_store
 
-    store, sql = _library()
-    asset = find_asset(sql, name)
+    store = existing_store()
+    asset = find_asset(store, name)
     say_status(f"exporting asset {asset['asset_id']}")
     from tasks.exports.asset import export_asset
 
@@ -192,10 +233,15 @@ def export(
 
 @app.command()
 def gallery(
-    out: Annotated[Path, typer.Option(help="A new folder, or an older gallery.")],
+    out: Annotated[
+        Path,
+        typer.Option(help="Folder that the gallery is written to: a new one, or an older gallery."),
+    ],
     category: Category = None,
     min_score: MinScore = None,
-    limit: Annotated[int, typer.Option(min=1, help="Assets at most, the best ones.")] = 10_000,
+    limit: Annotated[
+        int, typer.Option(min=1, help="The maximum number of assets, of which the best are taken.")
+    ] = 10_000,
     as_json: AsJson = False,
 ) -> None:
     """Write a page to leaf through the assets, which opens from the disk.

@@ -8,23 +8,27 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flows.cli import questions, upkeep
-from flows.cli.output import Cell, format_bytes, print_json, print_pairs, print_table
-from flows.cli.shared_options import AsJson
+from flows.cli import upkeep
+from flows.cli.output import (
+    Cell,
+    format_bytes,
+    loudness,
+    print_json,
+    print_pairs,
+    print_table,
+)
+from flows.cli.shared_options import AsJson, tell_run
+from flows.cli.tables import heading_of
 
 if TYPE_CHECKING:
     from datetime import datetime
 
 app = typer.Typer(help="What the store holds.", no_args_is_help=True)
-app.add_typer(questions.app)
 app.add_typer(upkeep.app)
 
 SHOWN_COLUMNS = {
     "scenes": ("scene_id", "num_frames", "num_views", "num_actors", "duration_s", "num_bytes"),
-    "runs": (
-        *("run_id", "scene_id", "preset", "painter", "status"),
-        *("started_at", "seconds", "num_gaussians", "derived_from", "change"),
-    ),
+    "runs": ("run_id", "scene_id", "preset", "status", "started_at", "seconds", "change"),
     "artefacts": ("artefact_id", "num_bytes", "seconds", "created_at"),
     "metrics": ("run_id", "protocol", "trajectory", "variant", "name", "value"),
     "painters": ("painter_id", "name", "num_bytes", "created_at"),
@@ -55,12 +59,16 @@ def list_table(
     table: Annotated[
         str,
         typer.Argument(
-            help="scenes, runs, artefacts, metrics, painters, sequences, attempts, assets or "
-            "sightings."
+            help="Table of the catalog: scenes, runs, artefacts, metrics, painters, sequences, "
+            "attempts, assets or sightings."
         ),
     ] = "runs",
     as_of: Annotated[
-        str | None, typer.Option(help="A version of the table, or a time: 2026-11-22T08:00.")
+        str | None,
+        typer.Option(
+            help="Version of the table, such as 3, or a time in UTC, such as 2026-11-22T08:00; as "
+            "it is now if absent."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -86,13 +94,14 @@ def list_table(
         print_json(found | ({"absent": missing} if table == "metrics" else {}))
         return
     columns = SHOWN_COLUMNS[table]
-    cells = [[_listed(name, row[name]) for name in columns] for row in rows]
+    cells = [[_listed(name, row) for name in columns] for row in rows]
     note = "\n".join(
         f"without a value: {', '.join(f'{name} ({count})' for name, count in names.items())}: "
         f"{reason}"
         for reason, names in absent.items()
     )
-    print_table(f"{table} in {store.name}", columns, cells, note)
+    headings = ["preset, painter" if name == "preset" else name for name in columns]
+    print_table(f"{table} in {store.name}", headings, cells, note)
 
 
 @app.command("tables")
@@ -132,7 +141,11 @@ def _version_or_time(text: str) -> "int | datetime":
 @app.command("show")
 def show_record(
     name: Annotated[
-        str, typer.Argument(help="A scene id, a run id or `latest`, or kind/digest; or a prefix.")
+        str,
+        typer.Argument(
+            help="A scene, a run id, latest (the newest run of all), or kind/digest of an "
+            "artefact; or the beginning of an id."
+        ),
     ],
     as_json: AsJson = False,
 ) -> None:
@@ -151,10 +164,18 @@ def show_record(
 
 @app.command("explain")
 def explain(
-    name: Annotated[str, typer.Argument(help="A run id or `latest`, or kind/digest; or a prefix.")],
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="A run id, a scene (its newest run), latest (the newest run of all), or "
+            "kind/digest of an artefact; or the beginning of an id."
+        ),
+    ],
     as_json: AsJson = False,
 ) -> None:
-    """Show what a run or an artefact was made from, and what makes it stale.
+    """Say whether a run or an artefact is up to date, or what makes it stale.
+
+    With --verbose also all that it was made from: inputs, settings and code.
 
     Example: lidarpainter catalog explain latest
     """
@@ -166,6 +187,8 @@ def explain(
 
     store = existing_store()
     table, row = find_row(store, name)
+    if table == "scenes":
+        table, row = "runs", _newest_run(store, name)
     explainer = Explainer(store, project_source().code_from)
     if table == "runs":
         found = explainer.run(row)
@@ -175,22 +198,34 @@ def explain(
         raise UnknownRecordError(f"{name!r} is in {table}, expected a run or an artefact")
     if as_json:
         print_json(found.to_dict())
+        return
+    lines = [found.verdict]
+    if loudness() == "verbose":
+        lines += told_explanation("", found, set())
     else:
-        sys.stdout.write("\n".join(told_explanation("", found, set())) + "\n")
+        if found.newest:
+            differs = ", ".join(found.newest["settings"]) or "nothing that was set"
+            lines.append(f"The newest of its kind is {found.newest['name']}; differs: {differs}.")
+        lines.append("--verbose shows what it was made from.")
+    sys.stdout.write("\n".join(lines) + "\n")
 
 
 @app.command("delete")
 def delete_record(
     name: Annotated[
-        str, typer.Argument(help="A run id or `latest`, kind/digest, or a scene id; or a prefix.")
+        str,
+        typer.Argument(
+            help="A run id, latest (the newest run of all), kind/digest of an artefact, or a "
+            "scene; or the beginning of an id."
+        ),
     ],
     with_dependents: Annotated[
-        bool, typer.Option("--with-dependents", help="Also what was made from it.")
+        bool, typer.Option("--with-dependents", help="Also delete what was made from it.")
     ] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only list what would go, and how much.")
+        bool, typer.Option("--dry-run", help="Only list what would be deleted, and its size.")
     ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Delete without asking.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Delete a run with the artefacts no other run needs, or an artefact, or a scene.
@@ -214,18 +249,14 @@ def delete_record(
         )
     if not dry_run and not yes and not sys.stdin.isatty():
         raise CatalogError("nobody can be asked whether to delete this, expected --yes")
-    num_bytes = sum(one.num_bytes for one in doomed)
     if not as_json:
-        rows = [[one.table[:-1], one.row_id, format_bytes(one.num_bytes)] for one in doomed]
-        title = f"{format_bytes(num_bytes)} of {store.name}"
-        print_table(title, ["what", "name", "size"], rows, num_text_columns=2)
+        upkeep.print_doomed(f"of {store.name}", doomed)
     if not dry_run:
         if not yes and not typer.confirm("Delete this?"):
             raise CatalogError("nothing was deleted")
         delete(store, doomed)
     if as_json:
-        going = [{"table": one.table, "id": one.row_id, "bytes": one.num_bytes} for one in doomed]
-        print_json({"is_deleted": not dry_run, "num_bytes": num_bytes, "rows": going})
+        print_json(upkeep.doomed_as_json(doomed, is_deleted=not dry_run))
 
 
 def told_explanation(part: str, found: Any, shown: set[str], depth: int = 0) -> Iterator[str]:  # noqa: ANN401
@@ -264,7 +295,7 @@ def find_row(store: Any, name: str) -> tuple[str, dict[str, Any]]:  # noqa: ANN4
     if not name:
         raise UnknownRecordError("'' names nothing, expected an id or the beginning of one")
     if name == LATEST:
-        return "runs", store.run(name)
+        return "runs", _newest_run(store, name)
     complaints = []
     for table in ("scenes", "runs", "artefacts", "painters"):
         try:
@@ -274,6 +305,14 @@ def find_row(store: Any, name: str) -> tuple[str, dict[str, Any]]:  # noqa: ANN4
             if "not unique" in str(error):
                 raise
     raise UnknownRecordError(f"nothing is called {name!r}: {'; '.join(complaints)}")
+
+
+def _newest_run(store: Any, name: str) -> dict[str, Any]:  # noqa: ANN401 - imported late
+    """The run that `latest` or a scene stands for, which is said on stderr."""
+    row: dict[str, Any] = store.run(name)
+    kind = json.loads(row["change"])["kind"] if row["change"] else None
+    tell_run(name, row["run_id"], row["scene_id"], kind)
+    return row
 
 
 def _absent(rows: list[dict[str, Any]]) -> dict[str, Counter[str]]:
@@ -298,8 +337,13 @@ def opened_row(row: dict[str, Any]) -> dict[str, Any]:
     return opened
 
 
-def _listed(name: str, value: Any) -> Cell:  # noqa: ANN401 - any value of a table
-    """A cell of a list, where a change is its kind and what was asked for, if that is short."""
+def _listed(name: str, row: dict[str, Any]) -> Cell:
+    """A cell of a list: a run's painter stands with its preset, a change in its words."""
+    value = row[name]
+    if name == "preset":
+        return ", ".join(filter(None, (value, row["painter"])))
+    if name == "name" and "metric_id" in row:
+        return heading_of(value)
     if name != "change" or value is None:
         return row_cell(name, value)
     change = json.loads(value)

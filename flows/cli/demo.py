@@ -21,9 +21,17 @@ STORE_NAME = "store"
 
 
 def demo(
-    out: Annotated[Path, typer.Option(help="Folder for the report and the store.")] = Path("demo"),
+    out: Annotated[
+        Path, typer.Option(help="Folder that the report and the store are written to.")
+    ] = Path("demo"),
     seed: Annotated[
-        int, typer.Option(min=0, max=999, help="Which street; painters train on other seeds.")
+        int,
+        typer.Option(
+            min=0,
+            max=999,
+            help="Number from 0 to 999 that decides which street is drawn; painters train on "
+            "streets of other seeds.",
+        ),
     ] = 1,
     painter: Painter = None,
     settings: Settings = None,
@@ -36,6 +44,9 @@ def demo(
 
     Example: lidarpainter demo --out demo
     """
+    from flows.environment import keep_prefect_in
+
+    keep_prefect_in(str(out / STORE_NAME))
     from catalog.errors import storage_errors
     from catalog.store import open_store
     from flows.cli.reconstruct import show
@@ -70,12 +81,11 @@ def demo(
 def _written_page(store: "Store", run_id: str, out: Path) -> Path:
     """The drive and a lane beside it in one file."""
     from flows.cli.progress import shown_progress
-    from flows.exports import export_request, export_run
-    from flows.views import PathRequest
+    from flows.exports import export_run
+    from lidarpainter_models.export.view_requests import ViewRequest
     from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
     from lidarpainter_models.geometry.trajectory_words import RECORDED
 
-    path = PathRequest(run=run_id, trajectory=parse_trajectory(RECORDED))
     with shown_progress():
-        export_run(store, export_request("page", {}, path, None), out)
+        export_run(store, run_id, "page", ViewRequest(trajectory=parse_trajectory(RECORDED)), out)
     return out

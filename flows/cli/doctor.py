@@ -14,14 +14,23 @@ UNFIT = 2
 def doctor(
     subject: Annotated[
         str | None,
-        typer.Argument(help="A scene (dataset/sequence), or a dataset's name; nothing: the setup."),
+        typer.Argument(
+            help="A stored scene (dataset/sequence), or the name of a dataset; if absent, the "
+            "setup of this machine is checked."
+        ),
     ] = None,
     root: Annotated[
-        Path | None, typer.Argument(help="With a dataset's name: its folder, as downloaded.")
+        Path | None,
+        typer.Argument(
+            help="The folder of that dataset, as downloaded; only with a dataset's name."
+        ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Where the overlay image goes; the store's folder doctor if absent."),
+        typer.Option(
+            help="File that the overlay image is written to; if absent, one in the store's folder "
+            "doctor."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

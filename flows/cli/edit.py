@@ -1,13 +1,14 @@
 """`lidarpainter edit`: take actors out of a run, put them in, let them go elsewhere."""
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from flows.cli.output import Cell, print_json, print_pairs, print_table, say_status
-from flows.cli.shared_options import AsJson, RunName, check_painter
+from flows.cli.output import Cell, print_json, print_pairs, print_table
+from flows.cli.shared_options import AsJson, RunName, check_painter, named_run
 from lidarpainter_models.errors import ConfigError
 
 ACTORS = "actors"
@@ -21,6 +22,8 @@ MOST_SCRIPT_BYTES = 10_000_000
 _NUMBER = re.compile(r"factor|speed|strength|.*_(m|s|deg|mps)")
 """Fields whose name says that they are numbers."""
 _WHOLE_NUMBER = "seed"
+LEAST_NAME = 8
+"""Characters of an actor's id in a table, which name it to `edit` too."""
 
 
 def edit(
@@ -28,24 +31,38 @@ def edit(
     words: Annotated[
         list[str] | None,
         typer.Argument(
-            help="actors (lists them), or an operation, whom, and field=value of docs/editing.md. "
-            "An actor is an id, the beginning of one, or nearest-ahead.",
+            help="The word actors, which lists them; or an operation of docs/editing.md (remove, "
+            "insert, move, swap, ...), the actor, and field=value. An actor is its id, the "
+            "beginning of it, or nearest-ahead.",
             show_default=False,
         ),
     ] = None,
     script: Annotated[
         list[Path] | None,
-        typer.Option(help="JSON list of operations; several are done one after the other."),
+        typer.Option(
+            help="File with a JSON list of operations; several files are done one after the other."
+        ),
     ] = None,
     painter: Annotated[
-        str | None, typer.Option(help="Who paints what nobody saw; the run's own if absent.")
+        str | None,
+        typer.Option(
+            help="Painter of what no camera saw: none, overlay, warp, nano, a .safetensors file, "
+            "or a model. The run's own if absent."
+        ),
     ] = None,
     allow_collisions: Annotated[
-        bool, typer.Option("--allow-collisions", help="Let actors and the camera go through walls.")
+        bool,
+        typer.Option(
+            "--allow-collisions",
+            help="Let actors and the camera go through what LiDAR saw standing there.",
+        ),
     ] = False,
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder for images along the script's `drive`, painted by clear day."),
+        typer.Option(
+            help="Folder that images along the script's `drive` are written to, painted where it "
+            "is a clear day."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -66,17 +83,15 @@ def edit(
     operations += [_operation(words)] if words else []
     from catalog.store import existing_store
     from lidarpainter_models.editing.operations import parse_operations
-    from tasks.runs import open_run
 
     known = parse_operations(operations, "edit")
-    open_run(existing_store(), run)
-    say_status(f"opening run {run}")
+    run_id = named_run(run)
     check_painter(painter)
     from flows.cli.progress import shown_progress
     from flows.edit import EditRequest, edit_run, shown_edit
 
     request = EditRequest(
-        run=run, operations=known, painter=painter, allows_collisions=allow_collisions
+        run=run_id, operations=known, painter=painter, allows_collisions=allow_collisions
     )
     with shown_progress():
         result = edit_run(existing_store(), request)
@@ -103,16 +118,29 @@ def _list(run: str, *, as_json: bool) -> None:
     from catalog.store import existing_store
 
     store = existing_store()
-    say_status(f"opening run {run}")
+    run_id = named_run(run)
     from flows.edit import list_actors
 
-    rows = list_actors(store, run)
+    rows = list_actors(store, run_id)
     if as_json:
         print_json({"run": run, "actors": rows})
         return
-    columns = list(rows[0]) if rows else ["actor_id"]
-    cells = [list(row.values()) for row in rows]
-    print_table(f"actors of run {run}", columns, cells, num_text_columns=2)
+    names = shortest_names([row["actor_id"] for row in rows])
+    columns = ["actor_id", "category", "is_moving", "length_m", "width_m", "height_m"]
+    columns += ["frames", "num_gaussians", "distance_m"]
+    cells = [
+        [name, *(row[column] for column in columns[1:])]
+        for name, row in zip(names, rows, strict=True)
+    ]
+    print_table(f"actors of run {run_id}", columns, cells, num_text_columns=2)
+
+
+def shortest_names(ids: Sequence[str]) -> list[str]:
+    """The beginnings of ids that still tell them apart, all of one length."""
+    length = LEAST_NAME
+    while len({one[:length] for one in ids}) < len(set(ids)):
+        length += 1
+    return [one[:length] for one in ids]
 
 
 def _operation(words: list[str]) -> dict[str, Any]:

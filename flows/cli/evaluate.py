@@ -5,11 +5,12 @@ from typing import Annotated, Any
 
 import typer
 
-from flows.cli.output import print_json, print_table, say_status
+from flows.cli.output import print_json, print_table
 from flows.cli.shared_options import (
     AsJson,
     RunName,
     check_painter,
+    named_run,
     parse_previous,
     refuse_unused,
 )
@@ -29,34 +30,57 @@ FLICKER_COLUMNS = ("flicker", "moving_flicker", "valid_share", "psnr", "num_pair
 ViewTimePainter = Annotated[
     str | None,
     typer.Option(
-        help="Painter for --postpaint; the run's own if absent. Scores of another one are printed, "
-        "not entered into the catalog."
+        help="Painter at view time: overlay, warp, nano, a .safetensors file, or a model; the "
+        "run's own if absent. Scores of another one are printed, but not entered into the "
+        "catalog."
     ),
 ]
 
 
 def evaluate(  # noqa: PLR0913 - the options of a command
     run: RunName,
-    protocol: Annotated[str, typer.Option(help=f"{', '.join(PROTOCOLS)}.")] = "paper",
+    protocol: Annotated[
+        str,
+        typer.Option(
+            help="How the run is scored: paper (held-out views, and views beside the path where "
+            "they are known), truth (views beside the path of a synthetic street, against exact "
+            "images), cross-camera (cameras that no fit saw), or flicker (neighbouring frames "
+            "against each other)."
+        ),
+    ] = "paper",
     postpaint: Annotated[
-        bool, typer.Option("--postpaint", help="Judge what is painted at view time as well.")
+        bool, typer.Option("--postpaint", help="Also score what is painted at view time.")
     ] = False,
     painter: ViewTimePainter = None,
     feature_weights: Annotated[
-        Path | None, typer.Option(help="SqueezeNet 1.1 weights for the feature distance.")
+        Path | None,
+        typer.Option(
+            help="File with weights of SqueezeNet 1.1, for the feature distance; it is left out if "
+            "absent."
+        ),
     ] = None,
     lpips_backbone: Annotated[
-        Path | None, typer.Option(help="torchvision's VGG-16, AlexNet or SqueezeNet, for LPIPS.")
+        Path | None,
+        typer.Option(
+            help="File with torchvision's weights of VGG-16, AlexNet or SqueezeNet, for LPIPS; it "
+            "is left out if absent."
+        ),
     ] = None,
     lpips_heads: Annotated[
-        Path | None, typer.Option(help="LPIPS heads (version 0.1) of the same network.")
+        Path | None,
+        typer.Option(help="File with the LPIPS heads (version 0.1) of the same network."),
     ] = None,
     all_views: Annotated[
-        bool, typer.Option("--all-views", help="Judge every held-out view, not a sample of them.")
+        bool,
+        typer.Option("--all-views", help="Score every held-out view in place of a sample of them."),
     ] = False,
     previous: Annotated[
         str | None,
-        typer.Option(help="For flicker: also lean on the frame before, mixed or shown (or both)."),
+        typer.Option(
+            help="With --protocol flicker: also score painting that uses the image painted before: "
+            "mixed (into what the next one is painted from), shown (to the painter), or both "
+            "with a comma between."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -68,16 +92,13 @@ def evaluate(  # noqa: PLR0913 - the options of a command
     _check(protocol, previous, weights, all_views=all_views)
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
-    from tasks.runs import open_run
 
-    previously = parse_previous(previous)
-    open_run(existing_store(), run)
-    say_status(f"opening run {run}")
+    previously, run_id = parse_previous(previous), named_run(run)
     check_painter(painter)
     from flows.evaluate import EvaluationRequest, evaluate_run
 
     request = EvaluationRequest(
-        run=run,
+        run=run_id,
         protocol=protocol,
         is_painted=postpaint,
         painter=painter,
@@ -98,7 +119,7 @@ def _check(
 ) -> None:
     """Refuse what cannot be judged before anything is loaded."""
     if protocol not in PROTOCOLS:
-        raise ConfigError(f"no protocol {protocol!r}, expected {', '.join(PROTOCOLS)}")
+        raise ConfigError(f"--protocol {protocol!r}: expected {', '.join(PROTOCOLS)}")
     if previous is not None and protocol != FLICKER:
         raise ConfigError(f"--previous is judged by --protocol {FLICKER}, not by {protocol}")
     if protocol in (CROSS_CAMERA, FLICKER):

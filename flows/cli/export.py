@@ -2,7 +2,7 @@
 
 import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -18,58 +18,64 @@ from flows.cli.shared_options import (
     PostpaintPainter,
     RunName,
     TrajectorySpec,
-    followed_path,
+    checked_words,
+    parse_frames,
     parse_names,
+    refuse_unused,
 )
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.export.formats import export_format, formats_help
+from lidarpainter_models.geometry.trajectory_words import RECORDED
 
-FormatName = Literal[  # `flows.exports.FORMATS`, known before anything is imported
-    "ply",
-    "spz",
-    "gltf",
-    "usd",
-    "colmap",
-    "nerfstudio",
-    "video",
-    "depth",
-    "semantics",
-    "page",
-    "lidar",
-    "lidar-bin",
-]
+FIGURES = {
+    "psnr": "PSNR of what the file shows against the scene, dB, higher is better",
+    "worst_psnr": "PSNR of the worst of three views, dB, higher is better",
+    "psnr_reason": "why there is no PSNR",
+}
+"""What figures of an exported scene are of."""
+SPZ_VERSION = 3
+"""The version of SPZ that most programs read."""
+
 Format = Annotated[
-    FormatName,
-    typer.Option(
-        "--format",
-        help="ply, spz, gltf, usd: the scene; colmap, nerfstudio: images with poses; video, depth, "
-        "semantics: what is seen; page: the drive in one HTML file; "
-        "lidar (PCD), lidar-bin (nuScenes): the sweeps.",
-    ),
+    str, typer.Option("--format", help=f"Format of the file or folder. {formats_help()}")
 ]
 Moment = Annotated[
-    str, typer.Option(help="Where actors stand: seconds since the first image, or frame:N.")
+    str,
+    typer.Option(
+        help="Moment at which actors stand where they are: seconds since the first image, such "
+        "as 1.5, or frame:N, counted from 0."
+    ),
 ]
 ActorNames = Annotated[
-    str | None, typer.Option(help="Ids of the actors to take along, or none; all if absent.")
+    str | None,
+    typer.Option(
+        help="Ids of the actors to take along, with commas between, or none; all if absent."
+    ),
 ]
 PerActor = Annotated[
-    bool, typer.Option("--per-actor", help="ply: the street and every actor in files of their own.")
+    bool,
+    typer.Option(
+        "--per-actor",
+        help="Write the street and every actor as PLY files of their own, into a new folder.",
+    ),
 ]
-Sky = Annotated[bool, typer.Option("--sky", help="Show the sky by far Gaussians.")]
-SpzVersionOption = Annotated[int, typer.Option(help="3 or 4; fewer programs read 4.")]
-Postpaint = Annotated[bool, typer.Option("--postpaint", help="Paint every rendered image.")]
+Sky = Annotated[bool, typer.Option("--sky", help="Take the sky along, as far Gaussians.")]
+SpzVersionOption = Annotated[
+    int, typer.Option(help="Version of SPZ: 3 or 4; fewer programs read 4.")
+]
+Postpaint = Annotated[bool, typer.Option("--postpaint", help="Paint every image that is rendered.")]
 
 
 def export(  # noqa: PLR0913 - the options of a command
     run: RunName,
     format_: Format,
-    out: Annotated[Path, typer.Option(help="The file, or a new folder.")],
+    out: Annotated[Path, typer.Option(help="The file to write, or a new folder.")],
     time: Moment = "0",
     actors: ActorNames = None,
     per_actor: PerActor = False,
     sky: Sky = False,
-    spz_version: SpzVersionOption = 3,
-    trajectory: TrajectorySpec = "recorded",
+    spz_version: SpzVersionOption = SPZ_VERSION,
+    trajectory: TrajectorySpec = RECORDED,
     camera: FollowedCameras = None,
     frames: FollowedFrames = None,
     width: ImageWidth = None,
@@ -88,29 +94,60 @@ def export(  # noqa: PLR0913 - the options of a command
 
     A film of the whole rig: lidarpainter export latest --format video --camera all --out rig.mp4
     """
+    row, followed = export_format(format_), parse_frames(frames)
+    time_s, frame = parse_time(time)
+    given = {
+        "--time": time_s > 0 or frame is not None,
+        "--actors": actors is not None,
+        "--per-actor": per_actor,
+        "--sky": sky,
+        "--spz-version": spz_version != SPZ_VERSION,
+        "--trajectory": trajectory != RECORDED,
+        "--camera": camera is not None,
+        "--frames": frames is not None,
+        "--width": width is not None,
+        "--postpaint": postpaint or painter is not None,
+        "--fps": fps is not None,
+        "--beside": beside is not None,
+    }
+    unread = {name: is_given for name, is_given in given.items() if name not in row.options}
+    refuse_unused(f"--format {row.name}", unread)
+    run_id = checked_words(run, trajectory, painter)
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
+    from flows.exports import export_run
+    from lidarpainter_models.export.view_requests import ViewKinds, ViewRequest
+    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+    from tasks.exports.scene import SceneRequest
 
-    time_s, frame = parse_time(time)
-    scene = {"time_s": time_s, "frame": frame, "actors": parse_actors(actors), "with_sky": sky}
-    scene |= {"is_per_actor": per_actor, "spz_version": spz_version}
-    path = followed_path(
-        run,
-        trajectory,
-        frames,
-        painter,
-        camera=camera,
-        is_painted=postpaint or painter is not None,
-        allows_collisions=allow_collisions,
-        width_px=width,
-        beside=beside,
+    scene = SceneRequest(
+        time_s=time_s,
+        frame=frame,
+        actors=parse_actors(actors),
+        is_per_actor=per_actor,
+        with_sky=sky,
+        spz_version=spz_version,
     )
-    from flows.exports import export_request, export_run
-
-    request = export_request(format_, scene, path, fps)
+    request = ViewRequest(
+        trajectory=parse_trajectory(trajectory),
+        camera=camera,
+        frames=followed,
+        width_px=width,
+        is_painted=postpaint or painter is not None,
+        painter=painter,
+        allows_collisions=allow_collisions,
+        beside=beside,
+        kinds=ViewKinds(fps=fps),
+    )
     with shown_progress():
-        result = export_run(existing_store(), request, out.absolute())
-    print_json(result) if as_json else print_pairs(f"{format_} of {result['scene']}", result)
+        result = export_run(
+            existing_store(), run_id, row.name, request, out.absolute(), scene=scene
+        )
+    if as_json:
+        print_json(result)
+    else:
+        shown = {FIGURES.get(name, name): value for name, value in result.items()}
+        print_pairs(f"{row.name} of {result['scene']}", shown)
 
 
 def parse_actors(text: str | None) -> tuple[str, ...] | None:
@@ -119,7 +156,7 @@ def parse_actors(text: str | None) -> tuple[str, ...] | None:
     Raises:
         ConfigError: an id is empty.
     """
-    return () if text == "none" else parse_names(text)
+    return () if text == "none" else parse_names(text, "--actors")
 
 
 def parse_time(text: str) -> tuple[float, int | None]:

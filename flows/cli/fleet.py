@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flows.cli.output import complain, loudness, print_json, print_pairs, print_table, say_status
+from flows.cli.output import print_json, print_pairs, print_table, say_status, tell
 from flows.cli.shared_options import AsJson
+from lidarpainter_models.errors import ConfigError
 
 if TYPE_CHECKING:
     from catalog.fleets import FleetLedger
@@ -19,7 +20,8 @@ TOLD_APART_BY = ("configuration", "cameras", "fit_seed")
 MOST_WORKERS = 150
 """Beyond 200 flow runs that wait, Prefect's queues starve (its issue 19403)."""
 Fleet = Annotated[
-    str | None, typer.Argument(help="Name of the fleet; the one that was asked for last if absent.")
+    str | None,
+    typer.Argument(help="Name of the fleet; if absent, the one that was asked for last."),
 ]
 
 app = typer.Typer(help="Many sequences from one manifest.", no_args_is_help=True)
@@ -27,24 +29,48 @@ app = typer.Typer(help="Many sequences from one manifest.", no_args_is_help=True
 
 @app.command("run")
 def run(  # noqa: PLR0913 - the options of a command
-    manifest: Annotated[Path, typer.Argument(help="TOML file, see docs/fleet.md.")],
+    manifest: Annotated[
+        Path,
+        typer.Argument(
+            help="TOML file that says which sequences are wanted and how, described in "
+            "docs/fleet.md."
+        ),
+    ],
     workers: Annotated[
         int,
-        typer.Option(min=1, max=MOST_WORKERS, help="Sequences at once, each in its own process."),
+        typer.Option(
+            min=1,
+            max=MOST_WORKERS,
+            help="Number of sequences made at once, each in a process of its own.",
+        ),
     ] = 1,
-    threads: Annotated[int, typer.Option(min=1, help="Of each worker.")] = 1,
+    threads: Annotated[int, typer.Option(min=1, help="Number of threads of each worker.")] = 1,
     accept_stale: Annotated[
-        bool, typer.Option("--accept-stale", help="Leave what older code has done as it is.")
+        bool,
+        typer.Option(
+            "--accept-stale",
+            help="Take what older code has made as it is, in place of making it again.",
+        ),
     ] = False,
     deploys: Annotated[
-        bool, typer.Option("--deploy", help="Let workers of a Prefect work pool make them.")
+        bool,
+        typer.Option(
+            "--deploy",
+            help="Let workers of a Prefect work pool make the sequences, in place of this command.",
+        ),
     ] = False,
     cron: Annotated[
         str | None,
-        typer.Option(help="With --deploy: look at the manifest at these times (UTC); else now."),
+        typer.Option(
+            help="With --deploy: when the manifest is looked at, in UTC, such as '0 3 * * *'; once "
+            "now if absent."
+        ),
     ] = None,
     pool: Annotated[
-        str | None, typer.Option(help="With --deploy: work pool, made if it is not there.")
+        str | None,
+        typer.Option(
+            help="With --deploy: name of the work pool, which is made if it is not there."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -66,7 +92,7 @@ def run(  # noqa: PLR0913 - the options of a command
         _deploy(asked.name, parameters, threads, cron=cron, pool=pool, as_json=as_json)
         return
     if cron is not None or pool is not None:
-        raise typer.BadParameter("--cron and --pool go with --deploy")
+        raise ConfigError(f"{'--pool' if cron is None else '--cron'} needs --deploy")
     folder = manifest.absolute().parent
     _run_here(asked, folder, workers, threads, accept_stale=accept_stale, as_json=as_json)
 
@@ -75,11 +101,14 @@ def run(  # noqa: PLR0913 - the options of a command
 def status(
     fleet: Fleet = None,
     failed: Annotated[
-        bool, typer.Option("--failed", help="Only what failed or was set aside, and why.")
+        bool, typer.Option("--failed", help="Show only what failed or was set aside, and why.")
     ] = False,
     metrics: Annotated[
         Path | None,
-        typer.Option(help="Also write this file, X.prom, in the text format of Prometheus."),
+        typer.Option(
+            help="File, such as fleet.prom, that figures are also written to in the text format of "
+            "Prometheus."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -107,7 +136,9 @@ def retry(
     fleet: Fleet = None,
     scene: Annotated[
         list[str] | None,
-        typer.Option(help="Only this scene, though it was set aside. May be repeated."),
+        typer.Option(
+            help="Only this scene, as dataset/sequence, even if it was set aside. May be repeated."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -134,16 +165,17 @@ def cancel(fleet: Fleet = None, as_json: AsJson = False) -> None:
 
 
 @app.command("work")
-def work(fleet: Annotated[str, typer.Argument(help="Name of the fleet.")]) -> None:
+def work(
+    fleet: Annotated[str, typer.Argument(help="Name of the fleet, as its manifest has it.")],
+) -> None:
     """Work on a fleet that was asked for, beside all others who do; `fleet run` starts these.
 
     Example: lidarpainter fleet work night-of-monday
     """
     ledger = _ledger()
     ledger.rows(fleet)
-    from flows.fleet.event_log import EventLog
     from flows.fleet.work import make_sequence
-    from flows.fleet.worker import Worker
+    from flows.fleet.worker import EventLog, Worker
     from tasks.progress import listening
 
     log = EventLog(fleet, sys.stderr.write)
@@ -154,7 +186,9 @@ def work(fleet: Annotated[str, typer.Argument(help="Name of the fleet.")]) -> No
 @app.command("report")
 def report(
     fleet: Fleet = None,
-    out: Annotated[Path, typer.Option(help="The page to write.")] = Path("fleet.html"),
+    out: Annotated[Path, typer.Option(help="HTML file that the page is written to.")] = Path(
+        "fleet.html"
+    ),
     as_json: AsJson = False,
 ) -> None:
     """Write one page about a fleet: throughput, failures, cost, quality, worst scenes, planner.
@@ -200,12 +234,12 @@ def _run_here(
     store.make()
     ledger = FleetLedger(store)
     for line in [*ledger.reconcile(), *_closed(ledger)]:
-        _tell(line)
+        tell(line)
     ledger.ask(wanted, accept_stale=accept_stale)
     counts = counts_of(ledger.rows(asked.name))
     if still := counts["waiting"] + counts["running"]:
         start = starter(store.address, asked.name, threads)
-        run_workers(ledger, asked.name, start, min(workers, still), _tell)
+        run_workers(ledger, asked.name, start, min(workers, still), tell)
     status = fleet_status(ledger, asked.name)
     _show(status, as_json=as_json)
     if not is_over(status):
@@ -223,7 +257,7 @@ def _deploy(
 ) -> None:
     say_status(f"deploying {name}")
     from catalog.store import open_store
-    from flows.fleet.deployment import POOL, deploy
+    from flows.fleet.deployed import POOL, deploy
 
     store = open_store().name
     asked = {**parameters, "store": store}
@@ -289,8 +323,3 @@ def _show_scenes(fleet: str, state: str, scenes: list[str], *, as_json: bool) ->
         print_json({"fleet": fleet, "scenes": scenes})
     else:
         print_table(f"fleet {fleet}, {state}", ["scene"], [[scene] for scene in scenes])
-
-
-def _tell(line: str) -> None:
-    if loudness() != "quiet":
-        complain(line)

@@ -20,24 +20,35 @@ COLUMNS = {
 
 
 def ingest(  # noqa: PLR0913 - one per option
-    dataset: Annotated[str, typer.Argument(help="pandaset, nuscenes, waymo or canonical.")],
+    dataset: Annotated[
+        str,
+        typer.Argument(
+            help="Form of the dataset: pandaset, nuscenes, waymo or canonical (scenes in the form "
+            "that this store has)."
+        ),
+    ],
     root: Annotated[
         Path, typer.Argument(help="The folder that holds the sequences, as downloaded.")
     ],
     sequences: Annotated[
-        list[str] | None, typer.Argument(help="Sequences to take; all found if none is named.")
+        list[str] | None,
+        typer.Argument(help="Names of the sequences to take; all that are found if none is named."),
     ] = None,
     frames: Annotated[
-        str | None, typer.Option(help="Frames A:B to take, B excluded; all if absent.")
+        str | None,
+        typer.Option(help="Frames to take as A:B, B excluded, such as 0:40; all if absent."),
     ] = None,
     cameras: Annotated[
-        str | None, typer.Option(help="Cameras to take, with commas between; all if absent.")
+        str | None,
+        typer.Option(help="Names of the cameras to take, with commas between; all if absent."),
     ] = None,
     jobs: Annotated[
-        int, typer.Option(min=1, help="Sequences read at once, each in a process of its own.")
+        int,
+        typer.Option(min=1, help="Number of sequences read at once, each in a process of its own."),
     ] = 1,
     again: Annotated[
-        bool, typer.Option("--again", help="Read anew, and replace what is in the store.")
+        bool,
+        typer.Option("--again", help="Read everything anew, and replace what is in the store."),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -51,7 +62,7 @@ def ingest(  # noqa: PLR0913 - one per option
     All segments, four at once: lidarpainter ingest waymo /data/waymo --jobs 4
     """
     chosen_frames = parse_frames(frames)
-    chosen_cameras = parse_names(cameras)
+    chosen_cameras = parse_names(cameras, "--cameras")
 
     say_status(f"looking for sequences in {root}")
     from catalog.store import open_store

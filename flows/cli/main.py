@@ -10,12 +10,13 @@ import sys
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from catalog.errors import CatalogError
-from catalog.store import STORE_ENVIRONMENT
+from catalog.store import DEFAULT_STORE, STORE_ENVIRONMENT
 from flows.cli import (
     assets,
     catalog,
@@ -35,11 +36,10 @@ from flows.cli import (
     view,
 )
 from flows.cli.output import Loudness, complain, loudness, set_loudness
-from flows.cli.usage import OneLineGroup
-from flows.environment import prepare_environment
+from flows.environment import keep_prefect_in, prepare_environment
 from flows.interruption import MESSAGE, Interrupted, is_interrupted
 from lidarpainter_models import __version__
-from lidarpainter_models.errors import LidarPainterError
+from lidarpainter_models.errors import ConfigError, LidarPainterError
 
 BAD_INPUT = 2
 UNEXPECTED = 1
@@ -49,9 +49,34 @@ LOG_LEVELS: dict[Loudness, str] = {
     "usual": "CRITICAL",
     "verbose": "WARNING",
 }
-"""Of Prefect: its errors reach the user as one line of ours, not as its traceback."""
+"""Log levels of Prefect: its errors reach the user as one line of ours, not as its traceback."""
 GLOBAL_OPTIONS = ("--store",)
 GLOBAL_FLAGS = ("--debug", "--quiet", "--verbose", "-v")
+
+USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
+"""The parent of typer's errors about words; it has no public name in every version of typer."""
+NO_WORDS = "NoArgsIsHelpError"
+
+
+class OneLineGroup(TyperGroup):
+    """The whole command; what it cannot read is raised instead of drawn in a box."""
+
+    def main(self, *args: Any, **options: Any) -> Any:  # noqa: ANN401 - as typer has it
+        """Run a command and leave with its code.
+
+        Raises:
+            ConfigError: an option or argument is missing, unknown or of the wrong kind.
+        """
+        try:
+            code = super().main(*args, **{**options, "standalone_mode": False})
+        except USAGE_ERROR as error:
+            if type(error).__name__ == NO_WORDS:
+                sys.stdout.write(error.ctx.get_help())
+                sys.exit(error.exit_code)
+            place = f" (see {error.ctx.command_path} --help)" if error.ctx else ""
+            raise ConfigError(f"{error.format_message().rstrip('.')}{place}") from None
+        sys.exit(code if isinstance(code, int) else 0)
+
 
 app = typer.Typer(
     name="lidarpainter",
@@ -93,33 +118,37 @@ def options(
     store: Annotated[
         Path | None,
         typer.Option(
-            help="The store: a folder or s3://BUCKET/PREFIX.",
+            help="The store that everything is kept in: a folder, or s3://BUCKET/PREFIX; "
+            "./lidarpainter-store if absent.",
             envvar=STORE_ENVIRONMENT,
             show_default=False,
         ),
     ] = None,
     debug: Annotated[  # noqa: ARG001 - `main` reads it; here it is only documented
-        bool, typer.Option("--debug", help="Show tracebacks and Prefect's log.")
+        bool, typer.Option("--debug", help="Show tracebacks and the log of Prefect.")
     ] = False,
     quiet: Annotated[  # noqa: ARG001 - likewise
-        bool, typer.Option("--quiet", help="Show no progress.")
+        bool, typer.Option("--quiet", help="Show no progress and no hints on stderr, only errors.")
     ] = False,
     verbose: Annotated[  # noqa: ARG001 - likewise
         bool,
         typer.Option(
-            "--verbose", "-v", help="Say what each stage depends on and where it lies; warnings."
+            "--verbose",
+            "-v",
+            help="Say what each stage depends on and where it lies, and show warnings and details.",
         ),
     ] = False,
     version: Annotated[  # noqa: ARG001 - its callback answers
         bool,
         typer.Option(
-            "--version", help="Print the version.", callback=_print_version, is_eager=True
+            "--version", help="Print the version and end.", callback=_print_version, is_eager=True
         ),
     ] = False,
 ) -> None:
     """Options of every command; they may also stand after it."""
     if store is not None:
         os.environ[STORE_ENVIRONMENT] = str(store)  # for every later `open_store()`
+    keep_prefect_in(os.environ.get(STORE_ENVIRONMENT) or DEFAULT_STORE)
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flows.cli.output import complain, loudness, print_json, print_table, say_status
+from flows.cli.output import print_json, print_table, say_status, tell
 from flows.cli.shared_options import AsJson, Settings, parse_names
 from lidarpainter_models.errors import ConfigError
 
@@ -23,21 +23,65 @@ COLUMNS = ("scene", "configuration", "seed", "cpu_seconds", "num_gaussians")
 SHOWN = ("recorded_psnr", "aside_psnr", "aside_depth")
 """Qualities in the table."""
 
-Scenes = Annotated[list[str], typer.Argument(help="dataset/sequence, as ingested.")]
-Out = Annotated[Path, typer.Option(help="Folder for the pictures.")]
-Preset = Annotated[str, typer.Option(help="What is changed, one thing at a time.")]
+Scenes = Annotated[
+    list[str], typer.Argument(help="Scene as dataset/sequence, such as pandaset/002.")
+]
+Out = Annotated[Path, typer.Option(help="Folder that the pictures are written to.")]
+Preset = Annotated[
+    str,
+    typer.Option(
+        help="Preset that is changed in one thing at a time: brief, preview, balanced or paper."
+    ),
+]
 Cameras = Annotated[
-    str | None, typer.Option(help="Cameras to train on, with commas between; all if absent.")
+    str | None,
+    typer.Option(help="Names of the cameras to fit to, with commas between; all if absent."),
 ]
 Seeds = Annotated[
-    int, typer.Option(min=1, max=100, help="How often each point is tried, for the bars.")
+    int,
+    typer.Option(
+        min=1,
+        max=100,
+        help="Number of seeds of the fit that each point is made with; bars show how far they "
+        "differ.",
+    ),
 ]
-Only = Annotated[
-    str | None, typer.Option(help="Names of what is compared, with commas between; all if absent.")
+OnlyWays = Annotated[
+    str | None,
+    typer.Option(
+        "--only",
+        help="Ways to compare, with commas between: preset, no-painter, overlay, warp, first-fit, "
+        "one-round, steps-x0.25, steps-x0.5, steps-x2, painted-views-x0.5, gaussians-x0.5 or "
+        "gaussians-x2; all if absent.",
+    ),
 ]
-Workers = Annotated[int, typer.Option(min=1, help="Points at once, each in a process of its own.")]
+OnlyFactors = Annotated[
+    str | None,
+    typer.Option(
+        "--only",
+        help="What is changed, with commas between: gaussians, harmonics, steps, rounds or "
+        "painted-views; all if absent.",
+    ),
+]
+OnlyCauses = Annotated[
+    str | None,
+    typer.Option(
+        "--only",
+        help="Causes of faults, with commas between: beams, reach, dropout, clutter, clock, "
+        "pose-noise, camera-yaw, focal-length, box-noise, missing-boxes, false-boxes, "
+        "wrong-classes, exposure, white-balance, motion-blur, darkness, dirt, swapped, "
+        "missing-cameras or frame-rate; all if absent.",
+    ),
+]
+Workers = Annotated[
+    int, typer.Option(min=1, help="Number of points made at once, each in a process of its own.")
+]
 Stale = Annotated[
-    bool, typer.Option("--accept-stale", help="Draw what older code has done as it is.")
+    bool,
+    typer.Option(
+        "--accept-stale",
+        help="Take what older code has made as it is, in place of making it again.",
+    ),
 ]
 
 
@@ -47,7 +91,7 @@ def chart(  # noqa: PLR0913 - the options of a command
     preset: Preset = "preview",
     train_cameras: Cameras = None,
     seeds: Seeds = 3,
-    only: Only = None,
+    only: OnlyWays = None,
     workers: Workers = 1,
     accept_stale: Stale = False,
     settings: Settings = None,
@@ -76,7 +120,7 @@ def size(  # noqa: PLR0913 - the options of a command
     preset: Preset = "preview",
     train_cameras: Cameras = None,
     seeds: Seeds = 3,
-    only: Only = None,
+    only: OnlyFactors = None,
     workers: Workers = 1,
     accept_stale: Stale = False,
     settings: Settings = None,
@@ -106,8 +150,10 @@ def stress(  # noqa: PLR0913 - the options of a command
     preset: Preset = "preview",
     train_cameras: Cameras = None,
     seeds: Seeds = 1,
-    only: Only = None,
-    levels: Annotated[int, typer.Option(min=1, help="Of each cause, from mild on.")] = 4,
+    only: OnlyCauses = None,
+    levels: Annotated[
+        int, typer.Option(min=1, help="Number of levels of each cause, from mild on.")
+    ] = 4,
     workers: Workers = 1,
     accept_stale: Stale = False,
     settings: Settings = None,
@@ -143,12 +189,12 @@ def stress(  # noqa: PLR0913 - the options of a command
         _made(sweep(scenes), workers=workers, accept_stale=accept_stale)
     times = {scene: sum(trial.scene == scene for trial in trials) for scene in scenes}
     cost = foretold(sweep(scenes), store, times)
-    _told(f"{len(trials)} recordings are spoilt and made with painting and without, {cost} in all")
+    tell(f"{len(trials)} recordings are spoilt and made with painting and without, {cost} in all")
     spoil_scenes(store, trials)
     everything = sweep([*scenes, *(trial.spoilt for trial in trials)])
     points = _made(everything, workers=workers, accept_stale=accept_stale)
     if doubted := in_doubt(points, trials):
-        _told(f"painting seems to harm {len(doubted)} recordings: {SEEDS_IN_DOUBT} seeds of them")
+        tell(f"painting seems to harm {len(doubted)} recordings: {SEEDS_IN_DOUBT} seeds of them")
         # a fleet of their own: one that is asked for less forgets the rest
         more = tuple(range(seeds, SEEDS_IN_DOUBT))
         again = replace(sweep(doubted), name="stress-in-doubt", seeds=more)
@@ -157,13 +203,27 @@ def stress(  # noqa: PLR0913 - the options of a command
 
 
 def figures(
-    manifest: Annotated[Path, typer.Argument(help="TOML file, see docs/measuring.md.")],
+    manifest: Annotated[
+        Path,
+        typer.Argument(
+            help="TOML file with the tables and the fleets behind them, described in "
+            "docs/measuring.md."
+        ),
+    ],
     only: Annotated[
-        str | None, typer.Option(help="Names of tables, with commas between; all if absent.")
+        str | None,
+        typer.Option(
+            help="Names of the tables to write, as the manifest has them, with commas between; all "
+            "if absent."
+        ),
     ] = None,
     workers: Workers = 1,
     feature_weights: Annotated[
-        Path | None, typer.Option(help="SqueezeNet 1.1 weights for the feature distance.")
+        Path | None,
+        typer.Option(
+            help="File with weights of SqueezeNet 1.1, for the feature distance; it is left out if "
+            "absent."
+        ),
     ] = None,
     accept_stale: Stale = False,
     as_json: AsJson = False,
@@ -175,7 +235,7 @@ def figures(
 
     Example: lidarpainter figures docs/figures.toml --only results
     """
-    chosen = parse_names(only)
+    chosen = parse_names(only, "--only")
     say_status("reading the tables")
     from catalog.store import open_store
     from flows.cli.progress import shown_progress
@@ -185,7 +245,7 @@ def figures(
     store.make()
     weights = {} if feature_weights is None else {"feature_weights": feature_weights}
     publisher = Publisher(
-        store=store, workers=workers, accept_stale=accept_stale, say=_told, weights=weights
+        store=store, workers=workers, accept_stale=accept_stale, say=tell, weights=weights
     )
     with shown_progress():
         result = publisher.publish(manifest, chosen)
@@ -201,11 +261,9 @@ def figures(
 
 def _known(only: str | None, names: Sequence[str]) -> tuple[str, ...]:
     """The names that were chosen, or all."""
-    chosen = parse_names(only) or tuple(names)
+    chosen = parse_names(only, "--only") or tuple(names)
     if unknown := [name for name in chosen if name not in names]:
-        raise ConfigError(
-            f"--only: nothing is called {', '.join(unknown)}, expected some of {', '.join(names)}"
-        )
+        raise ConfigError(f"--only {', '.join(unknown)!r}: expected some of {', '.join(names)}")
     return chosen
 
 
@@ -233,7 +291,7 @@ def _sweep(
     return Sweep(
         name=name,
         scenes=tuple(scenes),
-        cameras=parse_names(train_cameras),
+        cameras=parse_names(train_cameras, "--train-cameras"),
         preset=preset,
         settings=tuple(settings or ()),
         configurations=tuple(configurations),
@@ -246,14 +304,8 @@ def _made(sweep: "Sweep", *, workers: int, accept_stale: bool) -> list["Point"]:
     from flows.measure.sweep import run_sweep
 
     ways = len(sweep.configurations) * len(sweep.seeds)
-    _told(f"{len(sweep.scenes) * ways} points: {len(sweep.scenes)} scenes in {ways} ways")
-    return run_sweep(sweep, existing_store(), workers=workers, accept_stale=accept_stale, say=_told)
-
-
-def _told(line: str) -> None:
-    """A line of progress, unless silence is asked for."""
-    if loudness() != "quiet":
-        complain(line)
+    tell(f"{len(sweep.scenes) * ways} points: {len(sweep.scenes)} scenes in {ways} ways")
+    return run_sweep(sweep, existing_store(), workers=workers, accept_stale=accept_stale, say=tell)
 
 
 def _show(result: dict[str, Any], *, as_json: bool) -> None:

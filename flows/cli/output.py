@@ -3,16 +3,17 @@
 import json
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal
+from shutil import get_terminal_size
+from typing import Any, Literal, TypeGuard
 
-from rich.console import Console
-from rich.table import Table
-
+from flows.cli.tables import ABSENT, Side, heading_of, pair_lines, table_lines
 from tasks.json_files import finite_or_none
 
 Cell = str | int | float | bool | None
-FILE_WIDTH = 200
-"""Columns of a table that is not written to a terminal."""
+PLAIN_WIDTH = 80
+"""Columns of what is not written to a terminal."""
+JSON_WIDTH = 100
+"""Columns of a line of JSON, if it can be broken."""
 CLEAR_LINE = "\r\x1b[K"
 
 Loudness = Literal["quiet", "usual", "verbose"]
@@ -49,10 +50,28 @@ def clear_status() -> None:
 
 
 def print_json(result: Mapping[str, Any]) -> None:
-    """One JSON object on stdout; numbers that JSON lacks (infinite, not a number) become null."""
+    """Print one JSON object on stdout, on few lines: what has room on one is not broken.
+
+    Numbers that JSON lacks (infinite, not a number) become null.
+    """
     clear_status()
-    text = json.dumps(finite_or_none(result), indent=2, allow_nan=False, ensure_ascii=False)
-    sys.stdout.write(text + "\n")
+    sys.stdout.write(_json_text(finite_or_none(result), 0) + "\n")
+
+
+def _json_text(value: Any, indent: int, before: int = 0) -> str:  # noqa: ANN401 - any JSON value
+    """A JSON value, broken into lines where it has no room behind what stands `before` it."""
+    text = json.dumps(value, allow_nan=False, ensure_ascii=False)
+    is_short = indent + before + len(text) < JSON_WIDTH
+    if is_short or not isinstance(value, dict | list) or not value:
+        return text
+    opening, closing = "{}" if isinstance(value, dict) else "[]"
+    if isinstance(value, dict):
+        names = [(f"{json.dumps(name, ensure_ascii=False)}: ", one) for name, one in value.items()]
+    else:
+        names = [("", part) for part in value]
+    pad = " " * (indent + 2)
+    lines = [f"{pad}{name}{_json_text(part, indent + 2, len(name))}" for name, part in names]
+    return "\n".join([opening, ",\n".join(lines), " " * indent + closing])
 
 
 def print_table(
@@ -63,44 +82,75 @@ def print_table(
     *,
     num_text_columns: int = 1,
 ) -> None:
-    """A table on stdout; an absent value is a dash, columns after the text ones stand right."""
+    """Print a table on stdout that fits its terminal, or 80 columns where that is none.
+
+    Columns where no row has a value are left out, and text wraps between words. A table that is too
+    wide even then is printed row by row, a line for each value.
+
+    Args:
+        title: what stands above.
+        columns: headings, or names of fields that `tables.HEADINGS` says in words.
+        rows: cells, as many as columns; None is an absent value, shown as a dash.
+        note: lines below the table.
+        num_text_columns: how many of the first columns stand left; the others stand right.
+    """
     clear_status()
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=FILE_WIDTH)
-    table = Table(title=title, title_justify="left", title_style="bold")
-    for index, column in enumerate(columns):
-        table.add_column(
-            column, overflow="fold", justify="left" if index < num_text_columns else "right"
-        )
-    for row in rows:
-        table.add_row(*(format_cell(cell) for cell in row))
-    console.print(table)
+    cells = [[format_cell(cell) for cell in row] for row in rows]
+    kept = [i for i in range(len(columns)) if not cells or any(row[i] != ABSENT for row in cells)]
+    headings = [heading_of(columns[i]) for i in kept]
+    body = [[row[i] for i in kept] for row in cells]
+    sides: list[Side] = ["left" if i < num_text_columns else "right" for i in kept]
+    for line in table_lines(title, headings, body, sides, width=_width()):
+        sys.stdout.write(line + "\n")
     if note:
-        console.print(note, markup=False, highlight=False)
+        sys.stdout.write(note + "\n")
 
 
 def print_pairs(title: str, pairs: Mapping[str, Cell], note: str = "") -> None:
-    """A table of two columns: what, and its value."""
-    print_table(title, ["what", "value"], list(pairs.items()), note, num_text_columns=2)
+    """Print what is known of one thing, a line for each value; absent values are left out."""
+    clear_status()
+    shown = {
+        heading_of(name): format_bytes(value) if _is_size(value, name) else format_cell(value)
+        for name, value in pairs.items()
+        if value is not None
+    }
+    sys.stdout.write("\n".join([title, *pair_lines(shown, width=_width())]) + "\n")
+    if note:
+        sys.stdout.write(note + "\n")
+
+
+def _width() -> int:
+    """Columns of the terminal, or as many as every terminal has."""
+    return get_terminal_size((PLAIN_WIDTH, 24)).columns if sys.stdout.isatty() else PLAIN_WIDTH
+
+
+def _is_size(value: Cell, name: str) -> TypeGuard[int | float]:
+    return name.endswith("bytes") and isinstance(value, int | float)
 
 
 def complain(message: str) -> None:
-    """One line on stderr."""
+    """One line on stderr that says what is wrong."""
     clear_status()
     line = " ".join(message.split())
     sys.stderr.write(f"lidarpainter: {line}\n")
 
 
+def tell(line: str) -> None:
+    """One line on stderr about what happens, unless silence is asked for; no error begins so."""
+    if loudness() != "quiet":
+        clear_status()
+        sys.stderr.write(f"{' '.join(line.split())}\n")
+
+
 def format_cell(value: Cell) -> str:
-    """Print a value: floats with three decimals, absent ones as a dash."""
-    if value is None:
-        return "-"
+    """A value as text: floats with three decimals, an absent one as a dash."""
+    if value is None or value == "":
+        return ABSENT
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.3f}"
-    return str(value).replace("[", "\\[")  # rich would read brackets as its markup
+    return str(value)
 
 
 def format_bytes(num_bytes: float) -> str:

@@ -108,23 +108,29 @@ def train(  # noqa: PLR0913 - the options of a command
 @app.command("evaluate")
 def evaluate(
     painters: Annotated[
-        list[str], typer.Option("--painter", help="A name or a weights file. May be repeated.")
+        list[str],
+        typer.Option(
+            "--painter",
+            help="A painter: overlay, warp, nano, a .safetensors file, or a model. "
+            "May be repeated.",
+        ),
     ],
     pairs: options.Pairs = None,
     runs: Annotated[
         list[str] | None,
         typer.Option(
             "--run",
-            help="A run (id, prefix or latest): its first fit is painted at held-out frames, or "
-            "beside the path of a synthetic street. May be repeated.",
+            help="A run by its id, the beginning of it, its scene, or latest: its first fit is "
+            "painted at held-out frames, or beside the path of a synthetic street. May be "
+            "repeated.",
         ),
     ] = None,
     feature_weights: options.Features = None,
     keep_below: Annotated[
         float | None,
         typer.Option(
-            help="Judge small painters again, leaving tiles unpainted that differ by less than "
-            "this from LiDAR and warps; 0.01 say."
+            help="Also score small painters that leave tiles unpainted which differ by less than "
+            "this from LiDAR and warps, such as 0.01 of full scale."
         ),
     ] = None,
     device: options.Device = "auto",
@@ -153,7 +159,7 @@ def evaluate(
 @app.command("info")
 def info(
     painter: Annotated[
-        str, typer.Option(help="A painter's name, a weights file, or a model.")
+        str, typer.Option(help="The painter: overlay, warp, nano, a .safetensors file, or a model.")
     ] = "nano",
     as_json: AsJson = False,
 ) -> None:
@@ -171,10 +177,14 @@ def info(
 @app.command("benchmark")
 def benchmark(
     painter: Annotated[
-        str, typer.Option(help="A painter's name, a weights file, or a model.")
+        str, typer.Option(help="The painter: overlay, warp, nano, a .safetensors file, or a model.")
     ] = "nano",
-    size: Annotated[str, typer.Option(help="Size of an image, WIDTHxHEIGHT.")] = "480x270",
-    repeats: Annotated[int, typer.Option(min=1, help="Views painted in each precision.")] = 5,
+    size: Annotated[
+        str, typer.Option(help="Size of an image in pixels as WIDTHxHEIGHT, such as 1024x576.")
+    ] = "480x270",
+    repeats: Annotated[
+        int, typer.Option(min=1, help="Number of views that are painted in each precision.")
+    ] = 5,
     device: options.Device = "auto",
     as_json: AsJson = False,
 ) -> None:
@@ -193,14 +203,18 @@ def benchmark(
 @app.command("ablate")
 def ablate(  # noqa: PLR0913 - the options of a command
     pairs_train: Annotated[
-        list[str], typer.Option(help="A folder of pairs to learn from. May be repeated.")
+        list[str], typer.Option(help="A folder of harvested pairs to learn from. May be repeated.")
     ],
     pairs_test: Annotated[
-        list[str], typer.Option(help="A folder of pairs to judge by. May be repeated.")
+        list[str], typer.Option(help="A folder of harvested pairs to score by. May be repeated.")
     ],
     chosen: Annotated[
         str | None,
-        typer.Option("--table", help="inputs, fusion, lidar, skips; commas between."),
+        typer.Option(
+            "--table",
+            help="Tables to make, with commas between: inputs, fusion, lidar or skips; all if "
+            "absent.",
+        ),
     ] = None,
     budget: options.Budget = None,
     steps: options.Steps = None,

@@ -15,29 +15,58 @@ MOST_STREETS = 10_000
 
 Settings = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Any of `lidarpainter settings --of train`. May be repeated."),
+    typer.Option(
+        "--set",
+        help="Changes one setting, such as training.steps=500; `lidarpainter settings --of "
+        "train` lists them all. May be repeated.",
+    ),
 ]
 Seeds = Annotated[
-    str | None, typer.Option(help="Synthetic streets by seed: 1000:1004 or 1000,1007.")
+    str | None,
+    typer.Option(
+        help="Synthetic streets by their seeds: a range 1000:1004, the last excluded, or a list "
+        "1000,1007."
+    ),
 ]
 Scenes = Annotated[
-    list[str] | None, typer.Option("--scene", help="A stored scene. May be repeated.")
+    list[str] | None,
+    typer.Option("--scene", help="A stored scene as dataset/sequence. May be repeated."),
 ]
 Split = Annotated[
-    str, typer.Option(help="Split of recorded scenes: alternate, forward:17:8 or all.")
+    str,
+    typer.Option(
+        help="Which frames of recorded scenes are fitted, the others giving true images: "
+        "alternate (every second one), forward:17:8 (17 are fitted, the next 8 are not), or"
+        " all."
+    ),
 ]
 Cameras = Annotated[
-    str | None, typer.Option(help="Cameras of recorded scenes, with commas between.")
+    str | None,
+    typer.Option(
+        help="Names of the cameras of recorded scenes, with commas between; all if absent."
+    ),
 ]
 Pairs = Annotated[
     list[str] | None,
-    typer.Option(help="A folder of pairs harvested before. May be repeated."),
+    typer.Option(help="A folder of pairs that were harvested before. May be repeated."),
 ]
 Features = Annotated[
-    Path | None, typer.Option(help="SqueezeNet 1.1 weights for the feature distance.")
+    Path | None,
+    typer.Option(
+        help="File with weights of SqueezeNet 1.1, for the feature distance; it is left out if "
+        "absent."
+    ),
 ]
-Budget = Annotated[float | None, typer.Option(help="CPU seconds of training.")]
-Steps = Annotated[int | None, typer.Option(help="Optimiser steps of training.")]
+Budget = Annotated[
+    float | None,
+    typer.Option(help="The maximum CPU seconds of training; the default of the painter if absent."),
+]
+Steps = Annotated[
+    int | None,
+    typer.Option(
+        help="Number of optimiser steps of training; the default of the painter if absent."
+    ),
+]
 Base = Annotated[
     str | None,
     typer.Option(
@@ -46,34 +75,65 @@ Base = Annotated[
     ),
 ]
 Start = Annotated[
-    Path | None, typer.Option(help="Go on from these weights: nano, or a .safetensors file.")
+    Path | None,
+    typer.Option(
+        help="Weights that the training goes on from: nano, or a .safetensors file; it starts "
+        "anew if absent."
+    ),
 ]
 Inputs = Annotated[
     str | None,
-    typer.Option(help="What the small painter may see, with commas between; by default all."),
+    typer.Option(
+        help="Inputs that the small painter sees, of `lidarpainter painter info`, with commas "
+        "between; all if absent."
+    ),
 ]
 Prompts = Annotated[
     str | None,
-    typer.Option(help="clear, and styles to learn beside it: clear,foggy,night,rain."),
+    typer.Option(
+        help="Styles to learn, with commas between: clear, which must be among them, foggy, "
+        "night and rain; clear alone if absent."
+    ),
 ]
 HeldBack = Annotated[
-    float, typer.Option(help="Share of the true images kept from training, to judge by.")
+    float,
+    typer.Option(
+        help="Share from 0 to 1 of the true images that is kept from training, to score by."
+    ),
 ]
 LpipsBackbone = Annotated[
     Path | None,
-    typer.Option(help="torchvision's VGG-16, AlexNet or SqueezeNet 1.1, for the loss with --base."),
+    typer.Option(
+        help="File with torchvision's weights of VGG-16, AlexNet or SqueezeNet 1.1, for the loss"
+        " with --base."
+    ),
 ]
 LpipsHeads = Annotated[
-    Path | None, typer.Option(help="LPIPS 0.1 heads of the same network, for the loss.")
+    Path | None,
+    typer.Option(
+        help="File with the LPIPS heads (version 0.1) of the same network, for the loss with "
+        "--base."
+    ),
 ]
 Processes = Annotated[
-    int, typer.Option(min=1, help="Train with --base in so many processes, a GPU for each.")
+    int,
+    typer.Option(
+        min=1, help="Number of processes that train with --base, each on a GPU of its own."
+    ),
 ]
 Out = Annotated[
     Path | None,
-    typer.Option(help="Folder, or .safetensors file, for the weights and their record."),
+    typer.Option(
+        help="Folder, or .safetensors file, that the weights and their record are written to."
+    ),
 ]
-Device = Annotated[str, typer.Option(help="Where painters run: auto, cpu, cuda or cuda:N.")]
+Device = Annotated[
+    str,
+    typer.Option(
+        help="Where painters run: auto (a GPU if there is one), cpu, cuda, or cuda:N for the "
+        "N-th GPU."
+    ),
+]
 
 
 def parse_seeds(text: str | None) -> tuple[int, ...]:

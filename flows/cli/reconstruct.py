@@ -27,44 +27,72 @@ FILE_KEYS = {"preset": str, "painter": str, "set": list}
 FIRST_FIT_SHARE = 0.6
 """Part of a time limit for the first fit; its rounds share the rest, as the steps of a preset."""
 Preset = Annotated[
-    str | None, typer.Option(help="brief, preview, balanced or paper; preview if absent.")
+    str | None,
+    typer.Option(
+        help="How much effort is made: brief (a minute or two), preview (minutes on a CPU), "
+        "balanced (the best trade), or paper (the effort of the paper); preview if absent."
+    ),
 ]
 TrainCameras = Annotated[
-    str | None, typer.Option(help="Cameras to train on, with commas between; all if absent.")
+    str | None,
+    typer.Option(help="Names of the cameras to fit to, with commas between; all if absent."),
 ]
 Seed = Annotated[
-    int | None, typer.Option(min=0, help="Decides in which order the fit sees its views.")
+    int | None,
+    typer.Option(min=0, help="Number that decides in which order the fit sees its views."),
 ]
 Evaluate = Annotated[
-    bool, typer.Option("--evaluate/--no-evaluate", help="Evaluate the scene, or later.")
+    bool,
+    typer.Option(
+        "--evaluate/--no-evaluate",
+        help="Score the scene on held-out views, or leave that to `lidarpainter evaluate`.",
+    ),
 ]
-Report = Annotated[bool, typer.Option("--report/--no-report", help="Write the page about the run.")]
+Report = Annotated[
+    bool,
+    typer.Option("--report/--no-report", help="Write the page about the run, or leave it out."),
+]
 Sideways = Annotated[
-    str | None, typer.Option(help="Metres to both sides to paint at, such as 2,3; at most 8.")
+    str | None,
+    typer.Option(
+        help="Metres to both sides of the path at which views are painted, such as 2,3; at most "
+        "8. The preset's if absent."
+    ),
 ]
-Upwards = Annotated[str | None, typer.Option(help="Metres up to paint at, such as 1.5; at most 8.")]
+Upwards = Annotated[
+    str | None,
+    typer.Option(
+        help="Metres above the path at which views are painted, such as 1.5; at most 8. The "
+        "preset's if absent."
+    ),
+]
 Rounds = Annotated[
     int | None,
-    typer.Option(help="Rounds of painting and continued fit, 0 or more; the preset's if absent."),
+    typer.Option(
+        help="Number of rounds, each one painting and the continued fit after it; 0 paints "
+        "nothing. The preset's if absent."
+    ),
 ]
 Memory = Annotated[
     str | None,
     typer.Option(
-        help="The most memory that a fit may take on a CPU, such as 6GB: it has fewer Gaussians "
-        "if need be."
+        help="The maximum memory of the process that fits on a CPU, such as 6GB or 800MB; the "
+        "scene gets fewer Gaussians where it would take more. No limit if absent."
     ),
 ]
 TimeLimit = Annotated[
     str | None,
     typer.Option(
-        help="The most time of all fits together, such as 10min: they have fewer steps if need be."
+        help="The maximum time of all fits together, such as 90s, 10min or 2h; fits make fewer "
+        "steps where they would take longer. No limit if absent."
     ),
 ]
 Split = Annotated[
     str | None,
     typer.Option(
-        help="Which frames are fitted and which evaluate: alternate (every second one), "
-        "forward:17:8 (the first 17 and the 8 after them), or all (fit all, evaluate none)."
+        help="Which frames are fitted and which are held out for scoring: alternate (every "
+        "second one is held out), forward:17:8 (17 are fitted, the next 8 held out), or all"
+        " (none is held out). The preset's if absent."
     ),
 ]
 ConfigFile = Annotated[
@@ -85,7 +113,7 @@ TensorBoard = Annotated[
 
 
 def reconstruct(  # noqa: PLR0913 - the options of a command
-    scene: Annotated[str, typer.Argument(help="dataset/sequence, as ingested.")],
+    scene: Annotated[str, typer.Argument(help="Scene as dataset/sequence, such as pandaset/002.")],
     preset: Preset = None,
     painter: Painter = None,
     device: DeviceName = "auto",
@@ -126,7 +154,7 @@ def reconstruct(  # noqa: PLR0913 - the options of a command
         "device": device,
         "rounds": rounds,
         "split": split,
-        "train_cameras": parse_names(train_cameras),
+        "train_cameras": parse_names(train_cameras, "--train-cameras"),
         "judge": evaluate,
         "report": report,
     }

@@ -1,7 +1,7 @@
 """`lidarpainter render`: images of a run along a trajectory."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -17,36 +17,53 @@ from flows.cli.shared_options import (
     PostpaintPainter,
     RunName,
     TrajectorySpec,
-    followed_path,
+    checked_words,
+    parse_frames,
     parse_previous,
     with_told_collisions,
 )
 from lidarpainter_models.errors import ConfigError
 
 Postpaint = Annotated[
-    bool, typer.Option("--postpaint", help="Paint every image; renders go to `unpainted/`.")
+    bool,
+    typer.Option(
+        "--postpaint",
+        help="Paint every image; what it was painted from is written to `unpainted/`.",
+    ),
 ]
 
 Prompt = Annotated[
-    str, typer.Option(help="What a painter that was trained for styles is asked for.")
+    str,
+    typer.Option(
+        help="What a painter that was trained for styles is asked for: clear, foggy, night or "
+        "rain; other painters know clear alone. Needs --postpaint or --painter."
+    ),
 ]
 Previous = Annotated[
     str | None,
-    typer.Option(help="Lean on the image painted before: mixed into the next, or shown."),
+    typer.Option(
+        help="What becomes of the image painted before: unused, mixed (into what the next one is"
+        " painted from), or shown (to the painter). Needs --postpaint or --painter."
+    ),
 ]
 Video = Annotated[
-    bool, typer.Option("--video", help="Add video.mp4: a film of each camera, and one of all.")
+    bool,
+    typer.Option(
+        "--video", help="Also write video.mp4, a film of each camera, and one of all together."
+    ),
 ]
-Depth = Annotated[bool, typer.Option("--depth", help="Add depth: 16-bit PNG, 256ths of a metre.")]
+Depth = Annotated[
+    bool, typer.Option("--depth", help="Also write depth as 16-bit PNG, in 256ths of a metre.")
+]
 Semantics = Annotated[
-    bool, typer.Option("--semantics", help="Add who is where: 16-bit PNG and a legend.")
+    bool, typer.Option("--semantics", help="Also write who is where, as 16-bit PNG with a legend.")
 ]
 
 
 def render(  # noqa: PLR0913 - the options of a command
     run: RunName,
     trajectory: TrajectorySpec,
-    out: Annotated[Path, typer.Option(help="Folder for the images.")],
+    out: Annotated[Path, typer.Option(help="Folder that the images are written to.")],
     camera: FollowedCameras = None,
     frames: FollowedFrames = None,
     width: ImageWidth = None,
@@ -70,38 +87,34 @@ def render(  # noqa: PLR0913 - the options of a command
 
     A film: lidarpainter render latest --trajectory lateral:2 --video --beside recorded --out p
     """
-    from catalog.store import existing_store
-    from flows.cli.progress import shown_progress
-    from lidarpainter_models.conditioning.settings import SequenceConfig
-
     if fps is not None and not video:
         raise ConfigError("--fps needs --video")
-    sequence, *others = parse_previous(previous) or (SequenceConfig(),)
-    if others:
+    sequences, followed = parse_previous(previous), parse_frames(frames)
+    if len(sequences) > 1:
         raise ConfigError(f"--previous {previous!r}: expected one of them here")
-    path = followed_path(
-        run,
-        trajectory,
-        frames,
-        painter,
-        camera=camera,
-        is_painted=postpaint or painter is not None,
-        allows_collisions=allow_collisions,
-        width_px=width,
-        beside=beside,
-    )
+    run_id = checked_words(run, trajectory, painter)
+    from catalog.store import existing_store
+    from flows.cli.progress import shown_progress
     from flows.views import render_run
-    from tasks.views.files import ViewKinds
+    from lidarpainter_models.conditioning.settings import SequenceConfig
+    from lidarpainter_models.export.view_requests import ViewKinds, ViewRequest
+    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 
-    kinds = ViewKinds(depth=depth, semantics=semantics, video=video, fps=fps)
+    request = ViewRequest(
+        trajectory=parse_trajectory(trajectory),
+        camera=camera,
+        frames=followed,
+        width_px=width,
+        is_painted=postpaint or painter is not None,
+        painter=painter,
+        prompt=prompt,
+        sequence=sequences[0] if sequences else SequenceConfig(),
+        allows_collisions=allow_collisions,
+        beside=beside,
+        kinds=ViewKinds(depth=depth, semantics=semantics, video=video, fps=fps),
+    )
     with shown_progress():
-        result = render_run(
-            existing_store(), path, out.absolute(), prompt=prompt, sequence=sequence, kinds=kinds
-        )
-    _say(result, as_json=as_json)
-
-
-def _say(result: dict[str, Any], *, as_json: bool) -> None:
+        result = render_run(existing_store(), run_id, request, out.absolute())
     if as_json:
         print_json(result)
     else:

@@ -12,14 +12,22 @@ from flows.cli.shared_options import AsJson
 
 def settings(
     prefix: Annotated[
-        str, typer.Argument(help="Only these: fit, fit.densification, ...; all if absent.")
+        str,
+        typer.Argument(
+            help="Beginning of the settings to list, such as fit or fit.densification; all if "
+            "absent."
+        ),
     ] = "",
     preset: Annotated[
-        str, typer.Option(help="Whose defaults are shown: brief, preview, balanced or paper.")
+        str,
+        typer.Option(help="Preset whose defaults are shown: brief, preview, balanced or paper."),
     ] = "preview",
     of: Annotated[
         Literal["reconstruct", "train"],
-        typer.Option(help="For --set of reconstruct and demo, or of painter train and harvest."),
+        typer.Option(
+            help="Commands whose settings are listed: reconstruct (and demo), or train (painter "
+            "train and harvest)."
+        ),
     ] = "reconstruct",
     as_json: AsJson = False,
 ) -> None:

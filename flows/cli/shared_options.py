@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
-from flows.cli.output import say_status
+from flows.cli.output import say_status, tell
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.trajectory_words import trajectory_help
 from lidarpainter_models.painter.known_painters import painter_help
 
 if TYPE_CHECKING:
-    from flows.views import PathRequest
     from lidarpainter_models.conditioning.settings import SequenceConfig
 
 RANGE = re.compile(r"(\d*):(\d*)")
@@ -23,81 +22,115 @@ Painter = Annotated[
 ]
 DeviceName = Annotated[
     str,
-    typer.Option(help="auto, cpu, cuda or cuda:N: where fits and painters run; auto takes a GPU."),
+    typer.Option(
+        help="Where fits and painters run: auto (a GPU if there is one), cpu, cuda, or cuda:N "
+        "for the N-th GPU."
+    ),
 ]
 Settings = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Any of `lidarpainter settings`: fit.steps=500. May be repeated."),
+    typer.Option(
+        "--set",
+        help="Changes one setting, such as fit.steps=500; `lidarpainter settings` lists them "
+        "all. May be repeated.",
+    ),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
-RunName = Annotated[str, typer.Argument(help="A run id, a unique prefix of one, or latest.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object in place of tables.")]
+RunName = Annotated[
+    str,
+    typer.Argument(
+        help="The run: its id or the beginning of it, a scene such as pandaset/002 (its newest "
+        "run), or latest (the newest run of all)."
+    ),
+]
 TrajectorySpec = Annotated[str, typer.Option(help=trajectory_help())]
 AllowCollisions = Annotated[
-    bool, typer.Option("--allow-collisions", help="Let the camera go through walls.")
+    bool,
+    typer.Option(
+        "--allow-collisions", help="Let the camera go through what LiDAR saw standing there."
+    ),
 ]
 FollowedCamera = Annotated[
-    str | None, typer.Option(help="Camera whose path is followed; the first trained on if absent.")
+    str | None,
+    typer.Option(help="Camera whose path is followed; the first one fitted to if absent."),
 ]
 FollowedCameras = Annotated[
     str | None,
     typer.Option(
         "--camera",
-        help="Camera whose path is followed, several with commas, or all; also cameras that no "
-        "fit used. The first trained on if absent.",
+        help="Camera whose path is followed, several with commas between, or all; also cameras "
+        "that no fit used. The first one fitted to if absent.",
     ),
 ]
 ImageWidth = Annotated[
     int | None,
     typer.Option(
-        "--width", help="Width of the images in pixels, at most as recorded; the fit's if absent."
+        "--width",
+        help="Width of the images in pixels, at most as recorded; that of the fit if absent.",
     ),
 ]
 Fps = Annotated[
-    float | None, typer.Option(help="Images a second of films; those of the recording if absent.")
+    float | None,
+    typer.Option(help="Images a second of the films; those of the recording if absent."),
 ]
 PostpaintPainter = Annotated[
-    str | None, typer.Option(help="Painter for --postpaint; the run's own if absent.")
+    str | None,
+    typer.Option(
+        help="Painter of the images, which it paints without --postpaint too: overlay, warp, "
+        "nano, a .safetensors file, or a model. The run's own if absent."
+    ),
 ]
 BesideWhat = Annotated[
     str | None,
     typer.Option(
         "--beside",
-        help="Show to the left: recorded, unpainted, or another run of the same scene.",
+        help="What is shown to the left of every image: recorded, unpainted (before painting), "
+        "or another run of the same scene.",
     ),
 ]
 FollowedFrames = Annotated[
-    str | None, typer.Option(help="Recorded frames A:B to follow, B excluded.")
+    str | None,
+    typer.Option(help="Recorded frames to follow as A:B, B excluded, such as 0:40; all if absent."),
 ]
 
 
-def followed_path(
-    run: str,
-    trajectory: str,
-    frames: str | None,
-    painter: str | None = None,
-    **fields: Any,  # noqa: ANN401 - of the request, as it has them
-) -> "PathRequest":
-    """Which path of a run is followed; wrong words are refused before anything slow is imported.
+def named_run(name: str) -> str:
+    """The id of a finished run; what `latest` or a scene stands for is said at once on stderr.
 
     Raises:
-        LidarPainterError: no such trajectory, frames or painter.
-        CatalogError: no such run.
+        UnknownRecordError: there is no such run, or it did not complete.
+        CatalogError: there is no store, or the run cannot be used.
     """
     from catalog.store import existing_store
-    from lidarpainter_models.geometry.trajectory_words import read_trajectory_words
     from tasks.runs import open_run
 
-    read_trajectory_words(trajectory)
-    chosen = parse_frames(frames)
-    open_run(existing_store(), run)
-    say_status(f"opening run {run}")
-    check_painter(painter)
-    from flows.views import PathRequest
-    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+    run = open_run(existing_store(), name)
+    if not run.run_id.startswith(name):
+        kind = None if run.change is None else str(run.change["kind"])
+        tell_run(name, run.run_id, run.scene_id, kind)
+    say_status(f"opening run {run.run_id}")
+    return run.run_id
 
-    return PathRequest(
-        run=run, trajectory=parse_trajectory(trajectory), frames=chosen, painter=painter, **fields
-    )
+
+def tell_run(name: str, run_id: str, scene_id: str, change: str | None) -> None:
+    """Say on stderr which run a name stands for, unless silence is asked for."""
+    kind = f" (changed: {change})" if change else ""
+    tell(f"{name} is run {run_id} of {scene_id}{kind}")
+
+
+def checked_words(run: str, trajectory: str, painter: str | None) -> str:
+    """The id of the run; wrong words are refused before anything slow is imported.
+
+    Raises:
+        LidarPainterError: no such trajectory or painter.
+        CatalogError: no such run.
+    """
+    from lidarpainter_models.geometry.trajectory_words import read_trajectory_words
+
+    read_trajectory_words(trajectory)
+    run_id = named_run(run)
+    check_painter(painter)
+    return run_id
 
 
 def with_told_collisions(result: dict[str, Any]) -> dict[str, Any]:
@@ -128,15 +161,15 @@ def parse_frames(text: str | None) -> slice | None:
         return None
     match = RANGE.fullmatch(text)
     if match is None:
-        raise ConfigError(f"frames {text!r}: expected A:B, such as 0:17")
+        raise ConfigError(f"--frames {text!r}: expected A:B, such as 0:17")
     start, stop = (int(part) if part else None for part in match.groups())
     if stop is not None and stop <= (start or 0):
-        raise ConfigError(f"frames {text!r}: expected A < B")
+        raise ConfigError(f"--frames {text!r}: expected A < B")
     return slice(start, stop)
 
 
-def parse_names(text: str | None) -> tuple[str, ...] | None:
-    """Names with commas between.
+def parse_names(text: str | None, option: str = "names") -> tuple[str, ...] | None:
+    """The names that an option lists with commas between.
 
     Raises:
         ConfigError: a name is empty.
@@ -145,7 +178,7 @@ def parse_names(text: str | None) -> tuple[str, ...] | None:
         return None
     names = tuple(name.strip() for name in text.split(","))
     if not all(names):
-        raise ConfigError(f"{text!r}: expected names with commas between")
+        raise ConfigError(f"{option} {text!r}: expected names with commas between")
     return names
 
 
@@ -179,26 +212,28 @@ def parse_previous(text: str | None) -> tuple["SequenceConfig", ...]:
 
 
 def parse_bytes(text: str) -> int:
-    """Bytes of a size such as 6GB or 800MB.
+    """The bytes of `--memory`, such as 6GB or 800MB.
 
     Raises:
         ConfigError: it is none.
     """
-    return round(_amount(text, {"MB": 1e6, "GB": 1e9}, "a size such as 6GB"))
+    return round(_amount("--memory", text, {"MB": 1e6, "GB": 1e9}, "a size such as 6GB"))
 
 
 def parse_seconds(text: str) -> float:
-    """Seconds of a time such as 90s, 10min or 2h.
+    """The seconds of `--time-limit`, such as 90s, 10min or 2h.
 
     Raises:
         ConfigError: it is none.
     """
-    return _amount(text, {"s": 1.0, "min": 60.0, "h": 3600.0}, "a time such as 10min")
+    return _amount(
+        "--time-limit", text, {"s": 1.0, "min": 60.0, "h": 3600.0}, "a time such as 10min"
+    )
 
 
-def _amount(text: str, units: dict[str, float], expected: str) -> float:
+def _amount(option: str, text: str, units: dict[str, float], expected: str) -> float:
     """A positive number with one of the units behind it, in the basic one."""
     found = re.fullmatch(rf"(\d+(?:\.\d+)?) ?({'|'.join(units)})", text.strip())
     if not found or float(found[1]) == 0:
-        raise ConfigError(f"{text!r}: expected {expected}, in {', '.join(units)}")
+        raise ConfigError(f"{option} {text!r}: expected {expected}, in {', '.join(units)}")
     return float(found[1]) * units[found[2]]

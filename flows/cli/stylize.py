@@ -1,7 +1,7 @@
 """`lidarpainter stylize`: a run in fog, at night or in rain, as images or as a scene."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Literal
 
 import typer
 
@@ -13,7 +13,8 @@ from flows.cli.shared_options import (
     FollowedFrames,
     RunName,
     TrajectorySpec,
-    followed_path,
+    checked_words,
+    parse_frames,
     refuse_unused,
 )
 from lidarpainter_models.errors import ConfigError
@@ -23,28 +24,53 @@ from lidarpainter_models.weather.mix import StyleMix
 Prompt = Annotated[
     str,
     typer.Option(
-        help="clear, foggy, night or rain, or several: foggy:0.5+night:0..1 is half a fog, and a "
-        "night that falls while the log passes."
+        help="The style: clear, foggy, night or rain, or several; foggy:0.5+night:0..1 is half a"
+        " fog, and a night that falls while the log passes."
     ),
 ]
 ImageFolder = Annotated[
-    Path | None, typer.Option("--out", help="Folder for the images; not with --in-scene.")
+    Path | None,
+    typer.Option("--out", help="Folder that the images are written to; not with --in-scene."),
 ]
 InScene = Annotated[
-    bool, typer.Option("--in-scene", help="Make a new run whose scene lives in the style.")
+    bool,
+    typer.Option(
+        "--in-scene", help="Make a new run whose scene is in the style, in place of images."
+    ),
 ]
 Strength = Annotated[
-    float, typer.Option(help="From 0, the clear scene, to 1; multiplies all of the prompt.")
+    float, typer.Option(help="Strength of all styles of the prompt, from 0 (the clear scene) to 1.")
 ]
 Visibility = Annotated[
-    float | None, typer.Option(help="Metres that one sees in fog of strength 1; 120 if absent.")
+    float | None, typer.Option(help="Metres that one sees in a fog of strength 1; 120 if absent.")
 ]
-ImageKind = Annotated[str, typer.Option(help="rendered, or recorded: style what the camera saw.")]
-Width = Annotated[int | None, typer.Option(help="In pixels; that of the fit if absent.")]
+ImageKind = Annotated[
+    Literal["rendered", "recorded"],
+    typer.Option(
+        help="Images to style: rendered (what the scene shows), or recorded (what the camera saw, "
+        "on the recorded path alone)."
+    ),
+]
+Width = Annotated[
+    int | None,
+    typer.Option(
+        help="Width of the images in pixels, at most as recorded; that of the fit if absent."
+    ),
+]
 ViewPainter = Annotated[
-    str | None, typer.Option(help="Paint every image with this before it is styled.")
+    str | None,
+    typer.Option(
+        help="Painter that paints every image before it is styled: overlay, warp, nano, a "
+        ".safetensors file, or a model. None if absent."
+    ),
 ]
-Seed = Annotated[int, typer.Option(help="Decides lit windows, puddles, drops and noise.", min=0)]
+Seed = Annotated[
+    int,
+    typer.Option(
+        help="Number that decides which windows are lit, and where puddles, drops and noise are.",
+        min=0,
+    ),
+]
 
 
 def stylize(  # noqa: PLR0913 - the options of a command
@@ -82,33 +108,37 @@ def stylize(  # noqa: PLR0913 - the options of a command
             "--allow-collisions": allow_collisions,
         }
         refuse_unused("--in-scene", given)
-    path = followed_path(
-        run,
-        trajectory,
-        frames,
-        painter,
-        camera=camera,
-        is_painted=painter is not None,
-        allows_collisions=allow_collisions,
-        width_px=width,
-    )
+    followed = parse_frames(frames)
+    run_id = checked_words(run, trajectory, painter)
     if out is None:
-        _style(run, mix, seed, as_json=as_json)
+        _make_styled_run(run_id, mix, seed, as_json=as_json)
         return
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
     from flows.views import stylize_run
+    from lidarpainter_models.export.styled_views import StyleRequest
+    from lidarpainter_models.export.view_requests import ViewRequest
+    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 
-    asked: dict[str, Any] = {"images": images, "seed": seed}
+    request = ViewRequest(
+        trajectory=parse_trajectory(trajectory),
+        camera=camera,
+        frames=followed,
+        width_px=width,
+        is_painted=painter is not None,
+        painter=painter,
+        allows_collisions=allow_collisions,
+    )
+    style = StyleRequest(mix=mix, images=images, seed=seed)
     with shown_progress():
-        result = stylize_run(existing_store(), path, out.absolute(), mix=mix, **asked)
+        result = stylize_run(existing_store(), run_id, request, style, out.absolute())
     if as_json:
         print_json(result)
     else:
         print_pairs(f"{mix.text} images of {result['scene']}", result)
 
 
-def _style(run: str, mix: StyleMix, seed: int, *, as_json: bool) -> None:
+def _make_styled_run(run: str, mix: StyleMix, seed: int, *, as_json: bool) -> None:
     """Make the run in the style and say what it is."""
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress

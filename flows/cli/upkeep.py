@@ -1,13 +1,17 @@
-"""`lidarpainter catalog gc`, `compact`, `vacuum`, `verify`, `export`, `import`: keeping a store."""
+"""`lidarpainter catalog` commands that keep a store: what is stale, what it cost, what may go."""
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from flows.cli.output import Cell, format_bytes, print_json, print_pairs, print_table, say_status
 from flows.cli.shared_options import AsJson
+
+if TYPE_CHECKING:
+    from catalog.deletion import Doomed
 
 DAMAGED = 1
 MOST_LISTED = 200
@@ -17,9 +21,14 @@ app = typer.Typer()
 
 Days = Annotated[
     float,
-    typer.Option(min=0.0, max=36500.0, help="How long ago counts as recent; 0.5 is half a day."),
+    typer.Option(
+        min=0.0, max=36500.0, help="Number of days that count as recent; 0.5 is half a day."
+    ),
 ]
-ForReal = Annotated[bool, typer.Option("--delete", help="Do it; else only list what would go.")]
+ForReal = Annotated[
+    bool,
+    typer.Option("--delete", help="Delete it; otherwise what would be deleted is only listed."),
+]
 
 
 @app.command("gc")
@@ -41,21 +50,30 @@ def collect(days: Days = 30.0, for_real: ForReal = False, as_json: AsJson = Fals
     doomed = plan_collection(store, datetime.now(UTC) - timedelta(days=days))
     if for_real:
         delete(store, doomed)
-    num_bytes = sum(one.num_bytes for one in doomed)
     if as_json:
-        going = [{"table": one.table, "id": one.row_id, "bytes": one.num_bytes} for one in doomed]
-        print_json({"is_deleted": for_real, "num_bytes": num_bytes, "rows": going})
+        print_json(doomed_as_json(doomed, is_deleted=for_real))
         return
+    note = "" if for_real or not doomed else "nothing was deleted: --delete does"
+    what = "deleted from" if for_real else "not needed in"
+    print_doomed(f"{what} {store.name}", doomed, note)
+
+
+def doomed_as_json(doomed: "Sequence[Doomed]", *, is_deleted: bool) -> dict[str, Any]:
+    """What goes out of a store, as commands that delete print it with `--json`."""
+    rows = [{"table": one.table, "id": one.row_id, "bytes": one.num_bytes} for one in doomed]
+    num_bytes = sum(one.num_bytes for one in doomed)
+    return {"is_deleted": is_deleted, "num_bytes": num_bytes, "rows": rows}
+
+
+def print_doomed(what: str, doomed: "Sequence[Doomed]", note: str = "") -> None:
+    """A table of what goes out of a store, the largest first."""
     largest = sorted(doomed, key=lambda one: -one.num_bytes)[:MOST_LISTED]
+    left = len(doomed) - len(largest)
+    notes = [*([f"and {left} smaller ones"] if left else []), *([note] if note else [])]
     rows: list[list[Cell]] = [
         [one.table[:-1], one.row_id, format_bytes(one.num_bytes)] for one in largest
     ]
-    left = len(doomed) - len(largest)
-    notes = [f"and {left} smaller ones"] if left else []
-    if doomed and not for_real:
-        notes.append("nothing was deleted: --delete does")
-    what = "deleted from" if for_real else "not needed in"
-    title = f"{format_bytes(num_bytes)} {what} {store.name}"
+    title = f"{format_bytes(sum(one.num_bytes for one in doomed))} {what}"
     print_table(title, ["what", "name", "size"], rows, "\n".join(notes), num_text_columns=2)
 
 
@@ -146,9 +164,13 @@ def verify_store(as_json: AsJson = False) -> None:
 @app.command("export")
 def export_selection(
     selection: Annotated[
-        list[str], typer.Argument(help="Run ids or `latest`, scene ids, kind/digest; or prefixes.")
+        list[str],
+        typer.Argument(
+            help="What is taken along: run ids, latest (the newest run of all), scenes, or "
+            "kind/digest of artefacts; or the beginnings of ids."
+        ),
     ],
-    out: Annotated[Path, typer.Option(help="The tar to write.")],
+    out: Annotated[Path, typer.Option(help="The tar file to write.")],
     as_json: AsJson = False,
 ) -> None:
     """Write runs with all that they need, or scenes, or artefacts, into one tar.
@@ -171,7 +193,7 @@ def export_selection(
 
 @app.command("import")
 def import_selection(
-    archive: Annotated[Path, typer.Argument(help="A tar that `catalog export` wrote.")],
+    archive: Annotated[Path, typer.Argument(help="A tar file that `catalog export` wrote.")],
     as_json: AsJson = False,
 ) -> None:
     """Take what `catalog export` wrote into this store; what is there already stays.
@@ -187,3 +209,87 @@ def import_selection(
         print_json({"store": store.name, "new_rows": counts})
     else:
         print_pairs(f"new in {store.name}", counts)
+
+
+@app.command("stale")
+def stale(as_json: AsJson = False) -> None:
+    """Show which runs today's code would make otherwise, why, and what redoing them takes.
+
+    Of the runs of one scene with the same parameters the newest counts. Seconds are those of the
+    stages concerned when they were computed; what several runs share counts once in the total.
+
+    Example: lidarpainter catalog stale
+    """
+    from dataclasses import asdict
+
+    from catalog.questions import stale_runs
+    from catalog.store import existing_store
+    from tasks.stages import project_source
+
+    store = existing_store()
+    found = stale_runs(store, project_source().code_from)
+    once = {name: cost for one in found for name, cost in one.artefacts.items()}
+    total = {
+        name: sum(cost[name] for cost in once.values())
+        for name in ("seconds", "cpu_seconds", "num_bytes")
+    }
+    scenes = len({one.scene_id for one in found})
+    if as_json:
+        print_json({"scenes": scenes, "total": total, "runs": [asdict(one) for one in found]})
+        return
+    columns = ["scene", "run", "stages", "changed", "s", "CPU s"]
+    rows: list[list[Cell]] = [
+        [
+            one.scene_id,
+            one.run_id,
+            ", ".join(sorted({name.partition("/")[0] for name in one.artefacts})),
+            ", ".join(one.changed),
+            one.total("seconds"),
+            one.total("cpu_seconds"),
+        ]
+        for one in found
+    ]
+    note = (
+        f"{scenes} scenes; to redo them took {total['seconds']:.0f} s, "
+        f"{total['cpu_seconds']:.0f} s of CPU, and {format_bytes(total['num_bytes'])}"
+    )
+    print_table(f"stale in {store.name}", columns, rows, note, num_text_columns=4)
+
+
+@app.command("cost")
+def cost(
+    scene: Annotated[str, typer.Argument(help="Scene as dataset/sequence, such as pandaset/002.")],
+    as_json: AsJson = False,
+) -> None:
+    """Show what a scene has cost: attempts of fleets by cause, and stages as computed.
+
+    Money follows from money_per_hour in the table `budget` of the fleet's manifest.
+
+    Example: lidarpainter catalog cost pandaset/002
+    """
+    from catalog.questions import cost_of
+    from catalog.store import existing_store
+
+    found = cost_of(existing_store(), scene)
+    if as_json:
+        print_json(found)
+        return
+    columns = ["what", "how many", "s", "CPU s", "size", "most memory", "money"]
+    rows = [_row(f"attempts: {cause}", one) for cause, one in found["by_cause"].items()]
+    rows += [_row("all attempts", found["attempts"])] if rows else []
+    rows += [_row(f"stage: {kind}", one) for kind, one in found["stages"].items()]
+    rows += [_row(f"all stages of {found['runs']} runs", found["stages_total"])]
+    print_table(f"cost of {scene}", columns, rows)
+
+
+def _row(name: str, spent: dict[str, Any]) -> list[Cell]:
+    memory, money = spent.get("peak_memory_bytes"), spent.get("money")
+    return [
+        name,
+        spent.get("attempts"),
+        spent["seconds"],
+        spent["cpu_seconds"],
+        format_bytes(spent["num_bytes"]),
+        format_bytes(memory) if memory else None,
+        money,
+    ]

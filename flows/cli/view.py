@@ -8,7 +8,13 @@ from typing import Annotated
 import typer
 
 from flows.cli.output import clear_status
-from flows.cli.shared_options import FollowedCamera, FollowedFrames, RunName, followed_path
+from flows.cli.shared_options import (
+    FollowedCamera,
+    FollowedFrames,
+    RunName,
+    named_run,
+    parse_frames,
+)
 
 
 def view(
@@ -17,10 +23,15 @@ def view(
     frames: FollowedFrames = None,
     port: Annotated[
         int | None,
-        typer.Option(min=1, max=65535, help="Port on this machine; a free one if absent."),
+        typer.Option(
+            min=1, max=65535, help="Port to listen on, on this machine alone; a free one if absent."
+        ),
     ] = None,
     browser: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="Open a browser on it.")
+        bool,
+        typer.Option(
+            "--browser/--no-browser", help="Open a browser on it, or only print its address."
+        ),
     ] = True,
 ) -> None:
     """Look at a finished run in a browser, live, until Ctrl-C.
@@ -30,11 +41,15 @@ def view(
 
     Example: lidarpainter view latest
     """
+    followed = parse_frames(frames)
+    run_id = named_run(run)
     from catalog.store import existing_store
+    from flows.views import view_run
+    from lidarpainter_models.export.view_requests import ViewRequest
+    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
     from lidarpainter_models.geometry.trajectory_words import RECORDED
 
-    path = followed_path(run, RECORDED, frames, camera=camera)
-    from flows.browsing import view_run
+    request = ViewRequest(trajectory=parse_trajectory(RECORDED), camera=camera, frames=followed)
 
     def opened_at(address: str) -> None:
         clear_status()
@@ -43,4 +58,11 @@ def view(
         if browser:
             webbrowser.open(address)
 
-    view_run(existing_store(), path, port=port, opened_at=opened_at, stopped=threading.Event())
+    view_run(
+        existing_store(),
+        run_id,
+        request,
+        port=port,
+        opened_at=opened_at,
+        stopped=threading.Event(),
+    )

@@ -19,6 +19,7 @@ import lidarpainter_models
 from catalog.digests import canonical_json, digest_text, plain
 from catalog.errors import UnknownRecordError
 from catalog.fleets import Wish
+from catalog.folders import expanded
 from catalog.store import split_scene_id
 from flows.fleet.manifest import STORED, SYNTHETIC, Manifest, Source, range_of
 from flows.overrides import with_changes, with_overrides
@@ -77,7 +78,7 @@ class Asked(BaseModel):
 
     @cached_property
     def parameters(self) -> ReconstructParameters:
-        """Of its run.
+        """The parameters of its run.
 
         Raises:
             ConfigError: there is no such preset or setting.
@@ -212,7 +213,8 @@ def _of_source(manifest: Manifest, source: Source, folder: Path, table: str) -> 
             dataset, _, name = scene.partition("/")
             yield Asked(sequence=name, **{**same, "dataset": dataset})
         return
-    root = Path(source.root or "").expanduser()
+    named = source.root or ""
+    root = expanded(named) if named.startswith("~") else Path(named)
     if not is_in_bucket(root):
         root = (folder / root).resolve()
     for name in _matching(source, root, table):

@@ -15,7 +15,7 @@ from lidarpainter_models.errors import (
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 OF_THIS_MACHINE = (BackendError, MissingPackageError, TrainingError)
-"""Of the library, but not the fault of the input."""
+"""Errors of the library that are not the fault of the input."""
 ORCHESTRATION = ("prefect", "httpx", "httpcore")
 """Packages whose errors say that Prefect is amiss, not that the work is wrong."""
 NO_MEMORY = ("can't allocate memory", "out of memory", "not enough memory")

@@ -41,7 +41,7 @@ class ApiLostError(CatalogError):
 
 
 def store_tag(store: Path | str) -> str:
-    """Of every flow run that works on a store; several may share one server."""
+    """The tag of every flow run that works on a store; several stores may share one server."""
     return f"store:{Path(store)}"
 
 

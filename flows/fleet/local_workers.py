@@ -18,9 +18,9 @@ from catalog.attempts import Ending
 from catalog.errors import CatalogError, StorageError
 from catalog.fleets import FleetLedger
 from catalog.store import open_store
-from flows.children import start_child
 from flows.fleet.causes import is_storage_away
 from flows.fleet.status import counts_of
+from flows.server import start_child
 
 WATCH_S = 0.5
 TELL_S = 5.0

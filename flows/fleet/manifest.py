@@ -95,7 +95,7 @@ class Source(BaseModel):
     dataset: Name
     """A dataset, `synthetic`, or `stored`."""
     root: Root | None = None
-    """Its folder or address, as downloaded; a relative one counts from the manifest."""
+    """Folder or address of the dataset, as downloaded; a relative one counts from the manifest."""
     sequences: Annotated[tuple[Glob, ...], Field(min_length=1)] | None = None
     """Names or globs; left out: all."""
     scenes: Annotated[tuple[SceneName, ...], Field(min_length=1)] | None = None
@@ -105,9 +105,9 @@ class Source(BaseModel):
     frames: Range | None = None
     """`A:B`, B excluded; left out: all, or as many as a street has by default."""
     seeds: Range | None = None
-    """Of streets, `A:B`, B excluded."""
+    """Seeds of streets, `A:B`, B excluded."""
     width_px: Annotated[StrictInt, Field(ge=8, le=4096)] | None = None
-    """Of the pictures of streets."""
+    """Width of the pictures of streets."""
     priority: StrictInt = 0
     """Higher ones go first."""
 
@@ -143,13 +143,13 @@ class Budget(BaseModel):
     model_config = _MODEL
 
     hours: Annotated[Number, Field(gt=0)] | None = None
-    """Of all workers together; nothing begins after that."""
+    """Hours of all workers together; nothing begins after that."""
     money_per_hour: Annotated[Number, Field(ge=0)] | None = None
-    """Of one worker, in whatever currency; for what `fleet report` and `catalog cost` say."""
+    """Price of one worker's hour, in whatever currency, for `fleet report` and `catalog cost`."""
     hours_per_sequence: Annotated[Number, Field(gt=0)] | None = None
     """An attempt that takes longer is ended, and tried again."""
     memory_gb: Annotated[Number, Field(gt=0)] | None = None
-    """Of all workers of one machine together; left out: what the machine has."""
+    """Memory of all workers of one machine together; left out: what the machine has."""
     free_disk_gb: Annotated[Number, Field(ge=0)] = 1.0
     """No work begins that would leave less room on the disk of the store."""
 
@@ -160,7 +160,7 @@ class Manifest(BaseModel):
     model_config = _MODEL
 
     name: Name
-    """Of the fleet; a manifest with the same name takes the place of the one before."""
+    """Name of the fleet; a manifest with the same name takes the place of the one before."""
     preset: StrictStr = "preview"
     painter: StrictStr | None = None
     """The preset's if absent."""

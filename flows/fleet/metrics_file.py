@@ -33,7 +33,7 @@ def write_metrics(ledger: FleetLedger, fleet: str, path: Path) -> None:
         StorageError: the file cannot be written.
     """
     rows = ledger.rows(fleet)
-    attempts = [row for row in ledger.store.tables.rows("attempts") if row["fleet"] == fleet]
+    attempts = ledger.attempts(fleet)
     registry = CollectorRegistry()
     registry.register(_Counted(fleet, attempts))
     states = Gauge(f"{PREFIX}_sequences", "By state.", ["fleet", "state"], registry=registry)

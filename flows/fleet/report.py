@@ -6,9 +6,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from statistics import median, quantiles
-from typing import Any
-
-import pyarrow.compute as pc
 
 import lidarpainter_models
 from catalog.artefacts import ArtefactRef
@@ -27,7 +24,7 @@ HOUR_S, GIGABYTE, GIBIBYTE = 3600.0, 1e9, 2.0**30
 NUM_PICTURED = 3
 """Scenes shown of the worst, and of the slowest."""
 MOST_ROWS = 50
-"""Of a table: reasons and scenes beyond are counted."""
+"""Rows of a table at most; those beyond are counted."""
 MOST_SCENES = 10
 QUALITY = ("psnr", "ssim", "lpips")
 FINAL_VARIANTS = ("painted", "refined")
@@ -44,7 +41,7 @@ class FleetRecord:
 
     @cached_property
     def rows(self) -> list[Row]:
-        """Its sequences, in the order of the manifest."""
+        """The sequences of the fleet, in the order of the manifest."""
         return self.ledger.rows(self.fleet)
 
     @cached_property
@@ -55,23 +52,18 @@ class FleetRecord:
 
     @cached_property
     def attempts(self) -> list[Row]:
-        """Its attempts by the time of their end."""
-        arrow = self.ledger.store.tables.arrow("attempts")
-        found = arrow.filter(pc.equal(arrow["fleet"], self.fleet)).to_pylist()
-        return sorted(found, key=lambda row: row["ended_at"])
+        """The attempts at sequences of the fleet, by the time of their end."""
+        return self.ledger.attempts(self.fleet)
 
     @cached_property
     def quality(self) -> dict[str, dict[str, float]]:
         """Figures of held-out views after the last round, by run and name."""
         runs = {row["run_id"] for row in self.rows if row["run_id"]}
-        arrow = self.ledger.store.tables.arrow("metrics")
-        is_shown = pc.and_(
-            pc.equal(arrow["protocol"], "recorded"), pc.is_in(arrow["name"], _texts(QUALITY))
-        )
-        is_shown = pc.and_(is_shown, pc.is_in(arrow["variant"], _texts(FINAL_VARIANTS)))
         found: dict[str, dict[str, float]] = {}
-        for row in arrow.filter(is_shown).to_pylist():
-            if row["run_id"] in runs and row["value"] is not None:
+        judged = self.ledger.store.tables.arrow("metrics", where={"run_id": runs})
+        for row in judged.to_pylist():
+            is_shown = row["protocol"] == "recorded" and row["variant"] in FINAL_VARIANTS
+            if is_shown and row["name"] in QUALITY and row["value"] is not None:
                 found.setdefault(row["run_id"], {})[row["name"]] = row["value"]
         return found
 
@@ -81,7 +73,7 @@ class FleetRecord:
         return Budget.model_validate_json(self.rows[0]["budget"]).money_per_hour
 
     def psnr(self, row: Row) -> float | None:
-        """Of the run of a sequence."""
+        """PSNR of the run of a sequence on held-out views, in dB; None where it was not scored."""
         return self.quality.get(row["run_id"] or "", {}).get("psnr")
 
     def picture(self, row: Row, title: str) -> WorstView | None:
@@ -131,12 +123,6 @@ def fleet_page(ledger: FleetLedger, fleet: str) -> Report:
             }
         },
     )
-
-
-def _texts(values: Sequence[str]) -> Any:  # noqa: ANN401 - Arrow's set of values
-    import pyarrow as pa
-
-    return pa.array(values)
 
 
 def _name(record: FleetRecord, row: Row) -> str:

@@ -28,7 +28,7 @@ def fleet_status(ledger: FleetLedger, fleet: str) -> dict[str, Any]:
     """
     rows = ledger.rows(fleet)
     counts = counts_of(rows)
-    attempts = [row for row in ledger.store.tables.rows("attempts") if row["fleet"] == fleet]
+    attempts = ledger.attempts(fleet)
     is_open = counts["waiting"] or counts["running"]
     budget = Budget.model_validate_json(rows[0]["budget"])
     return {

@@ -5,6 +5,7 @@ number of workers may run, on any number of machines that share the store, and e
 moment: whoever looks next enters that and goes on.
 """
 
+import json
 import os
 import threading
 import time
@@ -12,13 +13,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
-from typing import NoReturn
+from typing import Literal, NoReturn
 
 import lidarpainter_models
 from catalog.attempts import Ending, attempt_id
 from catalog.errors import StorageError
 from catalog.fleets import FleetLedger
-from catalog.leases import Lease
+from catalog.leases import Holder, Lease
 from catalog.tables import Row
 from flows.fleet.asked import Asked
 from flows.fleet.causes import cause_of, is_storage_away
@@ -29,8 +30,9 @@ from flows.fleet.manifest import Budget
 from flows.fleet.planner import Planner
 from flows.fleet.work import Work
 from flows.interruption import at_interruption
-from tasks.progress import working_on
+from tasks.progress import ProgressListener, subject, working_on
 
+Event = Literal["said", "stage-began", "stage-waits", "stage-ended"]
 POLL_S = 2.0
 REPLAN_S = 30.0
 """How long the planner goes by what it read last."""
@@ -176,7 +178,7 @@ class Worker:
         raise SystemExit
 
     def _planner(self) -> Planner:
-        """By what is known now, or was a short while ago."""
+        """The planner that goes by what is known now, or was a short while ago."""
         now = time.monotonic()
         if self._plans is None or now - self._plans[0] > REPLAN_S:
             self._plans = (now, Planner.of(self.ledger.store))
@@ -188,3 +190,39 @@ class Worker:
             self._told = why
         if sleeps:
             time.sleep(self.poll_s)
+
+
+class EventLog(ProgressListener):
+    """Writes what a worker says and what its stages do as JSON lines.
+
+    {"time": "...", "fleet": "...", "worker": "...", "event": "stage-ended",
+     "scene": "pandaset/002", "run": "...", "stage": "fit", "seconds": 61.2, "is_new": true}
+    """
+
+    def __init__(self, fleet: str, write: Callable[[str], object]) -> None:
+        self._write = write
+        self._always = {"fleet": fleet, "worker": Holder.current().name}
+
+    def __call__(self, text: str) -> None:
+        """Enter what the worker says, in words."""
+        self._enter("said", text=" ".join(text.split()))
+
+    def started(self, stage: str) -> None:
+        """Enter that a stage begins."""
+        self._enter("stage-began", stage=stage)
+
+    def advanced(self, stage: str, done: float, total: float, note: str) -> None:
+        """Enter nothing: a stage says this many times a second."""
+
+    def waiting(self, stage: str, process_id: str) -> None:
+        """Enter that another process makes the same."""
+        self._enter("stage-waits", stage=stage, process=process_id)
+
+    def finished(self, stage: str, seconds: float, *, is_new: bool) -> None:
+        """Enter that a stage is over, and what it took when it was computed."""
+        self._enter("stage-ended", stage=stage, seconds=round(seconds, 3), is_new=is_new)
+
+    def _enter(self, event: Event, **facts: str | float | bool) -> None:
+        now = datetime.now(UTC).isoformat(timespec="milliseconds")
+        line = {"time": now, **self._always, "event": event, **subject(), **facts}
+        self._write(json.dumps(line, ensure_ascii=False) + "\n")

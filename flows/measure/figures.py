@@ -61,7 +61,7 @@ FORMATS = {
     "cpu_minutes": ".1f",
     "memory_gb": ".1f",
 }
-"""By a figure's name or what it ends with behind / or _."""
+"""How figures are written, by their name or what it ends with behind / or _."""
 
 
 def metric_names(figure: str) -> tuple[MetricName, ...]:

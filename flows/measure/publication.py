@@ -50,7 +50,7 @@ ON_REQUEST = {CROSS_CAMERA, FLICKER}
 """Protocols that no run is judged by as it ends."""
 VIEW_TIME = "view-time"
 DIGITS = 8
-"""Of a figure in the record."""
+"""Significant digits of a figure in the record."""
 CODE_DIGITS = 12
 WRITTEN, LEFT = "written", "left as it was"
 

@@ -39,11 +39,11 @@ class Trial:
     """A recording with a fault."""
 
     scene: str
-    """As recorded."""
+    """Id of the scene as recorded."""
     cause: str
     level: float
     spoilt: str
-    """Its scene id."""
+    """Id of the scene with the fault."""
 
 
 def trials_of(
@@ -133,7 +133,7 @@ def stress_of(points: Sequence[Point], trials: Sequence[Trial], out: Path) -> di
 
 
 def _noticed(points: Sequence[Point], trials: Sequence[Trial]) -> list[str]:
-    """By cause: from which level on the system says of a recording what it does not as recorded."""
+    """Sentences by cause: from which level on the system notices that a recording is spoilt."""
     said = {point.scene: point.suspicions for point in points if point.suspicions is not None}
     lines = []
     for cause, scene in dict.fromkeys((t.cause, t.scene) for t in trials if t.spoilt in said):
@@ -171,12 +171,12 @@ class _Curve:
     cause: str
     scene: str
     number: int
-    """Of the scene."""
+    """Number of the scene among all, which decides its colour."""
     levels: list[str]
     painted: list[Spread]
     unpainted: list[Spread]
     gains: list[Spread]
-    """Of pairs of one seed."""
+    """What painting gains: means over pairs of one seed."""
 
 
 def _curves(
@@ -185,7 +185,7 @@ def _curves(
     figures: Mapping[tuple[str, str], _Trials],
     quality: str,
 ) -> list[_Curve]:
-    """Of all scenes that have the cause and the figure."""
+    """The curves of all scenes that have the cause and the figure."""
     curves = []
     for number, scene in enumerate(dict.fromkeys(trial.scene for trial in trials)):
         spoilt = [t for t in trials if (t.cause, t.scene) == (cause, scene)]
@@ -267,7 +267,7 @@ def _as_it_gains(curve: _Curve) -> list[Line]:
 
 
 def _told(curves: Sequence[_Curve], quality: str) -> list[str]:
-    """By cause: where the lead of painting is halved, where it hurts; the worst case last."""
+    """Sentences by cause: where the lead of painting is halved, where it hurts; the worst last."""
     says, worst = [], (0.0, "")
     for curve in curves:
         gains, levels = [gain.mean for gain in curve.gains], curve.levels

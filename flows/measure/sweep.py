@@ -22,7 +22,7 @@ from flows.fleet.status import counts_of
 from tasks.opened import open_scene
 
 THREADS = 1
-"""Of the workers that make points."""
+"""Threads of a worker that makes points."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,19 +30,19 @@ class Sweep:
     """What is to be compared, on what."""
 
     name: str
-    """Of the fleet."""
+    """Name of the fleet."""
     scenes: tuple[str, ...]
     cameras: tuple[str, ...] | None
     preset: str
     settings: tuple[str, ...]
-    """Of all configurations."""
+    """Settings that all configurations have, as `key=value`."""
     configurations: tuple[Configuration, ...]
     seeds: tuple[int, ...]
     publish: tuple[Publication, ...] = ("scores",)
 
     @property
     def manifest(self) -> Manifest:
-        """As a fleet is asked for."""
+        """The sweep as the manifest of a fleet."""
         return Manifest(
             name=self.name,
             preset=self.preset,

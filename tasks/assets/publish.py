@@ -18,7 +18,7 @@ from lidarpainter_models.observations.fit_size import fit_camera, shrink_image
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.scenes.records import RecordedView
-from tasks.editing.edit import opened_world
+from tasks.editing.donors import opened_world
 from tasks.json_files import write_json
 from tasks.opened import OpenedRun, opened
 from tasks.progress import Progress

@@ -3,23 +3,19 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any
 
 import torch
 
-from catalog.artefacts import ArtefactRef, Workplace
-from catalog.assets import find_asset
-from catalog.digests import canonical_json, digest_file, digest_text
+from catalog.artefacts import Workplace
+from catalog.digests import digest_file
 from catalog.store import Store, open_store
-from lidarpainter_models.assets.asset_files import read_asset
 from lidarpainter_models.conditioning.scene_styles import styled_scene
 from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.editing.actor_models import ActorModel
 from lidarpainter_models.editing.edits import Encounter, edited, encounters
 from lidarpainter_models.editing.filled_scenes import filled, masked_observations
 from lidarpainter_models.editing.joins import OtherRun
-from lidarpainter_models.editing.motions import LogTimes
 from lidarpainter_models.editing.operations import (
     ActorSource,
     Insert,
@@ -33,14 +29,13 @@ from lidarpainter_models.editing.operations import (
 from lidarpainter_models.editing.worlds import EditedWorld
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene, describe
-from lidarpainter_models.gaussians.model.ply_files import read_ply
 from lidarpainter_models.gaussians.model.styling.scene_style import LampChange
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.painter.known_painters import NO_PAINTER
 from lidarpainter_models.painter.selection import PainterChoice
-from lidarpainter_models.scenes.driving_scene import driven_road
 from lidarpainter_models.storage.tensor_files import write_tensors
+from tasks.editing.donors import PARKED, digests_of, donor_of, model_of, opened_world
 from tasks.opened import global_frame_of, open_scene
 from tasks.progress import Progress
 from tasks.runs import FinishedRun, open_run
@@ -48,10 +43,6 @@ from tasks.stored import load_observations, load_scene, save_observations, save_
 
 FILLED_FILE = "filled.safetensors"
 """Confidence of the last Gaussians of the scene, which were filled in."""
-PARKED = "parked"
-"""What the summary of edited observations calls those that are still part of the street."""
-CATEGORY = "car"
-"""Of what comes from a file, which does not say."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +59,8 @@ class Edits:
         found = {"scene": open_scene(self.store, self.source.scene_id).content_digest}
         for number, operation in enumerate(self.operations, start=1):
             if isinstance(operation, Insert | Swap):
-                found |= _digests(f"actor-{number}", self._donor(operation.source))
+                donor = donor_of(self._store_of(operation.source), operation.source)
+                found |= digests_of(f"actor-{number}", donor)
             if isinstance(operation, Join):
                 found |= self._digests_of_joined(f"run-{number}", operation)
             if isinstance(operation, Insert | Move):
@@ -106,7 +98,11 @@ class Edits:
     def _models(self) -> Mapping[ActorSource, ActorModel]:
         """What actors of other runs and of files look like."""
         sources = [one.source for one in self.operations if isinstance(one, Insert | Swap)]
-        return {one: self._model(one) for one in sources if one.run or one.ply or one.asset}
+        return {
+            one: model_of(self._store_of(one), one)
+            for one in sources
+            if one.run or one.ply or one.asset
+        }
 
     def _others(self) -> dict[Join, OtherRun]:
         """The runs that are joined."""
@@ -128,87 +124,14 @@ class Edits:
             is_same_drive=run.scene_id == self.source.scene_id,
         )
 
-    def _donor(self, source: ActorSource) -> "FinishedRun | LibraryActor | str | None":
-        """The run, asset or file that an actor comes from; None is the edited run itself."""
-        if source.ply is not None:
-            return source.ply
-        if source.asset is not None:
-            return LibraryActor.named(self._store_of(source), source.asset)
-        if source.run is None:
-            if source.store is not None:
-                raise ConfigError("a store without a run, expected both or neither")
-            return None
-        return open_run(self._store_of(source), source.run)
-
-    def _model(self, source: ActorSource) -> ActorModel:
-        donor = self._donor(source)
-        if isinstance(donor, FinishedRun):
-            world = opened_world(self._store_of(source), donor)
-            return world.model_of(world.find(str(source.actor)))
-        if isinstance(donor, LibraryActor):
-            return read_asset(donor.path)
-        return ActorModel.of_gaussians(read_ply(_file(str(donor))), CATEGORY)
-
     def _digests_of_joined(self, part: str, operation: Join) -> dict[str, str]:
         store = self._store_of(operation)
         run = open_run(store, operation.run)
         scene = open_scene(store, run.scene_id)
-        return {**_digests(part, run), f"{part}-scene": scene.content_digest}
+        return {**digests_of(part, run), f"{part}-scene": scene.content_digest}
 
     def _store_of(self, source: ActorSource | Join) -> Store:
         return self.store if source.store is None else open_store(source.store)
-
-
-@dataclass(frozen=True, kw_only=True)
-class LibraryActor:
-    """The files of an actor of the library of assets."""
-
-    path: Path
-    digest: str
-    """Of the files, which may become others when the actor is seen better."""
-
-    @classmethod
-    def named(cls, store: Store, name: str) -> "LibraryActor":
-        """An actor by the id of its asset, or a unique prefix of one.
-
-        Raises:
-            UnknownRecordError: there is none, or several begin so.
-            DamagedArtefactError: its files are not what was written.
-            ConfigError: it is no actor, or has no files.
-        """
-        row = find_asset(store, name)
-        if row["kind"] != "actor":
-            raise ConfigError(f"asset {row['asset_id']} is a {row['kind']}, expected an actor")
-        ref = ArtefactRef.of_id(row["artefact_id"])
-        files = store.artefacts.verified(ref).files
-        own = {file: one for file, one in files.items() if file.startswith(f"{row['folder']}/")}
-        if not own:
-            raise ConfigError(f"asset {row['asset_id']} has no files in {row['artefact_id']}")
-        path = store.artefacts.folder(ref) / row["folder"]
-        return cls(path=path, digest=digest_text(canonical_json(own)))
-
-
-def opened_world(store: Store, run: FinishedRun) -> EditedWorld:
-    """A finished run, ready to be edited."""
-    scene = open_scene(store, run.scene_id)
-    seen = load_observations(store, run.final.observations)
-    # what is mended is mended by day
-    fitted = replace(load_scene(store, run.final.gaussians), style=None)
-    bodies = {track.actor_id for track in fitted.actors.recorded_tracks}
-    parked = [track for track in scene.tracks if not track.is_moving]
-    left = store.artefacts.manifest(run.final.observations).summary.get(PARKED)
-    return EditedWorld(
-        scene=fitted,
-        fitted=fitted,
-        lidar_map=seen.lidar_map,
-        views=seen.views,
-        parked=tuple(
-            track
-            for track in parked
-            if track.actor_id not in bodies and (left is None or track.actor_id in left)
-        ),
-        log=LogTimes(ego=driven_road(scene)),
-    )
 
 
 def checked_encounters(edits: Edits) -> list[Encounter]:
@@ -281,21 +204,3 @@ def _build_observations(place: Workplace, _progress: Progress, *, edits: Edits) 
         "hidden_share": sum(hidden) / max(len(hidden), 1),
         PARKED: [track.actor_id for track in world.parked],
     }
-
-
-def _digests(part: str, donor: FinishedRun | LibraryActor | str | None) -> dict[str, str]:
-    if donor is None:
-        return {}
-    if isinstance(donor, LibraryActor):
-        return {part: donor.digest}
-    if isinstance(donor, str):
-        return {part: digest_file(_file(donor))}
-    seen, fitted = donor.final.observations, donor.final.gaussians
-    return {part: fitted.digest, f"{part}-observations": seen.digest}
-
-
-def _file(name: str) -> Path:
-    path = Path(name)
-    if not path.is_file():
-        raise ConfigError(f"no file {name}, expected Gaussians as PLY")
-    return path

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 
@@ -15,28 +15,27 @@ from catalog.tables import Row
 from lidarpainter_models.assets.asset_files import FRAME, GAUSSIANS_FILE
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.export.contents import SceneContents
+from lidarpainter_models.export.formats import FORMATS, ExportFormat, export_format
 from lidarpainter_models.export.gallery import DATA, PAGE, write_gallery
-from lidarpainter_models.export.gltf_files import write_gltf
-from lidarpainter_models.export.spz_files import write_spz
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.ply_files import read_ply, write_ply
-from lidarpainter_models.storage.whole_files import storage_errors
-from lidarpainter_models.storage.whole_folders import AsideFolder
-from tasks.exports.scene import ENDINGS
-
-AssetFormat = Literal["ply", "spz", "gltf"]
+from tasks.exports.places import new_folder
 
 
-def export_asset(store: Store, asset: Row, format_: AssetFormat, out: Path) -> dict[str, Any]:
+def export_asset(store: Store, asset: Row, wanted: str, out: Path) -> dict[str, Any]:
     """Write an actor or a block of street in its own frame.
 
     Raises:
-        ConfigError: the name ends otherwise, or the asset is a sky or a trajectory.
+        ConfigError: no such format, the name ends otherwise, or the asset is no Gaussians.
         CatalogError: its files are gone.
         WriteError: the disk refuses; nothing is left half-written.
     """
-    if out.suffix.lower() not in ENDINGS[format_]:
-        raise ConfigError(f"{out.name}: expected a name in {', '.join(ENDINGS[format_])}")
+    row = export_format(wanted)
+    if not row.takes_assets:
+        known = ", ".join(one.name for one in FORMATS if one.takes_assets)
+        raise ConfigError(f"--format {wanted!r}: expected one of {known}")
+    if out.suffix.lower() not in row.endings:
+        raise ConfigError(f"{out.name}: expected a name in {', '.join(row.endings)}")
     folder = asset_path(store, asset, "folder")
     if folder is not None:
         store.artefacts.files(ArtefactRef.of_id(asset["artefact_id"]))
@@ -47,7 +46,7 @@ def export_asset(store: Store, asset: Row, format_: AssetFormat, out: Path) -> d
             f"a {asset['kind']} has no Gaussians to export; its files are in {folder}"
         )
     gaussians = read_ply(folder / GAUSSIANS_FILE)
-    _write(gaussians, asset, format_, out)
+    _write(gaussians, asset, row, out)
     return {
         "asset_id": asset["asset_id"],
         "path": str(out),
@@ -58,23 +57,21 @@ def export_asset(store: Store, asset: Row, format_: AssetFormat, out: Path) -> d
     }
 
 
-def _write(gaussians: GaussianSet, asset: Row, format_: AssetFormat, out: Path) -> None:
-    match format_:
-        case "ply":
-            said = (f"asset {asset['asset_id']}, {asset['category']}", FRAME, asset["licence"])
-            write_ply(out, gaussians, [" ".join(str(one).split()) for one in said])
-        case "spz":
-            write_spz(out, gaussians)
-        case "gltf":
-            alone = SceneContents(
-                name=asset["name"],
-                street=gaussians,
-                actors=(),
-                timestamps_ns=torch.zeros(1, dtype=torch.int64),
-                world_from_actor=torch.zeros(1, 0, 4, 4, dtype=torch.float64),
-                is_present=torch.zeros(1, 0, dtype=torch.bool),
-            )
-            write_gltf(out, alone)
+def _write(gaussians: GaussianSet, asset: Row, row: ExportFormat, out: Path) -> None:
+    """Write the Gaussians of an asset; a PLY file says in comments whose they are."""
+    if row.name == "ply":
+        said = (f"asset {asset['asset_id']}, {asset['category']}", FRAME, asset["licence"])
+        write_ply(out, gaussians, [" ".join(str(one).split()) for one in said])
+        return
+    alone = SceneContents(
+        name=asset["name"],
+        street=gaussians,
+        actors=(),
+        timestamps_ns=torch.zeros(1, dtype=torch.int64),
+        world_from_actor=torch.zeros(1, 0, 4, 4, dtype=torch.float64),
+        is_present=torch.zeros(1, 0, dtype=torch.bool),
+    )
+    row.load_writer()(out, alone)
 
 
 def export_gallery(store: Store, assets: Sequence[Row], out: Path) -> dict[str, Any]:
@@ -84,20 +81,10 @@ def export_gallery(store: Store, assets: Sequence[Row], out: Path) -> dict[str, 
         ConfigError: the folder holds something else.
         WriteError: the disk refuses; an older gallery stays.
     """
-    names = {path.name for path in out.iterdir()} if out.is_dir() else set()
-    is_free = out.is_dir() or not (out.exists() or out.is_symlink())
-    if not is_free or (names and not names >= {DATA, PAGE}):
-        raise ConfigError(f"{out} is no gallery: expected a new folder, or an older gallery")
-    folder = AsideFolder(out)
-    try:
-        with storage_errors(out):
-            _fetch_pictures(store, assets)
-            picture_of = partial(asset_path, store, column="thumbnail")
-            num_pictures = write_gallery(folder.path, assets, picture_of)
-            folder.publish()
-    except BaseException:
-        folder.discard()
-        raise
+    with new_folder(out, replaces=(DATA, PAGE)) as folder:
+        _fetch_pictures(store, assets)
+        picture_of = partial(asset_path, store, column="thumbnail")
+        num_pictures = write_gallery(folder, assets, picture_of)
     return {"path": str(out / PAGE), "num_assets": len(assets), "num_pictures": num_pictures}
 
 

@@ -1,74 +1,66 @@
 """Write a drive as a data set that others reconstruct from: recorded images, and views beside."""
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from lidarpainter_models.conditioning.followed_paths import FollowedPath
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.export.datasets import (
-    IMAGE_FOLDER,
-    PosedImage,
-    map_sample,
-    write_colmap,
-    write_nerfstudio,
-)
+from lidarpainter_models.export.datasets import IMAGE_FOLDER, PosedImage, map_sample
+from lidarpainter_models.export.formats import ExportFormat
 from lidarpainter_models.export.images import write_png
+from lidarpainter_models.export.view_files import recorded_image
+from lidarpainter_models.export.view_requests import ViewRequest
+from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+from lidarpainter_models.geometry.trajectory_words import RECORDED
 from lidarpainter_models.storage.whole_files import write_whole
 from tasks.exports.places import new_folder
 from tasks.opened import opened
 from tasks.progress import listener
-from tasks.specs import FittedRef, RunSpec
 from tasks.stages import stage_task
 from tasks.stored import load_observations
-from tasks.views.files import recorded_image
-from tasks.views.render import RenderRequest, followed_paths
+from tasks.views.render import ViewedRun, followed_paths
 
 STAGE = "export"
-DatasetFormat = Literal["colmap", "nerfstudio"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class DatasetRequest:
-    """Which images are wanted, in which form."""
-
-    format: DatasetFormat
-    recorded: RenderRequest
-    """Whose recorded images are taken, and how wide."""
-    beside: RenderRequest | None
-    """The rendered or painted views to add; None adds none."""
-
-    def __post_init__(self) -> None:
-        """Refuse renders of what was recorded."""
-        if self.beside is not None and self.beside.trajectory.is_recorded:
-            raise ConfigError("recorded images are taken as they are: --trajectory lateral:2, ...")
 
 
 @stage_task
 def export_dataset(
-    run: RunSpec, fitted: FittedRef, request: DatasetRequest, out: Path
+    viewed: ViewedRun, request: ViewRequest, row: ExportFormat, out: Path
 ) -> dict[str, Any]:
-    """Write images, the poses that the fit found, and the points of the LiDAR map.
+    """Write recorded images, views beside them, their refined poses, and points of the LiDAR map.
+
+    Recorded images have their own width, views beside that of the fit, unless one is asked for.
 
     Raises:
         SceneError: the scene has no such camera, or no frame is left.
-        ConfigError: something is there already.
+        ConfigError: something is there already, or the recorded path is to be rendered.
         WriteError: the disk refuses; nothing is left half-written.
     """
-    recorded = followed_paths(run, fitted, request.recorded)
-    beside = [] if request.beside is None else followed_paths(run, fitted, request.beside)
+    has_beside = not request.trajectory.is_recorded or request.is_painted
+    if has_beside and request.trajectory.is_recorded:
+        raise ConfigError("recorded images are taken as they are: --trajectory lateral:2, ...")
+    this = opened(viewed.run)
+    widest_px = max(view.camera.width_px for view in this.scene.views)
+    plain = ViewRequest(
+        trajectory=parse_trajectory(RECORDED),
+        camera=request.camera,
+        frames=request.frames,
+        width_px=request.width_px or widest_px,
+        allows_collisions=request.allows_collisions,
+    )
+    recorded = followed_paths(viewed, plain)
+    beside = followed_paths(viewed, request) if has_beside else []
     listener().started(STAGE)
     total = sum(len(path.views) for path in (*recorded, *beside))
     images: list[PosedImage] = []
-    points = map_sample(load_observations(opened(run).store, fitted.observations).lidar_map.street)
+    points = map_sample(load_observations(this.store, viewed.fitted.observations).lidar_map.street)
     with new_folder(out) as folder:
         for write, paths in ((_write_recorded, recorded), (_write_seen, beside)):
             for path in paths:
                 for number in range(len(path.views)):
                     images.append(write(path, number, folder / IMAGE_FOLDER))
                     listener().advanced(STAGE, len(images), total, "")
-        write_form = write_colmap if request.format == "colmap" else write_nerfstudio
-        write_form(folder, images, points)
+        row.load_writer()(folder, images, points)
     return {
         "path": str(out),
         "num_images": len(images),

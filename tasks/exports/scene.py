@@ -2,17 +2,14 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from lidarpainter_models.errors import ConfigError, SceneError
-from lidarpainter_models.export.contents import SceneContents, scene_contents
+from lidarpainter_models.export.contents import FRAME, SceneContents, scene_contents
 from lidarpainter_models.export.fidelity import fidelity
-from lidarpainter_models.export.gltf_files import write_gltf
-from lidarpainter_models.export.spz_files import SpzVersion, read_spz, write_spz
-from lidarpainter_models.export.usd_files import USD_ENDINGS, write_usd
+from lidarpainter_models.export.formats import ExportFormat
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.gaussians.model.ply_files import read_ply, write_ply
+from lidarpainter_models.gaussians.model.ply_files import write_ply
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.observations.views import SceneObservations
 from tasks.exports.places import new_folder
@@ -23,14 +20,6 @@ from tasks.stages import stage_task
 from tasks.stored import load_observations, load_scene
 
 STAGE = "export"
-SceneFormat = Literal["ply", "spz", "gltf", "usd"]
-ENDINGS: dict[SceneFormat, tuple[str, ...]] = {
-    "ply": (".ply",),
-    "spz": (".spz",),
-    "gltf": (".glb",),
-    "usd": USD_ENDINGS,
-}
-FRAME = "x forward, y left, z up at the first frame; metres"
 _NUM_COMPARED = 3
 """Cameras by which a loss is measured: at the beginning, the middle and the end of the drive."""
 
@@ -39,9 +28,8 @@ _NUM_COMPARED = 3
 class SceneRequest:
     """Which parts of a scene are wanted, when, and in which format."""
 
-    format: SceneFormat
     time_s: float = 0.0
-    """Since the first image of the log; where actors stand."""
+    """Seconds since the first image of the log, when actors stand where they are."""
     frame: int | None = None
     """The position of a recorded frame in place of a time."""
     actors: tuple[str, ...] | None = None
@@ -50,35 +38,33 @@ class SceneRequest:
     """PLY only: a folder with the street and every actor in its box frame."""
     with_sky: bool = False
     """Whether far Gaussians show the sky; otherwise there is none."""
-    spz_version: SpzVersion = 3
+    spz_version: int = 3
+    """Version of SPZ, 3 or 4."""
 
     def __post_init__(self) -> None:
-        """Refuse formats and versions that are none.
+        """Refuse versions that there are not.
 
         Raises:
             ConfigError: one of these.
         """
-        if self.format not in ENDINGS:
-            raise ConfigError(f"no format {self.format!r}, expected one of {', '.join(ENDINGS)}")
         if self.spz_version not in (3, 4):
             raise ConfigError(f"--spz-version {self.spz_version}: expected 3 or 4")
 
-    def check(self, out: Path) -> None:
+    def check(self, row: ExportFormat, out: Path) -> None:
         """Refuse what cannot be written, before anything is opened.
 
         Raises:
             ConfigError: the name ends otherwise, or parts are asked of a format without.
         """
-        if self.is_per_actor and self.format != "ply":
-            raise ConfigError(f"parts are written as ply, not as {self.format}")
-        endings = ENDINGS[self.format]
-        if not self.is_per_actor and out.suffix.lower() not in endings:
-            raise ConfigError(f"{out.name}: expected a name in {', '.join(endings)}")
+        if self.is_per_actor and not row.may_be_folder:
+            raise ConfigError(f"parts are written as ply, not as {row.name}")
+        if not self.is_per_actor and out.suffix.lower() not in row.endings:
+            raise ConfigError(f"{out.name}: expected a name in {', '.join(row.endings)}")
 
 
 @stage_task
 def export_scene(
-    run: RunSpec, fitted: FittedRef, request: SceneRequest, out: Path
+    run: RunSpec, fitted: FittedRef, row: ExportFormat, request: SceneRequest, out: Path
 ) -> dict[str, Any]:
     """Write the scene, and say how much is in it and what the format loses.
 
@@ -87,29 +73,30 @@ def export_scene(
         SceneError: no such actor, or none at all where only actors are wanted.
         WriteError: the disk refuses; nothing is left half-written.
     """
-    request.check(out)
+    request.check(row, out)
     this = opened(run)
     listener().started(STAGE)
     scene = load_scene(this.store, fitted.gaussians)
     seen = load_observations(this.store, fitted.observations)
     times_ns = sorted({view.timestamp_ns for view in this.scene.views_of(seen.camera_names[0])})
     time_ns = _moment(times_ns, request)
-    is_moving = request.format in ("gltf", "usd")
     baked = scene.baked(time_ns)  # no format knows fog or lamps: colours as its style has them
     contents = scene_contents(
         baked,
         run.split.scene_id,
-        times_ns if is_moving else [time_ns],
+        times_ns if row.is_moving else [time_ns],
         actors=request.actors,
         with_sky=request.with_sky,
     )
     if request.is_per_actor and not contents.actors:
         raise SceneError(f"scene {contents.name} has no moving actor: leave --per-actor out")
-    shown = min(range(len(times_ns)), key=lambda n: abs(times_ns[n] - time_ns)) * is_moving
-    files = _write(request, contents, shown, out)
+    nearest = min(range(len(times_ns)), key=lambda n: abs(times_ns[n] - time_ns))
+    shown = nearest * row.is_moving
+    files = _write(row, request, contents, shown, out)
     listener().advanced(STAGE, 1, 2, "written")
-    placed_ns = times_ns[shown] if is_moving else time_ns
-    exported = _read_back(request, contents, shown, out)
+    placed_ns = times_ns[shown] if row.is_moving else time_ns
+    read = None if request.is_per_actor else row.load_reader()
+    exported = contents.placed(shown) if read is None else read(out)
     said: dict[str, Any] = {"psnr": None, "psnr_reason": "actors were chosen"}
     if request.actors is None:
         sky = None if request.with_sky else baked.sky
@@ -119,7 +106,7 @@ def export_scene(
     return {
         "path": str(out),
         "num_bytes": sum(file.stat().st_size for file in files),
-        "num_gaussians": contents.num_gaussians if is_moving else len(exported),
+        "num_gaussians": contents.num_gaussians if row.is_moving else len(exported),
         "num_actors": len(contents.actors),
         "time_s": (placed_ns - times_ns[0]) * 1e-9,
         "frame": FRAME,
@@ -140,20 +127,15 @@ def _moment(times_ns: list[int], request: SceneRequest) -> int:
     return times_ns[0] + round(request.time_s * 1e9)
 
 
-def _write(request: SceneRequest, contents: SceneContents, shown: int, out: Path) -> list[Path]:
+def _write(
+    row: ExportFormat, request: SceneRequest, contents: SceneContents, shown: int, out: Path
+) -> list[Path]:
     """Write the wanted format; the files that were made."""
     if request.is_per_actor:
         return _write_parts(contents, out)
-    match request.format:
-        case "ply":
-            comments = (f"{contents.name}: {FRAME}; colours before any camera's exposure",)
-            write_ply(out, contents.placed(shown), comments)
-        case "spz":
-            write_spz(out, contents.placed(shown), version=request.spz_version)
-        case "gltf":
-            write_gltf(out, contents, time=shown)
-        case "usd":
-            write_usd(out, contents, time=shown)
+    has_versions = "--spz-version" in row.options
+    versions: dict[str, Any] = {"version": request.spz_version} if has_versions else {}
+    row.load_writer()(out, contents, time=shown, **versions)
     return [out]
 
 
@@ -170,15 +152,6 @@ def _write_parts(contents: SceneContents, out: Path) -> list[Path]:
             )
             write_ply(folder / f"actor-{number:03d}.ply", actor.gaussians, said)
     return sorted(out.glob("*.ply"))
-
-
-def _read_back(
-    request: SceneRequest, contents: SceneContents, shown: int, out: Path
-) -> GaussianSet:
-    """What the file shows; formats that keep every number are not read again."""
-    if request.is_per_actor or request.format in ("gltf", "usd"):
-        return contents.placed(shown)
-    return read_spz(out) if request.format == "spz" else read_ply(out)
 
 
 def _compared_cameras(scene: GaussianScene, seen: SceneObservations) -> list[Camera]:

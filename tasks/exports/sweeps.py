@@ -1,10 +1,10 @@
 """Write the recorded LiDAR sweeps of a run's scene."""
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from lidarpainter_models.errors import SceneError
-from lidarpainter_models.export.lidar_files import write_pcd, write_pcd_bin
+from lidarpainter_models.export.formats import ExportFormat
 from tasks.exports.places import new_folder
 from tasks.json_files import write_json
 from tasks.opened import opened
@@ -14,12 +14,13 @@ from tasks.stages import stage_task
 
 STAGE = "export"
 INDEX_FILE = "sweeps.json"
-SweepFormat = Literal["lidar", "lidar-bin"]
+ENDINGS = {"lidar": ".pcd", "lidar-bin": ".pcd.bin"}
+"""How the file of a sweep ends."""
 
 
 @stage_task
 def export_sweeps(
-    run: RunSpec, sweep_format: SweepFormat, frames: slice | None, out: Path
+    run: RunSpec, row: ExportFormat, frames: slice | None, out: Path
 ) -> dict[str, Any]:
     """Write a file for every sweep, and `sweeps.json` with when and where it was taken.
 
@@ -33,7 +34,7 @@ def export_sweeps(
     sweeps = [sweep for sweep in scene.sweeps if sweep.frame_index in wanted]
     if not sweeps:
         raise SceneError(f"{scene.path.name}: no LiDAR sweep is left to export")
-    write, ending = (write_pcd, ".pcd") if sweep_format == "lidar" else (write_pcd_bin, ".pcd.bin")
+    write, ending = row.load_writer(), ENDINGS[row.name]
     listener().started(STAGE)
     rows = []
     with new_folder(out) as folder:

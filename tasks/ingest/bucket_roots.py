@@ -14,8 +14,8 @@ from pathlib import Path
 
 from catalog.buckets import Bucket
 from catalog.errors import storage_errors
-from catalog.folders import make_writable
-from catalog.mirrors import AT_ONCE, cache_folder
+from catalog.folders import cache_folder, make_writable
+from catalog.mirrors import AT_ONCE
 from lidarpainter_models.errors import DataError
 
 

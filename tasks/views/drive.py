@@ -1,8 +1,8 @@
 """A finished run in a browser: as a page that plays it from the disk, or live."""
 
 import threading
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,38 +11,31 @@ import lidarpainter_models
 from catalog.store import open_store
 from lidarpainter_models.conditioning.followed_paths import FollowedPath
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.export.view_requests import ViewRequest, only_path
 from lidarpainter_models.geometry.trajectory_specs import Trajectory, parse_trajectory
 from lidarpainter_models.geometry.trajectory_words import RECORDED
 from lidarpainter_models.storage.whole_files import write_whole
 from tasks.evaluation.shown import view_time_painting
 from tasks.opened import opened
 from tasks.progress import listener
-from tasks.specs import FittedRef, RunSpec
+from tasks.specs import FittedRef
 from tasks.stages import stage_task
 from tasks.stored import load_scene
-from tasks.views.render import RenderRequest, followed_path
+from tasks.views.render import ViewedRun, followed_paths
 
 if TYPE_CHECKING:
     from lidarpainter_models.viewing.drive_nodes import ShownDrive
 
 STAGE = "page"
+SHOWN = "painted"
+"""What the scene of a run at its end is called."""
 BESIDE = ("lateral:2", "lateral:-2", RECORDED)
 """Where the page drives after the recorded path, if nothing else is asked for: the first of these
 that leads into no wall."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class DriveRequest:
-    """What of a run is shown in a browser."""
-
-    view: RenderRequest
-    """Whose path is followed, and where to; unpainted."""
-    scenes: dict[str, FittedRef]
-    """Fitted scenes by the names that people choose from; the first is shown first."""
-
-
 @stage_task
-def write_page(run: RunSpec, request: DriveRequest, out: Path) -> dict[str, Any]:
+def write_page(viewed: ViewedRun, request: ViewRequest, out: Path) -> dict[str, Any]:
     """Write a page that drives the recorded path, then the one asked for or one beside it.
 
     Raises:
@@ -53,8 +46,8 @@ def write_page(run: RunSpec, request: DriveRequest, out: Path) -> dict[str, Any]
     from lidarpainter_models.export.page import PageNotes
     from lidarpainter_models.viewing.recording import Leg, recorded_page
 
-    drive = shown_drive(run, request)
-    trajectory = request.view.trajectory
+    drive = shown_drive(viewed, request, {SHOWN: viewed.fitted})
+    trajectory = request.trajectory
     aside = _beside(drive.path) if trajectory.is_recorded else trajectory
     recorded = drive.path.recorded
     name = f"{recorded.dataset}/{recorded.sequence}"
@@ -78,8 +71,9 @@ def write_page(run: RunSpec, request: DriveRequest, out: Path) -> dict[str, Any]
 
 
 def view_live(
-    run: RunSpec,
-    request: DriveRequest,
+    viewed: ViewedRun,
+    request: ViewRequest,
+    scenes: Mapping[str, FittedRef],
     *,
     port: int | None,
     opened_at: Callable[[str], None],
@@ -87,19 +81,26 @@ def view_live(
 ) -> None:
     """Show a drive in a browser until stopped; tells its address when it is there.
 
+    Args:
+        viewed: the run whose path is followed, and whose scene painters are shown.
+        request: the camera and the frames that are followed.
+        scenes: fitted scenes by the names that people choose from; the first is shown first.
+        port: where to listen; None takes a free one.
+        opened_at: told the address.
+        stopped: ends the viewer when it is set.
+
     Raises:
         SceneError: the run did not train on that camera, or no frame is left.
         ConfigError: the port is in use or not allowed.
     """
     from lidarpainter_models.viewing.viewer import live_viewer
 
-    this = opened(run)
-    fitted = next(iter(request.scenes.values()))
+    this = opened(viewed.run)
     painting = view_time_painting(
-        this.store, fitted, request.view.conditions, this.painter, this.device
+        this.store, viewed.fitted, viewed.conditions, this.painter, this.device
     )
     label = f"{this.scene.dataset}/{this.scene.sequence}"
-    with live_viewer(shown_drive(run, request), painting, label=label, port=port) as (
+    with live_viewer(shown_drive(viewed, request, scenes), painting, label=label, port=port) as (
         viewer,
         address,
     ):
@@ -120,16 +121,17 @@ def _meets_walls(path: FollowedPath) -> bool:
     return False
 
 
-def shown_drive(run: RunSpec, request: DriveRequest) -> "ShownDrive":
-    """Load what is shown; scenes other than the first when they are asked for."""
+def shown_drive(
+    viewed: ViewedRun, request: ViewRequest, scenes: Mapping[str, FittedRef]
+) -> "ShownDrive":
+    """Load what is shown; scenes other than the run's own when they are asked for."""
     from lidarpainter_models.viewing.drive_nodes import ShownDrive
 
-    path = followed_path(run, next(iter(request.scenes.values())), request.view)
-    store = open_store(run.store_path)
+    path = only_path(followed_paths(viewed, request), request)
+    store = open_store(viewed.run.store_path)
     return ShownDrive(
         path=replace(path, trajectory=parse_trajectory(RECORDED)),
         scenes={
-            name: partial(load_scene, store, fitted.gaussians)
-            for name, fitted in request.scenes.items()
+            name: partial(load_scene, store, fitted.gaussians) for name, fitted in scenes.items()
         },
     )

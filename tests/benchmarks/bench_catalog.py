@@ -23,8 +23,8 @@ from deltalake import DeltaTable, write_deltalake
 from rich.console import Console
 from rich.table import Table
 
-from catalog.asset_queries import AssetFilter, find_asset, find_assets
-from catalog.assets import enter_sightings
+from catalog.asset_queries import AssetFilter, find_assets
+from catalog.assets import enter_sightings, find_asset
 from catalog.sql import CatalogSql
 from catalog.store import open_store
 from catalog.tables import FILE_BYTES
@@ -73,7 +73,7 @@ def ask(root, count):
     (sql,) = opened
     questions = {
         "night sedans": lambda: find_assets(sql, NIGHT_SEDANS, sort="score", most=50),
-        "one": lambda: find_asset(sql, asset_id(count // 2)[:12]),
+        "one": lambda: find_asset(open_store(root), asset_id(count // 2)[:12]),
         "by category": lambda: sql.ask("SELECT category, count(*) FROM assets GROUP BY category"),
     }
     return found | {name: timed(question) for name, question in questions.items()}

@@ -2,7 +2,7 @@
 
 import pytest
 
-from catalog.asset_queries import AssetFilter, find_asset, find_assets, sightings_of
+from catalog.asset_queries import AssetFilter, find_assets
 from catalog.errors import UnknownRecordError
 from catalog.sql import CatalogSql
 from catalog.tables import CatalogTables
@@ -77,11 +77,3 @@ def test_an_unknown_word_says_what_there_is(sql):
         found(sql, category="tram")
     with pytest.raises(UnknownRecordError, match="front, rear"):
         found(sql, sides=("below",))
-
-
-def test_an_asset_is_found_by_a_prefix_with_its_sightings(sql):
-    assert find_asset(sql, "c")["asset_id"] == "c1"
-    assert [row["sighting_id"] for row in sightings_of(sql, "a1")] == ["s2", "s1"]
-    for name, said in (("a", "not unique: a1, a2"), ("x", "no asset 'x'"), ("", "no asset ''")):
-        with pytest.raises(UnknownRecordError, match=said):
-            find_asset(sql, name)

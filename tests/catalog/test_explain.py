@@ -115,6 +115,14 @@ def test_the_newest_of_the_same_purpose_shows_the_setting_that_changed(toy, fitt
     }
 
 
+def test_what_one_run_made_twice_is_not_held_against_itself(toy, fitted):
+    observations = toy.explained(fitted).inputs["observations"].name.partition("/")[2]
+    later = toy.make("fitted", {"observations": observations, "painter": "nano"}, steps=4)
+    row = {"run_id": "r1", "artefacts": [fitted.artefact_id, later.artefact_id]}
+    toy.store.tables.merge("runs", [row])
+    assert toy.explained(fitted).newest is None
+
+
 def test_a_run_is_stale_with_any_of_its_artefacts(toy, fitted):
     now = datetime(2026, 1, 1, tzinfo=UTC)
     record = RunRecord(
@@ -134,10 +142,13 @@ def test_a_run_is_stale_with_any_of_its_artefacts(toy, fitted):
     )
     toy.store.tables.merge("runs", [record.row()])
     row = toy.store.run("r1")
-    assert Explainer(toy.store, toy.code_today).run(row).stale == ()
+    found = Explainer(toy.store, toy.code_today).run(row)
+    assert found.stale == ()
+    assert found.verdict == "r1 is up to date: today's code would make it again as it is."
     toy.change("fitted.py", "return 2", "return 3")
     found = Explainer(toy.store, toy.code_today).run(row)
     assert found.stale == (f"{fitted.artefact_id} is stale",)
+    assert found.verdict == "r1 is stale in fitted: code changed: toy.fitted."
     assert json.loads(json.dumps(found.to_dict()))["is_stale"]
 
 

@@ -87,6 +87,9 @@ def test_latest_is_the_run_that_completed_last(tmp_path):
     store.tables.merge("runs", [record.row() for record in records])
     assert store.run("latest")["run_id"] == "late"
     assert store.run("ear")["seconds"] == 86_400.0
+    assert store.run(records[0].scene_id)["run_id"] == "late"
+    with pytest.raises(UnknownRecordError, match="no complete run of other/scene in"):
+        store.run("other/scene")
 
 
 def test_run_ids_follow_content_parameters_and_source():

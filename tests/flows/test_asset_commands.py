@@ -92,7 +92,7 @@ def test_gallery_is_written_anew_in_place_of_an_older_one_only(library, tmp_path
     (tmp_path / "mine" / "work.txt").write_text("kept")
     answer = call("assets", "gallery", "--out", tmp_path / "mine", store=library)
     assert (answer.code, answer.out) == (2, "")
-    assert "is no gallery" in answer.err
+    assert "is there already" in answer.err
     assert (tmp_path / "mine" / "work.txt").read_text() == "kept"
 
 

@@ -25,7 +25,7 @@ def test_page_is_one_file_that_names_the_scene(tiny_run, tmp_path):
 )
 def test_page_that_cannot_be_is_one_line(tiny_run, tmp_path, words, expected):
     out = tmp_path / "drive.html"
-    asked = ("export", "latest", "--format", "page", "--out", out, *words)
+    asked = ("export", tiny_run.run_id, "--format", "page", "--out", out, *words)
     answer = call(*asked, store=tiny_run.store)
     assert answer.code == 2
     assert expected in answer.err

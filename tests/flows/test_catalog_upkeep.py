@@ -30,6 +30,13 @@ def test_catalog_shows_a_scene_a_run_and_an_artefact_by_prefix(tiny_run):
         assert name in succeed("catalog", "show", name, store=tiny_run.store).out
 
 
+@pytest.mark.parametrize("name", ["latest", SCENE])
+def test_what_stands_for_a_run_is_told_at_once(tiny_run, name):
+    answer = succeed("catalog", "explain", name, store=tiny_run.store)
+    assert answer.err == f"{name} is run {tiny_run.run_id} of {SCENE}\n"
+    assert answer.out.startswith(f"{tiny_run.run_id} is up to date: ")
+
+
 @pytest.mark.parametrize("command", ["list", "show", "explain", "delete"])
 def test_every_command_of_the_catalog_answers_about_the_run(tiny_run, command):
     names = {"list": ("runs",), "delete": (tiny_run.run_id, "--dry-run")}

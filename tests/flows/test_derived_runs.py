@@ -58,7 +58,9 @@ def test_a_changed_run_leads_back_and_leaves_its_source_alone(own_run, derive):
     assert torch.equal(after.gaussians.sh_dc, before.gaussians.sh_dc + 0.5)
     shown = succeed("catalog", "show", result["run_id"], "--json", store=own_run.store).json
     assert shown["derived_from"] == own_run.run_id
-    explained = succeed("catalog", "explain", result["run_id"], store=own_run.store).out
+    words = ("catalog", "explain", result["run_id"])
+    assert "is up to date" in succeed(*words, store=own_run.store).out
+    explained = succeed(*words, "--verbose", store=own_run.store).out
     assert f"derived_from: {own_run.run_id}" in explained
 
 

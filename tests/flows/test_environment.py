@@ -2,7 +2,11 @@ import os
 
 import pytest
 
-from flows.environment import prepare_environment
+from catalog.errors import CatalogError
+from catalog.folders import home_folder
+from catalog.store import open_store
+from flows.cli.main import main
+from flows.environment import keep_prefect_in, prepare_environment
 from tasks.job_limits import usable_cores
 
 
@@ -26,3 +30,47 @@ def test_thread_count_of_the_user_stays():
     os.environ["NUMBA_NUM_THREADS"] = "7"
     prepare_environment()
     assert os.environ["NUMBA_NUM_THREADS"] == "7"
+
+
+@pytest.mark.usefixtures("bare_environment")
+@pytest.mark.parametrize("known", ["", "intranet.example, localhost"])
+def test_own_servers_are_reached_past_a_proxy(known):
+    os.environ["http_proxy"] = "http://127.0.0.1:9"
+    os.environ["no_proxy"] = known
+    prepare_environment()
+    hosts = os.environ["no_proxy"].split(",")
+    own = {"127.0.0.1", "localhost", "::1"}
+    assert sorted(hosts) == sorted({"intranet.example", *own} if known else own)
+    assert os.environ["NO_PROXY"] == os.environ["no_proxy"]
+
+
+@pytest.mark.usefixtures("bare_environment")
+def test_prefect_lives_in_the_store_of_who_has_no_home_and_has_not_said_where(tmp_path):
+    os.environ.pop("PREFECT_HOME", None)
+    os.environ["HOME"] = str(tmp_path)
+    keep_prefect_in(str(tmp_path / "one"))
+    assert "PREFECT_HOME" not in os.environ
+    os.environ["HOME"] = str(tmp_path / "none")
+    keep_prefect_in(str(tmp_path / "one"))
+    assert os.environ["PREFECT_HOME"] == str(tmp_path / "one" / "prefect")
+    keep_prefect_in(str(tmp_path / "two"))
+    assert os.environ["PREFECT_HOME"] == str(tmp_path / "two" / "prefect")
+    os.environ["PREFECT_HOME"] = "/mine"
+    keep_prefect_in(str(tmp_path / "one"))
+    assert os.environ["PREFECT_HOME"] == "/mine"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_who_has_neither_home_nor_name_is_served(bare_environment, monkeypatch, capsys):  # noqa: ARG001
+    for name in ("HOME", "XDG_CACHE_HOME"):
+        os.environ.pop(name, None)
+
+    def nobody(_number):
+        raise KeyError("uid not found")
+
+    monkeypatch.setattr("pwd.getpwuid", nobody)
+    assert home_folder() is None
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("lidarpainter ")
+    with pytest.raises(CatalogError, match="~/store: there is no home folder, expected HOME"):
+        open_store("~/store")

@@ -1,12 +1,24 @@
-"""Every command's help has an example, and the examples are words that the command knows."""
+"""Help stands alone: an example of known words, and a sentence with the values of each option."""
 
+import re
 import shlex
+from typing import Literal, get_args, get_origin
 
 import pytest
 import typer
 from commands import succeed
 
+from catalog.asset_queries import SIDES
+from catalog.schemas import TABLES
+from flows.cli.evaluate import PROTOCOLS
 from flows.cli.main import app
+from flows.measure.configurations import chart_ways, size_factors
+from flows.presets import PRESETS, preset
+from lidarpainter_models.conditioning.settings import PreviousUse
+from lidarpainter_models.export.formats import FORMAT_NAMES, FORMATS
+from lidarpainter_models.geometry.trajectory_words import KINDS
+from lidarpainter_models.painter.styles import STYLE_PROMPTS
+from lidarpainter_models.stress.causes import CAUSES
 
 
 def commands(group, *path):
@@ -21,6 +33,27 @@ def commands(group, *path):
 
 
 COMMANDS = commands(typer.main.get_command(app))
+GIVEN = preset("preview", "dataset/sequence")
+SENTENCE = re.compile(r"[A-Z][^\n]*[.]")
+TYPERS_OWN = ("install_completion", "show_completion")
+VALUES = {
+    "--preset": PRESETS,
+    "--format": FORMAT_NAMES,
+    "--split": ("alternate", "forward:17:8", "all"),
+    "--previous": get_args(PreviousUse)[1:],
+    "--device": ("auto", "cpu", "cuda", "cuda:N"),
+    "--trajectory": KINDS,
+    "--beside": ("recorded", "unpainted"),
+    "--prompt": STYLE_PROMPTS,
+    "--protocol": PROTOCOLS,
+    "table": TABLES,
+    ("assets", "export", "--format"): [row.name for row in FORMATS if row.takes_assets],
+    ("assets", "list", "--sides"): SIDES,
+    ("chart", "--only"): [way.name for way in chart_ways(GIVEN)],
+    ("size", "--only"): [factor.name for factor in size_factors(GIVEN)],
+    ("stress", "--only"): CAUSES,
+}
+"""What options take that is a list somewhere; an argument is called by its name."""
 
 
 def examples(command):
@@ -45,9 +78,31 @@ def test_help_has_an_example_of_known_words(path):
 
 
 @pytest.mark.parametrize("path", COMMANDS, ids=" ".join)
-def test_every_option_says_what_it_is(path):
-    assert [one.name for one in COMMANDS[path].params if not one.help] == []
+def test_every_option_says_in_a_sentence_what_it_is(path):
+    for one in COMMANDS[path].params:
+        text = one.help or ""
+        assert SENTENCE.fullmatch(text), (one.name, text)
+        assert len(text.split()) > 2, (one.name, text)
+        assert [name for name in values_of(path, one) if not names(text, name)] == [], one.name
     assert "Example" in succeed(*path, "--help").out
+
+
+def test_global_options_say_in_a_sentence_what_they_are():
+    for one in typer.main.get_command(app).params:
+        assert one.name in TYPERS_OWN or SENTENCE.fullmatch(one.help), one.name
+
+
+def values_of(path, option):
+    """The values that an option takes, where they are a list."""
+    annotation, name = option.type_descriptor.annotation, max(option.opts, key=len)
+    if get_origin(annotation) is Literal:
+        return get_args(annotation)
+    return VALUES.get((*path, name), VALUES.get(name, ()))
+
+
+def names(text, value):
+    """Whether a text names a value as a word of its own."""
+    return re.search(rf"(?<![\w-]){re.escape(value)}(?![\w-])", text)
 
 
 @pytest.mark.parametrize(

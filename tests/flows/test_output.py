@@ -20,7 +20,8 @@ from tasks.progress import listener
         (True, "yes"),
         (29.53449, "29.534"),
         (7, "7"),
-        ("a[bold]", "a\\[bold]"),
+        ("a[bold]", "a[bold]"),
+        ("", "-"),
     ],
 )
 def test_cells_are_short_and_never_markup(value, expected):
@@ -39,11 +40,47 @@ def test_json_stays_json_where_a_number_is_infinite(capsys):
     assert json.loads(capsys.readouterr().out) == {"psnr": None, "views": [1, None]}
 
 
-def test_a_table_shows_every_cell(capsys):
-    print_table("scores", ["view", "psnr"], [["left-2m", 24.5], ["[x]", None]], "in dB")
-    print_pairs("run", {"run": "abc"})
+def test_json_takes_few_lines(capsys):
+    result = {"short": [1, 2], "views": {f"view-{number}": [number / 3] * 3 for number in range(9)}}
+    print_json(result)
     out = capsys.readouterr().out
-    assert all(word in out for word in ("scores", "left-2m", "24.500", "[x]", "in dB", "abc"))
+    assert json.loads(out) == result
+    assert out.startswith('{\n  "short": [1, 2],\n  "views": {\n    "view-0": [0.0, 0.0, 0.0],\n')
+    assert len(out.splitlines()) == 14
+
+
+def test_a_table_shows_every_cell_under_words_with_units(capsys):
+    print_table("scores", ["view", "psnr"], [["left-2m", 24.5], ["[x]", None]], "in dB")
+    print_pairs("run", {"run_id": "abc", "error": None, "num_bytes": 1500})
+    assert capsys.readouterr().out.splitlines() == [
+        "scores",
+        "view     PSNR, dB, higher is better",
+        "-------  --------------------------",
+        "left-2m                      24.500",
+        "[x]                               -",
+        "in dB",
+        "run",
+        "  run   abc",
+        "  size  1.5 kB",
+    ]
+
+
+def test_a_table_fits_and_breaks_between_words(capsys):
+    reason = "what is said about this row takes far more room than one line of a terminal has"
+    rows = [["interpolated poses", reason, None, 1.0], ["recorded", "short", None, 2.0]]
+    print_table("wide", ["view", "reason", "error", "flicker"], rows, num_text_columns=3)
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert "error" not in lines[1]
+    words = " ".join(lines).split()
+    assert {*reason.split(), "interpolated", "flicker,"} <= set(words)
+
+
+def test_a_table_that_cannot_fit_is_told_row_by_row(capsys):
+    path = "/a/path/" + "x" * 90
+    print_table("files", ["path", "num_gaussians"], [[path, 3], ["/b", None]])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines == ["files", "", f"  path       {path}", "  Gaussians  3", "", "  path  /b"]
 
 
 def test_lines_say_how_a_stage_ended(capsys):

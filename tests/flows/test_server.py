@@ -12,6 +12,7 @@ import pytest
 
 from flows.environment import prepare_environment
 
+PROXIES = dict.fromkeys(("http_proxy", "https_proxy", "all_proxy"), "http://127.0.0.1:9")
 ROOT = Path(__file__).resolve().parents[2]
 FLOW = """
 import sys, time
@@ -42,8 +43,10 @@ def answers(api: str) -> bool:
 
 
 def start_flow(tmp_path, seconds):
-    environment = {**os.environ, "PREFECT_HOME": str(tmp_path / "prefect")}
-    environment.pop("PREFECT_API_URL", None)
+    """Start a flow in a process of its own, on a machine behind a proxy."""
+    environment = {**os.environ, **PROXIES, "PREFECT_HOME": str(tmp_path / "prefect")}
+    for name in ("PREFECT_API_URL", "no_proxy", "NO_PROXY"):
+        environment.pop(name, None)
     return subprocess.Popen(
         [sys.executable, "-c", FLOW, str(tmp_path / "server.log"), str(seconds)],
         stdout=subprocess.PIPE,

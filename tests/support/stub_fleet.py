@@ -75,7 +75,7 @@ def stub_worker(root, fleet, say=lambda _line: None):
 
 def stub_starter(root, fleet, _threads):
     """In place of `flows.fleet.local_workers.starter`."""
-    from flows.children import start_child
+    from flows.server import start_child
 
     def start(number):
         path = log_path(Path(root), fleet, number)

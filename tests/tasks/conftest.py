@@ -16,6 +16,7 @@ from tasks.reconstruction.publish import begin_run, complete_run
 from tasks.reconstruction.report import REPORT_FILE, ReportInputs, write_report
 from tasks.runs import open_run
 from tasks.specs import FittedRef
+from tasks.views.render import ViewedRun
 
 
 @pytest.fixture(scope="package")
@@ -118,3 +119,14 @@ def run(store, parameters, stages, final):
     refs = tuple(stage.ref for stage in stages.values())
     complete_run.fn(store.root, record, result, scores, refs)
     return open_run(store, record.run_id)
+
+
+@pytest.fixture(scope="package")
+def viewed(store, run, parameters):
+    """The run as stages that show it are given it."""
+    return ViewedRun(
+        run=parameters.run_spec(store.root),
+        fitted=run.final,
+        observation=parameters.observation,
+        conditions=parameters.conditions,
+    )

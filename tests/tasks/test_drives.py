@@ -17,6 +17,7 @@ from websockets.sync.client import connect
 
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.evaluation.shown import ViewTimePainting
+from lidarpainter_models.export.view_requests import ViewRequest
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.geometry.transforms import invert_rigid, quaternion_from_rotation
 from lidarpainter_models.viewing import servers
@@ -25,23 +26,15 @@ from lidarpainter_models.viewing.controls import CLICK_HINT
 from lidarpainter_models.viewing.drive_nodes import SEAT_FROM_CAMERA
 from lidarpainter_models.viewing.servers import local_server
 from lidarpainter_models.viewing.viewer import LiveViewer
-from tasks.views.drive import DriveRequest, shown_drive, write_page
-from tasks.views.render import RenderRequest
+from tasks.views.drive import shown_drive, write_page
+
+RECORDED = ViewRequest(trajectory=parse_trajectory("recorded"))
 
 
 @pytest.fixture(scope="module")
-def wanted(run, parameters):
-    view = RenderRequest(
-        trajectory=parse_trajectory("recorded"),
-        observation=parameters.observation,
-        conditions=parameters.conditions,
-    )
-    return DriveRequest(view=view, scenes={"painted": run.final, "before painting": run.unpainted})
-
-
-@pytest.fixture(scope="module")
-def drive(store, parameters, wanted):
-    return shown_drive(parameters.run_spec(store.root), wanted)
+def drive(run, viewed):
+    scenes = {"painted": run.final, "before painting": run.unpainted}
+    return shown_drive(viewed, RECORDED, scenes)
 
 
 @pytest.fixture(scope="module")
@@ -289,12 +282,9 @@ def test_viser_that_would_let_other_pages_in_is_refused(monkeypatch):
     another.stop.assert_called_once()
 
 
-def test_page_drives_the_recorded_path_and_one_beside_it(
-    store, parameters, wanted, tmp_path, capfd
-):
+def test_page_drives_the_recorded_path_and_one_beside_it(viewed, tmp_path, capfd):
     out = tmp_path / "drive.html"
-    run = parameters.run_spec(store.root)
-    made = write_page.fn(run, wanted, out)
+    made = write_page.fn(viewed, RECORDED, out)
     page = out.read_text("utf-8")
     assert made["bytes"] == len(page) < 2_000_000
     assert "<title>LidarPainter: toy/street</title>" in page
@@ -302,7 +292,6 @@ def test_page_drives_the_recorded_path_and_one_beside_it(
     assert capfd.readouterr().out == ""
 
 
-def test_page_along_no_camera_is_refused(store, parameters, wanted):
-    run = parameters.run_spec(store.root)
+def test_page_along_no_camera_is_refused(run, viewed):
     with pytest.raises(SceneError, match="no camera"):
-        shown_drive(run, replace(wanted, view=replace(wanted.view, camera="rear")))
+        shown_drive(viewed, replace(RECORDED, camera="rear"), {"painted": run.final})

@@ -7,11 +7,11 @@ import pytest
 import torch
 from chromium import NO_WEBGL, Chromium, found_browser, until
 
+from lidarpainter_models.export.view_requests import ViewRequest
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.viewing.annotations import vertical_fov_rad
 from lidarpainter_models.viewing.viewer import live_viewer
-from tasks.views.drive import DriveRequest, shown_drive, write_page
-from tasks.views.render import RenderRequest
+from tasks.views.drive import shown_drive, write_page
 
 pytestmark = pytest.mark.slow
 WIDTH_PX, HEIGHT_PX = 480, 270
@@ -24,26 +24,19 @@ def _a_browser_is_here():
     found_browser()
 
 
+RECORDED = ViewRequest(trajectory=parse_trajectory("recorded"))
+
+
 @pytest.fixture(scope="module")
-def wanted(run, parameters):
-    view = RenderRequest(
-        trajectory=parse_trajectory("recorded"),
-        observation=parameters.observation,
-        conditions=parameters.conditions,
-    )
+def drive(run, viewed):
     scenes = {"painted": run.final, "before painting": run.unpainted}
-    return DriveRequest(view=view, scenes=scenes)
+    return shown_drive(viewed, RECORDED, scenes)
 
 
 @pytest.fixture(scope="module")
-def asked(store, parameters):
-    return parameters.run_spec(store.root)
-
-
-@pytest.fixture(scope="module")
-def page(asked, wanted, tmp_path_factory):
+def page(viewed, tmp_path_factory):
     out = tmp_path_factory.mktemp("page") / "drive.html"
-    write_page.fn(asked, wanted, out)
+    write_page.fn(viewed, RECORDED, out)
     return out
 
 
@@ -70,8 +63,7 @@ def psnr(drive, camera, view, rgb):
     return float(-10 * error.log10())
 
 
-def test_live_viewer_shows_what_the_renderer_shows_wherever_the_panel_says(asked, wanted, tmp_path):
-    drive = shown_drive(asked, wanted)
+def test_live_viewer_shows_what_the_renderer_shows_wherever_the_panel_says(drive, tmp_path):
     with (
         live_viewer(drive, None, label="toy", port=0) as (viewer, address),
         browser(tmp_path) as chromium,
@@ -88,8 +80,7 @@ def test_live_viewer_shows_what_the_renderer_shows_wherever_the_panel_says(asked
             until(agrees)
 
 
-def test_page_from_the_disk_plays_and_asks_nobody(page, wanted, asked, tmp_path):
-    drive = shown_drive(asked, wanted)
+def test_page_from_the_disk_plays_and_asks_nobody(page, drive, tmp_path):
     with browser(tmp_path) as chromium:
         chromium.open(page.as_uri())
         camera, view = drive.path.camera(0), drive.path.views[0]

@@ -10,16 +10,17 @@ import pytest
 
 from lidarpainter_models.conditioning.view_evidence import EvidenceGatherer
 from lidarpainter_models.errors import ConfigError, SceneError, WriteError
+from lidarpainter_models.export.formats import export_format
+from lidarpainter_models.export.view_requests import ViewKinds, ViewRequest
 from lidarpainter_models.gaussians.model.instance_images import SKY
 from lidarpainter_models.gaussians.model.ply_files import read_ply
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
-from tasks.exports.dataset import DatasetRequest, export_dataset
+from tasks.exports.dataset import export_dataset
 from tasks.exports.scene import SceneRequest, export_scene
 from tasks.exports.sweeps import export_sweeps
 from tasks.exports.views import export_images, export_video
 from tasks.stored import load_scene
-from tasks.views.files import ViewKinds
-from tasks.views.render import RenderRequest, render
+from tasks.views.render import render
 
 
 @pytest.fixture
@@ -28,15 +29,9 @@ def asked(store, run, parameters):
     return parameters.run_spec(store.root), run.final
 
 
-@pytest.fixture
-def view(parameters):
-    """Two views a metre to the left."""
-    return RenderRequest(
-        trajectory=parse_trajectory("lateral:1"),
-        frames=slice(1, 3),
-        observation=parameters.observation,
-        conditions=parameters.conditions,
-    )
+VIEW = ViewRequest(trajectory=parse_trajectory("lateral:1"), frames=slice(1, 3))
+"""Two views a metre to the left."""
+PLY = export_format("ply")
 
 
 @pytest.mark.parametrize(
@@ -45,7 +40,7 @@ def view(parameters):
 )
 def test_a_scene_is_written_and_says_what_is_lost(asked, tmp_path, wanted, ending, least_db):
     out = tmp_path / "made" / f"street.{ending}"
-    made = export_scene.fn(*asked, SceneRequest(format=wanted, frame=2), out)
+    made = export_scene.fn(*asked, export_format(wanted), SceneRequest(frame=2), out)
     assert made["path"] == str(out)
     assert made["num_bytes"] == out.stat().st_size
     assert made["num_actors"] == 1
@@ -54,8 +49,7 @@ def test_a_scene_is_written_and_says_what_is_lost(asked, tmp_path, wanted, endin
 
 
 def test_actors_stand_in_files_of_their_own(store, asked, tmp_path):
-    request = SceneRequest(format="ply", is_per_actor=True)
-    export_scene.fn(*asked, request, tmp_path / "parts")
+    export_scene.fn(*asked, PLY, SceneRequest(is_per_actor=True), tmp_path / "parts")
     names = sorted(path.name for path in (tmp_path / "parts").iterdir())
     assert names == ["actor-000.ply", "street.ply"]
     scene = load_scene(store, asked[1].gaussians)
@@ -66,7 +60,7 @@ def test_actors_stand_in_files_of_their_own(store, asked, tmp_path):
 
 
 def test_chosen_actors_are_not_called_a_loss(asked, tmp_path):
-    made = export_scene.fn(*asked, SceneRequest(format="ply", actors=()), tmp_path / "a.ply")
+    made = export_scene.fn(*asked, PLY, SceneRequest(actors=()), tmp_path / "a.ply")
     assert (made["num_actors"], made["psnr"]) == (0, None)
 
 
@@ -78,7 +72,6 @@ def test_chosen_actors_are_not_called_a_loss(asked, tmp_path):
         ({"frame": 99}, "a.ply", ConfigError, "--time frame:99: expected 0 to 3"),
         ({}, "a.obj", ConfigError, r"a\.obj: expected a name in \.ply"),
         ({"actors": (), "is_per_actor": True}, "a", SceneError, "leave --per-actor out"),
-        ({"format": "gltf", "is_per_actor": True}, "a", ConfigError, "not as gltf"),
         ({}, "file/a.ply", WriteError, "cannot be written"),
         ({"is_per_actor": True}, "full", ConfigError, "is there already"),
     ],
@@ -87,17 +80,14 @@ def test_what_cannot_be_written_is_refused(asked, tmp_path, changes, name, error
     (tmp_path / "file").touch()
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "kept").touch()
-    request = SceneRequest(**{"format": "ply", **changes})
     with pytest.raises(error, match=complaint):
-        export_scene.fn(*asked, request, tmp_path / name)
+        export_scene.fn(*asked, PLY, SceneRequest(**changes), tmp_path / name)
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "full", "kept"]
 
 
 @pytest.mark.parametrize("wanted", ["colmap", "nerfstudio"])
-def test_a_data_set_has_recorded_images_and_views_beside(asked, view, tmp_path, wanted):
-    recorded = replace(view, trajectory=parse_trajectory("recorded"))
-    request = DatasetRequest(format=wanted, recorded=recorded, beside=view)
-    made = export_dataset.fn(*asked, request, tmp_path / "set")
+def test_a_data_set_has_recorded_images_and_views_beside(viewed, tmp_path, wanted):
+    made = export_dataset.fn(viewed, VIEW, export_format(wanted), tmp_path / "set")
     assert (made["num_recorded"], made["num_images"]) == (2, 4)
     if wanted == "colmap":
         found = pycolmap.Reconstruction(tmp_path / "set" / "sparse" / "0")
@@ -110,13 +100,14 @@ def test_a_data_set_has_recorded_images_and_views_beside(asked, view, tmp_path, 
     assert folders == ["front", "front_lateral-1"]
     for name in names:
         assert cv2.imread(str(tmp_path / "set" / "images" / name)) is not None
+    render_recorded = replace(VIEW, trajectory=parse_trajectory("recorded"), is_painted=True)
     with pytest.raises(ConfigError, match="recorded images are taken as they are"):
-        replace(request, beside=recorded)
+        export_dataset.fn(viewed, render_recorded, export_format(wanted), tmp_path / "other")
 
 
-def test_depth_and_semantics_say_the_same_of_the_sky(asked, view, tmp_path):
+def test_depth_and_semantics_say_the_same_of_the_sky(viewed, tmp_path):
     kinds = ViewKinds(images=False, depth=True, semantics=True)
-    made = export_images.fn(*asked, replace(view, kinds=kinds), tmp_path / "maps")
+    made = export_images.fn(viewed, replace(VIEW, kinds=kinds), tmp_path / "maps")
     assert made["num_images"] == 2
     depth = cv2.imread(str(tmp_path / "maps" / "depth" / "0001.png"), cv2.IMREAD_UNCHANGED)
     who = cv2.imread(str(tmp_path / "maps" / "semantics" / "0001.png"), cv2.IMREAD_UNCHANGED)
@@ -127,33 +118,33 @@ def test_depth_and_semantics_say_the_same_of_the_sky(asked, view, tmp_path):
     assert not (tmp_path / "maps" / "0001.png").exists()
 
 
-def test_a_film_shows_the_recording_to_the_left(asked, view, tmp_path):
+def test_a_film_shows_the_recording_to_the_left(viewed, tmp_path):
     kinds = ViewKinds(images=False, video=True, fps=4.0)
-    request = replace(view, kinds=kinds, beside="recorded")
-    made = export_video.fn(*asked, request, tmp_path / "a.mp4")
+    request = replace(VIEW, kinds=kinds, beside="recorded")
+    made = export_video.fn(viewed, request, tmp_path / "a.mp4")
     film = cv2.VideoCapture(str(tmp_path / "a.mp4"))
     assert (made["fps"], film.get(cv2.CAP_PROP_FRAME_COUNT)) == (4.0, 2)
     assert film.get(cv2.CAP_PROP_FRAME_WIDTH) == 240  # twice the width of the fit
     with pytest.raises(ConfigError, match=r"a\.avi: expected a name in \.mp4"):
-        export_video.fn(*asked, request, tmp_path / "a.avi")
+        export_video.fn(viewed, request, tmp_path / "a.avi")
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
 
 
 @pytest.mark.parametrize(("wanted", "ending"), [("lidar", ".pcd"), ("lidar-bin", ".pcd.bin")])
 def test_recorded_sweeps_come_with_their_poses(asked, tmp_path, wanted, ending):
-    made = export_sweeps.fn(asked[0], wanted, slice(0, 2), tmp_path / "sweeps")
+    made = export_sweeps.fn(asked[0], export_format(wanted), slice(0, 2), tmp_path / "sweeps")
     listed = json.loads((tmp_path / "sweeps" / "sweeps.json").read_text())["sweeps"]
     assert (made["num_sweeps"], len(listed)) == (2, 2)
     assert all((tmp_path / "sweeps" / row["file"]).name.endswith(ending) for row in listed)
     with pytest.raises(SceneError, match="no LiDAR sweep is left"):
-        export_sweeps.fn(asked[0], wanted, slice(90, 99), tmp_path / "none")
+        export_sweeps.fn(asked[0], export_format(wanted), slice(90, 99), tmp_path / "none")
     assert not (tmp_path / "none").exists()
 
 
-def test_renders_come_with_film_depth_semantics_and_a_companion(asked, view, tmp_path):
+def test_renders_come_with_film_depth_semantics_and_a_companion(viewed, tmp_path):
     kinds = ViewKinds(depth=True, semantics=True, video=True)
-    request = replace(view, kinds=kinds, beside=asked[1])
-    made = render.fn(*asked, request, tmp_path)
+    with_other = replace(viewed, beside=viewed.fitted)
+    made = render.fn(with_other, replace(VIEW, kinds=kinds), tmp_path)
     assert made["fps"] == pytest.approx(10, abs=0.1)
     row = json.loads((tmp_path / "trajectory.json").read_text())["images"][0]
     for kind in ("file", "depth", "semantics", "beside"):
@@ -162,21 +153,19 @@ def test_renders_come_with_film_depth_semantics_and_a_companion(asked, view, tmp
     np.testing.assert_array_equal(pair[:, :120], pair[:, 120:])  # the other run is this one
     assert (tmp_path / "video.mp4").is_file()
     with pytest.raises(ConfigError, match="--beside unpainted needs a painter"):
-        replace(view, beside="unpainted")
+        replace(VIEW, beside="unpainted")
 
 
-def test_images_say_how_far_they_can_be_trusted_and_films_do_not_ask(
-    asked, view, tmp_path, monkeypatch
-):
+def test_images_say_how_far_they_can_be_trusted_and_films_do_not_ask(viewed, tmp_path, monkeypatch):
     asks = []
     gathered = EvidenceGatherer.of
     monkeypatch.setattr(
         EvidenceGatherer, "of", lambda *words, **named: asks.append(1) or gathered(*words, **named)
     )
-    render.fn(*asked, view, tmp_path / "images")
+    render.fn(viewed, VIEW, tmp_path / "images")
     rows = json.loads((tmp_path / "images" / "trajectory.json").read_text())["images"]
     assert len(asks) == len(rows)
     assert all(0 <= row["confidence"] <= 1 for row in rows)
-    film = replace(view, kinds=ViewKinds(images=False, video=True))
-    export_video.fn(*asked, film, tmp_path / "drive.mp4")
+    film = replace(VIEW, kinds=ViewKinds(images=False, video=True))
+    export_video.fn(viewed, film, tmp_path / "drive.mp4")
     assert len(asks) == len(rows)

@@ -8,22 +8,22 @@ import pytest
 
 from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.export.styled_views import StyleRequest
+from lidarpainter_models.export.view_requests import ViewRequest
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.weather.mix import StyleMix
-from tasks.views.render import RenderRequest, render
-from tasks.views.stylize import StylizeRequest, stylize
+from tasks.views.render import render
+from tasks.views.stylize import stylize
 
 
 @pytest.mark.parametrize("is_painted", [False, True])
-def test_a_run_is_rendered_where_nobody_drove(store, run, parameters, tmp_path, is_painted):
-    request = RenderRequest(
+def test_a_run_is_rendered_where_nobody_drove(viewed, tmp_path, is_painted):
+    request = ViewRequest(
         trajectory=parse_trajectory("lane-change:2+up:0.5"),
         frames=slice(1, 3),
         is_painted=is_painted,
-        observation=parameters.observation,
-        conditions=parameters.conditions,
     )
-    made = render.fn(parameters.run_spec(store.root), run.final, request, tmp_path)
+    made = render.fn(viewed, request, tmp_path)
     assert made["num_images"] == 2
     described = json.loads((tmp_path / "trajectory.json").read_text())
     assert [row["file"] for row in described["images"]] == ["0001.png", "0002.png"]
@@ -35,15 +35,13 @@ def test_a_run_is_rendered_where_nobody_drove(store, run, parameters, tmp_path, 
 
 
 @pytest.mark.parametrize("images", ["rendered", "recorded"])
-def test_a_run_is_shown_in_fog_beside_the_clear_images(store, run, parameters, tmp_path, images):
-    view = RenderRequest(
+def test_a_run_is_shown_in_fog_beside_the_clear_images(viewed, tmp_path, images):
+    view = ViewRequest(
         trajectory=parse_trajectory("recorded"),
         frames=slice(1, 3),
-        observation=parameters.observation,
-        conditions=parameters.conditions,
     )
-    request = StylizeRequest(mix=StyleMix.parse("foggy"), view=view, images=images)
-    made = stylize.fn(parameters.run_spec(store.root), run.final, request, tmp_path / "a")
+    style = StyleRequest(mix=StyleMix.parse("foggy"), images=images)
+    made = stylize.fn(viewed, view, style, tmp_path / "a")
     assert made["num_images"] == 2
     assert 0.5 < made["edge_f1"] <= 1
     described = json.loads((tmp_path / "a" / "trajectory.json").read_text())
@@ -52,37 +50,33 @@ def test_a_run_is_shown_in_fog_beside_the_clear_images(store, run, parameters, t
         cv2.imread(str(tmp_path / "a" / name)) for name in ("0001.png", "clear/0001.png")
     )
     assert float(foggy.std()) < float(clear.std())
-    stylize.fn(parameters.run_spec(store.root), run.final, request, tmp_path / "b")
+    stylize.fn(viewed, view, style, tmp_path / "b")
     again = (tmp_path / "b" / "0001.png").read_bytes()
     assert again == (tmp_path / "a" / "0001.png").read_bytes()
 
 
-def test_a_painter_is_asked_for_the_prompt(store, run, parameters, tmp_path):
-    request = RenderRequest(
+def test_a_painter_is_asked_for_the_prompt(viewed, tmp_path):
+    request = ViewRequest(
         trajectory=parse_trajectory("recorded"),
         frames=slice(1, 2),
         is_painted=True,
         prompt="foggy",
-        observation=parameters.observation,
-        conditions=parameters.conditions,
     )
     with pytest.raises(ConfigError, match="knows no prompt 'foggy', only: clear"):
-        render.fn(parameters.run_spec(store.root, painter="nano"), run.final, request, tmp_path)
+        render.fn(replace(viewed, run=replace(viewed.run, painter="nano")), request, tmp_path)
     with pytest.raises(ConfigError, match="prompt 'foggy' needs a painter"):
         replace(request, is_painted=False)
 
 
-def test_a_path_is_painted_with_the_previous_image_mixed_in(store, run, parameters, tmp_path):
-    plain = RenderRequest(
+def test_a_path_is_painted_with_the_previous_image_mixed_in(viewed, tmp_path):
+    plain = ViewRequest(
         trajectory=parse_trajectory("lateral:1"),
         frames=slice(0, 3),
         is_painted=True,
-        observation=parameters.observation,
-        conditions=parameters.conditions,
     )
     mixed = replace(plain, sequence=SequenceConfig(previous="mixed"))
     for name, request in (("plain", plain), ("mixed", mixed)):
-        render.fn(parameters.run_spec(store.root), run.final, request, tmp_path / name)
+        render.fn(viewed, request, tmp_path / name)
     same = [
         (tmp_path / "plain" / name).read_bytes() == (tmp_path / "mixed" / name).read_bytes()
         for name in ("0000.png", "0001.png", "0002.png")
@@ -92,43 +86,37 @@ def test_a_path_is_painted_with_the_previous_image_mixed_in(store, run, paramete
         replace(mixed, is_painted=False)
 
 
-def test_recorded_images_exist_only_where_somebody_stood(parameters):
-    view = RenderRequest(
+def test_recorded_images_exist_only_where_somebody_stood():
+    view = ViewRequest(
         trajectory=parse_trajectory("lateral:2"),
-        observation=parameters.observation,
-        conditions=parameters.conditions,
     )
     with pytest.raises(ConfigError, match="on the recorded trajectory"):
-        StylizeRequest(mix=StyleMix.parse("foggy"), view=view, images="recorded")
+        StyleRequest(mix=StyleMix.parse("foggy"), images="recorded").check(view)
     with pytest.raises(ConfigError, match="no images 'drawn'"):
-        StylizeRequest(mix=StyleMix.parse("foggy"), view=view, images="drawn")
+        StyleRequest(mix=StyleMix.parse("foggy"), images="drawn")
 
 
-def test_an_unknown_camera_is_named_before_anything_is_drawn(store, run, parameters, tmp_path):
-    request = RenderRequest(
+def test_an_unknown_camera_is_named_before_anything_is_drawn(viewed, tmp_path):
+    request = ViewRequest(
         trajectory=parse_trajectory("recorded"),
         camera="back",
-        observation=parameters.observation,
-        conditions=parameters.conditions,
     )
     with pytest.raises(SceneError, match="has no camera 'back', it has front"):
-        render.fn(parameters.run_spec(store.root), run.final, request, tmp_path)
+        render.fn(viewed, request, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_path_into_a_wall_is_refused_unless_that_is_wanted(store, run, parameters, tmp_path):
+def test_a_path_into_a_wall_is_refused_unless_that_is_wanted(viewed, tmp_path):
     places = tmp_path / "places.csv"
     places.write_text("x_m,y_m,yaw_deg\n0,0,0\n20,-4,0\n")  # the wall is at 20 m
-    request = RenderRequest(
+    request = ViewRequest(
         trajectory=parse_trajectory(f"waypoints:{places}"),
-        observation=parameters.observation,
-        conditions=parameters.conditions,
     )
-    spec, out = parameters.run_spec(store.root), tmp_path / "out"
+    out = tmp_path / "out"
     with pytest.raises(ConfigError, match=r"leads the camera into a wall: \d+ LiDAR points from"):
-        render.fn(spec, run.final, request, out)
+        render.fn(viewed, request, out)
     assert not out.exists()
-    made = render.fn(spec, run.final, replace(request, allows_collisions=True), out)
+    made = render.fn(viewed, replace(request, allows_collisions=True), out)
     assert made["collisions"][0]["obstacle"] == "points"
     described = json.loads((out / "trajectory.json").read_text())
     assert described["collisions"] == made["collisions"]

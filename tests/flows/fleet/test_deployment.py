@@ -11,7 +11,7 @@ from production_services import NO_POSTGRES
 from stub_fleet import stub_ledger, write_stub_manifest
 from stub_stages import write_inputs
 
-from flows.fleet.deployment import deploy
+from flows.fleet.deployed import deploy
 from lidarpainter_models.errors import ConfigError
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "docs" / "examples" / "deploy"
@@ -59,7 +59,7 @@ def test_without_a_schedule_it_fires_once_now(client, tmp_path):
     ("words", "said"),
     [
         (["--deploy"], "expected PREFECT_API_URL to name the API"),
-        (["--cron", "0 3 * * *"], "--cron and --pool go with --deploy"),
+        (["--cron", "0 3 * * *"], "--cron needs --deploy"),
     ],
 )
 def test_what_cannot_be_deployed_is_refused_in_one_line(words, said, tmp_path, monkeypatch):

@@ -12,9 +12,9 @@ from catalog.attempts import Ending
 from catalog.records import MetricRecord, metric_rows
 from catalog.store import open_store
 from flows.fleet.asked import wishes
-from flows.fleet.event_log import EventLog
 from flows.fleet.manifest import read_manifest
 from flows.fleet.report import fleet_page
+from flows.fleet.worker import EventLog
 from lidarpainter_models.export.report import render_report
 from tasks.progress import listener, listening, working_on
 

@@ -6,10 +6,10 @@ from dataclasses import asdict, dataclass
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from lidarpainter_models.conditioning.followed_paths import (
@@ -21,6 +21,7 @@ from lidarpainter_models.evaluation.view_confidence import BUNDLED
 from lidarpainter_models.export.images import write_depth_png, write_index_png, write_png
 from lidarpainter_models.export.rig_images import rig_rows, tiled
 from lidarpainter_models.export.videos import images_per_second, video_file
+from lidarpainter_models.export.view_requests import RECORDING, ViewKinds
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.instance_images import SKY, STREET, instance_image
 from lidarpainter_models.geometry.cameras import Camera
@@ -28,47 +29,22 @@ from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.observations.fit_size import shrink_image
 from lidarpainter_models.scenes.records import RecordedView
-from tasks.json_files import write_json
 
-POSES_FILE = "trajectory.json"
-LEGEND_FILE = "semantics.json"
-VIDEO_FILE = "video.mp4"
 UNPAINTED_FOLDER = "unpainted"
-
-Beside = Literal["recorded", "unpainted"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViewKinds:
-    """Which files are wanted of every view."""
-
-    images: bool = True
-    depth: bool = False
-    """Camera z as 16-bit PNG, in 256ths of a metre."""
-    semantics: bool = False
-    """Who is where as 16-bit PNG, with a legend."""
-    video: bool = False
-    fps: float | None = None
-    """Images a second of the film; None takes those of the recording."""
-
-    @property
-    def has_poses(self) -> bool:
-        """Whether files are written that say where each was taken from."""
-        return self.images or self.depth or self.semantics
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Companion:
     """What is shown to the left of every image."""
 
-    beside: Beside | GaussianScene
+    beside: str | GaussianScene
     """The recording, the render before it was painted, or another scene of the same log."""
 
     def image(
         self, path: FollowedPath, camera: Camera, view: RecordedView, shown: ShownMoment
     ) -> Float[Tensor, "height width 3"]:
         """The other image, in [0, 1] and of the same size."""
-        if self.beside == "recorded":
+        if self.beside == RECORDING:
             return recorded_image(path, camera, view)
         if isinstance(self.beside, GaussianScene):
             other = self.beside.render(camera, view.timestamp_ns, camera_name=view.camera_name)
@@ -76,13 +52,29 @@ class Companion:
         return shown.rgb if shown.unpainted_rgb is None else shown.unpainted_rgb
 
 
+@dataclass(frozen=True, kw_only=True)
+class WrittenViews:
+    """What was written of the paths of a rig."""
+
+    rows: list[list[dict[str, Any]]]
+    """By path: where each view was taken, how far it can be trusted, and its files, as JSON."""
+    fps: float
+    """Images a second of films."""
+
+
 def recorded_image(
     path: FollowedPath, camera: Camera, view: RecordedView
 ) -> Float[Tensor, "height width 3"]:
-    """What was recorded at a moment, at the size of a camera."""
-    image = path.recorded.read_image(view)
+    """What was recorded at a moment, at the size of a camera; in [0, 1]."""
+    return recorded_u8(path, camera, view).float() / 255
+
+
+def recorded_u8(
+    path: FollowedPath, camera: Camera, view: RecordedView
+) -> UInt8[Tensor, "height width 3"]:
+    """What was recorded at a moment, at the size of a camera, in bytes."""
     size = {"width_px": camera.width_px, "height_px": camera.height_px}
-    return shrink_image(image, **size).float() / 255
+    return shrink_image(path.recorded.read_image(view), **size)
 
 
 def write_views(
@@ -94,12 +86,12 @@ def write_views(
     films: Sequence[Path] = (),
     together: Path | None = None,
     advanced: Callable[[], None],
-) -> list[dict[str, Any]]:
+) -> WrittenViews:
     """Write everything that is wanted of the paths of a rig, moment by moment.
 
     Args:
         paths: where to look from, a path for each camera.
-        folders: where files of each, and the poses they were taken from, are put.
+        folders: where the files of each are put.
         kinds: what is wanted.
         companion: what stands to the left in films and in `beside/`, above in `together`.
         films: one for each path; none if empty.
@@ -125,11 +117,7 @@ def write_views(
                 advanced()
             if rig is not None:
                 rig.add(_rig_image(paths, seen))
-    made = [
-        _described(path, own, kinds, folder)
-        for path, own, folder in zip(paths, rows, folders, strict=True)
-    ]
-    return [one | ({"fps": max(rates)} if kinds.video else {}) for one in made]
+    return WrittenViews(rows=rows, fps=max(rates))
 
 
 class _Written(NamedTuple):
@@ -189,19 +177,6 @@ def _ego_from_camera(path: FollowedPath) -> Float[Tensor, "4 4"]:
     view, recorded = path.views[0], path.recorded
     world_from_ego = recorded.world_from_ego[recorded.frame_position(view.frame_index)]
     return invert_rigid(world_from_ego) @ view.camera.world_from_camera
-
-
-def _described(
-    path: FollowedPath, rows: list[dict[str, Any]], kinds: ViewKinds, folder: Path
-) -> dict[str, Any]:
-    """What was made of a camera's path; where its images were taken is put beside them."""
-    collisions = [found.to_dict() for found in path.collisions()]
-    if kinds.semantics:
-        write_json(folder / LEGEND_FILE, legend(path.builder.scene))
-    if kinds.has_poses:
-        about = {"trajectory": path.trajectory.spec, "collisions": collisions}
-        write_json(folder / POSES_FILE, {**about, "images": rows})
-    return {"camera": path.camera_name, "num_images": len(rows), "collisions": collisions}
 
 
 def _write_view(
