@@ -9,6 +9,7 @@ from typing import Any
 from catalog.store import Store
 from flows.derive import Change, derive_run
 from flows.parameters import view_parameters
+from flows.style_run import STYLE
 from flows.views import render_run
 from lidarpainter_models.devices import chosen_device
 from lidarpainter_models.editing.edits import refuse_walls

@@ -66,7 +66,7 @@ def describe(name: str) -> dict[str, Any]:
     """What a painter is, what it is made of and how it was trained."""
     choice = PainterChoice.of(name)
     found = describe_painter(choice.load(torch.device("cpu")))
-    num_bytes = sum(path.stat().st_size for path in choice.files)
+    num_bytes = sum(path.stat().st_size for path in choice.row.files(name))
     return {"painter": name, "digest": choice.digest, "num_bytes": num_bytes, **found}
 
 

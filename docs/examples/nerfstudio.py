@@ -34,7 +34,7 @@ TERMS = {
 def write(folder: Path, store: Path, licence: str) -> Path:
     """Write the folder as <store>/scenes/nerfstudio/<its name>."""
     transforms = json.loads((folder / "transforms.json").read_text())
-    cloud = open3d.io.read_point_cloud(str(folder / transforms["ply_file_path"]))
+    cloud = open3d.io.read_point_cloud(folder / transforms["ply_file_path"])
     frames = _by_moment(transforms["frames"])
     origin_m = _pose(frames[0][0])[:3, 3].clone()  # the scene's world begins at the first camera
     dealt_m = torch.from_numpy(np.asarray(cloud.points)) - origin_m
@@ -125,6 +125,8 @@ def _jpeg(file: Path) -> bytes:
     if content.startswith(b"\xff\xd8"):
         return content
     pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    if pixels is None:
+        sys.exit(f"{file}: no image that can be decoded")
     return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
 
 

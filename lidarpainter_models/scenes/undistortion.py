@@ -26,7 +26,6 @@ WIDEST_DEG = 130.0
 """Across a pinhole image, at most: at 130 degrees its border has a fifth of the middle's detail."""
 NARROWEST_DEG = 5.0
 """A lens of which no more can be shown is none."""
-_INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px")
 _BORDER_POINTS = 32  # along each side: between two of them a lens bends by far less than a pixel
 _STEPS = 40  # of a bisection: a focal length to twelve digits
 
@@ -39,31 +38,45 @@ def pinhole_of(lens: Camera, distortion: Distortion) -> Camera:
     """
     if distortion.model == "none":
         return lens
-    intrinsics = tuple(float(getattr(lens, name)) for name in _INTRINSICS)
-    found = _pinhole_intrinsics(intrinsics, lens.width_px, lens.height_px, distortion)
-    return replace(lens, **dict(zip(_INTRINSICS, found, strict=True)))
+    found = _pinhole_intrinsics(_intrinsics(lens), lens.width_px, lens.height_px, distortion)
+    return _with_intrinsics(lens, found)
+
+
+Intrinsics = tuple[float, float, float, float]
+"""fx, fy, cx, cy in pixels."""
+
+
+def _intrinsics(camera: Camera) -> Intrinsics:
+    return camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px
+
+
+def _with_intrinsics(camera: Camera, intrinsics: Intrinsics) -> Camera:
+    fx_px, fy_px, cx_px, cy_px = (float(number) for number in intrinsics)
+    return replace(camera, fx_px=fx_px, fy_px=fy_px, cx_px=cx_px, cy_px=cy_px)
 
 
 @lru_cache(maxsize=64)
 def _pinhole_intrinsics(
-    intrinsics: tuple[float, ...], width_px: int, height_px: int, distortion: Distortion
-) -> tuple[float, ...]:
+    intrinsics: Intrinsics, width_px: int, height_px: int, distortion: Distortion
+) -> Intrinsics:
     """The intrinsics of `pinhole_of`, found once for all images of a camera."""
+    fx_px, fy_px, cx_px, cy_px = intrinsics
     lens = Camera(
         world_from_camera=torch.eye(4, dtype=torch.float64),
-        **dict(zip(_INTRINSICS, intrinsics, strict=True)),
+        fx_px=fx_px,
+        fy_px=fy_px,
+        cx_px=cx_px,
+        cy_px=cy_px,
         width_px=width_px,
         height_px=height_px,
     )
     matrix = _whole_image_matrix(lens, distortion)
     if matrix is not None and min(matrix[0, 0], matrix[1, 1]) > 0:
         middle = matrix[:2, 2] + 0.5
-        found = (matrix[0, 0], matrix[1, 1], *middle)
-        whole = replace(lens, **dict(zip(_INTRINSICS, map(float, found), strict=True)))
+        whole = _with_intrinsics(lens, (matrix[0, 0], matrix[1, 1], middle[0], middle[1]))
         if _is_bounded(whole) and _is_single(whole, distortion):
-            return tuple(getattr(whole, name) for name in _INTRINSICS)
-    pinhole = _middle(lens, distortion)
-    return tuple(getattr(pinhole, name) for name in _INTRINSICS)
+            return _intrinsics(whole)
+    return _intrinsics(_middle(lens, distortion))
 
 
 def undistort(

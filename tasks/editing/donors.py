@@ -91,6 +91,8 @@ def model_of(store: Store, source: ActorSource) -> ActorModel:
         return world.model_of(world.find(str(source.actor)))
     if isinstance(donor, LibraryActor):
         return read_asset(donor.path)
+    if donor is None:
+        raise ConfigError("the edited run's own actors are found in its world, not in another")
     return ActorModel.of_gaussians(read_ply(donor), CATEGORY)
 
 
