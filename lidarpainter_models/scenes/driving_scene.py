@@ -18,6 +18,7 @@ from torch import Tensor
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.geometry.driven_paths import DrivenPath
+from lidarpainter_models.scenes.own_boxes import own_places, without_own_boxes
 from lidarpainter_models.scenes.records import (
     Distortion,
     ImageRecord,
@@ -234,8 +235,12 @@ class DrivingScene:
         )
         boxes = self._stored.table("boxes")
         columns = boxes.drop_columns(["world_from_box"]).to_pydict()
-        self.tracks: tuple[ActorTrack, ...] = tracks_from_boxes(
-            columns, _poses(boxes, "world_from_box")
+        path = self.frame_timestamps_ns, self.world_from_ego
+        self.tracks: tuple[ActorTrack, ...]
+        self.tracks, self.own_boxes = without_own_boxes(
+            tracks_from_boxes(columns, _poses(boxes, "world_from_box")),
+            own_places(self.views, self.sweeps, *path),
+            *path,
         )
 
 
