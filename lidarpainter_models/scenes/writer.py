@@ -15,8 +15,6 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import torch
 from jaxtyping import Float, Integer
 from torch import Tensor
@@ -26,7 +24,7 @@ from lidarpainter_models.geometry.transforms import is_rigid
 from lidarpainter_models.scenes import schema
 from lidarpainter_models.scenes.array_writer import create_arrays
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, SweepPoints
-from lidarpainter_models.scenes.stored import content_digest, stored_digest
+from lidarpainter_models.scenes.stored import content_digest, stored_digest, write_table
 from lidarpainter_models.scenes.validation import (
     require_jpeg,
     require_label,
@@ -38,7 +36,6 @@ from lidarpainter_models.scenes.validation import (
     require_size,
     require_start,
     require_time,
-    shown,
 )
 from lidarpainter_models.storage.whole_files import storage_errors
 from lidarpainter_models.storage.whole_folders import AsideFolder
@@ -299,7 +296,9 @@ class SceneWriter:
     def _write_manifest(self) -> str:
         folder = self._aside.path
         arrays = {name: array.finish() for name, array in self._arrays.items()}
-        tables = {name: self._write_table(folder, name) for name in schema.TABLES}
+        tables = {
+            name: write_table(folder, name, self._rows[name], self._name) for name in schema.TABLES
+        }
         content = {
             "schema_version": schema.SCHEMA_VERSION,
             **self._identity,
@@ -327,18 +326,6 @@ class SceneWriter:
         }
         (folder / schema.MANIFEST_NAME).write_text(json.dumps(manifest, indent=1) + "\n", "utf-8")
         return manifest["content_digest"]
-
-    def _write_table(self, folder: Path, name: str) -> dict[str, Any]:
-        try:
-            table = pa.Table.from_pylist(self._rows[name], schema=schema.arrow_schema(name))
-        except (pa.ArrowException, TypeError, ValueError, OverflowError) as error:
-            raise DataError(
-                f"{self._name}: the table of {name} holds a value of another kind than the format "
-                f"says ({shown(str(error))})"
-            ) from None
-        pq.write_table(table, folder / f"{name}.parquet", compression="zstd")
-        # of what is stored, which an int among floats is not
-        return {"num_rows": len(table), "sha256": content_digest(table.to_pylist())}
 
     def _counts(self) -> dict[str, int]:
         return {
