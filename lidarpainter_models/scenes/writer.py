@@ -73,8 +73,7 @@ class SceneWriter:
         self._camera_names: list[str] = []
         self._lidar_names: list[str] = []
         self._seen: set[tuple[str, int, str]] = set()
-        self._box_frames: dict[tuple[str, int], int] = {}
-        """By actor and time of its box, in which frame it was."""
+        self._box_frames: dict[tuple[str, int], int] = {}  # by actor and time
         self._provenance: Mapping[str, Any] = {}
 
     def __enter__(self) -> "SceneWriter":
@@ -252,10 +251,8 @@ class SceneWriter:
             require_time(box.timestamp_ns, where)
             earlier = self._box_frames.setdefault((box.actor_id, box.timestamp_ns), frame_index)
             if earlier != frame_index:
-                raise DataError(
-                    f"{where}: its box has the time {box.timestamp_ns} ns of the one in frame "
-                    f"{earlier}, expected each label once, at the time when it holds"
-                )
+                told = f"its box has the time {box.timestamp_ns} ns of the one in frame {earlier}"
+                raise DataError(f"{where}: {told}, expected each label once, at its own time")
             length_m, width_m, height_m = box.size_m
             self._rows["boxes"].append(
                 {
