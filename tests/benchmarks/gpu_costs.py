@@ -93,7 +93,7 @@ def measure_stages(findings: Findings, device: torch.device) -> None:
         config = lp.FitConfig(steps=steps, log_every=steps)
         config = _with_gaussians(config, count)
         fitted = lp.fit_gaussians(seen, config, device=device).scene
-        name = f"{size['width_px']}x{size['height_px']}"
+        name = f"{width_px}x{height_px}"
 
         def add(what: str, run: Callable[[], object], repeats: int, of: int = 1) -> None:
             cost = cost_of(f"{what}, {name}", run, device, repeats)
