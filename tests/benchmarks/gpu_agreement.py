@@ -24,7 +24,7 @@ from lidarpainter_models.kernels.backends import (
 )
 
 CPU = torch.device("cpu")
-RASTERISERS = ("cuda", "triton")
+RASTERISERS: tuple[Backend, ...] = ("cuda", "triton")
 MOST_PSNR_DB = 0.3
 """Between two short fits: roundings split other Gaussians."""
 FIT = FitConfig(

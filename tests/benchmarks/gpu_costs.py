@@ -65,9 +65,8 @@ def _seconds(run: Callable[[], object], device: torch.device) -> float:
 def measure_rasterisers(findings: Findings, device: torch.device) -> None:
     """Images with all gradients, by every fast backend of the device."""
     is_gpu = device.type == "cuda"
-    fast: tuple[Backend, ...] = ("cuda", "triton")
-    names = [name for name in fast if name in available_backends("gaussian_raster")]
-    for backend in names if is_gpu else ["cpu"]:
+    fast: tuple[Backend, ...] = ("cuda", "triton") if is_gpu else ("cpu",)
+    for backend in [name for name in fast if name in available_backends("gaussian_raster")]:
         for size in RASTER_SIZES if is_gpu else REHEARSED_RASTER_SIZES:
             count, width_px, height_px = size
             what = f"draw and go back, {count} Gaussians, {width_px}x{height_px}, {backend}"

@@ -55,7 +55,7 @@ RATES = [0.03, 2e-3, 1e-2, 3e-2, 6e-3, 6e-4]
 class Trial:
     """A kernel's work."""
 
-    run: Callable[[str, torch.device], list[Tensor]]
+    run: Callable[[Backend, torch.device], list[Tensor]]
     tolerance: float
     """Of `disagreement` between float32 on two devices; a few entries may sit on a threshold."""
 

@@ -72,7 +72,7 @@ class StrictTensor(Tensor):
         _hold(made)
         return made
 
-    def __repr__(self, **_options: Any) -> str:
+    def __repr__(self) -> str:  # type: ignore[override]  # mypy forgets names of its options
         return f"StrictTensor({self.held!r})"
 
     def tolist(self) -> Any:
