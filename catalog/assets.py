@@ -87,11 +87,12 @@ def find_asset(store: Store, name: str) -> Row:
     Raises:
         UnknownRecordError: there is none, or several begin so.
     """
-    columns = ("asset_id", "occurrence_id")  # the second finds what was merged into another one
-    sightings = store.tables.arrow(SIGHTINGS.name, columns=columns)
-    for column in columns:
-        begins = pc.starts_with(sightings[column], pattern=name)
-        found = set(sightings.filter(begins)["asset_id"].to_pylist()) if name else set()
+    # a sighting's own id finds what was merged into another asset
+    for table, column in ((ASSETS.name, "asset_id"), (SIGHTINGS.name, "occurrence_id")):
+        rows = store.tables.arrow(table, columns=sorted({"asset_id", column}))
+        begins = pc.starts_with(rows[column], pattern=name)
+        found = set(rows.filter(begins)["asset_id"].to_pylist()) if name else set()
+        found = {name} if name in found else found
         if len(found) == 1:
             return store.tables.row(ASSETS.name, found.pop())
         if found:

@@ -280,8 +280,7 @@ def open_store(path: Path | str | None = None) -> Store:
     made before something is written.
 
     Raises:
-        CatalogError: something that is not a folder is in the way, the path cannot hold tables, or
-            the address is none.
+        CatalogError: no folder can be there, its path cannot hold tables, or the address is none.
     """
     text = str(path or os.environ.get(STORE_ENVIRONMENT) or DEFAULT_STORE)
     if text.startswith("s3:/"):
@@ -290,8 +289,7 @@ def open_store(path: Path | str | None = None) -> Store:
     root = expanded(text)
     if found := _UNSTORABLE.search(str(root)):
         raise CatalogError(
-            f"the store {str(root)!r} has {found[0]!r} in its path, which Delta tables cannot "
-            "have: choose another folder"
+            f"{str(root)!r}, the store: Delta tables cannot have {found[0]!r} in a path"
         )
     if root.exists() and not root.is_dir():
         raise CatalogError(f"the store {root} is a file, expected a folder")

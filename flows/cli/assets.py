@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from flows.cli.catalog import opened_row, row_cell, told_explanation
 from flows.cli.output import print_json, print_pairs, print_table, say_status
+from flows.cli.rows import opened_row, row_cell, told_explanation
 from flows.cli.shared_options import AsJson, named_run, parse_names
 
 if TYPE_CHECKING:
@@ -68,39 +68,52 @@ def publish(
     print_table("published", columns, [[one[name] for name in columns] for one in results])
 
 
+Style = Annotated[
+    str | None,
+    typer.Option(
+        help="Word of the style that the asset was seen in, such as night, or recorded for "
+        "none; all if absent."
+    ),
+]
+Sides = Annotated[
+    str | None,
+    typer.Option(
+        help="Sides that must all have been seen, with commas between: front, rear, left, "
+        "right or top."
+    ),
+]
+Sort = Annotated[
+    SortName,
+    typer.Option(
+        help="Column whose highest values come first: score, coverage, psnr_db, length_m, "
+        "num_views, num_points or created_at."
+    ),
+]
+Kind = Annotated[
+    str | None,
+    typer.Option(help="Kind of the assets: actor, street, sky or trajectory; all if absent."),
+]
+Dataset = Annotated[
+    str | None,
+    typer.Option(help="Dataset that the log comes from, such as pandaset; all if absent."),
+]
+
+
 @app.command("list")
 def list_assets(  # noqa: PLR0913 - the options of a command
-    kind: Annotated[
-        str | None,
-        typer.Option(help="Kind of the assets: actor, street, sky or trajectory; all if absent."),
-    ] = None,
+    kind: Kind = None,
     category: Category = None,
-    dataset: Annotated[
-        str | None,
-        typer.Option(help="Dataset that the log comes from, such as pandaset; all if absent."),
-    ] = None,
+    dataset: Dataset = None,
     licence: Annotated[
         str | None,
         typer.Option(help="Part of the name of the licence, such as CC BY; all if absent."),
     ] = None,
-    style: Annotated[
-        str | None,
-        typer.Option(
-            help="Word of the style that the asset was seen in, such as night, or recorded for "
-            "none; all if absent."
-        ),
-    ] = None,
+    style: Style = None,
     scene: Annotated[
         str | None,
         typer.Option(help="Scene that the asset was seen in, as dataset/sequence; all if absent."),
     ] = None,
-    sides: Annotated[
-        str | None,
-        typer.Option(
-            help="Sides that must all have been seen, with commas between: front, rear, left, "
-            "right or top."
-        ),
-    ] = None,
+    sides: Sides = None,
     min_sides: Annotated[
         int | None, typer.Option(help="The minimum number of sides that were seen, up to 5.")
     ] = None,
@@ -113,13 +126,7 @@ def list_assets(  # noqa: PLR0913 - the options of a command
     max_lpips: Annotated[
         float | None, typer.Option(help="The maximum LPIPS, where it was measured.")
     ] = None,
-    sort: Annotated[
-        SortName,
-        typer.Option(
-            help="Column whose highest values come first: score, coverage, psnr_db, length_m, "
-            "num_views, num_points or created_at."
-        ),
-    ] = "score",
+    sort: Sort = "score",
     limit: Annotated[int, typer.Option(min=1, help="The maximum number of rows.")] = 50,
     as_json: AsJson = False,
 ) -> None:

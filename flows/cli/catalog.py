@@ -3,7 +3,6 @@
 import json
 import sys
 from collections import Counter
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -11,12 +10,12 @@ import typer
 from flows.cli import upkeep
 from flows.cli.output import (
     Cell,
-    format_bytes,
     loudness,
     print_json,
     print_pairs,
     print_table,
 )
+from flows.cli.rows import opened_row, row_cell, told_explanation
 from flows.cli.shared_options import AsJson, tell_run
 from flows.cli.tables import heading_of
 
@@ -44,14 +43,6 @@ NEWEST_FIRST = {
     "attempts": "started_at",
     "assets": "created_at",
 }
-JSON_COLUMNS = (
-    *("parameters", "stage_seconds", "result", "change"),
-    *("inputs", "config", "summary", "record"),
-    *("asked", "budget", "effort"),
-)
-"""Columns that hold JSON text: shown as what they hold."""
-LONGEST_JSON = 120
-"""Characters of such a column in a table."""
 
 
 @app.command("list")
@@ -259,30 +250,6 @@ def delete_record(
         print_json(upkeep.doomed_as_json(doomed, is_deleted=not dry_run))
 
 
-def told_explanation(part: str, found: Any, shown: set[str], depth: int = 0) -> Iterator[str]:  # noqa: ANN401
-    """An explanation as indented lines; what was explained above is only named."""
-    indent = "  " * depth
-    state = f"STALE: {'; '.join(found.stale)}" if found.stale else ""
-    again = "see above" if found.name in shown and found.facts else ""
-    title = f"{part}: {found.name}" if part else found.name
-    yield indent + "  ".join(text for text in (title, state, again) if text)
-    if again:
-        return
-    shown.add(found.name)
-    for fact, value in found.facts.items():
-        if value:
-            yield f"{indent}  {fact}: {_short(value)}"
-    for what, value in (found.newest or {}).items():
-        yield f"{indent}  newest {what}: {_short(value)}"
-    for name, made in found.inputs.items():
-        yield from told_explanation("" if name == made.name else name, made, shown, depth + 1)
-
-
-def _short(value: Any) -> str:  # noqa: ANN401 - any JSON value
-    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-    return f"{text[:LONGEST_JSON]}... (--json shows all)" if len(text) > LONGEST_JSON else text
-
-
 def find_row(store: Any, name: str) -> tuple[str, dict[str, Any]]:  # noqa: ANN401 - imported late
     """The row with a name, wherever it stands.
 
@@ -325,18 +292,6 @@ def _absent(rows: list[dict[str, Any]]) -> dict[str, Counter[str]]:
     return found
 
 
-def opened_row(row: dict[str, Any]) -> dict[str, Any]:
-    """A row with times as text and JSON columns as what they hold."""
-    from catalog.records import json_of
-
-    opened = {}
-    for name, value in row.items():
-        if value is not None and name in JSON_COLUMNS:
-            value = json_of(row, name)
-        opened[name] = value.isoformat() if hasattr(value, "isoformat") else value
-    return opened
-
-
 def _listed(name: str, row: dict[str, Any]) -> Cell:
     """A cell of a list: a run's painter stands with its preset, a change in its words."""
     value = row[name]
@@ -348,15 +303,3 @@ def _listed(name: str, row: dict[str, Any]) -> Cell:
         return row_cell(name, value)
     change = json.loads(value)
     return " ".join(filter(None, (change["kind"], change["parameters"].get("prompt"))))
-
-
-def row_cell(name: str, value: Any) -> Cell:  # noqa: ANN401 - any value of a table
-    """A cell of a table: sizes, times and lists as people read them, long JSON cut off."""
-    if value is None or isinstance(value, (bool, float, int)):
-        return format_bytes(value) if value is not None and name.endswith("bytes") else value
-    if isinstance(value, list):
-        return ", ".join(map(str, value))
-    if hasattr(value, "isoformat"):
-        return value.strftime("%Y-%m-%d %H:%M:%S")  # UTC, as all times of the catalog
-    is_long = name in JSON_COLUMNS and len(value) > LONGEST_JSON
-    return f"{value[:LONGEST_JSON]}... (--json shows all)" if is_long else str(value)

@@ -1,11 +1,12 @@
 """`lidarpainter doctor`: is this machine, this scene or this dataset fit for work?"""
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from flows.cli.output import print_json, print_table, say_status
+from flows.cli.output import loudness, print_json, print_table, say_status
 from flows.cli.shared_options import AsJson
 
 UNFIT = 2
@@ -52,7 +53,7 @@ def doctor(
     elif root is not None:
         findings = data_checks.check_dataset(open_store(), subject, root, out)
     else:
-        findings = data_checks.check_stored_scene(existing_store(), subject, out)
+        findings = data_checks.check_stored_scene(existing_store(), subject, out, _looking_at)
     is_fit = all(finding.verdict != "fail" for finding in findings)
     if as_json:
         rows = [
@@ -67,3 +68,12 @@ def doctor(
         )
     if not is_fit:
         raise typer.Exit(UNFIT)
+
+
+def _looking_at(name: str) -> None:
+    """Say what is looked at next: in one place of a terminal, in lines of a file."""
+    if sys.stderr.isatty():
+        say_status(f"looking at {name}")
+    elif loudness() != "quiet":
+        sys.stderr.write(f"looking at {name}\n")
+        sys.stderr.flush()

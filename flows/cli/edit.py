@@ -26,30 +26,34 @@ LEAST_NAME = 8
 """Characters of an actor's id in a table, which name it to `edit` too."""
 
 
+Words = Annotated[
+    list[str] | None,
+    typer.Argument(
+        help="The word actors, which lists them; or an operation of docs/editing.md (remove, "
+        "insert, move, swap, ...), the actor, and field=value. An actor is its id, the "
+        "beginning of it, or nearest-ahead.",
+        show_default=False,
+    ),
+]
+Painter = Annotated[
+    str | None,
+    typer.Option(
+        help="Painter of what no camera saw: none, overlay, warp, nano, a .safetensors file, "
+        "or a model. The run's own if absent."
+    ),
+]
+
+
 def edit(
     run: RunName,
-    words: Annotated[
-        list[str] | None,
-        typer.Argument(
-            help="The word actors, which lists them; or an operation of docs/editing.md (remove, "
-            "insert, move, swap, ...), the actor, and field=value. An actor is its id, the "
-            "beginning of it, or nearest-ahead.",
-            show_default=False,
-        ),
-    ] = None,
+    words: Words = None,
     script: Annotated[
         list[Path] | None,
         typer.Option(
             help="File with a JSON list of operations; several files are done one after the other."
         ),
     ] = None,
-    painter: Annotated[
-        str | None,
-        typer.Option(
-            help="Painter of what no camera saw: none, overlay, warp, nano, a .safetensors file, "
-            "or a model. The run's own if absent."
-        ),
-    ] = None,
+    painter: Painter = None,
     allow_collisions: Annotated[
         bool,
         typer.Option(

@@ -37,17 +37,28 @@ ViewTimePainter = Annotated[
 ]
 
 
+Protocol = Annotated[
+    str,
+    typer.Option(
+        help="How the run is scored: paper (held-out views, and views beside the path where "
+        "they are known), truth (views beside the path of a synthetic street, against exact "
+        "images), cross-camera (cameras that no fit saw), or flicker (neighbouring frames "
+        "against each other)."
+    ),
+]
+Previous = Annotated[
+    str | None,
+    typer.Option(
+        help="With --protocol flicker: also score painting that uses the image painted before: "
+        "mixed (into what the next one is painted from), shown (to the painter), or both "
+        "with a comma between."
+    ),
+]
+
+
 def evaluate(  # noqa: PLR0913 - the options of a command
     run: RunName,
-    protocol: Annotated[
-        str,
-        typer.Option(
-            help="How the run is scored: paper (held-out views, and views beside the path where "
-            "they are known), truth (views beside the path of a synthetic street, against exact "
-            "images), cross-camera (cameras that no fit saw), or flicker (neighbouring frames "
-            "against each other)."
-        ),
-    ] = "paper",
+    protocol: Protocol = "paper",
     postpaint: Annotated[
         bool, typer.Option("--postpaint", help="Also score what is painted at view time.")
     ] = False,
@@ -74,14 +85,7 @@ def evaluate(  # noqa: PLR0913 - the options of a command
         bool,
         typer.Option("--all-views", help="Score every held-out view in place of a sample of them."),
     ] = False,
-    previous: Annotated[
-        str | None,
-        typer.Option(
-            help="With --protocol flicker: also score painting that uses the image painted before: "
-            "mixed (into what the next one is painted from), shown (to the painter), or both "
-            "with a comma between."
-        ),
-    ] = None,
+    previous: Previous = None,
     as_json: AsJson = False,
 ) -> None:
     """Judge a finished run on views it never saw.

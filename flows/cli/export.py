@@ -1,8 +1,9 @@
 """`lidarpainter export`: a run as files of other programs."""
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -24,8 +25,11 @@ from flows.cli.shared_options import (
     refuse_unused,
 )
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.export.formats import export_format, formats_help
+from lidarpainter_models.export.formats import ExportFormat, export_format, formats_help
 from lidarpainter_models.geometry.trajectory_words import RECORDED
+
+if TYPE_CHECKING:
+    from tasks.exports.scene import SceneRequest
 
 FIGURES = {
     "psnr": "PSNR of what the file shows against the scene, dB, higher is better",
@@ -33,6 +37,11 @@ FIGURES = {
     "psnr_reason": "why there is no PSNR",
 }
 """What figures of an exported scene are of."""
+OPTIONS = (
+    *("--time", "--actors", "--per-actor", "--sky", "--spz-version"),
+    *("--trajectory", "--camera", "--frames", "--width", "--postpaint", "--fps", "--beside"),
+)
+"""The options that some formats read: of scenes, then of views."""
 SPZ_VERSION = 3
 """The version of SPZ that most programs read."""
 
@@ -96,44 +105,24 @@ def export(  # noqa: PLR0913 - the options of a command
     """
     row, followed = export_format(format_), parse_frames(frames)
     time_s, frame = parse_time(time)
-    given = {
-        "--time": time_s > 0 or frame is not None,
-        "--actors": actors is not None,
-        "--per-actor": per_actor,
-        "--sky": sky,
-        "--spz-version": spz_version != SPZ_VERSION,
-        "--trajectory": trajectory != RECORDED,
-        "--camera": camera is not None,
-        "--frames": frames is not None,
-        "--width": width is not None,
-        "--postpaint": postpaint or painter is not None,
-        "--fps": fps is not None,
-        "--beside": beside is not None,
-    }
-    unread = {name: is_given for name, is_given in given.items() if name not in row.options}
-    refuse_unused(f"--format {row.name}", unread)
+    has_time, paints = time_s > 0 or frame is not None, postpaint or painter is not None
+    of_scene = (has_time, actors, per_actor, sky, spz_version != SPZ_VERSION)
+    of_views = (trajectory != RECORDED, camera, frames, width, paints, fps, beside)
+    _refuse_unread(row, (*of_scene, *of_views))
     run_id = checked_words(run, trajectory, painter)
     from catalog.store import existing_store
     from flows.cli.progress import shown_progress
     from flows.exports import export_run
     from lidarpainter_models.export.view_requests import ViewKinds, ViewRequest
     from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
-    from tasks.exports.scene import SceneRequest
 
-    scene = SceneRequest(
-        time_s=time_s,
-        frame=frame,
-        actors=parse_actors(actors),
-        is_per_actor=per_actor,
-        with_sky=sky,
-        spz_version=spz_version,
-    )
+    scene = _scene_request((time_s, frame), actors, per_actor, sky, spz_version)
     request = ViewRequest(
         trajectory=parse_trajectory(trajectory),
         camera=camera,
         frames=followed,
         width_px=width,
-        is_painted=postpaint or painter is not None,
+        is_painted=paints,
         painter=painter,
         allows_collisions=allow_collisions,
         beside=beside,
@@ -148,6 +137,41 @@ def export(  # noqa: PLR0913 - the options of a command
     else:
         shown = {FIGURES.get(name, name): value for name, value in result.items()}
         print_pairs(f"{row.name} of {result['scene']}", shown)
+
+
+def _refuse_unread(row: ExportFormat, given: Sequence[object]) -> None:
+    """Refuse options, in the order of `OPTIONS`, that are given and that the format does not read.
+
+    Raises:
+        ConfigError: naming the first of them.
+    """
+    values = zip(OPTIONS, given, strict=True)
+    unread = {
+        name: value is not None and value is not False
+        for name, value in values
+        if name not in row.options
+    }
+    refuse_unused(f"--format {row.name}", unread)
+
+
+def _scene_request(
+    moment: tuple[float, int | None],
+    actors: str | None,
+    is_per_actor: bool,
+    with_sky: bool,
+    spz_version: int,
+) -> "SceneRequest":
+    """What a format of scenes is asked for; the moment is in seconds or a position of a frame."""
+    from tasks.exports.scene import SceneRequest
+
+    return SceneRequest(
+        time_s=moment[0],
+        frame=moment[1],
+        actors=parse_actors(actors),
+        is_per_actor=is_per_actor,
+        with_sky=with_sky,
+        spz_version=spz_version,
+    )
 
 
 def parse_actors(text: str | None) -> tuple[str, ...] | None:

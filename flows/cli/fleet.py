@@ -27,23 +27,26 @@ Fleet = Annotated[
 app = typer.Typer(help="Many sequences from one manifest.", no_args_is_help=True)
 
 
+Workers = Annotated[
+    int,
+    typer.Option(
+        min=1,
+        max=MOST_WORKERS,
+        help="Number of sequences made at once, each in a process of its own.",
+    ),
+]
+RunManifest = Annotated[
+    Path,
+    typer.Argument(
+        help="TOML file that says which sequences are wanted and how, described in docs/fleet.md."
+    ),
+]
+
+
 @app.command("run")
 def run(  # noqa: PLR0913 - the options of a command
-    manifest: Annotated[
-        Path,
-        typer.Argument(
-            help="TOML file that says which sequences are wanted and how, described in "
-            "docs/fleet.md."
-        ),
-    ],
-    workers: Annotated[
-        int,
-        typer.Option(
-            min=1,
-            max=MOST_WORKERS,
-            help="Number of sequences made at once, each in a process of its own.",
-        ),
-    ] = 1,
+    manifest: RunManifest,
+    workers: Workers = 1,
     threads: Annotated[int, typer.Option(min=1, help="Number of threads of each worker.")] = 1,
     accept_stale: Annotated[
         bool,

@@ -19,14 +19,17 @@ COLUMNS = {
 }
 
 
+Dataset = Annotated[
+    str,
+    typer.Argument(
+        help="Form of the dataset: pandaset, nuscenes, waymo or canonical (scenes in the form "
+        "that this store has)."
+    ),
+]
+
+
 def ingest(  # noqa: PLR0913 - one per option
-    dataset: Annotated[
-        str,
-        typer.Argument(
-            help="Form of the dataset: pandaset, nuscenes, waymo or canonical (scenes in the form "
-            "that this store has)."
-        ),
-    ],
+    dataset: Dataset,
     root: Annotated[
         Path, typer.Argument(help="The folder that holds the sequences, as downloaded.")
     ],

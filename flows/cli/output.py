@@ -119,6 +119,14 @@ def print_pairs(title: str, pairs: Mapping[str, Cell], note: str = "") -> None:
         sys.stdout.write(note + "\n")
 
 
+def print_result(title: str, result: Mapping[str, Any], *, as_json: bool) -> None:
+    """Print what a command made: as one JSON object, or in rows below a title."""
+    if as_json:
+        print_json(result)
+    else:
+        print_pairs(title, result)
+
+
 def _width() -> int:
     """Columns of the terminal, or as many as every terminal has."""
     return get_terminal_size((PLAIN_WIDTH, 24)).columns if sys.stdout.isatty() else PLAIN_WIDTH

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from flows.cli.output import print_json, print_pairs
+from flows.cli.output import print_json, print_pairs, print_result
 from flows.cli.shared_options import (
     AllowCollisions,
     AsJson,
@@ -132,10 +132,7 @@ def stylize(  # noqa: PLR0913 - the options of a command
     style = StyleRequest(mix=mix, images=images, seed=seed)
     with shown_progress():
         result = stylize_run(existing_store(), run_id, request, style, out.absolute())
-    if as_json:
-        print_json(result)
-    else:
-        print_pairs(f"{mix.text} images of {result['scene']}", result)
+    print_result(f"{mix.text} images of {result['scene']}", result, as_json=as_json)
 
 
 def _make_styled_run(run: str, mix: StyleMix, seed: int, *, as_json: bool) -> None:

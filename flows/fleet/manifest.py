@@ -221,7 +221,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     if len(content) > MAX_BYTES:
         raise ConfigError(f"{path}: expected a manifest of at most {MAX_BYTES} bytes")
     try:
-        return tomllib.loads(content.decode("utf-8"))
+        return tomllib.loads(content.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:  # of TOML, of UTF-8, or too deep
         raise ConfigError(f"{path}: expected TOML: {error}") from None
 

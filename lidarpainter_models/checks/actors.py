@@ -4,14 +4,18 @@ Wrong conventions (length along y, yaw from another axis, boxes at another momen
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from lidarpainter_models.checks.lidar_reach import LidarReach, could_any_hit, reaches_of
 from lidarpainter_models.geometry.boxes import is_inside_box
+from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.tracks import ActorTrack
 
@@ -21,9 +25,15 @@ NEAR_M = 40.0
 """Boxes nearer than this should hold points."""
 MIN_HELD_SHARE = 0.7
 MIN_AHEAD_SHARE = 0.8
-_MIN_TRAVEL_M = 1.0
+_MIN_STEP_M, _MAX_STEP_NS = 1.0, 1_000_000_000
+"""From one box of a track to a later one; a longer gap tells nothing of the way between."""
 _MIN_STEPS = 2
 """Between boxes; a single one may be one wrong number."""
+_FACE_M, _FLOOR_M = 0.05, 0.1
+"""Points so near to a face of a box may be in or out; those so low over its bottom may be road."""
+_SAME_PLACE_M, _MOST_CHANGED, _MIN_CHANGED = 4.0, 0.3, 10
+"""How far an actor gets in a frame at the most; the share of actors that get a new id meanwhile,
+and their number, beyond which ids are said not to last."""
 _DUPLICATE_SHARE = 0.5
 """Two boxes closer than this share of the smaller one's width are the same place."""
 _NUM_RECOUNTED = 20
@@ -54,11 +64,10 @@ def check_box_axes(scene: DrivingScene) -> tuple[Verdict, str]:
     """Whether the x axis of moving boxes points where they go."""
     travelling = ahead = across = steps = 0
     for track in scene.tracks:
-        path = track.world_from_box[-1, :3, 3] - track.world_from_box[0, :3, 3]
-        if track.is_moving and path.norm() >= _MIN_TRAVEL_M:
-            cosines = (track.world_from_box[:, :3, 0] @ path / path.norm()).numpy()
+        cosines = _cosines_ahead(track) if track.is_moving else np.zeros(0)
+        if len(cosines):
             travelling += 1
-            steps += len(cosines) - 1
+            steps += len(track.timestamps_ns) - 1
             ahead += bool(np.median(cosines) > 0.7)
             # a wrong convention turns nearly all boxes of an actor, a wrong number one of them
             across += bool(np.quantile(np.abs(cosines), MIN_AHEAD_SHARE) < 0.5)
@@ -69,6 +78,58 @@ def check_box_axes(scene: DrivingScene) -> tuple[Verdict, str]:
         verdict: Verdict = "fail" if steps >= _MIN_STEPS else "warn"
         return verdict, f"{detail}, {across} across it: is the length along x?"
     return ("ok" if ahead >= MIN_AHEAD_SHARE * travelling else "warn"), detail
+
+
+def _cosines_ahead(track: ActorTrack) -> np.ndarray:
+    """Of the angles between the x axis of boxes and the way to the next box some way on."""
+    centres_m, axes = track.world_from_box[:, :3, 3].numpy(), track.world_from_box[:, :3, 0].numpy()
+    times_ns, cosines = track.timestamps_ns.numpy(), []
+    for first in range(len(times_ns)):
+        is_near = times_ns[first + 1 :] - times_ns[first] <= _MAX_STEP_NS
+        way_m = centres_m[first + 1 :][is_near] - centres_m[first]
+        length_m = np.linalg.norm(way_m, axis=1)
+        if len(length_m) and length_m.max() >= _MIN_STEP_M:
+            later = int(np.argmax(length_m >= _MIN_STEP_M))
+            ends = axes[[first, first + 1 + later]]
+            cosines += (ends @ way_m[later] / length_m[later]).tolist()
+    return np.array(cosines)
+
+
+def check_own_boxes(scene: DrivingScene) -> tuple[Verdict, str]:
+    """Whether boxes hold the recording car itself."""
+    if not scene.own_boxes:
+        return "ok", "no box holds the recording car"
+    named = ", ".join(str(own) for own in scene.own_boxes[:3])
+    return "warn", f"boxes that hold the recording car itself are ignored: {named}"
+
+
+def check_lasting_ids(scene: DrivingScene) -> tuple[Verdict, str]:
+    """Whether actors keep their id from frame to frame."""
+    place = {
+        (int(frame), track.actor_id): (track.world_from_box[row, :3, 3].numpy(), track.category)
+        for track in scene.tracks
+        for row, frame in enumerate(track.frame_indices)
+    }
+    by_frame: dict[int, dict[str, tuple[np.ndarray, str]]] = {}
+    for (frame, actor_id), where in place.items():
+        by_frame.setdefault(frame, {})[actor_id] = where
+    kept = changed = 0
+    for frame, following in pairwise(scene.frame_indices):
+        before, after = by_frame.get(frame, {}), by_frame.get(following, {})
+        kept += len(before.keys() & after.keys())
+        new = [where for actor_id, where in after.items() if actor_id not in before]
+        for centre_m, category in (w for actor_id, w in before.items() if actor_id not in after):
+            changed += any(
+                category == other and np.linalg.norm(centre_m - new_m) < _SAME_PLACE_M
+                for new_m, other in new
+            )
+    detail = f"{changed} of {kept + changed} boxes have another id in the next frame"
+    if changed >= _MIN_CHANGED and changed > _MOST_CHANGED * (kept + changed):
+        return "warn", (
+            f"{detail}: ids must last, else no actor is seen to move and what drives is smeared "
+            "into the street"
+        )
+    return "ok", detail if kept + changed else "no actor is in two frames"
 
 
 def check_duplicate_tracks(scene: DrivingScene) -> tuple[Verdict, str]:
@@ -83,6 +144,7 @@ def check_duplicate_tracks(scene: DrivingScene) -> tuple[Verdict, str]:
 def _near_moving_boxes(scene: DrivingScene) -> list[tuple[bool, bool]]:
     """Of each box of a moving actor near the car: could a LiDAR hit it, does it hold points."""
     reaches: dict[int, list[LidarReach]] = {}
+    points_m: dict[int, Tensor] = {}
     found = []
     for track in scene.tracks:
         if not track.is_moving:
@@ -93,9 +155,34 @@ def _near_moving_boxes(scene: DrivingScene) -> list[tuple[bool, bool]]:
             if (world_from_box[:3, 3] - ego_m).norm() < NEAR_M:
                 if frame_index not in reaches:
                     reaches[frame_index] = reaches_of(scene, frame_index)
+                    points_m[frame_index] = _points(scene, frame_index)
                 could_be_hit = could_any_hit(reaches[frame_index], world_from_box, track.size_m)
-                found.append((could_be_hit, bool(track.num_points[row] > 0)))
+                holds = bool(track.num_points[row] > 0) or _counted(
+                    points_m[frame_index], world_from_box, track.size_m, _FACE_M, _FLOOR_M
+                )
+                found.append((could_be_hit, bool(holds)))
     return found
+
+
+def _points(scene: DrivingScene, frame_index: int) -> Float[Tensor, "points 3"]:
+    sweeps = scene.sweeps_of(frame_index)
+    return torch.cat([torch.zeros(0, 3), *(scene.read_column(sweep, "xyz_m") for sweep in sweeps)])
+
+
+def _counted(
+    xyz_m: Float[Tensor, "points 3"],
+    world_from_box: Float[Tensor, "4 4"],
+    size_m: Float[Tensor, "3"],
+    margin_m: float,
+    floor_m: float | None = None,
+) -> int:
+    """How many points a box holds; of one grown, those higher than `floor_m` over its bottom."""
+    near = (xyz_m - world_from_box[:3, 3].to(xyz_m)).norm(dim=1) < size_m.norm()
+    inside = xyz_m[near][is_inside_box(xyz_m[near], world_from_box, size_m, margin_m=margin_m)]
+    if floor_m is None or not len(inside):
+        return len(inside)
+    height_m = transform_points(invert_rigid(world_from_box).to(inside), inside)[:, 2]
+    return int((height_m > floor_m - size_m[2] / 2).sum())
 
 
 def _pairs_that_meet(tracks: Sequence[ActorTrack]) -> list[tuple[int, int]]:
@@ -135,10 +222,11 @@ def _largest_miscount(scene: DrivingScene) -> str:
     for track in scene.tracks[:_NUM_RECOUNTED]:
         rows = (track.frame_indices == frame_index).nonzero()[:, 0]
         for row in rows.tolist():
-            stated = int(track.num_points[row])
-            counted = int(is_inside_box(xyz_m, track.world_from_box[row], track.size_m).sum())
-            if abs(stated - counted) > max(20, stated // 2):
+            stated, box = int(track.num_points[row]), (track.world_from_box[row], track.size_m)
+            fewest, most = (_counted(xyz_m, *box, margin_m) for margin_m in (-_FACE_M, _FACE_M))
+            if not fewest - max(20, stated // 2) <= stated <= most + max(20, stated // 2):
                 return (
-                    f"{track.actor_id} states {stated} points in frame {frame_index}, has {counted}"
+                    f"{track.actor_id} states {stated} points in frame {frame_index}, has "
+                    f"{fewest} to {most}"
                 )
     return ""

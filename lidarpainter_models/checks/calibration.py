@@ -7,11 +7,15 @@ place of their gradient). A turn about the optical axis (roll) is looked for las
 and pitch and at none (a roll can look like a small one of these), and judged where it stands out:
 it moves the sides of an image alone.
 
+Edges alone lie: a guard rail beside a lane fits the next marking as well. So a camera fails only
+where a second kind of evidence agrees (what the images of a moving car show of the same points);
+where nothing else can tell, it is warned of, and where that disagrees, edges are not believed.
+
 Camera frame: x right, y down, z forward. Yaw turns about y, pitch about x, roll about z.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -40,8 +44,11 @@ MIN_PEAK = 3.5
 With cameras of the same scenes turned by five degrees or more, where no turn can be right, the best
 one stands out by 3.0 (median); where it is right, by 5.
 """
-MIN_EDGE_POINTS = 500
+MIN_EDGE_POINTS, MIN_IMAGES = 500, 3
 """Fewer, over all frames, say nothing."""
+MIN_STORED_PEAK = 1.5
+"""Where no turn stands out, the stored one is not doubted that lies so many deviations better than
+the mean one: little structure, not a wrong mount."""
 _TURNS_DEG = np.arange(-2.0, 2.01, 0.25)
 _ROLLS_DEG = np.arange(-3.0, 3.01, 0.25)
 _PEAK_WIDTH_DEG, _ROLL_PEAK_WIDTH_DEG = 0.6, 0.8
@@ -61,7 +68,8 @@ class CameraTurn:
     roll_deg: float
     roll_peak: float
     """How many deviations the roll stands out."""
-    num_points: int
+    stored_peak: float = 0.0
+    """How many deviations the stored rotation stands out from all that were tried."""
 
     @property
     def is_wrong(self) -> bool:
@@ -82,35 +90,53 @@ def _trust(peak: float) -> str:
     return f"not trusted (stands out by {peak:.1f} deviations from other turns, not {MIN_PEAK})"
 
 
-def check_calibration(edges: SceneEdges) -> tuple[Verdict, str]:
-    """Whether depth edges lie on image edges without turning any camera."""
+Agrees = Callable[[str, CameraTurn], bool | None]
+"""Whether other evidence agrees that a camera is turned so; None where it cannot tell."""
+
+
+def check_calibration(
+    edges: SceneEdges, agrees: Agrees = lambda _name, _turn: None
+) -> tuple[Verdict, str]:
+    """Whether depth edges lie on image edges without turning any camera.
+
+    Args:
+        edges: of the scene.
+        agrees: what else tells how a camera is turned, asked where edges call it turned.
+    """
     scene = edges.scene
-    found = {
-        name: best_turn(edges.images[name]) if _is_fine_enough(scene, name) else None
-        for name in scene.camera_names
-    }
-    wrong, unsure, details = [], [], []
-    for name, turn in found.items():
-        if turn is None:
-            details.append(f"{name} cannot be told ({_why_untold(scene, name)})")
-            continue
-        details.append(f"{name} {turn}")
-        if turn.is_wrong:
-            wrong.append(name)
-        elif turn.peak < MIN_PEAK:
-            unsure.append(name)
-    detail = f"degrees off: {'; '.join(details)}"
-    if wrong:
+    said = {name: _said_of(edges, name, agrees) for name in scene.camera_names}
+    detail = f"degrees off: {'; '.join(f'{name} {words}' for name, (_, words) in said.items())}"
+    if wrong := [name for name, (state, _) in said.items() if state == "wrong"]:
         return "fail", f"{', '.join(wrong)} turned on its mount; {detail}"
-    if unsure:
+    if alone := [name for name, (state, _) in said.items() if state == "alone"]:
+        return "warn", f"{', '.join(alone)} turned, by edges alone: see the overlay; {detail}"
+    if unsure := [name for name, (state, _) in said.items() if state == "unsure"]:
         return "warn", f"{', '.join(unsure)}: no turn within 2 degrees fits the edges; {detail}"
     return "ok", detail
+
+
+def _said_of(edges: SceneEdges, name: str, agrees: Agrees) -> tuple[str, str]:
+    """Whether a camera is wrong, unsure, sound or untold, and what its edges and images say."""
+    if name in edges.blank:
+        return "untold", "cannot be told (its images show nothing)"
+    turn = best_turn(edges.images[name]) if _is_fine_enough(edges.scene, name) else None
+    if turn is None:
+        return "untold", f"cannot be told ({_why_untold(edges.scene, name)})"
+    if not turn.is_wrong:
+        is_unsure = turn.peak < MIN_PEAK and turn.stored_peak < MIN_STORED_PEAK
+        return "unsure" if is_unsure else "sound", str(turn)
+    agreed = agrees(name, turn)
+    if agreed is None:
+        return "alone", f"{turn} (nothing else can tell)"
+    if agreed:
+        return "wrong", str(turn)
+    return "sound", f"{turn} by edges alone: not believed, its images in motion do not agree"
 
 
 def best_turn(images: Sequence[EdgeImage]) -> CameraTurn | None:
     """The turn of a camera that puts depth edges on image edges; None where none can be told."""
     num_points = sum(len(points) for image in images for points, _ in image.points.values())
-    if num_points < MIN_EDGE_POINTS:
+    if num_points < MIN_EDGE_POINTS or len(images) < MIN_IMAGES:
         return None
     turns_deg = np.stack(np.meshgrid(_TURNS_DEG, _TURNS_DEG, 0.0, indexing="ij"), axis=-1)
     plane = edge_scores(images, turns_deg.reshape(-1, 3)).reshape(turns_deg.shape[:2])
@@ -125,7 +151,7 @@ def best_turn(images: Sequence[EdgeImage]) -> CameraTurn | None:
         peak=_peak(plane, apart > _PEAK_WIDTH_DEG),
         roll_deg=float(roll_deg),
         roll_peak=_peak(line, np.abs(_ROLLS_DEG - roll_deg) > _ROLL_PEAK_WIDTH_DEG),
-        num_points=num_points,
+        stored_peak=float((edge_scores(images, np.zeros((1, 3)))[0] - plane.mean()) / plane.std()),
     )
 
 
@@ -143,7 +169,7 @@ def _why_untold(scene: DrivingScene, camera_name: str) -> str:
     if not _is_fine_enough(scene, camera_name):
         px_per_deg = _px_per_deg(scene, camera_name)
         return f"images of {px_per_deg:.1f} pixels a degree, {_MIN_PX_PER_DEG} are needed"
-    return f"fewer than {MIN_EDGE_POINTS} points at depth edges in its images"
+    return f"fewer than {MIN_EDGE_POINTS} points at depth edges or {MIN_IMAGES} images"
 
 
 def _roll_scores(images: Sequence[EdgeImage], pitch_deg: float, yaw_deg: float) -> np.ndarray:

@@ -11,7 +11,7 @@ Camera frame: x right, y down, z forward.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from lidarpainter_models.checks.pictures import blank_cameras
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rotation_from_vector
@@ -59,6 +60,15 @@ class EdgeImage:
     points: dict[str, tuple[np.ndarray, np.ndarray]]
     """In the camera's frame, with their weights."""
 
+    def seen_from(self, camera: Camera) -> "EdgeImage":
+        """The same points before a camera that stands or looks otherwise, in the same pixels."""
+        moved = (camera.camera_from_world.double() @ self.camera.world_from_camera.double()).numpy()
+        points = {
+            kind: (xyz_m @ moved[:3, :3].T + moved[:3, 3], weight)
+            for kind, (xyz_m, weight) in self.points.items()
+        }
+        return replace(self, points=points)
+
 
 class SceneEdges:
     """The edge images of each camera of a scene, found once for all who look at them."""
@@ -72,6 +82,11 @@ class SceneEdges:
         frames = _slow_frames(self.scene)
         edges = {frame_index: _depth_edges(self.scene, frame_index) for frame_index in frames}
         return {name: _edge_images(self.scene, name, edges) for name in self.scene.camera_names}
+
+    @cached_property
+    def blank(self) -> dict[str, str]:
+        """What the images of cameras look like that show nothing, see `blank_cameras`."""
+        return blank_cameras(self.scene)
 
 
 def _slow_frames(scene: DrivingScene) -> list[int]:

@@ -15,6 +15,7 @@ from lidarpainter_models.scenes.tracks import ActorTrack
 
 _NEAREST_M, _FARTHEST_M = 3.0, 90.0
 _NEAR_PLANE_M = 0.3
+_LEGEND_PX, _LEGEND_WIDTH_PX, _RAMP_PX = 28, 700, 120
 _MOVING_RGB, _PARKED_RGB = (80, 255, 80), (255, 255, 255)
 
 
@@ -29,6 +30,25 @@ def draw_overlay(scene: DrivingScene, view: RecordedView) -> UInt8[Tensor, "heig
         _draw_points(image, view.camera, scene.read_positions(view.frame_index))
     draw_boxes(image, view.camera, scene.tracks, view.timestamp_ns)
     return torch.from_numpy(image)
+
+
+def with_legend(overlay: UInt8[Tensor, "height width 3"]) -> UInt8[Tensor, "taller wider 3"]:
+    """The overlay over a strip that says what its colours mean."""
+    image = overlay.numpy()
+    strip = np.full((_LEGEND_PX, max(image.shape[1], _LEGEND_WIDTH_PX), 3), 30, np.uint8)
+    ramp = np.tile(np.arange(_RAMP_PX) * 255 // _RAMP_PX, (12, 1)).astype(np.uint8)
+    strip[8:20, 150 : 150 + _RAMP_PX] = cv2.applyColorMap(ramp, cv2.COLORMAP_TURBO)[..., ::-1]
+    words = (
+        (f"LiDAR points: {_NEAREST_M:g} m", 5, (255, 255, 255)),
+        (f"{_FARTHEST_M:g} m", 158 + _RAMP_PX, (255, 255, 255)),
+        ("box: moves", 330, _MOVING_RGB),
+        ("box: parked", 430, _PARKED_RGB),
+        ("crossed face: its front", 530, (255, 255, 255)),
+    )
+    for text, left, colour in words:
+        cv2.putText(strip, text, (left, 19), cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, 1, cv2.LINE_AA)
+    beside = np.zeros((image.shape[0], strip.shape[1] - image.shape[1], 3), np.uint8)
+    return torch.from_numpy(np.concatenate([np.concatenate([image, beside], axis=1), strip]))
 
 
 def draw_boxes(

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera, Shutter
@@ -35,6 +35,8 @@ _EDGE_PX, _LEAST_SHARE, _MOST_SHARE = 11, 0.7, 1.4  # of its own depth, all arou
 class HubImage:
     """One image, what it moved like, and the returns of its frame's sweeps in it."""
 
+    place: int
+    """Position among the camera's images."""
     camera: Camera
     twist_per_s: Float[np.ndarray, "6"]
     contrast: ContrastImage
@@ -53,6 +55,13 @@ class Hub:
     points: Float[np.ndarray, "points 3"]
     images: Sequence[HubImage]
     own: int
+
+    def among(self, places: range) -> "Hub | None":
+        """The hub with only the images of these places; None where it is not among them."""
+        if self.images[self.own].place not in places:
+            return None
+        images = [image for image in self.images if image.place in places]
+        return Hub(self.points, images, images.index(self.images[self.own]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +94,18 @@ def hubs_of(
     scene: DrivingScene,
     moved: Sequence[tuple[RecordedView, Shutter]],
     returns: Mapping[int, FrameReturns],
+    own_body: Bool[np.ndarray, "rows columns"] | None = None,
 ) -> list[Hub]:
-    """What is compared of one camera's images; those that are nobody's neighbours are not read."""
+    """What is compared of one camera's images; those that are nobody's neighbours are not read.
+
+    What shows the recording car itself (on any grid) is not compared.
+    """
     wanted = compared_images(len(moved))
     made = side_by_side(
-        lambda index: _image(scene, *moved[index], returns[moved[index][0].frame_index]), wanted
+        lambda place: _image(
+            scene, place, *moved[place], returns[moved[place][0].frame_index], own_body
+        ),
+        wanted,
     )
     images = dict(zip(wanted, made, strict=True))
     hubs = []
@@ -115,7 +131,12 @@ def hub_neighbours(num_images: int) -> list[tuple[int, range]]:
 
 
 def _image(
-    scene: DrivingScene, view: RecordedView, shutter: Shutter, returns: FrameReturns
+    scene: DrivingScene,
+    place: int,
+    view: RecordedView,
+    shutter: Shutter,
+    returns: FrameReturns,
+    own_body: Bool[np.ndarray, "rows columns"] | None,
 ) -> HubImage:
     share = min(1.0, WIDTH_PX / view.camera.width_px)
     camera = view.camera.resized(
@@ -126,13 +147,17 @@ def _image(
     rgb = cv2.resize(scene.read_image(view).numpy(), size, interpolation=cv2.INTER_AREA)
     depth_m = sparse_lidar_depth(returns.xyz_m, camera).numpy()
     far_m = np.where(depth_m > 0, depth_m, np.float32(1e6))
+    if own_body is not None:
+        is_own = cv2.resize(own_body.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        depth_m, far_m = np.where(is_own, 0, depth_m), np.where(is_own, -1e6, far_m)
     return HubImage(
+        place=place,
         camera=camera,
         twist_per_s=shutter.twist_per_s.numpy(),
         contrast=ContrastImage.of(rgb),
         standing=returns.standing,
         depth_m=depth_m,
-        nearest_m=cv2.erode(far_m, np.ones((5, 5), np.uint8)),
+        nearest_m=cv2.erode(far_m.astype(np.float32), np.ones((5, 5), np.uint8)),
     )
 
 

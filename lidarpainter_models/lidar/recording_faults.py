@@ -1,40 +1,36 @@
 """Find what a camera's recording gets wrong: its clock, its mounting angles, how it reads its rows.
 
 LiDAR points of what stands still have a known place, so a point must look alike in all images that
-show it. For each camera a turn, a lateness and a readout are sought under which the points do:
-photometric bundle adjustment (Alismail et al. 2016) whose structure is measured and whose colours
-are eliminated (each point's mean over its images), by Gauss-Newton with a robust weight (Geman and
-McClure, 1987), after a search over the lateness. That the structure is held is what makes the
-readout visible: geometry that is free to move absorbs it at constant speed.
+show it. For each camera a turn, a lateness and a readout are sought under which the points do
+(`hub_agreement`): photometric bundle adjustment (Alismail et al. 2016) whose structure is measured
+and whose colours are eliminated (each point's mean over its images), by Gauss-Newton with a robust
+weight (Geman and McClure, 1987), after a search over the lateness. That the structure is held is
+what makes the readout visible: geometry that is free to move absorbs it at constant speed.
 
 The variance is divided by the strength of what is compared, else it would be least where images
-show least. A fault is believed where it is larger than what is found in sound recordings and stands
-out from the scatter between groups of images (Liang and Zeger, 1986). A car that stands shows
-neither clock nor readout. Camera frame: x right, y down, z forward.
+show least. A fault is believed where it is larger than what is found in sound recordings, stands
+out from the scatter between groups of images (Liang and Zeger, 1986), and is found in each half of
+the images so that the other half, set aside, agrees better with it, and where depth edges lie on
+image edges no worse with it: lamps of the car itself, reflections and bare roads look alike under
+many a fault. A car that stands shows neither clock nor readout. Camera frame: x right, y down, z
+forward.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
-import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 
-from lidarpainter_models.geometry.cameras import Shutter
-from lidarpainter_models.kernels.point_contrasts import (
-    LATE,
-    READOUT,
-    TURN,
-    AssumedCamera,
-    depths_before,
-    seen_contrasts,
-)
+from lidarpainter_models.checks.depth_edges import SceneEdges, edge_scores
+from lidarpainter_models.geometry.cameras import Camera, Shutter
+from lidarpainter_models.kernels.point_contrasts import LATE, READOUT, TURN
 from lidarpainter_models.kernels.side_by_side import side_by_side
+from lidarpainter_models.lidar.hub_agreement import Found, found_in, gains_of
 from lidarpainter_models.lidar.hub_images import (
     WIDTH_PX,
     FrameReturns,
     Hub,
-    HubImage,
     compared_images,
     hubs_of,
     returns_of,
@@ -48,36 +44,46 @@ LEAST_TURN_RAD = np.radians([0.25, 0.25, 0.75])
 LEAST_LATE_S, LEAST_READOUT_S = 0.015, 0.01
 """Sound cameras of synthetic streets are found within 10 and 5 ms."""
 MIN_STANDS_OUT = 4.0  # standard errors
-MIN_SPEED_MPS = 2.0  # a slower car's images look alike whenever they were taken
+LEAST_GAIN, LEAST_GAINING = 0.02, 0.75
+"""Of the difference between images set aside, the share by which a fault that is there lessens it
+(median over hubs), and the share of hubs in which it does."""
+LEAST_IMAGES, LEAST_AGREEING, LEAST_WAY_M = 8, 3, 1.0
+"""Images in which a fault may be found, as each half of them must tell; in which a turn is tried,
+and the way between the first and the last of them."""
+MOST_LOSS = 0.05
+"""Of the difference (median over hubs): what costs more is not so, what costs less may be."""
+MIN_SPEED_MPS, MAX_SPEED_MPS = 2.0, 60.0
+"""A slower car's images look alike whenever they were taken; faster is none, but wrong times."""
 MIN_PX_PER_DEG = 2.2  # as in the doctor's check of calibration
-_SEARCHED_S = np.linspace(-0.06, 0.06, 7)
-_SEARCH_LEVEL, _SEARCH_ROUNDS, _SEARCH_STRIDE = 3, 3, 3
-_SCHEDULE = ((3, 5), (2, 14))  # level and rounds of Gauss-Newton
-_STEP = 1.5  # derivatives of images that do not fit yet are too small
-_OUTLIER = 5.0  # medians from which on a difference counts little
-_EXPECTED = np.array([0.01, 0.01, 0.01, 0.05, 0.03])
-_SAMPLES_OF_PRIOR = 500.0  # neighbouring points look alike
 
 
-class Found(NamedTuple):
-    """A camera's turn (rad), lateness and readout (s), and their standard errors."""
+def find_faults(
+    scene: DrivingScene,
+    views: Sequence[RecordedView],
+    own_bodies: Mapping[str, Bool[np.ndarray, "rows columns"]] | None = None,
+) -> dict[str, CameraFault]:
+    """What is wrong about the cameras of some views, by name.
 
-    values: Float[np.ndarray, "5"]
-    errors: Float[np.ndarray, "5"]
+    Args:
+        scene: where images and points are read from.
+        views: each camera's in order of time.
+        own_bodies: what of a camera's images is the recording car (on any grid), by its name.
 
-
-def find_faults(scene: DrivingScene, views: Sequence[RecordedView]) -> dict[str, CameraFault]:
-    """What is wrong about the cameras of some views, by name; cameras that are sound are left out.
-
-    Views are each camera's in order of time.
+    Returns:
+        Nothing of cameras that are sound or that `cannot_be_told` names.
     """
     names = sorted({view.camera_name for view in views})
     moved = [_comparable([view for view in views if view.camera_name == name]) for name in names]
+    bodies, edges = own_bodies or {}, SceneEdges(scene)
     compared = {own[index][0].frame_index for own in moved for index in compared_images(len(own))}
     returns = returns_of(scene, sorted(compared))
-    found = side_by_side(lambda own: _measured(scene, own, returns), moved)
-    faults = [None if one is None else believed(one) for one in found]
-    return {name: fault for name, fault in zip(names, faults, strict=True) if fault is not None}
+    named = list(zip(moved, (bodies.get(name) for name in names), strict=True))
+    faults = side_by_side(lambda own: _fault(scene, own[0], returns, own[1]), named)
+    return {
+        name: fault
+        for name, fault in zip(names, faults, strict=True)
+        if fault is not None and _edges_agree(edges, name, views, fault)
+    }
 
 
 def believed(found: Found) -> CameraFault | None:
@@ -93,169 +99,95 @@ def believed(found: Found) -> CameraFault | None:
     return CameraFault(turn_rad=(x, y, z), late_s=float(late), readout_s=float(readout))
 
 
-def _comparable(views: Sequence[RecordedView]) -> list[tuple[RecordedView, Shutter]]:
-    """A camera's views with how they moved; none where too little is seen.
+def cannot_be_told(views: Sequence[RecordedView]) -> list[str]:
+    """Cameras of which `find_faults` cannot tell: few or coarse images, or a car that stands."""
+    names = sorted({view.camera_name for view in views})
+    return [n for n in names if not _comparable([v for v in views if v.camera_name == n])]
 
-    Three images or fewer show too little, and so do coarse ones and a car that stands.
+
+def images_agree(
+    scene: DrivingScene,
+    camera_name: str,
+    turn_rad: Float[np.ndarray, "3"],
+    own_body: Bool[np.ndarray, "rows columns"] | None = None,
+) -> bool | None:
+    """Whether a camera's images agree better if it is turned by so much about its own axes.
+
+    Returns:
+        None where that cannot be told: the car stands, or its images show too little.
+        False only where they agree clearly worse.
     """
+    views = scene.views_of(camera_name)
+    way_m = float((views[-1].camera.centre_world - views[0].camera.centre_world).norm())
+    if len(views) < LEAST_AGREEING or way_m < LEAST_WAY_M or not _is_fine_enough(views[0].camera):
+        return None
+    stands = Shutter(twist_per_s=torch.zeros(6))  # a turn shows without knowing speeds
+    moved = [(view, view.camera.shutter or stands) for view in views]
+    compared = [moved[place][0].frame_index for place in compared_images(len(moved))]
+    hubs = hubs_of(scene, moved, returns_of(scene, sorted(set(compared))), own_body)
+    if len(hubs) < LEAST_AGREEING:
+        return None
+    gains = gains_of(hubs, np.array([*turn_rad, 0.0, 0.0]))
+    if _is_gain(gains):
+        return True
+    return False if np.median(gains) < -MOST_LOSS else None
+
+
+def _comparable(views: Sequence[RecordedView]) -> list[tuple[RecordedView, Shutter]]:
+    """A camera's views with how they moved; none where too little is seen."""
     moved = [(view, shutter) for view in views if (shutter := view.camera.shutter) is not None]
     speeds_mps = [float(shutter.twist_per_s[3:].norm()) for _, shutter in moved]
-    if len(moved) <= 3 or np.median(speeds_mps) < MIN_SPEED_MPS:
+    if len(moved) < LEAST_IMAGES or not MIN_SPEED_MPS <= np.median(speeds_mps) <= MAX_SPEED_MPS:
         return []
-    camera = views[0].camera
+    return moved if _is_fine_enough(views[0].camera) else []
+
+
+def _is_fine_enough(camera: Camera) -> bool:
     share = min(1.0, WIDTH_PX / camera.width_px)
-    return moved if camera.fx_px * share * np.radians(1) >= MIN_PX_PER_DEG else []
+    return bool(camera.fx_px * share * np.radians(1) >= MIN_PX_PER_DEG)
 
 
-def _measured(
+def _fault(
     scene: DrivingScene,
     moved: Sequence[tuple[RecordedView, Shutter]],
     returns: Mapping[int, FrameReturns],
-) -> Found | None:
-    """The parameters of one camera under which its images agree; a told readout is kept.
-
-    Returns:
-        None where nothing can be compared.
-    """
-    hubs = hubs_of(scene, moved, returns)
+    own_body: Bool[np.ndarray, "rows columns"] | None,
+) -> CameraFault | None:
+    """What is wrong about one camera, tried on images set aside; a told readout is kept."""
+    hubs = hubs_of(scene, moved, returns, own_body)
     if not hubs:
         return None
     is_told = any(shutter.is_rolling for _, shutter in moved)
     free = np.arange(READOUT if is_told else READOUT + 1)
-    return _refined(hubs, _searched(hubs, free), free)
+    fault = believed(found_in(hubs, free))
+    return fault if fault is not None and _gains(hubs, fault, free, len(moved)) else None
 
 
-def _assumed(image: HubImage, values: Float[np.ndarray, "5"]) -> AssumedCamera:
-    """An image's camera under some parameters; a told readout is kept."""
-    camera, across_s = image.camera, (0.0, float(values[READOUT]))
-    if camera.shutter is not None and camera.shutter.is_rolling:
-        across_s = camera.shutter.across_s
-    focal, centre = (camera.fx_px, camera.fy_px), (camera.cx_px, camera.cy_px)
-    return AssumedCamera(
-        camera_from_world=camera.camera_from_world.numpy(),
-        twist_per_s=image.twist_per_s,
-        turned_from_camera=cv2.Rodrigues(-values[TURN])[0],
-        lens=np.array([*focal, *centre, camera.width_px, camera.height_px], np.float64),
-        late_s=float(values[LATE]),
-        across_s=np.array(across_s),
-    )
-
-
-class _Compared(NamedTuple):
-    """What the images of a hub show of its points."""
-
-    contrast: Float[np.ndarray, "images points"]
-    is_seen: Bool[np.ndarray, "images points"]
-    slope: Float[np.ndarray, "images points 5"]
-    """Derivative of the contrast by the parameters."""
-    shared_slope: Float[np.ndarray, "images points 5"]
-    """The same with the mean gradient of a point, which has less noise."""
-
-
-def _compared(hub: Hub, values: Float[np.ndarray, "5"], level: int, stride: int) -> _Compared:
-    points = hub.points[::stride]
-    cameras = [_assumed(image, values) for image in hub.images]
-    hub_depth_m = depths_before(points, cameras[hub.own])
-    seen = [
-        seen_contrasts(points, camera, image.contrast.levels, image.nearest_m, level, hub_depth_m)
-        for image, camera in zip(hub.images, cameras, strict=True)
+def _gains(hubs: Sequence[Hub], fault: CameraFault, free: np.ndarray, num_images: int) -> bool:
+    """Whether either half of the images agrees better with what the other half tells of a fault."""
+    is_said = np.array([*fault.turn_rad, fault.late_s, fault.readout_s]) != 0
+    halves = [
+        [part for hub in hubs if (part := hub.among(places)) is not None]
+        for places in (range(num_images // 2), range(num_images // 2, num_images))
     ]
-    is_seen = np.array([one.is_seen for one in seen])
-    gradient = np.sum([one.gradient for one in seen], 0)
-    mean = gradient / np.maximum(is_seen.sum(0), 1)[:, None]
-    return _Compared(
-        contrast=np.array([one.contrast for one in seen]),
-        is_seen=is_seen,
-        slope=np.array([one.slope for one in seen]),
-        shared_slope=np.array([np.einsum("pa,pab->pb", mean, one.motion) for one in seen]),
+    if not all(halves):
+        return False
+    return all(
+        _is_gain(gains_of(aside, found_in(seen, free).values * is_said))
+        for seen, aside in (halves, halves[::-1])
     )
 
 
-class _Equations(NamedTuple):
-    """A step's normal equations, one right side for each hub."""
-
-    matrix: Float[np.ndarray, "5 5"]
-    sides: Float[np.ndarray, "hubs 5"]
-    difference: float
-    """Variance of what images show of a point, over the strength of what they show."""
-    noise: float
-    outlier: float
-
-
-def _equations(
-    hubs: Sequence[Hub],
-    values: Float[np.ndarray, "5"],
-    level: int,
-    outlier: float | None,
-    stride: int = 1,
-) -> _Equations:
-    compared = [_compared(hub, values, level, stride) for hub in hubs]
-    if outlier is None:
-        away = [np.abs(c.contrast - _mean(c.is_seen, c.contrast))[c.is_seen] for c in compared]
-        outlier = _OUTLIER * float(np.median(np.concatenate(away)))
-    matrix, sides, slopes, sums = np.zeros((5, 5)), [], [], np.zeros(3)
-    for c in compared:
-        weight = c.is_seen.astype(float)
-        for _ in range(3):
-            away = c.contrast - _mean(weight, c.contrast)
-            weight = c.is_seen / (1 + (away / outlier) ** 2) ** 2
-        weight *= c.is_seen.sum(0) > 1
-        away = c.contrast - _mean(weight, c.contrast)
-        slope = c.slope - _mean(weight, c.slope)
-        shared = c.shared_slope - _mean(weight, c.shared_slope)
-        matrix += np.einsum("ipa,ip,ipb->ab", shared, weight, shared)
-        matrix += 0.1 * np.einsum("ipa,ip,ipb->ab", slope, weight, slope)
-        sides.append(np.einsum("ipa,ip->a", slope, weight * away))
-        slopes.append(np.einsum("ipa,ip->a", c.slope, weight * c.contrast))
-        sums += (weight * away**2).sum(), (weight * c.contrast**2).sum(), weight.sum()
-    difference = sums[0] / max(sums[1], 1e-9)
-    # of the quotient: what only makes the images weaker is no progress
-    right = np.array(sides) - difference * np.array(slopes)
-    return _Equations(matrix, right, difference, sums[0] / max(sums[2], 1e-9), outlier)
+def _edges_agree(
+    edges: SceneEdges, camera_name: str, views: Sequence[RecordedView], fault: CameraFault
+) -> bool:
+    """Whether depth edges lie on image edges as well with a fault as without it."""
+    frames = {view.frame_index for view in views}
+    stored = [image for image in edges.images[camera_name] if image.frame_index in frames]
+    faulty = [image.seen_from(fault.corrected(image.camera)) for image in stored]
+    with_fault, without = (edge_scores(them, np.zeros((1, 3)))[0] for them in (faulty, stored))
+    return bool(with_fault >= without)
 
 
-def _mean(weight: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Over the images, point by point."""
-    weight = weight.reshape(*weight.shape, *[1] * (values.ndim - 2))
-    return (weight * values).sum(0) / np.maximum(weight.sum(0), 1e-9)
-
-
-def _stepped(
-    found: _Equations, values: np.ndarray, free: np.ndarray, samples: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """The values after a step, and the inverse of the matrix of the free ones."""
-    prior = samples * found.noise / _EXPECTED**2
-    inverse = np.linalg.inv((found.matrix + np.diag(prior))[np.ix_(free, free)])
-    stepped = values.copy()
-    stepped[free] -= _STEP * inverse @ (found.sides.sum(0) + prior * values)[free]
-    return stepped, inverse
-
-
-def _searched(hubs: Sequence[Hub], free: np.ndarray) -> Float[np.ndarray, "5"]:
-    """Of several latenesses the best one, each with its own turn."""
-    tried: list[tuple[float, int, np.ndarray]] = []
-    outlier = None
-    for late_s in _SEARCHED_S:
-        values = np.zeros(5)
-        values[LATE] = late_s
-        for _ in range(_SEARCH_ROUNDS):
-            found = _equations(hubs, values, _SEARCH_LEVEL, outlier, _SEARCH_STRIDE)
-            outlier, before = found.outlier, values
-            values, _ = _stepped(found, values, free[TURN], _SAMPLES_OF_PRIOR / _SEARCH_STRIDE)
-        tried.append((found.difference, len(tried), before))
-    return min(tried)[2]
-
-
-def _refined(hubs: Sequence[Hub], values: Float[np.ndarray, "5"], free: np.ndarray) -> Found:
-    """All free parameters, and how much they scatter between hubs."""
-    for level, rounds in _SCHEDULE:
-        outlier = None
-        for _ in range(rounds):
-            found = _equations(hubs, values, level, outlier)
-            outlier = found.outlier
-            values, inverse = _stepped(found, values, free, _SAMPLES_OF_PRIOR)
-    scatter = found.sides[:, free].T @ found.sides[:, free]
-    covariance = inverse @ scatter @ inverse * len(hubs) / max(len(hubs) - 1, 1)
-    errors = np.zeros(5)
-    errors[free] = np.sqrt(np.diag(covariance))
-    return Found(values, errors)
+def _is_gain(gains: Float[np.ndarray, " hubs"]) -> bool:
+    return bool(np.median(gains) >= LEAST_GAIN and (gains > 0).mean() >= LEAST_GAINING)

@@ -5,7 +5,9 @@ the nearer it is; an edge of the car's own bonnet, boot or mirror stays. So brig
 along the epipolar lines, and the median over images taken far apart (as in Dekel et al. 2017, who
 find watermarks so) keeps only what stays. It is asked only where the street would have moved: below
 the horizon, where even the ground is near. What the edges that stay enclose with the border of the
-image is the body. A car that stands shows no body, and nor does one as dark as the road.
+image is the body. At night a bonnet may be lit by each lamp that it passes: then its outline stays
+while its brightness does not, and what stays is the place of the change alone. A car that stands
+shows no body, and nor does one as dark as the road.
 """
 
 from collections.abc import Sequence
@@ -14,6 +16,7 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
+from scipy.ndimage import median_filter
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
@@ -24,7 +27,7 @@ from lidarpainter_models.scenes.records import RecordedView
 
 WIDTH_PX = 480
 """Width at which images are compared."""
-MOST_IMAGES, LEAST_IMAGES = 24, 8
+MOST_IMAGES, LEAST_IMAGES = 24, 3
 """Images of a camera that are compared, evenly over the way; fewer tell nothing."""
 LEAST_BASELINE_M = 0.2
 """Images taken nearer to each other than this count as one."""
@@ -33,6 +36,16 @@ LEAST_MOTION_PX = 10.0
 MOST_HEIGHT_M = 3.0
 """No camera stands higher above the road; a lower one sees nearer ground, which moves faster."""
 LEAST_EDGE = 1.5  # grey levels a pixel that stay
+LEAST_ACROSS = 0.3
+"""Of the whole change of brightness, so much is along the epipolar line: lane markings and curbs
+slide along themselves."""
+RIDGE = 2.5
+"""A change that stays in place is so much larger than that around it, whatever its sign."""
+RIDGE_PX = 25  # what is around
+LINE_SHARE, FEW_LINE_SHARE, FEW_IMAGES = 0.04, 0.15, 8
+"""Of the width: shorter pieces of an edge tell nothing; the second where images are few, for then
+patterns of the street meet by chance. Of few images only a body as wide as a bonnet is believed."""
+WIDE_SHARE = 0.5  # of the width: so long an edge need not reach the border, which may be dark
 STAYS_IN = 0.85
 """A sure edge is there in so many of the images."""
 STANDS_OUT = 2.4
@@ -55,12 +68,22 @@ def own_bodies(
     Args:
         scene: where images and tracks are read from.
         views: those that may be looked at.
+
+    Returns:
+        Nothing for cameras that `cannot_be_told` names.
     """
     moving = MovingBoxes([track for track in scene.tracks if track.is_moving])
     names = sorted({view.camera_name for view in views})
     chosen = [_far_apart([view for view in views if view.camera_name == name]) for name in names]
     bodies = side_by_side(lambda own: _own_body(scene, own, moving), chosen)
     return {name: body for name, body in zip(names, bodies, strict=True) if body.any()}
+
+
+def cannot_be_told(views: Sequence[RecordedView]) -> dict[str, int]:
+    """How many images taken apart there are of the cameras that have too few of them to tell."""
+    names = sorted({view.camera_name for view in views})
+    apart = {name: _far_apart([v for v in views if v.camera_name == name]) for name in names}
+    return {name: len(own) for name, own in apart.items() if len(own) < LEAST_IMAGES}
 
 
 def _own_body(
@@ -75,7 +98,7 @@ def _own_body(
         for place, (view, camera) in enumerate(zip(views, cameras, strict=True))
     ]
     edges, sure = (mask & _would_have_moved(cameras) for mask in _what_stays(seen))
-    return _enclosed(edges, sure)
+    return _enclosed(edges, sure, only_wide=len(seen) < FEW_IMAGES)
 
 
 def in_words(camera_name: str, body: Bool[np.ndarray | Tensor, "height width"]) -> str:
@@ -137,18 +160,41 @@ def _seen_change(
     flow = _flow(camera, way)
     length = np.maximum(np.linalg.norm(flow, axis=-1), 1e-9)
     change = (right * flow[..., 0] + down * flow[..., 1]) / length
+    change[np.abs(change) < LEAST_ACROSS * np.hypot(right, down)] = 0
     return change.astype(np.float32), ~moving.pixels(camera, view.timestamp_ns).numpy()
 
 
 def _what_stays(
     seen: Sequence[tuple[Float[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]],
 ) -> tuple[Bool[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
-    """Pixels on the same edge in most of the images that count, and in nearly all of them."""
-    sign = np.sign(sum(change * counts for change, counts in seen))
-    same = sum((sign * change > LEAST_EDGE) & counts for change, counts in seen)
+    """Pixels on the same edge in most of the images that count, and in nearly all of them.
+
+    An edge is the same where it has the same sign, or where it stands out from its surroundings.
+    """
     total = np.maximum(sum(counts.astype(int) for _, counts in seen), 1)
-    stands_out = 2 * same - total > STANDS_OUT * np.sqrt(total)
-    return stands_out, stands_out & (same > STAYS_IN * total)
+    sign = np.sign(sum(change * counts for change, counts in seen))
+    held = sum((sign * change > LEAST_EDGE) & counts for change, counts in seen)
+    strength = sum(np.abs(change) * counts for change, counts in seen) / total
+    around = cv2.blur(strength.astype(np.float32), (RIDGE_PX, RIDGE_PX))
+    either = sum((np.abs(change) > LEAST_EDGE) & counts for change, counts in seen)
+    held = np.where(strength > RIDGE * around, either, held)
+    stands_out = 2 * held - total > STANDS_OUT * np.sqrt(total)
+    stands_out |= (held == total) & (total >= LEAST_IMAGES)  # as sure as a few images can be
+    lines = _long(stands_out, FEW_LINE_SHARE if len(seen) < FEW_IMAGES else LINE_SHARE)
+    return lines, lines & (held > STAYS_IN * total)
+
+
+def _long(
+    edges: Bool[np.ndarray, "height width"], least_share: float
+) -> Bool[np.ndarray, "height width"]:
+    """The edges that go on for this share of the width."""
+    window = np.ones((3, 3), np.uint8)
+    count, pieces, extents, _ = cv2.connectedComponentsWithStats(
+        cv2.dilate(edges.astype(np.uint8), window)
+    )
+    sides_px = extents[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)
+    is_long = (sides_px >= least_share * edges.shape[1]) & (np.arange(count) > 0)
+    return edges & is_long[pieces]
 
 
 def _would_have_moved(cameras: Sequence[Camera]) -> Bool[np.ndarray, "height width"]:
@@ -163,7 +209,10 @@ def _would_have_moved(cameras: Sequence[Camera]) -> Bool[np.ndarray, "height wid
 
 
 def _enclosed(
-    edges: Bool[np.ndarray, "height width"], sure: Bool[np.ndarray, "height width"]
+    edges: Bool[np.ndarray, "height width"],
+    sure: Bool[np.ndarray, "height width"],
+    *,
+    only_wide: bool,
 ) -> Bool[np.ndarray, "height width"]:
     """What groups of edges near the border of the image enclose with that border."""
     height, width = edges.shape
@@ -173,17 +222,45 @@ def _enclosed(
     count, groups = cv2.connectedComponents(cv2.dilate(edges.astype(np.uint8), window))
     for group in range(1, count):
         row, column = np.nonzero(edges & (groups == group))
-        to_border = np.stack([column, width - 1 - column, height - 1 - row])
-        if sure[row, column].mean() < SURE_SHARE or to_border.min() > BORDER_SHARE * width:
+        if sure[row, column].mean() < SURE_SHARE:
             continue
         points = np.stack([column, row], axis=1).astype(np.int32)
-        sides = ((1, height - 1), (0, 0), (0, width - 1))
-        hulls = [_hull_to_border(points, axis, at) for axis, at in sides]
-        sound = [hull for hull in hulls if _outlined(hull, edges) >= LEAST_OUTLINE]
-        largest = max(sound, key=cv2.contourArea, default=None)
-        if largest is not None and cv2.contourArea(largest) >= LEAST_AREA * edges.size:
-            cv2.fillConvexPoly(body, largest, 1)
+        outline = None if only_wide else _outline_at_border(points, edges)
+        outline = _outline_across(points, edges.shape) if outline is None else outline
+        if outline is not None and cv2.contourArea(outline) >= LEAST_AREA * edges.size:
+            cv2.fillPoly(body, [outline], 1)
     return body > 0
+
+
+def _outline_at_border(
+    points: Int[np.ndarray, "points 2"], edges: Bool[np.ndarray, "height width"]
+) -> np.ndarray | None:
+    """What edges near a border of the image enclose with it; None where it is no body."""
+    height, width = edges.shape
+    to_border = np.stack([points[:, 0], width - 1 - points[:, 0], height - 1 - points[:, 1]])
+    if to_border.min() > BORDER_SHARE * width:
+        return None
+    sides = ((1, height - 1), (0, 0), (0, width - 1))
+    hulls = [_hull_to_border(points, axis, at) for axis, at in sides]
+    sound = [hull for hull in hulls if _outlined(hull, edges) >= LEAST_OUTLINE]
+    return max(sound, key=cv2.contourArea, default=None)
+
+
+def _outline_across(
+    points: Int[np.ndarray, "points 2"], shape: tuple[int, int]
+) -> np.ndarray | None:
+    """What lies below one edge across most of the image; None where there is no such edge."""
+    height, width = shape
+    columns = np.unique(points[:, 0])
+    if len(columns) < WIDE_SHARE * width:
+        return None
+    row = np.array([points[points[:, 0] == column, 1].min() for column in columns], np.float64)
+    upper = np.interp(np.arange(width), columns, median_filter(row, round(GROUP_SHARE * width)))
+    if np.abs(points[:, 1] - upper[points[:, 0]]).mean() > GROUP_SHARE * width:
+        return None
+    line = np.stack([np.arange(width), upper.round()], axis=1)
+    ends = [(width - 1, height - 1), (0, height - 1)]
+    return np.concatenate([line, ends]).astype(np.int32)
 
 
 def _hull_to_border(points: Int[np.ndarray, "points 2"], axis: int, at: int) -> np.ndarray:

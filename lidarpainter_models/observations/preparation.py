@@ -67,9 +67,9 @@ def _prepared(
     progress: Callable[[int, int], None],
 ) -> SceneObservations:
     """`prepare_observations` of a split that has training views."""
-    faults = find_faults(scene, split.train) if config.corrects_cameras else {}
+    bodies = own_bodies(scene, split.train)
+    faults = find_faults(scene, split.train, bodies) if config.corrects_cameras else {}
     taken = [_as_taken(view, faults) for view in split.train]
-    bodies = own_bodies(scene, taken)
     hidden = {name: _at_fit_size(body, taken, name, config) for name, body in bodies.items()}
     points, is_estimated = _points(scene, split, taken, bodies)
     colouring = MapColouring(points, scene.tracks, taken)

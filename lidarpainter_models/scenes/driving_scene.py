@@ -21,6 +21,7 @@ from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.scenes.image_bytes import decode_image
+from lidarpainter_models.scenes.own_boxes import own_places, without_own_boxes
 from lidarpainter_models.scenes.records import (
     Distortion,
     ImageRecord,
@@ -237,8 +238,12 @@ class DrivingScene:
         )
         boxes = self._stored.table("boxes")
         columns = boxes.drop_columns(["world_from_box"]).to_pydict()
-        self.tracks: tuple[ActorTrack, ...] = tracks_from_boxes(
-            columns, _poses(boxes, "world_from_box")
+        path = self.frame_timestamps_ns, self.world_from_ego
+        self.tracks: tuple[ActorTrack, ...]
+        self.tracks, self.own_boxes = without_own_boxes(
+            tracks_from_boxes(columns, _poses(boxes, "world_from_box")),
+            own_places(self.views, self.sweeps, *path),
+            *path,
         )
 
 

@@ -18,8 +18,11 @@ from lidarpainter_models.scenes.records import Sweep
 
 WEATHER_REACH_M = 40.0
 """No drop returns enough light from further away, where what is thin stands alone."""
-CELL_RAD = math.radians(1.0)
-"""Directions and ranges fall into cells; what lies in a cell and those beside it is around."""
+CELL_RAD, LARGEST_CELL_RAD = math.radians(1.0), math.radians(4.0)
+"""Directions and ranges fall into cells; what lies in a cell and those beside it is around. Cells
+are doubled up to the larger size until as many returns lie around most as `FEW_AROUND`: a LiDAR of
+few beams is judged by its own spacing, and a turn that is sparser still tells nothing."""
+FEW_AROUND = 12
 CELL_RANGE = 0.03
 """As a share of the range."""
 LEAST_SHARE = 0.03
@@ -32,7 +35,6 @@ air is clear, and all of it is real: 0.2 to 0.5 % of four recordings in clear ai
 three with 2 % of their returns made drops. Left out they cost PandaSet 1.1 dB on the road ahead of
 its frames (three seeds). Where it is more the turn is too sparse to tell drops."""
 
-_COLUMNS, _ROWS = round(2 * math.pi / CELL_RAD), round(math.pi / CELL_RAD) + 2
 _BESIDE = (-1, 0, 1)
 
 
@@ -61,9 +63,25 @@ def stands_alone(offset_m: Float[Tensor, "points 3"]) -> Bool[Tensor, " points"]
     range_m = offset_m.norm(dim=1).clamp(min=1e-3)
     if len(range_m) < LEAST_RETURNS:
         return torch.zeros_like(range_m, dtype=torch.bool)
+    cell_rad = CELL_RAD
+    while cell_rad <= LARGEST_CELL_RAD:
+        is_alone, around = _alone_among_cells(offset_m, range_m, cell_rad)
+        is_alone &= range_m <= WEATHER_REACH_M
+        is_sparse = is_alone.sum() > MOST_ALONE * (range_m <= WEATHER_REACH_M).sum()
+        if is_sparse or around.median() >= FEW_AROUND:
+            return is_alone
+        cell_rad *= 2
+    return torch.zeros_like(is_alone)
+
+
+def _alone_among_cells(
+    offset_m: Float[Tensor, "points 3"], range_m: Float[Tensor, " points"], cell_rad: float
+) -> tuple[Bool[Tensor, " points"], Int[Tensor, " points"]]:
+    """Which returns nothing around confirms, and how many others there are around each."""
+    num_columns, num_rows = round(2 * math.pi / cell_rad), round(math.pi / cell_rad) + 2
     turn = torch.atan2(offset_m[:, 1], offset_m[:, 0]) + math.pi
     rise = torch.asin((offset_m[:, 2] / range_m).clamp(-1, 1)) + math.pi / 2
-    direction = (turn / CELL_RAD).long() % _COLUMNS * _ROWS + (rise / CELL_RAD).long() + 1
+    direction = (turn / cell_rad).long() % num_columns * num_rows + (rise / cell_rad).long() + 1
     layer = ((range_m / range_m.min()).log() / CELL_RANGE).long() + 1
     layers = int(layer.max()) + 2
     cells, of_point, count = torch.unique(
@@ -72,14 +90,13 @@ def stands_alone(offset_m: Float[Tensor, "points 3"]) -> Bool[Tensor, " points"]
     directions, of_cell = torch.unique(cells // layers, return_inverse=True)
     count_in = torch.zeros_like(directions).index_add_(0, of_cell, count)
     near, around = -torch.ones_like(count), -torch.ones_like(count)  # but for the return itself
-    for step in (right * _ROWS + up for right in _BESIDE for up in _BESIDE):
-        looked_at = (directions + step) % (_COLUMNS * _ROWS)
+    for step in (right * num_rows + up for right in _BESIDE for up in _BESIDE):
+        looked_at = (directions + step) % (num_columns * num_rows)
         around += _counted(directions, count_in, looked_at)[of_cell]
         there = looked_at[of_cell] * layers + cells % layers
         for further in _BESIDE:
             near += _counted(cells, count, there + further)
-    is_alone = ((near < 1) | (near < LEAST_SHARE * around))[of_point]
-    return is_alone & (range_m <= WEATHER_REACH_M)
+    return ((near < 1) | (near < LEAST_SHARE * around))[of_point], around[of_point]
 
 
 def _counted(

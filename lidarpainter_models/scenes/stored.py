@@ -8,7 +8,7 @@ each file is asked for before it is opened, and of an array only the chunks that
 
 import hashlib
 import json
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import zarr
 
-from lidarpainter_models.errors import SceneError
+from lidarpainter_models.errors import DataError, SceneError
 from lidarpainter_models.scenes import schema
 from lidarpainter_models.scenes.validation import shown
 
@@ -32,6 +32,26 @@ _ENTRIES |= {"content_digest": str, "dataset": str, "sequence": str}
 def content_digest(value: object) -> str:
     """Digest of JSON-able content; Python writes floats exactly, so equal means equal."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def write_table(
+    folder: Path, name: str, rows: Sequence[Mapping[str, Any]], where: str
+) -> dict[str, Any]:
+    """Write a table of the schema; gives its entry for the manifest. `where` names the scene.
+
+    Raises:
+        DataError: a row holds a value of another kind than the schema says.
+    """
+    try:
+        table = pa.Table.from_pylist(list(rows), schema=schema.arrow_schema(name))
+    except (pa.ArrowException, TypeError, ValueError, OverflowError) as error:
+        raise DataError(
+            f"{where}: the table of {name} holds a value of another kind than the format says "
+            f"({shown(str(error))})"
+        ) from None
+    pq.write_table(table, folder / f"{name}.parquet", compression="zstd")
+    # the digest is of what is stored, which an int among floats is not
+    return {"num_rows": len(table), "sha256": content_digest(table.to_pylist())}
 
 
 def stored_digest(path: Path) -> str | None:

@@ -15,8 +15,6 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import torch
 from jaxtyping import Float, Integer
 from torch import Tensor
@@ -26,7 +24,7 @@ from lidarpainter_models.geometry.transforms import is_rigid
 from lidarpainter_models.scenes import schema
 from lidarpainter_models.scenes.array_writer import create_arrays
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, SweepPoints
-from lidarpainter_models.scenes.stored import content_digest, stored_digest
+from lidarpainter_models.scenes.stored import content_digest, stored_digest, write_table
 from lidarpainter_models.scenes.validation import (
     require_jpeg,
     require_label,
@@ -38,7 +36,6 @@ from lidarpainter_models.scenes.validation import (
     require_size,
     require_start,
     require_time,
-    shown,
 )
 from lidarpainter_models.storage.whole_files import storage_errors
 from lidarpainter_models.storage.whole_folders import AsideFolder
@@ -76,8 +73,7 @@ class SceneWriter:
         self._camera_names: list[str] = []
         self._lidar_names: list[str] = []
         self._seen: set[tuple[str, int, str]] = set()
-        self._box_frames: dict[tuple[str, int], int] = {}
-        """By actor and time of its box, in which frame it was."""
+        self._box_frames: dict[tuple[str, int], int] = {}  # by actor and time
         self._provenance: Mapping[str, Any] = {}
 
     def __enter__(self) -> "SceneWriter":
@@ -255,10 +251,8 @@ class SceneWriter:
             require_time(box.timestamp_ns, where)
             earlier = self._box_frames.setdefault((box.actor_id, box.timestamp_ns), frame_index)
             if earlier != frame_index:
-                raise DataError(
-                    f"{where}: its box has the time {box.timestamp_ns} ns of the one in frame "
-                    f"{earlier}, expected each label once, at the time when it holds"
-                )
+                told = f"its box has the time {box.timestamp_ns} ns of the one in frame {earlier}"
+                raise DataError(f"{where}: {told}, expected each label once, at its own time")
             length_m, width_m, height_m = box.size_m
             self._rows["boxes"].append(
                 {
@@ -299,7 +293,9 @@ class SceneWriter:
     def _write_manifest(self) -> str:
         folder = self._aside.path
         arrays = {name: array.finish() for name, array in self._arrays.items()}
-        tables = {name: self._write_table(folder, name) for name in schema.TABLES}
+        tables = {
+            name: write_table(folder, name, self._rows[name], self._name) for name in schema.TABLES
+        }
         content = {
             "schema_version": schema.SCHEMA_VERSION,
             **self._identity,
@@ -327,18 +323,6 @@ class SceneWriter:
         }
         (folder / schema.MANIFEST_NAME).write_text(json.dumps(manifest, indent=1) + "\n", "utf-8")
         return manifest["content_digest"]
-
-    def _write_table(self, folder: Path, name: str) -> dict[str, Any]:
-        try:
-            table = pa.Table.from_pylist(self._rows[name], schema=schema.arrow_schema(name))
-        except (pa.ArrowException, TypeError, ValueError, OverflowError) as error:
-            raise DataError(
-                f"{self._name}: the table of {name} holds a value of another kind than the format "
-                f"says ({shown(str(error))})"
-            ) from None
-        pq.write_table(table, folder / f"{name}.parquet", compression="zstd")
-        # of what is stored, which an int among floats is not
-        return {"num_rows": len(table), "sha256": content_digest(table.to_pylist())}
 
     def _counts(self) -> dict[str, int]:
         return {

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.splits import split_frames
+from lidarpainter_models.scenes.splits import split_views
 from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
 from lidarpainter_models.stress.causes import cause_of
 from lidarpainter_models.stress.frames import Frame, read_frame
@@ -64,7 +64,7 @@ def write_spoilt(
         semantic_classes=scene.semantic_classes,
         more={**more, STRESS: spoilt_from(scene, cause, level)},
     )
-    train, _ = split_frames(scene.frame_indices, SPLIT)
+    train = split_views(scene, SPLIT).train_frames
     name = spoilt_name(scene, cause, level)
     with SceneWriter(store, DATASET, name, header) as writer:
         for done, frame_index in enumerate(scene.frame_indices, start=1):

@@ -4,16 +4,28 @@ import json
 import tempfile
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import cached_property
 from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool
 
 from catalog.errors import CatalogError
 from catalog.store import Store
-from lidarpainter_models.checks.doctor import check_scene, draw_overlay
+from lidarpainter_models.checks.calibration import CameraTurn
+from lidarpainter_models.checks.doctor import check_scene, draw_overlay, not_computed
+from lidarpainter_models.checks.overlay import with_legend
+from lidarpainter_models.checks.pictures import blank_cameras
 from lidarpainter_models.errors import LidarPainterError, SceneError
 from lidarpainter_models.export.images import write_png
 from lidarpainter_models.lidar.exposure_differences import exposure_differences
-from lidarpainter_models.lidar.recording_faults import find_faults
-from lidarpainter_models.observations.own_body import in_words, own_bodies
+from lidarpainter_models.lidar.recording_faults import (
+    cannot_be_told,
+    find_faults,
+    images_agree,
+)
+from lidarpainter_models.observations import own_body
+from lidarpainter_models.observations.own_body import LEAST_IMAGES, in_words, own_bodies
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from tasks.health import Finding
@@ -21,35 +33,66 @@ from tasks.ingest.bucket_roots import root_at_hand
 from tasks.ingest.sequences import find_sequences
 from tasks.opened import open_scene
 
+LookingAt = Callable[[str], None]
+"""Told the name of what is looked at next."""
 CAMERA_FAULTS = "camera faults"
 CORRECTS = "--set observation.corrects_cameras=true"
 TRIAL_FRAMES = slice(0, 6)
 """A dataset is tried on this much of each sequence: enough to tell how its cameras are turned."""
 
 
-def check_stored_scene(store: Store, scene_id: str, out: Path | None) -> list[Finding]:
+def check_stored_scene(
+    store: Store, scene_id: str, out: Path | None, looking_at: LookingAt = lambda _name: None
+) -> list[Finding]:
     """Check a scene of the store; writes an overlay image and all findings as JSON.
 
-    `out` is a file or folder for the overlay image, by default the store's folder `doctor`; the
-    JSON lies beside it under the same name.
+    Args:
+        store: where the scene is.
+        scene_id: its dataset and sequence, with a slash between.
+        out: a file or folder for the overlay image, by default the store's folder `doctor`; the
+            JSON lies beside it under the same name.
+        looking_at: told what is looked at next.
     """
     scene = open_scene(store, scene_id)
     path = out or store.root / "doctor" / scene.dataset / f"{scene.sequence}.png"
     if path.suffix != ".png":
         path = path / "overlay.png"
-    return _examined(scene, path, findings_about(scene))
+    return _examined(scene, path, findings_about(scene, looking_at=looking_at))
 
 
 def findings_about(
-    scene: DrivingScene, progress: Callable[[int, int], None] = lambda _done, _total: None
+    scene: DrivingScene,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
+    looking_at: LookingAt = lambda _name: None,
 ) -> list[Finding]:
     """Everything that is looked for in a whole scene; a trial of a few frames says too little."""
-    looks = [_findings, _camera_faults, *([_exposure] if scene.lidar_names else []), _own_bodies]
-    found = []
-    for done, look in enumerate(looks, start=1):
-        found += look(scene)
+    bodies = _Bodies(scene)
+    looks: dict[str, Callable[[], list[Finding]]] = {
+        "scene": lambda: _findings(scene, bodies, looking_at),
+        CAMERA_FAULTS: lambda: _camera_faults(scene, bodies),
+        "exposure": lambda: _exposure(scene) if scene.lidar_names else [],
+        "own body": lambda: _own_bodies(scene, bodies),
+    }
+    found: list[Finding] = []
+    for done, (name, look) in enumerate(looks.items(), start=1):
+        looking_at(name)
+        try:
+            found += look()
+        except Exception as error:  # noqa: BLE001 - what one look cannot compute ends no run
+            found.append(Finding(name, "warn", not_computed(error)))
         progress(done, len(looks))
     return found
+
+
+class _Bodies:
+    """What of each camera's images is the recording car, found when it is first asked for."""
+
+    def __init__(self, scene: DrivingScene) -> None:
+        self._scene = scene
+
+    @cached_property
+    def masks(self) -> dict[str, Bool[np.ndarray, "height width"]]:
+        return own_bodies(self._scene, self._scene.views)
 
 
 def check_dataset(store: Store, dataset: str, root: Path, out: Path | None) -> list[Finding]:
@@ -65,7 +108,7 @@ def check_dataset(store: Store, dataset: str, root: Path, out: Path | None) -> l
                     path = ingest_scene(dataset, folder, sequence, Path(trial), frames=TRIAL_FRAMES)
                 image = (out or store.root / "doctor" / dataset) / f"{sequence}.png"
                 scene = DrivingScene.open(path)
-                found = _examined(scene, image, _findings(scene))
+                found = _examined(scene, image, _findings(scene, _Bodies(scene)))
             except (LidarPainterError, CatalogError) as error:
                 found = [Finding("reading", "fail", str(error))]
         findings += [Finding(f"{sequence}: {f.name}", f.verdict, f.detail) for f in found]
@@ -86,38 +129,60 @@ def _examined(scene: DrivingScene, image: Path, found: list[Finding]) -> list[Fi
     return [*findings, Finding("report", "ok", str(file))]
 
 
-def _findings(scene: DrivingScene) -> list[Finding]:
-    return [Finding(check.name, check.verdict, check.detail) for check in check_scene(scene)]
+def _findings(
+    scene: DrivingScene, bodies: _Bodies, looking_at: LookingAt = lambda _name: None
+) -> list[Finding]:
+    def agrees(name: str, turn: CameraTurn) -> bool | None:
+        turned_deg = [turn.pitch_deg, turn.yaw_deg, turn.roll_deg]
+        return images_agree(scene, name, -np.radians(turned_deg), bodies.masks.get(name))
+
+    checks = check_scene(scene, agrees, looking_at)
+    return [Finding(check.name, check.verdict, check.detail) for check in checks]
 
 
-def _camera_faults(scene: DrivingScene) -> list[Finding]:
+def _camera_faults(scene: DrivingScene, bodies: _Bodies) -> list[Finding]:
     """What a fit can correct about the cameras."""
-    faults = find_faults(scene, scene.views)
-    said = [f"{name} {fault}" for name, fault in faults.items()]
-    if not said:
-        return [Finding(CAMERA_FAULTS, "ok", "clocks, angles and readouts are as stored")]
-    return [Finding(CAMERA_FAULTS, "warn", f"{'; '.join(said)} ({CORRECTS} corrects it in a fit)")]
+    untold = cannot_be_told(scene.views)
+    faults = find_faults(scene, scene.views, bodies.masks)
+    if faults:
+        said = "; ".join(f"{name} {fault}" for name, fault in faults.items())
+        tried = "views set aside agree better with it"
+        return [Finding(CAMERA_FAULTS, "warn", f"{said} ({tried}: {CORRECTS} corrects it)")]
+    told = [name for name in scene.camera_names if name not in untold]
+    said = f"{', '.join(told)}: clocks, angles and readouts are as stored" if told else ""
+    if untold:
+        why = "few or coarse images, or a car that stands"
+        said += f"{'; ' if told else ''}{', '.join(untold)} cannot be told ({why})"
+    return [Finding(CAMERA_FAULTS, "ok", said)]
 
 
 def _exposure(scene: DrivingScene) -> list[Finding]:
     """How images differ in brightness."""
+    if blank := blank_cameras(scene):
+        said = "; ".join(f"{name} {words}" for name, words in blank.items())
+        return [Finding("exposure", "warn", f"not compared: {said}")]
     try:
-        said = exposure_differences(scene)
+        differences = exposure_differences(scene)
     except SceneError as error:
         return [Finding("exposure", "fail", str(error))]
-    if not said:
+    if not differences:
         return [Finding("exposure", "ok", "images are exposed alike")]
-    return [Finding("exposure", "warn", "; ".join(said))]
+    return [Finding("exposure", "warn", "; ".join(differences))]
 
 
-def _own_bodies(scene: DrivingScene) -> list[Finding]:
+def _own_bodies(scene: DrivingScene, bodies: _Bodies) -> list[Finding]:
     """Which cameras show the recording car, which a fit leaves out."""
-    found = own_bodies(scene, scene.views)
-    said = [in_words(name, body) for name, body in found.items()]
-    return [Finding("own body", "ok", " ".join(said) or "no camera shows the recording car")]
+    said = [in_words(name, body) for name, body in bodies.masks.items()]
+    untold = own_body.cannot_be_told(scene.views)
+    if len(untold) < len(scene.camera_names):
+        who = "No other camera" if said else "No camera"
+        said += [f"{who} {'that was checked ' if untold else ''}shows the recording car."]
+    for name, number in untold.items():
+        said.append(f"{name} was not checked ({number} images taken apart, {LEAST_IMAGES} needed).")
+    return [Finding("own body", "ok", " ".join(said))]
 
 
 def _write_overlay(scene: DrivingScene, path: Path) -> Path:
     of_camera = scene.views_of(scene.views[0].camera_name)
-    rgb_u8 = draw_overlay(scene, of_camera[len(of_camera) // 2])
+    rgb_u8 = with_legend(draw_overlay(scene, of_camera[len(of_camera) // 2]))
     return write_png(rgb_u8.float() / 255, path)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from drawn_streets import drawn_street
 
-from lidarpainter_models.checks.clear_air import check_clear_air
+from lidarpainter_models.checks.sweeps import check_clear_air
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.synthetic import SyntheticStreetConfig, record_street
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS

@@ -10,8 +10,15 @@ import pytest
 import torch
 
 from lidarpainter_models.checks import actors
-from lidarpainter_models.checks.actors import check_box_axes, check_duplicate_tracks
+from lidarpainter_models.checks.actors import (
+    check_box_axes,
+    check_box_points,
+    check_duplicate_tracks,
+    check_lasting_ids,
+)
 from lidarpainter_models.checks.doctor import check_ego_poses, check_scene, draw_overlay
+from lidarpainter_models.checks.pictures import check_pictures
+from lidarpainter_models.checks.sweeps import check_clear_air, check_origins
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 
 
@@ -36,7 +43,7 @@ def finding(scene, name):
 def test_sound_scene_passes_every_check(small_scene):
     checks = check_scene(small_scene)
     assert [check for check in checks if check.verdict != "ok"] == []
-    assert len({check.name for check in checks}) == 16
+    assert len({check.name for check in checks}) == 21
 
 
 @pytest.fixture
@@ -78,6 +85,56 @@ def test_ego_whose_x_is_not_forward_is_found(scene):
     assert "drives across its x axis: is ego x forward, y left?" in check.detail
     scene.world_from_ego = scene.world_from_ego @ across  # backwards is a way to drive
     assert check_ego_poses(scene)[0] == "ok"
+
+
+def test_times_in_another_unit_are_said_in_one_line(scene):
+    scene.frame_timestamps_ns = scene.frame_timestamps_ns // 1000
+    verdict, detail = check_ego_poses(scene)
+    assert verdict == "fail"
+    assert "m/s throughout, no car does: times must be in nanoseconds" in detail
+
+
+@pytest.mark.parametrize("level", [0, 200])
+def test_camera_whose_images_show_nothing_is_found(scene, monkeypatch, level):
+    read, random = scene.read_image, np.random.default_rng(0)
+
+    def blank(view):
+        image = read(view)
+        if view.camera_name != "left_camera":
+            return image
+        return torch.from_numpy(random.integers(level, level + 2, image.shape).astype(np.uint8))
+
+    monkeypatch.setattr(scene, "read_image", blank)
+    look = "black" if level == 0 else "of one even brightness"
+    verdict, detail = check_pictures(scene)
+    assert verdict == "fail"
+    assert detail.startswith(f"left_camera is {look} in all 3 images")
+
+
+def test_what_a_check_cannot_compute_ends_no_run(scene):
+    scene.tracks = None
+    check = finding(scene, "boxes point ahead")
+    assert check.verdict == "warn"
+    assert check.detail.startswith("not checked: it could not be computed (TypeError: ")
+
+
+def test_origin_on_the_road_is_found_and_no_rain(scene):
+    assert check_origins(scene)[0] == "ok"
+    lowered = torch.tensor([0.0, 0.0, 1.8], dtype=torch.float64)
+    scene.sweeps = tuple(
+        replace(sweep, world_from_lidar=moved_down(sweep.world_from_lidar, lowered))
+        for sweep in scene.sweeps
+    )
+    verdict, detail = check_origins(scene)
+    assert verdict == "warn"
+    assert "world_from_lidar must be where the LiDAR is" in detail
+    assert "rain" not in check_clear_air(scene)[1]
+
+
+def moved_down(pose, by_m):
+    lower = pose.clone()
+    lower[:3, 3] -= by_m
+    return lower
 
 
 def test_camera_clock_off_by_half_a_second_is_found(scene):
@@ -185,6 +242,79 @@ def test_one_step_aside_is_no_wrong_convention(scene):
 
     assert moved_aside(2) == "warn"
     assert moved_aside(3) == "fail"
+
+
+def with_path(scene, times_s, path_m, axes):
+    """The scene with one moving actor that stands so and looks so at some times."""
+    boxes = torch.eye(4, dtype=torch.float64).repeat(len(times_s), 1, 1)
+    boxes[:, :2, 3] = torch.tensor(path_m, dtype=torch.float64)
+    boxes[:, :2, 0] = torch.tensor(axes, dtype=torch.float64)
+    boxes[:, :2, 1] = boxes[:, :2, 0] @ torch.tensor([[0.0, 1.0], [-1.0, 0.0]]).double()
+    rows = torch.arange(len(times_s))
+    scene.tracks = (
+        replace(
+            next(track for track in scene.tracks if track.is_moving),
+            world_from_box=boxes,
+            frame_indices=rows,
+            timestamps_ns=torch.tensor([round(1e9 * time_s) for time_s in times_s]),
+            num_points=rows,
+        ),
+    )
+    return scene
+
+
+def test_a_turn_and_a_gap_in_a_track_are_no_wrong_convention(scene):
+    angles = np.linspace(0, np.pi, 12)
+    turn_m = 6 * np.stack([np.sin(angles), 1 - np.cos(angles)], axis=1)
+    looks = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    times_s = [0.2 * step for step in range(12)]
+    assert check_box_axes(with_path(scene, times_s, turn_m, looks))[0] == "ok"
+    there_m = [[2.0 * step, 0.0] for step in range(4)]
+    back_m = [[6.0 - 2.0 * step, 30.0] for step in range(4)]  # away for 20 s, and elsewhere then
+    times_s = [0.2 * step for step in range(4)] + [20 + 0.2 * step for step in range(4)]
+    looks = [[1.0, 0.0]] * 4 + [[-1.0, 0.0]] * 4
+    assert check_box_axes(with_path(scene, times_s, there_m + back_m, looks))[0] == "ok"
+
+
+def test_points_on_the_faces_of_a_box_are_held(scene):
+    moving = [track for track in scene.tracks if track.is_moving]
+    scene.tracks = tuple(
+        replace(track, num_points=torch.zeros_like(track.num_points)) for track in moving
+    )
+    corners = [
+        (
+            track.world_from_box[row]
+            @ torch.tensor([*(track.size_m.double() / 2 * side), 1.0]).double()
+        )[:3]
+        for track in scene.tracks
+        for row in range(len(track.frame_indices))
+        for side in (torch.tensor([-1.0, 0.0, 0.0]),)
+    ]
+    on_faces = torch.stack(corners).float()
+    read = scene.read_column
+    scene.read_column = lambda sweep, name: (
+        torch.cat([read(sweep, name), on_faces]) if name == "xyz_m" else read(sweep, name)
+    )
+    assert check_box_points(scene)[0] == "ok"
+
+
+def test_ids_that_do_not_last_are_found(scene):
+    assert check_lasting_ids(scene)[0] == "ok"
+    scene.tracks = tuple(
+        replace(
+            track,
+            actor_id=f"{track.actor_id}.{copy}.{row}",
+            frame_indices=track.frame_indices[row : row + 1],
+            timestamps_ns=track.timestamps_ns[row : row + 1],
+            world_from_box=track.world_from_box[row : row + 1],
+            num_points=track.num_points[row : row + 1],
+        )
+        for copy, track in enumerate([*scene.tracks] * 5)
+        for row in range(len(track.frame_indices))
+    )
+    verdict, detail = check_lasting_ids(scene)
+    assert verdict == "warn"
+    assert "ids must last" in detail
 
 
 def test_actor_with_two_tracks_is_found(pandaset, tmp_path):

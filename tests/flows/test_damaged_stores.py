@@ -19,10 +19,10 @@ RUN = {
     "artefacts": ["observations/a", "gaussians/b"],
 }
 EVERY = [
-    ("catalog", "show", "latest", "--json"),
-    ("catalog", "explain", "latest"),
-    ("evaluate", "latest"),
-    ("render", "latest", "--trajectory", "recorded", "--out", "x"),
+    ("catalog", "show", "r1", "--json"),
+    ("catalog", "explain", "r1"),
+    ("evaluate", "r1"),
+    ("render", "r1", "--trajectory", "recorded", "--out", "x"),
 ]
 
 

@@ -9,8 +9,14 @@ import torch
 from toy_street import ToyStreet
 
 from lidarpainter_models.geometry.cameras import Shutter
+from lidarpainter_models.lidar import recording_faults
 from lidarpainter_models.lidar.contrast_images import ContrastImage
-from lidarpainter_models.lidar.recording_faults import Found, believed, find_faults
+from lidarpainter_models.lidar.recording_faults import (
+    Found,
+    believed,
+    cannot_be_told,
+    find_faults,
+)
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import split_views
 from lidarpainter_models.synthetic import SyntheticStreetConfig, write_street
@@ -43,6 +49,18 @@ def test_small_and_uncertain_departures_are_no_faults():
     assert (fault.turn_rad, fault.late_s, fault.readout_s) == ((0.0, 0.009, 0.0), 0.05, 0.0)
 
 
+@pytest.mark.parametrize(
+    ("num_frames", "speed_mps", "untold"),
+    [(8, 10.0, []), (7, 10.0, ["front"]), (8, 1.0, ["front"]), (8, 9000.0, ["front"])],
+    ids=["told", "few images", "stands", "times in microseconds"],
+)
+def test_what_cannot_be_told_is_named(num_frames, speed_mps, untold):
+    driving = Shutter(twist_per_s=torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, speed_mps]))
+    views = ToyStreet(num_frames=num_frames).views
+    moved = [replace(v, camera=replace(v.camera, shutter=driving, fx_px=300.0)) for v in views]
+    assert cannot_be_told(moved) == untold
+
+
 def test_contrast_does_not_see_exposure():
     rgb = np.random.default_rng(0).integers(60, 120, (64, 64, 3)).astype(np.uint8)
     dark, bright = (ContrastImage.of(image).levels[3] for image in (rgb, 2 * rgb))
@@ -50,10 +68,11 @@ def test_contrast_does_not_see_exposure():
 
 
 def test_each_sweep_is_read_once_for_all_cameras(monkeypatch):
-    street = ToyStreet(num_frames=4, camera_gains=(("front", 1.0), ("beside", 0.8)))
+    street = ToyStreet(num_frames=8, camera_gains=(("front", 1.0), ("beside", 0.8)))
     driving = Shutter(twist_per_s=torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 10.0]))
     moved = [replace(v, camera=replace(v.camera, shutter=driving)) for v in street.views]
     read, read_column = [], street.read_column
+    monkeypatch.setattr(recording_faults, "_edges_agree", lambda *_: True)  # a toy has no edges
     monkeypatch.setattr(
         street,
         "read_column",

@@ -14,7 +14,12 @@ from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rigid_from_rotation
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.metrics.perceptual import load_distances
-from lidarpainter_models.observations.own_body import in_words, on_grid, own_bodies
+from lidarpainter_models.observations.own_body import (
+    cannot_be_told,
+    in_words,
+    on_grid,
+    own_bodies,
+)
 from lidarpainter_models.observations.preparation import prepare_observations
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.observations.stored_form import (
@@ -49,8 +54,11 @@ def car_ahead():
 class RoadDrive(ToyStreet):
     """A car on a plain of random patches; what of its images is the car itself shines a little."""
 
-    def __init__(self, body, *, step_m=0.6, looks=LOOK_FORWARD, num_frames=12):
+    def __init__(
+        self, body, *, step_m=0.6, looks=LOOK_FORWARD, num_frames=12, is_night=False, lamps=0
+    ):
         super().__init__(num_frames)
+        self.is_night, self.lamps = is_night, lamps
         self.body, self.tracks = body, ()
         place = np.random.default_rng(0)
         self.patches = cv2.GaussianBlur(
@@ -87,26 +95,55 @@ class RoadDrive(ToyStreet):
         image = np.where(rays[..., 2] < 0, self.patches[row, column], 210)
         if self.body is not None:
             shine = 20 * np.sin(np.arange(WIDTH_PX) / 25 + view.frame_index)
-            image = np.where(self.body, 40 + shine, image)
+            lit = self.lamps * (view.frame_index % 2)  # brighter than the road under each lamp
+            image = np.where(self.body, 40 + shine + lit, image)
+        if self.is_night:
+            row, column = np.mgrid[:HEIGHT_PX, :WIDTH_PX]
+            lamp = np.exp(-(((column - 160) / 110) ** 4) - ((row - 130) / 60) ** 4)
+            noise = np.random.default_rng(view.frame_index).normal(0, 3, image.shape)
+            image = np.clip(0.5 * lamp * image + 12 + noise, 0, 255)
         return torch.from_numpy(np.repeat(image[..., None], 3, axis=2).astype(np.uint8))
 
 
-@pytest.mark.parametrize(("body", "looks"), [(bonnet, LOOK_FORWARD), (mirror, SIDEWAYS)])
-def test_the_car_is_found_where_it_is(body, looks):
-    street = RoadDrive(body(), looks=looks)
+@pytest.mark.parametrize(
+    ("body", "options"),
+    [
+        (bonnet, {}),
+        (mirror, {"looks": SIDEWAYS}),
+        (bonnet, {"lamps": 200}),
+        (bonnet, {"num_frames": 3, "step_m": 5.0}),
+        (bonnet, {"is_night": True}),
+    ],
+    ids=["bonnet", "mirror", "lit by lamps", "three images", "night"],
+)
+def test_the_car_is_found_where_it_is(body, options):
+    street = RoadDrive(body(), **options)
     (found,) = own_bodies(street, street.views).values()
     found = on_grid(found, width_px=WIDTH_PX, height_px=HEIGHT_PX).numpy()
-    assert (found & body()).sum() / (found | body()).sum() > 0.9
+    assert (found & body()).sum() / (found | body()).sum() > 0.8
+    assert cannot_be_told(street.views) == {}
 
 
 @pytest.mark.parametrize(
-    ("body", "step_m"),
-    [(None, 0.6), (bonnet, 0.0), (car_ahead, 0.6)],
-    ids=["no body", "a car that stands", "a car ahead"],
+    ("body", "options"),
+    [
+        (None, {}),
+        (None, {"is_night": True}),
+        (None, {"num_frames": 3, "step_m": 5.0}),
+        (bonnet, {"step_m": 0.0}),
+        (car_ahead, {}),
+    ],
+    ids=["no body", "no body at night", "three images", "a car that stands", "a car ahead"],
 )
-def test_what_is_no_part_of_the_car_stays(body, step_m):
-    street = RoadDrive(body and body(), step_m=step_m)
+def test_what_is_no_part_of_the_car_stays(body, options):
+    street = RoadDrive(body and body(), **options)
     assert own_bodies(street, street.views) == {}
+
+
+def test_a_camera_with_too_few_images_taken_apart_cannot_be_told():
+    standing = RoadDrive(bonnet(), step_m=0.0)
+    assert cannot_be_told(standing.views) == {"front": 1}
+    assert cannot_be_told(RoadDrive(bonnet(), num_frames=2).views) == {"front": 2}
 
 
 @pytest.fixture(scope="module")

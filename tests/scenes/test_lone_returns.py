@@ -77,3 +77,9 @@ def test_as_few_lone_returns_as_in_clear_air_stay(share, kept_share):
     kept = is_confirmed(directions * torch.where(is_drop, 0.9 * stop * range_m, range_m)[:, None])
     assert kept.float().mean() == pytest.approx(kept_share, abs=0.01)
     assert kept.all() == (kept_share == 1)
+
+
+@pytest.mark.parametrize(("beams", "columns"), [(32, 120), (16, 240), (16, 900)])
+def test_a_lidar_of_wide_spacing_is_judged_by_its_own(beams, columns):
+    directions, range_m = turn_of(beams, columns)
+    assert stands_alone(directions * range_m[:, None]).float().mean() < 0.005

@@ -162,9 +162,7 @@ def test_a_camera_is_turned_in_frames_that_judge_as_in_those_that_train(clean, s
     noise = torch.randn(len(views), 6, generator=torch.Generator().manual_seed(0))
     corrections.view_tangent.copy_(1e-4 * noise)
     for view, before in zip(held_out, clean.views[1::2], strict=True):
-        judged = corrections.corrected(
-            view.camera, key=None, timestamp_ns=view.timestamp_ns, camera_name=view.camera_name
-        )
+        judged = corrections.refined(view.camera, view.key, view.timestamp_ns)
         apart = before.camera.world_from_camera[:3, 2] @ judged.world_from_camera[:3, 2]
         assert float(torch.rad2deg(torch.arccos(apart))) == pytest.approx(1.0, abs=0.03)
 

@@ -16,10 +16,10 @@ from lidarpainter_models.checks.doctor import (
     MAX_CAMERA_LAG_S,
     MAX_SPEED_MPS,
     MAX_TURN_RADPS,
-    sampled_positions,
 )
 from lidarpainter_models.checks.lidar_reach import LidarReach, could_any_hit
 from lidarpainter_models.checks.sweep_agreement import nearest_gap_m, points_near
+from lidarpainter_models.checks.sweeps import sampled_positions
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.transforms import quaternion_from_rotation
 from lidarpainter_models.readers.source_logs.drive_poses import NS_PER_S

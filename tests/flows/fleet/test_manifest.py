@@ -83,6 +83,12 @@ def test_a_manifest_that_is_absent_or_huge_is_one_line(tmp_path, written):
         read_manifest(written("#" * 2_000_000))
 
 
+def test_a_manifest_saved_by_a_windows_editor_is_read(tmp_path):
+    file = tmp_path / "night.toml"
+    file.write_bytes(b"\xef\xbb\xbf" + GOOD.replace("\n", "\r\n").encode())
+    assert read_manifest(file).name == "night"
+
+
 def test_streets_are_drawn_as_the_source_says(asked_of):
     one, two = asked_of(f'{GOOD}frames = "0:6"\nwidth_px = 320\ncameras = ["front_camera"]\n')
     assert [one.scene_id, two.scene_id] == ["synthetic/street-0001", "synthetic/street-0002"]

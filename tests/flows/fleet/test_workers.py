@@ -327,7 +327,7 @@ def test_a_scene_from_elsewhere_is_made_under_its_own_name(store, tmp_path, monk
         made = {"artefacts": {}, "computed_now": {}, "peak_memory_bytes": None}
         return {"run_id": f"run of {parameters.scene}", **made}
 
-    monkeypatch.setattr("flows.fleet.work.reconstruct", SimpleNamespace(fn=reconstructed))
+    monkeypatch.setattr("flows.fleet.work.reconstruct", reconstructed)
     said = []
     Worker(ledger=ledger, fleet="stub", work=make_sequence, say=said.append, poll_s=0.2).run()
     (row,) = ledger.rows("stub")
@@ -347,7 +347,7 @@ def test_a_worker_lets_go_of_what_a_sequence_had_opened(store, tmp_path, monkeyp
         made = {"artefacts": {}, "computed_now": {}, "peak_memory_bytes": None}
         return {"run_id": str(len(opened)), **made}
 
-    monkeypatch.setattr("flows.fleet.work.reconstruct", SimpleNamespace(fn=reconstructed))
+    monkeypatch.setattr("flows.fleet.work.reconstruct", reconstructed)
     Worker(ledger=ledger, fleet="stub", work=make_sequence, say=print, poll_s=0.2).run()
     assert (len(opened), kept) == (2, [])
 

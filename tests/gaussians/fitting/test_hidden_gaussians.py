@@ -138,7 +138,7 @@ def wall_and_what_is_behind():
 def test_a_probe_measures_the_pixels_that_each_gaussian_fills():
     scene, camera, bodies = wall_and_what_is_behind()
     probe = ones(4)
-    image = draw_gaussians(scene.gaussians, bodies, camera, channel=probe)
+    image = draw_gaussians(scene.gaussians, bodies, camera, channels=probe)
     probed(image).backward()
     px = probe.grad[:, 0] / PROBE
     assert float(px.sum()) == pytest.approx(float(image.alpha.detach().sum()), rel=1e-4)
@@ -150,7 +150,7 @@ def test_a_probe_beside_the_actors_changes_no_image():
     scene, camera, bodies = wall_and_what_is_behind()
     plain = draw_gaussians(scene.gaussians, bodies, camera, with_actor_alpha=True)
     measured = draw_gaussians(
-        scene.gaussians, bodies, camera, with_actor_alpha=True, channel=ones(4)
+        scene.gaussians, bodies, camera, with_actor_alpha=True, channels=ones(4)
     )
     assert torch.equal(plain.rgb, measured.rgb)
     assert torch.equal(plain.features[..., 0], measured.features[..., 0])

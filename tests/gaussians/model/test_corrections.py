@@ -32,7 +32,7 @@ def test_camera_without_training_views_stays_as_recorded():
     cameras = two_cameras()
     cameras.view_tangent.add_(0.01)
     camera = camera_at(0.5)
-    found = cameras.corrected(camera, key=None, timestamp_ns=0, camera_name="back")
+    found = cameras.refined(camera, (0, "back"), 0)
     assert found is camera
 
 
@@ -40,8 +40,8 @@ def test_constant_of_a_camera_reaches_its_other_times():
     cameras = two_cameras()
     cameras.camera_tangent[1, 1] = 0.02
     camera = camera_at(0.5)
-    turned = cameras.corrected(camera, key=(7, "left"), timestamp_ns=1, camera_name="left")
-    same = cameras.corrected(camera, key=(7, "front"), timestamp_ns=1, camera_name="front")
+    turned = cameras.refined(camera, (7, "left"), 1)
+    same = cameras.refined(camera, (7, "front"), 1)
     assert (turned.world_from_camera - camera.world_from_camera).abs().max() > 0.01
     assert torch.allclose(same.world_from_camera, camera.world_from_camera, atol=1e-9)
 
@@ -115,8 +115,8 @@ def test_a_fault_of_a_camera_reaches_its_other_times():
     cameras = replace(two_cameras(), faults={"left": CameraFault(late_s=0.05)})
     moving = Shutter(twist_per_s=torch.tensor([0.0, 0, 0, 0, 0, 10.0], dtype=torch.float64))
     camera = replace(camera_at(0.5), shutter=moving)
-    late = cameras.corrected(camera, key=(7, "left"), timestamp_ns=1, camera_name="left")
-    sound = cameras.corrected(camera, key=(7, "front"), timestamp_ns=1, camera_name="front")
+    late = cameras.refined(camera, (7, "left"), 1)
+    sound = cameras.refined(camera, (7, "front"), 1)
     assert float(late.centre_world[0]) == pytest.approx(1.0)
     assert late.taken_ns(0) == 50_000_000
     assert float(sound.centre_world[0]) == pytest.approx(0.5)

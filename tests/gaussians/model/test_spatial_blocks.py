@@ -8,13 +8,8 @@ from gaussian_world import FRAME_NS, camera_at, car_track, round_gaussians, scen
 
 from lidarpainter_models.gaussians.fitting.gaussian_adam import most_sigmas
 from lidarpainter_models.gaussians.fitting.learning_rates import LearningRates
-from lidarpainter_models.gaussians.model import gaussian_scene
 from lidarpainter_models.gaussians.model.actors import Actors
-from lidarpainter_models.gaussians.model.scene_rendering import (
-    camera_from_body,
-    draw_gaussians,
-    draw_over_sky,
-)
+from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body, draw_gaussians
 from lidarpainter_models.gaussians.model.spatial_blocks import SpatialBlocks
 from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
@@ -147,22 +142,15 @@ def same_image(one, other):
 
 @pytest.mark.parametrize("across_s", [(0.0, 0.0), (0.0, 0.03), (0.02, 0.0)])
 @pytest.mark.parametrize("seed", range(4))
-def test_a_view_is_drawn_from_what_it_can_show_alone(across_s, seed, monkeypatch):
+def test_a_view_is_drawn_from_what_it_can_show_alone(across_s, seed):
     scene = scene_of(scattered(2000, seed), [camera_at(0.0)], [car_track(3)])
     twist = torch.tensor([0.02, 0.3, -0.1, 0.5, 0.0, 15.0], dtype=torch.float64)
     shutter = Shutter(across_s=across_s, twist_per_s=twist)
     camera = replace(view_at(scene, seed)[0], shutter=shutter)
-    drawn = []
-
-    def draw(gaussians, *rest, **named):
-        drawn.append(len(gaussians))
-        return draw_over_sky(gaussians, *rest, **named)
-
-    monkeypatch.setattr(gaussian_scene, "draw_over_sky", draw)
     of_a_fit = scene.with_gaussians(scene.gaussians.as_leaves())
     assert same_image(scene.render(camera, FRAME_NS), of_a_fit.render(camera, FRAME_NS))
-    assert drawn[0] < 0.8 * 2000
-    assert drawn[1] == 2000
+    assert len(scene.drawable(camera, FRAME_NS).rows) < 0.8 * 2000
+    assert len(of_a_fit.drawable(camera, FRAME_NS).rows) == 2000
 
 
 def test_limbs_that_reach_into_a_view_are_drawn():

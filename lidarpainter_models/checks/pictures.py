@@ -1,0 +1,47 @@
+"""Whether each camera's images show anything: black or even ones have no edge and no colour."""
+
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.records import RecordedView
+
+MOST_EVEN_LEVELS = 3.0
+"""Spread of the brightness (10th to 90th percentile of 255) of an image that shows nothing; of one
+at night, blurred as it is here, it is 20 and more."""
+BLACK_LEVEL = 16.0
+_NUM_LOOKED_AT = 8
+_SIZE_PX = (160, 90)
+"""Images are made so small first: noise is none then."""
+
+
+def check_pictures(scene: DrivingScene) -> tuple[Literal["ok", "fail"], str]:
+    """Whether the images of each camera show something."""
+    if blank := blank_cameras(scene):
+        said = "; ".join(f"{name} {words}" for name, words in blank.items())
+        return "fail", f"{said}: leave it out (ingest --cameras)"
+    return "ok", "the images of each camera show something"
+
+
+def blank_cameras(scene: DrivingScene) -> dict[str, str]:
+    """What is to be said of cameras whose images show nothing, all of them, by name."""
+    said = {}
+    for name in scene.camera_names:
+        views = scene.views_of(name)
+        step = -(-len(views) // _NUM_LOOKED_AT)
+        if all(_even_level(scene, view) is not None for view in views[::step]):
+            levels = [_even_level(scene, view) for view in views]
+            even = [level for level in levels if level is not None]
+            if len(even) == len(views):
+                look = "black" if max(even) < BLACK_LEVEL else "of one even brightness"
+                said[name] = f"is {look} in all {len(views)} images"
+    return said
+
+
+def _even_level(scene: DrivingScene, view: RecordedView) -> float | None:
+    """Brightness of an image that shows nothing; None of one that shows something."""
+    small = cv2.resize(scene.read_image(view).numpy(), _SIZE_PX, interpolation=cv2.INTER_AREA)
+    low, middle, high = np.percentile(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), (10, 50, 90))
+    return float(middle) if high - low < MOST_EVEN_LEVELS else None

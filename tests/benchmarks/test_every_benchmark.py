@@ -1,0 +1,76 @@
+"""Every benchmark runs to its end in its smallest form, as its own text says to call it."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from chromium import found_browser
+from written_logs import WRITERS
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+TWO_COLOURS = """<canvas width=9 height=9></canvas><script>
+document.querySelector('canvas').getContext('2d').fillRect(0, 0, 4, 9)</script>"""
+
+
+def run(name, *words):
+    """Run a script beside this one; what it printed."""
+    paths = os.pathsep.join(map(str, (ROOT, ROOT / "tests" / "support")))
+    done = subprocess.run(
+        [sys.executable, HERE / name, *map(str, words)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": paths},
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
+
+
+def slow(*case):
+    return pytest.param(*case, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "told"),
+    [
+        ("bench_catalog.py", ("60",), "60"),
+        ("bench_fleet.py", ("2",), "2 sequences:"),
+        ("bench_nuscenes_tables.py", ("--rows", "1000"), "1,000"),
+        ("bench_questions.py", ("5",), "5 scenes, 35 artefacts"),
+        ("bench_one_step.py", ("costs", "--size", "64x64"), "{"),
+        slow("bench_length.py", ("--quick",), "... over"),
+        slow("bench_waymo_reader.py", ("--frames", "1"), "v2:"),
+    ],
+)
+def test_a_benchmark_that_makes_its_own_input_tells_figures(name, words, told):
+    assert told in run(name, *words)
+
+
+def test_every_part_of_the_kernels_suite_is_measured_in_small(tmp_path):
+    told = run("suite.py", "--quick", "--out", tmp_path / "benchmarks.json")
+    parts = ("machine", "gaussian_raster", "iteration", "adam", "growth", "memory", "point_splat")
+    assert [part for part in parts if f"{part}." not in told] == []
+    assert "iteration.twins" in told
+
+
+def test_ingest_is_timed_and_its_digests_are_one(tmp_path):
+    log = WRITERS["pandaset"](tmp_path)
+    words = ("--dataset", log.dataset, "--sequence", log.sequence, "--runs", "1", "--serial")
+    assert run("bench_ingest.py", log.root, *words).count("frames ahead:") == 2
+
+
+@pytest.mark.slow
+def test_pages_and_galleries_are_timed_in_a_browser(tmp_path):
+    found_browser()
+    page = tmp_path / "page.html"
+    page.write_text(TWO_COLOURS, "utf-8")
+    assert "first image after" in run("bench_page.py", page, "1")
+    assert "a filter in" in run("bench_gallery.py", "20", "1")
+
+
+@pytest.mark.slow
+def test_a_long_log_is_written(tmp_path):
+    assert "synthetic/whole-log: 5 images" in run("whole_log.py", tmp_path, "--frames", "1")
