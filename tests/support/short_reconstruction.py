@@ -19,7 +19,7 @@ from lidarpainter_models.conditioning.novel_guidance import (
 from lidarpainter_models.conditioning.settings import NovelGuidanceConfig
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.shown import ShownScene, ViewTimePainting
-from lidarpainter_models.evaluation.strip_views import StripJudgement
+from lidarpainter_models.evaluation.strip_views import StripEvaluation
 from lidarpainter_models.gaussians.fitting.config import (
     EffortConfig,
     FitConfig,
@@ -111,8 +111,8 @@ class ShortReconstruction:
         held_out = HeldOut(scene=self.recording, test_views=self.split.test, observation=self.size)
         painting = self.painting_of(scene) if is_painted else None
         shown = ShownScene(scene=scene, painting=painting)
-        judgement = StripJudgement(held_out=held_out, views=self.split)
-        scores = judgement.scores(shown, lambda _done, _total: None)
+        strips = StripEvaluation(held_out=held_out, views=self.split)
+        scores = strips.scores(shown, lambda _done, _total: None)
         return {name: found["psnr"] for name, found in scores.items()}
 
     def _continued(self, guidance) -> GaussianScene:
