@@ -101,7 +101,7 @@ def test_painter_goes_to_the_gpu_if_there_is_one(model_folder, monkeypatch):
         went.append((device.type, dtype))
         return UnpaintedPainter()
 
-    monkeypatch.setattr(selection, "load_one_step", load)
+    monkeypatch.setattr(loading, "load_one_step", load)
     monkeypatch.setattr(selection, "_loaded", {})
     load_painter(str(model_folder))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
