@@ -14,6 +14,7 @@ from tiny_diffusion import write_model
 from lidarpainter_models.errors import ConfigError, MissingPackageError, WeightsError
 from lidarpainter_models.painter import selection
 from lidarpainter_models.painter.baselines import UnpaintedPainter
+from lidarpainter_models.painter.one_step import loading
 from lidarpainter_models.painter.one_step.assembly import trained_names
 from lidarpainter_models.painter.one_step.loading import load_one_step
 from lidarpainter_models.painter.one_step.presets import PRESETS
