@@ -24,7 +24,7 @@ from lidarpainter_models.scenes.records import Distortion
 
 WIDEST_DEG = 130.0
 """Across a pinhole image, at most: at 130 degrees its border has a fifth of the middle's detail."""
-NARROWEST_DEG = 5.0
+NARROWEST_DEG = 25.0
 """A lens of which no more can be shown is none."""
 _BORDER_POINTS = 32  # along each side: between two of them a lens bends by far less than a pixel
 _STEPS = 40  # of a bisection: a focal length to twelve digits

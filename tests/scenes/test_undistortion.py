@@ -75,7 +75,7 @@ def test_every_pixel_shows_what_the_lens_saw_in_its_direction(name):
 
 
 def test_a_lens_that_shows_next_to_nothing_once_is_refused():
-    with pytest.raises(ConfigError, match="shows less than 5 degrees of its image once"):
+    with pytest.raises(ConfigError, match="shows less than 25 degrees of its image once"):
         pinhole_of(lens(100.0), Distortion("brown", (-500.0, 0.0, 0.0, 0.0)))
 
 
