@@ -68,7 +68,7 @@ def measured(number: int, *, as_flows: bool, bucket: str | None = None) -> tuple
 
 def _as_flow(asked: Asked, store: Path, attempt: str) -> work.Made:
     """As a worker makes a sequence, with stages that do nothing."""
-    work._made = lambda asked, store: stub_work(asked, store, attempt)
+    work._made = lambda asked, store_path: stub_work(asked, store_path, attempt)
     return work.make_sequence(asked, store, attempt)
 
 

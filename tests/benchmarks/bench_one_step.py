@@ -17,6 +17,7 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import torch
 from one_step_ablations import ablation_tables
@@ -56,7 +57,7 @@ def compare_wirings(height_px, width_px, rounds):
     By wiring: medians, the largest peak, how many times faster than `plain` by CPU seconds, and the
     mean absolute difference to its image, averaged over 16x16 pixels.
     """
-    found = {wiring: [] for wiring in WIRINGS}
+    found: dict[str, list[dict[str, Any]]] = {wiring: [] for wiring in WIRINGS}
     for _ in range(rounds):
         for wiring in WIRINGS:
             found[wiring].append(_in_own_process(measure_wiring, wiring, height_px, width_px))
@@ -94,6 +95,7 @@ def ablate(model, train_folders, test_folders, settings):
     from flows.ablate_painter import AblationParameters, ablate_painter
     from flows.overrides import with_overrides
     from flows.server import prefect_server
+    from lidarpainter_models.painter.one_step.training import OneStepTrainingConfig
     from lidarpainter_models.painter.training_jobs import recipe_for
 
     base = AblationParameters(
@@ -103,6 +105,7 @@ def ablate(model, train_folders, test_folders, settings):
         training=recipe_for(model),
     )
     base = with_overrides(base, settings)
+    assert isinstance(base.training, OneStepTrainingConfig), f"{model} is no one-step painter"
     parameters = base.model_copy(update={"tables": ablation_tables(base.training)})
     store = open_store()
     with prefect_server(store.root / "logs" / "prefect.log"):

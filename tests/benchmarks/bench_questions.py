@@ -11,6 +11,7 @@ import tempfile
 import time
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from catalog.code_closure import Code
 from catalog.questions import cost_of, stale_runs
@@ -45,7 +46,12 @@ def artefacts(scene):
 def fill(store, scenes):
     """Write the rows of so many scenes."""
     now = datetime.now(UTC)
-    rows = {"scenes": [], "runs": [], "artefacts": [], "attempts": []}
+    rows: dict[str, list[dict[str, Any]]] = {
+        "scenes": [],
+        "runs": [],
+        "artefacts": [],
+        "attempts": [],
+    }
     for number in range(scenes):
         scene, made = f"toy/{number}", list(artefacts(number))
         rows["artefacts"] += made

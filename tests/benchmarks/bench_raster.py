@@ -167,7 +167,7 @@ def thread_figures(size, repeats):
 
     Beside it what the machine makes of two threads that share nothing: cores may be shared, too.
     """
-    if numba.config.NUMBA_NUM_THREADS < 2:
+    if vars(numba.config)["NUMBA_NUM_THREADS"] < 2:
         return []
     splats = street_like_splats(*size)
     works = {

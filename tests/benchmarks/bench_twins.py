@@ -10,6 +10,7 @@ import os
 import time
 from collections import defaultdict
 from dataclasses import replace
+from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
@@ -65,7 +66,9 @@ def fit_with_sky(size):
 def step_times(choice, repeats, size=SIZE):
     """Least CPU milliseconds of a step by part: its kernels, `backward`, the raster's, `step`."""
     timed = Timed()
-    doors = [importlib.import_module(f"lidarpainter_models.kernels.{name}") for name in KERNELS]
+    doors: list[Any] = [
+        importlib.import_module(f"lidarpainter_models.kernels.{name}") for name in KERNELS
+    ]
     raster = importlib.import_module("lidarpainter_models.kernels.gaussian_raster.cpu")
     kept = torch.autograd.backward, raster._DrawViews.backward
     try:

@@ -81,7 +81,7 @@ def _blended(record, left, top, rows, light):
             exponent = record[LOG_OPACITY] - record[ALONG] * dy * dy - record[ACROSS] * u * u
             alpha = math.exp(exponent)
             if alpha >= CUT and light[row, column] > 0.0:
-                remaining = light[row, column] * (1.0 - min(alpha, TOP))
+                remaining = light[row, column] * (1.0 - (alpha if alpha < TOP else TOP))
                 count += remaining >= STOP
                 light[row, column] = remaining if remaining >= STOP else 0.0
     return count

@@ -17,13 +17,14 @@ from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.gaussians.fitting.number_of_gaussians import DensificationConfig
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.kernels.backends import (
+    Backend,
     available_backends,
     kernels_chosen,
     why_missing,
 )
 
 CPU = torch.device("cpu")
-RASTERISERS = ("cuda", "triton")
+RASTERISERS: tuple[Backend, ...] = ("cuda", "triton")
 MOST_PSNR_DB = 0.3
 """Between two short fits: roundings split other Gaussians."""
 FIT = FitConfig(
@@ -36,7 +37,7 @@ FIT = FitConfig(
 
 def compare_kernels(findings: Findings, device: torch.device) -> None:
     """Every kernel by its door."""
-    backend = "auto" if device.type == "cuda" else "reference"
+    backend: Backend = "auto" if device.type == "cuda" else "reference"
     compared = "GPU, numba" if device.type == "cuda" else "torch, numba"
     for kernel, trial in kernel_trials.TRIALS.items():
         with findings.part(kernel):
@@ -59,7 +60,7 @@ def kernels_without_trial() -> list[str]:
     return sorted(name for name in packages - tried if "reference" in available_backends(name))
 
 
-def compare_rasteriser(findings: Findings, backend: str, device: torch.device) -> None:
+def compare_rasteriser(findings: Findings, backend: Backend, device: torch.device) -> None:
     """Images and gradients of one of the rasterisers for a GPU."""
     reason = why_missing("gaussian_raster", backend)
     if reason is not None:

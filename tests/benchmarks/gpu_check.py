@@ -43,7 +43,7 @@ def check(model: str | None, out: Path | None):
         compare_fits,
         measure_rasterisers,
         measure_stages,
-        lambda *given: measure_painters(*given, model),
+        lambda found, where: measure_painters(found, where, model),
     ):
         part(findings, device)
         findings.machine["took"] = f"{time.perf_counter() - started:.0f} s"

@@ -22,7 +22,7 @@ from torch.profiler import profile, supported_activities
 
 import lidarpainter_models as lp
 from lidarpainter_models.errors import WeightsError
-from lidarpainter_models.kernels.backends import available_backends
+from lidarpainter_models.kernels.backends import Backend, available_backends
 from lidarpainter_models.painter.augmentation import AugmentationConfig
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig, train_nano
 from lidarpainter_models.painter.selection import PainterChoice
@@ -65,8 +65,8 @@ def _seconds(run: Callable[[], object], device: torch.device) -> float:
 def measure_rasterisers(findings: Findings, device: torch.device) -> None:
     """Images with all gradients, by every fast backend of the device."""
     is_gpu = device.type == "cuda"
-    names = [name for name in ("cuda", "triton") if name in available_backends("gaussian_raster")]
-    for backend in names if is_gpu else ["cpu"]:
+    fast: tuple[Backend, ...] = ("cuda", "triton") if is_gpu else ("cpu",)
+    for backend in [name for name in fast if name in available_backends("gaussian_raster")]:
         for size in RASTER_SIZES if is_gpu else REHEARSED_RASTER_SIZES:
             count, width_px, height_px = size
             what = f"draw and go back, {count} Gaussians, {width_px}x{height_px}, {backend}"
@@ -79,18 +79,20 @@ def measure_rasterisers(findings: Findings, device: torch.device) -> None:
 def measure_stages(findings: Findings, device: torch.device) -> None:
     """A small street through fit, render, conditions and the small painter."""
     is_gpu = device.type == "cuda"
-    size = {"width_px": 480, "height_px": 270} if is_gpu else {"width_px": 96, "height_px": 54}
+    width_px, height_px = (480, 270) if is_gpu else (96, 54)
     count, steps = (60_000, 200) if is_gpu else (1500, 10)
     with findings.part("stages of a street"), TemporaryDirectory() as folder:
-        street = lp.SyntheticStreetConfig(seed=5, num_frames=4, samples_per_axis=1, **size)
+        street = lp.SyntheticStreetConfig(
+            seed=5, num_frames=4, samples_per_axis=1, width_px=width_px, height_px=height_px
+        )
         scene = lp.open_scene(lp.write_street(street, Path(folder)))
         split = lp.split_views(scene, "alternate", ("front_camera",))
-        observation = lp.ObservationConfig(width_px=size["width_px"])
+        observation = lp.ObservationConfig(width_px=width_px)
         seen = lp.prepare_observations(scene, split, observation)
         config = lp.FitConfig(steps=steps, log_every=steps)
         config = _with_gaussians(config, count)
         fitted = lp.fit_gaussians(seen, config, device=device).scene
-        name = f"{size['width_px']}x{size['height_px']}"
+        name = f"{width_px}x{height_px}"
 
         def add(what: str, run: Callable[[], object], repeats: int, of: int = 1) -> None:
             cost = cost_of(f"{what}, {name}", run, device, repeats)

@@ -49,13 +49,6 @@ def test_a_benchmark_that_makes_its_own_input_tells_figures(name, words, told):
     assert told in run(name, *words)
 
 
-def test_every_part_of_the_kernels_suite_is_measured_in_small(tmp_path):
-    told = run("suite.py", "--quick", "--out", tmp_path / "benchmarks.json")
-    parts = ("machine", "gaussian_raster", "iteration", "adam", "growth", "memory", "point_splat")
-    assert [part for part in parts if f"{part}." not in told] == []
-    assert "iteration.twins" in told
-
-
 def test_ingest_is_timed_and_its_digests_are_one(tmp_path):
     log = WRITERS["pandaset"](tmp_path)
     words = ("--dataset", log.dataset, "--sequence", log.sequence, "--runs", "1", "--serial")

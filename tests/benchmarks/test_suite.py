@@ -2,6 +2,7 @@
 
 import json
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ def test_every_part_of_the_suite_runs_in_its_smallest_form(tmp_path, monkeypatch
 
 
 def figure(**changes):
-    values = {"name": "one", "value": 6.0, "unit": "ms", "floor": 2.0, "limit": 4.0}
+    values: dict[str, Any] = {"name": "one", "value": 6.0, "unit": "ms", "floor": 2.0, "limit": 4.0}
     return Figure(**values | changes)
 
 

@@ -12,12 +12,15 @@ from pathlib import Path
 import pytest
 import torch
 from gaussian_world import FRAME_NS, camera_at
-from lidarpainter_models.gaussians.fitting.settings import FitLossWeights
 from styled_world import clear_scene, styled
 
 from lidarpainter_models.export.contents import scene_contents
 from lidarpainter_models.export.fidelity import world_image
-from lidarpainter_models.gaussians.fitting.config import FitConfig, GuidanceConfig
+from lidarpainter_models.gaussians.fitting.config import (
+    FitConfig,
+    FitLossWeights,
+    GuidanceConfig,
+)
 from lidarpainter_models.gaussians.fitting.images import FitImage
 from lidarpainter_models.gaussians.fitting.lamp_images import Look, lacking
 from lidarpainter_models.gaussians.fitting.state import FitState

@@ -100,10 +100,19 @@ def test_a_camera_that_no_fit_used_rides_on_the_rig_as_the_fit_found_it(tiny_run
             "--time 'soon': expected seconds",
         ),
         (("--format", "ply", "--out", "a.ply", "--actors", "x"), "has no actor 'x', it has"),
-        (("--format", "video", "--out", "a.mp4", "--sky"), "--sky has no use for --format video"),
-        (("--format", "ply", "--out", "a.ply", "--camera", "all"), "--camera has no use for"),
-        (("--format", "gltf", "--out", "a.glb", "--per-actor"), "--per-actor has no use for"),
-        (("--format", "depth", "--out", "a", "--postpaint"), "--postpaint has no use for"),
+        (("--format", "video", "--out", "a.mp4", "--sky"), "--format video has no use for --sky"),
+        (
+            ("--format", "ply", "--out", "a.ply", "--camera", "all"),
+            "--format ply has no use for --camera",
+        ),
+        (
+            ("--format", "gltf", "--out", "a.glb", "--per-actor"),
+            "--format gltf has no use for --per-actor",
+        ),
+        (
+            ("--format", "depth", "--out", "a", "--postpaint"),
+            "--format depth has no use for --postpaint",
+        ),
         (("--format", "spz", "--out", "a.spz", "--spz-version", "2"), "expected 3 or 4"),
         (("--format", "depth", "--out", "a", "--camera", "roof"), "has no camera 'roof'"),
         (("--format", "depth", "--out", "a", "--width", "9999"), "expected at most"),

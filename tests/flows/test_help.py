@@ -16,7 +16,7 @@ from flows.measure.configurations import chart_ways, size_factors
 from flows.presets import PRESETS, preset
 from lidarpainter_models.conditioning.settings import PreviousUse
 from lidarpainter_models.export.formats import FORMAT_NAMES, FORMATS
-from lidarpainter_models.geometry.trajectory_words import KINDS
+from lidarpainter_models.geometry.trajectory_words import TRAJECTORY_WORDS
 from lidarpainter_models.painter.styles import STYLE_PROMPTS
 from lidarpainter_models.stress.causes import CAUSES
 
@@ -42,7 +42,7 @@ VALUES = {
     "--split": ("alternate", "forward:17:8", "all"),
     "--previous": get_args(PreviousUse)[1:],
     "--device": ("auto", "cpu", "cuda", "cuda:N"),
-    "--trajectory": KINDS,
+    "--trajectory": tuple(TRAJECTORY_WORDS),
     "--beside": ("recorded", "unpainted"),
     "--prompt": STYLE_PROMPTS,
     "--protocol": PROTOCOLS,

@@ -15,6 +15,7 @@ import threading
 import time
 import urllib.request
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
 
@@ -61,8 +62,14 @@ class _Gate:
 
     def __init__(self, application):
         self.application = application
-        self.faults = {"before": 0, "after": 0, "every": 1, "slow_s": 0.0, "only": ""}
-        self.seen = []
+        self.faults: dict[str, Any] = {
+            "before": 0,
+            "after": 0,
+            "every": 1,
+            "slow_s": 0.0,
+            "only": "",
+        }
+        self.seen: list[str] = []
         self.turn = threading.Lock()
 
     def __call__(self, environ, start_response):
@@ -106,6 +113,7 @@ def running_stand_in():
     words = [sys.executable, "-W", "ignore", __file__]
     environment = {**os.environ, **ENVIRONMENT}
     with subprocess.Popen(words, stdout=subprocess.PIPE, env=environment) as process:
+        assert process.stdout is not None
         try:
             stand_in = StandIn(f"http://127.0.0.1:{int(process.stdout.readline())}")
             stand_in.make_bucket()

@@ -9,6 +9,7 @@ import random
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -135,7 +136,7 @@ class Site:
     def flows(self):
         """Processes of flow runs, by whether they have a sequence in hand."""
         at_work = {lease.holder.process_id for lease in stub_ledger(self.store).leases.held()}
-        found = {"flow at work": [], "flow that begins": []}
+        found: dict[str, list[psutil.Process]] = {"flow at work": [], "flow that begins": []}
         for process in psutil.process_iter(["pid", "cmdline"]):
             with suppress(psutil.Error):
                 words = process.info["cmdline"] or []
@@ -164,10 +165,10 @@ class Chaos:
     kills: int
     is_disk_small: bool
     """Whether the store lies on a disk that can be filled."""
-    disturb_bucket: object = None
+    disturb_bucket: Callable[[], object] | None = None
     """Called where a disk would be filled; None where there is no bucket."""
-    say: object = print
-    killed: dict = field(default_factory=dict)
+    say: Callable[[str], object] = print
+    killed: dict[str, int] = field(default_factory=dict)
 
     def run(self):
         generator = random.Random(self.seed)  # noqa: S311 - an order, not a secret

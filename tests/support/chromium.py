@@ -14,6 +14,7 @@ import subprocess
 import time
 import urllib.request
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -45,7 +46,8 @@ class Chromium:
     def __init__(self, folder: Path, *, width_px, height_px, words=SOFTWARE_WEBGL):
         size = f"--window-size={width_px},{height_px}"
         command = [found_browser(), *WORDS, *words, f"--user-data-dir={folder}", size]
-        self.folder, self.events, self._number = Path(folder), [], 0
+        self.folder, self._number = Path(folder), 0
+        self.events: list[dict[str, Any]] = []
         self._size = {"width": width_px, "height": height_px, "deviceScaleFactor": 1}
         self._process = subprocess.Popen(
             [*command, "about:blank"],

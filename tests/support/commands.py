@@ -53,6 +53,7 @@ def settings(*assignments):
 def seen_image(path, width_px, height_px):
     """An image on disk, of the size it should have, that shows something."""
     bgr_u8 = cv2.imread(str(path))
+    assert bgr_u8 is not None
     assert bgr_u8.shape == (height_px, width_px, 3)
     assert bgr_u8.std() > 5
     return bgr_u8

@@ -7,6 +7,7 @@ sensor) and the boxes at every sweep, all in the dataset's global frame.
 """
 
 import sys
+from typing import Any
 
 import numpy as np
 from nuscenes.nuscenes import NuScenes
@@ -51,7 +52,7 @@ def sweep_answers(kit, data, position):
 
 def main(root, path):
     kit = NuScenes("v1.0-mini", root, verbose=False)
-    answers = {}
+    answers: dict[str, Any] = {}
     for data in kit.sample_data:
         if data["channel"].startswith("CAM"):
             answers |= image_answers(kit, data)

@@ -42,17 +42,18 @@ def isect_tiles(
     grid = torch.tensor([tile_width, tile_height])
     low = ((centre - radius) / tile_size).floor().long().clamp(min=0)
     high = torch.minimum(((centre + radius) / tile_size).ceil().long(), grid)
-    keys, rows, counts = [], [], []
+    found: list[int] = []
+    rows, counts = [], []
     depth_bits = depths.reshape(nnz).view(torch.int32).long()
     for row in range(nnz):
-        before = len(keys)
+        before = len(found)
         for y in range(int(low[row, 1]), int(high[row, 1])):
             for x in range(int(low[row, 0]), int(high[row, 0])):
                 tile = (int(image[row]) * tile_height + y) * tile_width + x
-                keys.append((tile << DEPTH_BITS) | int(depth_bits[row]))
+                found.append((tile << DEPTH_BITS) | int(depth_bits[row]))
                 rows.append(row)
-        counts.append(len(keys) - before)
-    keys, order = torch.tensor(keys, dtype=torch.int64).sort(stable=True)
+        counts.append(len(found) - before)
+    keys, order = torch.tensor(found, dtype=torch.int64).sort(stable=True)
     return torch.tensor(counts).reshape(dims), keys, torch.tensor(rows, dtype=torch.int32)[order]
 
 

@@ -61,7 +61,7 @@ def fuzz(ingest, damage, seeds, *, sandbox, named):
         sandbox: a folder that holds the log and in which `store` is made.
         named: texts one of which an error must contain.
     """
-    outcomes = Counter()
+    outcomes: Counter[str] = Counter()
     store = Path(sandbox, "store")
     for seed in seeds:
         file, damaged = damage(np.random.default_rng(seed))
@@ -135,7 +135,7 @@ def _failed_checks(path):
     return _KNOWN_SCENES[scene.content_digest]
 
 
-_KNOWN_SCENES = {}
+_KNOWN_SCENES: dict[str, tuple[str, ...]] = {}
 
 
 def _remembering(scene):

@@ -17,6 +17,7 @@ from splat_drawing import SPLATS
 from torch import Tensor
 
 from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_tangent
+from lidarpainter_models.kernels.backends import Backend
 from lidarpainter_models.kernels.box_owners import box_owners
 from lidarpainter_models.kernels.colour_sampling import project_inside
 from lidarpainter_models.kernels.frustum_culling import Blocks, mark_seen, refresh_bounds
@@ -54,7 +55,7 @@ RATES = [0.03, 2e-3, 1e-2, 3e-2, 6e-3, 6e-4]
 class Trial:
     """A kernel's work."""
 
-    run: Callable[[str, torch.device], list[Tensor]]
+    run: Callable[[Backend, torch.device], list[Tensor]]
     tolerance: float
     """Of `disagreement` between float32 on two devices; a few entries may sit on a threshold."""
 
@@ -91,13 +92,13 @@ def moved(part: Any, device: torch.device) -> Any:
     """A tensor on a device, or a dataclass of which some fields are, or hold, tensors."""
     if isinstance(part, Tensor):
         return part.to(device)
-    if not is_dataclass(part):
+    if not is_dataclass(part) or isinstance(part, type):
         return part
     kept = {field.name: getattr(part, field.name) for field in fields(part)}
     return replace(part, **{name: moved(value, device) for name, value in kept.items()})
 
 
-def _boxes(backend: str, device: torch.device) -> list[Tensor]:
+def _boxes(backend: Backend, device: torch.device) -> list[Tensor]:
     draw = Draw(device)
     owners = box_owners(
         3 * draw.normal(5000, 3),
@@ -110,7 +111,7 @@ def _boxes(backend: str, device: torch.device) -> list[Tensor]:
     return [owners]
 
 
-def _splat(backend: str, device: torch.device) -> list[Tensor]:
+def _splat(backend: Backend, device: torch.device) -> list[Tensor]:
     draw, (height_px, width_px) = Draw(device), SIZE_PX
     size = torch.tensor([width_px, height_px], device=device)
     found = splat_points(
@@ -124,7 +125,7 @@ def _splat(backend: str, device: torch.device) -> list[Tensor]:
     return [found]
 
 
-def _blend(backend: str, device: torch.device) -> list[Tensor]:
+def _blend(backend: Backend, device: torch.device) -> list[Tensor]:
     draw, (height_px, width_px) = Draw(device), SIZE_PX
     size = torch.tensor([width_px, height_px], device=device)
     found = blend_points(
@@ -139,7 +140,7 @@ def _blend(backend: str, device: torch.device) -> list[Tensor]:
     return list(found)
 
 
-def _projection(backend: str, device: torch.device) -> list[Tensor]:
+def _projection(backend: Backend, device: torch.device) -> list[Tensor]:
     """Which points fall into an image, and where: all of the colouring that runs on a GPU."""
     draw, (height_px, width_px) = Draw(device), SIZE_PX
     points = 20 * draw.uniform(5000, 3) - 10
@@ -154,17 +155,17 @@ def _projection(backend: str, device: torch.device) -> list[Tensor]:
     return [inside, seen]
 
 
-def _image_loss(backend: str, device: torch.device) -> list[Tensor]:
+def _image_loss(backend: Backend, device: torch.device) -> list[Tensor]:
     draw = Draw(device)
     rendered, target = draw.uniform(*SIZE_PX, 3).requires_grad_(), draw.uniform(*SIZE_PX, 3)
     weighted = l1_ssim_loss(rendered, target, pixel_weight=draw.uniform(*SIZE_PX), backend=backend)
     similarity = ssim_map(rendered, target, backend=backend)
     (weighted + l1_ssim_loss(rendered, target, backend=backend) + similarity.mean()).backward()
     alone = ssim_map(target, rendered.detach(), backend=backend)
-    return [weighted.detach(), similarity.detach(), alone, rendered.grad]
+    return [weighted.detach(), similarity.detach(), alone, _gradient(rendered)]
 
 
-def _pixel_terms(backend: str, device: torch.device) -> list[Tensor]:
+def _pixel_terms(backend: Backend, device: torch.device) -> list[Tensor]:
     draw = Draw(device)
     leaves = [draw.uniform(*SIZE_PX, 3), 20 * draw.uniform(*SIZE_PX), draw.uniform(*SIZE_PX)]
     leaves = [*leaves, draw.uniform(*SIZE_PX, 3), draw.uniform(3, 4)]
@@ -186,10 +187,15 @@ def _pixel_terms(backend: str, device: torch.device) -> list[Tensor]:
     terms = pixel_terms(image, leaves[3], facts, rules, exposure=leaves[4], backend=backend)
     (terms.shown.sum() + terms.sky + terms.depth).backward()
     found = [terms.shown.detach(), terms.sky.detach(), terms.depth.detach()]
-    return [*found, *(leaf.grad for leaf in leaves)]
+    return [*found, *(_gradient(leaf) for leaf in leaves)]
 
 
-def _sky(backend: str, device: torch.device) -> list[Tensor]:
+def _gradient(leaf: Tensor) -> Tensor:
+    assert leaf.grad is not None
+    return leaf.grad
+
+
+def _sky(backend: Backend, device: torch.device) -> list[Tensor]:
     draw, (height_px, width_px) = Draw(device), SIZE_PX
     layout = SkyLayout(
         azimuth_left_rad=math.pi,
@@ -215,7 +221,7 @@ def _sky(backend: str, device: torch.device) -> list[Tensor]:
     return [seen, *found, texture]
 
 
-def _culling(backend: str, device: torch.device) -> list[Tensor]:
+def _culling(backend: Backend, device: torch.device) -> list[Tensor]:
     draw, count, num_blocks = Draw(device), 6000, 90
     block_of_row = torch.arange(count, device=device) % num_blocks
     order = torch.argsort(block_of_row, stable=True)
@@ -240,7 +246,7 @@ def _culling(backend: str, device: torch.device) -> list[Tensor]:
     return [blocks.low, blocks.high, blocks.reach, seen]
 
 
-def _adam(backend: str, device: torch.device) -> list[Tensor]:
+def _adam(backend: Backend, device: torch.device) -> list[Tensor]:
     draw, count = Draw(device), 500
     shapes = ((3,), (4,), (3,), (), (1, 3), (3, 3))
     kept = Parameters(*(draw.normal(count, *shape) for shape in shapes))
@@ -255,7 +261,7 @@ def _adam(backend: str, device: torch.device) -> list[Tensor]:
     return list(kept)
 
 
-def _light(backend: str, device: torch.device) -> list[Tensor]:
+def _light(backend: Backend, device: torch.device) -> list[Tensor]:
     surfaces, appearance, around, lamps, poses = (moved(part, device) for part in random_scene(500))
     camera = camera_at(-3.0)
     before = camera.camera_from_world.to(device) @ poses
@@ -266,7 +272,7 @@ def _light(backend: str, device: torch.device) -> list[Tensor]:
     return [thrown, seen]
 
 
-def raster(size: tuple[int, int, int], backend: str, device: torch.device) -> list[Tensor]:
+def raster(size: tuple[int, int, int], backend: Backend, device: torch.device) -> list[Tensor]:
     """Images of a street-like scene, and the gradients of a loss on them."""
     return draw_and_go_back(raster_scene(size, device), backend)
 
@@ -278,7 +284,7 @@ def raster_scene(size: tuple[int, int, int], device: torch.device) -> dict[str, 
     return scene | leaves | {"body_index": scene["body_index"].to(device)}
 
 
-def draw_and_go_back(scene: dict[str, Any], backend: str) -> list[Tensor]:
+def draw_and_go_back(scene: dict[str, Any], backend: Backend) -> list[Tensor]:
     """The images of such a scene, and the gradients of a loss on them."""
     leaves = {name: scene[name] for name in LEARNED}
     splats = Splats(**{name: scene[name] for name in SPLATS})
@@ -301,6 +307,6 @@ TRIALS = {
     "ssim": Trial(_image_loss, 1e-4),
 }
 """All but the rasteriser, which has several fast backends."""
-RASTER_TOLERANCE = {"triton": 2e-3, "cuda": 1e-2}
+RASTER_TOLERANCE: dict[Backend, float] = {"triton": 2e-3, "cuda": 1e-2}
 """A pixel on the alpha cut may fall on either side; gsplat clamps alpha at 0.999 and takes the fast
 exponential of the GPU."""

@@ -11,6 +11,7 @@ import copy
 import json
 import struct
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,20 @@ STRANGE_NUMBERS = (
     *(float("nan"), float("inf"), float("-inf"), 1e308, -1e308, 5e-324),
     *(0, -1, 2**31, 2**53 + 1, 2**63, -(2**63) - 1, 2**64, 10**30, 10**400, 0.5, -0.0),
 )
-OTHER_TYPES = (None, True, False, 7, 1.5, "", "text", [], {}, [[]], [None], {"a": {"b": []}})
+OTHER_TYPES: tuple[Any, ...] = (
+    None,
+    True,
+    False,
+    7,
+    1.5,
+    "",
+    "text",
+    [],
+    {},
+    [[]],
+    [None],
+    {"a": {"b": []}},
+)
 TRAVERSALS = (
     *("../../../../etc/passwd", "/etc/passwd", "..", ".", "/", "~/x", "samples/../../x"),
     *("a\\..\\..\\b", "C:\\x", "file:///etc/passwd", "name\x00.jpg", "\ud800", "x" * 5000),
@@ -48,8 +62,10 @@ def damaged_json(content, rng):
     if rng.random() < 0.2:
         return damaged_bytes(content, rng)
     value = json.loads(content)
-    ways = (_other_type, _strange_number, _without_key, _twice, _unknown_token, _known_token)
-    ways = (*ways, _traversal, _deep)
+    ways = (
+        *(_other_type, _strange_number, _without_key, _twice),
+        *(_unknown_token, _known_token, _traversal, _deep),
+    )
     value, description = ways[rng.integers(len(ways))](value, rng)
     depth = int(rng.choice([50, 2000, 200_000]))
     nested = b"[" * depth + b"]" * depth

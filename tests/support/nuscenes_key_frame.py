@@ -12,6 +12,7 @@ import shutil
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -82,7 +83,7 @@ class _Tables:
     def __init__(self, root):
         self.root = root
         names = "sample_data ego_pose calibrated_sensor sensor sample_annotation instance category"
-        self.rows = {name: [] for name in names.split()}
+        self.rows: dict[str, list[dict[str, Any]]] = {name: [] for name in names.split()}
 
     def add_data(self, channel, time_s, global_from_ego, ego_from_sensor, *, file, intrinsic=()):
         name = f"samples/{channel}/{file.name}"

@@ -12,6 +12,7 @@ import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -71,7 +72,7 @@ FAR_AWAY = rigid_from_rotation(
 
 def street_like_nuscenes(store, *, global_from_world=FAR_AWAY, **settings):
     """A street seen by six cameras and a LiDAR of 20 Hz, its boxes at the moments they are seen."""
-    chosen = {
+    chosen: dict[str, Any] = {
         "seed": 5,
         "num_frames": 7,
         "width_px": 96,
@@ -137,7 +138,7 @@ class _Log:
         self.scene, self.root, self.name, self.key_every = scene, root, name, key_every
         names = "scene sample sample_data sample_annotation ego_pose calibrated_sensor sensor"
         names += " instance category attribute visibility log map"
-        self.tables = {table: [] for table in names.split()}
+        self.tables: dict[str, list[dict[str, Any]]] = {table: [] for table in names.split()}
         self.ends_us = [end_us(scene, position) for position in range(len(scene.frame_indices))]
         self.keys = list(range(0, len(self.ends_us), key_every))
 
@@ -235,10 +236,10 @@ class _Log:
             self.tables["category"].append(row)
         for track in self.scene.tracks:
             length_m, width_m, height_m = track.size_m.double().tolist()
-            for row, frame_index in enumerate(track.frame_indices.tolist()):
+            for seen, frame_index in enumerate(track.frame_indices.tolist()):
                 position = self.scene.frame_indices.index(frame_index)
                 if position % self.key_every == 0:
-                    pose = self.scene.global_from_world @ track.world_from_box[row]
+                    pose = self.scene.global_from_world @ track.world_from_box[seen]
                     annotation = {
                         "token": token_of(self.name, track.actor_id, position),
                         "sample_token": self.sample_of(position),
@@ -247,7 +248,7 @@ class _Log:
                         "attribute_tokens": [],
                         **written_pose(pose),
                         "size": [width_m, length_m, height_m],
-                        "num_lidar_pts": int(track.num_points[row]),
+                        "num_lidar_pts": int(track.num_points[seen]),
                         "num_radar_pts": 0,
                     }
                     self.tables["sample_annotation"].append(annotation)

@@ -39,7 +39,7 @@ def clip(*, begins_m=0.0, drawn_m=0.0, exposure=1.0):
                 camera_name="front",
                 timestamp_ns=frame * FRAME_NS,
                 is_seen=True,
-                truth_rgb=lambda truth=truth: truth,
+                truth_rgb=truth.clone,
             )
         )
     global_from_world = torch.eye(4, dtype=torch.float64)

@@ -1,6 +1,7 @@
 """Images, points, boxes and frames that a `SceneWriter` takes, each as small as can be."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -33,7 +34,7 @@ def some_points(num_points=50, seed=0):
 
 
 def some_record(**changes):
-    lens = {"fx_px": 30.0, "fy_px": 30.0, "cx_px": 16.0, "cy_px": 12.0}
+    lens: dict[str, Any] = {"fx_px": 30.0, "fy_px": 30.0, "cx_px": 16.0, "cy_px": 12.0}
     camera = Camera(world_from_camera=IDENTITY, width_px=32, height_px=24, **lens)
     return ImageRecord(**{"camera_name": "front", "timestamp_ns": 5, "camera": camera, **changes})
 

@@ -38,7 +38,7 @@ class Shop:
         return other
 
     def made(self, kind, **inputs):
-        recipe = Recipe(kind=kind, inputs=inputs, config={}, code=Code(modules={}, starts=[]))
+        recipe = Recipe(kind=kind, inputs=inputs, config={}, code=Code(modules={}, starts=()))
 
         def build(place):
             (place.output / "data").write_bytes(b"-" * 1000)

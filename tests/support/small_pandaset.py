@@ -8,6 +8,7 @@ import gzip
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -120,7 +121,7 @@ class PandasetFolder:
     def read_table(self, name: str) -> dict[str, np.ndarray]:
         return read_table_bytes((self.path / name).read_bytes(), self.path / name)
 
-    def boxes_at(self, time_s: float) -> list[dict[str, object]]:
+    def boxes_at(self, time_s: float) -> list[dict[str, Any]]:
         return boxes_at(time_s)
 
     def write_log(self) -> None:
@@ -158,7 +159,9 @@ class PandasetFolder:
         ground = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
         ground = START_M + np.column_stack([ground, np.full(len(ground), -0.3)])
         by_spinning, by_forward = time_s + SPINNING_SEES_S, time_s + FORWARD_SEES_S
-        seen = [  # points, their times, LiDAR, class
+        seen: list[
+            tuple[np.ndarray, np.ndarray | float, int, int]
+        ] = [  # points, their times, LiDAR, class
             (ground, time_s - 0.1 * np.linspace(0, 1, len(ground)), 0, 1),
             (box_surface(parked_position(), 5), time_s - 0.03, 0, 2),
             (box_surface(other_position(by_spinning), 6), by_spinning, 0, 2),
@@ -178,7 +181,7 @@ class PandasetFolder:
         classes = np.repeat([kind for *_, kind in seen], counts)
         self.write_table(f"annotations/semseg/{index:02d}.pkl.gz", {"class": classes})
 
-    def write_boxes(self, index: int, boxes: list[dict[str, object]]) -> None:
+    def write_boxes(self, index: int, boxes: list[dict[str, Any]]) -> None:
         length_m, width_m, height_m = CAR_SIZE_M
         columns = {
             "uuid": np.array([box["uuid"] for box in boxes], dtype=object),
@@ -199,11 +202,11 @@ class PandasetFolder:
         }
         self.write_table(f"annotations/cuboids/{index:02d}.pkl.gz", columns)
 
-    def ingest(self, store: Path, **options: object) -> Path:
+    def ingest(self, store: Path, **options: Any) -> Path:
         return ingest_scene("pandaset", self.root, self.sequence, store, **options)
 
 
-def boxes_at(time_s: float) -> list[dict[str, object]]:
+def boxes_at(time_s: float) -> list[dict[str, Any]]:
     """The parked car once, the moving one as each LiDAR saw it."""
     parked = {"uuid": "parked", "stationary": True, "sensor": -1, "sibling": "-"}
     moving = {"stationary": False}

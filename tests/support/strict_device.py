@@ -56,7 +56,7 @@ class StrictTensor(Tensor):
     """A tensor of the device; its numbers are `held` on the CPU."""
 
     held: Tensor
-    __torch_function__ = torch._C._disabled_torch_function_impl
+    __torch_function__: Any = torch._C._disabled_torch_function_impl
 
     @staticmethod
     def __new__(cls, held: Tensor) -> "StrictTensor":
@@ -72,7 +72,7 @@ class StrictTensor(Tensor):
         _hold(made)
         return made
 
-    def __repr__(self) -> str:
+    def __repr__(self) -> str:  # type: ignore[override]  # mypy forgets names of its options
         return f"StrictTensor({self.held!r})"
 
     def tolist(self) -> Any:
@@ -80,7 +80,9 @@ class StrictTensor(Tensor):
         return self.cpu().tolist()
 
     @classmethod
-    def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
+    def __torch_dispatch__(  # type: ignore[override]  # torch calls it so, whatever its stub says
+        cls, func, types, args=(), kwargs=None
+    ):
         return _run(func, args, kwargs or {})
 
 
@@ -198,7 +200,7 @@ class _ToHost(torch.autograd.Function):
     """Numbers of the device without a wait: this is the rasteriser's own business."""
 
     @staticmethod
-    def forward(_ctx: Any, value: Tensor) -> Tensor:
+    def forward(_ctx: Any, value: StrictTensor) -> Tensor:
         return value.held.detach().clone()
 
     @staticmethod
@@ -212,7 +214,7 @@ class _FromHost(torch.autograd.Function):
         return StrictTensor(value.detach().clone())
 
     @staticmethod
-    def backward(_ctx: Any, gradient: Tensor) -> Tensor:
+    def backward(_ctx: Any, gradient: StrictTensor) -> Tensor:
         return gradient.held
 
 
@@ -243,7 +245,7 @@ def strict_runs(patch: Any) -> Iterator[torch.device]:
     patch.setattr(torch, "tensor", tensor)  # torch's own reaches no fallback written in Python
     # inference tensors are no wrappers' business
     patch.setattr(torch, "inference_mode", torch.no_grad)
-    patch.setattr(NanoPainter, "paint", torch.no_grad()(NanoPainter.paint.__wrapped__))
+    patch.setattr(NanoPainter, "paint", torch.no_grad()(vars(NanoPainter.paint)["__wrapped__"]))
     waits.clear()
     # threads of devices are made at a process's first backward pass, perhaps before this device
     with torch.autograd.set_multithreading_enabled(False):

@@ -9,10 +9,11 @@ import os
 import time
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from stub_fleet import TIME_TO_LIVE_S
 
-from catalog.artefacts import Recipe
+from catalog.artefacts import ArtefactRef, Recipe
 from catalog.code_closure import Code
 from catalog.leases import Leases
 from catalog.records import artefact_row
@@ -54,7 +55,8 @@ def make(asked, store_path):
     digest, content = whole[:DIGEST_BYTES], whole[DIGEST_BYTES:]
     if hashlib.sha256(content).digest() != digest:
         raise DataError(f"{path.name}: its bytes are not those that its digest was made of")
-    store, refs = open_store(store_path), []
+    store = open_store(store_path)
+    refs: list[ArtefactRef] = []
     for kind in KINDS:
         source = refs[-1].digest if refs else digest.hex()
         recipe = Recipe(kind=kind, inputs={"scene": source}, config={}, code=CODE)
@@ -81,7 +83,8 @@ def stages_ledger(store):
 
 _Ledger = deployed.FleetLedger
 if "STUB_INPUTS" in os.environ:  # in a process of the pool, not where tests are collected
-    deployed.FleetLedger = stages_ledger
-    deployed.Worker = partial(Worker, poll_s=0.5)
+    replaced: Any = deployed
+    replaced.FleetLedger = stages_ledger
+    replaced.Worker = partial(Worker, poll_s=0.5)
     flow_runs.BEGIN_S = BEGIN_S
     work._made = make

@@ -4,6 +4,8 @@ Grey ground, a wall across (red to the left, blue to the right), and a green car
 right to left at 10 m/s while each sweep takes a tenth of a second.
 """
 
+from pathlib import Path
+
 import torch
 
 from lidarpainter_models.geometry.cameras import Camera
@@ -65,7 +67,7 @@ class ToyStreet(DrivingScene):
     """A scene that computes what a stored one would read."""
 
     def __init__(self, num_frames=4, camera_gains=(("front", 1.0),)):
-        self.path, self.dataset, self.sequence = "toy", "toy", "street"
+        self.path, self.dataset, self.sequence = Path("toy"), "toy", "street"
         self.camera_gains = dict(camera_gains)
         self.camera_names = tuple(self.camera_gains)
         times_s = [0.1 * frame for frame in range(num_frames)]

@@ -12,6 +12,7 @@ import subprocess
 import sys
 from pathlib import Path
 from tempfile import NamedTemporaryFile
+from typing import Any
 
 import torch
 import triton
@@ -52,7 +53,9 @@ def alignments(value, *path):
 
 def compiled(kernel, arguments, options, architecture):
     """Registers and stack of a kernel as it is launched; both of the cubin."""
-    signature, constants, alignment = {}, {}, {}
+    signature: dict[str, str] = {}
+    constants: dict[str, Any] = {}
+    alignment: dict[tuple[int, ...], Any] = {}
     for place, (name, value) in enumerate(arguments.items()):
         if kernel.params[place].is_constexpr:
             signature[name], constants[name] = "constexpr", value

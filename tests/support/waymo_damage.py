@@ -98,8 +98,8 @@ def _damaged_field(number, kind, value, rng):
         damage = damaged_bytes(value, rng)
         return [(number, kind, damage.content)], damage.description
     if kind == _VARINT:
-        new = int(rng.choice(np.array(_STRANGE_WHOLES, dtype=object)))
-        return [(number, kind, new)], f"is {new}"
+        whole = int(rng.choice(np.array(_STRANGE_WHOLES, dtype=object)))
+        return [(number, kind, whole)], f"is {whole}"
     numbers = [float(x) for x in STRANGE_NUMBERS if abs(x) < 1e300 or x != x or x in (1e308,)]
     near = value * float(rng.choice([-1.0, 0.5, 1.001, 2.0]))
     new = float(rng.choice([*numbers, near, near, near]))

@@ -59,7 +59,7 @@ class RealFrame:
             name: [getattr(record, name) for record in records]
             for name in ("actor_id", "category", "timestamp_ns", "is_moving", "num_points")
         }
-        sizes = zip(*[record.size_m for record in records], strict=True)
+        sizes = map(list, zip(*[record.size_m for record in records], strict=True))
         columns |= dict(zip(("length_m", "width_m", "height_m"), sizes, strict=True))
         columns["frame_index"] = [0] * len(records)
         return tracks_from_boxes(columns, torch.stack([box.world_from_box for box in records]))
@@ -76,7 +76,9 @@ class RealFrame:
         """The image, undistorted, with the boxes over it."""
         record = self.record(camera_name)
         jpeg = np.frombuffer(self.images[camera_name].jpeg, np.uint8)
-        rgb = cv2.cvtColor(cv2.imdecode(jpeg, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+        bgr = cv2.imdecode(jpeg, cv2.IMREAD_COLOR)
+        assert bgr is not None
+        rgb = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
         pinhole = pinhole_of(record.camera, record.distortion)
         image = np.ascontiguousarray(undistort(rgb, record.camera, record.distortion, pinhole))
         draw_boxes(image, pinhole, self.tracks(), record.timestamp_ns)

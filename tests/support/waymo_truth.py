@@ -14,6 +14,7 @@ The truth is what the formats can express, so that a reader must give it back as
 
 from collections import defaultdict
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -54,7 +55,7 @@ class CameraSetup:
     yaw_deg: float
     exposure_ms: float
     """Middle of the exposure, after the frame's pose."""
-    readout: str
+    readout: Literal["down", "up", "left", "right"]
     position_m: tuple[float, float, float]
 
 
@@ -111,6 +112,7 @@ class WaymoTruth:
     """Points near the car that found both echoes of their pixel taken."""
 
     def global_from_ego(self, timestamp_ns):
+        assert self.scene is not None
         return self.scene.global_from_world @ self.street.world_from_ego(timestamp_ns)
 
 
