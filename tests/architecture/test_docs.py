@@ -16,7 +16,7 @@ LINK = re.compile(r"\]\((?!https?://)([^)#\s]+)(?:#[^)\s]*)?\)")
 ANCHOR = re.compile(r"\]\((?!https?://)([^)#\s]*)#([^)\s]+)\)")
 HEADING = re.compile(r"^#+ (.*)$", re.MULTILINE)
 NAMED = re.compile(r"`([\w./-]+)`")
-MADE_BY_MAKE = {"docs/_site", "docs/_site/index.html"}
+MADE_BY_MAKE = {"docs/_site/index.html"}
 QUESTION = re.compile(r"^\| (.+\?) \| `([\w./]+)` \| `(\w+)` \|$", re.MULTILINE)
 
 
