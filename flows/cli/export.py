@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flows.cli.output import print_json, print_pairs
+from flows.cli.output import print_result
 from flows.cli.shared_options import (
     AllowCollisions,
     AsJson,
@@ -132,11 +132,9 @@ def export(  # noqa: PLR0913 - the options of a command
         result = export_run(
             existing_store(), run_id, row.name, request, out.absolute(), scene=scene
         )
-    if as_json:
-        print_json(result)
-    else:
-        shown = {FIGURES.get(name, name): value for name, value in result.items()}
-        print_pairs(f"{row.name} of {result['scene']}", shown)
+    shown = {FIGURES.get(name, name): value for name, value in result.items()}
+    title = f"{row.name} of {result['scene']}"
+    print_result(title, result if as_json else shown, as_json=as_json)
 
 
 def _refuse_unread(row: ExportFormat, given: Sequence[object]) -> None:

@@ -18,7 +18,9 @@ RANGE = re.compile(r"(\d*):(\d*)")
 
 Painter = Annotated[
     str | None,
-    typer.Option(help=f"{painter_help()}. The preset's if absent."),
+    typer.Option(
+        help=f"Painter of the views beside the path: {painter_help()}. The preset's if absent."
+    ),
 ]
 DeviceName = Annotated[
     str,
@@ -43,7 +45,7 @@ RunName = Annotated[
         "run), or latest (the newest run of all)."
     ),
 ]
-TrajectorySpec = Annotated[str, typer.Option(help=trajectory_help())]
+TrajectorySpec = Annotated[str, typer.Option(help=f"Where the camera goes: {trajectory_help()}")]
 AllowCollisions = Annotated[
     bool,
     typer.Option(

@@ -46,9 +46,6 @@ one stands out by 3.0 (median); where it is right, by 5.
 """
 MIN_EDGE_POINTS, MIN_IMAGES = 500, 3
 """Fewer, over all frames, say nothing."""
-MIN_STORED_PEAK = 1.5
-"""Where no turn stands out, the stored one is not doubted that lies so many deviations better than
-the mean one: little structure, not a wrong mount."""
 _TURNS_DEG = np.arange(-2.0, 2.01, 0.25)
 _ROLLS_DEG = np.arange(-3.0, 3.01, 0.25)
 _PEAK_WIDTH_DEG, _ROLL_PEAK_WIDTH_DEG = 0.6, 0.8
@@ -68,8 +65,6 @@ class CameraTurn:
     roll_deg: float
     roll_peak: float
     """How many deviations the roll stands out."""
-    stored_peak: float = 0.0
-    """How many deviations the stored rotation stands out from all that were tried."""
 
     @property
     def is_wrong(self) -> bool:
@@ -123,8 +118,7 @@ def _said_of(edges: SceneEdges, name: str, agrees: Agrees) -> tuple[str, str]:
     if turn is None:
         return "untold", f"cannot be told ({_why_untold(edges.scene, name)})"
     if not turn.is_wrong:
-        is_unsure = turn.peak < MIN_PEAK and turn.stored_peak < MIN_STORED_PEAK
-        return "unsure" if is_unsure else "sound", str(turn)
+        return "unsure" if turn.peak < MIN_PEAK else "sound", str(turn)
     agreed = agrees(name, turn)
     if agreed is None:
         return "alone", f"{turn} (nothing else can tell)"
@@ -151,7 +145,6 @@ def best_turn(images: Sequence[EdgeImage]) -> CameraTurn | None:
         peak=_peak(plane, apart > _PEAK_WIDTH_DEG),
         roll_deg=float(roll_deg),
         roll_peak=_peak(line, np.abs(_ROLLS_DEG - roll_deg) > _ROLL_PEAK_WIDTH_DEG),
-        stored_peak=float((edge_scores(images, np.zeros((1, 3)))[0] - plane.mean()) / plane.std()),
     )
 
 

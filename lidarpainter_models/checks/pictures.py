@@ -11,17 +11,18 @@ from lidarpainter_models.scenes.records import RecordedView
 MOST_EVEN_LEVELS = 3.0
 """Spread of the brightness (10th to 90th percentile of 255) of an image that shows nothing; of one
 at night, blurred as it is here, it is 20 and more."""
-BLACK_LEVEL = 16.0
+BLACK, BLACK_LEVEL = "black", 16.0
 _NUM_LOOKED_AT = 8
 _SIZE_PX = (160, 90)
 """Images are made so small first: noise is none then."""
 
 
-def check_pictures(scene: DrivingScene) -> tuple[Literal["ok", "fail"], str]:
-    """Whether the images of each camera show something."""
+def check_pictures(scene: DrivingScene) -> tuple[Literal["ok", "warn", "fail"], str]:
+    """Whether the images of each camera show something; black ones cannot be meant."""
     if blank := blank_cameras(scene):
         said = "; ".join(f"{name} {words}" for name, words in blank.items())
-        return "fail", f"{said}: leave it out (ingest --cameras)"
+        is_black = any(words.startswith(f"is {BLACK}") for words in blank.values())
+        return "fail" if is_black else "warn", f"{said}: leave it out (ingest --cameras)"
     return "ok", "the images of each camera show something"
 
 
@@ -35,7 +36,7 @@ def blank_cameras(scene: DrivingScene) -> dict[str, str]:
             levels = [_even_level(scene, view) for view in views]
             even = [level for level in levels if level is not None]
             if len(even) == len(views):
-                look = "black" if max(even) < BLACK_LEVEL else "of one even brightness"
+                look = BLACK if max(even) < BLACK_LEVEL else "of one even brightness"
                 said[name] = f"is {look} in all {len(views)} images"
     return said
 

@@ -107,7 +107,7 @@ def test_camera_whose_images_show_nothing_is_found(scene, monkeypatch, level):
     monkeypatch.setattr(scene, "read_image", blank)
     look = "black" if level == 0 else "of one even brightness"
     verdict, detail = check_pictures(scene)
-    assert verdict == "fail"
+    assert verdict == ("fail" if level == 0 else "warn")
     assert detail.startswith(f"left_camera is {look} in all 3 images")
 
 

@@ -134,12 +134,13 @@ def test_every_stage_tells_how_far_it_is_from_its_start_to_its_end(tiny_run, mon
         if stage != "examine"  # as another run of the scene has left it
     }
     for stage, lines in told.items():
-        assert len(lines) > 1, stage
-        assert " 100 %, " in lines[-2], stage
+        assert len(lines) > 2, stage
+        assert f"{stage}: stage " in lines[0], stage
+        assert " 99 %, " in lines[-2], stage  # it is whole when it is over
         assert lines[-1].endswith(" s"), stage
-        assert all("; run " in line for line in lines[:-2]), stage
-    assert [line.rpartition(", ")[2] for line in told["fit"][:2]] == ["25 %", "50 %"]
-    assert told["fit"][0].startswith("fit: 0 %, ")
+        assert all("; run " in line for line in lines[:-1]), stage
+    assert [line.rpartition(", ")[2] for line in told["fit"][1:3]] == ["25 %", "50 %"]
+    assert " 0 %, " in told["fit"][1]
     assert "0:00" not in said
 
 

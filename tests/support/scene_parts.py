@@ -12,6 +12,8 @@ from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, SweepPoin
 from lidarpainter_models.scenes.writer import SceneHeader
 
 IDENTITY = torch.eye(4, dtype=torch.float64)
+AHEAD = IDENTITY.clone()
+AHEAD[0, 3] = 10.0  # metres: a box around the origin would be the recording car's own
 HEADER = SceneHeader(licence="test", global_from_world=IDENTITY)
 
 
@@ -44,7 +46,7 @@ def some_box(**changes):
         "actor_id": "car-1",
         "category": "Car",
         "timestamp_ns": 5,
-        "world_from_box": IDENTITY,
+        "world_from_box": AHEAD,
         "size_m": (4.0, 2.0, 1.5),
         "is_moving": True,
         "num_points": 3,

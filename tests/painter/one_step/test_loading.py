@@ -14,6 +14,7 @@ from tiny_diffusion import write_model
 from lidarpainter_models.errors import ConfigError, MissingPackageError, WeightsError
 from lidarpainter_models.painter import selection
 from lidarpainter_models.painter.baselines import UnpaintedPainter
+from lidarpainter_models.painter.one_step import loading
 from lidarpainter_models.painter.one_step.assembly import trained_names
 from lidarpainter_models.painter.one_step.loading import load_one_step
 from lidarpainter_models.painter.one_step.presets import PRESETS
@@ -101,7 +102,7 @@ def test_painter_goes_to_the_gpu_if_there_is_one(model_folder, monkeypatch):
         went.append((device.type, dtype))
         return UnpaintedPainter()
 
-    monkeypatch.setattr(selection, "load_one_step", load)
+    monkeypatch.setattr(loading, "load_one_step", load)
     monkeypatch.setattr(selection, "_loaded", {})
     load_painter(str(model_folder))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
