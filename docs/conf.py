@@ -19,7 +19,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
 ]
-exclude_patterns = ["_site", "pictures/LICENCES.md"]
+exclude_patterns = ["_site"]
 suppress_warnings = ["myst.header"]  # headings of lower levels where a page has no chapters
 default_role = "literal"  # docstrings write `names` as Markdown does
 myst_enable_extensions = ["colon_fence"]
