@@ -5,7 +5,7 @@ whole: checkpoints (`fit.safetensors`) and the first look (`first-look.png`).
 """
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -48,12 +48,28 @@ class _Sources:
 
     digests: Mapping[str, str]
     """Digests of the inputs, by the part they play."""
-    observations: Callable[[], SceneObservations]
-    start: Callable[[], GaussianScene | None]
-    guidance: Callable[[], tuple[GuidanceView, ...]]
-    perceptual: Callable[[], Perceptual | None] | None
+    store: Store
+    refs: Mapping[str, ArtefactRef]
+    """The inputs that there are."""
+    lpips: LpipsFiles | None
     config: FitConfig
     device: torch.device
+
+    def observations(self) -> SceneObservations:
+        """Read what was recorded."""
+        return load_observations(self.store, self.refs["observations"])
+
+    def start(self) -> GaussianScene | None:
+        """Read the scene that is continued, if there is one."""
+        return load_scene(self.store, self.refs["start"]) if "start" in self.refs else None
+
+    def guidance(self) -> tuple[GuidanceView, ...]:
+        """Read the painted views, none if nothing was painted."""
+        return load_guidance(self.store, self.refs["guidance"]) if "guidance" in self.refs else ()
+
+    def perceptual(self) -> Perceptual | None:
+        """Read the distance of images that the loss weighs, if it weighs one."""
+        return None if self.lpips is None else load_lpips(self.lpips, self.device)
 
 
 @stage_task
@@ -126,16 +142,11 @@ def _sources(
     weighed = lpips if config.weighs_perceptual else None
     there = {name: ref for name, ref in inputs.items() if ref is not None}
     digests = {name: ref.digest for name, ref in there.items()}
-
-    def read(load: Callable[..., Any], name: str, absent: Any) -> Callable[[], Any]:  # noqa: ANN401
-        return partial(load, this.store, there[name]) if name in there else lambda: absent
-
     return _Sources(
         digests=digests | (file_digests(weighed.named) if weighed is not None else {}),
-        observations=partial(load_observations, this.store, there["observations"]),
-        start=read(load_scene, "start", None),
-        guidance=read(load_guidance, "guidance", ()),
-        perceptual=partial(load_lpips, weighed, this.device) if weighed is not None else None,
+        store=this.store,
+        refs=there,
+        lpips=weighed,
         config=config,
         device=this.device,
     )
@@ -212,7 +223,7 @@ def _run(
         ),
         progress=told,
         first_look=None if start else look,
-        perceptual=sources.perceptual() if sources.perceptual else None,
+        perceptual=sources.perceptual(),
         device=sources.device,
     )
 

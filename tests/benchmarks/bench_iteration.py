@@ -193,7 +193,7 @@ def _adam_of(fit):
     seen = fit.state.gaussian_adam.seen(scene.gaussians, rows)
     for leaf in (seen.means, seen.rotation_wxyz, seen.log_scale, seen.opacity_logit, seen.sh):
         leaf.grad = leaf.detach().clone()
-    return lambda: fit.state.step_gaussians(seen, 0.5)
+    return lambda: fit.state.step_gaussians(seen)
 
 
 def frame_growth_figures(rounds, *, blocks=(1, 4, 16), size=SIZE):

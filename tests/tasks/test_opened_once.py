@@ -6,7 +6,7 @@ import pytest
 from toy_store import small_parameters, write_toy_scene
 
 from catalog.store import open_store
-from lidarpainter_models.painter.selection import PainterChoice
+from lidarpainter_models.painter.baselines import OverlayPainter
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from tasks import opened as opening
 from tasks.evaluation.views import evaluate, load_scores
@@ -27,7 +27,7 @@ class Counted:
         self.opened, self.painters = [], []
         self._watch(monkeypatch, DrivingScene, "read_image", self._decoding)
         self._watch(monkeypatch, DrivingScene, "__init__", lambda _scene, _stored: self._opening())
-        self._watch(monkeypatch, PainterChoice, "_read", lambda choice, *_: self._loading(choice))
+        self._watch(monkeypatch, OverlayPainter, "__init__", self._loading)
 
     def _watch(self, monkeypatch, owner, name, told):
         original = getattr(owner, name)
@@ -44,8 +44,8 @@ class Counted:
     def _opening(self):
         self.opened.append(self.stage)
 
-    def _loading(self, choice):
-        self.painters.append((self.stage, choice.name))
+    def _loading(self, painter):
+        self.painters.append((self.stage, painter.name))
 
 
 @pytest.fixture

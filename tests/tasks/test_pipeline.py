@@ -62,7 +62,7 @@ def test_the_code_of_a_stage_holds_every_module_that_ran(store, stages, ran):
 
 def test_an_artefact_is_explained_back_to_its_scene(run, store, capsys, monkeypatch):
     monkeypatch.setenv(STORE_ENVIRONMENT, str(store.root))
-    assert main(["catalog", "explain", run.run_id]) == 0
+    assert main(["catalog", "explain", run.run_id, "--verbose"]) == 0
     page = capsys.readouterr().out
     assert f"scene: {TOY_SCENE}" in page
     assert "STALE" not in page

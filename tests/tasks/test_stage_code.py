@@ -143,7 +143,7 @@ def test_scoring_code_changes_what_scores_and_nothing_else(copied):
 def test_the_rasteriser_changes_the_fit_and_all_after_it_but_not_what_it_is_fitted_to(copied):
     module = f"{LIBRARY}.kernels.gaussian_raster.cpu"
     changed = changed_by(copied, module, "return ", "return None or ")
-    after = {"fit", "refine", "paint", "report"}
+    after = {"fit", "paint", "report"}
     assert changed >= {"tasks.evaluation.views", *(f"tasks.reconstruction.{one}" for one in after)}
     assert "tasks.reconstruction.prepare" not in changed
 

@@ -92,8 +92,6 @@ def test_recorded_images_exist_only_where_somebody_stood():
     )
     with pytest.raises(ConfigError, match="on the recorded trajectory"):
         StyleRequest(mix=StyleMix.parse("foggy"), images="recorded").check(view)
-    with pytest.raises(ConfigError, match="no images 'drawn'"):
-        StyleRequest(mix=StyleMix.parse("foggy"), images="drawn")
 
 
 def test_an_unknown_camera_is_named_before_anything_is_drawn(viewed, tmp_path):
