@@ -14,6 +14,7 @@ import cv2
 import torch
 
 from catalog.artefacts import ArtefactRef, Workplace
+from catalog.store import Store
 from lidarpainter_models.evaluation.round_gain import round_gain
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import FitConfig
