@@ -5,7 +5,7 @@ whole: checkpoints (`fit.safetensors`) and the first look (`first-look.png`).
 """
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -52,7 +52,9 @@ class _Sources:
     store: Store
     refs: Mapping[str, ArtefactRef]
     """The inputs that there are."""
-    lpips: LpipsFiles | None
+    perceptual: Callable[[], Perceptual] | None
+    """Reads the distance of images that the loss weighs, if it weighs one; of its code nothing is
+    part of a fit's key, its weights are among the digests."""
     config: FitConfig
     device: torch.device
 
@@ -67,10 +69,6 @@ class _Sources:
     def guidance(self) -> tuple[GuidanceView, ...]:
         """Read the painted views, none if nothing was painted."""
         return load_guidance(self.store, self.refs["guidance"]) if "guidance" in self.refs else ()
-
-    def perceptual(self) -> Perceptual | None:
-        """Read the distance of images that the loss weighs, if it weighs one."""
-        return None if self.lpips is None else load_lpips(self.lpips, self.device)
 
 
 @stage_task
@@ -147,7 +145,7 @@ def _sources(
         digests=digests | (file_digests(weighed.named) if weighed is not None else {}),
         store=this.store,
         refs=there,
-        lpips=weighed,
+        perceptual=partial(load_lpips, weighed, this.device) if weighed is not None else None,
         config=config,
         device=this.device,
     )
@@ -224,7 +222,7 @@ def _run(
         ),
         progress=told,
         first_look=None if start else look,
-        perceptual=sources.perceptual(),
+        perceptual=sources.perceptual() if sources.perceptual else None,
         device=sources.device,
     )
 

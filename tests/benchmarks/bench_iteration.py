@@ -5,6 +5,7 @@ process of its own.
 """
 
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -238,6 +239,7 @@ def memory_figures(*, size=MEMORY_SIZE):
     """Peak memory of a step with so many Gaussians beyond parameters and Adam's moments."""
     told = subprocess.run(
         [sys.executable, __file__, *map(str, size)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         capture_output=True,
         text=True,
         check=True,
