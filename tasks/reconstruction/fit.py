@@ -52,7 +52,7 @@ class _Sources:
     store: Store
     refs: Mapping[str, ArtefactRef]
     """The inputs that there are."""
-    perceptual: Callable[[], Perceptual] | None
+    perceptual: Callable[[], Perceptual | None] | None
     """Reads the distance of images that the loss weighs, if it weighs one; of its code nothing is
     part of a fit's key, its weights are among the digests."""
     config: FitConfig
