@@ -73,7 +73,7 @@ _SHUTTER = RollingShutter(duration_s=0.04, direction="down", first_row_s=-0.03)
 """Every camera reads its rows from 30 ms before the time and pose of its image to 10 ms after.
 
 The data set does not say so; neurad-studio's reader of it has these times (Tonderski et al.,
-NeuRAD, 2024), and a fit to sequence 002 is sharpest with them (docs/datasets.md).
+NeuRAD, 2024).
 """
 
 
