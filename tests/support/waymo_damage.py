@@ -1,6 +1,4 @@
-"""Damage Waymo's files below their checksums: messages and tables that look whole.
-
-Range images, columns and rows that lack something are damaged one by one in `test_hostile_*.py`.
+"""Damage Waymo's files below their checksums: messages, matrices and tables that look whole.
 
 Every way takes a seeded `numpy.random.Generator`. `damaged_record_file` gives a TFRecord file,
 `damaged_component` one Parquet file of a folder; both say what was done.
@@ -8,13 +6,15 @@ Every way takes a seeded `numpy.random.Generator`. `damaged_record_file` gives a
 
 import io
 import struct
+import zlib
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from mutations import STRANGE_NUMBERS, TRAVERSALS, Damage, damaged_bytes
-from waymo_records import tfrecord, varint
+from waymo_records import matrix, message, tfrecord, varint, whole
 
+FRAME_IMAGES, FRAME_LASERS, FRAME_LABELS = 4, 5, 6
 _VARINT, _DOUBLE, _BYTES, _GROUP, _FLOAT = 0, 1, 2, 3, 5
 _STRANGE_WHOLES = (0, 1, 7, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 2**64 - 1)
 
@@ -23,7 +23,7 @@ def damaged_record_file(records, rng):
     """A TFRecord file made of records, one of which (or the file itself) is damaged."""
     records = list(records)
     index = int(rng.integers(len(records)))
-    ways = (_file_bytes, _record_bytes, _any_field, _any_field, _any_field, _records)
+    ways = (_file_bytes, _record_bytes, _any_field, _any_field, _any_field, _range_image, _records)
     way = ways[rng.integers(len(ways))]
     damage = way(records, index, rng)
     return Damage(damage.content, f"{way.__name__} of record {index}: {damage.description}")
@@ -57,6 +57,47 @@ def _records(records, index, rng):
     }
     name = list(ways)[rng.integers(len(ways))]
     return Damage(tfrecord(ways[name]()), name)
+
+
+def _range_image(records, index, rng):
+    """A compressed matrix of a LiDAR is replaced by a damaged one that unpacks, or by a bomb."""
+    fields = split(records[index])
+    lasers = [place for place, field in enumerate(fields) if field[0] == FRAME_LASERS]
+    place = lasers[rng.integers(len(lasers))]
+    laser = split(fields[place][2])
+    echo = int(rng.integers(1, len(laser)))
+    image = split(laser[echo][2])
+    part = int(rng.integers(len(image)))
+    content, description = _damaged_matrix(zlib.decompress(image[part][2]), rng)
+    image[part] = (image[part][0], _BYTES, zlib.compress(content, 1))
+    laser[echo] = (laser[echo][0], _BYTES, joined(image))
+    fields[place] = (FRAME_LASERS, _BYTES, joined(laser))
+    records[index] = joined(fields)
+    return Damage(tfrecord(records), description)
+
+
+def _damaged_matrix(content, rng):
+    (_, _, data), (_, _, shape) = split(content)
+    dims = [value for _, _, value in split(shape)]
+    values = np.frombuffer(data, "<f4").reshape(dims).copy()
+    way = int(rng.integers(6))
+    if way == 0:
+        number = rng.choice([np.nan, np.inf, -np.inf, 3e38, -3e38, 0.0, 1e-40, 500.0])
+        values.reshape(-1)[rng.integers(values.size)] = number
+        return matrix(values), f"a value is {number}"
+    if way == 1:
+        dims[rng.integers(len(dims))] = int(rng.choice([0, 1, 7, 2**31 - 1, 65536]))
+        numbers = b"".join(whole(1, size) for size in dims)
+        return message(1, data) + message(2, numbers), f"shape {dims}"
+    if way == 2:
+        return bytes(int(rng.choice([10**6, 2 * 10**8]))), "a bomb of zeros"
+    if way == 3:
+        number = rng.choice([np.nan, np.inf, 1e30, 0.0])
+        return matrix(np.full_like(values, number)), f"all values are {number}"
+    if way == 4:
+        return matrix(values[:, : max(values.shape[1] // 2, 1)]), "half of the columns"
+    damage = damaged_bytes(content, rng)
+    return damage.content, f"inside the matrix: {damage.description}"
 
 
 def damaged_message(content, rng):
@@ -98,8 +139,8 @@ def _damaged_field(number, kind, value, rng):
         damage = damaged_bytes(value, rng)
         return [(number, kind, damage.content)], damage.description
     if kind == _VARINT:
-        whole = int(rng.choice(np.array(_STRANGE_WHOLES, dtype=object)))
-        return [(number, kind, whole)], f"is {whole}"
+        strange = int(rng.choice(np.array(_STRANGE_WHOLES, dtype=object)))
+        return [(number, kind, strange)], f"is {strange}"
     numbers = [float(x) for x in STRANGE_NUMBERS if abs(x) < 1e300 or x != x or x in (1e308,)]
     near = value * float(rng.choice([-1.0, 0.5, 1.001, 2.0]))
     new = float(rng.choice([*numbers, near, near, near]))
@@ -179,11 +220,30 @@ def damaged_component(folder, rng):
     if rng.random() < 0.4:
         return path, damaged_bytes(path.read_bytes(), rng)
     table = pq.read_table(path)
-    ways = (_strange_value, _strange_value, _rows_moved)
+    ways = (_column_gone, _column_of_texts, _null, _strange_value, _rows_moved, _strange_value)
     table, description = ways[rng.integers(len(ways))](table, rng)
     written = io.BytesIO()
     pq.write_table(table, written, row_group_size=int(rng.choice([1, 2, 5, 1000])))
     return path, Damage(written.getvalue(), description)
+
+
+def _column_gone(table, rng):
+    name = table.schema.names[rng.integers(table.num_columns)]
+    return table.drop_columns([name]), f"no {name}"
+
+
+def _column_of_texts(table, rng):
+    name = table.schema.names[rng.integers(table.num_columns)]
+    texts = pa.array(["../../x"] * table.num_rows)
+    return _with(table, name, texts), f"{name} holds texts"
+
+
+def _null(table, rng):
+    name = table.schema.names[rng.integers(table.num_columns)]
+    values = table[name].to_pylist()
+    if values:
+        values[rng.integers(len(values))] = None
+    return _with(table, name, pa.array(values, type=table.schema.field(name).type)), f"{name} null"
 
 
 def _strange_value(table, rng):

@@ -25,7 +25,7 @@ from catalog.errors import DamagedArtefactError, StorageError
 from catalog.fleets import FleetLedger
 from catalog.leases import FolderObjects, Leases
 from catalog.store import open_store
-from flows.fleet.asked import wishes
+from flows.fleet.asked import Asked, wishes
 from flows.fleet.causes import cause_of
 from flows.fleet.limits import admits
 from flows.fleet.manifest import Budget, read_manifest
@@ -335,6 +335,17 @@ def test_a_scene_from_elsewhere_is_made_under_its_own_name(store, tmp_path, monk
     assert (row["scene_id"], row["state"]) == ("toy/street", "done"), said
     assert row["run_id"] == "run of toy/street"
     assert store.scene_ids() == ["toy/street"]
+
+
+def test_a_street_that_another_draws_meanwhile_is_not_drawn_again(asked, store, monkeypatch):
+    is_there, drawn, named = iter([False, True]), [], asked.rows("stub")[0]
+    made = {"run_id": "r", "artefacts": {}, "computed_now": {}, "peak_memory_bytes": None}
+    monkeypatch.delenv("PREFECT_API_URL", raising=False)
+    monkeypatch.setattr("flows.fleet.work.has_street", lambda *_: next(is_there))
+    monkeypatch.setattr("flows.fleet.work.ingest_street", lambda *given: drawn.append(given))
+    monkeypatch.setattr("flows.fleet.work.reconstruct", lambda *_: made)
+    made_now = make_sequence(Asked.model_validate_json(named["asked"]), store.address, "attempt")
+    assert (made_now.run_id, drawn, list(is_there)) == ("r", [], [])
 
 
 def test_a_worker_lets_go_of_what_a_sequence_had_opened(store, tmp_path, monkeypatch):

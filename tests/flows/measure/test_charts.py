@@ -229,6 +229,43 @@ def test_levels_at_which_painting_seems_to_hurt_are_given_more_seeds():
     assert in_doubt(points, trials) == ["stress/beams-8"]
 
 
+def test_more_seeds_of_doubted_levels_join_all_other_points(tmp_path, monkeypatch):
+    from flows.cli import measure
+    from flows.measure import stress, sweep
+    from flows.measure.stress import Trial
+
+    trials = [
+        Trial(scene=SCENES[0], cause="beams", level=float(level), spoilt=f"stress/beams-{level}")
+        for level in ("8", "4")
+    ]
+    gains = {SCENES[0]: 0.2, "stress/beams-8": -0.15, "stress/beams-4": 0.1}
+    asked, shown = [], []
+
+    def made(sweep, **_):
+        asked.append(sweep)
+        return [
+            point(name, way.name, seed, 25.0 + gains[name] * (way.name == "painted"), 100)
+            for name in sweep.scenes
+            for way in sweep.configurations
+            for seed in sweep.seeds
+        ]
+
+    monkeypatch.setattr("catalog.store.existing_store", lambda: None)
+    monkeypatch.setattr(stress, "trials_of", lambda *_: trials)
+    monkeypatch.setattr(stress, "spoil_scenes", lambda *_: None)
+    monkeypatch.setattr(sweep, "was_asked", lambda *_: True)
+    monkeypatch.setattr(sweep, "foretold", lambda *_: "nothing")
+    monkeypatch.setattr(measure, "_made", made)
+    monkeypatch.setattr(measure, "_show", lambda result, **_: shown.append(result))
+    measure.stress([SCENES[0]], tmp_path)
+    first, again = asked
+    assert (again.scenes, again.seeds) == (("stress/beams-8",), (1, 2))
+    assert first.name != again.name  # a fleet forgets what it is no longer asked for
+    drawn = {(one["scene"], one["configuration"], one["seed"]) for one in shown[0]["points"]}
+    assert len(drawn) == len(shown[0]["points"]) == 3 * 2 + 2 * 2
+    assert any("at 1 of 2 levels" in line for line in shown[0]["says"])
+
+
 def test_stress_says_from_which_level_on_a_cause_is_noticed(tmp_path):
     from flows.measure.stress import Trial, stress_of
 
