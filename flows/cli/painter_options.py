@@ -36,8 +36,8 @@ Split = Annotated[
     str,
     typer.Option(
         help="Which frames of recorded scenes are fitted, the others giving true images: "
-        "alternate (every second one), forward:17:8 (17 are fitted, the next 8 are not), or"
-        " all."
+        "alternate (every second one), forward:17:8 (every second of the first 17, and the "
+        "last 8 are not), or all."
     ),
 ]
 Cameras = Annotated[

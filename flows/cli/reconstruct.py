@@ -91,7 +91,8 @@ Split = Annotated[
     str | None,
     typer.Option(
         help="Which frames are fitted and which are held out for scoring: alternate (every "
-        "second one is held out), forward:17:8 (17 are fitted, the next 8 held out), or all"
+        "second one is held out), forward:17:8 (every second of the first 17 is fitted, the "
+        "last 8 are held out), or all"
         " (none is held out). The preset's if absent."
     ),
 ]
