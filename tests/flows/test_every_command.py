@@ -140,8 +140,8 @@ def test_every_stage_tells_how_far_it_is_from_its_start_to_its_end(tiny_run, mon
         assert (" 99 %, " in lines[-2]) != ("whether views became better" in lines[-2]), stage
         assert lines[-1].endswith(" s"), stage
         assert all("; run " in line for line in lines[:-1]), stage
-    assert [line.rpartition(", ")[2] for line in told["fit"][1:3]] == ["25 %", "50 %"]
     assert " 0 %, " in told["fit"][1]
+    assert [line.rpartition(", ")[2] for line in told["fit"][2:4]] == ["25 %", "50 %"]
     assert "0:00" not in said
 
 

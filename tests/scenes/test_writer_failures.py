@@ -73,7 +73,7 @@ def test_full_disk_while_publishing_leaves_the_old_scene(tmp_path, monkeypatch):
     def refuse(*_args, **_options):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("lidarpainter_models.scenes.writer.pq.write_table", refuse)
+    monkeypatch.setattr("lidarpainter_models.scenes.stored.pq.write_table", refuse)
     with pytest.raises(WriteError), SceneWriter(tmp_path, "rig", "a", HEADER) as writer:
         add_frame(writer, num_points=30)
     assert DrivingScene.open(writer.path).content_digest == before
