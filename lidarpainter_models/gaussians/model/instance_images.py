@@ -37,7 +37,8 @@ def instance_image(
         first = draw_gaussians(gaussians, bodies, camera, channels=is_street, backend=backend)
         best, shown = first.features[..., 0], torch.zeros_like(first.alpha, dtype=torch.int64)
         visible = torch.unique(own[first.visible & (own > STREET)])
-        for some in visible.split(_NUM_TOGETHER):
+        for first_row in range(0, len(visible), _NUM_TOGETHER):
+            some = visible[first_row : first_row + _NUM_TOGETHER]
             channels = (own[:, None] == some).float()
             image = draw_gaussians(gaussians, bodies, camera, channels=channels, backend=backend)
             share, place = image.features.max(dim=-1)

@@ -58,3 +58,10 @@ def test_a_rolling_shutter_shows_actors_where_the_image_has_them():
     who = instance_image(scene, camera, 0)
     is_actor = (who != STREET) & (who != SKY)
     assert int((is_actor ^ shown).sum()) < 0.1 * int((at_once ^ shown).sum())
+
+
+def test_a_log_without_actors_has_street_and_sky():
+    assert set(instance_image(world_of_cars(0), camera_at(0.0), 0).unique().tolist()) == {
+        STREET,
+        SKY,
+    }
