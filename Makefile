@@ -39,9 +39,13 @@ docs: $(DOCUMENTERS)
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --fresh-env -q docs docs/_site
 
 # the tables of README and docs from runs of this code, hours where there are none yet. PANDASET is
-# the data set as downloaded, WEIGHTS SqueezeNet's; without them their tables stay as they are
+# the data set as downloaded, STRANGERS a folder of logs in canonical form, WEIGHTS SqueezeNet's;
+# without them their tables stay as they are
 figures: $(INSTALLED) $(SYSTEM)
 	$(if $(PANDASET),$(FIGURES) ingest pandaset $(PANDASET) 002 --frames 0:28)
+	$(if $(STRANGERS),$(FIGURES) ingest canonical $(STRANGERS)/kitti drive_0005)
+	$(if $(STRANGERS),$(FIGURES) ingest canonical $(STRANGERS)/aimotive night)
+	$(BIN)/python scripts/street_logs.py figures-store
 	$(FIGURES) figures docs/figures.toml $(if $(WEIGHTS),--feature-weights $(WEIGHTS))
 
 # five minutes on a machine with a GPU: agreement with the CPU, speed, memory; gpu-check.md

@@ -82,7 +82,8 @@ class CameraTurn:
 def _trust(peak: float) -> str:
     if peak >= MIN_PEAK:
         return "trusted"
-    return f"not trusted (stands out by {peak:.1f} deviations from other turns, not {MIN_PEAK})"
+    said = f"{peak:.2f} of {MIN_PEAK:.1f} deviations from other turns"
+    return f"not trusted (stands out by {said})"
 
 
 Agrees = Callable[[str, CameraTurn], bool | None]

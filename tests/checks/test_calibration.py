@@ -69,8 +69,8 @@ def test_roll_that_does_not_stand_out_is_said_to_be_not_trusted():
     turn = CameraTurn(yaw_deg=0.25, pitch_deg=0.0, peak=5.2, roll_deg=-2.25, roll_peak=2.13)
     assert not turn.is_wrong
     assert str(turn) == (
-        "yaw +0.25 pitch +0.00 trusted, roll -2.25 not trusted (stands out by 2.1 deviations from "
-        "other turns, not 3.5)"
+        "yaw +0.25 pitch +0.00 trusted, roll -2.25 not trusted (stands out by 2.13 of 3.5 "
+        "deviations from other turns)"
     )
 
 
