@@ -14,10 +14,10 @@ from datetime import UTC, datetime
 from functools import cached_property
 from typing import Any
 
-from catalog.attempts import FIRST_PAUSE_S, Ending, attempt_row, row_after, split_attempt_id
 from catalog.digests import canonical_json, digest_text
 from catalog.errors import UnknownRecordError
 from catalog.leases import Lease, Leases
+from catalog.retries import FIRST_PAUSE_S, Ending, attempt_row, row_after, split_attempt_id
 from catalog.store import Store
 from catalog.tables import Row
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from catalog.artefacts import ArtefactRef, Manifest
-from catalog.attempts import by_cause
 from catalog.errors import CatalogError, IdentityError, UnknownRecordError
 from catalog.explain import SCENE, CodeToday, changed_modules
 from catalog.records import json_of
+from catalog.retries import by_cause
 from catalog.store import Store
 from catalog.tables import Row
 

@@ -3,8 +3,8 @@
 import errno
 from collections.abc import Callable
 
-from catalog.attempts import Cause
 from catalog.errors import CatalogError, ConflictError, UnreachableError, disk_error
+from catalog.retries import Cause
 from flows.fleet.flow_runs import is_of_lost_api
 from lidarpainter_models.errors import (
     BackendError,

@@ -17,10 +17,10 @@ from urllib.request import Request, urlopen
 
 import httpx
 
-from catalog.attempts import attempt_id
 from catalog.errors import CatalogError, ConflictError
 from catalog.fleets import FleetLedger
 from catalog.leases import Lease, Leases
+from catalog.retries import attempt_id
 from flows.fleet.heartbeat import Heartbeat
 
 if TYPE_CHECKING:

@@ -14,9 +14,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from catalog.attempts import Ending
 from catalog.errors import CatalogError, StorageError
 from catalog.fleets import FleetLedger
+from catalog.retries import Ending
 from catalog.store import open_store
 from flows.fleet.causes import is_storage_away
 from flows.fleet.status import counts_of

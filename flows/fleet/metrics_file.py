@@ -10,9 +10,9 @@ from prometheus_client import CollectorRegistry, Gauge, write_to_textfile
 from prometheus_client.core import CounterMetricFamily
 from prometheus_client.registry import Collector
 
-from catalog.attempts import by_cause
 from catalog.errors import storage_errors
 from catalog.fleets import FleetLedger
+from catalog.retries import by_cause
 from catalog.tables import Row
 from flows.fleet.status import counts_of, planner_error
 

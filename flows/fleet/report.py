@@ -9,9 +9,9 @@ from statistics import median, quantiles
 
 import lidarpainter_models
 from catalog.artefacts import ArtefactRef
-from catalog.attempts import by_cause
 from catalog.errors import CatalogError
 from catalog.fleets import FleetLedger
+from catalog.retries import by_cause
 from catalog.tables import Row
 from flows.fleet.manifest import Budget
 from flows.fleet.status import counts_of, planner_error

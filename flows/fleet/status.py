@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
-from catalog.attempts import State
 from catalog.fleets import FleetLedger
+from catalog.retries import State
 from catalog.tables import Row
 from flows.fleet.limits import lacks_disk, over_budget
 from flows.fleet.manifest import Budget

@@ -16,10 +16,10 @@ from functools import partial
 from typing import Literal, NoReturn
 
 import lidarpainter_models
-from catalog.attempts import Ending, attempt_id
 from catalog.errors import StorageError
 from catalog.fleets import FleetLedger
 from catalog.leases import Holder, Lease
+from catalog.retries import Ending, attempt_id
 from catalog.tables import Row
 from flows.fleet.asked import Asked
 from flows.fleet.causes import cause_of, is_storage_away

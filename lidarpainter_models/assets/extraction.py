@@ -27,8 +27,8 @@ from lidarpainter_models.editing.actor_models import (
 from lidarpainter_models.editing.worlds import EditedWorld, as_moving
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.export.images import write_webp
+from lidarpainter_models.gaussians.model.drawing import draw_gaussians
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.gaussians.model.scene_rendering import draw_gaussians
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.geometry.transforms import invert_rigid

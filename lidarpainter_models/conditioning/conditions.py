@@ -22,8 +22,8 @@ from lidarpainter_models.conditioning.references import WarpTarget, warped_refer
 from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.conditioning.surface_depth import surface_depth
 from lidarpainter_models.conditioning.warping import SKY_ALPHA, SourceImage, source_costs_m
+from lidarpainter_models.gaussians.model.drawing import SceneRender
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.gaussians.model.scene_rendering import SceneRender
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.lidar_images import LidarImage, render_lidar
 from lidarpainter_models.lidar.lidar_map import LidarMap

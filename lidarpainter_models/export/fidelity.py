@@ -7,13 +7,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.gaussians.model.scene_rendering import (
+from lidarpainter_models.gaussians.model.drawing import (
     camera_from_body,
     draw_gaussians,
     draw_over_sky,
 )
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.sky import SkyTexture
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.metrics.images import psnr_from_error, squared_error

@@ -26,9 +26,9 @@ from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import fit_step
 from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
+from lidarpainter_models.gaussians.model.drawing import camera_from_body
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
 from lidarpainter_models.gaussians.model.sky import SkyTexture, sky_layout
 from lidarpainter_models.geometry.transforms import rigid_from_rotation
 from lidarpainter_models.kernels.ssim import l1_ssim_loss

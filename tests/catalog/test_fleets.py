@@ -7,17 +7,17 @@ from pathlib import Path
 import pytest
 from fleet_wishes import wish
 
-from catalog.attempts import MAX_TRIES, Ending
 from catalog.errors import UnknownRecordError
 from catalog.fleets import FleetLedger
 from catalog.leases import FolderObjects, Leases
+from catalog.retries import MAX_TRIES, Ending
 from catalog.store import open_store
 
 ROOT = Path(__file__).resolve().parents[2]
 DONE = Ending(cause="done", run_id="run", seconds=2.0)
 WORKER = """
 import sys, time
-from catalog.attempts import Ending
+from catalog.retries import Ending
 from catalog.fleets import FleetLedger
 from catalog.store import open_store
 ledger = FleetLedger(open_store(sys.argv[1]))

@@ -5,9 +5,9 @@ import json
 import pytest
 from fleet_wishes import wish
 
-from catalog.attempts import Ending
 from catalog.fleets import FleetLedger
 from catalog.points import points_of
+from catalog.retries import Ending
 from catalog.store import open_store
 
 RESULT = {

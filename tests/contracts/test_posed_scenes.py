@@ -211,4 +211,4 @@ def test_lamps_bending_and_shutters_are_asked_in_one_place(call):
         for path in (ROOT / top).rglob("*.py")
         if re.search(rf"{before}{re.escape(call)}\(", path.read_text("utf-8"))
     }
-    assert callers == {"gaussian_scene.py" if call == "PosedScene.of" else "posed_scene.py"}
+    assert callers == {"gaussian_scene.py" if call == "PosedScene.of" else "scene_rendering.py"}

@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.gaussians.fitting.images import FitImage
+from lidarpainter_models.gaussians.model.drawing import OPAQUE
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import SH_CONSTANT
-from lidarpainter_models.gaussians.model.scene_rendering import OPAQUE
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.gaussian_raster import Splats, render_gaussians
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lidarpainter_models.gaussians.fitting.config import FitConfig, FitLossWeights
 from lidarpainter_models.gaussians.fitting.images import FitImage
-from lidarpainter_models.gaussians.model.posed_scene import PosedScene
+from lidarpainter_models.gaussians.model.scene_rendering import PosedScene
 from lidarpainter_models.gaussians.model.sky import MIN_TRANSMITTANCE
 from lidarpainter_models.geometry.box_masks import project_boxes
 from lidarpainter_models.kernels.gaussian_raster import SplatImage

@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lidarpainter_models.gaussians.model.drawing import camera_from_body
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
 from lidarpainter_models.geometry.transforms import invert_rigid, rotation_from_quaternion
 from lidarpainter_models.scenes.splits import sampled_rows
 

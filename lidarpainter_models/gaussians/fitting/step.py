@@ -23,8 +23,8 @@ from lidarpainter_models.gaussians.fitting.loss import (
     recorded_loss,
 )
 from lidarpainter_models.gaussians.fitting.state import FitState
-from lidarpainter_models.gaussians.model.posed_scene import PosedScene
-from lidarpainter_models.gaussians.model.scene_rendering import OPAQUE
+from lidarpainter_models.gaussians.model.drawing import OPAQUE
+from lidarpainter_models.gaussians.model.scene_rendering import PosedScene
 from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
 from lidarpainter_models.gaussians.model.sky import (
     FINAL_LEARNING_RATE,

@@ -12,14 +12,14 @@ from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.gaussians.model.actors import Actors
 from lidarpainter_models.gaussians.model.blinking import Blinking
 from lidarpainter_models.gaussians.model.corrections import CameraCorrections, ExposureCorrections
+from lidarpainter_models.gaussians.model.drawing import SceneRender
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.gaussians.model.posed_scene import (
+from lidarpainter_models.gaussians.model.rolling_shutter import MOST_GROWTH
+from lidarpainter_models.gaussians.model.scene_rendering import (
     DrawableScene,
     PosedScene,
     gaussians_at,
 )
-from lidarpainter_models.gaussians.model.rolling_shutter import MOST_GROWTH
-from lidarpainter_models.gaussians.model.scene_rendering import SceneRender
 from lidarpainter_models.gaussians.model.sky import SkyTexture
 from lidarpainter_models.gaussians.model.spatial_blocks import SpatialBlocks
 from lidarpainter_models.gaussians.model.styling.scene_style import SceneStyle

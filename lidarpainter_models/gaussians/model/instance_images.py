@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from lidarpainter_models.gaussians.model.drawing import draw_gaussians
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
-from lidarpainter_models.gaussians.model.scene_rendering import draw_gaussians
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.backends import Backend
 

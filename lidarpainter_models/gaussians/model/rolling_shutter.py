@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.gaussians.model.actors import Actors
-from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
+from lidarpainter_models.gaussians.model.drawing import camera_from_body
 from lidarpainter_models.gaussians.model.seen_gaussians import AnyGaussians
 from lidarpainter_models.geometry.cameras import Camera, Shutter
 from lidarpainter_models.geometry.transforms import (

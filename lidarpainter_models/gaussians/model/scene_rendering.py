@@ -1,112 +1,162 @@
-"""Draw Gaussians, actors' bodies in place, over their sky.
+"""A scene at one moment before one camera: the one way from a scene to what is drawn of it.
 
-A Gaussian of an actor sits in the actor's box frame; at a time its centre and covariance are
-carried by the actor's pose, mu = R_t mu_v + t_t and Sigma = R_t Sigma_v R_t^T (Street Gaussians,
-Yan et al. 2024). Camera frame: x right, y down, z forward; world: z up; metres.
+Whoever shows a scene (a fit, an image, its masks, the search for lamps, a browser, an export) asks
+here where its bodies stand and what its Gaussians are then: lit by their lamps, bent as people are,
+and each where it is when the shutter of the camera reads its pixel. What a style makes of colours
+comes before, sky, lens and exposure after (`DrawableScene`).
+
+Camera frame: x right, y down, z forward; world: z up; metres.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidarpainter_models.gaussians.model.seen_gaussians import DrawableGaussians
+from lidarpainter_models.gaussians.model.actors import ActorPoses, Actors
+from lidarpainter_models.gaussians.model.blinking import Blinking
+from lidarpainter_models.gaussians.model.corrections import ExposureCorrections
+from lidarpainter_models.gaussians.model.drawing import (
+    SceneRender,
+    camera_from_body,
+    draw_gaussians,
+    draw_over_sky,
+)
+from lidarpainter_models.gaussians.model.rolling_shutter import as_read, bodies_while_read
+from lidarpainter_models.gaussians.model.seen_gaussians import AnyGaussians, DrawableGaussians
 from lidarpainter_models.gaussians.model.sky import SkyTexture
+from lidarpainter_models.gaussians.model.spatial_blocks import View
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.kernels.backends import Backend
-from lidarpainter_models.kernels.gaussian_raster import SplatImage, Splats, render_gaussians
+from lidarpainter_models.kernels.gaussian_raster import SplatImage
 
-OPAQUE = 1 - 1 / 512
-"""From this opacity on the sky is not looked up: it would change no byte by more than half."""
-_FAR_BEHIND_M = -1e6
+
+def gaussians_at(
+    gaussians: AnyGaussians, actors: Actors, blinking: Blinking, timestamp_ns: int | None
+) -> AnyGaussians:
+    """The Gaussians of a scene at a time, each still in the frame of its own body.
+
+    Args:
+        gaussians: those of the scene or some of them; differentiable in centres and colours.
+        actors: how they bend.
+        blinking: the lamps that light some of them.
+        timestamp_ns: when; None is for what holds many moments and cannot change Gaussians from
+            one to the next: lamps are lit as on average, and nobody bends.
+    """
+    if timestamp_ns is None:
+        return blinking.lit_on_average(gaussians)
+    return actors.bending.bent(blinking.lit(gaussians, timestamp_ns), timestamp_ns)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SceneRender:
-    """One rendered view."""
+class PosedScene:
+    """Where the bodies of a scene stand before a camera while it takes an image."""
 
-    rgb: Float[Tensor, "height width 3"]
-    """Gaussians over sky, not clamped above 1."""
-    depth_m: Float[Tensor, "height width"]
-    """Expected camera z of what is seen; 0 where the Gaussians cover less than half."""
-    alpha: Float[Tensor, "height width"]
-    """Opacity of the Gaussians, before the sky."""
-    actor_alpha: Float[Tensor, "height width"]
-    """The part of alpha that belongs to actors."""
+    camera: Camera
+    """At its refined pose; where it is differentiable, `bodies` carry the gradient."""
+    taken_ns: int
+    """When the middle of the image is read."""
+    poses: ActorPoses
+    """World poses of the actors at that time, and which of them are there."""
+    bodies: Float[Tensor, "bodies 4 4"]
+    """`camera_from_body` of the street and every actor; float32, on the CPU."""
+    actors: Actors
+    blinking: Blinking
 
-
-def camera_from_body(
-    world_from_camera: Float[Tensor, "4 4"],
-    world_from_actors: Float[Tensor, "actors 4 4"],
-    present: Float[Tensor, " actors"],
-) -> Float[Tensor, "bodies 4 4"]:
-    """Where every body stands in the camera; differentiable in the poses, float32, on the CPU.
-
-    Absent actors are put far behind the camera, where nothing is drawn.
-    """
-    camera_from_world = invert_rigid(world_from_camera.double())
-    if len(world_from_actors) == 0:
-        return camera_from_world[None].float()
-    absent = torch.eye(4, dtype=torch.float64)
-    absent[2, 3] = _FAR_BEHIND_M
-    is_present = present[:, None, None] > 0
-    camera_from_actor = torch.where(is_present, camera_from_world @ world_from_actors, absent)
-    return torch.cat([camera_from_world[None], camera_from_actor]).float()
-
-
-def draw_gaussians(
-    gaussians: DrawableGaussians,
-    bodies: Float[Tensor, "bodies 4 4"],
-    camera: Camera,
-    *,
-    with_actor_alpha: bool = False,
-    channels: Float[Tensor, "gaussians channels"] | None = None,
-    screen_gradient_out: Float[Tensor, " gaussians"] | None = None,
-    backend: Backend = "auto",
-) -> SplatImage:
-    """Blend Gaussians whose bodies stand before the camera like this, without sky.
-
-    The image's features are the actors' alpha if it is wanted, then the `channels` if given.
-    """
-    features = [(gaussians.body_index > 0).float()[:, None]] if with_actor_alpha else []
-    features += [] if channels is None else [channels]
-    splats = Splats(
-        means=gaussians.means,
-        rotation_wxyz=gaussians.rotation_wxyz,
-        scale_m=gaussians.scale_m,
-        opacity=gaussians.opacity,
-        sh=gaussians.sh,
-        body_index=gaussians.body_index,
-    )
-    return render_gaussians(
-        splats,
-        bodies.to(gaussians.means.device, non_blocking=True),
-        camera,
-        features=torch.cat(features, dim=1) if features else None,
-        screen_gradient_out=screen_gradient_out,
-        backend=backend,
-    )
-
-
-def draw_over_sky(
-    gaussians: DrawableGaussians,
-    bodies: Float[Tensor, "bodies 4 4"],
-    sky: SkyTexture,
-    camera: Camera,
-    *,
-    backend: Backend = "auto",
-) -> SceneRender:
-    """The view of a camera, without gradient."""
-    with torch.no_grad():
-        image = draw_gaussians(gaussians, bodies, camera, with_actor_alpha=True, backend=backend)
-        clear = (1 - image.alpha)[..., None]
-        rgb = image.rgb + clear * sky.sample(sky.rays(camera, image.alpha < OPAQUE))
-        depth_m = image.depth_m / image.alpha.clamp(min=1e-4)
-        return SceneRender(
-            rgb=rgb,
-            depth_m=torch.where(image.alpha >= 0.5, depth_m, torch.zeros_like(depth_m)),
-            alpha=image.alpha,
-            actor_alpha=image.features[..., 0],
+    @classmethod
+    def of(
+        cls,
+        actors: Actors,
+        blinking: Blinking,
+        camera: Camera,
+        taken_ns: int,
+        *,
+        poses: ActorPoses,
+        world_from_camera: Float[Tensor, "4 4"] | None = None,
+    ) -> "PosedScene":
+        """Place the bodies before a camera; `world_from_camera` is its own pose with a gradient."""
+        pose = camera.world_from_camera if world_from_camera is None else world_from_camera
+        return cls(
+            camera=camera,
+            taken_ns=taken_ns,
+            poses=poses,
+            bodies=camera_from_body(pose, *poses),
+            actors=actors,
+            blinking=blinking,
         )
+
+    def held(self) -> "PosedScene":
+        """The same, but no gradient reaches poses and bending."""
+        bending = self.actors.bending
+        still = replace(bending, offset_m=bending.offset_m.detach())
+        world_from_actors, present = self.poses
+        return replace(
+            self,
+            poses=(world_from_actors.detach(), present),
+            bodies=self.bodies.detach(),
+            actors=replace(self.actors, bending=still),
+        )
+
+    def looks(self) -> list[View]:
+        """The camera and its bodies in moments that show all that the image can show.
+
+        These are the middle of the image and, where a shutter rolls, when its first and its last
+        pixel is read; without gradient.
+        """
+        bodies = self.bodies.detach()
+        read = bodies_while_read(bodies, self.camera, self.actors, self.taken_ns)
+        return [(self.camera, moment) for moment in (bodies, *read)]
+
+    def shown(self, gaussians: AnyGaussians) -> AnyGaussians:
+        """Gaussians of the scene as this image shows them, in the frames of their bodies.
+
+        Lit, bent, and as the shutter reads them; differentiable in centres, sizes and colours.
+        """
+        then = gaussians_at(gaussians, self.actors, self.blinking, self.taken_ns)
+        return as_read(then, self.bodies, self.camera, self.actors, self.taken_ns)
+
+    def draw(
+        self,
+        gaussians: AnyGaussians,
+        *,
+        with_actor_alpha: bool = False,
+        channel: Float[Tensor, "gaussians 1"] | None = None,
+        screen_gradient_out: Float[Tensor, " gaussians"] | None = None,
+    ) -> SplatImage:
+        """Blend Gaussians of the scene as this image shows them; see `draw_gaussians`."""
+        return draw_gaussians(
+            self.shown(gaussians),
+            self.bodies,
+            self.camera,
+            with_actor_alpha=with_actor_alpha,
+            channels=channel,
+            screen_gradient_out=screen_gradient_out,
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DrawableScene:
+    """All that an image of a scene is made of; without gradient."""
+
+    posed: PosedScene
+    gaussians: DrawableGaussians
+    """As the image shows them (`PosedScene.shown`), in the colours of the style if there is one."""
+    rows: Int[Tensor, " gaussians"]
+    """Which of the scene's Gaussians these are: at least all that the image can show."""
+    sky: SkyTexture
+    exposure: ExposureCorrections
+    lens: Callable[[SceneRender], SceneRender] | None = None
+    """What happens in the lens: the glare of lamps at night."""
+
+    def render(self, *, camera_name: str | None = None, backend: Backend = "auto") -> SceneRender:
+        """Draw it over its sky, with colours exposed as those of `camera_name`, if there is one."""
+        with torch.no_grad():
+            posed = self.posed
+            drawn = draw_over_sky(
+                self.gaussians, posed.bodies, self.sky, posed.camera, backend=backend
+            )
+            drawn = drawn if self.lens is None else self.lens(drawn)
+            rgb = self.exposure.apply(drawn.rgb, camera_name, posed.taken_ns)
+            return replace(drawn, rgb=rgb)

@@ -6,8 +6,8 @@ import httpx
 import pytest
 from stub_fleet import stub_ledger, stub_worker, write_stub_manifest
 
-from catalog.attempts import attempt_id
 from catalog.leases import FolderObjects, Leases
+from catalog.retries import attempt_id
 from flows.fleet import flow_runs as flow_runs_module
 from flows.fleet.asked import Asked, wishes
 from flows.fleet.flow_runs import (

@@ -8,8 +8,8 @@ from commands import call, succeed
 from prometheus_client.parser import text_string_to_metric_families
 from stub_fleet import behave, stub_ledger, stub_worker, write_stub_manifest
 
-from catalog.attempts import Ending
 from catalog.records import MetricRecord, metric_rows
+from catalog.retries import Ending
 from catalog.store import open_store
 from flows.fleet.asked import wishes
 from flows.fleet.manifest import read_manifest

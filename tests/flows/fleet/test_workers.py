@@ -20,10 +20,10 @@ from stub_fleet import (
 )
 from toy_store import write_toy_scene
 
-from catalog.attempts import Ending
 from catalog.errors import DamagedArtefactError, StorageError
 from catalog.fleets import FleetLedger
 from catalog.leases import FolderObjects, Leases
+from catalog.retries import Ending
 from catalog.store import open_store
 from flows.fleet.asked import Asked, wishes
 from flows.fleet.causes import cause_of

@@ -24,8 +24,8 @@ from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import add_guidance_gradients, fit_step
 from lidarpainter_models.gaussians.initialisation.scene import initialise_scene
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
+from lidarpainter_models.gaussians.model.drawing import camera_from_body, draw_gaussians
 from lidarpainter_models.gaussians.model.rolling_shutter import as_read
-from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body, draw_gaussians
 from lidarpainter_models.gaussians.model.stored_scene import scene_to_arrays
 from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.geometry.transforms import rigid_from_tangent

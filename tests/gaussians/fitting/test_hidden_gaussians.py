@@ -18,7 +18,7 @@ from lidarpainter_models.gaussians.fitting.hidden_gaussians import (
 from lidarpainter_models.gaussians.fitting.images import full_image
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import fit_step
-from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body, draw_gaussians
+from lidarpainter_models.gaussians.model.drawing import camera_from_body, draw_gaussians
 from lidarpainter_models.observations.views import GuidanceView, TrainingView
 
 CPU = torch.device("cpu")

@@ -7,7 +7,7 @@ import torch
 from bench_iteration import Fit
 
 from lidarpainter_models.gaussians.fitting.state import FitState
-from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
+from lidarpainter_models.gaussians.model.drawing import camera_from_body
 
 BLOCKS, PASSES = 4, 6
 EPS = torch.finfo(torch.float32).eps

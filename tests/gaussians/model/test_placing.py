@@ -7,12 +7,12 @@ import torch
 from gaussian_world import camera_at
 from random_gaussians import random_gaussians
 
+from lidarpainter_models.gaussians.model.drawing import camera_from_body, draw_gaussians
 from lidarpainter_models.gaussians.model.placing import (
     carried_gaussians,
     harmonic_turn,
     joined_gaussians,
 )
-from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body, draw_gaussians
 from lidarpainter_models.geometry.transforms import rigid_from_rotation, rotation_from_vector
 from lidarpainter_models.kernels.gaussian_raster.reference import harmonic_basis
 

@@ -7,8 +7,8 @@ import torch
 from gaussian_world import FRAME_NS, camera_at, car_track, round_gaussians
 
 from lidarpainter_models.gaussians.model.actors import Actors
+from lidarpainter_models.gaussians.model.drawing import camera_from_body
 from lidarpainter_models.gaussians.model.rolling_shutter import as_read, bodies_while_read
-from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body
 from lidarpainter_models.geometry.cameras import Shutter
 
 MIDDLE_NS = FRAME_NS

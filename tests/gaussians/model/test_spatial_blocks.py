@@ -9,7 +9,7 @@ from gaussian_world import FRAME_NS, camera_at, car_track, round_gaussians, scen
 from lidarpainter_models.gaussians.fitting.gaussian_adam import most_sigmas
 from lidarpainter_models.gaussians.fitting.learning_rates import LearningRates
 from lidarpainter_models.gaussians.model.actors import Actors
-from lidarpainter_models.gaussians.model.scene_rendering import camera_from_body, draw_gaussians
+from lidarpainter_models.gaussians.model.drawing import camera_from_body, draw_gaussians
 from lidarpainter_models.gaussians.model.spatial_blocks import SpatialBlocks
 from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.geometry.transforms import rigid_from_tangent

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from lidarpainter_models.gaussians.model.actors import ActorPoses, Actors
 from lidarpainter_models.gaussians.model.corrections import ExposureCorrections
+from lidarpainter_models.gaussians.model.drawing import SceneRender, camera_from_body
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
-from lidarpainter_models.gaussians.model.posed_scene import DrawableScene, PosedScene
-from lidarpainter_models.gaussians.model.scene_rendering import SceneRender, camera_from_body
+from lidarpainter_models.gaussians.model.scene_rendering import DrawableScene, PosedScene
 from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
 from lidarpainter_models.gaussians.model.sky import SkyTexture
 from lidarpainter_models.gaussians.model.styling.glare import add_glare
