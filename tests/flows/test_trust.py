@@ -7,7 +7,6 @@ from pathlib import Path
 
 from tiny_street import FRONT, NUM_FRAMES
 
-from catalog.store import open_store
 from flows.views import viewed_run
 from lidarpainter_models.evaluation.view_confidence import BUNDLED
 from lidarpainter_models.export.view_requests import ViewRequest
@@ -50,7 +49,7 @@ def test_demo_says_how_far_each_stretch_can_be_trusted(tiny_run):
 
 
 def test_delivered_frames_are_trusted_as_their_run_says(tiny_run):
-    store = open_store(tiny_run.store)
+    store = tiny_run.store
     request = ViewRequest(trajectory=parse_trajectory("recorded"))
     finished = open_run(store, tiny_run.result["run_id"])
     viewed = viewed_run(store, finished, request)
