@@ -8,11 +8,14 @@ from typing import Any
 from catalog.store import Store
 from flows.parameters import view_parameters
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.evaluation.anchoring import calibration_of
+from lidarpainter_models.evaluation.score_tables import ENVELOPE
+from lidarpainter_models.evaluation.view_confidence import Calibration
 from lidarpainter_models.export.styled_views import StyleRequest
 from lidarpainter_models.export.view_requests import RECORDING, UNPAINTED, ViewRequest
 from lidarpainter_models.observations.fit_size import require_recorded_width
 from tasks.opened import open_scene
-from tasks.runs import FinishedRun, is_of_its_scene, open_run
+from tasks.runs import FinishedRun, is_of_its_scene, lineage, open_run
 from tasks.specs import FittedRef
 from tasks.views.drive import SHOWN, view_live
 from tasks.views.render import ViewedRun, render
@@ -89,8 +92,15 @@ def viewed_run(store: Store, finished: FinishedRun, request: ViewRequest) -> Vie
         fitted=finished.final,
         observation=parameters.observation,
         conditions=parameters.conditions,
+        calibration=_calibration(store, finished),
         beside=_beside(store, finished, request.beside),
     )
+
+
+def _calibration(store: Store, finished: FinishedRun) -> Calibration:
+    """As the envelope of the run says, or of the nearest one that it was changed from."""
+    envelopes = (run.result.get(ENVELOPE) for run in lineage(store, finished))
+    return calibration_of(next((found for found in envelopes if found), None))
 
 
 def _beside(store: Store, finished: FinishedRun, beside: str | None) -> FittedRef | None:

@@ -11,7 +11,7 @@ straight on past the end of the log. One step at a time: no step says anything a
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import repeat
 from typing import Any
 
@@ -168,7 +168,7 @@ def trust_envelope(
         "promised": PROMISED,
         "cameras": list(camera_names),
         "num_frames": num_frames,
-        "calibration": calibration.record,
+        "calibration": asdict(calibration),
         "stretches": rows,
     }
 

@@ -8,6 +8,8 @@ FLICKER = "flicker"
 """Entry of an evaluation that compared neighbouring frames."""
 ENVELOPE = "envelope"
 """Entry of the scores of a run: how far beside the path the scene can be trusted."""
+HELD_OUT = "held_out"
+"""Entry of an envelope: how held-out frames of the log part from what was predicted of them."""
 TRUSTED = ("left_m", "right_m", "up_m", "ahead_m", "yaw_left_deg", "yaw_right_deg")
 """What an envelope says of a stretch, in metres and degrees."""
 UNTRUSTED = "a stretch is not trusted even on the recorded path"

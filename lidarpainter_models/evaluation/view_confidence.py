@@ -7,11 +7,23 @@ The confidence is the probability that the frame has 25 dB or more against its t
 size of the fit. The weights are those of a least-squares fit on synthetic streets, whose true
 images are known from anywhere; offset and spread those of a logistic regression on streets that
 the weights did not see (Platt scaling). `scripts/calibrate_confidence.py` makes both.
+
+Logs part from streets, so a run anchors the numbers on held-out frames of its own log. Its shift
+has the prior N(0, `LOGS_PART_DB`^2); with n frames whose residuals (measured - predicted) have mean
+m and deviation s, all in dB,
+
+    kept = n LOGS_PART_DB^2 / (n LOGS_PART_DB^2 + s^2),    shift = kept m,
+    deviation^2 = s^2 + (1 - kept) LOGS_PART_DB^2,         spread = deviation sqrt(3) / pi.
+
+A log that is worse lowers every prediction. One that is better raises those alone that are as high
+as its held-out frames were on average, since what is shown well on the path need not be beside it.
+Without such frames nothing moves and the whole deviation between logs is left.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from statistics import fmean, stdev
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -25,6 +37,15 @@ PROMISED = 0.9
 NEAR_DB = 4.0
 """Frames so far from `GOOD_DB` count half in the fit of the weights: the border matters."""
 NUM_BINS = 10
+LOGS_PART_DB = 2.0
+"""Deviation between logs of what is measured from what is predicted, on average over a log: streets
+and the few real logs that were measured part by 1 to 1.5 dB, and few are no promise for all."""
+LEAST_FRAMES = 3
+"""Fewer held-out frames say nothing about a log."""
+RISE_DB = 1.0
+"""So far below the mean of the held-out frames a raise has faded to nothing."""
+DEVIATIONS = math.pi / math.sqrt(3)
+"""Deviation of a logistic distribution of spread 1."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,13 +72,44 @@ class Calibration:
     offset_db: float
     spread_db: float
     record: str
+    raised_db: float = 0.0
+    """Added to predictions of `raised_from_db` or more; never negative."""
+    raised_from_db: float = 0.0
 
     def of(self, evidence: ViewEvidence) -> FrameConfidence:
         """What is said about the frame that the evidence was measured for."""
         found = (weight * getattr(evidence, name) for name, weight in self.weights.items())
         predicted_db = self.intercept_db + sum(found)
+        part = 1 + (predicted_db - self.raised_from_db) / RISE_DB
+        predicted_db += self.raised_db * min(max(part, 0.0), 1.0)
         beyond = (predicted_db - GOOD_DB - self.offset_db) / self.spread_db
         return FrameConfidence(predicted_db=predicted_db, confidence=_logistic(beyond))
+
+    def anchored(self, held_out_db: Sequence[tuple[float, float]]) -> "Calibration":
+        """For one log, by the predicted and the measured PSNR of its held-out frames.
+
+        The weights stay, so more evidence still never lowers a confidence. Fewer frames than
+        `LEAST_FRAMES` count as none: then no log is promised more than before.
+        """
+        if len(held_out_db) < LEAST_FRAMES:
+            kept, mean_db, above_db, scatter_db = 0.0, 0.0, 0.0, self.spread_db * DEVIATIONS
+            checked = "not checked against held-out frames of this log"
+        else:
+            residuals = [measured - predicted for predicted, measured in held_out_db]
+            mean_db, above_db = fmean(residuals), fmean(predicted for predicted, _ in held_out_db)
+            scatter_db = max(self.spread_db * DEVIATIONS, stdev(residuals))
+            known = len(residuals) * LOGS_PART_DB**2
+            kept = known / (known + scatter_db**2)
+            checked = f"anchored on {len(residuals)} held-out frames of this log"
+        deviation_db = math.hypot(scatter_db, LOGS_PART_DB * math.sqrt(1 - kept))
+        return replace(
+            self,
+            intercept_db=self.intercept_db + min(kept * mean_db, 0.0),
+            raised_db=max(kept * mean_db, 0.0),
+            raised_from_db=above_db,
+            spread_db=deviation_db / DEVIATIONS,
+            record=f"{self.record}; {checked}",
+        )
 
 
 EVIDENCE = tuple(field.name for field in fields(ViewEvidence))

@@ -229,7 +229,7 @@ def _envelope(envelope: Mapping[str, Any]) -> Table:
             f"{envelope['promised']:.0%}: the least over {', '.join(envelope['cameras'])} and the "
             "ends of the stretch, predicted from what recorded images and LiDAR say of "
             f"{envelope['num_frames']} frames, without their true images. "
-            f"Calibrated on {envelope['calibration']}. {HIGHER_NOTE}"
+            f"Calibrated on {envelope['calibration']['record']}. {HIGHER_NOTE}"
         ),
     )
 

@@ -6,6 +6,7 @@ from typing import Any
 from lidarpainter_models.evaluation.score_tables import (
     DEPTH,
     ENVELOPE,
+    HELD_OUT,
     TRUSTED,
     fitted_on,
 )
@@ -36,6 +37,7 @@ def verdict(result: Mapping[str, Any]) -> list[str]:
             _recorded(recorded, is_even=not weak),
             _aside(result),
             _trusted(envelope, weak),
+            _checked(envelope.get(HELD_OUT)),
             _actors(recorded),
         ]
     sentences = (*judged, _early(result), _taken_back(result.get("gains") or {}))
@@ -117,6 +119,25 @@ def _trusted(envelope: Mapping[str, Any], weak: Sequence[Mapping[str, Any]]) -> 
     where = f"{doubt}; on the others every frame is" if weak else "All along, every frame is"
     return (
         f"{where} to be trusted ({good_db:g} dB or more) up to {metres}, {turns:g} degrees of yaw."
+    )
+
+
+def _checked(held_out: Mapping[str, Any] | None) -> str:
+    """Whether what can be trusted was checked on the log itself; None is of an older run."""
+    if held_out is None:
+        return ""
+    residual_db = held_out["residual_db"]
+    if residual_db is None:
+        return (
+            "How far it can be trusted is not checked against held-out frames of this log: "
+            "less is promised."
+        )
+    if not held_out["is_unlike"]:
+        return ""
+    way = "better" if residual_db > 0 else "worse"
+    return (
+        f"This log is unlike the streets that confidence is calibrated on: its held-out frames are "
+        f"{abs(residual_db):.1f} dB {way} than predicted, and what is promised follows them."
     )
 
 

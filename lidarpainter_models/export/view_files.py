@@ -17,7 +17,7 @@ from lidarpainter_models.conditioning.followed_paths import (
     ShownMoment,
     image_record,
 )
-from lidarpainter_models.evaluation.view_confidence import BUNDLED
+from lidarpainter_models.evaluation.view_confidence import Calibration
 from lidarpainter_models.export.images import write_depth_png, write_index_png, write_png
 from lidarpainter_models.export.rig_images import rig_rows, tiled
 from lidarpainter_models.export.videos import images_per_second, video_file
@@ -52,6 +52,17 @@ class Companion:
         return shown.rgb if shown.unpainted_rgb is None else shown.unpainted_rgb
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Delivery:
+    """What is written of every view."""
+
+    kinds: ViewKinds
+    calibration: Calibration
+    """Turns evidence into confidence."""
+    companion: Companion | None = None
+    """What stands to the left in films and in `beside/`, above in a film of all cameras."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class WrittenViews:
     """What was written of the paths of a rig."""
@@ -80,9 +91,8 @@ def recorded_u8(
 def write_views(
     paths: Sequence[FollowedPath],
     folders: Sequence[Path],
-    kinds: ViewKinds,
+    delivery: Delivery,
     *,
-    companion: Companion | None = None,
     films: Sequence[Path] = (),
     together: Path | None = None,
     advanced: Callable[[], None],
@@ -92,13 +102,12 @@ def write_views(
     Args:
         paths: where to look from, a path for each camera.
         folders: where the files of each are put.
-        kinds: what is wanted.
-        companion: what stands to the left in films and in `beside/`, above in `together`.
+        delivery: what is wanted.
         films: one for each path; none if empty.
         together: a film that shows all cameras at once.
         advanced: called after every view.
     """
-    rates = [_images_per_second(path, kinds) for path in paths]
+    rates = [_images_per_second(path, delivery.kinds) for path in paths]
     rows: list[list[dict[str, Any]]] = [[] for _ in paths]
     with ExitStack() as stack:
         writers = [
@@ -106,7 +115,7 @@ def write_views(
             for film, rate in zip(films, rates, strict=False)
         ]
         rig = stack.enter_context(video_file(together, max(rates))) if together else None
-        written = _written(paths, folders, kinds, companion)
+        written = _written(paths, folders, delivery)
         for _, of_moment in groupby(written, key=attrgetter("frame_index")):
             seen: dict[int, list[Tensor]] = {}
             for view in of_moment:
@@ -135,8 +144,7 @@ class _Written(NamedTuple):
 def _written(
     paths: Sequence[FollowedPath],
     folders: Sequence[Path],
-    kinds: ViewKinds,
-    companion: Companion | None,
+    delivery: Delivery,
 ) -> Iterator[_Written]:
     """Write all views, moment by moment; several at once where none leans on the one before."""
     moments = sorted(
@@ -147,7 +155,7 @@ def _written(
 
     def write(moment: tuple[int, int, int]) -> _Written:
         frame_index, place, number = moment
-        found = _write_view(paths[place], number, kinds, folders[place], companion)
+        found = _write_view(paths[place], number, folders[place], delivery)
         return _Written(frame_index, place, *found)
 
     if any(path.painter is not None and path.painter.goes_in_order for path in paths):
@@ -180,10 +188,11 @@ def _ego_from_camera(path: FollowedPath) -> Float[Tensor, "4 4"]:
 
 
 def _write_view(
-    path: FollowedPath, number: int, kinds: ViewKinds, folder: Path, companion: Companion | None
+    path: FollowedPath, number: int, folder: Path, delivery: Delivery
 ) -> tuple[dict[str, Any], list[Tensor]]:
     """One view's files: where it was taken, and what films show of it."""
     view, camera = path.views[number], path.camera(number)
+    kinds, companion = delivery.kinds, delivery.companion
     shown = path.shown(camera, view)
     seen = [shown.rgb]
     if companion is not None:
@@ -203,7 +212,7 @@ def _write_view(
     name = f"{view.frame_index:04d}.png"
     row = image_record(name, camera, view)
     if kinds.has_poses:
-        row |= {**_confidence(path, camera, view), "file": None}
+        row |= {**_confidence(path, camera, view, delivery.calibration), "file": None}
     for kind, write, pixels in wanted:
         if pixels is not None:
             row[kind] = name if kind == "file" else f"{kind}/{name}"
@@ -211,12 +220,14 @@ def _write_view(
     return row, seen
 
 
-def _confidence(path: FollowedPath, camera: Camera, view: RecordedView) -> dict[str, Any]:
+def _confidence(
+    path: FollowedPath, camera: Camera, view: RecordedView, calibration: Calibration
+) -> dict[str, Any]:
     """How far the scene can be trusted there, before anybody paints it; None in a style."""
     if path.evidence is None:
         return {"confidence": None, "predicted_db": None}
     found = path.evidence.of(camera, view.timestamp_ns, view.camera_name)
-    return asdict(BUNDLED.of(found))
+    return asdict(calibration.of(found))
 
 
 def legend(scene: GaussianScene) -> dict[str, Any]:

@@ -8,12 +8,17 @@ from typing import Any
 from catalog.artefacts import ArtefactRef, Workplace
 from catalog.store import Store
 from lidarpainter_models.conditioning.view_evidence import EvidenceGatherer
+from lidarpainter_models.evaluation.anchoring import (
+    MOST_VIEWS,
+    judged_frames,
+    predicted_and_measured,
+    what_frames_say,
+)
 from lidarpainter_models.evaluation.envelope import MovedViews, trust_envelope
-from lidarpainter_models.evaluation.score_tables import ENVELOPE, least_of
+from lidarpainter_models.evaluation.held_out import HeldOut
+from lidarpainter_models.evaluation.score_tables import ENVELOPE, HELD_OUT, least_of
 from lidarpainter_models.evaluation.settings import EvaluationConfig
 from lidarpainter_models.evaluation.view_confidence import BUNDLED
-from lidarpainter_models.observations.settings import ObservationConfig
-from lidarpainter_models.scenes.driving_scene import DrivingScene
 from tasks.evaluation.views import evaluation_inputs
 from tasks.json_files import read_json, write_json
 from tasks.opened import OpenedRun, opened
@@ -28,7 +33,10 @@ FILE = "envelope.json"
 
 @stage_task
 def find_envelope(run: RunSpec, fitted: FittedRef, config: EvaluationConfig) -> StageResult:
-    """Walk away from the path of a fitted scene, on every stretch, as far as it can be trusted."""
+    """Walk away from the path of a fitted scene, on every stretch, as far as it can be trusted.
+
+    What is promised is anchored on held-out frames of the log, where there are some.
+    """
     this = opened(run)
     return run_stage(
         this.store,
@@ -36,12 +44,11 @@ def find_envelope(run: RunSpec, fitted: FittedRef, config: EvaluationConfig) -> 
         stage=STAGE,
         kind=ENVELOPE,
         inputs=evaluation_inputs(this, fitted, view_time=False),
-        config={"observation": asdict(config.observation)},
+        config={"split": run.split, "observation": asdict(config.observation)},
         build=partial(
             _build,
-            scene=this.scene,
+            held_out=this.held_out(config.observation),
             gatherer=partial(_gatherer, this, fitted),
-            observation=config.observation,
         ),
     )
 
@@ -61,12 +68,14 @@ def _build(
     place: Workplace,
     progress: Progress,
     *,
-    scene: DrivingScene,
+    held_out: HeldOut,
     gatherer: Callable[[], EvidenceGatherer],
-    observation: ObservationConfig,
 ) -> dict[str, Any]:
     evidence = gatherer()
-    views = MovedViews(scene=scene, gatherer=evidence, observation=observation)
-    found = trust_envelope(views, evidence.camera_names, BUNDLED, progress=progress)
+    known = predicted_and_measured(judged_frames(held_out.sampled(MOST_VIEWS), evidence))
+    views = MovedViews(scene=held_out.scene, gatherer=evidence, observation=held_out.observation)
+    calibration = BUNDLED.anchored(known)
+    found = trust_envelope(views, evidence.camera_names, calibration, progress=progress)
+    found[HELD_OUT] = what_frames_say(known)
     write_json(place.output / FILE, found)
     return {"num_frames": found["num_frames"], **least_of(found)}

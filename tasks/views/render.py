@@ -1,14 +1,17 @@
 """Render a finished run along a trajectory, painted at view time if asked for."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from lidarpainter_models.conditioning.followed_paths import FollowedPath
 from lidarpainter_models.conditioning.settings import ConditionConfig
+from lidarpainter_models.evaluation.anchoring import calibration_of
+from lidarpainter_models.evaluation.view_confidence import Calibration
 from lidarpainter_models.export import view_requests
-from lidarpainter_models.export.view_files import Companion, legend, write_views
+from lidarpainter_models.export.view_files import Companion, Delivery, legend, write_views
 from lidarpainter_models.export.view_requests import ViewRequest
 from lidarpainter_models.observations.settings import ObservationConfig
 from tasks.evaluation.shown import condition_builder
@@ -35,6 +38,8 @@ class ViewedRun:
     """How the images of the fit were made."""
     conditions: ConditionConfig
     """What painters are told of a view."""
+    calibration: Calibration = field(default_factory=partial(calibration_of, None))
+    """What its frames can be trusted by: as its envelope says, where it has one."""
     beside: FittedRef | None = None
     """Another fitted scene of the same log, which is shown to the left."""
 
@@ -109,8 +114,9 @@ def write_paths(
     written = write_views(
         paths,
         folders,
-        kinds,
-        companion=_companion(viewed, request),
+        Delivery(
+            kinds=kinds, calibration=viewed.calibration, companion=_companion(viewed, request)
+        ),
         films=films,
         together=together,
         advanced=advanced,

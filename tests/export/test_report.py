@@ -117,7 +117,7 @@ def test_a_page_says_how_far_each_stretch_can_be_trusted():
         "promised": 0.9,
         "cameras": ["front_camera"],
         "num_frames": 40,
-        "calibration": "numbers made up",
+        "calibration": {"record": "numbers made up"},
         "stretches": [stretch],
     }
     result = RESULT | {"recorded": None, "envelope": envelope}

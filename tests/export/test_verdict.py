@@ -62,6 +62,30 @@ def test_a_stretch_that_nobody_can_promise_is_no_number_and_takes_from_the_prais
     assert verdict(run(envelope=everywhere))[2].startswith("Weak: on 1 of 1 stretches")
 
 
+def log_check(residual_db, *, is_unlike):
+    """An envelope whose held-out frames part so far from what was predicted."""
+    said = {"num_frames": 24, "residual_db": residual_db, "is_unlike": is_unlike}
+    return {**envelope(), "held_out": said}
+
+
+@pytest.mark.parametrize(
+    ("residual_db", "expected"), [(-9.24, "9.2 dB worse than"), (4.9, "4.9 dB better than")]
+)
+def test_a_log_unlike_all_that_confidence_was_calibrated_on_is_said_to_be(residual_db, expected):
+    sentences = verdict(run(envelope=log_check(residual_db, is_unlike=True)))
+    (sentence,) = [one for one in sentences if one.startswith("This log is unlike")]
+    assert expected in sentence
+
+
+def test_what_was_not_checked_on_the_log_is_said_to_be_unchecked():
+    unchecked = verdict(run(envelope=log_check(None, is_unlike=False)))
+    (sentence,) = [one for one in unchecked if "checked" in one]
+    assert "not checked against held-out frames of this log" in sentence
+    older = verdict(run(envelope=envelope()))
+    assert verdict(run(envelope=log_check(0.5, is_unlike=False))) == older
+    assert set(unchecked) - {sentence} == set(older)
+
+
 def test_worst_of_several_ways_is_named():
     novel = {
         "left-2m": {"depth_within_5_percent": 0.96},

@@ -8,6 +8,7 @@ import pytest
 
 from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.evaluation.view_confidence import BUNDLED
 from lidarpainter_models.export.styled_views import StyleRequest
 from lidarpainter_models.export.view_requests import ViewRequest
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
@@ -32,6 +33,18 @@ def test_a_run_is_rendered_where_nobody_drove(viewed, tmp_path, is_painted):
     at_home, aside = (row["predicted_db"] for row in described["images"])
     assert at_home > aside
     assert all(0 <= row["confidence"] <= 1 for row in described["images"])
+
+
+def test_what_is_said_of_frames_is_by_the_calibration_of_their_run(viewed, tmp_path):
+    request = ViewRequest(trajectory=parse_trajectory("recorded"), frames=slice(1, 2))
+    said = []
+    for calibration in (BUNDLED, replace(BUNDLED, intercept_db=BUNDLED.intercept_db + 10)):
+        render.fn(replace(viewed, calibration=calibration), request, tmp_path)
+        described = json.loads((tmp_path / "trajectory.json").read_text())
+        said.append(described["images"][0])
+    first, second = said
+    assert second["predicted_db"] == pytest.approx(first["predicted_db"] + 10)
+    assert second["confidence"] > first["confidence"]
 
 
 @pytest.mark.parametrize("images", ["rendered", "recorded"])
