@@ -11,6 +11,7 @@ shows no body, and nor does one as dark as the road.
 """
 
 from collections.abc import Sequence
+from operator import attrgetter
 
 import cv2
 import numpy as np
@@ -90,7 +91,10 @@ def _own_body(
     scene: DrivingScene, views: Sequence[RecordedView], moving: MovingBoxes
 ) -> Bool[np.ndarray, "height width"]:
     """What stays in views of one camera that are far apart."""
-    cameras = [view.camera.no_wider(WIDTH_PX) for view in views]
+    # images of one camera may differ in size: binning that was switched on, an exchanged mode
+    small = min((view.camera.no_wider(WIDTH_PX) for view in views), key=attrgetter("width_px"))
+    size = {"width_px": small.width_px, "height_px": small.height_px}
+    cameras = [view.camera.resized(**size) for view in views]
     if len(views) < LEAST_IMAGES:
         return np.zeros((cameras[0].height_px, cameras[0].width_px), np.bool_)
     seen = [

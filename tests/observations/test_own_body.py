@@ -1,5 +1,7 @@
 """The recording car in its own images: found where it is, and nowhere else."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -122,6 +124,29 @@ def test_the_car_is_found_where_it_is(body, options):
     found = on_grid(found, width_px=WIDTH_PX, height_px=HEIGHT_PX).numpy()
     assert (found & body()).sum() / (found | body()).sum() > 0.8
     assert cannot_be_told(street.views) == {}
+
+
+class BinnedDrive(RoadDrive):
+    """A camera that bins its pixels from the middle of the drive on."""
+
+    def read_image(self, view):
+        if view.camera.width_px == WIDTH_PX:
+            return super().read_image(view)
+        whole = view.camera.resized(width_px=WIDTH_PX, height_px=HEIGHT_PX)
+        image = super().read_image(replace(view, camera=whole)).numpy()
+        return torch.from_numpy(cv2.resize(image, None, fx=0.5, fy=0.5))
+
+
+def test_images_of_one_camera_may_differ_in_size():
+    street = BinnedDrive(bonnet())
+    small = {"width_px": WIDTH_PX // 2, "height_px": HEIGHT_PX // 2}
+    views = [
+        replace(view, camera=view.camera.resized(**small)) if view.frame_index > 5 else view
+        for view in street.views
+    ]
+    (found,) = own_bodies(street, views).values()
+    found = on_grid(found, width_px=WIDTH_PX, height_px=HEIGHT_PX).numpy()
+    assert (found & bonnet()).sum() / (found | bonnet()).sum() > 0.75
 
 
 @pytest.mark.parametrize(
