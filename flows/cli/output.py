@@ -60,18 +60,24 @@ def print_json(result: Mapping[str, Any]) -> None:
 
 def _json_text(value: Any, indent: int, before: int = 0) -> str:  # noqa: ANN401 - any JSON value
     """A JSON value, broken into lines where it has no room behind what stands `before` it."""
-    text = json.dumps(value, allow_nan=False, ensure_ascii=False)
+    text = _on_one_line(value)
     is_short = indent + before + len(text) < JSON_WIDTH
     if is_short or not isinstance(value, dict | list) or not value:
         return text
     opening, closing = "{}" if isinstance(value, dict) else "[]"
     if isinstance(value, dict):
-        names = [(f"{json.dumps(name, ensure_ascii=False)}: ", one) for name, one in value.items()]
+        names = [(f"{_on_one_line(name)}: ", one) for name, one in value.items()]
     else:
         names = [("", part) for part in value]
     pad = " " * (indent + 2)
     lines = [f"{pad}{name}{_json_text(part, indent + 2, len(name))}" for name, part in names]
     return "\n".join([opening, ",\n".join(lines), " " * indent + closing])
+
+
+def _on_one_line(value: Any) -> str:  # noqa: ANN401 - any JSON value
+    """JSON with letters beyond ASCII escaped where stdout cannot show them."""
+    is_utf8 = (getattr(sys.stdout, "encoding", None) or "utf-8").lower() == "utf-8"
+    return json.dumps(value, allow_nan=False, ensure_ascii=not is_utf8)
 
 
 def print_table(

@@ -5,6 +5,8 @@ more, and every one twice as much.
 """
 
 import functools
+import json
+import os
 import resource
 import subprocess
 import sys
@@ -143,3 +145,25 @@ def test_words_that_begin_are_shown_on_a_terminal_alone(store):
     assert command.finish() == 2
     assert command.shown.strip().startswith("opening a/b ...")
     assert "lidarpainter: no scene a/b in" in command.shown
+
+
+@pytest.mark.parametrize(
+    "encoding",
+    [
+        {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+        {"PYTHONIOENCODING": "ascii"},
+    ],
+    ids=["C locale", "ASCII stdout"],
+)
+def test_a_path_beyond_ascii_is_read_and_told_whatever_the_locale_is(encoding, tmp_path):
+    store = open_store(tmp_path / "köln-通り")
+    store.tables.merge("runs", [{**RUN, "scene_id": "a/b", "parameters": "{}", "result": "{}"}])
+    words = ["-m", "flows.cli", "--store", str(store.root), "catalog", "list", "runs", "--json"]
+    answer = subprocess.run(
+        [sys.executable, *words],
+        capture_output=True,
+        cwd=ROOT,
+        env=os.environ | encoding,
+        check=True,
+    )
+    assert json.loads(answer.stdout)["store"] == str(store.root)
