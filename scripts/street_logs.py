@@ -1,4 +1,4 @@
-"""Draw the streets of the table of logs: one clear street, others recorded worse.
+"""Draw the streets of the table of logs: one clear street, and one at dusk.
 
     python scripts/street_logs.py STORE
 
