@@ -29,7 +29,8 @@ def run() -> None:
 
 def _read_names_as_utf8() -> None:
     """Begin anew in Python's UTF-8 mode where a locale such as C would read names as ASCII."""
-    if sys.getfilesystemencoding() != "utf-8":
+    is_asked = os.environ.get("PYTHONUTF8") == "1"  # in vain under `python -I`: not a second time
+    if sys.getfilesystemencoding() != "utf-8" and not is_asked:
         os.environ["PYTHONUTF8"] = "1"
         os.execv(sys.executable, sys.orig_argv)  # noqa: S606 - this very command
 
