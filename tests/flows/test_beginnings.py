@@ -18,7 +18,7 @@ from terminals import ROOT, TerminalCommand
 from catalog.store import open_store
 
 FLOOR_S = 0.1
-HELP_S, FIRST_OUTPUT_S, TYPO_S = 0.5, 1.0, 3.0
+HELP_S, FIRST_OUTPUT_S, TYPO_S = 0.5, 1.0, 2.0
 HEAVY = {"torch", "prefect", "numba", "scipy", "cv2", "zarr", "open3d"}
 REPORT_IMPORTS = f"""
 import sys
