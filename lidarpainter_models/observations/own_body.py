@@ -34,6 +34,9 @@ LEAST_BASELINE_M = 0.2
 """Images taken nearer to each other than this count as one."""
 LEAST_MOTION_PX = 10.0
 """A place is judged where the ground would have moved so far from the first image to the last."""
+LOWER_PART, LEAST_LOOKED_AT = 4, 0.7
+"""Bodies are at the bottom of an image: where less of its lowest fourth is judged, the search did not
+look."""
 MOST_HEIGHT_M = 3.0
 """No camera stands higher above the road; a lower one sees nearer ground, which moves faster."""
 LEAST_EDGE = 1.5  # grey levels a pixel that stay
@@ -80,21 +83,38 @@ def own_bodies(
     return {name: body for name, body in zip(names, bodies, strict=True) if body.any()}
 
 
-def cannot_be_told(views: Sequence[RecordedView]) -> dict[str, int]:
-    """How many images taken apart there are of the cameras that have too few of them to tell."""
+def cannot_be_told(views: Sequence[RecordedView]) -> dict[str, str]:
+    """Why the search could not look, by the cameras of which it cannot tell."""
     names = sorted({view.camera_name for view in views})
-    apart = {name: _far_apart([v for v in views if v.camera_name == name]) for name in names}
-    return {name: len(own) for name, own in apart.items() if len(own) < LEAST_IMAGES}
+    whys = {name: _too_little([v for v in views if v.camera_name == name]) for name in names}
+    return {name: why for name, why in whys.items() if why is not None}
+
+
+def _too_little(views: Sequence[RecordedView]) -> str | None:
+    """What keeps the search from looking at a camera's views."""
+    apart = _far_apart(views)
+    if len(apart) < LEAST_IMAGES:
+        return f"{len(apart)} images taken apart, {LEAST_IMAGES} needed"
+    moved = _would_have_moved(_compared(apart))
+    if moved[-moved.shape[0] // LOWER_PART :].mean() >= LEAST_LOOKED_AT:
+        return None
+    width_px = moved.shape[1]
+    return f"in images {width_px} px wide the street near the car moved too little to tell"
+
+
+def _compared(views: Sequence[RecordedView]) -> list[Camera]:
+    """The cameras of some views on the grid on which their images are compared."""
+    # images of one camera may differ in size: binning that was switched on, an exchanged mode
+    small = min((view.camera.no_wider(WIDTH_PX) for view in views), key=attrgetter("width_px"))
+    size = {"width_px": small.width_px, "height_px": small.height_px}
+    return [view.camera.resized(**size) for view in views]
 
 
 def _own_body(
     scene: DrivingScene, views: Sequence[RecordedView], moving: MovingBoxes
 ) -> Bool[np.ndarray, "height width"]:
     """What stays in views of one camera that are far apart."""
-    # images of one camera may differ in size: binning that was switched on, an exchanged mode
-    small = min((view.camera.no_wider(WIDTH_PX) for view in views), key=attrgetter("width_px"))
-    size = {"width_px": small.width_px, "height_px": small.height_px}
-    cameras = [view.camera.resized(**size) for view in views]
+    cameras = _compared(views)
     if len(views) < LEAST_IMAGES:
         return np.zeros((cameras[0].height_px, cameras[0].width_px), np.bool_)
     seen = [

@@ -72,14 +72,15 @@ def write_spoilt(
             if frame_index in train or fault.is_of_log:
                 seed = zlib.crc32(f"{cause} {frame_index}".encode())
                 frame = fault.spoil(frame, level, np.random.default_rng(seed))
-            _write(writer, frame)
+            write_frame(writer, frame)
             if progress is not None:
                 progress(done, len(scene.frame_indices))
         writer.set_provenance({"spoilt": f"{scene.dataset}/{scene.sequence}"})
     return writer.path
 
 
-def _write(writer: SceneWriter, frame: Frame) -> None:
+def write_frame(writer: SceneWriter, frame: Frame) -> None:
+    """Write a frame with all that it holds."""
     writer.add_frame(
         frame.frame_index, timestamp_ns=frame.timestamp_ns, world_from_ego=frame.world_from_ego
     )

@@ -25,7 +25,7 @@ from lidarpainter_models.lidar.recording_faults import (
     images_agree,
 )
 from lidarpainter_models.observations import own_body
-from lidarpainter_models.observations.own_body import LEAST_IMAGES, in_words, own_bodies
+from lidarpainter_models.observations.own_body import in_words, own_bodies
 from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from tasks.health import Finding
@@ -177,8 +177,7 @@ def _own_bodies(scene: DrivingScene, bodies: _Bodies) -> list[Finding]:
     if len(untold) < len(scene.camera_names):
         who = "No other camera" if said else "No camera"
         said += [f"{who} {'that was checked ' if untold else ''}shows the recording car."]
-    for name, number in untold.items():
-        said.append(f"{name} was not checked ({number} images taken apart, {LEAST_IMAGES} needed).")
+    said += [f"{name} was not checked ({why})." for name, why in untold.items()]
     return [Finding("own body", "ok", " ".join(said))]
 
 

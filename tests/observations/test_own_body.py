@@ -167,8 +167,17 @@ def test_what_is_no_part_of_the_car_stays(body, options):
 
 def test_a_camera_with_too_few_images_taken_apart_cannot_be_told():
     standing = RoadDrive(bonnet(), step_m=0.0)
-    assert cannot_be_told(standing.views) == {"front": 1}
-    assert cannot_be_told(RoadDrive(bonnet(), num_frames=2).views) == {"front": 2}
+    assert cannot_be_told(standing.views) == {"front": "1 images taken apart, 3 needed"}
+    two = RoadDrive(bonnet(), num_frames=2)
+    assert cannot_be_told(two.views) == {"front": "2 images taken apart, 3 needed"}
+
+
+def test_a_camera_whose_street_hardly_moves_cannot_be_told():
+    coarse = [
+        replace(view, camera=view.camera.resized(width_px=48, height_px=27))
+        for view in RoadDrive(bonnet(), num_frames=4).views
+    ]
+    assert "48 px wide" in cannot_be_told(coarse)["front"]
 
 
 @pytest.fixture(scope="module")
