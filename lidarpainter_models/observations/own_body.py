@@ -35,8 +35,7 @@ LEAST_BASELINE_M = 0.2
 LEAST_MOTION_PX = 10.0
 """A place is judged where the ground would have moved so far from the first image to the last."""
 LOWER_PART, LEAST_LOOKED_AT = 4, 0.7
-"""Bodies are at the bottom of an image: where less of its lowest fourth is judged, the search did not
-look."""
+"""Bodies are at the bottom: images of whose lowest fourth less is judged were not searched."""
 MOST_HEIGHT_M = 3.0
 """No camera stands higher above the road; a lower one sees nearer ground, which moves faster."""
 LEAST_EDGE = 1.5  # grey levels a pixel that stay
