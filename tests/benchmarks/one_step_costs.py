@@ -92,7 +92,7 @@ def count_tflop(
     """
     if min(height_px, width_px) < 1:
         raise ConfigError(f"a view needs pixels, got {width_px}x{height_px}")
-    network = _shapes(config, architecture, has_adapters=False)
+    network = _shapes(config, architecture, has_adapters=False).to(META)  # buffers too
     rows, columns = (-(-size // STRIDE_PX) * STRIDE_PX // CELL_PX for size in (height_px, width_px))
     images = torch.empty(len(config.inputs), 1, 3, rows * CELL_PX, columns * CELL_PX, device=META)
     text = torch.empty(1, TEXT_TOKENS, architecture.text_width, device=META)
