@@ -5,10 +5,12 @@ What the user has set stays as it is.
 
 import ctypes
 import os
+import sys
 import tempfile
 import warnings
 from contextlib import suppress
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from catalog.folders import cache_folder, expanded, home_folder
 from tasks.job_limits import usable_cores
@@ -29,6 +31,7 @@ KEPT_BYTES = 32 << 20
 """Largest freed block that the C library keeps for the next use: as far as glibc goes by itself."""
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 """This machine: servers of our own listen there, and a proxy would look for them on its own one."""
+PROXIES = ("http_proxy", "https_proxy", "all_proxy")
 PREFECT_HOME = "PREFECT_HOME"
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8  # of malloc.h
 
@@ -81,10 +84,26 @@ def keep_prefect_in(store: str) -> None:
 
 
 def _reach_own_servers() -> None:
-    """Have clients reach servers on this machine past any proxy that the environment names."""
+    """Have clients reach servers on this machine past any proxy that the environment names.
+
+    A proxy whose address is none is left out and named: HTTP clients end with it, whomever they
+    are to reach.
+    """
+    for name in [name for name in os.environ if name.lower() in PROXIES]:
+        if not _is_address(os.environ[name]):
+            said = f"{name} is left out: {os.environ.pop(name)!r} is no address of a proxy"
+            sys.stderr.write(f"lidarpainter: {said} (http://HOST:PORT)\n")
     known = (os.environ.get("no_proxy") or os.environ.get("NO_PROXY") or "").split(",")
     hosts = dict.fromkeys(filter(None, (*map(str.strip, known), *LOOPBACK)))
     os.environ["no_proxy"] = os.environ["NO_PROXY"] = ",".join(hosts)
+
+
+def _is_address(proxy: str) -> bool:
+    """Whether a host is named, with a number as its port if any; an empty text names no proxy."""
+    with suppress(ValueError):
+        parts = urlsplit(proxy if "://" in proxy else f"http://{proxy}")
+        return not proxy or (bool(parts.hostname) and parts.port != 0)
+    return False
 
 
 def _keep_freed_memory() -> None:

@@ -45,6 +45,16 @@ def test_own_servers_are_reached_past_a_proxy(known):
 
 
 @pytest.mark.usefixtures("bare_environment")
+@pytest.mark.parametrize("proxy", ["::not a proxy::", "http://", "proxy:80x"])
+def test_a_proxy_whose_address_is_none_is_left_out_and_named(proxy, capsys):
+    os.environ["HTTP_PROXY"], os.environ["https_proxy"] = proxy, "proxy.example:3128"
+    prepare_environment()
+    assert "HTTP_PROXY" not in os.environ
+    assert os.environ["https_proxy"] == "proxy.example:3128"
+    assert f"HTTP_PROXY is left out: {proxy!r}" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("bare_environment")
 def test_prefect_lives_in_the_store_of_who_has_no_home_and_has_not_said_where(tmp_path):
     os.environ.pop("PREFECT_HOME", None)
     os.environ["HOME"] = str(tmp_path)
