@@ -5,7 +5,6 @@ Wrong conventions (length along y, yaw from another axis, boxes at another momen
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 import torch
@@ -14,12 +13,11 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from lidarpainter_models.checks.lidar_reach import LidarReach, could_any_hit, reaches_of
+from lidarpainter_models.checks.verdicts import Verdict
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.tracks import ActorTrack
-
-Verdict = Literal["ok", "warn", "fail"]
 
 NEAR_M = 40.0
 """Boxes nearer than this should hold points."""

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Float
 
 from lidarpainter_models.checks.pictures import blank_cameras
+from lidarpainter_models.checks.verdicts import sampled_positions
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rotation_from_vector
@@ -91,7 +92,7 @@ class SceneEdges:
 
 def _slow_frames(scene: DrivingScene) -> list[int]:
     """A few frames with sweeps, spread over the slower half of a log; all of a short one."""
-    swept = sorted({sweep.frame_index for sweep in scene.sweeps})
+    swept = scene.swept_frames
     if len(swept) > 2:
         rows = [scene.frame_position(frame_index) for frame_index in swept]
         place_m = scene.world_from_ego[rows, :3, 3].numpy()
@@ -99,8 +100,7 @@ def _slow_frames(scene: DrivingScene) -> list[int]:
         speed_mps = np.linalg.norm(np.gradient(place_m, time_s, axis=0), axis=1)
         slower = np.argsort(speed_mps, kind="stable")[: max(_NUM_FRAMES, len(swept) // 2)]
         swept = [swept[place] for place in sorted(slower)]
-    places = np.linspace(0, len(swept) - 1, min(len(swept), _NUM_FRAMES)).round().astype(int)
-    return [swept[place] for place in np.unique(places)]
+    return [swept[place] for place in sampled_positions(len(swept), _NUM_FRAMES)]
 
 
 def _edge_images(

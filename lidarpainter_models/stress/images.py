@@ -6,7 +6,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from lidarpainter_models.stress.frames import Frame, Shot
+from lidarpainter_models.scenes.frame_content import SourceImage
+from lidarpainter_models.stress.frames import Frame, with_pixels
 
 GAMMA = 2.2
 """Exponent between image values and light, about; light is changed in linear units."""
@@ -20,15 +21,15 @@ SPOTS = 12
 
 def exposure(frame: Frame, level: float, dice: np.random.Generator) -> Frame:
     """Brightness jumps from picture to picture, by up to a share of it."""
-    return _each(frame, lambda shot, _: _brighter(shot, 1 + dice.uniform(-level, level)))
+    return _each(frame, lambda image, _: _brighter(image, 1 + dice.uniform(-level, level)))
 
 
 def white_balance(frame: Frame, level: float, dice: np.random.Generator) -> Frame:
     """Red and blue jump against each other from picture to picture."""
 
-    def tinted(shot: Shot, _: int) -> Shot:
+    def tinted(image: SourceImage, _: int) -> SourceImage:
         tilt = 1 + dice.uniform(-level, level)
-        return shot.with_pixels(lambda bgr: bgr * np.array([1 / tilt, 1, tilt], np.float32))
+        return with_pixels(image, lambda bgr: bgr * np.array([1 / tilt, 1, tilt], np.float32))
 
     return _each(frame, tinted)
 
@@ -40,7 +41,7 @@ def motion_blur(frame: Frame, level: float, _dice: np.random.Generator) -> Frame
         length = max(round(level * bgr.shape[1] / 1000), 1)
         return cv2.blur(bgr, (length, 1))
 
-    return _each(frame, lambda shot, _: shot.with_pixels(smeared))
+    return _each(frame, lambda image, _: with_pixels(image, smeared))
 
 
 def darkness(frame: Frame, level: float, dice: np.random.Generator) -> Frame:
@@ -51,13 +52,13 @@ def darkness(frame: Frame, level: float, dice: np.random.Generator) -> Frame:
         noise = level * NIGHT_NOISE * dice.standard_normal(bgr.shape)
         return 255 * (light + noise).clip(0, 1) ** (1 / GAMMA)
 
-    return _each(frame, lambda shot, _: shot.with_pixels(dark))
+    return _each(frame, lambda image, _: with_pixels(image, dark))
 
 
 def dirt(frame: Frame, level: float, _dice: np.random.Generator) -> Frame:
     """Grey blots on every lens, as wide as a share of the picture, at the same place for ever."""
 
-    def blotted(shot: Shot, number: int) -> Shot:
+    def blotted(image: SourceImage, number: int) -> SourceImage:
         places = np.random.default_rng(number).uniform(0, 1, (SPOTS, 2))
 
         def change(bgr: np.ndarray) -> np.ndarray:
@@ -69,35 +70,35 @@ def dirt(frame: Frame, level: float, _dice: np.random.Generator) -> Frame:
             soft = cv2.GaussianBlur(veil, (0, 0), max(level * width / 8, 0.5))[..., None]
             return bgr + DENSITY * soft * (GREY - bgr)
 
-        return shot.with_pixels(change)
+        return with_pixels(image, change)
 
     return _each(frame, blotted)
 
 
 def swapped_cameras(frame: Frame, level: float, _dice: np.random.Generator) -> Frame:
     """The pictures of the first pairs of cameras of one size have changed places."""
-    shots = list(frame.shots)
-    for first in range(0, min(2 * int(level), len(shots) - 1), 2):
-        one, two = shots[first], shots[first + 1]
+    images = list(frame.images)
+    for first in range(0, min(2 * int(level), len(images) - 1), 2):
+        one, two = images[first], images[first + 1]
         if _size(one) == _size(two):
-            shots[first] = replace(one, jpeg=two.jpeg)
-            shots[first + 1] = replace(two, jpeg=one.jpeg)
-    return replace(frame, shots=tuple(shots))
+            images[first] = replace(one, jpeg=two.jpeg)
+            images[first + 1] = replace(two, jpeg=one.jpeg)
+    return replace(frame, images=tuple(images))
 
 
 def missing_cameras(frame: Frame, level: float, _dice: np.random.Generator) -> Frame:
     """So many cameras are not there, the last ones; one always stays."""
-    return replace(frame, shots=frame.shots[: max(len(frame.shots) - int(level), 1)])
+    return replace(frame, images=frame.images[: max(len(frame.images) - int(level), 1)])
 
 
-def _each(frame: Frame, change: Callable[[Shot, int], Shot]) -> Frame:
-    shots = tuple(change(shot, number) for number, shot in enumerate(frame.shots))
-    return replace(frame, shots=shots)
+def _each(frame: Frame, change: Callable[[SourceImage, int], SourceImage]) -> Frame:
+    images = tuple(change(image, number) for number, image in enumerate(frame.images))
+    return replace(frame, images=images)
 
 
-def _brighter(shot: Shot, factor: float) -> Shot:
-    return shot.with_pixels(lambda bgr: 255 * (bgr / 255) * factor ** (1 / GAMMA))
+def _brighter(image: SourceImage, factor: float) -> SourceImage:
+    return with_pixels(image, lambda bgr: 255 * (bgr / 255) * factor ** (1 / GAMMA))
 
 
-def _size(shot: Shot) -> tuple[int, int]:
-    return shot.record.camera.width_px, shot.record.camera.height_px
+def _size(image: SourceImage) -> tuple[int, int]:
+    return image.record.camera.width_px, image.record.camera.height_px

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_tangent
 from lidarpainter_models.scenes.records import BoxRecord
-from lidarpainter_models.stress.frames import Frame
+from lidarpainter_models.stress.frames import Frame, seen_from
 
 RAD_PER_M = 0.02
 """Noise of a pose turns it as well: 1.1 degrees beside a metre."""
@@ -32,13 +32,13 @@ def pose_noise(frame: Frame, level: float, dice: np.random.Generator) -> Frame:
 def clock_offset(frame: Frame, level: float, _dice: np.random.Generator) -> Frame:
     """Pictures are said to be taken so many milliseconds later than they were."""
     late_ns = round(level * 1e6)
-    shots = []
-    for shot in frame.shots:
-        then = shot.record.timestamp_ns
+    images = []
+    for image in frame.images:
+        then = image.record.timestamp_ns
         motion = _driven(frame, then, late_ns)
-        late = shot.seen_from(motion @ shot.record.camera.world_from_camera)
-        shots.append(replace(late, record=replace(late.record, timestamp_ns=then + late_ns)))
-    return replace(frame, shots=tuple(shots))
+        late = seen_from(image, motion @ image.record.camera.world_from_camera)
+        images.append(replace(late, record=replace(late.record, timestamp_ns=then + late_ns)))
+    return replace(frame, images=tuple(images))
 
 
 def _driven(frame: Frame, start_ns: int, for_ns: int) -> Float[Tensor, "4 4"]:
@@ -50,18 +50,18 @@ def _driven(frame: Frame, start_ns: int, for_ns: int) -> Float[Tensor, "4 4"]:
 def camera_yaw(frame: Frame, level: float, _dice: np.random.Generator) -> Frame:
     """Every camera is said to look so many degrees further to the right than it does."""
     turn = rigid_from_tangent(torch.tensor([0, math.radians(level), 0, 0, 0, 0]).double())
-    shots = (shot.seen_from(shot.record.camera.world_from_camera @ turn) for shot in frame.shots)
-    return replace(frame, shots=tuple(shots))
+    images = ((image, image.record.camera.world_from_camera) for image in frame.images)
+    return replace(frame, images=tuple(seen_from(image, pose @ turn) for image, pose in images))
 
 
 def focal_length(frame: Frame, level: float, _dice: np.random.Generator) -> Frame:
     """Every focal length is said to be longer by a share."""
-    shots = []
-    for shot in frame.shots:
-        lens = shot.record.camera
+    images = []
+    for image in frame.images:
+        lens = image.record.camera
         longer = replace(lens, fx_px=lens.fx_px * (1 + level), fy_px=lens.fy_px * (1 + level))
-        shots.append(replace(shot, record=replace(shot.record, camera=longer)))
-    return replace(frame, shots=tuple(shots))
+        images.append(replace(image, record=replace(image.record, camera=longer)))
+    return replace(frame, images=tuple(images))
 
 
 def box_noise(frame: Frame, level: float, dice: np.random.Generator) -> Frame:

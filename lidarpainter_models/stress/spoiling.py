@@ -11,7 +11,7 @@ from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import split_views
 from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
 from lidarpainter_models.stress.causes import cause_of
-from lidarpainter_models.stress.frames import Frame, read_frame
+from lidarpainter_models.stress.frames import read_frame
 
 DATASET = "stress"
 GENERATOR = "generator"
@@ -72,25 +72,8 @@ def write_spoilt(
             if frame_index in train or fault.is_of_log:
                 seed = zlib.crc32(f"{cause} {frame_index}".encode())
                 frame = fault.spoil(frame, level, np.random.default_rng(seed))
-            _write(writer, frame)
+            frame.write(writer)
             if progress is not None:
                 progress(done, len(scene.frame_indices))
         writer.set_provenance({"spoilt": f"{scene.dataset}/{scene.sequence}"})
     return writer.path
-
-
-def _write(writer: SceneWriter, frame: Frame) -> None:
-    writer.add_frame(
-        frame.frame_index, timestamp_ns=frame.timestamp_ns, world_from_ego=frame.world_from_ego
-    )
-    for shot in frame.shots:
-        writer.add_image(shot.record, shot.jpeg)
-    for turn in frame.turns:
-        writer.add_sweep(
-            turn.sweep.lidar_name,
-            turn.points,
-            timestamp_ns=turn.sweep.timestamp_ns,
-            world_from_lidar=turn.sweep.world_from_lidar,
-            semantics=turn.semantics,
-        )
-    writer.add_boxes(frame.boxes)

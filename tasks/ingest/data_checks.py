@@ -13,8 +13,8 @@ from jaxtyping import Bool
 from catalog.errors import CatalogError
 from catalog.store import Store
 from lidarpainter_models.checks.calibration import CameraTurn
-from lidarpainter_models.checks.doctor import check_scene, draw_overlay, not_computed
-from lidarpainter_models.checks.overlay import with_legend
+from lidarpainter_models.checks.doctor import check_scene, not_computed
+from lidarpainter_models.checks.overlay import draw_overlay, with_legend
 from lidarpainter_models.checks.pictures import blank_cameras
 from lidarpainter_models.errors import LidarPainterError, SceneError
 from lidarpainter_models.export.images import write_png

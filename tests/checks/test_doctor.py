@@ -16,7 +16,8 @@ from lidarpainter_models.checks.actors import (
     check_duplicate_tracks,
     check_lasting_ids,
 )
-from lidarpainter_models.checks.doctor import check_ego_poses, check_scene, draw_overlay
+from lidarpainter_models.checks.doctor import check_ego_poses, check_scene
+from lidarpainter_models.checks.overlay import draw_overlay
 from lidarpainter_models.checks.pictures import check_pictures
 from lidarpainter_models.checks.sweeps import check_clear_air, check_origins
 from lidarpainter_models.scenes.driving_scene import DrivingScene

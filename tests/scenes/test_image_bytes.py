@@ -11,9 +11,10 @@ from splat_drawing import pinhole
 
 import lidarpainter_models
 from lidarpainter_models.export.images import read_image
+from lidarpainter_models.scenes.frame_content import SourceImage
 from lidarpainter_models.scenes.image_bytes import can_decode, decode_image
 from lidarpainter_models.scenes.records import ImageRecord
-from lidarpainter_models.stress.frames import Shot
+from lidarpainter_models.stress.frames import with_pixels
 
 QUARTER_TURN = 6
 
@@ -50,7 +51,8 @@ def test_a_tag_that_asks_for_a_turn_is_ignored(jpeg, tmp_path):
 def test_a_spoilt_image_keeps_its_way_up(jpeg):
     camera = pinhole(fx_px=48.0, fy_px=48.0, cx_px=24.0, cy_px=12.0, width_px=48, height_px=24)
     record = ImageRecord(camera_name="front", timestamp_ns=0, camera=camera)
-    spoilt = Shot(record=record, jpeg=jpeg).with_pixels(lambda bgr: bgr)
+    image = SourceImage(record=record, jpeg=jpeg, source="here")
+    spoilt = with_pixels(image, lambda bgr: bgr)
     assert lies_as_stored(decode_image(spoilt.jpeg))
 
 

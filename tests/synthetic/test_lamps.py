@@ -19,12 +19,7 @@ from lidarpainter_models.synthetic.plan.car_kinds import SHAPES
 from lidarpainter_models.synthetic.street import START_NS
 from lidarpainter_models.synthetic.textures.cars import add_car_surfaces
 from lidarpainter_models.synthetic.textures.surfaces import SurfaceSet
-from lidarpainter_models.synthetic.world.brake_lenses import (
-    PROUD_M,
-    RIM_M,
-    brake_lens_surface,
-    with_brake_lenses,
-)
+from lidarpainter_models.synthetic.world.brake_lenses import PROUD_M, RIM_M, with_brake_lenses
 from lidarpainter_models.synthetic.world.car_shapes import build_car
 from lidarpainter_models.synthetic.world.lamps import Switching, SwitchingLamps
 
@@ -217,8 +212,12 @@ def test_every_moving_car_has_two_lenses_and_nobody_else_has_any(street):
         assert counts[index] == (2 if has_brakes else 0)
 
 
+def drawn_lamps(seed):
+    return SwitchingLamps(*map(np.random.default_rng, np.random.SeedSequence(seed).spawn(2)))
+
+
 def test_cars_brake_once_or_twice_with_pauses():
-    lamps = SwitchingLamps.of_streams(*np.random.SeedSequence(3).spawn(2))
+    lamps = drawn_lamps(3)
     for _ in range(200):
         times_s = np.array(lamps.switchings[lamps.add_brakes()].times_s)
         assert times_s.size in (2, 4)
@@ -233,7 +232,7 @@ def test_cars_brake_once_or_twice_with_pauses():
 
 
 def test_signals_of_other_streets_change_at_other_times_and_both_ways():
-    drawn = [SwitchingLamps.of_streams(*np.random.SeedSequence(i).spawn(2)) for i in range(20)]
+    drawn = [drawn_lamps(seed) for seed in range(20)]
     for lamps in drawn:
         assert lamps.add_signals() == {"red": 0, "green": 1}
     first = [lamps.switchings[1] for lamps in drawn]
@@ -255,8 +254,8 @@ def test_lenses_lie_on_the_rear_of_every_kind_of_car(kind):
     surfaces = SurfaceSet()
     shape = SHAPES[kind]
     mesh, size = build_car(shape, add_car_surfaces(surfaces, shape, np.random.default_rng(0)))
-    surface = brake_lens_surface(surfaces, 4)
-    braking, (left, right) = with_brake_lenses(mesh, size, shape, surface, 4)
+    braking, (left, right) = with_brake_lenses(mesh, size, shape, surfaces, 4)
+    surface = len(surfaces.surfaces) - 1
     assert (surfaces.surfaces[surface].lamp, left.lamp, right.lamp) == (4, 4, 4)
     corners = braking.corners()[braking.surface == surface]
     assert (np.abs(corners) <= size / 2).all()  # the box stays as tight as it was

@@ -41,12 +41,12 @@ from lidarpainter_models.readers.nuscenes.recordings import (
 from lidarpainter_models.readers.nuscenes.sweeps import TURN_NS, LidarPoints, read_lidar_points
 from lidarpainter_models.readers.source_logs.drive_poses import level_frame, pose_at
 from lidarpainter_models.readers.source_logs.folder import SourceFolder
-from lidarpainter_models.readers.source_logs.frame_content import (
+from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames
+from lidarpainter_models.scenes.frame_content import (
     FrameContent,
     SourceImage,
     SourceSweep,
 )
-from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, SweepPoints
 from lidarpainter_models.scenes.schema import GLOBAL_FRAME
 from lidarpainter_models.scenes.writer import SceneHeader

@@ -43,13 +43,13 @@ from lidarpainter_models.readers.source_logs.drive_poses import (
     turned_about_up,
 )
 from lidarpainter_models.readers.source_logs.folder import SourceFolder
-from lidarpainter_models.readers.source_logs.frame_content import (
+from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames
+from lidarpainter_models.readers.source_logs.swept_boxes import SweepTimes, moving_actors
+from lidarpainter_models.scenes.frame_content import (
     FrameContent,
     SourceImage,
     SourceSweep,
 )
-from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames
-from lidarpainter_models.readers.source_logs.swept_boxes import SweepTimes, moving_actors
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, RollingShutter
 from lidarpainter_models.scenes.validation import jpeg_header_size, require_classes
 from lidarpainter_models.scenes.writer import SceneHeader

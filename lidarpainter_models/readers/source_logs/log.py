@@ -14,7 +14,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 
 from lidarpainter_models.errors import DataError, LidarPainterError, WriteError
 from lidarpainter_models.readers.source_logs.drive_checks import DriveChecks
-from lidarpainter_models.readers.source_logs.frame_content import FrameContent
+from lidarpainter_models.scenes.frame_content import FrameContent
 from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
 
 NUM_AHEAD = 1

@@ -36,11 +36,6 @@ from lidarpainter_models.readers.source_logs.drive_checks import (
     require_timely,
 )
 from lidarpainter_models.readers.source_logs.drive_poses import NS_PER_S, level_frame, nanoseconds
-from lidarpainter_models.readers.source_logs.frame_content import (
-    FrameContent,
-    SourceImage,
-    SourceSweep,
-)
 from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames, naming
 from lidarpainter_models.readers.waymo.boxes import FramePoints, box_records, moving_ids
 from lidarpainter_models.readers.waymo.calibration import CAMERA_NAMES, TOP
@@ -59,6 +54,11 @@ from lidarpainter_models.readers.waymo.log import (
 from lidarpainter_models.readers.waymo.range_images import range_points
 from lidarpainter_models.readers.waymo.v1 import WaymoRecordSegment
 from lidarpainter_models.readers.waymo.v2 import WaymoParquetSegment
+from lidarpainter_models.scenes.frame_content import (
+    FrameContent,
+    SourceImage,
+    SourceSweep,
+)
 from lidarpainter_models.scenes.records import SweepPoints
 from lidarpainter_models.scenes.validation import jpeg_header_size
 from lidarpainter_models.scenes.writer import SceneHeader

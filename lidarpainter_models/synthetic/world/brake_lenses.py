@@ -30,21 +30,18 @@ EMISSION = 8.0
 ROWS, COLUMNS = 3, 6
 
 
-def brake_lens_surface(surfaces: SurfaceSet, lamp: int) -> int:
-    """Dark red glass that a lamp makes bright."""
-    tint = tint_from_bytes(RED)
-    return surfaces.add(
-        Surface(semantics=StreetClass.CAR, tint=tint, gloss=0.5, emission=EMISSION, lamp=lamp)
-    )
-
-
 def with_brake_lenses(
-    mesh: Mesh, size_m: np.ndarray, shape: CarShape, surface: int, lamp: int
+    mesh: Mesh, size_m: np.ndarray, shape: CarShape, surfaces: SurfaceSet, lamp: int
 ) -> tuple[Mesh, tuple[Lens, ...]]:
     """A car's mesh with a left and a right lens of one lamp, and where they are.
 
+    They are of dark red glass that the lamp makes bright.
     The mesh is that of `build_car`, `size_m` (3) its box: lenses keep inside.
     """
+    tint = tint_from_bytes(RED)
+    surface = surfaces.add(
+        Surface(semantics=StreetClass.CAR, tint=tint, gloss=0.5, emission=EMISSION, lamp=lamp)
+    )
     tail = -shape.length_m / 2 + 0.15
     belt = float(np.interp(tail, *np.transpose(shape.belt)))
     roof = float(np.interp(tail, *np.transpose(shape.roof)))

@@ -27,7 +27,7 @@ from lidarpainter_models.synthetic.world.solids import add_box, add_tube
 UP = np.array([0.0, 0.0, 1.0])
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class HungFacade:
     """A facade where it hangs, and what is added to it."""
 
@@ -58,8 +58,7 @@ class HungFacade:
     def plain(self, colour: tuple[float, float, float], gloss: float = 0.0) -> int:
         """A surface of one colour."""
         tint = tint_from_bytes((int(colour[0]), int(colour[1]), int(colour[2])))
-        surface = Surface(semantics=StreetClass.BUILDING, tint=tint, gloss=gloss)
-        return self.surfaces.add(surface)
+        return self.surfaces.add(Surface(semantics=StreetClass.BUILDING, tint=tint, gloss=gloss))
 
     def add_cornice(self) -> None:
         """A stepped ledge along the roof."""

@@ -28,25 +28,17 @@ class Light:
     exposure: float = 0.86
 
 
-@dataclass(frozen=True, eq=False)
-class MovingMesh:
-    """A mesh in its box frame, drawn wherever its box is."""
-
-    mesh: Mesh
-    actor: int
-
-
 def pack_scene(
     street: Mesh,
     street_actor: np.ndarray,
-    moving: list[MovingMesh],
+    moving: list[tuple[Mesh, int]],
     surfaces: SurfaceSet,
     light: Light,
 ) -> tuple[layout.SceneArrays, np.ndarray, np.ndarray]:
     """Everything a ray needs.
 
     The street stands still, in the world; `street_actor` (primitives) is the actor index of each of
-    its primitives, -1 for none.
+    its primitives, -1 for none. Moving meshes, with their actors, are in their box frames.
 
     Returns:
         The arrays, and the root node (int32) and radius (metres) of every moving mesh.
@@ -54,7 +46,7 @@ def pack_scene(
     value, index = surfaces.surface_arrays()
     texels, texture_index = surfaces.texture_arrays()
     meshes = [(street, street_actor)]
-    meshes += [(part.mesh, np.full(len(part.mesh.surface), part.actor)) for part in moving]
+    meshes += [(mesh, np.full(len(mesh.surface), actor)) for mesh, actor in moving]
     trees, roots, num_nodes, num_prims = [], [], 0, 0
     for mesh, actor in meshes:
         tree = _pack_tree(mesh, actor, index, num_nodes, num_prims)
@@ -77,7 +69,7 @@ def pack_scene(
         to_linear=linear_from_srgb(np.arange(256) / 255).astype(np.float32),
         to_display=_tone_curve(),
     )
-    radii = [np.linalg.norm(part.mesh.corners(), axis=-1).max() + 0.01 for part in moving]
+    radii = [np.linalg.norm(mesh.corners(), axis=-1).max() + 0.01 for mesh, _ in moving]
     return arrays, np.array(roots[1:], np.int32), np.array(radii, np.float64)
 
 
