@@ -11,9 +11,9 @@ from small_pandaset import PandasetFolder
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.geometry.boxes import is_inside_box
-from lidarpainter_models.readers import ingest_scene, list_sequences, open_log
+from lidarpainter_models.readers import ingest_scene, list_sequences
 from lidarpainter_models.readers.pandaset.dataframe_pickle import read_table_bytes
-from lidarpainter_models.readers.source_logs.log import read_ahead, write_log
+from lidarpainter_models.readers.source_logs.log import read_ahead
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.stored import stored_digest
 
@@ -123,19 +123,6 @@ def test_stated_number_of_points_is_that_inside_the_box(small_scene):
     assert track.num_points.tolist() == [60, 60, 60]
 
 
-@pytest.mark.parametrize("num_ahead", [1, 3])
-def test_frames_read_ahead_give_the_same_scene(sound_pandaset, tmp_path, num_ahead):
-    serial, ahead = (
-        write_log(
-            open_log("pandaset", sound_pandaset.root, "002"), tmp_path / str(count), num_ahead=count
-        )
-        for count in (0, num_ahead)
-    )
-    assert stored_digest(serial) == stored_digest(ahead)
-    files = [path.relative_to(serial) for path in serial.rglob("*") if path.is_file()]
-    assert all((serial / file).read_bytes() == (ahead / file).read_bytes() for file in files)
-
-
 def test_frames_are_read_only_a_little_ahead():
     read = []
 
@@ -143,9 +130,9 @@ def test_frames_are_read_only_a_little_ahead():
         read.append(frame_index)
         return frame_index
 
-    with read_ahead(note, range(20), num_ahead=2) as frames:
+    with read_ahead(note, range(20)) as frames:
         for frame_index in frames:
-            assert max(read) <= frame_index + 2
+            assert max(read) <= frame_index + 1
     assert read == list(range(20))
 
 
@@ -155,7 +142,7 @@ def test_error_in_a_frame_is_raised_when_the_frame_is_due():
             raise DataError("frame 1")
         return frame_index
 
-    with read_ahead(refuse, range(4), num_ahead=2) as frames:
+    with read_ahead(refuse, range(4)) as frames:
         assert next(frames) == 0
         with pytest.raises(DataError, match="frame 1"):
             next(frames)

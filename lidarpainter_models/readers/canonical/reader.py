@@ -89,14 +89,7 @@ class ForeignScene:
     def __init__(
         self, root: Path, sequence: str, frames: slice | None, cameras: tuple[str, ...] | None
     ) -> None:
-        """Check one scene folder, all of it.
-
-        The root holds the scene folders, or is the scene folder itself. Frames are taken by
-        position, cameras by name; None takes all.
-
-        Raises:
-            DataError: something of the scene is missing, damaged or makes no sense.
-        """
+        """Check one scene folder, all of it, see `open_log`; the root may be the folder itself."""
         self.folder = _scene_folder(root, sequence)
         if not self.folder.is_dir():
             raise DataError(f"{self.folder}: no such scene folder")

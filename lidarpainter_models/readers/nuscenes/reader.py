@@ -73,14 +73,7 @@ class NuscenesLog:
     def __init__(
         self, root: Path, sequence: str, frames: slice | None, cameras: tuple[str, ...] | None
     ) -> None:
-        """Open a scene.
-
-        The root holds `v1.0-*`, `samples` and `sweeps`. Sweeps are taken by position, cameras by
-        channel; None takes all.
-
-        Raises:
-            DataError: something in the tables is missing, damaged or makes no sense.
-        """
+        """Open a scene, see `open_log`; the root holds `v1.0-*`, `samples` and `sweeps`."""
         self.place, self.sequence = str(root), sequence
         self.source = SourceFolder(root)
         self._tables, scene = find_scene(root, sequence)
@@ -132,7 +125,6 @@ class NuscenesLog:
         camera = Camera(
             world_from_camera=self._world_from_global @ image.global_from_sensor,
             **image.calibration.intrinsics,
-            shutter=None,
             width_px=width_px,
             height_px=height_px,
         )

@@ -20,8 +20,7 @@ from collections import Counter
 import numpy as np
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.readers.pandaset.dataframe_pickle import Table
-from lidarpainter_models.readers.pandaset.tables import read_table
+from lidarpainter_models.readers.pandaset.dataframe_pickle import Table, read_table
 from lidarpainter_models.readers.source_logs.folder import SourceFolder
 from lidarpainter_models.readers.source_logs.swept_boxes import FORWARD, SPINNING, SourceBox
 from lidarpainter_models.scenes.schema import is_safe_name

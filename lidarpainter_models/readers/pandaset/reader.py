@@ -91,13 +91,7 @@ class PandasetLog:
     def __init__(
         self, root: Path, sequence: str, frames: slice | None, cameras: tuple[str, ...] | None
     ) -> None:
-        """Open a sequence.
-
-        Frames are taken by position, cameras by name; None takes all.
-
-        Raises:
-            DataError: something in the log is missing, damaged or makes no sense.
-        """
+        """Open a sequence, see `open_log`."""
         folder = root / sequence
         self.place, self.sequence = str(folder), sequence
         if not folder.is_dir():
@@ -158,7 +152,6 @@ class PandasetLog:
         camera = Camera(
             world_from_camera=self.world_from_global @ recorded.global_from_camera[frame_index],
             **recorded.intrinsics,
-            shutter=None,
             width_px=width_px,
             height_px=height_px,
         )

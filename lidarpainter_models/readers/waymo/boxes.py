@@ -42,24 +42,17 @@ class FramePoints:
         self.time_s = time_s
         """Of the frame's pose; where a LiDAR's columns have no time, that of its points."""
         self._top_position_m = top_position_m
-        self._parts: list[tuple[np.ndarray, np.ndarray, bool]] = []
+        self._parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
     def add(self, xyz_m: np.ndarray, offset_s: np.ndarray, *, is_top: bool) -> None:
         """Take the points of one LiDAR, each with its time after `time_s`."""
-        self._parts.append((xyz_m, offset_s, is_top))
+        sensor = np.full(len(xyz_m), SPINNING if is_top else FORWARD)
+        self._parts.append((xyz_m, offset_s, sensor))
 
     def times(self) -> SweepTimes:
         """When the LiDARs saw a place, in seconds after `time_s`."""
-        sensors = [
-            np.full(len(xyz_m), SPINNING if is_top else FORWARD)
-            for xyz_m, _offset_s, is_top in self._parts
-        ]
-        return SweepTimes(
-            np.concatenate([xyz_m for xyz_m, *_ in self._parts]),
-            np.concatenate([offset_s for _, offset_s, _ in self._parts]),
-            np.concatenate(sensors),
-            self._top_position_m,
-        )
+        columns = map(np.concatenate, zip(*self._parts, strict=True))
+        return SweepTimes(*columns, lidar_position_m=self._top_position_m)
 
 
 def moving_ids(frames: list[WaymoFrame]) -> set[str]:
@@ -112,10 +105,11 @@ def _synced(
     label: WaymoLabel, frame: WaymoFrame, clocks: dict[str, ImageClock]
 ) -> tuple[UprightBox, float] | None:
     """The camera-synced box and its time; None where the frame does not have both."""
-    if label.synced is None or label.synced.camera_name not in clocks:
+    camera_name, box = label.synced or ("", label.box)
+    if camera_name not in clocks:
         return None
-    box, pose = label.synced.box, frame.global_from_vehicle.numpy()
-    time_s = clocks[label.synced.camera_name].time_of(pose[:3, :3] @ box.centre_m + pose[:3, 3])
+    pose = frame.global_from_vehicle.numpy()
+    time_s = clocks[camera_name].time_of(pose[:3, :3] @ box.centre_m + pose[:3, 3])
     return None if time_s is None else (box, time_s)
 
 
