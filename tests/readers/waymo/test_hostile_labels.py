@@ -1,8 +1,7 @@
 """Bad labels of Waymo, and names that are not there or lead elsewhere, get one clear line."""
 
 import pytest
-from waymo_damage import joined, split
-from waymo_edits import LABELS, with_frame
+from waymo_edits import LABELS, joined, split, with_frame
 from waymo_records import double, message, text
 
 from lidarpainter_models.errors import DataError

@@ -4,8 +4,17 @@ import zlib
 
 import numpy as np
 import pytest
-from waymo_damage import joined, split
-from waymo_edits import CAMERAS, CONTEXT, IMAGES, LASERS, LIDARS, everywhere, with_frame
+from waymo_edits import (
+    CAMERAS,
+    CONTEXT,
+    IMAGES,
+    LASERS,
+    LIDARS,
+    everywhere,
+    joined,
+    split,
+    with_frame,
+)
 from waymo_records import matrix, message, whole
 
 from lidarpainter_models.errors import DataError
