@@ -40,7 +40,6 @@ from lidarpainter_models.readers.source_logs.drive_poses import (
     level_frame,
     nanoseconds,
     pose_at,
-    turned_about_up,
 )
 from lidarpainter_models.readers.source_logs.folder import SourceFolder
 from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames
@@ -190,19 +189,9 @@ class PandasetLog:
         times = SweepTimes(points.xyz_m, points.time_s, points.sensor, lidar_m)
         records = []
         for box in self.boxes[frame_index]:
-            global_from_box = turned_about_up(box.yaw_rad, torch.from_numpy(box.centre_m))
-            rows = times.inside(box)
-            records.append(
-                BoxRecord(
-                    actor_id=box.actor_id,
-                    category=box.category,
-                    timestamp_ns=nanoseconds(times.time_of(box, rows)),
-                    world_from_box=self.world_from_global @ global_from_box,
-                    size_m=box.size_m,
-                    is_moving=box.actor_id in self.moving,
-                    num_points=len(rows),
-                )
-            )
+            rows, is_moving = times.inside(box), box.actor_id in self.moving
+            told = {"time_s": times.time_of(box, rows), "num_points": len(rows)}
+            records.append(box.record(self.world_from_global, is_moving=is_moving, **told))
         return records
 
     def _global_from_lidar(self, timestamp_ns: int, sensor: int) -> Float[Tensor, "4 4"]:

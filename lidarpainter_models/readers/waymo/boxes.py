@@ -14,11 +14,9 @@ stated to move and does so at 1 m/s on average.
 """
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.readers.source_logs.drive_poses import nanoseconds, turned_about_up
 from lidarpainter_models.readers.source_logs.swept_boxes import (
     FORWARD,
     MOVING_MPS,
@@ -86,18 +84,8 @@ def box_records(
         box = _source_box(label, label.box if found is None else found[0])
         rows = times.inside(box)
         time_s = points.time_s + times.time_of(box, rows) if found is None else found[1]
-        vehicle_from_box = turned_about_up(box.yaw_rad, torch.from_numpy(box.centre_m))
-        records.append(
-            BoxRecord(
-                actor_id=label.actor_id,
-                category=label.category,
-                timestamp_ns=nanoseconds(time_s),
-                world_from_box=world_from_vehicle @ vehicle_from_box,
-                size_m=box.size_m,
-                is_moving=label.actor_id in moving,
-                num_points=len(rows),
-            )
-        )
+        told = {"is_moving": label.actor_id in moving, "num_points": len(rows)}
+        records.append(box.record(world_from_vehicle, time_s=time_s, **told))
     return records
 
 

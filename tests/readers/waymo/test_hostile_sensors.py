@@ -42,13 +42,6 @@ def test_camera_asked_for_that_no_frame_has(records, tmp_path):
         records.ingest(tmp_path / "store", cameras=("FRONT", "SIDE_RIGHT"))
 
 
-@pytest.mark.parametrize("kept", [0, 2, 100, -2])
-def test_truncated_image(refusal, messages, kept):
-    line = refusal(with_frame(messages, [(IMAGES, 1), 2], lambda jpeg: jpeg[:kept]))
-    assert "images[1] (SIDE_LEFT): " in line
-    assert "JPEG" in line
-
-
 def test_image_of_another_size(refusal, messages):
     line = refusal(everywhere(messages, [CONTEXT, CAMERAS, 4], lambda width: width * 2))
     assert "the image is 32 x 24 px, expected 64 x 24 px as calibrated" in line
