@@ -20,7 +20,7 @@ from lidarpainter_models.synthetic.world.furniture import StreetFurniture
 from lidarpainter_models.synthetic.world.ground import add_ground
 from lidarpainter_models.synthetic.world.lamps import SwitchingLamps
 from lidarpainter_models.synthetic.world.meshes import Mesh, MeshBuilder
-from lidarpainter_models.synthetic.world.packing import Light, pack_scene
+from lidarpainter_models.synthetic.world.packing import light_array, pack_scene
 from lidarpainter_models.synthetic.world.traffic import StreetActor, Traffic
 from lidarpainter_models.synthetic.world.vegetation import (
     SPECIES,
@@ -198,13 +198,13 @@ def draw_clouds(rng: np.random.Generator, *, cover: float) -> np.ndarray:
     return as_rgba(colour, 0.92 * opacity)
 
 
-def draw_light(surfaces: SurfaceSet, plan: StreetPlan, rng: np.random.Generator) -> Light:
+def draw_light(surfaces: SurfaceSet, plan: StreetPlan, rng: np.random.Generator) -> np.ndarray:
     """A day: how high the sun, how warm its light, how much cloud."""
     clouds = surfaces.add_texture(draw_clouds(rng, cover=rng.uniform(0.3, 0.75)), repeats=True)
     height = plan.sun_direction[2]
     warmth = 1.0 - height
-    return Light(
-        sun_direction=plan.sun_direction,
+    return light_array(
+        plan.sun_direction,
         sun_rgb=(2.65, 2.65 * (0.98 - 0.14 * warmth), 2.65 * (0.92 - 0.34 * warmth)),
         haze_per_m=1 / rng.uniform(900, 2400),
         cloud_texture=clouds,
