@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError
+from lidarpainter_models.readers.source_logs.log import naming
 from lidarpainter_models.readers.waymo.calibration import (
     CameraCalibration,
     LidarCalibration,
@@ -251,10 +252,8 @@ def actor_name(object_id: str, place: str) -> str:
         DataError: the id is no name even so.
     """
     name = f"id{object_id}" if object_id[:1] in ("-", "_") else object_id
-    try:
+    with naming(place):
         return require_name(name, "actor")
-    except DataError as error:
-        raise DataError(f"{place}: {error}") from None
 
 
 def category_name(kind: int, place: str) -> str:
