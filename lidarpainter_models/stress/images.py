@@ -21,7 +21,12 @@ SPOTS = 12
 
 def exposure(frame: Frame, level: float, dice: np.random.Generator) -> Frame:
     """Brightness jumps from picture to picture, by up to a share of it."""
-    return _each(frame, lambda image, _: _brighter(image, 1 + dice.uniform(-level, level)))
+
+    def brighter(image: SourceImage, _: int) -> SourceImage:
+        factor = 1 + dice.uniform(-level, level)
+        return with_pixels(image, lambda bgr: 255 * (bgr / 255) * factor ** (1 / GAMMA))
+
+    return _each(frame, brighter)
 
 
 def white_balance(frame: Frame, level: float, dice: np.random.Generator) -> Frame:
@@ -94,10 +99,6 @@ def missing_cameras(frame: Frame, level: float, _dice: np.random.Generator) -> F
 def _each(frame: Frame, change: Callable[[SourceImage, int], SourceImage]) -> Frame:
     images = tuple(change(image, number) for number, image in enumerate(frame.images))
     return replace(frame, images=images)
-
-
-def _brighter(image: SourceImage, factor: float) -> SourceImage:
-    return with_pixels(image, lambda bgr: 255 * (bgr / 255) * factor ** (1 / GAMMA))
 
 
 def _size(image: SourceImage) -> tuple[int, int]:
