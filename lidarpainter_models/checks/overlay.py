@@ -28,9 +28,7 @@ def draw_overlay(scene: DrivingScene, view: RecordedView) -> UInt8[Tensor, "heig
     image = np.ascontiguousarray(scene.read_image(view).numpy())
     if scene.sweeps_of(view.frame_index):
         _draw_points(image, view.camera, scene.read_positions(view.frame_index))
-    for track in scene.tracks:
-        if track.is_present(view.timestamp_ns):
-            _draw_box(image, view.camera, track, view.timestamp_ns)
+    draw_boxes(image, view.camera, scene.tracks, view.timestamp_ns)
     return torch.from_numpy(image)
 
 
@@ -51,6 +49,15 @@ def with_legend(overlay: UInt8[Tensor, "height width 3"]) -> UInt8[Tensor, "tall
         cv2.putText(strip, text, (left, 19), cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, 1, cv2.LINE_AA)
     beside = np.zeros((image.shape[0], strip.shape[1] - image.shape[1], 3), np.uint8)
     return torch.from_numpy(np.concatenate([np.concatenate([image, beside], axis=1), strip]))
+
+
+def draw_boxes(
+    image: np.ndarray, camera: Camera, tracks: tuple[ActorTrack, ...], timestamp_ns: int
+) -> None:
+    """Draw the actors that are there at a time over an image (height, width, 3; bytes)."""
+    for track in tracks:
+        if track.is_present(timestamp_ns):
+            _draw_box(image, camera, track, timestamp_ns)
 
 
 def _draw_points(image: np.ndarray, camera: Camera, xyz_m: Tensor) -> None:
