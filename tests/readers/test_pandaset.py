@@ -3,6 +3,7 @@
 import gzip
 import pickle
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -193,40 +194,35 @@ def test_log_without_point_classes_gives_a_scene_without(pandaset, tmp_path):
     assert scene.read_semantics(0) is None
 
 
-@pytest.mark.parametrize("as_pandas", [1, 2])
-def test_tables_of_old_and_new_pandas_are_read(pickled_table, as_pandas, tmp_path):
-    columns = {
-        "uuid": np.array(["a", None, "c"], dtype=object),
-        "x": np.array([1.0, np.nan, 3.0]),
-        "n": np.array([1, -2, 3]),
-        "flag": np.array([True, False, True]),
-        "y": np.array([4.0, 5.0, 6.0]),
-        "small": np.array([4, 5, 6], dtype=np.uint8),
-    }
-    content = pickled_table(columns, as_pandas=as_pandas)
-    table = read_table_bytes(content, tmp_path / "table.pkl")
-    assert list(table) == list(columns)
-    for name, column in columns.items():
+COLUMNS = {
+    "uuid": np.array(["a", None, "c"], dtype=object),
+    "x": np.array([1.0, np.nan, 3.0]),
+    "n": np.array([1, -2, 3]),
+    "flag": np.array([True, False, True]),
+    "y": np.array([4.0, 5.0, 6.0]),
+    "small": np.array([4, 5, 6], dtype=np.uint8),
+}
+
+
+def require_columns(content):
+    table = read_table_bytes(content, Path("table.pkl"))
+    assert list(table) == list(COLUMNS)
+    for name, column in COLUMNS.items():
         np.testing.assert_array_equal(table[name], column)
+
+
+@pytest.mark.parametrize("as_pandas", [1, 2])
+def test_tables_of_old_and_new_pandas_are_read(pickled_table, as_pandas):
+    require_columns(pickled_table(COLUMNS, as_pandas=as_pandas))
 
 
 @pytest.mark.parametrize("protocol", [2, 3, 4, 5])
-def test_tables_of_todays_pandas_are_read_too(protocol, tmp_path):
+def test_tables_of_todays_pandas_are_read_too(protocol):
     pandas = pytest.importorskip("pandas")
-    columns = {
-        "uuid": np.array(["a", None, "c"], dtype=object),
-        "x": np.array([1.0, np.nan, 3.0]),
-        "n": np.array([1, -2, 3]),
-        "flag": np.array([True, False, True]),
-        "y": np.array([4.0, 5.0, 6.0], dtype=np.float32),
-    }
-    names = pandas.Index(list(columns), dtype=object)
-    series = {name: pandas.Series(value, dtype=value.dtype) for name, value in columns.items()}
+    names = pandas.Index(list(COLUMNS), dtype=object)
+    series = {name: pandas.Series(value, dtype=value.dtype) for name, value in COLUMNS.items()}
     frame = pandas.DataFrame(series, columns=names)
-    table = read_table_bytes(pickle.dumps(frame, protocol=protocol), tmp_path / "table.pkl")
-    assert list(table) == list(columns)
-    for name, column in columns.items():
-        np.testing.assert_array_equal(table[name], column)
+    require_columns(pickle.dumps(frame, protocol=protocol))
 
 
 @pytest.mark.slow
