@@ -14,12 +14,7 @@ from lidarpainter_models.synthetic.plan.car_kinds import CarShape
 from lidarpainter_models.synthetic.raytracing.scene_arrays import KIND_CUT_OUT
 from lidarpainter_models.synthetic.textures.noise import as_rgba, fractal_noise
 from lidarpainter_models.synthetic.textures.signs import licence_plate
-from lidarpainter_models.synthetic.textures.surfaces import (
-    StreetClass,
-    Surface,
-    SurfaceSet,
-    tint_from_bytes,
-)
+from lidarpainter_models.synthetic.textures.surfaces import StreetClass, Surface, SurfaceSet
 
 PER_M = 96.0
 PAINTS = (
@@ -101,7 +96,7 @@ def add_car_surfaces(surfaces: SurfaceSet, shape: CarShape, rng: np.random.Gener
     rim = surfaces.add_texture(_draw_rim(rng))
     return CarAtlas(
         body=surfaces.add(Surface(semantics=car, texture=texture, gloss=1.0)),
-        paint=surfaces.add(Surface(semantics=car, tint=tint_from_bytes(paint), gloss=PAINT_GLOSS)),
+        paint=surfaces.plain(paint, car, gloss=PAINT_GLOSS),
         rubber=surfaces.add(Surface(semantics=car, tint=(0.012, 0.012, 0.013))),
         chrome=surfaces.add(Surface(semantics=car, tint=(0.35, 0.36, 0.37), gloss=0.8)),
         rim=surfaces.add(Surface(semantics=car, texture=rim, kind=KIND_CUT_OUT)),

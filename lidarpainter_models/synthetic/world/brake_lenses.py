@@ -6,12 +6,7 @@ Everything is in the box frame of the car: x ahead, y left, z up, origin at the 
 import numpy as np
 
 from lidarpainter_models.synthetic.plan.car_kinds import CarShape
-from lidarpainter_models.synthetic.textures.surfaces import (
-    StreetClass,
-    Surface,
-    SurfaceSet,
-    tint_from_bytes,
-)
+from lidarpainter_models.synthetic.textures.surfaces import StreetClass, SurfaceSet
 from lidarpainter_models.synthetic.world.lamps import Lens
 from lidarpainter_models.synthetic.world.meshes import Mesh, MeshBuilder
 
@@ -38,10 +33,7 @@ def with_brake_lenses(
     They are of dark red glass that the lamp makes bright.
     The mesh is that of `build_car`, `size_m` (3) its box: lenses keep inside.
     """
-    tint = tint_from_bytes(RED)
-    surface = surfaces.add(
-        Surface(semantics=StreetClass.CAR, tint=tint, gloss=0.5, emission=EMISSION, lamp=lamp)
-    )
+    surface = surfaces.plain(RED, StreetClass.CAR, gloss=0.5, emission=EMISSION, lamp=lamp)
     tail = -shape.length_m / 2 + 0.15
     belt = float(np.interp(tail, *np.transpose(shape.belt)))
     roof = float(np.interp(tail, *np.transpose(shape.roof)))

@@ -17,7 +17,6 @@ from lidarpainter_models.synthetic.textures.signs import (
 )
 from lidarpainter_models.synthetic.textures.surfaces import (
     StreetClass,
-    Surface,
     SurfaceSet,
     tint_from_bytes,
 )
@@ -45,19 +44,9 @@ class StreetFurniture:
     rng: np.random.Generator
     lamps: SwitchingLamps = field(default_factory=SwitchingLamps)
 
-    def plain(
-        self,
-        colour: tuple[int, int, int],
-        kind: StreetClass,
-        *,
-        emission: float = 0.0,
-        lamp: int = -1,
-    ) -> int:
-        """A surface of one colour."""
-        tint = tint_from_bytes(colour)
-        return self.surfaces.add(
-            Surface(semantics=kind, tint=tint, gloss=0.15, emission=emission, lamp=lamp)
-        )
+    def plain(self, colour: tuple[int, int, int], kind: StreetClass, **light: float) -> int:
+        """A surface of one colour, which may shine."""
+        return self.surfaces.plain(colour, kind, gloss=0.15, **light)
 
     def foot(self, s_m: float, side: int, inset_m: float = EDGE_M) -> np.ndarray:
         """A place on the sidewalk; `inset_m` from the kerb."""
