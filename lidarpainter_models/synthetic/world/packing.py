@@ -10,13 +10,13 @@ from lidarpainter_models.synthetic.textures.surfaces import (
 )
 from lidarpainter_models.synthetic.world.meshes import Mesh
 
-Vector = tuple[float, float, float]
+Triple = tuple[float, float, float]
 
 
 def light_array(
-    sun_direction: Vector,
+    sun_direction: Triple,
     *,
-    sun_rgb: Vector,
+    sun_rgb: Triple,
     haze_per_m: float,
     cloud_texture: int,
     cloud_offset: tuple[float, float],
