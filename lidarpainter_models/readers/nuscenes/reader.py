@@ -125,6 +125,7 @@ class NuscenesLog:
         camera = Camera(
             world_from_camera=self._world_from_global @ image.global_from_sensor,
             **image.calibration.intrinsics,
+            shutter=None,
             width_px=width_px,
             height_px=height_px,
         )

@@ -151,6 +151,7 @@ class PandasetLog:
         camera = Camera(
             world_from_camera=self.world_from_global @ recorded.global_from_camera[frame_index],
             **recorded.intrinsics,
+            shutter=None,
             width_px=width_px,
             height_px=height_px,
         )
@@ -190,8 +191,8 @@ class PandasetLog:
         records = []
         for box in self.boxes[frame_index]:
             rows, is_moving = times.inside(box), box.actor_id in self.moving
-            told = {"time_s": times.time_of(box, rows), "num_points": len(rows)}
-            records.append(box.record(self.world_from_global, is_moving=is_moving, **told))
+            stated = self.world_from_global, times.time_of(box, rows), len(rows)
+            records.append(box.record(*stated, is_moving=is_moving))
         return records
 
     def _global_from_lidar(self, timestamp_ns: int, sensor: int) -> Float[Tensor, "4 4"]:

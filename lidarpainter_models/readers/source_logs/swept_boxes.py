@@ -46,10 +46,10 @@ class SourceBox:
     def record(
         self,
         world_from_source: Float[Tensor, "4 4"],
-        *,
         time_s: float,
-        is_moving: bool,
         num_points: int,
+        *,
+        is_moving: bool,
     ) -> BoxRecord:
         """The box in the world, when it holds (since the epoch)."""
         source_from_box = turned_about_up(self.yaw_rad, torch.from_numpy(self.centre_m))

@@ -49,8 +49,8 @@ class FramePoints:
 
     def times(self) -> SweepTimes:
         """When the LiDARs saw a place, in seconds after `time_s`."""
-        columns = map(np.concatenate, zip(*self._parts, strict=True))
-        return SweepTimes(*columns, lidar_position_m=self._top_position_m)
+        xyz_m, offset_s, sensor = map(np.concatenate, zip(*self._parts, strict=True))
+        return SweepTimes(xyz_m, offset_s, sensor, self._top_position_m)
 
 
 def moving_ids(frames: list[WaymoFrame]) -> set[str]:
@@ -84,8 +84,8 @@ def box_records(
         box = _source_box(label, label.box if found is None else found[0])
         rows = times.inside(box)
         time_s = points.time_s + times.time_of(box, rows) if found is None else found[1]
-        told = {"is_moving": label.actor_id in moving, "num_points": len(rows)}
-        records.append(box.record(world_from_vehicle, time_s=time_s, **told))
+        is_moving = label.actor_id in moving
+        records.append(box.record(world_from_vehicle, time_s, len(rows), is_moving=is_moving))
     return records
 
 

@@ -69,7 +69,8 @@ def build_city(
     plan_rng, ground_rng, house_rng, green_rng, thing_rng, car_rng, sky_rng, ego_rng, lot_rng = (
         np.random.default_rng(stream) for stream in streams[:9]
     )
-    lamps = SwitchingLamps(*map(np.random.default_rng, streams[9:] if are_lamps_switching else ()))
+    signal_rng, brake_rng = map(np.random.default_rng, streams[9:])
+    lamps = SwitchingLamps(signal_rng, brake_rng) if are_lamps_switching else SwitchingLamps()
     plan = draw_plan(plan_rng)
     surfaces, builder = SurfaceSet(), MeshBuilder()
     add_ground(builder, surfaces, plan, ground_rng)

@@ -1,5 +1,7 @@
 """Street trees and hedges: trunks, branches, and crowns of leafy cards with cut-out leaves."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
@@ -38,11 +40,10 @@ def add_species(
 ) -> LeafSurfaces:
     """Textures and surfaces of one kind of leaves."""
     texture = surfaces.add_texture(draw_leaves(rng, colour))
-    looks = {"semantics": StreetClass.VEGETATION, "texture": texture, "kind": KIND_CUT_OUT}
-    return tuple(
-        surfaces.add(Surface(**looks, tint=(depth, depth, depth), translucency=0.55))
-        for depth in DEPTHS
+    leaf = Surface(
+        semantics=StreetClass.VEGETATION, texture=texture, kind=KIND_CUT_OUT, translucency=0.55
     )
+    return tuple(surfaces.add(replace(leaf, tint=(depth, depth, depth))) for depth in DEPTHS)
 
 
 def bark_surface(surfaces: SurfaceSet, rng: np.random.Generator) -> int:
