@@ -4,8 +4,8 @@ Wrong conventions (length along y, yaw from another axis, boxes at another momen
 """
 
 from collections.abc import Sequence
+from functools import cache
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 import torch
@@ -14,12 +14,11 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from lidarpainter_models.checks.lidar_reach import LidarReach, could_any_hit, reaches_of
+from lidarpainter_models.checks.verdicts import Verdict
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.tracks import ActorTrack
-
-Verdict = Literal["ok", "warn", "fail"]
 
 NEAR_M = 40.0
 """Boxes nearer than this should hold points."""
@@ -105,14 +104,12 @@ def check_own_boxes(scene: DrivingScene) -> tuple[Verdict, str]:
 
 def check_lasting_ids(scene: DrivingScene) -> tuple[Verdict, str]:
     """Whether actors keep their id from frame to frame."""
-    place = {
-        (int(frame), track.actor_id): (track.world_from_box[row, :3, 3].numpy(), track.category)
-        for track in scene.tracks
-        for row, frame in enumerate(track.frame_indices)
-    }
     by_frame: dict[int, dict[str, tuple[np.ndarray, str]]] = {}
-    for (frame, actor_id), where in place.items():
-        by_frame.setdefault(frame, {})[actor_id] = where
+    for track in scene.tracks:
+        for frame, centre_m in zip(
+            track.frame_indices.tolist(), track.world_from_box[:, :3, 3].numpy(), strict=True
+        ):
+            by_frame.setdefault(frame, {})[track.actor_id] = (centre_m, track.category)
     kept = changed = 0
     for frame, following in pairwise(scene.frame_indices):
         before, after = by_frame.get(frame, {}), by_frame.get(following, {})
@@ -143,8 +140,11 @@ def check_duplicate_tracks(scene: DrivingScene) -> tuple[Verdict, str]:
 
 def _near_moving_boxes(scene: DrivingScene) -> list[tuple[bool, bool]]:
     """Of each box of a moving actor near the car: could a LiDAR hit it, does it hold points."""
-    reaches: dict[int, list[LidarReach]] = {}
-    points_m: dict[int, Tensor] = {}
+
+    @cache
+    def swept(frame_index: int) -> tuple[list[LidarReach], Tensor]:
+        return reaches_of(scene, frame_index), _points(scene, frame_index)
+
     found = []
     for track in scene.tracks:
         if not track.is_moving:
@@ -153,12 +153,10 @@ def _near_moving_boxes(scene: DrivingScene) -> list[tuple[bool, bool]]:
             world_from_box = track.world_from_box[row]
             ego_m = scene.world_from_ego[scene.frame_position(frame_index), :3, 3]
             if (world_from_box[:3, 3] - ego_m).norm() < NEAR_M:
-                if frame_index not in reaches:
-                    reaches[frame_index] = reaches_of(scene, frame_index)
-                    points_m[frame_index] = _points(scene, frame_index)
-                could_be_hit = could_any_hit(reaches[frame_index], world_from_box, track.size_m)
+                reaches, points_m = swept(frame_index)
+                could_be_hit = could_any_hit(reaches, world_from_box, track.size_m)
                 holds = bool(track.num_points[row] > 0) or _counted(
-                    points_m[frame_index], world_from_box, track.size_m, _FACE_M, _FLOOR_M
+                    points_m, world_from_box, track.size_m, _FACE_M, _FLOOR_M
                 )
                 found.append((could_be_hit, bool(holds)))
     return found

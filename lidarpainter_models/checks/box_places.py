@@ -6,17 +6,14 @@ how far it is off. Only what stands still is looked at, for moving ones are smea
 speed while they are swept. Box frame: x along the length, y left, z up; metres.
 """
 
-from typing import Literal
-
 import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from lidarpainter_models.checks.verdicts import Verdict, sampled_positions
 from lidarpainter_models.geometry.transforms import invert_rigid, transform_points
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.tracks import ActorTrack
-
-Verdict = Literal["ok", "warn", "fail"]
 
 MAX_OFF_M = 0.25
 """Beyond which boxes are said to stand wrong, in the median: sound ones are found within 0.1."""
@@ -34,15 +31,14 @@ _OUTSIDE_COSTS, _WAY_COSTS = 2.0, 0.05  # the latter a metre
 
 def check_box_places(scene: DrivingScene) -> tuple[Verdict, str]:
     """Whether the boxes of standing cars lie around their points."""
-    swept = sorted({sweep.frame_index for sweep in scene.sweeps})
-    places = np.linspace(0, len(swept) - 1, min(len(swept), _NUM_FRAMES)).round().astype(int)
+    swept = scene.swept_frames
     standing = [
         track
         for track in scene.tracks
         if not track.is_moving and track.size_m[0] >= _LEAST_LENGTH_M
     ]
     off_m = []
-    for frame_index in (swept[place] for place in np.unique(places)):
+    for frame_index in (swept[place] for place in sampled_positions(len(swept), _NUM_FRAMES)):
         xyz_m = scene.read_positions(frame_index).double()
         for track in standing:
             row = (track.frame_indices == frame_index).nonzero()[:, 0]

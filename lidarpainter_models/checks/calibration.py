@@ -17,19 +17,11 @@ Camera frame: x right, y down, z forward. Yaw turns about y, pitch about x, roll
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
-from lidarpainter_models.checks.depth_edges import (
-    EdgeImage,
-    SceneEdges,
-    edge_scores,
-    reduced,
-)
-from lidarpainter_models.scenes.driving_scene import DrivingScene
-
-Verdict = Literal["ok", "warn", "fail"]
+from lidarpainter_models.checks.depth_edges import EdgeImage, SceneEdges, edge_scores, reduced
+from lidarpainter_models.checks.verdicts import Verdict
 
 MAX_TURN_DEG = 0.6
 """A camera farther off is wrong.
@@ -115,9 +107,16 @@ def _said_of(edges: SceneEdges, name: str, agrees: Agrees) -> tuple[str, str]:
     """Whether a camera is wrong, unsure, sound or untold, and what its edges and images say."""
     if name in edges.blank:
         return "untold", "cannot be told (its images show nothing)"
-    turn = best_turn(edges.images[name]) if _is_fine_enough(edges.scene, name) else None
+    # of the coarsest image that is looked at
+    focal_px = min(reduced(view.camera).fx_px for view in edges.scene.views_of(name))
+    px_per_deg = focal_px * math.radians(1.0)
+    if px_per_deg < _MIN_PX_PER_DEG:
+        coarse = f"images of {px_per_deg:.1f} pixels a degree, {_MIN_PX_PER_DEG} are needed"
+        return "untold", f"cannot be told ({coarse})"
+    turn = best_turn(edges.images[name])
     if turn is None:
-        return "untold", f"cannot be told ({_why_untold(edges.scene, name)})"
+        few = f"fewer than {MIN_EDGE_POINTS} points at depth edges or {MIN_IMAGES} images"
+        return "untold", f"cannot be told ({few})"
     if not turn.is_wrong:
         return "unsure" if turn.peak < MIN_PEAK else "sound", str(turn)
     agreed = agrees(name, turn)
@@ -147,23 +146,6 @@ def best_turn(images: Sequence[EdgeImage]) -> CameraTurn | None:
         roll_deg=float(roll_deg),
         roll_peak=_peak(line, np.abs(_ROLLS_DEG - roll_deg) > _ROLL_PEAK_WIDTH_DEG),
     )
-
-
-def _is_fine_enough(scene: DrivingScene, camera_name: str) -> bool:
-    return _px_per_deg(scene, camera_name) >= _MIN_PX_PER_DEG
-
-
-def _px_per_deg(scene: DrivingScene, camera_name: str) -> float:
-    """Of the coarsest image that is looked at."""
-    cameras = [reduced(view.camera) for view in scene.views_of(camera_name)]
-    return min(camera.fx_px for camera in cameras) * math.radians(1.0)
-
-
-def _why_untold(scene: DrivingScene, camera_name: str) -> str:
-    if not _is_fine_enough(scene, camera_name):
-        px_per_deg = _px_per_deg(scene, camera_name)
-        return f"images of {px_per_deg:.1f} pixels a degree, {_MIN_PX_PER_DEG} are needed"
-    return f"fewer than {MIN_EDGE_POINTS} points at depth edges or {MIN_IMAGES} images"
 
 
 def _roll_scores(images: Sequence[EdgeImage], pitch_deg: float, yaw_deg: float) -> np.ndarray:

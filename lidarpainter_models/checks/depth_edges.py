@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Float
 
 from lidarpainter_models.checks.pictures import blank_cameras
+from lidarpainter_models.checks.verdicts import sampled_positions
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import rotation_from_vector
@@ -38,15 +39,11 @@ _MIN_JUMP_M, _MIN_JUMP_SHARE, _FULL_JUMP_M = 1.0, 0.2, 3.0
 _MAX_POINTS = 4000
 """Of one frame and kind of edge."""
 _ACTOR_MARGIN_M = 0.4
+_NO_POINTS = np.zeros((0, 3)), np.zeros(0)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EdgePoints:
-    """Points on the near side of a depth edge, in the world."""
-
-    xyz_m: np.ndarray
-    weight: np.ndarray
-    """Larger for deeper steps."""
+EdgePoints = tuple[np.ndarray, np.ndarray]
+"""Points on the near side of depth edges, and their weights, larger for deeper steps."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,8 +54,8 @@ class EdgeImage:
     camera: Camera
     strengths: dict[str, np.ndarray]
     """How much more of an edge each pixel is than those around it."""
-    points: dict[str, tuple[np.ndarray, np.ndarray]]
-    """In the camera's frame, with their weights."""
+    points: dict[str, EdgePoints]
+    """In the camera's frame."""
 
     def seen_from(self, camera: Camera) -> "EdgeImage":
         """The same points before a camera that stands or looks otherwise, in the same pixels."""
@@ -91,7 +88,7 @@ class SceneEdges:
 
 def _slow_frames(scene: DrivingScene) -> list[int]:
     """A few frames with sweeps, spread over the slower half of a log; all of a short one."""
-    swept = sorted({sweep.frame_index for sweep in scene.sweeps})
+    swept = scene.swept_frames
     if len(swept) > 2:
         rows = [scene.frame_position(frame_index) for frame_index in swept]
         place_m = scene.world_from_ego[rows, :3, 3].numpy()
@@ -99,8 +96,7 @@ def _slow_frames(scene: DrivingScene) -> list[int]:
         speed_mps = np.linalg.norm(np.gradient(place_m, time_s, axis=0), axis=1)
         slower = np.argsort(speed_mps, kind="stable")[: max(_NUM_FRAMES, len(swept) // 2)]
         swept = [swept[place] for place in sorted(slower)]
-    places = np.linspace(0, len(swept) - 1, min(len(swept), _NUM_FRAMES)).round().astype(int)
-    return [swept[place] for place in np.unique(places)]
+    return [swept[place] for place in sampled_positions(len(swept), _NUM_FRAMES)]
 
 
 def _edge_images(
@@ -133,8 +129,8 @@ def reduced(camera: Camera) -> Camera:
 
 
 def _depth_edges(scene: DrivingScene, frame_index: int) -> dict[str, EdgePoints]:
-    """Points where a near surface ends: `across` neighbouring azimuths, or `along` elevations."""
-    found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {"across": [], "along": []}
+    """Where a near surface ends in the world: `across` azimuths, or `along` elevations."""
+    found: dict[str, list[EdgePoints]] = {kind: [_NO_POINTS] for kind in ("across", "along")}
     for sweep in scene.sweeps_of(frame_index):
         xyz_m = _standing_points(scene, sweep)
         world_from_lidar = sweep.world_from_lidar.numpy()
@@ -155,9 +151,9 @@ def _depth_edges(scene: DrivingScene, frame_index: int) -> dict[str, EdgePoints]
             weight = np.sqrt(np.minimum(jump_m[chosen], _FULL_JUMP_M))
             found[kind].append((xyz_m[chosen], weight))
     return {
-        kind: EdgePoints(
-            xyz_m=np.concatenate([xyz_m for xyz_m, _ in parts] or [np.zeros((0, 3))]),
-            weight=np.concatenate([weight for _, weight in parts] or [np.zeros(0)]),
+        kind: (
+            np.concatenate([xyz_m for xyz_m, _ in parts]),
+            np.concatenate([weight for _, weight in parts]),
         )
         for kind, parts in found.items()
     }
@@ -218,17 +214,15 @@ def _edge_strengths(rgb_u8: np.ndarray, camera: Camera) -> dict[str, np.ndarray]
     return strengths
 
 
-def _in_camera(
-    edges: dict[str, EdgePoints], camera: Camera
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Edge points in front of a camera, in its frame, with their weights."""
+def _in_camera(edges: dict[str, EdgePoints], camera: Camera) -> dict[str, EdgePoints]:
+    """Edge points in front of a camera, in its frame."""
     camera_from_world = camera.camera_from_world.numpy()
     kinds = {}
-    for kind, points in edges.items():
-        xyz_m = points.xyz_m @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+    for kind, (world_m, weight) in edges.items():
+        xyz_m = world_m @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
         reach = camera.width_px / camera.fx_px * xyz_m[:, 2]
         ahead = (xyz_m[:, 2] > 0.5) & (np.abs(xyz_m[:, 0]) < reach)
-        kinds[kind] = xyz_m[ahead], points.weight[ahead]
+        kinds[kind] = xyz_m[ahead], weight[ahead]
     return kinds
 
 

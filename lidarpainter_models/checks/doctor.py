@@ -8,7 +8,6 @@ it will be poor.
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 import torch
@@ -25,7 +24,6 @@ from lidarpainter_models.checks.actors import (
 from lidarpainter_models.checks.box_places import check_box_places
 from lidarpainter_models.checks.calibration import Agrees, check_calibration
 from lidarpainter_models.checks.depth_edges import SceneEdges
-from lidarpainter_models.checks.overlay import draw_overlay
 from lidarpainter_models.checks.pictures import check_pictures
 from lidarpainter_models.checks.swapped_images import check_swapped_images
 from lidarpainter_models.checks.sweeps import (
@@ -36,18 +34,10 @@ from lidarpainter_models.checks.sweeps import (
     check_sweeps_agree,
 )
 from lidarpainter_models.checks.traffic import check_traffic
+from lidarpainter_models.checks.verdicts import Verdict
 from lidarpainter_models.errors import SceneError
-from lidarpainter_models.geometry.transforms import (
-    interpolate_rigid_track,
-    invert_rigid,
-    is_rigid,
-    quaternion_from_rotation,
-)
-from lidarpainter_models.scenes.driving_scene import DrivingScene
-
-__all__ = ["Check", "check_scene", "draw_overlay"]
-
-Verdict = Literal["ok", "warn", "fail"]
+from lidarpainter_models.geometry.transforms import invert_rigid, is_rigid, turn_rad
+from lidarpainter_models.scenes.driving_scene import DrivingScene, driven_road
 
 MAX_SPEED_MPS = 60.0
 MAX_SPEED_CHANGE_MPS2 = 15.0
@@ -82,36 +72,35 @@ def check_scene(
         looking_at: told the name of each check before it is run.
     """
     edges = SceneEdges(scene)
-    checks: tuple[tuple[str, Callable[[DrivingScene], tuple[Verdict, str]]], ...] = (
-        ("stored content", check_content),
-        ("licence", check_licence),
-        ("ego poses", check_ego_poses),
-        ("timestamps", check_timestamps),
-        ("camera sync", check_camera_sync),
-        ("camera rig", check_camera_rig),
-        ("images", check_pictures),
-        ("ground", check_ground),
-        ("LiDAR origins", check_origins),
-        ("sweeps agree", check_sweeps_agree),
-        ("clear air", check_clear_air),
-        ("points in images", check_coverage),
-        ("camera calibration", lambda _: check_calibration(edges, agrees)),
-        ("cameras in their place", lambda _: check_swapped_images(edges)),
-        ("boxes hold points", check_box_points),
-        ("boxes around points", check_box_places),
-        ("boxes point ahead", check_box_axes),
-        ("duplicate tracks", check_duplicate_tracks),
-        ("lasting ids", check_lasting_ids),
-        ("own boxes", check_own_boxes),
-        ("unboxed traffic", check_traffic),
+    has_lidar = bool(scene.lidar_names)
+    checks: tuple[tuple[str, Callable[[DrivingScene], tuple[Verdict, str]], bool], ...] = (
+        ("stored content", check_content, True),
+        ("licence", check_licence, True),
+        ("ego poses", check_ego_poses, True),
+        ("timestamps", check_timestamps, True),
+        ("camera sync", check_camera_sync, has_lidar),
+        ("camera rig", check_camera_rig, True),
+        ("images", check_pictures, True),
+        ("ground", check_ground, has_lidar),
+        ("LiDAR origins", check_origins, has_lidar),
+        ("sweeps agree", check_sweeps_agree, has_lidar),
+        ("clear air", check_clear_air, has_lidar),
+        ("points in images", check_coverage, has_lidar),
+        ("camera calibration", lambda _: check_calibration(edges, agrees), has_lidar),
+        ("cameras in their place", lambda _: check_swapped_images(edges), has_lidar),
+        ("boxes hold points", check_box_points, has_lidar),
+        ("boxes around points", check_box_places, has_lidar),
+        ("boxes point ahead", check_box_axes, True),
+        ("duplicate tracks", check_duplicate_tracks, True),
+        ("lasting ids", check_lasting_ids, True),
+        ("own boxes", check_own_boxes, True),
+        ("unboxed traffic", check_traffic, has_lidar),
     )
-    if scene.lidar_names:
-        return [_run(name, check, scene, looking_at) for name, check in checks]
-    without = "none: a fit takes its points from images, and what needs points is not checked"
-    return [
-        *(_run(name, check, scene, looking_at) for name, check in checks if name not in _BY_POINTS),
-        Check(name="LiDAR", verdict="warn", detail=without),
-    ]
+    found = [_run(name, check, scene, looking_at) for name, check, is_due in checks if is_due]
+    if not has_lidar:
+        without = "none: a fit takes its points from images, and what needs points is not checked"
+        found.append(Check(name="LiDAR", verdict="warn", detail=without))
+    return found
 
 
 def _run(
@@ -162,7 +151,7 @@ def check_ego_poses(scene: DrivingScene) -> tuple[Verdict, str]:
     step_s = scene.frame_timestamps_ns.diff().double() / 1e9
     velocity = scene.world_from_ego[:, :3, 3].diff(dim=0) / step_s[:, None]
     speed = velocity.norm(dim=1)
-    turn = _turn_rad(scene.world_from_ego[:-1], scene.world_from_ego[1:]) / step_s
+    turn = turn_rad(scene.world_from_ego[:-1], scene.world_from_ego[1:]) / step_s
     detail = f"speed {speed.min():.1f} to {speed.max():.1f} m/s, turn up to {turn.max():.2f} rad/s"
     if speed.median() > MAX_SPEED_MPS:
         return "fail", (
@@ -219,35 +208,22 @@ def check_camera_sync(scene: DrivingScene) -> tuple[Verdict, str]:
 
 def check_camera_rig(scene: DrivingScene) -> tuple[Verdict, str]:
     """Whether every camera stays where it is on the car."""
-    worst_m, worst_rad, worst_name = 0.0, 0.0, ""
+    worst_m, worst_rad, worst_name = 0.0, 0.0, scene.camera_names[-1]
     first_ns, last_ns = (int(scene.frame_timestamps_ns[row]) for row in (0, -1))
     for name in scene.camera_names:
-        ego_from_camera = torch.stack(
-            [
-                invert_rigid(
-                    interpolate_rigid_track(
-                        scene.frame_timestamps_ns, scene.world_from_ego, view.timestamp_ns
-                    )
-                )
-                @ view.camera.world_from_camera
-                for view in scene.views_of(name)
-                if first_ns <= view.timestamp_ns <= last_ns
-            ]
-            or [torch.eye(4, dtype=torch.float64)]
-        )
+        views = [v for v in scene.views_of(name) if first_ns <= v.timestamp_ns <= last_ns]
+        if not views:
+            continue
+        ego = driven_road(scene).at(torch.tensor([view.timestamp_ns for view in views]))
+        world_from_camera = torch.stack([view.camera.world_from_camera for view in views])
+        ego_from_camera = invert_rigid(ego.world_from_body) @ world_from_camera
         middle = ego_from_camera[len(ego_from_camera) // 2]
         spread_m = float((ego_from_camera[:, :3, 3] - middle[:3, 3]).norm(dim=1).max())
-        spread_rad = float(_turn_rad(ego_from_camera, middle.expand_as(ego_from_camera)).max())
+        spread_rad = float(turn_rad(ego_from_camera, middle.expand_as(ego_from_camera)).max())
         if spread_m >= worst_m:
             worst_m, worst_rad, worst_name = spread_m, spread_rad, name
     detail = f"at most {worst_m:.3f} m and {worst_rad:.4f} rad off its place ({worst_name})"
     return ("ok" if worst_m <= MAX_RIG_SPREAD_M else "warn"), detail
-
-
-def _turn_rad(first: Tensor, second: Tensor) -> Tensor:
-    """Angle between the rotations of two stacks of poses."""
-    cosine = quaternion_from_rotation(first[:, :3, :3].transpose(-1, -2) @ second[:, :3, :3])[:, 0]
-    return 2 * torch.arccos(cosine.clamp(max=1.0))
 
 
 def _drives_across(world_from_ego: Float[Tensor, "frames 4 4"]) -> bool:
@@ -261,18 +237,3 @@ def _drives_across(world_from_ego: Float[Tensor, "frames 4 4"]) -> bool:
 
 def _frame_after(scene: DrivingScene, step: int) -> int:
     return scene.frame_indices[min(step + 1, len(scene.frame_indices) - 1)]
-
-
-_BY_POINTS = {
-    "camera sync",
-    "ground",
-    "LiDAR origins",
-    "sweeps agree",
-    "clear air",
-    "points in images",
-    "camera calibration",
-    "cameras in their place",
-    "boxes hold points",
-    "boxes around points",
-    "unboxed traffic",
-}

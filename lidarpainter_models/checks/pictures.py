@@ -1,10 +1,9 @@
 """Whether each camera's images show anything: black or even ones have no edge and no colour."""
 
-from typing import Literal
-
 import cv2
 import numpy as np
 
+from lidarpainter_models.checks.verdicts import Verdict
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
 
@@ -17,7 +16,7 @@ _SIZE_PX = (160, 90)
 """Images are made so small first: noise is none then."""
 
 
-def check_pictures(scene: DrivingScene) -> tuple[Literal["ok", "warn", "fail"], str]:
+def check_pictures(scene: DrivingScene) -> tuple[Verdict, str]:
     """Whether the images of each camera show something; black ones cannot be meant."""
     if blank := blank_cameras(scene):
         said = "; ".join(f"{name} {words}" for name, words in blank.items())

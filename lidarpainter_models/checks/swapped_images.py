@@ -7,17 +7,11 @@ they lie better on another's, and the other's on its, files were named the wrong
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
-from typing import Literal
 
 import numpy as np
 
-from lidarpainter_models.checks.depth_edges import (
-    EdgeImage,
-    SceneEdges,
-    edge_scores,
-)
-
-Verdict = Literal["ok", "warn", "fail"]
+from lidarpainter_models.checks.depth_edges import EdgeImage, SceneEdges, edge_scores
+from lidarpainter_models.checks.verdicts import Verdict
 
 MIN_LEAD = 0.08
 """By which another's images must fit better, in deviations of edge strength.

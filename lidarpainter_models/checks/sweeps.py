@@ -3,8 +3,6 @@
 World: z up; lengths are metres.
 """
 
-from typing import Literal
-
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -12,11 +10,10 @@ from torch import Tensor
 
 from lidarpainter_models.checks.lidar_reach import reaches_of
 from lidarpainter_models.checks.sweep_agreement import NEIGHBOURHOOD_M, points_near, sweep_offset_m
+from lidarpainter_models.checks.verdicts import Verdict, sampled_positions
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.lone_returns import WEATHER_REACH_M, is_confirmed, stands_alone
 from lidarpainter_models.scenes.records import RecordedView
-
-Verdict = Literal["ok", "warn", "fail"]
 
 MIN_COVERAGE = 0.15
 MOST_TILTED = 0.7
@@ -41,7 +38,6 @@ _COVERAGE_CELLS = (9, 16)
 _GROUND_CELL_M = 2.0
 _GROUND_THICKNESS_M = 0.3
 _NUM_GROUND_TRIES = 1000
-_NUM_SAMPLED_FRAMES = 4
 _POINT_STRIDE = 3
 """Every third point tells as well which cells of an image are covered."""
 
@@ -83,7 +79,7 @@ def check_origins(scene: DrivingScene) -> tuple[Verdict, str]:
 
 def check_sweeps_agree(scene: DrivingScene) -> tuple[Verdict, str]:
     """Whether consecutive sweeps lie on each other in the world: poses and motion compensation."""
-    frames = sorted({sweep.frame_index for sweep in scene.sweeps})
+    frames = scene.swept_frames
     if len(frames) < 2:
         return "warn", "a single sweep: nothing to compare"
     offsets_m = []
@@ -98,7 +94,7 @@ def check_sweeps_agree(scene: DrivingScene) -> tuple[Verdict, str]:
     return ("ok" if max(offsets_m) <= MAX_SWEEP_OFFSET_M else "fail"), detail
 
 
-def check_clear_air(scene: DrivingScene) -> tuple[Literal["ok", "warn"], str]:
+def check_clear_air(scene: DrivingScene) -> tuple[Verdict, str]:
     """Whether a fit keeps the returns, or leaves out many that stand alone."""
     step = len(scene.frame_indices) // NUM_FRAMES | 1  # odd, as every other frame may be unlike
     num_near = num_lone = num_left_out = 0
@@ -133,11 +129,11 @@ def check_clear_air(scene: DrivingScene) -> tuple[Literal["ok", "warn"], str]:
 def check_coverage(scene: DrivingScene) -> tuple[Verdict, str]:
     """How much of each camera's image the LiDAR reaches, in cells of a 16 x 9 grid."""
     covered: dict[str, list[float]] = {name: [] for name in scene.camera_names}
-    frames = sorted({sweep.frame_index for sweep in scene.sweeps})
-    for position in sampled_positions(len(frames)):
-        xyz_m = scene.read_positions(frames[position])[::_POINT_STRIDE]
+    frames = scene.swept_frames
+    for frame in (frames[position] for position in sampled_positions(len(frames))):
+        xyz_m = scene.read_positions(frame)[::_POINT_STRIDE]
         for view in scene.views:
-            if view.frame_index == frames[position]:
+            if view.frame_index == frame:
                 covered[view.camera_name].append(_covered_share(view, xyz_m))
     shares = {name: float(np.mean(found or [0.0])) for name, found in covered.items()}
     detail = ", ".join(f"{name} {share:.0%}" for name, share in shares.items())
@@ -191,8 +187,3 @@ def _ground_plane(points_m: np.ndarray) -> tuple[float, float]:
     plane, _ = cloud.segment_plane(_GROUND_THICKNESS_M, 3, _NUM_GROUND_TRIES)
     slope_rad = np.arctan2(np.hypot(plane[0], plane[1]), abs(plane[2]))
     return float(slope_rad), float(-plane[3] / np.copysign(max(abs(plane[2]), 1e-9), plane[2]))
-
-
-def sampled_positions(count: int) -> list[int]:
-    """A few positions spread evenly over `count`."""
-    return sorted({round(x) for x in np.linspace(0, count - 1, min(count, _NUM_SAMPLED_FRAMES))})

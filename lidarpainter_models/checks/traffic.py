@@ -6,8 +6,6 @@ empty are put together to things by cells of the ground.
 World: z up; lengths are metres.
 """
 
-from typing import Literal
-
 import cv2
 import numpy as np
 import torch
@@ -15,6 +13,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import minimum_filter
 from torch import Tensor
 
+from lidarpainter_models.checks.verdicts import Verdict
 from lidarpainter_models.geometry.boxes import is_inside_box
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import Sweep
@@ -36,7 +35,7 @@ _LEAST_CELLS, _LEAST_POINTS = 5, 40
 _BOX_MARGIN_M = 0.6
 
 
-def check_traffic(scene: DrivingScene) -> tuple[Literal["ok", "warn"], str]:
+def check_traffic(scene: DrivingScene) -> tuple[Verdict, str]:
     """Whether moving things are boxed."""
     triples = _triples(scene)
     if not triples:

@@ -104,6 +104,14 @@ def rigid_from_tangent(tangent: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*ba
     return rigid_from_rotation(rotation_from_vector(tangent[..., :3]), tangent[..., 3:])
 
 
+def turn_rad(
+    first: Float[Tensor, "*batch 4 4"], second: Float[Tensor, "*batch 4 4"]
+) -> Float[Tensor, "*batch"]:
+    """Angle between the rotations of poses."""
+    turn = first[..., :3, :3].mT @ second[..., :3, :3]
+    return 2 * torch.arccos(quaternion_from_rotation(turn)[..., 0].clamp(max=1.0))
+
+
 def interpolate_rigid(
     world_from_first: Float[Tensor, "*batch 4 4"],
     world_from_second: Float[Tensor, "*batch 4 4"],

@@ -28,7 +28,7 @@ def exposure_differences(scene: DrivingScene) -> list[str]:
     Raises:
         SceneError: no point lies in range.
     """
-    frames = set(_runs(sorted({sweep.frame_index for sweep in scene.sweeps})))
+    frames = set(_runs(scene.swept_frames))
     views = [view for view in scene.views if view.frame_index in frames]
     street = gather_points(scene, frames).street
     if len(street) == 0:

@@ -1,11 +1,113 @@
-"""Readers of datasets as downloaded; each ends its dataset's oddities and writes a scene."""
+"""Readers of datasets as downloaded; each ends its dataset's oddities and writes a scene.
 
-from lidarpainter_models.readers.datasets import (
-    ingest_scene,
-    known_datasets,
-    list_sequences,
-    open_log,
-    scene_id_of,
+Here is which datasets there are, what they hold, and how one is ingested.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from lidarpainter_models.errors import DataError
+from lidarpainter_models.readers.canonical.reader import (
+    ForeignScene,
+    list_canonical_scenes,
+    own_scene_id,
 )
+from lidarpainter_models.readers.nuscenes.reader import NuscenesLog, list_nuscenes_scenes
+from lidarpainter_models.readers.pandaset.reader import PandasetLog, list_pandaset_sequences
+from lidarpainter_models.readers.source_logs.log import Progress, SourceLog, write_log
+from lidarpainter_models.readers.waymo.reader import WaymoLog, list_waymo_segments
+from lidarpainter_models.scenes.validation import require_name
 
-__all__ = ["ingest_scene", "known_datasets", "list_sequences", "open_log", "scene_id_of"]
+ListSequences = Callable[[Path], tuple[str, ...]]
+"""The sequences below a root, by name."""
+OpenLog = Callable[[Path, str, slice | None, tuple[str, ...] | None], SourceLog]
+"""Takes the root, the sequence, and which frames and cameras to take, all of them if None."""
+
+CANONICAL = "canonical"
+"""In place of a dataset: scenes that were written elsewhere, whatever dataset they are of."""
+
+_READERS: dict[str, tuple[ListSequences, OpenLog]] = {
+    "pandaset": (list_pandaset_sequences, PandasetLog),
+    "nuscenes": (list_nuscenes_scenes, NuscenesLog),
+    "waymo": (list_waymo_segments, WaymoLog),
+    CANONICAL: (list_canonical_scenes, ForeignScene),
+}
+
+
+def known_datasets() -> tuple[str, ...]:
+    """Names of the datasets that can be read."""
+    return tuple(_READERS)
+
+
+def list_sequences(dataset: str, root: Path) -> tuple[str, ...]:
+    """The sequences found below a dataset's root.
+
+    Raises:
+        DataError: the dataset is not known, or the root is no folder or holds no sequence.
+    """
+    list_found, _open_log = _reader(dataset)
+    if not Path(root).is_dir():
+        raise DataError(f"{root}: no such folder, expected the root of {dataset}")
+    found = list_found(Path(root))
+    if not found:
+        raise DataError(f"{root}: no {dataset} sequence found")
+    return found
+
+
+def scene_id_of(dataset: str, root: Path, sequence: str) -> str:
+    """What a sequence will be called in a store: `dataset/sequence`, or as its own manifest says.
+
+    Raises:
+        DataError: it is a scene from elsewhere whose manifest says no names.
+    """
+    return own_scene_id(root, sequence) if dataset == CANONICAL else f"{dataset}/{sequence}"
+
+
+def ingest_scene(
+    dataset: str,
+    root: Path,
+    sequence: str,
+    store: Path,
+    *,
+    frames: slice | None = None,
+    cameras: tuple[str, ...] | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Read one sequence of a dataset and write it into the store; gives the scene's path.
+
+    Raises:
+        DataError: the dataset is not known, or the log is missing something, damaged or senseless.
+        WriteError: the store cannot be written.
+    """
+    log = open_log(dataset, root, sequence, frames=frames, cameras=cameras)
+    return write_log(log, Path(store), progress=progress)
+
+
+def open_log(
+    dataset: str,
+    root: Path,
+    sequence: str,
+    *,
+    frames: slice | None = None,
+    cameras: tuple[str, ...] | None = None,
+) -> SourceLog:
+    """Open one sequence of a dataset.
+
+    The root is the folder as downloaded. Frames are taken by position, cameras by name; None takes
+    all.
+
+    Raises:
+        DataError: the dataset is not known, or the log is missing something, damaged or senseless.
+    """
+    _list_found, open_found = _reader(dataset)
+    require_name(sequence, "sequence")
+    return open_found(Path(root), sequence, frames, cameras)
+
+
+def _reader(dataset: str) -> tuple[ListSequences, OpenLog]:
+    try:
+        return _READERS[dataset]
+    except KeyError:
+        raise DataError(
+            f"dataset {dataset!r} is not known, expected one of {', '.join(_READERS)}"
+        ) from None

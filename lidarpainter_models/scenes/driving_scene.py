@@ -4,7 +4,7 @@ World: x forward, y left, z up, origin at the first ego pose. A `DrivingScene` i
 tables are in memory, images and points are read when asked for.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -122,8 +122,9 @@ class DrivingScene:
         if image is None:
             raise SceneError(f"{self.path}: the image {view.key} cannot be decoded")
         image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-        lens, distortion = self._lenses[view.index]
-        return torch.from_numpy(undistort(image, lens, distortion, view.camera))
+        record = self._images[view.index]
+        shown = undistort(image, record.camera, record.distortion, view.camera)
+        return torch.from_numpy(shown)
 
     def read_jpeg(self, view: RecordedView) -> bytes:
         """The recorded image as the camera's own JPEG bytes."""
@@ -132,18 +133,11 @@ class DrivingScene:
 
     def image_record(self, view: RecordedView) -> ImageRecord:
         """What is stored of the image itself: through which lens it was taken, undone or not."""
-        camera, distortion = self._lenses[view.index]
-        return ImageRecord(
-            camera_name=view.camera_name,
-            timestamp_ns=self._stated_ns[view.index],
-            camera=camera,
-            distortion=distortion,
-            rolling_shutter=self._shutters[view.index],
-        )
+        return self._images[view.index]
 
     def is_stored_undistorted(self, view: RecordedView) -> bool:
         """Whether the camera's own bytes show what `read_image` gives."""
-        return self._lenses[view.index][1].model == "none"
+        return self._images[view.index].distortion.model == "none"
 
     def read_sweep(self, sweep: Sweep) -> SweepPoints:
         """The points of one sweep, in the world."""
@@ -161,6 +155,11 @@ class DrivingScene:
     def has_lidar(self, frame_indices: Collection[int]) -> bool:
         """Whether a LiDAR swept in any of these frames."""
         return any(sweep.frame_index in frame_indices for sweep in self.sweeps)
+
+    @property
+    def swept_frames(self) -> list[int]:
+        """Frames that have a LiDAR sweep, ascending."""
+        return sorted({sweep.frame_index for sweep in self.sweeps})
 
     def sweeps_of(self, frame_index: int) -> tuple[Sweep, ...]:
         """The sweeps of all LiDARs in one frame."""
@@ -202,26 +201,13 @@ class DrivingScene:
         poses = _poses(cameras, "world_from_camera")
         shutters = recorded_shutters(rows, poses)
         self._image_ranges = [(row["offset"], row["num_bytes"]) for row in rows]
-        self._lenses = [
-            (
-                _lens(row, pose, shutter),
-                Distortion(row["distortion_model"], tuple(row["distortion_terms"])),
-            )
+        self._images = [
+            image_of_row(row, pose, shutter)
             for row, pose, shutter in zip(rows, poses, shutters, strict=True)
         ]
-        self._shutters = [_shutter(row) for row in rows]
-        self._stated_ns = [row["timestamp_ns"] for row in rows]
         self.views: tuple[RecordedView, ...] = tuple(
-            RecordedView(
-                frame_index=row["frame_index"],
-                camera_name=row["camera"],
-                timestamp_ns=stated_ns + (round(1e9 * shutter.middle_s) if shutter else 0),
-                camera=pinhole_of(_at_middle_row(lens, shutter), distortion),
-                index=index,
-            )
-            for index, (row, stated_ns, (lens, distortion), shutter) in enumerate(
-                zip(rows, self._stated_ns, self._lenses, self._shutters, strict=True)
-            )
+            _recorded_view(row["frame_index"], record, index)
+            for index, (row, record) in enumerate(zip(rows, self._images, strict=True))
         )
         sweeps = self._stored.table("sweeps")
         poses = _poses(sweeps, "world_from_lidar")
@@ -238,12 +224,12 @@ class DrivingScene:
         )
         boxes = self._stored.table("boxes")
         columns = boxes.drop_columns(["world_from_box"]).to_pydict()
-        path = self.frame_timestamps_ns, self.world_from_ego
+        ego = driven_road(self)
         self.tracks: tuple[ActorTrack, ...]
         self.tracks, self.own_boxes = without_own_boxes(
             tracks_from_boxes(columns, _poses(boxes, "world_from_box")),
-            own_places(self.views, self.sweeps, *path),
-            *path,
+            own_places(self.views, self.sweeps, ego),
+            ego,
         )
 
 
@@ -252,35 +238,43 @@ def _poses(table: pa.Table, column: str) -> Float[Tensor, "rows 4 4"]:
     return torch.from_numpy(np.array(flat, dtype=np.float64)).reshape(-1, 4, 4)
 
 
-def _lens(row: dict[str, Any], world_from_camera: Float[Tensor, "4 4"], shutter: Shutter) -> Camera:
-    return Camera(
-        shutter=shutter,
-        world_from_camera=world_from_camera,
-        fx_px=row["fx_px"],
-        fy_px=row["fy_px"],
-        cx_px=row["cx_px"],
-        cy_px=row["cy_px"],
-        width_px=row["width_px"],
-        height_px=row["height_px"],
+def image_of_row(
+    row: Mapping[str, Any],
+    world_from_camera: Float[Tensor, "4 4"],
+    shutter: Shutter | None = None,
+) -> ImageRecord:
+    """What a row of the table of images says of one; `shutter` is how its camera moved."""
+    read = ("duration_s", "direction", "first_row_s")
+    columns = ("rolling_shutter_s", "rolling_shutter_direction", "rolling_shutter_first_row_s")
+    told = {name: row[column] for name, column in zip(read, columns, strict=True)}
+    lens = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
+    return ImageRecord(
+        camera_name=row["camera"],
+        timestamp_ns=row["timestamp_ns"],
+        camera=Camera(
+            world_from_camera=world_from_camera,
+            shutter=shutter,
+            **{name: row[name] for name in lens},
+        ),
+        distortion=Distortion(row["distortion_model"], tuple(row["distortion_terms"])),
+        rolling_shutter=None if told["duration_s"] is None else RollingShutter(**told),
     )
 
 
-def _shutter(row: dict[str, Any]) -> RollingShutter | None:
-    if row["rolling_shutter_s"] is None:
-        return None
-    return RollingShutter(
-        duration_s=row["rolling_shutter_s"],
-        direction=row["rolling_shutter_direction"],
-        first_row_s=row["rolling_shutter_first_row_s"],
+def _recorded_view(frame_index: int, record: ImageRecord, index: int) -> RecordedView:
+    """The view when and where the middle row of its image was read."""
+    camera = record.camera
+    middle_s = record.rolling_shutter.middle_s if record.rolling_shutter else 0.0
+    if middle_s and camera.shutter:
+        moved = rigid_from_tangent(middle_s * camera.shutter.twist_per_s)
+        camera = replace(camera, world_from_camera=camera.world_from_camera @ moved)
+    return RecordedView(
+        frame_index=frame_index,
+        camera_name=record.camera_name,
+        timestamp_ns=record.timestamp_ns + round(1e9 * middle_s),
+        camera=pinhole_of(camera, record.distortion),
+        index=index,
     )
-
-
-def _at_middle_row(lens: Camera, stored: RollingShutter | None) -> Camera:
-    """The camera where it was when the middle row of its image was read."""
-    if stored is None or stored.middle_s == 0 or lens.shutter is None:
-        return lens
-    moved = rigid_from_tangent(stored.middle_s * lens.shutter.twist_per_s)
-    return replace(lens, world_from_camera=lens.world_from_camera @ moved)
 
 
 def driven_road(scene: DrivingScene) -> DrivenPath:

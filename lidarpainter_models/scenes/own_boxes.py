@@ -9,14 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lidarpainter_models.geometry.transforms import (
-    interpolate_rigid,
-    interpolate_rigid_track,
-    invert_rigid,
-)
+from lidarpainter_models.geometry.driven_paths import DrivenPath
+from lidarpainter_models.geometry.transforms import invert_rigid
 from lidarpainter_models.scenes.records import RecordedView, Sweep
 from lidarpainter_models.scenes.tracks import ActorTrack
 
@@ -42,10 +39,7 @@ class OwnBoxes:
 
 
 def own_places(
-    views: Sequence[RecordedView],
-    sweeps: Sequence[Sweep],
-    times_ns: Int[Tensor, " frames"],
-    world_from_ego: Float[Tensor, "frames 4 4"],
+    views: Sequence[RecordedView], sweeps: Sequence[Sweep], ego: DrivenPath
 ) -> Float[Tensor, "places 3"]:
     """Where on the car its origin, cameras and LiDARs are, in the ego frame (float64)."""
     poses: dict[str, tuple[int, Tensor]] = {}
@@ -54,26 +48,17 @@ def own_places(
         poses.setdefault(f"camera {view.camera_name}", (view.timestamp_ns, pose))
     for sweep in sweeps:
         poses.setdefault(f"LiDAR {sweep.lidar_name}", (sweep.timestamp_ns, sweep.world_from_lidar))
-    places = [torch.zeros(3, dtype=torch.float64)]
-    for time_ns, pose in poses.values():
-        ego_from_world = invert_rigid(interpolate_rigid_track(times_ns, world_from_ego, time_ns))
-        places.append((ego_from_world @ pose.double())[:3, 3])
-    return torch.stack(places)
+    times_ns, world_from_sensor = zip(*poses.values(), strict=True)
+    ego_from_world = invert_rigid(ego.at(torch.tensor(times_ns)).world_from_body)
+    places = (ego_from_world @ torch.stack(world_from_sensor).double())[:, :3, 3]
+    return torch.cat([torch.zeros(1, 3, dtype=torch.float64), places])
 
 
 def holds_own_car(
-    track: ActorTrack,
-    places_ego: Float[Tensor, "places 3"],
-    times_ns: Int[Tensor, " frames"],
-    world_from_ego: Float[Tensor, "frames 4 4"],
+    track: ActorTrack, places_ego: Float[Tensor, "places 3"], ego: DrivenPath
 ) -> Bool[Tensor, " times"]:
     """Which boxes of a track hold the recording car, where it is at the time of each box."""
-    inside_ns = track.timestamps_ns.clamp(int(times_ns[0]), int(times_ns[-1]))
-    after = torch.searchsorted(times_ns, inside_ns).clamp(max=len(times_ns) - 1)
-    before = (after - 1).clamp(min=0)
-    span_ns = (times_ns[after] - times_ns[before]).clamp(min=1)
-    share = (inside_ns - times_ns[before]).double() / span_ns
-    world_from_own = interpolate_rigid(world_from_ego[before], world_from_ego[after], share)
+    world_from_own = ego.at(track.timestamps_ns).world_from_body
     box_from_ego = invert_rigid(track.world_from_box.double()) @ world_from_own
     places_box = places_ego @ box_from_ego[:, :3, :3].mT + box_from_ego[:, None, :3, 3]
     half_m = track.size_m.double() / 2 + torch.tensor(GROWN_M, dtype=torch.float64)
@@ -81,35 +66,19 @@ def holds_own_car(
 
 
 def without_own_boxes(
-    tracks: Sequence[ActorTrack],
-    places_ego: Float[Tensor, "places 3"],
-    times_ns: Int[Tensor, " frames"],
-    world_from_ego: Float[Tensor, "frames 4 4"],
+    tracks: Sequence[ActorTrack], places_ego: Float[Tensor, "places 3"], ego: DrivenPath
 ) -> tuple[tuple[ActorTrack, ...], tuple[OwnBoxes, ...]]:
     """The tracks of other actors, and which boxes were left out."""
     kept, own = [], []
     for track in tracks:
-        holds = holds_own_car(track, places_ego, times_ns, world_from_ego)
+        holds = holds_own_car(track, places_ego, ego)
         if not bool(holds.any()):
             kept.append(track)
             continue
         total, held = len(holds), int(holds.sum())
-        own.append(
-            OwnBoxes(
-                actor_id=track.actor_id,
-                category=track.category,
-                num_boxes=held,
-                num_of_track=total,
-            )
-        )
+        named = {"actor_id": track.actor_id, "category": track.category}
+        own.append(OwnBoxes(**named, num_boxes=held, num_of_track=total))
         if held < LEAST_OWN_SHARE * total:
-            kept.append(
-                replace(
-                    track,
-                    frame_indices=track.frame_indices[~holds],
-                    timestamps_ns=track.timestamps_ns[~holds],
-                    world_from_box=track.world_from_box[~holds],
-                    num_points=track.num_points[~holds],
-                )
-            )
+            rows = ("frame_indices", "timestamps_ns", "world_from_box", "num_points")
+            kept.append(replace(track, **{name: getattr(track, name)[~holds] for name in rows}))
     return tuple(kept), tuple(own)

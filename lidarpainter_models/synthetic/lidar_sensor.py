@@ -1,7 +1,5 @@
 """The LiDAR of the street: beams, timing, noise and lost returns on top of the traced ranges."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from lidarpainter_models.synthetic.config import RigLidar
@@ -26,21 +24,13 @@ def beam_inclinations_rad(beams: int) -> np.ndarray:
     return np.deg2rad(degrees[chosen])
 
 
-@dataclass(frozen=True, eq=False)
-class Firing:
-    """When and where to each column of a turn is fired."""
+def firings(lidar: RigLidar, turn_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """When each column of a turn is fired, from its middle, and where to; both (columns).
 
-    offset_s: np.ndarray
-    """(columns), from the middle of the turn."""
-    azimuth_rad: np.ndarray
-    """(columns), counter-clockwise from ahead; the turn goes clockwise, ahead comes in its middle.
+    Azimuths are counter-clockwise from ahead; the turn goes clockwise, ahead comes in its middle.
     """
-
-
-def firings(lidar: RigLidar, turn_s: float) -> Firing:
-    """The columns of one turn."""
     share = (np.arange(lidar.columns) + 0.5) / lidar.columns
-    return Firing((share - 0.5) * turn_s, np.pi - 2 * np.pi * share)
+    return (share - 0.5) * turn_s, np.pi - 2 * np.pi * share
 
 
 def returns_mask(

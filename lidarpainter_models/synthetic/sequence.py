@@ -109,7 +109,9 @@ def _record_image(
             camera_name=rig.name,
             timestamp_ns=timestamp_ns,
             camera=stated.at(stated.world_from_camera @ error),
-            rolling_shutter=_told_readout(config, rig),
+            rolling_shutter=RollingShutter(duration_s=rig.readout_s, direction="down")
+            if rig.readout_s and config.is_readout_told
+            else None,
         ),
         jpeg.tobytes(),
     )
@@ -139,12 +141,6 @@ def _record_boxes(
                 num_points=num_points,
             )
         )
-
-
-def _told_readout(config: SyntheticStreetConfig, rig: RigCamera) -> RollingShutter | None:
-    if rig.readout_s == 0 or not config.is_readout_told:
-        return None
-    return RollingShutter(duration_s=rig.readout_s, direction="down")
 
 
 def _turned_right(angle_rad: float) -> Float[Tensor, "4 4"]:

@@ -29,7 +29,6 @@ from lidarpainter_models.synthetic.raytracing.scene_arrays import InstanceArrays
 from lidarpainter_models.synthetic.textures.surfaces import StreetClass
 from lidarpainter_models.synthetic.truth import ActorState, LensState, SimulatedSweep, TrueImage
 from lidarpainter_models.synthetic.world.city import ActorChange, City, build_city
-from lidarpainter_models.synthetic.world.traffic import StreetActor
 
 START_NS = 1_700_000_000_000_000_000
 GENERATOR = "lidarpainter synthetic street"
@@ -37,20 +36,8 @@ WORLD_VERSION = 2
 """Raise it whenever equal settings would give another world."""
 
 
-@lru_cache(maxsize=1)
-def _city(
-    seed: int,
-    speed_mps: tuple[float, float] | None,
-    are_people_walking: bool,
-    are_lamps_switching: bool,
-) -> City:
-    """The last one is kept: whoever records a street judges it later."""
-    return build_city(
-        seed,
-        speed_mps=speed_mps,
-        are_people_walking=are_people_walking,
-        are_lamps_switching=are_lamps_switching,
-    )
+_city = lru_cache(maxsize=1)(build_city)
+"""The last one is kept: whoever records a street judges it later."""
 
 
 class SyntheticStreet:
@@ -58,21 +45,17 @@ class SyntheticStreet:
 
     def __init__(self, config: SyntheticStreetConfig) -> None:
         self.config = config
-        self._city = _city(
-            config.seed, config.speed_mps, config.are_people_walking, config.are_lamps_switching
-        )
+        self._city: City = _city(**self._world())
+
+    def _world(self) -> dict[str, Any]:
+        """What of the settings decides what stands and moves in the street."""
+        names = ("seed", "speed_mps", "are_people_walking", "are_lamps_switching")
+        return {name: getattr(self.config, name) for name in names}
 
     def changed(self, change: ActorChange) -> "SyntheticStreet":
         """The same street with other actors in it: the exact truth of an edit."""
-        config = self.config
         other = copy(self)
-        other._city = build_city(
-            config.seed,
-            speed_mps=config.speed_mps,
-            are_people_walking=config.are_people_walking,
-            are_lamps_switching=config.are_lamps_switching,
-            change=change,
-        )
+        other._city = build_city(**self._world(), change=change)
         return other
 
     @classmethod
@@ -224,8 +207,8 @@ class SyntheticStreet:
 
         config, lidar = self.config, self.config.lidar
         timestamp_ns = self.timestamps_ns[frame_index]
-        firing = firings(lidar, config.frame_interval_s)
-        time_s = _seconds(timestamp_ns) + firing.offset_s
+        offset_s, azimuth_rad = firings(lidar, config.frame_interval_s)
+        time_s = _seconds(timestamp_ns) + offset_s
         ego_from_lidar = np.eye(4)
         ego_from_lidar[2, 3] = lidar.up_m
         poses = self._city.ego.world_from_ego(time_s) @ ego_from_lidar
@@ -234,7 +217,7 @@ class SyntheticStreet:
             self._city.arrays,
             self._instances(time_s),
             np.ascontiguousarray(poses[:, :3]),
-            firing.azimuth_rad,
+            azimuth_rad,
             inclination,
             lidar.max_range_m,
         )
@@ -243,7 +226,7 @@ class SyntheticStreet:
         intensity = intensities(surface, rng)[is_kept]
         noise_m = lidar.range_noise_m * rng.standard_normal(range_m.shape)
         flat = np.cos(inclination)[None, :]
-        azimuth = firing.azimuth_rad[:, None]
+        azimuth = azimuth_rad[:, None]
         up = np.broadcast_to(np.sin(inclination)[None, :], range_m.shape)
         rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), up], axis=-1)
         column, beam = np.nonzero(is_kept)
@@ -257,9 +240,7 @@ class SyntheticStreet:
             points=SweepPoints(
                 xyz_m=torch.from_numpy(world.astype(np.float32)),
                 intensity=torch.from_numpy(intensity),
-                time_offset_ns=torch.from_numpy(
-                    np.rint(firing.offset_s[column] * 1e9).astype(np.int64)
-                ),
+                time_offset_ns=torch.from_numpy(np.rint(offset_s[column] * 1e9).astype(np.int64)),
                 ring=torch.from_numpy(beam.astype(np.int32)),
                 return_index=torch.zeros(column.size, dtype=torch.int32),
                 lidar=torch.zeros(column.size, dtype=torch.int32),
@@ -280,18 +261,14 @@ class SyntheticStreet:
             contact[:, index, 0:2] = pose[:, :2, 3]
             contact[:, index, 2:4] = pose[:, :2, 0]
             contact[:, index, 4:6] = actor.size_m[:2] / 2
+        postures = np.stack([actor.posture(time_s) for actor in moving])
         return InstanceArrays(
-            roots=self._roots(moving, time_s),
+            roots=np.take_along_axis(city.roots, postures, axis=1).T.copy(),
             radius_m=city.radius_m,
             world_from_box=np.ascontiguousarray(poses[:, :, :3]),
             contact=contact,
             is_lit=city.lamps.is_lit(time_s),
         )
-
-    def _roots(self, moving: list[StreetActor], time_s: np.ndarray) -> np.ndarray:
-        """The mesh of everything that moves at given times."""
-        postures = np.stack([actor.posture(time_s) for actor in moving], axis=1)
-        return np.take_along_axis(self._city.roots, postures.T, axis=1).T.copy()
 
 
 def ego_from_camera(rig: RigCamera) -> Float[Tensor, "4 4"]:

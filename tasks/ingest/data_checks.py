@@ -4,7 +4,7 @@ import json
 import tempfile
 from collections.abc import Callable
 from dataclasses import asdict
-from functools import cached_property
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +13,8 @@ from jaxtyping import Bool
 from catalog.errors import CatalogError
 from catalog.store import Store
 from lidarpainter_models.checks.calibration import CameraTurn
-from lidarpainter_models.checks.doctor import check_scene, draw_overlay, not_computed
-from lidarpainter_models.checks.overlay import with_legend
+from lidarpainter_models.checks.doctor import check_scene, not_computed
+from lidarpainter_models.checks.overlay import draw_overlay, with_legend
 from lidarpainter_models.checks.pictures import blank_cameras
 from lidarpainter_models.errors import LidarPainterError, SceneError
 from lidarpainter_models.export.images import write_png
@@ -35,6 +35,7 @@ from tasks.opened import open_scene
 
 LookingAt = Callable[[str], None]
 """Told the name of what is looked at next."""
+Bodies = Callable[[], dict[str, Bool[np.ndarray, "height width"]]]
 CAMERA_FAULTS = "camera faults"
 CORRECTS = "--set observation.corrects_cameras=true"
 TRIAL_FRAMES = slice(0, 6)
@@ -66,7 +67,7 @@ def findings_about(
     looking_at: LookingAt = lambda _name: None,
 ) -> list[Finding]:
     """Everything that is looked for in a whole scene; a trial of a few frames says too little."""
-    bodies = _Bodies(scene)
+    bodies = _bodies_of(scene)
     looks: dict[str, Callable[[], list[Finding]]] = {
         "scene": lambda: _findings(scene, bodies, looking_at),
         CAMERA_FAULTS: lambda: _camera_faults(scene, bodies),
@@ -84,15 +85,9 @@ def findings_about(
     return found
 
 
-class _Bodies:
+def _bodies_of(scene: DrivingScene) -> Bodies:
     """What of each camera's images is the recording car, found when it is first asked for."""
-
-    def __init__(self, scene: DrivingScene) -> None:
-        self._scene = scene
-
-    @cached_property
-    def masks(self) -> dict[str, Bool[np.ndarray, "height width"]]:
-        return own_bodies(self._scene, self._scene.views)
+    return cache(lambda: own_bodies(scene, scene.views))
 
 
 def check_dataset(store: Store, dataset: str, root: Path, out: Path | None) -> list[Finding]:
@@ -108,7 +103,7 @@ def check_dataset(store: Store, dataset: str, root: Path, out: Path | None) -> l
                     path = ingest_scene(dataset, folder, sequence, Path(trial), frames=TRIAL_FRAMES)
                 image = (out or store.root / "doctor" / dataset) / f"{sequence}.png"
                 scene = DrivingScene.open(path)
-                found = _examined(scene, image, _findings(scene, _Bodies(scene)))
+                found = _examined(scene, image, _findings(scene, _bodies_of(scene)))
             except (LidarPainterError, CatalogError) as error:
                 found = [Finding("reading", "fail", str(error))]
         findings += [Finding(f"{sequence}: {f.name}", f.verdict, f.detail) for f in found]
@@ -130,20 +125,20 @@ def _examined(scene: DrivingScene, image: Path, found: list[Finding]) -> list[Fi
 
 
 def _findings(
-    scene: DrivingScene, bodies: _Bodies, looking_at: LookingAt = lambda _name: None
+    scene: DrivingScene, bodies: Bodies, looking_at: LookingAt = lambda _name: None
 ) -> list[Finding]:
     def agrees(name: str, turn: CameraTurn) -> bool | None:
         turned_deg = [turn.pitch_deg, turn.yaw_deg, turn.roll_deg]
-        return images_agree(scene, name, -np.radians(turned_deg), bodies.masks.get(name))
+        return images_agree(scene, name, -np.radians(turned_deg), bodies().get(name))
 
     checks = check_scene(scene, agrees, looking_at)
     return [Finding(check.name, check.verdict, check.detail) for check in checks]
 
 
-def _camera_faults(scene: DrivingScene, bodies: _Bodies) -> list[Finding]:
+def _camera_faults(scene: DrivingScene, bodies: Bodies) -> list[Finding]:
     """What a fit can correct about the cameras."""
     untold = cannot_be_told(scene.views)
-    faults = find_faults(scene, scene.views, bodies.masks)
+    faults = find_faults(scene, scene.views, bodies())
     if faults:
         said = "; ".join(f"{name} {fault}" for name, fault in faults.items())
         tried = "views set aside agree better with it"
@@ -170,9 +165,9 @@ def _exposure(scene: DrivingScene) -> list[Finding]:
     return [Finding("exposure", "warn", "; ".join(differences))]
 
 
-def _own_bodies(scene: DrivingScene, bodies: _Bodies) -> list[Finding]:
+def _own_bodies(scene: DrivingScene, bodies: Bodies) -> list[Finding]:
     """Which cameras show the recording car, which a fit leaves out."""
-    said = [in_words(name, body) for name, body in bodies.masks.items()]
+    said = [in_words(name, body) for name, body in bodies().items()]
     untold = own_body.cannot_be_told(scene.views)
     if len(untold) < len(scene.camera_names):
         who = "No other camera" if said else "No camera"

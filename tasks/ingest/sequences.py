@@ -5,8 +5,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from lidarpainter_models.errors import DataError, LidarPainterError
-from lidarpainter_models.readers import known_datasets, list_sequences, scene_id_of
-from lidarpainter_models.readers.datasets import CANONICAL
+from lidarpainter_models.readers import CANONICAL, known_datasets, list_sequences, scene_id_of
 from lidarpainter_models.scenes.schema import MANIFEST_NAME
 from tasks.ingest.bucket_roots import is_in_bucket, root_at_hand, sequences_in_bucket
 

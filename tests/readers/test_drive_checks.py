@@ -35,49 +35,54 @@ def refusal(pandaset, tmp_path):
     return refused
 
 
-def test_jump_of_the_car(pandaset, refusal):
-    edit_json(pandaset, "lidar/poses.json", lambda poses: poses[2]["position"].update(x=110.0))
-    assert "frame 2, pose: the vehicle has moved" in refusal()
+UPRIGHT = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
+"""A heading with which a camera looks into the sky."""
 
 
-def test_car_that_spins(pandaset, refusal):
-    turned = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
-    edit_json(pandaset, "lidar/poses.json", lambda poses: poses[1]["heading"].update(turned))
-    assert "frame 1, pose: the vehicle has moved 1.0 m and turned 0.79 rad in 0.100 s" in refusal()
-
-
-def test_images_of_another_time(pandaset, refusal):
-    name = "camera/left_camera/timestamps.json"
-    edit_json(pandaset, name, lambda times_s: [time_s + 0.5 for time_s in times_s])
-    assert "left_camera/00.jpg: taken +0.5" in refusal()
-
-
-def test_images_whose_times_stand_still(pandaset, refusal):
-    name = "camera/left_camera/timestamps.json"
-    edit_json(pandaset, name, lambda times_s: [times_s[0] + 0.05] * len(times_s))
-    assert "left_camera/01.jpg: taken at" in refusal()
-
-
-def test_camera_beside_the_car(pandaset, refusal):
-    name = "camera/back_camera/poses.json"
-    edit_json(pandaset, name, lambda poses: poses[1]["position"].update(x=140.0))
-    assert "back_camera/01.jpg: the sensor is 3" in refusal()
-
-
-def test_camera_that_looks_into_the_sky(pandaset, refusal):
-    def look_up(poses):
-        for pose in poses:
-            pose["heading"] = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
-
-    edit_json(pandaset, "camera/right_camera/poses.json", look_up)
-    line = refusal()
-    assert "right_camera/00.jpg: no LiDAR point falls into any image of right_camera" in line
-
-
-def test_lens_that_looks_past_its_image(pandaset, refusal):
-    name = "camera/front_camera/intrinsics.json"
-    edit_json(pandaset, name, lambda lens: lens.update(cx=1e5))
-    assert "front_camera/00.jpg: no LiDAR point falls into any image" in refusal()
+@pytest.mark.parametrize(
+    ("name", "change", "complaint"),
+    [
+        (
+            "lidar/poses",
+            lambda poses: poses[2]["position"].update(x=110.0),
+            "frame 2, pose: the vehicle has moved",
+        ),
+        (
+            "lidar/poses",
+            lambda poses: poses[1]["heading"].update(UPRIGHT),
+            "frame 1, pose: the vehicle has moved 1.0 m and turned 0.79 rad in 0.100 s",
+        ),
+        (
+            "camera/left_camera/timestamps",
+            lambda times_s: [time_s + 0.5 for time_s in times_s],
+            "left_camera/00.jpg: taken +0.5",
+        ),
+        (
+            "camera/left_camera/timestamps",
+            lambda times_s: [times_s[0] + 0.05] * len(times_s),
+            "left_camera/01.jpg: taken at",
+        ),
+        (
+            "camera/back_camera/poses",
+            lambda poses: poses[1]["position"].update(x=140.0),
+            "back_camera/01.jpg: the sensor is 3",
+        ),
+        (
+            "camera/right_camera/poses",
+            lambda poses: [{**pose, "heading": UPRIGHT} for pose in poses],
+            "right_camera/00.jpg: no LiDAR point falls into any image of right_camera",
+        ),
+        (
+            "camera/front_camera/intrinsics",
+            lambda lens: lens.update(cx=1e5),
+            "front_camera/00.jpg: no LiDAR point falls into any image",
+        ),
+    ],
+    ids=["jump", "spin", "other time", "time stands still", "off the car", "sky", "past its image"],
+)
+def test_what_no_car_records_is_refused(pandaset, refusal, name, change, complaint):
+    edit_json(pandaset, f"{name}.json", change)
+    assert complaint in refusal()
 
 
 def test_point_beyond_the_reach_of_a_lidar(pandaset, refusal):
@@ -112,10 +117,7 @@ def raise_boxes(pandaset):
 
 def test_moving_boxes_that_never_hold_points(raise_boxes, refusal):
     raise_boxes(range(6))
-    line = refusal()
-    assert (
-        "002: none of 6 boxes of moving actors within 40 m that a LiDAR could hit holds a" in line
-    )
+    assert "002: none of 6 boxes of moving actors within 40 m that a LiDAR could hit" in refusal()
 
 
 @pytest.mark.parametrize(("frames", "num_frames"), [(range(5), 6), (range(4), 4)])
@@ -127,8 +129,6 @@ def test_some_empty_boxes_are_left_to_the_doctor(
 
 
 def test_camera_that_sees_points_in_one_image_is_taken(pandaset, tmp_path):
-    def look_up_once(poses):
-        poses[0]["heading"] = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
-
-    edit_json(pandaset, "camera/right_camera/poses.json", look_up_once)
+    name = "camera/right_camera/poses.json"
+    edit_json(pandaset, name, lambda poses: poses[0]["heading"].update(UPRIGHT))
     assert pandaset.ingest(tmp_path / "store").is_dir()

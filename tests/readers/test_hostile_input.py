@@ -1,21 +1,20 @@
 """A bad log gets one clear line, nothing of it is run, and no half-written scene is left."""
 
-import errno
 import gzip
 import json
+import os
 import pickle
 import shutil
 import struct
 
 import numpy as np
 import pytest
+from fuzzing import judge
 from pickled_tables import pickled_table
 
-from lidarpainter_models.errors import DataError, LidarPainterError, UnsafePickleError, WriteError
-from lidarpainter_models.readers import ingest_scene
+from lidarpainter_models.errors import DataError, LidarPainterError, UnsafePickleError
 from lidarpainter_models.readers.pandaset import dataframe_pickle
 from lidarpainter_models.readers.pandaset.dataframe_pickle import read_table_bytes
-from lidarpainter_models.scenes import array_writer
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 
 
@@ -67,33 +66,25 @@ def test_truncated_image(pandaset, store, kept):
     assert "JPEG" in message
 
 
-def test_unknown_camera_names_the_known_ones(pandaset, store):
-    kind, message = refusal(pandaset, store, cameras=("front_camera", "roof_camera"))
-    assert kind is DataError
-    assert "no camera 'roof_camera', expected some of front_camera, front_left_camera" in message
+NAN_X = {"x": float("nan")}
 
 
-@pytest.mark.parametrize("folder", ["lidar", "camera/right_camera"])
-def test_nan_pose(pandaset, store, folder):
-    edit_json(pandaset, f"{folder}/poses.json", lambda p: p[1]["position"].update(x=float("nan")))
+@pytest.mark.parametrize(
+    ("name", "change", "expected"),
+    [
+        ("lidar/poses", lambda p: p[1]["position"].update(NAN_X), "poses.json, frame 1: x is nan"),
+        ("camera/right_camera/poses", lambda p: p[1]["position"].update(NAN_X), "frame 1: x is na"),
+        ("lidar/poses", lambda p: p[2]["heading"].update(w=7.0), "frame 2: the heading is no unit"),
+        ("camera/back_camera/poses", lambda p: p.pop(), "2 entries, expected 3, one per frame"),
+        ("camera/back_camera/intrinsics", lambda lens: lens.update(fx=-1), "must be positive"),
+    ],
+)
+def test_senseless_json(pandaset, store, name, change, expected):
+    edit_json(pandaset, f"{name}.json", change)
     kind, message = refusal(pandaset, store)
     assert kind is DataError
-    assert f"{folder}/poses.json, frame 1: x is nan, expected a finite number" in message
-
-
-def test_pose_without_a_unit_quaternion(pandaset, store):
-    edit_json(pandaset, "lidar/poses.json", lambda p: p[2]["heading"].update(w=7.0))
-    assert "frame 2: the heading is no unit quaternion" in refusal(pandaset, store)[1]
-
-
-def test_fewer_poses_than_frames(pandaset, store):
-    edit_json(pandaset, "camera/back_camera/poses.json", lambda poses: poses.pop())
-    assert "2 entries, expected 3, one per frame" in refusal(pandaset, store)[1]
-
-
-def test_negative_focal_length(pandaset, store):
-    edit_json(pandaset, "camera/back_camera/intrinsics.json", lambda lens: lens.update(fx=-1))
-    assert "focal lengths must be positive" in refusal(pandaset, store)[1]
+    assert f"{name}.json" in message
+    assert expected in message
 
 
 def test_json_of_another_shape(pandaset, store):
@@ -113,30 +104,27 @@ def empty_points(num_points=0):
     return {**columns, "d": np.zeros(num_points, dtype=np.int64)}
 
 
-def test_zero_points(pandaset, store):
-    pandaset.write_table("lidar/01.pkl.gz", empty_points())
+@pytest.mark.parametrize(
+    ("columns", "expected"),
+    [
+        (empty_points(), "zero points of a known LiDAR, expected at least one"),
+        ({**empty_points(5), "y": np.full(5, np.inf)}, "points or their times are not finite"),
+        (
+            {name: column for name, column in empty_points(5).items() if name != "t"},
+            "no column t; it has x, y, z, i, d",
+        ),
+        (
+            {**empty_points(2), "y": np.array(["a", "b"], dtype=object)},
+            "column y: holds something other than numbers",
+        ),
+    ],
+)
+def test_senseless_points(pandaset, store, columns, expected):
+    pandaset.write_table("lidar/01.pkl.gz", columns)
     kind, message = refusal(pandaset, store)
     assert kind is DataError
-    assert "lidar/01.pkl.gz: zero points of a known LiDAR, expected at least one" in message
-
-
-def test_points_that_are_not_finite(pandaset, store):
-    columns = {**empty_points(5), "y": np.full(5, np.inf)}
-    pandaset.write_table("lidar/01.pkl.gz", columns)
-    assert "01.pkl.gz: points or their times are not finite" in refusal(pandaset, store)[1]
-
-
-def test_table_without_a_column(pandaset, store):
-    columns = empty_points(5)
-    del columns["t"]
-    pandaset.write_table("lidar/01.pkl.gz", columns)
-    assert "01.pkl.gz: no column t; it has x, y, z, i, d" in refusal(pandaset, store)[1]
-
-
-def test_column_of_texts_where_numbers_belong(pandaset, store):
-    columns = {**empty_points(2), "y": np.array(["a", "b"], dtype=object)}
-    pandaset.write_table("lidar/01.pkl.gz", columns)
-    assert "column y: holds something other than numbers" in refusal(pandaset, store)[1]
+    assert "lidar/01.pkl.gz" in message
+    assert expected in message
 
 
 def test_classes_for_other_points(pandaset, store):
@@ -265,26 +253,51 @@ def test_senseless_pickle_is_one_line(program, tmp_path):
     assert "\n" not in str(raised.value)
 
 
-def test_full_disk(pandaset, store, monkeypatch):
-    def refuse(*_arguments):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(array_writer.ArrayAppender, "_flush", refuse)
-    kind, message = refusal(pandaset, store)
-    assert kind is WriteError
-    assert "002: cannot be written: No space left on device; free some space" in message
-
-
-def test_failed_ingest_leaves_an_earlier_scene_as_it_was(pandaset, store):
-    path = pandaset.ingest(store)
-    before = (path / "manifest.json").read_bytes()
-    (pandaset.path / "camera/front_camera/02.jpg").write_bytes(b"\xff\xd8\xff")
-    with pytest.raises(DataError):
-        pandaset.ingest(store)
-    assert (path / "manifest.json").read_bytes() == before
-    assert [found.name for found in path.parent.iterdir()] == ["002"]
+def refused_table(log, content, tmp_path):
+    log.write("lidar/00.pkl.gz", gzip.compress(content, 1))
+    store = tmp_path / "store"
+    verdict = judge(
+        lambda: log.ingest(store), store=store, sandbox=tmp_path, named=("lidar/00.pkl.gz",)
+    )
+    assert verdict.outcome == "refused"
+    return verdict.error
 
 
-def test_unknown_dataset(tmp_path):
-    with pytest.raises(DataError, match="dataset 'nothing' is not known"):
-        ingest_scene("nothing", tmp_path, "002", tmp_path)
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (lambda: bytes(80_000_000), "unpacks to more than"),
+        # a pickle of endless marks
+        (lambda: b"\x80\x03" + b"(" * 600_000 + b"t" * 600_000 + b".", "more than 100000 opcodes"),
+        # a deep tuple as a key, which must not be hashed
+        (lambda: b"\x80\x03}N" + b"\x85" * 90_000 + b"Ns.", "a key is neither"),
+        (
+            lambda: pickled_table({name: np.zeros(1_000_001, np.int8) for name in "xyzitd"}),
+            "1000001 rows, expected at most 1000000",
+        ),
+    ],
+)
+def test_table_without_bounds_is_refused_soon(pandaset, tmp_path, content, complaint):
+    assert complaint in refused_table(pandaset, content(), tmp_path)
+
+
+def test_image_that_states_more_than_it_may_is_refused(pandaset, store):
+    file = pandaset.path / "camera/front_camera/00.jpg"
+    content = bytearray(file.read_bytes())
+    start = content.index(b"\xff\xc0") + 5
+    content[start : start + 4] = b"\xff\xff\xff\xff"
+    file.write_bytes(content)
+    assert "states 65535 x 65535 px" in refusal(pandaset, store)[1]
+
+
+def test_pipe_in_the_place_of_a_file_is_refused(pandaset, store):
+    file = pandaset.path / "lidar/00.pkl.gz"
+    file.unlink()
+    os.mkfifo(file)
+    assert refusal(pandaset, store)[1].endswith("not a file")
+
+
+def test_time_beyond_all_nanoseconds_is_refused(pandaset, store):
+    pandaset.write("lidar/timestamps.json", b"[1e308, 1.0, 2.0]")
+    line = refusal(pandaset, store)[1]
+    assert "timestamps.json: expected a list of times in seconds" in line

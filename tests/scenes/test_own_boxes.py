@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from lidarpainter_models.checks.actors import check_own_boxes
+from lidarpainter_models.scenes.driving_scene import driven_road
 from lidarpainter_models.scenes.own_boxes import own_places, without_own_boxes
 
 
@@ -26,9 +27,9 @@ def around_the_car(scene, size_m, *, height_m=0.8, rows=slice(None)):
 
 
 def without(scene, *tracks):
-    path = scene.frame_timestamps_ns, scene.world_from_ego
-    places = own_places(scene.views, scene.sweeps, *path)
-    return without_own_boxes((*scene.tracks, *tracks), places, *path)
+    ego = driven_road(scene)
+    places = own_places(scene.views, scene.sweeps, ego)
+    return without_own_boxes((*scene.tracks, *tracks), places, ego)
 
 
 @pytest.mark.parametrize("size_m", [(4.8, 2.0, 1.7), (14.0, 8.0, 4.0)], ids=["car", "far larger"])

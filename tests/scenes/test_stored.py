@@ -9,9 +9,8 @@ import zarr
 
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.transforms import is_rigid
-from lidarpainter_models.scenes import schema
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from lidarpainter_models.scenes.stored import StoredScene, stored_digest
+from lidarpainter_models.scenes.stored import stored_digest
 
 
 @pytest.fixture
@@ -20,17 +19,6 @@ def copied_scene(small_scene, tmp_path):
     path = tmp_path / "scene"
     shutil.copytree(small_scene.path, path)
     return path
-
-
-def test_scene_is_where_the_store_keeps_scenes(small_scene):
-    store = small_scene.path.parents[2]
-    assert store / "scenes" / "pandaset" / "002" == small_scene.path
-
-
-def test_every_table_has_the_columns_of_the_schema(small_scene):
-    stored = StoredScene(small_scene.path)
-    for name, columns in schema.TABLES.items():
-        assert stored.table(name).column_names == [column.name for column in columns]
 
 
 def test_poses_come_back_as_float64(small_scene):
@@ -49,12 +37,6 @@ def test_whole_content_is_what_was_written_until_one_number_changes(copied_scene
     (copied_scene / "manifest.json").write_text(json.dumps(manifest))
     with pytest.raises(SceneError, match="array point_intensity is not what was written"):
         DrivingScene.open(copied_scene).verify_content()
-
-
-def test_view_sweep_and_camera_are_found_by_name(small_scene):
-    assert small_scene.view(1, "back_camera").key == (1, "back_camera")
-    assert len(small_scene.views_of("back_camera")) == 3
-    assert small_scene.frame_position(2) == 2
 
 
 def test_asking_for_what_is_not_there_names_what_is(small_scene):

@@ -19,7 +19,8 @@ from scene_parts import (
     some_record,
 )
 
-from lidarpainter_models.checks.doctor import check_scene, draw_overlay
+from lidarpainter_models.checks.doctor import check_scene
+from lidarpainter_models.checks.overlay import draw_overlay
 from lidarpainter_models.errors import DataError, SceneError
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.scenes.driving_scene import DrivingScene

@@ -29,6 +29,15 @@ class SceneDifferences:
     num_points_in_other_boxes: int = 0
     """Of the true points, by their nearest point read."""
 
+    def require_rounding(self, *, metres, point_m, degrees):
+        """Refuse more than rounding of poses and points; all else must be as it was."""
+        assert self.intrinsics == self.num_other_images == 0
+        assert self.num_unpaired_boxes == self.num_points_in_other_boxes == 0
+        assert max(self.camera_centre_m, self.box_centre_m) < metres
+        assert max(self.camera_rotation_deg, self.box_rotation_deg) < degrees
+        assert self.point_m < point_m
+        assert self.box_size_m < 1e-6
+
 
 def scene_differences(truth, read, *, frames=None, camera_names=None):
     """Compare two `DrivingScene`s.

@@ -40,8 +40,8 @@ class RealFrame:
     def read(cls, path):
         segment = WaymoRecordSegment(path)
         frame = segment.read_frame(0)
-        sensors = segment.read_sensors(0)
-        return cls(segment, frame, {image.camera_name: image for image in sensors.images})
+        images, _ = segment.read_sensors(0)
+        return cls(segment, frame, {image.camera_name: image for image in images})
 
     def tracks(self) -> tuple[ActorTrack, ...]:
         """One box per label, at the time of the FRONT image: there are no points to ask."""

@@ -17,7 +17,7 @@ from lidarpainter_models.synthetic.street import sample_offsets
 from lidarpainter_models.synthetic.textures.noise import as_rgba
 from lidarpainter_models.synthetic.textures.surfaces import StreetClass, Surface, SurfaceSet
 from lidarpainter_models.synthetic.world.meshes import Mesh, MeshBuilder
-from lidarpainter_models.synthetic.world.packing import Light, MovingMesh, pack_scene
+from lidarpainter_models.synthetic.world.packing import light_array, pack_scene
 from lidarpainter_models.synthetic.world.solids import add_ball, add_box, add_tube
 
 WIDTH_PX, HEIGHT_PX = 40, 24
@@ -30,7 +30,8 @@ class World:
 
     def __init__(self, sun=(0.0, 0.0, 1.0)):
         self.surfaces, self.builder = SurfaceSet(), MeshBuilder()
-        self.light = Light(sun_direction=sun)
+        air = {"haze_per_m": 1 / 1400, "cloud_texture": 0, "cloud_offset": (0.0, 0.0)}
+        self.light = light_array(sun, sun_rgb=(2.5, 2.3, 1.95), **air)
         self.grey = self.surfaces.add(Surface(semantics=StreetClass.BUILDING, tint=(0.3, 0.3, 0.3)))
 
     def arrays(self, moving=()):
@@ -183,7 +184,7 @@ def moving_box(actor=3):
     world = World()
     builder = MeshBuilder()
     add_box(builder, (0, 0, 0), (2.0, 2.0, 2.0), world.grey)
-    return world, MovingMesh(builder.build(), actor)
+    return world, (builder.build(), actor)
 
 
 def test_a_moving_mesh_is_drawn_where_its_box_is():

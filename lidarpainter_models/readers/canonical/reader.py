@@ -15,26 +15,20 @@ from typing import Any
 import torch
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.readers.canonical.checks import (
     MAX_MANIFEST_BYTES,
     read_foreign_manifest,
     read_small_json,
 )
-from lidarpainter_models.readers.source_logs.frame_content import (
+from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames, naming
+from lidarpainter_models.scenes import schema
+from lidarpainter_models.scenes.driving_scene import image_of_row
+from lidarpainter_models.scenes.frame_content import (
     FrameContent,
     SourceImage,
     SourceSweep,
 )
-from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames, naming
-from lidarpainter_models.scenes import schema
-from lidarpainter_models.scenes.records import (
-    BoxRecord,
-    Distortion,
-    ImageRecord,
-    RollingShutter,
-    SweepPoints,
-)
+from lidarpainter_models.scenes.records import BoxRecord, SweepPoints
 from lidarpainter_models.scenes.stored import StoredScene
 from lidarpainter_models.scenes.validation import SHUTTER_DIRECTIONS, require_name, require_pose
 from lidarpainter_models.scenes.writer import SceneHeader
@@ -95,14 +89,7 @@ class ForeignScene:
     def __init__(
         self, root: Path, sequence: str, frames: slice | None, cameras: tuple[str, ...] | None
     ) -> None:
-        """Check one scene folder, all of it.
-
-        The root holds the scene folders, or is the scene folder itself. Frames are taken by
-        position, cameras by name; None takes all.
-
-        Raises:
-            DataError: something of the scene is missing, damaged or makes no sense.
-        """
+        """Check one scene folder, all of it, see `open_log`; the root may be the folder itself."""
         self.folder = _scene_folder(root, sequence)
         if not self.folder.is_dir():
             raise DataError(f"{self.folder}: no such scene folder")
@@ -186,30 +173,13 @@ class ForeignScene:
         if not 0 <= row["num_bytes"] <= _MAX_JPEG_BYTES:
             raise DataError(f"{where}: an image of {row['num_bytes']} bytes")
         jpeg = self.stored.read_rows("image_bytes", row["offset"], row["num_bytes"])
-        shutter = None
-        if row["rolling_shutter_s"] is not None:
-            if row["rolling_shutter_direction"] not in SHUTTER_DIRECTIONS:
-                raise DataError(f"{where}: the rolling shutter reads in no known direction")
-            shutter = RollingShutter(
-                duration_s=row["rolling_shutter_s"],
-                direction=row["rolling_shutter_direction"],
-                first_row_s=row["rolling_shutter_first_row_s"],
-            )
-        lens = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
-        camera = Camera(
-            world_from_camera=require_pose(_pose(row["world_from_camera"]), where),
-            **{name: row[name] for name in lens},
-        )
-        terms = row["distortion_terms"]
-        if any(term is None for term in terms):
+        is_rolling = row["rolling_shutter_s"] is not None
+        if is_rolling and row["rolling_shutter_direction"] not in SHUTTER_DIRECTIONS:
+            raise DataError(f"{where}: the rolling shutter reads in no known direction")
+        pose = require_pose(_pose(row["world_from_camera"]), where)
+        if any(term is None for term in row["distortion_terms"]):
             raise DataError(f"{where}: a distortion term is empty")
-        record = ImageRecord(
-            camera_name=row["camera"],
-            timestamp_ns=row["timestamp_ns"],
-            camera=camera,
-            distortion=Distortion(row["distortion_model"], tuple(terms)),
-            rolling_shutter=shutter,
-        )
+        record = image_of_row(row, pose)
         return SourceImage(record=record, jpeg=jpeg.tobytes(), source=where)
 
     def _sweep(self, row: dict[str, Any]) -> SourceSweep:

@@ -28,6 +28,7 @@ from lidarpainter_models.readers.nuscenes.dataset import NuscenesTables, Sample
 from lidarpainter_models.readers.nuscenes.recordings import LIDAR_NAME, Recording
 from lidarpainter_models.readers.nuscenes.rows import TableRow
 from lidarpainter_models.readers.nuscenes.sweeps import turn_offset_ns
+from lidarpainter_models.readers.source_logs.log import naming
 from lidarpainter_models.scenes.tracks import does_move
 from lidarpainter_models.scenes.validation import require_name, require_size
 
@@ -124,10 +125,8 @@ def _read_boxes(
 
 def _read_category(tables: NuscenesTables, instance: str, asked_by: str) -> str:
     row = tables["instance"].row(instance, asked_by)
-    try:
+    with naming(row.where):
         require_name(instance, "actor")
-    except DataError as error:
-        raise DataError(f"{row.where}: {error}") from None
     return tables["category"].row(row.text("category_token"), row.where).text("name")
 
 

@@ -9,7 +9,6 @@ import stat
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
 
 from lidarpainter_models.errors import DataError
 from lidarpainter_models.readers.nuscenes.rows import TableRow, shown
@@ -32,14 +31,6 @@ _KEYS = {
 """The tables that are read and the column each is looked up by."""
 
 
-class _Stamp(NamedTuple):
-    """Tells a table from one that has taken its place."""
-
-    size: int
-    changed_ns: int
-    inode: int
-
-
 class NuscenesTables:
     """The tables of one version, each read when first asked for."""
 
@@ -54,7 +45,7 @@ class NuscenesTables:
             raise DataError(f"{path}: the table is missing") from None
         if not stat.S_ISREG(status.st_mode):  # a pipe would be waited for without end
             raise DataError(f"{path}: not a file")
-        stamp = _Stamp(status.st_size, status.st_mtime_ns, status.st_ino)
+        stamp = (status.st_size, status.st_mtime_ns, status.st_ino)
         return _read_table(path, _KEYS[name], stamp)
 
     def digests(self) -> dict[str, str]:
@@ -63,7 +54,7 @@ class NuscenesTables:
 
 
 @lru_cache(maxsize=3 * len(_KEYS))
-def _read_table(path: Path, key: str, stamp: _Stamp) -> NuscenesTable:  # noqa: ARG001
+def _read_table(path: Path, key: str, stamp: tuple[int, ...]) -> NuscenesTable:  # noqa: ARG001
     """One table, kept for the next sequence; `stamp` makes a changed file be read anew."""
     return NuscenesTable(path, key)
 

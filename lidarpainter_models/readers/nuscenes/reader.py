@@ -41,12 +41,12 @@ from lidarpainter_models.readers.nuscenes.recordings import (
 from lidarpainter_models.readers.nuscenes.sweeps import TURN_NS, LidarPoints, read_lidar_points
 from lidarpainter_models.readers.source_logs.drive_poses import level_frame, pose_at
 from lidarpainter_models.readers.source_logs.folder import SourceFolder
-from lidarpainter_models.readers.source_logs.frame_content import (
+from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames
+from lidarpainter_models.scenes.frame_content import (
     FrameContent,
     SourceImage,
     SourceSweep,
 )
-from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, SweepPoints
 from lidarpainter_models.scenes.schema import GLOBAL_FRAME
 from lidarpainter_models.scenes.writer import SceneHeader
@@ -73,14 +73,7 @@ class NuscenesLog:
     def __init__(
         self, root: Path, sequence: str, frames: slice | None, cameras: tuple[str, ...] | None
     ) -> None:
-        """Open a scene.
-
-        The root holds `v1.0-*`, `samples` and `sweeps`. Sweeps are taken by position, cameras by
-        channel; None takes all.
-
-        Raises:
-            DataError: something in the tables is missing, damaged or makes no sense.
-        """
+        """Open a scene, see `open_log`; the root holds `v1.0-*`, `samples` and `sweeps`."""
         self.place, self.sequence = str(root), sequence
         self.source = SourceFolder(root)
         self._tables, scene = find_scene(root, sequence)

@@ -6,12 +6,11 @@ from pathlib import PurePosixPath
 from typing import Any, TypeGuard
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.geometry.transforms import rigid_from_rotation, rotation_from_quaternion
+from lidarpainter_models.readers.source_logs.drive_poses import stated_pose
 
 NS_PER_US = 1_000
 MAX_NUMBER = 1e7
@@ -67,11 +66,10 @@ class TableRow:
 
     def pose(self) -> Float[Tensor, "4 4"]:
         """The transform of `translation` (metres) and `rotation` (w, x, y, z), float64."""
-        rotation_wxyz = torch.tensor(self.numbers("rotation", 4), dtype=torch.float64)
-        if not 0.99 < float(rotation_wxyz.norm()) < 1.01:
+        pose = stated_pose(self.numbers("rotation", 4), self.numbers("translation", 3))
+        if pose is None:
             raise self.refusal("rotation", "a unit quaternion")
-        translation_m = torch.tensor(self.numbers("translation", 3), dtype=torch.float64)
-        return rigid_from_rotation(rotation_from_quaternion(rotation_wxyz), translation_m)
+        return pose
 
     def intrinsics(self) -> dict[str, float]:
         """fx_px, fy_px, cx_px and cy_px of `camera_intrinsic`, a 3x3 pinhole matrix."""

@@ -116,7 +116,7 @@ class _RowStream:
         self._path = path
         self._decoder = json.JSONDecoder()
         self._digest = hashlib.sha256()
-        self._text, self._base, self._position, self._is_over = "", 0, 0, False
+        self._text, self._base, self._position = "", 0, 0
 
     @property
     def sha256(self) -> str:

@@ -20,8 +20,7 @@ from collections import Counter
 import numpy as np
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.readers.pandaset.dataframe_pickle import Table
-from lidarpainter_models.readers.pandaset.tables import read_table
+from lidarpainter_models.readers.pandaset.dataframe_pickle import Table, read_table
 from lidarpainter_models.readers.source_logs.folder import SourceFolder
 from lidarpainter_models.readers.source_logs.swept_boxes import FORWARD, SPINNING, SourceBox
 from lidarpainter_models.scenes.schema import is_safe_name
@@ -44,7 +43,7 @@ def read_boxes(source: SourceFolder, frame_index: int) -> Table:
     Raises:
         DataError: the table is damaged, or a box has no place, size, heading, id or category.
     """
-    name = boxes_file(frame_index)
+    name = f"annotations/cuboids/{frame_index:02d}.pkl.gz"
     table = read_table(source, name, BOX_NUMBERS, texts=BOX_TEXTS, max_rows=MAX_BOXES)
     for row in range(len(table["yaw"])):
         kind, actor_id = table["label"][row], str(table["uuid"][row])
@@ -62,11 +61,6 @@ def read_boxes(source: SourceFolder, frame_index: int) -> Table:
     if not np.isin(table["cuboids.sensor_id"], (-1, SPINNING, FORWARD)).all():
         raise DataError(f"{source.root / name}: a sensor_id is none of -1, 0 and 1")
     return table
-
-
-def boxes_file(frame_index: int) -> str:
-    """Where the boxes of a frame lie."""
-    return f"annotations/cuboids/{frame_index:02d}.pkl.gz"
 
 
 def merge_boxes(tables: dict[int, Table]) -> dict[int, list[SourceBox]]:

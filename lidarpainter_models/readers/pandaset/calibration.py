@@ -13,8 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.geometry.transforms import rigid_from_rotation, rotation_from_quaternion
-from lidarpainter_models.readers.source_logs.drive_poses import nanoseconds
+from lidarpainter_models.readers.source_logs.drive_poses import nanoseconds, stated_pose
 from lidarpainter_models.readers.source_logs.folder import SourceFolder
 from lidarpainter_models.scenes.validation import require_time
 
@@ -95,13 +94,11 @@ def _pose(entry: Any, where: str) -> Float[Tensor, "4 4"]:  # noqa: ANN401
     )
     if not (isinstance(position, dict) and isinstance(heading, dict)):
         raise DataError(f"{where}: expected a position and a heading")
-    numbers = [_number(position, axis, where) for axis in "xyz"]
-    translation_m = torch.tensor(numbers, dtype=torch.float64)
-    numbers = [_number(heading, axis, where) for axis in "wxyz"]
-    rotation_wxyz = torch.tensor(numbers, dtype=torch.float64)
-    if not 0.99 < float(rotation_wxyz.norm()) < 1.01:
+    translation_m = [_number(position, axis, where) for axis in "xyz"]
+    pose = stated_pose([_number(heading, axis, where) for axis in "wxyz"], translation_m)
+    if pose is None:
         raise DataError(f"{where}: the heading is no unit quaternion")
-    return rigid_from_rotation(rotation_from_quaternion(rotation_wxyz), translation_m)
+    return pose
 
 
 def _one_per_frame(values: list, num_frames: int | None, where: str) -> list:

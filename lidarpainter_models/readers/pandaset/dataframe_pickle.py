@@ -16,6 +16,7 @@ import numpy as np
 
 from lidarpainter_models.errors import DataError, UnsafePickleError
 from lidarpainter_models.readers.pandaset.pickle_tree import Made, Named, read_pickle_tree
+from lidarpainter_models.readers.source_logs.folder import SourceFolder
 from lidarpainter_models.scenes.validation import shown
 
 MAX_TABLE_BYTES = 64 * 1024 * 1024
@@ -30,45 +31,71 @@ _GZIP_WINDOW_BITS = 31
 Table = dict[str, np.ndarray]
 """Columns by name, all of one length."""
 
-_FRAMES = frozenset({Named("pandas.core.frame", "DataFrame"), Named("pandas", "DataFrame")})
-_MANAGERS = frozenset(
-    {
-        Named("pandas.core.internals.managers", "BlockManager"),
-        Named("pandas.core.internals", "BlockManager"),
-    }
+
+def _known_as(name: str, *modules: str) -> frozenset[Named]:
+    return frozenset(Named(module, name) for module in modules)
+
+
+_FRAMES = _known_as("DataFrame", "pandas.core.frame", "pandas")
+_INTERNALS = "pandas.core.internals"
+_MANAGERS = _known_as("BlockManager", f"{_INTERNALS}.managers", _INTERNALS)
+_NEW_INDEX = _known_as("_new_Index", "pandas.core.indexes.base")
+_INDEX_KINDS = (
+    _known_as("Index", "pandas.core.indexes.base", "pandas")
+    | _known_as("RangeIndex", "pandas.core.indexes.range", "pandas")
+    | _known_as("Int64Index", "pandas.core.indexes.numeric")
 )
-_NEW_INDEX = Named("pandas.core.indexes.base", "_new_Index")
-_INDEX_KINDS = frozenset(
-    {
-        Named("pandas.core.indexes.base", "Index"),
-        Named("pandas", "Index"),
-        Named("pandas.core.indexes.range", "RangeIndex"),
-        Named("pandas", "RangeIndex"),
-        Named("pandas.core.indexes.numeric", "Int64Index"),
-    }
-)
-_BLOCKS = frozenset(
-    {
-        Named("pandas._libs.internals", "_unpickle_block"),
-        Named("pandas.core.internals.blocks", "new_block"),
-    }
-)
-_SLICES = frozenset({Named("builtins", "slice"), Named("__builtin__", "slice")})
-_ENCODE = Named("_codecs", "encode")
-_DTYPE = Named("numpy", "dtype")
-_RECONSTRUCT = frozenset(
-    Named(f"numpy.{core}.multiarray", "_reconstruct") for core in ("core", "_core")
-)
-_FROM_BUFFER = frozenset(
-    Named(f"numpy.{core}.numeric", "_frombuffer") for core in ("core", "_core")
-)
-ALLOWED_NAMES = frozenset(
-    {*_FRAMES, *_MANAGERS, *_INDEX_KINDS, *_BLOCKS, *_SLICES, *_RECONSTRUCT, *_FROM_BUFFER}
-    | {_NEW_INDEX, _ENCODE, _DTYPE, Named("numpy", "ndarray")}
+_BLOCKS = _known_as("_unpickle_block", "pandas._libs.internals")
+_BLOCKS |= _known_as("new_block", f"{_INTERNALS}.blocks")
+_SLICES = _known_as("slice", "builtins", "__builtin__")
+_ENCODE = _known_as("encode", "_codecs")
+_DTYPE = _known_as("dtype", "numpy")
+_RECONSTRUCT = _known_as("_reconstruct", "numpy.core.multiarray", "numpy._core.multiarray")
+_FROM_BUFFER = _known_as("_frombuffer", "numpy.core.numeric", "numpy._core.numeric")
+ALLOWED_NAMES = frozenset().union(
+    *(_FRAMES, _MANAGERS, _NEW_INDEX, _INDEX_KINDS, _BLOCKS, _SLICES, _ENCODE, _DTYPE),
+    *(_RECONSTRUCT, _FROM_BUFFER, _known_as("ndarray", "numpy")),
 )
 _NUMBER_CODE = re.compile(r"b1|[iu][1248]|f[248]")
 _GZIP_MAGIC = b"\x1f\x8b"
 _BYTE_ORDERS = ("<", ">", "=", "|")
+
+
+def read_table(
+    source: SourceFolder,
+    name: str,
+    numbers: tuple[str, ...],
+    *,
+    texts: tuple[str, ...] = (),
+    max_rows: int = MAX_TABLE_ROWS,
+) -> Table:
+    """The named columns of one table, gzipped under this name or unpacked under it without `.gz`.
+
+    Columns of numbers and flags come as float64 or int64, columns of texts as they are.
+
+    Raises:
+        DataError: the file cannot be read, or lacks a column.
+    """
+    if not (source.root / name).exists() and (source.root / name).with_suffix("").exists():
+        name = name.removesuffix(".gz")
+    path = source.root / name
+    table = read_table_bytes(source.read_bytes(name), path, max_rows=max_rows)
+    missing = [column for column in (*numbers, *texts) if column not in table]
+    if missing:
+        found = shown(", ".join(table))
+        raise DataError(f"{path}: no column {', '.join(missing)}; it has {found}")
+    return {
+        **{column: _numbers(table[column], f"{path}, column {column}") for column in numbers},
+        **{column: table[column] for column in texts},
+    }
+
+
+def _numbers(column: np.ndarray, where: str) -> np.ndarray:
+    kind = np.int64 if column.dtype.kind in "biu" else np.float64
+    try:
+        return column.astype(kind, copy=False)
+    except (TypeError, ValueError, OverflowError):
+        raise DataError(f"{where}: holds something other than numbers") from None
 
 
 def read_table_bytes(
@@ -172,7 +199,7 @@ def _blocks(manager: Made) -> tuple[list[str], list[tuple[np.ndarray, list[int]]
 
 
 def _index_values(index: Made) -> list[Any]:
-    if index.by != _NEW_INDEX or len(index.arguments) != 2:
+    if index.by not in _NEW_INDEX or len(index.arguments) != 2:
         raise DataError("the column names of the pandas table are not understood")
     return list(_array(index.arguments[1]["data"]))
 
@@ -193,7 +220,7 @@ def _array(made: Made) -> np.ndarray:
         content, dtype, shape, order = made.arguments
     else:
         raise DataError(f"an array is made by {made.by}, which is not understood")
-    if isinstance(content, Made) and content.by == _ENCODE:
+    if isinstance(content, Made) and content.by in _ENCODE:
         content = content.arguments[0]
     sizes = tuple(operator.index(size) for size in shape)
     if not 1 <= len(sizes) <= 2 or min(sizes) < 0:
@@ -217,7 +244,7 @@ def _flat_array(content: object, kind: np.dtype) -> np.ndarray:
 def _dtype(dtype: Made) -> np.dtype:
     text = dtype.arguments[0]
     code = text.lstrip("<>|=") if isinstance(text, str) else ""
-    if dtype.by != _DTYPE or (code[:1] != "O" and not _NUMBER_CODE.fullmatch(code)):
+    if dtype.by not in _DTYPE or (code[:1] != "O" and not _NUMBER_CODE.fullmatch(code)):
         raise DataError(f"column type {code!r:.50} is not a number, a flag or a text")
     if code[:1] == "O":
         return np.dtype(object)

@@ -40,21 +40,11 @@ MAX_OPCODES = 100_000
 """A pickle with more is refused; those of PandaSet have a few thousand."""
 
 _MARK = object()
-_CONSTANTS: dict[str, Callable[[], Any]] = {
-    "NONE": lambda: None,
-    "NEWTRUE": lambda: True,
-    "NEWFALSE": lambda: False,
-    "EMPTY_TUPLE": tuple,
-    "EMPTY_LIST": list,
-    "EMPTY_DICT": dict,
-}
 _LITERALS = (
     *("INT", "LONG", "FLOAT", "BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT"),
     *("STRING", "BINSTRING", "SHORT_BINSTRING", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE"),
     *("BINUNICODE8", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8"),
 )
-_IGNORED = frozenset({"PROTO", "FRAME"})
-_TUPLE_SIZES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 
 
 class _Machine:
@@ -67,10 +57,20 @@ class _Machine:
         self.memo: dict[int, Any] = {}
         self.actions: dict[str, Callable[[Any], object]] = {
             **dict.fromkeys(_LITERALS, self.stack.append),
-            **{name: self._push_constant(make) for name, make in _CONSTANTS.items()},
-            **{name: self._push_tuple(size) for name, size in _TUPLE_SIZES.items()},
+            **dict.fromkeys(("PROTO", "FRAME"), lambda _: None),
+            "NONE": lambda _: self.stack.append(None),
+            "NEWTRUE": lambda _: self.stack.append(True),
+            "NEWFALSE": lambda _: self.stack.append(False),
+            "EMPTY_TUPLE": lambda _: self.stack.append(()),
+            "EMPTY_LIST": lambda _: self.stack.append([]),
+            "EMPTY_DICT": lambda _: self.stack.append({}),
+            "TUPLE1": lambda _: self._push_tuple(1),
+            "TUPLE2": lambda _: self._push_tuple(2),
+            "TUPLE3": lambda _: self._push_tuple(3),
             "MARK": lambda _: self._mark(),
-            **dict.fromkeys(("BINGET", "LONG_BINGET", "GET"), self._get),
+            **dict.fromkeys(
+                ("BINGET", "LONG_BINGET", "GET"), lambda key: self.stack.append(self.memo[key])
+            ),
             **dict.fromkeys(("BINPUT", "LONG_BINPUT", "PUT"), self._put),
             **dict.fromkeys(("REDUCE", "NEWOBJ"), self._make),
             "MEMOIZE": lambda _: self._put(len(self.memo)),
@@ -89,16 +89,10 @@ class _Machine:
             "DUP": lambda _: self.stack.append(self.stack[-1]),
         }
 
-    def _push_constant(self, make: Callable[[], Any]) -> Callable[[Any], None]:
-        return lambda _: self.stack.append(make())
-
-    def _push_tuple(self, size: int) -> Callable[[Any], None]:
-        def push(_: object) -> None:
-            items = tuple(self.stack[-size:])
-            del self.stack[-size:]
-            self.stack.append(items)
-
-        return push
+    def _push_tuple(self, size: int) -> None:
+        items = tuple(self.stack[-size:])
+        del self.stack[-size:]
+        self.stack.append(items)
 
     def _mark(self) -> None:
         self.marks.append(len(self.stack))
@@ -111,9 +105,6 @@ class _Machine:
         items = self.stack[position + 1 :]
         del self.stack[position:]
         return items
-
-    def _get(self, key: int) -> None:
-        self.stack.append(self.memo[key])
 
     def _put(self, key: int) -> None:
         self.memo[key] = self.stack[-1]
@@ -167,8 +158,6 @@ def read_pickle_tree(content: bytes, allowed: Iterable[Named]) -> Any:  # noqa: 
                 raise DataError(f"the pickle has more than {MAX_OPCODES} opcodes")
             if opcode.name == "STOP":
                 return machine.stack.pop()
-            if opcode.name in _IGNORED:
-                continue
             action = machine.actions.get(opcode.name)
             if action is None:
                 raise UnsafePickleError(

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.readers.pandaset.tables import read_table
+from lidarpainter_models.readers.pandaset.dataframe_pickle import read_table
 from lidarpainter_models.readers.source_logs.drive_poses import NS_PER_S
 from lidarpainter_models.readers.source_logs.folder import SourceFolder
 from lidarpainter_models.scenes.records import SweepPoints

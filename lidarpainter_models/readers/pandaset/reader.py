@@ -40,16 +40,15 @@ from lidarpainter_models.readers.source_logs.drive_poses import (
     level_frame,
     nanoseconds,
     pose_at,
-    turned_about_up,
 )
 from lidarpainter_models.readers.source_logs.folder import SourceFolder
-from lidarpainter_models.readers.source_logs.frame_content import (
+from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames
+from lidarpainter_models.readers.source_logs.swept_boxes import SweepTimes, moving_actors
+from lidarpainter_models.scenes.frame_content import (
     FrameContent,
     SourceImage,
     SourceSweep,
 )
-from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames
-from lidarpainter_models.readers.source_logs.swept_boxes import SweepTimes, moving_actors
 from lidarpainter_models.scenes.records import BoxRecord, ImageRecord, RollingShutter
 from lidarpainter_models.scenes.validation import jpeg_header_size, require_classes
 from lidarpainter_models.scenes.writer import SceneHeader
@@ -91,13 +90,7 @@ class PandasetLog:
     def __init__(
         self, root: Path, sequence: str, frames: slice | None, cameras: tuple[str, ...] | None
     ) -> None:
-        """Open a sequence.
-
-        Frames are taken by position, cameras by name; None takes all.
-
-        Raises:
-            DataError: something in the log is missing, damaged or makes no sense.
-        """
+        """Open a sequence, see `open_log`."""
         folder = root / sequence
         self.place, self.sequence = str(folder), sequence
         if not folder.is_dir():
@@ -197,19 +190,9 @@ class PandasetLog:
         times = SweepTimes(points.xyz_m, points.time_s, points.sensor, lidar_m)
         records = []
         for box in self.boxes[frame_index]:
-            global_from_box = turned_about_up(box.yaw_rad, torch.from_numpy(box.centre_m))
-            rows = times.inside(box)
-            records.append(
-                BoxRecord(
-                    actor_id=box.actor_id,
-                    category=box.category,
-                    timestamp_ns=nanoseconds(times.time_of(box, rows)),
-                    world_from_box=self.world_from_global @ global_from_box,
-                    size_m=box.size_m,
-                    is_moving=box.actor_id in self.moving,
-                    num_points=len(rows),
-                )
-            )
+            rows, is_moving = times.inside(box), box.actor_id in self.moving
+            stated = self.world_from_global, times.time_of(box, rows), len(rows)
+            records.append(box.record(*stated, is_moving=is_moving))
         return records
 
     def _global_from_lidar(self, timestamp_ns: int, sensor: int) -> Float[Tensor, "4 4"]:

@@ -19,11 +19,11 @@ from lidarpainter_models.checks.doctor import (
 )
 from lidarpainter_models.checks.lidar_reach import LidarReach, could_any_hit
 from lidarpainter_models.checks.sweep_agreement import nearest_gap_m, points_near
-from lidarpainter_models.checks.sweeps import sampled_positions
+from lidarpainter_models.checks.verdicts import sampled_positions
 from lidarpainter_models.errors import DataError
-from lidarpainter_models.geometry.transforms import quaternion_from_rotation
+from lidarpainter_models.geometry.transforms import turn_rad
 from lidarpainter_models.readers.source_logs.drive_poses import NS_PER_S
-from lidarpainter_models.readers.source_logs.frame_content import (
+from lidarpainter_models.scenes.frame_content import (
     FrameContent,
     SourceImage,
     SourceSweep,
@@ -139,9 +139,7 @@ class DriveChecks:
 
 def apart(first: Float[Tensor, "4 4"], second: Float[Tensor, "4 4"]) -> tuple[float, float]:
     """Distance of the origins in metres, and the angle between the axes in radians."""
-    apart_m = float((first[:3, 3] - second[:3, 3]).norm())
-    cosine = quaternion_from_rotation(first[:3, :3].T @ second[:3, :3])[0]
-    return apart_m, float(2 * torch.arccos(cosine.clamp(max=1.0)))
+    return float((first[:3, 3] - second[:3, 3]).norm()), float(turn_rad(first, second))
 
 
 def require_motion(

@@ -1,13 +1,18 @@
 """Poses and times along a drive, as every reader needs them."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.geometry.transforms import interpolate_rigid, rigid_from_rotation
+from lidarpainter_models.geometry.transforms import (
+    interpolate_rigid,
+    rigid_from_rotation,
+    rotation_from_quaternion,
+)
 
 NS_PER_S = 1_000_000_000
 
@@ -39,6 +44,17 @@ def turned_about_up(angle_rad: float, translation_m: Float[Tensor, "3"]) -> Floa
     cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
     rotation = [[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]
     return rigid_from_rotation(torch.tensor(rotation, dtype=torch.float64), translation_m)
+
+
+def stated_pose(
+    rotation_wxyz: Sequence[float], translation_m: Sequence[float]
+) -> Float[Tensor, "4 4"] | None:
+    """The pose that a log states, float64; None where the rotation is no unit quaternion."""
+    rotation = torch.tensor(rotation_wxyz, dtype=torch.float64)
+    if not 0.99 < float(rotation.norm()) < 1.01:
+        return None
+    translation = torch.tensor(translation_m, dtype=torch.float64)
+    return rigid_from_rotation(rotation_from_quaternion(rotation), translation)
 
 
 def nanoseconds(time_s: float) -> int:

@@ -2,10 +2,10 @@
 
 Unpacking, hashing and sorting release the interpreter, so a thread prepares the next frame while
 the last one is written. Frames are read in order by that one thread: a log may be a stream, what
-is stored does not depend on it, and never more than `num_ahead` + 1 frames are in memory.
+is stored does not depend on it, and never more than two frames are in memory: on two cores more
+only wait for the threads that check and write.
 """
 
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -14,11 +14,8 @@ from typing import Protocol, TypeVar, runtime_checkable
 
 from lidarpainter_models.errors import DataError, LidarPainterError, WriteError
 from lidarpainter_models.readers.source_logs.drive_checks import DriveChecks
-from lidarpainter_models.readers.source_logs.frame_content import FrameContent
+from lidarpainter_models.scenes.frame_content import FrameContent
 from lidarpainter_models.scenes.writer import SceneHeader, SceneWriter
-
-NUM_AHEAD = 1
-"""Beside the threads that check and write: on two cores more only wait for the others."""
 
 Progress = Callable[[int, int], None]
 """Told frames done and frames in all."""
@@ -48,16 +45,8 @@ class SourceLog(Protocol):
         ...
 
 
-def write_log(
-    log: SourceLog,
-    store: Path,
-    *,
-    progress: Progress | None = None,
-    num_ahead: int = NUM_AHEAD,
-) -> Path:
+def write_log(log: SourceLog, store: Path, *, progress: Progress | None = None) -> Path:
     """Write a log into the store as a canonical scene; gives the scene's path.
-
-    `num_ahead` frames are prepared before they are due.
 
     Raises:
         DataError: something in the log is missing, damaged or makes no sense.
@@ -68,7 +57,7 @@ def write_log(
     with (
         naming(log.place),
         SceneWriter(store, log.dataset, log.sequence, log.header) as writer,
-        read_ahead(log.read_frame, log.frame_indices, num_ahead=num_ahead) as contents,
+        read_ahead(log.read_frame, log.frame_indices) as contents,
     ):
         for done, content in enumerate(contents, start=1):
             with naming(content.place, within=log.place):
@@ -102,35 +91,27 @@ def naming(place: str, *, within: str | None = None) -> Iterator[None]:
 
 @contextmanager
 def read_ahead(
-    read: Callable[[int], Content], frame_indices: Sequence[int], *, num_ahead: int
+    read: Callable[[int], Content], frame_indices: Sequence[int]
 ) -> Iterator[Iterator[Content]]:
     """What `read` gives for each frame, in order; an error is raised when its frame is due.
 
-    With none ahead each frame is read when it is asked for. Leaving the block ends the thread.
+    Leaving the block ends the thread.
     """
-    if num_ahead == 0:
-        yield map(read, frame_indices)
-        return
     pool = ThreadPoolExecutor(1, thread_name_prefix="frame")
+
+    def in_order() -> Iterator[Content]:
+        ahead: Future[Content] | None = None
+        for frame_index in frame_indices:
+            due, ahead = ahead, pool.submit(read, frame_index)
+            if due is not None:
+                yield due.result()
+        if ahead is not None:
+            yield ahead.result()
+
     try:
-        yield _in_order(pool, read, frame_indices, num_ahead)
+        yield in_order()
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def _in_order(
-    pool: ThreadPoolExecutor,
-    read: Callable[[int], Content],
-    frame_indices: Sequence[int],
-    num_ahead: int,
-) -> Iterator[Content]:
-    waiting: deque[Future[Content]] = deque()
-    for frame_index in frame_indices:
-        waiting.append(pool.submit(read, frame_index))
-        if len(waiting) > num_ahead:
-            yield waiting.popleft().result()
-    while waiting:
-        yield waiting.popleft().result()
 
 
 def chosen_frames(num_frames: int, frames: slice | None, where: object) -> list[int]:

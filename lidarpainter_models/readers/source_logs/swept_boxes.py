@@ -8,7 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from lidarpainter_models.readers.source_logs.drive_poses import nanoseconds, turned_about_up
+from lidarpainter_models.scenes.records import BoxRecord
 from lidarpainter_models.scenes.tracks import does_move
 
 SPINNING, FORWARD = 0, 1
@@ -38,6 +42,26 @@ class SourceBox:
     size_m: tuple[float, float, float]
     """Length, width, height."""
     is_stationary: bool
+
+    def record(
+        self,
+        world_from_source: Float[Tensor, "4 4"],
+        time_s: float,
+        num_points: int,
+        *,
+        is_moving: bool,
+    ) -> BoxRecord:
+        """The box in the world, when it holds (since the epoch)."""
+        source_from_box = turned_about_up(self.yaw_rad, torch.from_numpy(self.centre_m))
+        return BoxRecord(
+            actor_id=self.actor_id,
+            category=self.category,
+            timestamp_ns=nanoseconds(time_s),
+            world_from_box=world_from_source @ source_from_box,
+            size_m=self.size_m,
+            is_moving=is_moving,
+            num_points=num_points,
+        )
 
 
 def moving_actors(frames: dict[int, list[SourceBox]], frame_time_s: dict[int, float]) -> set[str]:

@@ -14,11 +14,9 @@ stated to move and does so at 1 m/s on average.
 """
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.readers.source_logs.drive_poses import nanoseconds, turned_about_up
 from lidarpainter_models.readers.source_logs.swept_boxes import (
     FORWARD,
     MOVING_MPS,
@@ -42,24 +40,17 @@ class FramePoints:
         self.time_s = time_s
         """Of the frame's pose; where a LiDAR's columns have no time, that of its points."""
         self._top_position_m = top_position_m
-        self._parts: list[tuple[np.ndarray, np.ndarray, bool]] = []
+        self._parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
     def add(self, xyz_m: np.ndarray, offset_s: np.ndarray, *, is_top: bool) -> None:
         """Take the points of one LiDAR, each with its time after `time_s`."""
-        self._parts.append((xyz_m, offset_s, is_top))
+        sensor = np.full(len(xyz_m), SPINNING if is_top else FORWARD)
+        self._parts.append((xyz_m, offset_s, sensor))
 
     def times(self) -> SweepTimes:
         """When the LiDARs saw a place, in seconds after `time_s`."""
-        sensors = [
-            np.full(len(xyz_m), SPINNING if is_top else FORWARD)
-            for xyz_m, _offset_s, is_top in self._parts
-        ]
-        return SweepTimes(
-            np.concatenate([xyz_m for xyz_m, *_ in self._parts]),
-            np.concatenate([offset_s for _, offset_s, _ in self._parts]),
-            np.concatenate(sensors),
-            self._top_position_m,
-        )
+        xyz_m, offset_s, sensor = map(np.concatenate, zip(*self._parts, strict=True))
+        return SweepTimes(xyz_m, offset_s, sensor, self._top_position_m)
 
 
 def moving_ids(frames: list[WaymoFrame]) -> set[str]:
@@ -93,18 +84,8 @@ def box_records(
         box = _source_box(label, label.box if found is None else found[0])
         rows = times.inside(box)
         time_s = points.time_s + times.time_of(box, rows) if found is None else found[1]
-        vehicle_from_box = turned_about_up(box.yaw_rad, torch.from_numpy(box.centre_m))
-        records.append(
-            BoxRecord(
-                actor_id=label.actor_id,
-                category=label.category,
-                timestamp_ns=nanoseconds(time_s),
-                world_from_box=world_from_vehicle @ vehicle_from_box,
-                size_m=box.size_m,
-                is_moving=label.actor_id in moving,
-                num_points=len(rows),
-            )
-        )
+        is_moving = label.actor_id in moving
+        records.append(box.record(world_from_vehicle, time_s, len(rows), is_moving=is_moving))
     return records
 
 
@@ -112,10 +93,11 @@ def _synced(
     label: WaymoLabel, frame: WaymoFrame, clocks: dict[str, ImageClock]
 ) -> tuple[UprightBox, float] | None:
     """The camera-synced box and its time; None where the frame does not have both."""
-    if label.synced is None or label.synced.camera_name not in clocks:
+    camera_name, box = label.synced or ("", label.box)
+    if camera_name not in clocks:
         return None
-    box, pose = label.synced.box, frame.global_from_vehicle.numpy()
-    time_s = clocks[label.synced.camera_name].time_of(pose[:3, :3] @ box.centre_m + pose[:3, 3])
+    pose = frame.global_from_vehicle.numpy()
+    time_s = clocks[camera_name].time_of(pose[:3, :3] @ box.centre_m + pose[:3, 3])
     return None if time_s is None else (box, time_s)
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError
+from lidarpainter_models.readers.source_logs.log import naming
 from lidarpainter_models.readers.waymo.calibration import (
     CameraCalibration,
     LidarCalibration,
@@ -26,6 +27,8 @@ from lidarpainter_models.scenes.validation import require_name, require_size
 CATEGORIES = {0: "unknown", 1: "vehicle", 2: "pedestrian", 3: "sign", 4: "cyclist"}
 """By `Label.Type`, without its prefix."""
 MAX_LABELS = 10_000
+RANGE_CHANNELS, POSE_CHANNELS = 4, 6
+"""Of a pixel of a range image, and of its pose."""
 MAX_REACH_M = 1000.0
 """No label, point or image belongs to a frame from farther away."""
 MAX_LAG_S = 0.15
@@ -55,16 +58,8 @@ class WaymoLabel:
     box: UprightBox
     """As the LiDARs saw the actor."""
     speed_mps: float
-    synced: "SyncedBox | None"
-    """As the camera that sees most of the actor caught it, if it says so."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SyncedBox:
-    """A box moved to the moment at which a camera caught its centre."""
-
-    camera_name: str
-    box: UprightBox
+    synced: tuple[str, UprightBox] | None
+    """The camera that sees most of the actor and the box when it caught its centre, if stated."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,14 +107,6 @@ class WaymoSweep:
     place: str
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class WaymoSensors:
-    """What the sensors recorded in one frame."""
-
-    images: tuple[WaymoImage, ...]
-    sweeps: tuple[WaymoSweep, ...]
-
-
 @runtime_checkable
 class WaymoSegment(Protocol):
     """One segment in either release."""
@@ -138,13 +125,25 @@ class WaymoSegment(Protocol):
         """Time, pose and labels of one frame."""
         ...
 
-    def read_sensors(self, index: int) -> WaymoSensors:
+    def read_sensors(self, index: int) -> tuple[list[WaymoImage], list[WaymoSweep]]:
         """Images and range images of one frame; frames are asked for in ascending order."""
         ...
 
     def provenance(self) -> dict[str, object]:
         """What was read, with a digest."""
         ...
+
+
+def checked_speed(x_mps: float, y_mps: float, place: str) -> float:
+    """The level speed of a label.
+
+    Raises:
+        DataError: it is not finite.
+    """
+    speed_mps = math.hypot(x_mps, y_mps)
+    if not math.isfinite(speed_mps):
+        raise DataError(f"{place}: the speed is not finite")
+    return speed_mps
 
 
 def checked_frame(
@@ -253,10 +252,8 @@ def actor_name(object_id: str, place: str) -> str:
         DataError: the id is no name even so.
     """
     name = f"id{object_id}" if object_id[:1] in ("-", "_") else object_id
-    try:
+    with naming(place):
         return require_name(name, "actor")
-    except DataError as error:
-        raise DataError(f"{place}: {error}") from None
 
 
 def category_name(kind: int, place: str) -> str:

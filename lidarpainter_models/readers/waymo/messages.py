@@ -113,21 +113,13 @@ def parse_message(name: str, content: bytes, where: str) -> Any:  # noqa: ANN401
     Raises:
         DataError: the bytes are cut off, nest too deeply, or are no such message.
     """
-    message = new_message(name)
+    message = _CLASSES[name]()
     try:
         message.ParseFromString(content)
     except DecodeError as error:
-        raise DataError(f"{where}: not a {name} message ({_one_line(error)})") from None
+        reason = " ".join(str(error).split()) or "it cannot be decoded"
+        raise DataError(f"{where}: not a {name} message ({reason})") from None
     return message
-
-
-def new_message(name: str) -> Message:
-    """An empty message of a name above."""
-    return _CLASSES[name]()
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split()) or "it cannot be decoded"
 
 
 def _file_descriptor() -> descriptor_pb2.FileDescriptorProto:

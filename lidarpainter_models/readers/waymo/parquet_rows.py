@@ -42,31 +42,19 @@ class ParquetRow:
 
     def number(self, column: str) -> float:
         """A number; a truth value is none."""
-        value = self._value(column)
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            return float(value)
-        raise DataError(f"{self.place}, {column}: {value!r}, expected a number")
+        return float(self._value(column, (int, float), "a number"))
 
     def whole_number(self, column: str) -> int:
         """A whole number."""
-        value = self._value(column)
-        if isinstance(value, int) and not isinstance(value, bool):
-            return value
-        raise DataError(f"{self.place}, {column}: {value!r}, expected a whole number")
+        return self._value(column, (int,), "a whole number")
 
     def text(self, column: str) -> str:
         """A text."""
-        value = self._value(column)
-        if isinstance(value, str):
-            return value
-        raise DataError(f"{self.place}, {column}: {value!r}, expected a text")
+        return self._value(column, (str,), "a text")
 
     def content(self, column: str) -> bytes:
         """A file's bytes."""
-        value = self._value(column)
-        if isinstance(value, bytes):
-            return value
-        raise DataError(f"{self.place}, {column}: {type(value).__name__}, expected bytes")
+        return self._value(column, (bytes,), "bytes")
 
     def numbers(self, column: str) -> np.ndarray:
         """A list of numbers; empty where the list is absent."""
@@ -81,10 +69,12 @@ class ParquetRow:
             raise DataError(f"{self.place}, {column}: a number of the list is absent")
         return value.to_numpy(zero_copy_only=False)
 
-    def _value(self, column: str) -> Any:  # noqa: ANN401
+    def _value(self, column: str, kinds: tuple[type, ...], expected: str) -> Any:  # noqa: ANN401
         value = self.values[column]
         if value is None:
             raise DataError(f"{self.place}, {column}: is empty")
+        if isinstance(value, bool) or not isinstance(value, kinds):
+            raise DataError(f"{self.place}, {column}: {value!r:.60}, expected {expected}")
         return value
 
 

@@ -114,7 +114,9 @@ def range_points(
     _require_first_echoes(sweep)
     inclination = calibration.row_inclinations_rad(num_rows, sweep.place)
     turned = calibration.vehicle_from_lidar[:2, 0].numpy()
-    azimuth = column_azimuths_rad(num_columns) - np.arctan2(turned[1], turned[0])
+    # of each column about the vehicle's z, counter-clockwise from ahead
+    azimuth = np.pi * (1 - 2 * (np.arange(num_columns) + 0.5) / num_columns)
+    azimuth -= np.arctan2(turned[1], turned[0])
     pixels = [_measured(image, sweep.place) for image in sweep.returns]
     row, column = (np.concatenate([found[axis] for found in pixels]) for axis in (0, 1))
     values = np.concatenate(
@@ -146,11 +148,6 @@ def range_points(
         return_index=np.repeat(np.arange(len(pixels)), [len(found[0]) for found in pixels]),
         num_columns=num_columns,
     )
-
-
-def column_azimuths_rad(num_columns: int) -> np.ndarray:
-    """Direction of each column about the vehicle's z, counter-clockwise from ahead."""
-    return np.pi * (1 - 2 * (np.arange(num_columns) + 0.5) / num_columns)
 
 
 def _require_first_echoes(sweep: WaymoSweep) -> None:

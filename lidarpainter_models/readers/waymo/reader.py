@@ -36,11 +36,6 @@ from lidarpainter_models.readers.source_logs.drive_checks import (
     require_timely,
 )
 from lidarpainter_models.readers.source_logs.drive_poses import NS_PER_S, level_frame, nanoseconds
-from lidarpainter_models.readers.source_logs.frame_content import (
-    FrameContent,
-    SourceImage,
-    SourceSweep,
-)
 from lidarpainter_models.readers.source_logs.log import chosen_cameras, chosen_frames, naming
 from lidarpainter_models.readers.waymo.boxes import FramePoints, box_records, moving_ids
 from lidarpainter_models.readers.waymo.calibration import CAMERA_NAMES, TOP
@@ -59,6 +54,11 @@ from lidarpainter_models.readers.waymo.log import (
 from lidarpainter_models.readers.waymo.range_images import range_points
 from lidarpainter_models.readers.waymo.v1 import WaymoRecordSegment
 from lidarpainter_models.readers.waymo.v2 import WaymoParquetSegment
+from lidarpainter_models.scenes.frame_content import (
+    FrameContent,
+    SourceImage,
+    SourceSweep,
+)
 from lidarpainter_models.scenes.records import SweepPoints
 from lidarpainter_models.scenes.validation import jpeg_header_size
 from lidarpainter_models.scenes.writer import SceneHeader
@@ -91,13 +91,7 @@ class WaymoLog:
     def __init__(
         self, root: Path, sequence: str, frames: slice | None, cameras: tuple[str, ...] | None
     ) -> None:
-        """Open a segment.
-
-        Frames are taken by position, cameras by name; None takes all.
-
-        Raises:
-            DataError: something in the segment is missing, damaged or makes no sense.
-        """
+        """Open a segment, see `open_log`."""
         self._segment = _open_segment(root, sequence)
         self.place, self.sequence, self._root = self._segment.place, sequence, root
         with naming(self.place):
@@ -125,15 +119,15 @@ class WaymoLog:
         """Everything of one frame, as the writer takes it."""
         frame = self._frames[frame_index]
         with naming(frame.place):
-            sensors = self._segment.read_sensors(frame_index)
-            if not sensors.images:
+            recorded, swept = self._segment.read_sensors(frame_index)
+            if not recorded:
                 raise DataError("zero images, expected at least one")
-            images = {image.camera_name: image for image in sensors.images}
+            images = {image.camera_name: image for image in recorded}
             self._require_images(images)
             time_s = self._time_s(frame, images)
             world_from_vehicle = self._world_from_global @ frame.global_from_vehicle
             points = FramePoints(time_s, self._top_position_m())
-            sweeps = self._sweeps(frame, sensors.sweeps, points)
+            sweeps = self._sweeps(frame, swept, points)
             boxes = box_records(
                 frame, points, images, self._segment.cameras, world_from_vehicle, self._moving
             )
@@ -144,11 +138,11 @@ class WaymoLog:
                 world_from_ego=world_from_vehicle,
                 images=[
                     self._image(frame, image, time_s)
-                    for image in sensors.images
+                    for image in recorded
                     if image.camera_name in self._cameras
                 ],
                 sweeps=sweeps,
-                boxes=list(boxes),
+                boxes=boxes,
             )
 
     def _require_images(self, images: dict[str, WaymoImage]) -> None:
@@ -185,7 +179,7 @@ class WaymoLog:
         return SourceImage(record=record, jpeg=image.jpeg, source=image.place)
 
     def _sweeps(
-        self, frame: WaymoFrame, sweeps: tuple[WaymoSweep, ...], points: FramePoints
+        self, frame: WaymoFrame, sweeps: list[WaymoSweep], points: FramePoints
     ) -> list[SourceSweep]:
         """The sweeps that have points, which are added to those of the frame."""
         found = [

@@ -8,7 +8,6 @@ of the file agree with it, so a hostile length is refused and not allocated.
 import hashlib
 import stat
 import struct
-from dataclasses import dataclass
 from pathlib import Path
 
 import google_crc32c
@@ -24,14 +23,6 @@ _CHECKSUM = struct.Struct("<I")
 _HEADER_BYTES = _LENGTH.size + _CHECKSUM.size
 _MASK_DELTA = 0xA282EAD8
 _WORD = 0xFFFFFFFF
-
-
-@dataclass(frozen=True, slots=True)
-class _Place:
-    """Where a record's content lies in its file."""
-
-    offset: int
-    num_bytes: int
 
 
 class TfrecordFile:
@@ -59,7 +50,7 @@ class TfrecordFile:
 
     def place(self, index: int) -> str:
         """The place to name in errors: file, record and byte."""
-        return f"{self.path}, record {index} at byte {self._records[index].offset - _HEADER_BYTES}"
+        return f"{self.path}, record {index} at byte {self._records[index][0] - _HEADER_BYTES}"
 
     def read(self, index: int) -> bytes:
         """The content of one record.
@@ -67,17 +58,17 @@ class TfrecordFile:
         Raises:
             DataError: the content is not what was written.
         """
-        record = self._records[index]
+        offset, num_bytes = self._records[index]
         try:
             with self.path.open("rb") as file:
-                file.seek(record.offset)
-                content = file.read(record.num_bytes)
+                file.seek(offset)
+                content = file.read(num_bytes)
                 checksum = file.read(_CHECKSUM.size)
         except OSError as error:
             raise DataError(f"{self.path}: cannot be read ({error.strerror})") from None
-        if len(content) != record.num_bytes or not _matches(content, checksum):
+        if len(content) != num_bytes or not _matches(content, checksum):
             raise DataError(
-                f"{self.place(index)}: the checksum of its {record.num_bytes} bytes differs, "
+                f"{self.place(index)}: the checksum of its {num_bytes} bytes differs, "
                 "expected what was written"
             )
         self._digest.update(content)
@@ -91,8 +82,9 @@ class TfrecordFile:
             "sha256": self._digest.hexdigest(),
         }
 
-    def _index(self) -> list[_Place]:
-        records: list[_Place] = []
+    def _index(self) -> list[tuple[int, int]]:
+        """Where the content of each record lies, and its length."""
+        records: list[tuple[int, int]] = []
         status = self.path.stat()
         if not stat.S_ISREG(status.st_mode):
             raise DataError(f"{self.path}: not a file")
@@ -112,7 +104,7 @@ class TfrecordFile:
                         f"{where}: states {num_bytes} bytes, the file ends after "
                         f"{max(size - offset, 0)}"
                     )
-                records.append(_Place(offset, num_bytes))
+                records.append((offset, num_bytes))
         return records
 
 

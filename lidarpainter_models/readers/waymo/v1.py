@@ -5,7 +5,6 @@ boxes), once frame by frame for the sensors. What every frame repeats about the 
 and calibrations, is taken from the first frame chosen, and the others must name the same segment.
 """
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -21,24 +20,25 @@ from lidarpainter_models.readers.waymo.calibration import (
 )
 from lidarpainter_models.readers.waymo.log import (
     MAX_LABELS,
-    SyncedBox,
+    POSE_CHANNELS,
+    RANGE_CHANNELS,
+    UprightBox,
     WaymoFrame,
     WaymoImage,
     WaymoLabel,
-    WaymoSensors,
     WaymoSweep,
     actor_name,
     category_name,
     checked_box,
     checked_frame,
     checked_image,
+    checked_speed,
     echoes_present,
 )
 from lidarpainter_models.readers.waymo.messages import parse_message
 from lidarpainter_models.readers.waymo.range_images import unpack_matrix
 from lidarpainter_models.readers.waymo.tfrecord import TfrecordFile
 
-RANGE_CHANNELS, POSE_CHANNELS = 4, 6
 _ECHOES = ("ri_return1", "ri_return2")
 _VELOCITY = ("v_x", "v_y", "v_z", "w_x", "w_y", "w_z")
 _TIMES = ("pose_timestamp", "shutter", "camera_trigger_time", "camera_readout_done_time")
@@ -82,7 +82,7 @@ class WaymoRecordSegment:
         )
         return checked_frame(frame.timestamp_micros, frame.pose.transform, labels, place)
 
-    def read_sensors(self, index: int) -> WaymoSensors:
+    def read_sensors(self, index: int) -> tuple[list[WaymoImage], list[WaymoSweep]]:
         """Images and range images of one frame.
 
         Raises:
@@ -92,18 +92,16 @@ class WaymoRecordSegment:
         frame = parse_message("Frame", self._file.read(index), place)
         _require_few(frame.images, CAMERA_NAMES, f"{place}, images")
         _require_few(frame.lasers, LIDAR_NAMES, f"{place}, lasers")
+        images = [
+            _image(content, f"{place}, images[{position}]")
+            for position, content in enumerate(frame.images)
+        ]
         sweeps = (
             _sweep(content, f"{place}, lasers[{position}]")
             for position, content in enumerate(frame.lasers)
             if content  # derived files keep the place of a LiDAR that they have emptied
         )
-        return WaymoSensors(
-            images=tuple(
-                _image(content, f"{place}, images[{position}]")
-                for position, content in enumerate(frame.images)
-            ),
-            sweeps=tuple(sweep for sweep in sweeps if sweep.returns),
-        )
+        return images, [sweep for sweep in sweeps if sweep.returns]
 
     def _require_same_segment(self, content: bytes, place: str) -> None:
         """Take the calibrations from the first frame; later ones repeat them byte for byte."""
@@ -199,23 +197,18 @@ def _label(content: bytes, where: str) -> WaymoLabel:
         actor_id=actor_name(object_id, where),
         category=category_name(message.type, where),
         box=checked_box([getattr(message.box, field) for field in _BOX], f"{where}, box"),
-        speed_mps=_speed(message.metadata, where),
+        speed_mps=checked_speed(
+            message.metadata.speed_x, message.metadata.speed_y, f"{where}, metadata"
+        ),
         synced=_synced_box(message, where),
     )
 
 
-def _synced_box(message: Any, where: str) -> SyncedBox | None:  # noqa: ANN401
+def _synced_box(message: Any, where: str) -> tuple[str, UprightBox] | None:  # noqa: ANN401
     """The camera-synced box, which counts only together with its camera."""
     if not (message.HasField("camera_synced_box") and message.most_visible_camera_name):
         return None
     where = f"{where}, camera_synced_box"
     name = message.most_visible_camera_name.decode("utf-8", "replace")
     numbers = [getattr(message.camera_synced_box, field) for field in _BOX]
-    return SyncedBox(sensor_name(name, CAMERA_NAMES, where), checked_box(numbers, where))
-
-
-def _speed(metadata: Any, where: str) -> float:  # noqa: ANN401
-    speed_mps = math.hypot(metadata.speed_x, metadata.speed_y)
-    if not math.isfinite(speed_mps):
-        raise DataError(f"{where}, metadata: the speed is not finite")
-    return speed_mps
+    return sensor_name(name, CAMERA_NAMES, where), checked_box(numbers, where)

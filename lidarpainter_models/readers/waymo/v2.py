@@ -8,7 +8,6 @@ means no labels; a file that is not in its folder is refused). Images and range 
 streamed: their files are in the order of time, row groups are never whole in memory.
 """
 
-import math
 from collections import defaultdict
 from pathlib import Path
 
@@ -26,23 +25,24 @@ from lidarpainter_models.readers.waymo.calibration import (
 )
 from lidarpainter_models.readers.waymo.log import (
     MAX_LABELS,
-    SyncedBox,
+    POSE_CHANNELS,
+    RANGE_CHANNELS,
+    UprightBox,
     WaymoFrame,
     WaymoImage,
     WaymoLabel,
-    WaymoSensors,
     WaymoSweep,
     actor_name,
     category_name,
     checked_box,
     checked_frame,
     checked_image,
+    checked_speed,
     echoes_present,
 )
 from lidarpainter_models.readers.waymo.parquet_rows import FrameStream, ParquetRow, ParquetRows
 from lidarpainter_models.readers.waymo.range_images import shaped_matrix
 
-RANGE_CHANNELS, POSE_CHANNELS = 4, 6
 SEGMENT, TIME = "key.segment_context_name", "key.frame_timestamp_micros"
 CAMERA, LIDAR, OBJECT = "key.camera_name", "key.laser_name", "key.laser_object_id"
 _POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
@@ -74,7 +74,7 @@ _TIMES = (
 )
 _ECHOES = tuple(f"[LiDARComponent].range_image_return{number}" for number in (1, 2))
 _PIXEL_POSES = "[LiDARPoseComponent].range_image_return1"
-_BOX_NUMBERS = (*("center.x", "center.y", "center.z", "size.x", "size.y", "size.z", "heading"),)
+_BOX_NUMBERS = ("center.x", "center.y", "center.z", "size.x", "size.y", "size.z", "heading")
 _BOX = tuple(f"[LiDARBoxComponent].box.{name}" for name in _BOX_NUMBERS)
 _TYPE = "[LiDARBoxComponent].type"
 _SPEED = ("[LiDARBoxComponent].speed.x", "[LiDARBoxComponent].speed.y")
@@ -130,7 +130,7 @@ class WaymoParquetSegment:
             raise DataError(f"{row.place}: {len(labels)} labels, expected {MAX_LABELS} at most")
         return checked_frame(time_us, row.numbers(_POSE).tolist(), labels, row.place)
 
-    def read_sensors(self, index: int) -> WaymoSensors:
+    def read_sensors(self, index: int) -> tuple[list[WaymoImage], list[WaymoSweep]]:
         """Images and range images of one frame; frames are asked for in ascending order.
 
         Raises:
@@ -138,16 +138,12 @@ class WaymoParquetSegment:
         """
         time_us = self._times_us[index]
         poses = {
-            sensor_name(self._sensor(row, LIDAR), LIDAR_NAMES, row.place): self._matrix(
-                "lidar_pose", row, _PIXEL_POSES, POSE_CHANNELS
-            )
+            _lidar_name(row): self._matrix("lidar_pose", row, _PIXEL_POSES, POSE_CHANNELS)
             for row in self._pixel_poses.rows_at(time_us)
         }
+        images = [self._image(row) for row in self._images.rows_at(time_us)]
         sweeps = (self._sweep(row, poses) for row in self._sweeps.rows_at(time_us))
-        return WaymoSensors(
-            images=tuple(self._image(row) for row in self._images.rows_at(time_us)),
-            sweeps=tuple(sweep for sweep in sweeps if sweep.returns),
-        )
+        return images, [sweep for sweep in sweeps if sweep.returns]
 
     def _open(
         self, component: str, columns: tuple[str, ...], optional: tuple[str, ...] = ()
@@ -176,7 +172,7 @@ class WaymoParquetSegment:
         columns = (CAMERA, *_LENS, _CAMERA_MOUNT, *_CAMERA_SIZE, _READOUT)
         cameras = {}
         for row in self._table("camera_calibration", columns):
-            name = sensor_name(self._sensor(row, CAMERA), CAMERA_NAMES, row.place)
+            name = _camera_name(row)
             width_px, height_px = (row.whole_number(column) for column in _CAMERA_SIZE)
             cameras[name] = camera_calibration(
                 name,
@@ -191,7 +187,7 @@ class WaymoParquetSegment:
     def _read_lidars(self) -> dict[str, LidarCalibration]:
         lidars = {}
         for row in self._table("lidar_calibration", (LIDAR, _LIDAR_MOUNT, *_BEAM_LIMITS, _BEAMS)):
-            name = sensor_name(self._sensor(row, LIDAR), LIDAR_NAMES, row.place)
+            name = _lidar_name(row)
             low_rad, high_rad = (row.number(column) for column in _BEAM_LIMITS)
             lidars[name] = lidar_calibration(
                 name,
@@ -231,14 +227,14 @@ class WaymoParquetSegment:
             )
         return labels
 
-    def _read_synced_boxes(self) -> dict[tuple[int, str], SyncedBox]:
+    def _read_synced_boxes(self) -> dict[tuple[int, str], tuple[str, UprightBox]]:
         """By frame and actor."""
         if not (self._folder / "lidar_camera_synced_box").is_dir():
             return {}
         rows = self._table("lidar_camera_synced_box", (TIME, OBJECT, _SYNCED_CAMERA, *_SYNCED_BOX))
         return {
-            (row.whole_number(TIME), row.text(OBJECT)): SyncedBox(
-                sensor_name(self._sensor(row, _SYNCED_CAMERA), CAMERA_NAMES, row.place),
+            (row.whole_number(TIME), row.text(OBJECT)): (
+                _camera_name(row, _SYNCED_CAMERA),
                 checked_box([row.number(column) for column in _SYNCED_BOX], row.place),
             )
             for row in rows
@@ -246,7 +242,7 @@ class WaymoParquetSegment:
 
     def _image(self, row: ParquetRow) -> WaymoImage:
         self._require_segment(row)
-        name = sensor_name(self._sensor(row, CAMERA), CAMERA_NAMES, row.place)
+        name = _camera_name(row)
         jpeg = row.content(_JPEG)
         self._files["camera_image"].take_digest(jpeg)
         return checked_image(
@@ -260,7 +256,7 @@ class WaymoParquetSegment:
 
     def _sweep(self, row: ParquetRow, poses: dict[str, np.ndarray]) -> WaymoSweep:
         self._require_segment(row)
-        name = sensor_name(self._sensor(row, LIDAR), LIDAR_NAMES, row.place)
+        name = _lidar_name(row)
         place = f"{row.place} ({name})"
         images = (self._matrix("lidar", row, echo, RANGE_CHANNELS) for echo in _ECHOES)
         returns = [image if image.size else None for image in images]
@@ -280,17 +276,24 @@ class WaymoParquetSegment:
         where = f"{row.place}, {column}"
         return shaped_matrix(values, row.numbers(f"{column}.shape").tolist(), channels, where)
 
-    def _sensor(self, row: ParquetRow, column: str) -> int | str:
-        """A sensor's number, or its name where the file spells it out."""
-        value = row.values[column]
-        return row.text(column) if isinstance(value, str) else row.whole_number(column)
+
+def _camera_name(row: ParquetRow, column: str = CAMERA) -> str:
+    """Of a camera that is given by its number, or its name where the file spells it out."""
+    return sensor_name(_sensor(row, column), CAMERA_NAMES, row.place)
+
+
+def _lidar_name(row: ParquetRow) -> str:
+    return sensor_name(_sensor(row, LIDAR), LIDAR_NAMES, row.place)
+
+
+def _sensor(row: ParquetRow, column: str) -> int | str:
+    value = row.values[column]
+    return row.text(column) if isinstance(value, str) else row.whole_number(column)
 
 
 def _speed(row: ParquetRow) -> float:
     """Level speed of a label, 0 where it is not stated."""
     if any(row.values[column] is None for column in _SPEED):
         return 0.0
-    speed_mps = math.hypot(*(row.number(column) for column in _SPEED))
-    if not math.isfinite(speed_mps):
-        raise DataError(f"{row.place}: the speed is not finite")
-    return speed_mps
+    x_mps, y_mps = (row.number(column) for column in _SPEED)
+    return checked_speed(x_mps, y_mps, row.place)

@@ -11,15 +11,18 @@ from lidarpainter_models.synthetic.raytracing.scene_arrays import (
     SURFACE,
     TEXTURE,
     TINT,
-    UV_CORNER,
-    UV_FIRST,
-    UV_SECOND,
     InstanceArrays,
     SceneArrays,
 )
 from lidarpainter_models.synthetic.raytracing.shade import classify, hit_normal, paint_at
 from lidarpainter_models.synthetic.raytracing.texture import sample_texture
-from lidarpainter_models.synthetic.raytracing.trace import INLINED, RAY, WORK_ROWS, trace_scene
+from lidarpainter_models.synthetic.raytracing.trace import (
+    INLINED,
+    RAY,
+    WORK_ROWS,
+    trace_scene,
+    uv_at,
+)
 
 BEAM_WIDTH_RAD = 0.002
 
@@ -27,13 +30,8 @@ BEAM_WIDTH_RAD = 0.002
 @numba.njit(**INLINED)
 def _reflection(scene: SceneArrays, hit: tuple) -> tuple[float, float]:
     """Brightness and gloss of the texture at a hit."""
-    prim, u, v = hit[1], hit[2], hit[3]
-    shading = scene.prim_shading[prim]
-    surface = scene.prim_index[prim, SURFACE]
-    place = (
-        shading[UV_CORNER] + u * shading[UV_FIRST] + v * shading[UV_SECOND],
-        shading[UV_CORNER + 1] + u * shading[UV_FIRST + 1] + v * shading[UV_SECOND + 1],
-    )
+    surface = scene.prim_index[hit[1], SURFACE]
+    place = uv_at(scene.prim_shading[hit[1]], hit[2], hit[3])
     colour = sample_texture(scene, scene.surface_index[surface, TEXTURE], place, 1)
     value = scene.surface_value[surface]
     bright = (

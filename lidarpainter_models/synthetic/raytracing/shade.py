@@ -29,7 +29,6 @@ from lidarpainter_models.synthetic.raytracing.scene_arrays import (
     TEXTURE,
     TINT,
     TRANSLUCENCY,
-    UV_CORNER,
     UV_FIRST,
     UV_SECOND,
     ZENITH_RGB,
@@ -38,7 +37,7 @@ from lidarpainter_models.synthetic.raytracing.scene_arrays import (
 )
 from lidarpainter_models.synthetic.raytracing.sky import mirrored_radiance
 from lidarpainter_models.synthetic.raytracing.texture import filtered_texture, sample_texture
-from lidarpainter_models.synthetic.raytracing.trace import INLINED, RAY, to_box, trace_scene
+from lidarpainter_models.synthetic.raytracing.trace import INLINED, RAY, to_box, trace_scene, uv_at
 
 SHADOW_START_M = 0.004
 SHADOW_REACH_M = 120.0
@@ -155,17 +154,13 @@ def _albedo(
     shading = scene.prim_shading[prim]
     surface = scene.prim_index[prim, SURFACE]
     value = scene.surface_value[surface]
-    place = (
-        shading[UV_CORNER] + hit[2] * shading[UV_FIRST] + hit[3] * shading[UV_SECOND],
-        shading[UV_CORNER + 1] + hit[2] * shading[UV_FIRST + 1] + hit[3] * shading[UV_SECOND + 1],
-    )
+    place = uv_at(shading, hit[2], hit[3])
     steps = _steps_in_uv(scene, prim, direction, differentials, hit[0])
     index = scene.surface_index[surface]
     colour = filtered_texture(scene, index[TEXTURE], place, steps[0], steps[1])
     factor = 1.0
     if index[DETAIL_TEXTURE] >= 0:
-        normal = shading
-        ax, ay, az = abs(normal[0]), abs(normal[1]), abs(normal[2])
+        ax, ay, az = abs(shading[0]), abs(shading[1]), abs(shading[2])
         s, t = point[0], point[1]
         if az < max(ax, ay):
             s, t = (point[1], point[2]) if ax > ay else (point[0], point[2])
@@ -226,15 +221,10 @@ def classify(scene: SceneArrays, prim: int, fourth: float) -> int:
 @numba.njit(**RAY)
 def paint_at(scene: SceneArrays, hit: tuple) -> float:
     """Share of road paint at a hit, unfiltered; 0 away from roads."""
-    prim, u, v = hit[1], hit[2], hit[3]
-    index = scene.surface_index[scene.prim_index[prim, SURFACE]]
+    index = scene.surface_index[scene.prim_index[hit[1], SURFACE]]
     if index[KIND] != KIND_ROAD:
         return 0.0
-    shading = scene.prim_shading[prim]
-    place = (
-        shading[UV_CORNER] + u * shading[UV_FIRST] + v * shading[UV_SECOND],
-        shading[UV_CORNER + 1] + u * shading[UV_FIRST + 1] + v * shading[UV_SECOND + 1],
-    )
+    place = uv_at(scene.prim_shading[hit[1]], hit[2], hit[3])
     return sample_texture(scene, index[TEXTURE], place, 0)[3]
 
 

@@ -81,13 +81,21 @@ def _hit_prim(row: np.ndarray, origin: tuple, direction: tuple) -> tuple[float, 
     return (row[6] * qx + row[7] * qy + row[8] * qz) * scale, u, v
 
 
+@numba.njit(**INLINED)
+def uv_at(shading: np.ndarray, u: float, v: float) -> tuple[float, float]:
+    """Texture place at the edge coordinates of a hit."""
+    return (
+        shading[UV_CORNER] + u * shading[UV_FIRST] + v * shading[UV_SECOND],
+        shading[UV_CORNER + 1] + u * shading[UV_FIRST + 1] + v * shading[UV_SECOND + 1],
+    )
+
+
 @numba.njit(**RAY)
 def is_cut_away(scene: SceneArrays, prim: int, u: float, v: float, width_m: float) -> bool:
     """Whether a cut-out texture is open where a ray of this width meets it."""
     shading = scene.prim_shading[prim]
     texture = scene.texture_index[scene.surface_index[scene.prim_index[prim, SURFACE], TEXTURE]]
-    s = shading[UV_CORNER] + u * shading[UV_FIRST] + v * shading[UV_SECOND]
-    t = shading[UV_CORNER + 1] + u * shading[UV_FIRST + 1] + v * shading[UV_SECOND + 1]
+    s, t = uv_at(shading, u, v)
     geometry = scene.prim_geometry[prim]
     edge_m = np.sqrt(geometry[3] ** 2 + geometry[4] ** 2 + geometry[5] ** 2)
     per_uv = np.sqrt(shading[UV_FIRST] ** 2 + shading[UV_FIRST + 1] ** 2)

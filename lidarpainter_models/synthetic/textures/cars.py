@@ -14,12 +14,7 @@ from lidarpainter_models.synthetic.plan.car_kinds import CarShape
 from lidarpainter_models.synthetic.raytracing.scene_arrays import KIND_CUT_OUT
 from lidarpainter_models.synthetic.textures.noise import as_rgba, fractal_noise
 from lidarpainter_models.synthetic.textures.signs import licence_plate
-from lidarpainter_models.synthetic.textures.surfaces import (
-    StreetClass,
-    Surface,
-    SurfaceSet,
-    tint_from_bytes,
-)
+from lidarpainter_models.synthetic.textures.surfaces import StreetClass, Surface, SurfaceSet
 
 PER_M = 96.0
 PAINTS = (
@@ -29,6 +24,7 @@ PAINTS = (
 )  # fmt: skip
 GLASS = (26.0, 31.0, 36.0)
 PAINT_GLOSS, GLASS_GLOSS = 0.62, 1.0
+Places = np.ndarray | list[tuple[float, float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,9 +37,7 @@ class CarAtlas:
     chrome: int
     rim: int
     plate: int
-    length_m: float
-    width_m: float
-    height_m: float
+    layout: "_Layout"
 
     def uv(self, corners: np.ndarray) -> np.ndarray:
         """Texture places (faces, 3, 2) of corners (faces, 3, 3), by the way each face looks."""
@@ -51,7 +45,7 @@ class CarAtlas:
         normal = np.abs(normal) / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
         is_end = (normal[:, 0] > 0.62) & (normal[:, 0] > normal[:, 2])
         is_top = ~is_end & (normal[:, 2] > normal[:, 1])
-        layout = _Layout(self.length_m, self.width_m, self.height_m)
+        layout = self.layout
         x, y, z = corners[..., 0], corners[..., 1], corners[..., 2]
         is_rear = corners[:, :, 0].mean(1) < 0
         end = np.where(is_rear[:, None, None], layout.rear(y, z), layout.front(y, z))
@@ -95,21 +89,19 @@ class _Layout:
 def add_car_surfaces(surfaces: SurfaceSet, shape: CarShape, rng: np.random.Generator) -> CarAtlas:
     """Paint a car: a random colour, plates of its own."""
     paint = PAINTS[int(rng.integers(len(PAINTS)))]
-    size = shape.length_m, shape.width_m, shape.height_m
-    texture = surfaces.add_texture(_CarPainter(shape, paint, rng).draw())
+    painter = _CarPainter(shape, paint, rng)
+    texture = surfaces.add_texture(painter.draw())
     car = StreetClass.CAR
     plate = surfaces.add_texture(licence_plate(rng))
     rim = surfaces.add_texture(_draw_rim(rng))
     return CarAtlas(
         body=surfaces.add(Surface(semantics=car, texture=texture, gloss=1.0)),
-        paint=surfaces.add(Surface(semantics=car, tint=tint_from_bytes(paint), gloss=PAINT_GLOSS)),
+        paint=surfaces.plain(paint, car, gloss=PAINT_GLOSS),
         rubber=surfaces.add(Surface(semantics=car, tint=(0.012, 0.012, 0.013))),
         chrome=surfaces.add(Surface(semantics=car, tint=(0.35, 0.36, 0.37), gloss=0.8)),
         rim=surfaces.add(Surface(semantics=car, texture=rim, kind=KIND_CUT_OUT)),
         plate=surfaces.add(Surface(semantics=car, texture=plate)),
-        length_m=size[0],
-        width_m=size[1],
-        height_m=size[2],
+        layout=painter.layout,
     )
 
 
@@ -135,24 +127,24 @@ class _CarPainter:
         self._draw_top()
         return as_rgba(self.colour, self.gloss)
 
-    def _fill(self, view: str, places: np.ndarray, colour: tuple, gloss: float) -> None:
+    def _pixels(self, view: str, places: Places) -> np.ndarray:
+        """Fixed-point pixels for OpenCV of places in a view's two metres."""
+        uv = getattr(self.layout, view)(*np.asarray(places, float).T)
+        return np.rint((uv * [self.columns, self.rows] - 0.5) * 16).astype(np.int32)
+
+    def _fill(self, view: str, places: Places, colour: tuple, gloss: float) -> None:
         """Fill a polygon of a view, given in the view's two metres."""
-        places = np.asarray(places, float)
-        uv = getattr(self.layout, view)(places[:, 0], places[:, 1])
-        pixels = np.rint((uv * [self.columns, self.rows] - 0.5) * 16).astype(np.int32)
+        pixels = self._pixels(view, places)
         cv2.fillPoly(self.colour, [pixels], tuple(map(float, colour)), cv2.LINE_AA, 4)
         cv2.fillPoly(self.gloss, [pixels], gloss, cv2.LINE_8, 4)
 
     def _rect(self, view: str, rect: tuple, colour: tuple, gloss: float = 0.3) -> None:
         a0, a1, b0, b1 = rect
-        places = np.array([[a0, b0], [a1, b0], [a1, b1], [a0, b1]])
-        self._fill(view, places, colour, gloss)
+        self._fill(view, [(a0, b0), (a1, b0), (a1, b1), (a0, b1)], colour, gloss)
 
     def _line(self, places: list[tuple[float, float]]) -> None:
         """A seam on the side."""
-        x, z = np.asarray(places, float).T
-        uv = self.layout.side(x, z)
-        pixels = np.rint((uv * [self.columns, self.rows] - 0.5) * 16).astype(np.int32)
+        pixels = self._pixels("side", places)
         shade = tuple(float(c) for c in self.paint * 0.35)
         cv2.polylines(self.colour, [pixels], False, shade, 1, cv2.LINE_AA, 4)
 
@@ -175,7 +167,7 @@ class _CarPainter:
             xs = np.linspace(start + 0.04, end - 0.04, 12)
             low = [(x, self._belt(x) + 0.04) for x in xs]
             high = [(x, max(self._roof(x) - 0.13, self._belt(x) + 0.05)) for x in xs[::-1]]
-            self._fill("side", np.array(low + high), GLASS, GLASS_GLOSS)
+            self._fill("side", low + high, GLASS, GLASS_GLOSS)
             self._draw_inside(start, end)
             self._line([(start, self._belt(start)), (start + 0.02, 0.36)])
         self._line([(edges[-1] - 0.05, self._belt(edges[-1])), (edges[-1] - 0.02, 0.36)])
@@ -198,7 +190,7 @@ class _CarPainter:
         xs = np.linspace(start + 0.12, end - 0.12, 8)
         low = [(x, self._belt(x) + 0.14) for x in xs]
         high = [(x, max(self._roof(x) - 0.19, self._belt(x) + 0.15)) for x in xs[::-1]]
-        self._fill("side", np.array(low + high), (66, 74, 80), GLASS_GLOSS)
+        self._fill("side", low + high, (66, 74, 80), GLASS_GLOSS)
         seat, belt = start + 0.45 * (end - start), self._belt(start)
         angles = np.linspace(0, 2 * np.pi, 16)
         head = np.stack([seat + 0.1 * np.cos(angles), belt + 0.2 + 0.12 * np.sin(angles)], 1)
@@ -243,21 +235,16 @@ class _CarPainter:
                 (-half + 0.2, rear_belt + 0.1), (half - 0.2, rear_belt + 0.1),
                 (half - 0.32, top), (-half + 0.32, top),
             ]  # fmt: skip
-            self._fill("rear", np.array(glass), GLASS, GLASS_GLOSS)
+            self._fill("rear", glass, GLASS, GLASS_GLOSS)
 
     def _draw_top(self) -> None:
         rear_base, rear_top, front_top, front_base = self.shape.glass
         half = self.shape.width_m / 2 * 0.93
-        windscreen = [
-            (front_base, -half + 0.06), (front_top, -half + 0.2),
-            (front_top, half - 0.2), (front_base, half - 0.06),
-        ]  # fmt: skip
-        self._fill("top", np.array(windscreen), GLASS, GLASS_GLOSS)
-        rear = [
-            (rear_base, -half + 0.08), (rear_top, -half + 0.2),
-            (rear_top, half - 0.2), (rear_base, half - 0.08),
-        ]  # fmt: skip
-        self._fill("top", np.array(rear), GLASS, GLASS_GLOSS)
+        for base, top, inset in ((front_base, front_top, 0.06), (rear_base, rear_top, 0.08)):
+            glass = [
+                (base, -half + inset), (top, -half + 0.2), (top, half - 0.2), (base, half - inset),
+            ]  # fmt: skip
+            self._fill("top", glass, GLASS, GLASS_GLOSS)
         if self.shape.category == "pickup":
             tail = -self.shape.length_m / 2
             bed = (tail + 0.12, rear_base - 0.1, -half + 0.12, half - 0.12)

@@ -54,7 +54,7 @@ class GroundCanvas:
         pixels = (pixels * self.per_m - 0.5) * (1 << SUBPIXEL_BITS)
         return np.rint(pixels).astype(np.int32)
 
-    def window(self, places: np.ndarray, margin_m: float = 0.2) -> tuple[slice, slice]:
+    def window(self, places: np.ndarray, margin_m: float) -> tuple[slice, slice]:
         """Rows and columns around places."""
         low = self.pixels(places).min(0) / (1 << SUBPIXEL_BITS) - margin_m * self.per_m
         high = self.pixels(places).max(0) / (1 << SUBPIXEL_BITS) + margin_m * self.per_m
@@ -74,17 +74,15 @@ class GroundCanvas:
         wear: np.ndarray | None = None,
     ) -> None:
         """Lay a colour over a polygon; `wear` (same shape as the canvas) thins it."""
-        rows, columns = self.window(places)
-        if rows.start >= rows.stop or columns.start >= columns.stop:
+        area = self.window(places, 0.2)
+        mask, polygon = self._mask(area, places)
+        if not mask.size:
             return
-        mask = np.zeros((rows.stop - rows.start, columns.stop - columns.start), np.uint8)
-        shift = np.array([columns.start, rows.start]) << SUBPIXEL_BITS
-        polygon = (self.pixels(places) - shift).astype(np.int32)
         cv2.fillPoly(mask, [polygon], 255, cv2.LINE_AA, SUBPIXEL_BITS)
         share = mask.astype(np.float32) * (strength / 255)
         if wear is not None:
-            share *= wear[rows, columns]
-        self._mix(rows, columns, share, colour, is_paint=is_paint)
+            share *= wear[area]
+        self._mix(area, share, colour, is_paint=is_paint)
 
     def stroke(
         self,
@@ -95,44 +93,38 @@ class GroundCanvas:
         strength: float = 1.0,
     ) -> None:
         """Lay a colour along a polyline."""
-        rows, columns = self.window(places, width_m + 0.1)
-        if rows.start >= rows.stop or columns.start >= columns.stop:
+        area = self.window(places, width_m + 0.1)
+        mask, line = self._mask(area, places)
+        if not mask.size:
             return
-        mask = np.zeros((rows.stop - rows.start, columns.stop - columns.start), np.uint8)
-        shift = np.array([columns.start, rows.start]) << SUBPIXEL_BITS
-        line = (self.pixels(places) - shift).astype(np.int32)
         width_px = width_m * self.per_m
         thickness = max(round(width_px), 1)
         cv2.polylines(mask, [line], False, 255, thickness, cv2.LINE_AA, SUBPIXEL_BITS)
         share = mask.astype(np.float32) * (strength * min(width_px, 1.0) / 255)
-        self._mix(rows, columns, share, colour, is_paint=False)
+        self._mix(area, share, colour, is_paint=False)
+
+    def _mask(self, area: tuple[slice, slice], places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """An empty mask of an area, and the pixels of places in it."""
+        shift = np.array([area[1].start, area[0].start], np.int32) << SUBPIXEL_BITS
+        return np.zeros(self.paint[area].shape, np.uint8), self.pixels(places) - shift
 
     def _mix(
         self,
-        rows: slice,
-        columns: slice,
+        place: tuple[slice, slice],
         share: np.ndarray,
         colour: tuple[float, float, float],
         *,
         is_paint: bool,
     ) -> None:
-        area = self.colour[rows, columns]
+        area, paint = self.colour[place], self.paint[place]
         area += share[..., None] * (np.asarray(colour, np.float32) - area)
-        paint = self.paint[rows, columns]
         paint += share * (float(is_paint) - paint)
 
 
 def strip(s_from: float, s_to: float, d_middle: float, width: float) -> np.ndarray:
     """Corners of a rectangle in street coordinates."""
-    half = width / 2
-    return np.array(
-        [
-            [s_from, d_middle - half],
-            [s_to, d_middle - half],
-            [s_to, d_middle + half],
-            [s_from, d_middle + half],
-        ]
-    )
+    low, high = d_middle - width / 2, d_middle + width / 2
+    return np.array([[s_from, low], [s_to, low], [s_to, high], [s_from, high]])
 
 
 def asphalt_detail(rng: np.random.Generator) -> np.ndarray:
@@ -266,8 +258,8 @@ def stencil(
     column = round((place[0] - canvas.start_m) * canvas.per_m) - mask.shape[1] // 2
     if row < 0 or column < 0 or column + mask.shape[1] > canvas.paint.shape[1]:
         return
-    rows, columns = slice(row, row + mask.shape[0]), slice(column, column + mask.shape[1])
-    canvas._mix(rows, columns, mask * 0.85, WHITE, is_paint=True)
+    area = slice(row, row + mask.shape[0]), slice(column, column + mask.shape[1])
+    canvas._mix(area, mask * 0.85, WHITE, is_paint=True)
 
 
 def parking_edge(plan: StreetPlan) -> tuple[float, float]:

@@ -147,7 +147,7 @@ def draw_gate(
         canvas.fill((x0, x1, level, level + 0.11), np.array(colour) * rng.uniform(0.9, 1.02))
         canvas.fill((x0, x1, level, level + 0.03), np.array(colour) * 0.6)
     if rng.random() < 0.6:
-        paint = rng.uniform(20, 230, 3)
+        red, green, blue = rng.uniform(20, 230, 3).tolist()
         words = TAGS[int(rng.integers(len(TAGS)))]
         rect = (x0 + 0.15, x1 - 0.15, z0 + 0.4, z0 + 0.6 * (z1 - z0) + 0.4)
-        canvas.text(rect, words, (float(paint[0]), float(paint[1]), float(paint[2])))
+        canvas.text(rect, words, (red, green, blue))

@@ -94,9 +94,8 @@ def _paint_dashes(
         dash = strip(start, end, LANE_M / 2, LINE_M)
         canvas.fill(dash, YELLOW if is_turn else WHITE, is_paint=True, wear=wear)
         for lane in plan.oncoming_d_m[:-1]:
-            canvas.fill(
-                strip(start, end, lane + LANE_M / 2, LINE_M), WHITE, is_paint=True, wear=wear
-            )
+            dash = strip(start, end, lane + LANE_M / 2, LINE_M)
+            canvas.fill(dash, WHITE, is_paint=True, wear=wear)
     if is_turn:
         canvas.fill(strip(first, last, LANE_M / 2 - 0.22, 0.1), YELLOW, is_paint=True, wear=wear)
 

@@ -74,8 +74,7 @@ def billboard(rng: np.random.Generator) -> np.ndarray:
 
 def street_name_plate(words: str) -> np.ndarray:
     """White on green, 1.4 m x 0.32 m."""
-    board = np.empty((64, 280, 3), np.float32)
-    board[:] = (18, 104, 66)
+    board = np.full((64, 280, 3), (18, 104, 66), np.float32)
     cv2.rectangle(board, (3, 3), (276, 60), (236, 240, 236), 2, cv2.LINE_AA)
     draw_text(board, words, box=(16, 13, 264, 51), colour=(244, 246, 242))
     return as_rgba(board, 0.1)
@@ -83,8 +82,7 @@ def street_name_plate(words: str) -> np.ndarray:
 
 def speed_plate(limit: int) -> np.ndarray:
     """A white plate with a limit, 0.6 m x 0.75 m."""
-    board = np.empty((150, 120, 3), np.float32)
-    board[:] = (240, 240, 236)
+    board = np.full((150, 120, 3), (240, 240, 236), np.float32)
     cv2.rectangle(board, (4, 4), (115, 145), (22, 22, 24), 3, cv2.LINE_AA)
     draw_text(board, "SPEED", box=(14, 12, 106, 36), colour=(22, 22, 24))
     draw_text(board, "LIMIT", box=(14, 42, 106, 66), colour=(22, 22, 24))
@@ -94,8 +92,7 @@ def speed_plate(limit: int) -> np.ndarray:
 
 def parking_plate(rng: np.random.Generator) -> np.ndarray:
     """A parking rule, 0.35 m x 0.5 m."""
-    board = np.empty((120, 84, 3), np.float32)
-    board[:] = (240, 240, 236)
+    board = np.full((120, 84, 3), (240, 240, 236), np.float32)
     ink = (176, 28, 30) if rng.random() < 0.5 else (20, 106, 62)
     cv2.rectangle(board, (3, 3), (80, 116), ink, 2, cv2.LINE_AA)
     lines = ("NO", "PARK", "ING") if ink[0] > 100 else ("2 HR", "PARK", "9-6")
@@ -108,8 +105,7 @@ def parking_plate(rng: np.random.Generator) -> np.ndarray:
 def stop_plate() -> np.ndarray:
     """A red octagon as a cut-out, 0.75 m across."""
     size = 150
-    board = np.zeros((size, size, 3), np.float32)
-    board[:] = (176, 24, 30)
+    board = np.full((size, size, 3), (176, 24, 30), np.float32)
     angles = np.deg2rad(np.arange(8) * 45 + 22.5)
     outline = size / 2 + size / 2 * 1.04 * np.stack([np.cos(angles), np.sin(angles)], 1)
     inner = size / 2 + size / 2 * 0.94 * np.stack([np.cos(angles), np.sin(angles)], 1)
@@ -125,8 +121,7 @@ def licence_plate(rng: np.random.Generator) -> np.ndarray:
     letters = "ABCDEFGHJKLMNPRSTUVWXYZ"
     middle = "".join(letters[int(i)] for i in rng.integers(len(letters), size=3))
     words = f"{int(rng.integers(1, 9))}{middle}{int(rng.integers(100, 999))}"
-    board = np.empty((68, 200, 3), np.float32)
-    board[:] = (236, 236, 230)
+    board = np.full((68, 200, 3), (236, 236, 230), np.float32)
     cv2.rectangle(board, (2, 2), (197, 65), (60, 66, 84), 2, cv2.LINE_AA)
     draw_text(board, words, box=(12, 14, 188, 56), colour=(24, 36, 104), weight=0.16)
     return as_rgba(board, 0.1)

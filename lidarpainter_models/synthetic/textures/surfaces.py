@@ -97,6 +97,15 @@ class SurfaceSet:
             self.surfaces.append(surface)
         return self._known[surface]
 
+    def plain(
+        self,
+        colour: tuple[int, int, int],
+        semantics: StreetClass,
+        **looks: Any,  # noqa: ANN401 - fields of `Surface`
+    ) -> int:
+        """Index of a surface of one sRGB colour, given as bytes."""
+        return self.add(Surface(semantics=semantics, tint=tint_from_bytes(colour), **looks))
+
     def painted(
         self,
         rgba: np.ndarray,

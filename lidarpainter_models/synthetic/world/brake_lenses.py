@@ -6,12 +6,7 @@ Everything is in the box frame of the car: x ahead, y left, z up, origin at the 
 import numpy as np
 
 from lidarpainter_models.synthetic.plan.car_kinds import CarShape
-from lidarpainter_models.synthetic.textures.surfaces import (
-    StreetClass,
-    Surface,
-    SurfaceSet,
-    tint_from_bytes,
-)
+from lidarpainter_models.synthetic.textures.surfaces import StreetClass, SurfaceSet
 from lidarpainter_models.synthetic.world.lamps import Lens
 from lidarpainter_models.synthetic.world.meshes import Mesh, MeshBuilder
 
@@ -30,21 +25,15 @@ EMISSION = 8.0
 ROWS, COLUMNS = 3, 6
 
 
-def brake_lens_surface(surfaces: SurfaceSet, lamp: int) -> int:
-    """Dark red glass that a lamp makes bright."""
-    tint = tint_from_bytes(RED)
-    return surfaces.add(
-        Surface(semantics=StreetClass.CAR, tint=tint, gloss=0.5, emission=EMISSION, lamp=lamp)
-    )
-
-
 def with_brake_lenses(
-    mesh: Mesh, size_m: np.ndarray, shape: CarShape, surface: int, lamp: int
+    mesh: Mesh, size_m: np.ndarray, shape: CarShape, surfaces: SurfaceSet, lamp: int
 ) -> tuple[Mesh, tuple[Lens, ...]]:
     """A car's mesh with a left and a right lens of one lamp, and where they are.
 
+    They are of dark red glass that the lamp makes bright.
     The mesh is that of `build_car`, `size_m` (3) its box: lenses keep inside.
     """
+    surface = surfaces.plain(RED, StreetClass.CAR, gloss=0.5, emission=EMISSION, lamp=lamp)
     tail = -shape.length_m / 2 + 0.15
     belt = float(np.interp(tail, *np.transpose(shape.belt)))
     roof = float(np.interp(tail, *np.transpose(shape.roof)))

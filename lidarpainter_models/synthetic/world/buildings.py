@@ -78,10 +78,8 @@ def add_buildings(
         if not lot.is_gap:
             _Building(builder, surfaces, plan, lot, rng).add()
         else:  # something closes the view behind a gap
-            back = Lot(
-                lot.side, lot.start_m - 6, lot.end_m + 6, lot.front_d_m + lot.side * 27,
-                False, False, False,
-            )  # fmt: skip
+            stretch = lot.start_m - 6, lot.end_m + 6
+            back = Lot(lot.side, *stretch, lot.front_d_m + lot.side * 27, False, False, False)
             _Building(builder, surfaces, plan, back, rng).add(is_background=True)
 
 
@@ -114,15 +112,7 @@ class _Building:
         per_m = 44.0 if lot.is_near and not is_background else 16.0
         front = self._hang(style, (width, height), per_m, origin, right)
         self._add_body(style, (width, depth, height), origin, right)
-        hung = HungFacade(
-            builder=self.builder,
-            surfaces=self.surfaces,
-            style=style,
-            facade=front,
-            origin=origin,
-            right=right,
-            rng=rng,
-        )
+        hung = HungFacade(self.builder, self.surfaces, style, front, origin, right, rng)
         hung.add_cornice()
         hung.add_roof_things(depth)
         if not is_background and lot.start_m < 150:
@@ -156,15 +146,14 @@ class _Building:
         inward = -np.cross(right, [0, 0, 1.0])
         tile = wall_tile(style.wall, style.colour, self.rng, size_m=TILE_M, per_m=16.0)
         wall = self.surfaces.painted(tile, StreetClass.BUILDING, repeats=True)
-        low = {-1: "right", 1: "left"}[self.lot.side]  # which end the street comes from
-        corner = {low: self.lot.is_corner_start}
-        corner["left" if low == "right" else "right"] = self.lot.is_corner_end
+        corners = [self.lot.is_corner_start, self.lot.is_corner_end]
+        if self.lot.side < 0:  # the street comes from the right
+            corners.reverse()
         up = np.array([0, 0, height])
-        for end in ("left", "right"):
-            foot = origin if end == "left" else origin + width * right
-            if corner[end]:
-                start = foot + depth * inward if end == "left" else foot
-                ahead = -inward if end == "left" else inward
+        for is_left, is_corner in zip((True, False), corners, strict=True):
+            foot = origin if is_left else origin + width * right
+            if is_corner:
+                start, ahead = (foot + depth * inward, -inward) if is_left else (foot, inward)
                 self._hang(style, (depth, height), 36.0, start, ahead)
                 continue
             uv = ((0, 0), (depth / TILE_M, 0), (0, height / TILE_M))
@@ -208,17 +197,14 @@ def _tower(size: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     style = draw_style(rng)
     floors, columns = max(int(size[2] / 3.4), 2), max(int(size[0] / 2.6), 2)
     cell = 10
-    image = np.empty((floors * cell, columns * cell, 4), np.float32)
-    image[:] = (*style.colour, 0)
+    image = np.full((floors * cell, columns * cell, 4), (*style.colour, 0), np.float32)
     lights = rng.uniform(0.55, 1.25, (floors, columns))
     glass = np.array([58, 70, 84.0])
     left = 1 if rng.random() < 0.5 else 3
     for floor in range(floors):
         for column in range(columns):
-            place = (
-                slice(floor * cell + 2, floor * cell + 8),
-                slice(column * cell + left, column * cell + cell - left + 1),
-            )
-            image[(*place, slice(0, 3))] = glass * lights[floor, column]
-            image[(*place, 3)] = 210
+            rows = slice(floor * cell + 2, floor * cell + 8)
+            pane = image[rows, column * cell + left : column * cell + cell - left + 1]
+            pane[..., :3] = glass * lights[floor, column]
+            pane[..., 3] = 210
     return np.clip(image, 0, 255).astype(np.uint8)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from lidarpainter_models.synthetic.world.furniture import StreetFurniture
 from lidarpainter_models.synthetic.world.ground import add_ground
 from lidarpainter_models.synthetic.world.lamps import SwitchingLamps
 from lidarpainter_models.synthetic.world.meshes import Mesh, MeshBuilder
-from lidarpainter_models.synthetic.world.packing import Light, MovingMesh, pack_scene
+from lidarpainter_models.synthetic.world.packing import light_array, pack_scene
 from lidarpainter_models.synthetic.world.traffic import StreetActor, Traffic
 from lidarpainter_models.synthetic.world.vegetation import (
     SPECIES,
@@ -68,7 +69,8 @@ def build_city(
     plan_rng, ground_rng, house_rng, green_rng, thing_rng, car_rng, sky_rng, ego_rng, lot_rng = (
         np.random.default_rng(stream) for stream in streams[:9]
     )
-    lamps = SwitchingLamps.of_streams(*streams[9:]) if are_lamps_switching else SwitchingLamps()
+    signal_rng, brake_rng = map(np.random.default_rng, streams[9:])
+    lamps = SwitchingLamps(signal_rng, brake_rng) if are_lamps_switching else SwitchingLamps()
     plan = draw_plan(plan_rng)
     surfaces, builder = SurfaceSet(), MeshBuilder()
     add_ground(builder, surfaces, plan, ground_rng)
@@ -88,7 +90,7 @@ def build_city(
     light = draw_light(surfaces, plan, sky_rng)
     street, owner = _standing(builder.build(), plan, actors)
     owners = [index for index, actor in enumerate(actors) if actor.is_moving]
-    moving = [MovingMesh(mesh, index) for index in owners for mesh in actors[index].meshes]
+    moving = [(mesh, index) for index in owners for mesh in actors[index].meshes]
     arrays, roots, radius_m = pack_scene(street, owner, moving, surfaces, light)
     last = np.cumsum([len(actors[index].meshes) for index in owners])
     most = max(len(actors[index].meshes) for index in owners)
@@ -151,9 +153,7 @@ def _fill_gap(
     start, end = lot.start_m + 0.3, lot.end_m - 0.3
     front = lot.front_d_m + lot.side * 0.15
     if rng.random() < 0.5:
-        for low, high in zip(
-            np.linspace(start, end, 4)[:-1], np.linspace(start, end, 4)[1:], strict=True
-        ):
+        for low, high in pairwise(np.linspace(start, end, 4)):
             first = plan.line.place(low, front, KERB_HEIGHT_M)
             second = plan.line.place(high, front, KERB_HEIGHT_M)
             length = float(np.linalg.norm(second - first))
@@ -199,13 +199,13 @@ def draw_clouds(rng: np.random.Generator, *, cover: float) -> np.ndarray:
     return as_rgba(colour, 0.92 * opacity)
 
 
-def draw_light(surfaces: SurfaceSet, plan: StreetPlan, rng: np.random.Generator) -> Light:
+def draw_light(surfaces: SurfaceSet, plan: StreetPlan, rng: np.random.Generator) -> np.ndarray:
     """A day: how high the sun, how warm its light, how much cloud."""
     clouds = surfaces.add_texture(draw_clouds(rng, cover=rng.uniform(0.3, 0.75)), repeats=True)
     height = plan.sun_direction[2]
     warmth = 1.0 - height
-    return Light(
-        sun_direction=plan.sun_direction,
+    return light_array(
+        plan.sun_direction,
         sun_rgb=(2.65, 2.65 * (0.98 - 0.14 * warmth), 2.65 * (0.92 - 0.34 * warmth)),
         haze_per_m=1 / rng.uniform(900, 2400),
         cloud_texture=clouds,

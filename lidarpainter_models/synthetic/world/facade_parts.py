@@ -13,12 +13,7 @@ from lidarpainter_models.synthetic.textures.signs import (
     blade_board,
     shop_board,
 )
-from lidarpainter_models.synthetic.textures.surfaces import (
-    StreetClass,
-    Surface,
-    SurfaceSet,
-    tint_from_bytes,
-)
+from lidarpainter_models.synthetic.textures.surfaces import StreetClass, SurfaceSet
 from lidarpainter_models.synthetic.textures.walls import WallCanvas
 from lidarpainter_models.synthetic.world.facades import FLOOR_M, GROUND_FLOOR_M, Facade, FacadeStyle
 from lidarpainter_models.synthetic.world.meshes import MeshBuilder
@@ -27,7 +22,7 @@ from lidarpainter_models.synthetic.world.solids import add_box, add_tube
 UP = np.array([0.0, 0.0, 1.0])
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class HungFacade:
     """A facade where it hangs, and what is added to it."""
 
@@ -57,9 +52,8 @@ class HungFacade:
 
     def plain(self, colour: tuple[float, float, float], gloss: float = 0.0) -> int:
         """A surface of one colour."""
-        tint = tint_from_bytes((int(colour[0]), int(colour[1]), int(colour[2])))
-        surface = Surface(semantics=StreetClass.BUILDING, tint=tint, gloss=gloss)
-        return self.surfaces.add(surface)
+        red, green, blue = map(int, colour)
+        return self.surfaces.plain((red, green, blue), StreetClass.BUILDING, gloss=gloss)
 
     def add_cornice(self) -> None:
         """A stepped ledge along the roof."""

@@ -147,8 +147,7 @@ def _ground_floor(
         left, right = bay * bay_m + 0.35, (bay + 1) * bay_m - 0.35
         if bay == door_bay:
             door = Opening(left, left + 1.15, 0.0, top, 0.3)
-            hue = rng.uniform(30, 150, 3)
-            draw_door(canvas, door, (float(hue[0]), float(hue[1]), float(hue[2])), rng)
+            draw_door(canvas, door, _colour(rng.uniform(30, 150, 3)), rng)
             openings.append(door)
             left += 1.15 + 0.3
         if right - left < 0.8:
@@ -159,21 +158,13 @@ def _ground_floor(
         elif style.ground_floor == "gate":
             grey = rng.uniform(90, 170)
             draw_gate(canvas, opening, (grey, grey, grey * 1.02), rng)
-        else:
-            opening = _home_window(canvas, style, (left + right) / 2, top, rng)
-            continue  # shallow, so drawn only
+        else:  # a window at eye height, so shallow that it is drawn only
+            middle, half = (left + right) / 2, min(style.window_width_m, 1.8) / 2
+            window = Opening(middle - half, middle + half, 1.0, top, 0.0)
+            draw_window(canvas, window, style.frame, style.panes, rng)
+            continue
         openings.append(opening)
     return openings
-
-
-def _home_window(
-    canvas: WallCanvas, style: FacadeStyle, middle: float, top: float, rng: np.random.Generator
-) -> Opening:
-    """A window at eye height."""
-    half = min(style.window_width_m, 1.8) / 2
-    opening = Opening(middle - half, middle + half, 1.0, top, 0.0)
-    draw_window(canvas, opening, style.frame, style.panes, rng)
-    return opening
 
 
 def add_facade(

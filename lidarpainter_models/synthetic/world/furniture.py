@@ -9,6 +9,7 @@ from lidarpainter_models.synthetic.plan.layout import KERB_HEIGHT_M, StreetPlan
 from lidarpainter_models.synthetic.raytracing.scene_arrays import KIND_CUT_OUT
 from lidarpainter_models.synthetic.textures.signs import (
     STREET_NAMES,
+    blade_board,
     parking_plate,
     speed_plate,
     stop_plate,
@@ -16,7 +17,6 @@ from lidarpainter_models.synthetic.textures.signs import (
 )
 from lidarpainter_models.synthetic.textures.surfaces import (
     StreetClass,
-    Surface,
     SurfaceSet,
     tint_from_bytes,
 )
@@ -44,19 +44,9 @@ class StreetFurniture:
     rng: np.random.Generator
     lamps: SwitchingLamps = field(default_factory=SwitchingLamps)
 
-    def plain(
-        self,
-        colour: tuple[int, int, int],
-        kind: StreetClass,
-        *,
-        emission: float = 0.0,
-        lamp: int = -1,
-    ) -> int:
-        """A surface of one colour."""
-        tint = tint_from_bytes(colour)
-        return self.surfaces.add(
-            Surface(semantics=kind, tint=tint, gloss=0.15, emission=emission, lamp=lamp)
-        )
+    def plain(self, colour: tuple[int, int, int], kind: StreetClass, **light: float) -> int:
+        """A surface of one colour, which may shine."""
+        return self.surfaces.plain(colour, kind, gloss=0.15, **light)
 
     def foot(self, s_m: float, side: int, inset_m: float = EDGE_M) -> np.ndarray:
         """A place on the sidewalk; `inset_m` from the kerb."""
@@ -104,8 +94,6 @@ class StreetFurniture:
 
     def _add_banner(self, centre: np.ndarray, heading: float) -> None:
         """Cloth on a lamp post with the town's event."""
-        from lidarpainter_models.synthetic.textures.signs import blade_board
-
         words = ("JAZZ", "OPERA", "FAIR", "SPORT")[int(self.rng.integers(4))]
         cloth = blade_board(words, self.rng, size_m=(0.75, 1.6))
         face = self.surfaces.painted(cloth, StreetClass.SIGN)
@@ -226,14 +214,11 @@ class StreetFurniture:
                 self._add_lens(place, yaw_rad, colour, switching.get(name, -1))
             else:
                 lit = name == "green"
-                surface = self.plain(
-                    colour if lit else _unlit(colour), StreetClass.SIGN, emission=LIT * lit
-                )
+                shown = colour if lit else _unlit(colour)
+                surface = self.plain(shown, StreetClass.SIGN, emission=LIT * lit)
                 add_ball(self.builder, place, (0.05, 0.05, 0.12), surface, rows=8)
-            add_tube(
-                self.builder, place + 0.02 * UP, place + 0.2 * front + 0.02 * UP, (0.15, 0.15),
-                black, sides=10,
-            )  # fmt: skip
+            back, end = place + 0.02 * UP, place + 0.2 * front + 0.02 * UP
+            add_tube(self.builder, back, end, (0.15, 0.15), black)
 
     def _add_lens(
         self, place: np.ndarray, yaw_rad: float, colour: tuple[int, int, int], lamp: int
@@ -278,19 +263,14 @@ class StreetFurniture:
         grey = self.plain((140, 144, 146), StreetClass.POLE)
         tops = []
         for s in np.arange(-70.0 + self.rng.uniform(0, 10), 190, 34.0):
-            s = float(s) if self.is_free(s) else plan_clear(self.plan, float(s))
+            if not self.is_free(s):
+                before, after = self.plan.cross_start_m - 2.0, self.plan.cross_end_m + 2.0
+                s = before if s - before < after - s else after
             foot, (ahead, inward, _) = self.foot(s, side, 0.75), self.axes(s, side)
             add_tube(self.builder, foot, foot + 11.0 * UP, (0.16, 0.11), wood)
             for height, reach in ((10.4, 1.25), (9.3, 1.0)):
-                arm = foot + height * UP
-                add_tube(
-                    self.builder,
-                    arm - reach * inward,
-                    arm + reach * inward,
-                    (0.06, 0.06),
-                    wood,
-                    sides=6,
-                )
+                arm, along = foot + height * UP, reach * inward
+                add_tube(self.builder, arm - along, arm + along, (0.06, 0.06), wood, sides=6)
             if self.rng.random() < 0.5:
                 can = foot + 7.9 * UP + 0.35 * ahead
                 add_tube(self.builder, can, can + 0.9 * UP, (0.24, 0.24), grey, has_caps=True)
@@ -307,8 +287,6 @@ class StreetFurniture:
 
     def _add_shelter(self) -> None:
         """A bus stop: a roof on posts, a bench, a back wall with a poster."""
-        from lidarpainter_models.synthetic.textures.signs import blade_board
-
         side = int(self.rng.choice([-1, 1]))
         s = self.rng.uniform(20, 38)
         metal = self.plain((56, 60, 64), StreetClass.FURNITURE)
@@ -335,9 +313,3 @@ def _unlit(colour: tuple[int, int, int]) -> tuple[int, int, int]:
     """What is seen of the glass of a signal while its lamp is off."""
     red, green, blue = (int(value * 0.28) for value in colour)
     return red, green, blue
-
-
-def plan_clear(plan: StreetPlan, s_m: float) -> float:
-    """The nearest place clear of the crossing."""
-    before, after = plan.cross_start_m - 2.0, plan.cross_end_m + 2.0
-    return before if s_m - before < after - s_m else after

@@ -13,12 +13,7 @@ from lidarpainter_models.synthetic.plan.layout import (
 from lidarpainter_models.synthetic.raytracing.scene_arrays import KIND_ROAD
 from lidarpainter_models.synthetic.textures.ground import asphalt_detail, lot_ground, sidewalk_slabs
 from lidarpainter_models.synthetic.textures.road_paint import paint_road
-from lidarpainter_models.synthetic.textures.surfaces import (
-    StreetClass,
-    Surface,
-    SurfaceSet,
-    tint_from_bytes,
-)
+from lidarpainter_models.synthetic.textures.surfaces import StreetClass, Surface, SurfaceSet
 from lidarpainter_models.synthetic.world.meshes import MeshBuilder
 
 STEP_M = 4.0
@@ -35,15 +30,8 @@ def add_ground(
     """All of the ground."""
     detail = surfaces.add_texture(asphalt_detail(rng), repeats=True)
     _add_road(builder, surfaces, plan, rng, detail)
-    asphalt = surfaces.add(
-        Surface(
-            semantics=StreetClass.ROAD,
-            tint=tint_from_bytes((97, 96, 94)),
-            detail_texture=detail,
-            detail_per_m=0.45,
-            detail_strength=0.35,
-        )
-    )
+    stones = {"detail_texture": detail, "detail_per_m": 0.45, "detail_strength": 0.35}
+    asphalt = surfaces.plain((97, 96, 94), StreetClass.ROAD, **stones)
     middle = (plan.cross_start_m, plan.cross_end_m)
     for near, far in _sides(plan):
         _add_sheet(builder, plan, middle, (near, far), asphalt, height_m=0.0)
@@ -55,16 +43,12 @@ def add_ground(
         detail_per_m=0.6,
         detail_strength=0.12,
     )
-    kerb = surfaces.add(
-        Surface(semantics=StreetClass.SIDEWALK, tint=tint_from_bytes((150, 148, 142)))
-    )
+    kerb = surfaces.plain((150, 148, 142), StreetClass.SIDEWALK)
     lot = surfaces.painted(lot_ground(rng), StreetClass.TERRAIN, repeats=True)
     for start, end in plan.blocks:
         for near, far in _sides(plan):
             _add_block(builder, plan, (start, end), (near, far), (surfaces.add(slabs), kerb, lot))
-    plain = surfaces.add(
-        Surface(semantics=StreetClass.TERRAIN, tint=tint_from_bytes((112, 112, 98)))
-    )
+    plain = surfaces.plain((112, 112, 98), StreetClass.TERRAIN)
     builder.quad([-1500, -1500, -1.2], [3000, 0, 0], [0, 3000, 0], plain)
 
 

@@ -61,13 +61,6 @@ class SwitchingLamps:
     standing: list[Lens] = field(default_factory=list)
     """Lenses of the street, in the world; those of cars are with the cars."""
 
-    @classmethod
-    def of_streams(
-        cls, signals: np.random.SeedSequence, brakes: np.random.SeedSequence
-    ) -> "SwitchingLamps":
-        """Lamps to be drawn from two streams."""
-        return cls(np.random.default_rng(signals), np.random.default_rng(brakes))
-
     def add_signals(self) -> dict[str, int]:
         """Draw when the signals of the street change; the lamp of each colour that does."""
         if self.signal_rng is None:

@@ -43,16 +43,11 @@ class Mesh:
     @classmethod
     def joined(cls, meshes: Sequence["Mesh"]) -> "Mesh":
         """All primitives of several meshes, in order."""
-        if not meshes:
-            return cls(
-                np.zeros((0, GEOMETRY_COLUMNS)),
-                np.zeros((0, SHADING_COLUMNS)),
-                np.zeros(0, np.int32),
-            )
+        geometry, shading = np.zeros((0, GEOMETRY_COLUMNS)), np.zeros((0, SHADING_COLUMNS))
         return cls(
-            np.concatenate([mesh.geometry for mesh in meshes]),
-            np.concatenate([mesh.shading for mesh in meshes]),
-            np.concatenate([mesh.surface for mesh in meshes]),
+            np.concatenate([geometry, *(mesh.geometry for mesh in meshes)]),
+            np.concatenate([shading, *(mesh.shading for mesh in meshes)]),
+            np.concatenate([np.zeros(0, np.int32), *(mesh.surface for mesh in meshes)]),
         )
 
     def corners(self) -> np.ndarray:

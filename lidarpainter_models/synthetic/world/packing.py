@@ -1,7 +1,5 @@
 """Pack meshes, surfaces and light into the arrays that are traced."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from lidarpainter_models.synthetic.raytracing import scene_arrays as layout
@@ -12,41 +10,42 @@ from lidarpainter_models.synthetic.textures.surfaces import (
 )
 from lidarpainter_models.synthetic.world.meshes import Mesh
 
-
-@dataclass(frozen=True, kw_only=True)
-class Light:
-    """Sun, sky and air; colours are linear."""
-
-    sun_direction: tuple[float, float, float]
-    sun_rgb: tuple[float, float, float] = (2.5, 2.3, 1.95)
-    zenith_rgb: tuple[float, float, float] = (0.30, 0.45, 0.74)
-    horizon_rgb: tuple[float, float, float] = (0.74, 0.80, 0.88)
-    ground_rgb: tuple[float, float, float] = (0.26, 0.24, 0.21)
-    haze_per_m: float = 1 / 1400
-    cloud_texture: int = 0
-    cloud_offset: tuple[float, float] = (0.0, 0.0)
-    exposure: float = 0.86
+Triple = tuple[float, float, float]
 
 
-@dataclass(frozen=True, eq=False)
-class MovingMesh:
-    """A mesh in its box frame, drawn wherever its box is."""
-
-    mesh: Mesh
-    actor: int
+def light_array(
+    sun_direction: Triple,
+    *,
+    sun_rgb: Triple,
+    haze_per_m: float,
+    cloud_texture: int,
+    cloud_offset: tuple[float, float],
+) -> np.ndarray:
+    """Sun, sky and air as `SceneArrays.light`; colours are linear."""
+    array = np.zeros(layout.LIGHT_COLUMNS)
+    array[layout.SUN_DIRECTION : layout.SUN_DIRECTION + 3] = sun_direction
+    array[layout.SUN_RGB : layout.SUN_RGB + 3] = sun_rgb
+    array[layout.ZENITH_RGB : layout.ZENITH_RGB + 3] = 0.30, 0.45, 0.74
+    array[layout.HORIZON_RGB : layout.HORIZON_RGB + 3] = 0.74, 0.80, 0.88
+    array[layout.GROUND_RGB : layout.GROUND_RGB + 3] = 0.26, 0.24, 0.21
+    array[layout.HAZE_PER_M] = haze_per_m
+    array[layout.CLOUD_TEXTURE] = cloud_texture
+    array[layout.EXPOSURE] = 0.86
+    array[layout.CLOUD_OFFSET : layout.CLOUD_OFFSET + 2] = cloud_offset
+    return array
 
 
 def pack_scene(
     street: Mesh,
     street_actor: np.ndarray,
-    moving: list[MovingMesh],
+    moving: list[tuple[Mesh, int]],
     surfaces: SurfaceSet,
-    light: Light,
+    light: np.ndarray,
 ) -> tuple[layout.SceneArrays, np.ndarray, np.ndarray]:
     """Everything a ray needs.
 
     The street stands still, in the world; `street_actor` (primitives) is the actor index of each of
-    its primitives, -1 for none.
+    its primitives, -1 for none. Moving meshes, with their actors, are in their box frames.
 
     Returns:
         The arrays, and the root node (int32) and radius (metres) of every moving mesh.
@@ -54,7 +53,7 @@ def pack_scene(
     value, index = surfaces.surface_arrays()
     texels, texture_index = surfaces.texture_arrays()
     meshes = [(street, street_actor)]
-    meshes += [(part.mesh, np.full(len(part.mesh.surface), part.actor)) for part in moving]
+    meshes += [(mesh, np.full(len(mesh.surface), actor)) for mesh, actor in moving]
     trees, roots, num_nodes, num_prims = [], [], 0, 0
     for mesh, actor in meshes:
         tree = _pack_tree(mesh, actor, index, num_nodes, num_prims)
@@ -73,11 +72,11 @@ def pack_scene(
         surface_index=index,
         texels=texels,
         texture_index=texture_index,
-        light=_light_array(light),
+        light=light,
         to_linear=linear_from_srgb(np.arange(256) / 255).astype(np.float32),
         to_display=_tone_curve(),
     )
-    radii = [np.linalg.norm(part.mesh.corners(), axis=-1).max() + 0.01 for part in moving]
+    radii = [np.linalg.norm(mesh.corners(), axis=-1).max() + 0.01 for mesh, _ in moving]
     return arrays, np.array(roots[1:], np.int32), np.array(radii, np.float64)
 
 
@@ -102,23 +101,6 @@ def _pack_tree(
     owner = np.stack([mesh.surface[order], actor[order]], axis=1).astype(np.int32)
     shading = mesh.shading[order].astype(np.float32)
     return bounds, children.astype(np.int32), geometry, shading, owner
-
-
-def _light_array(light: Light) -> np.ndarray:
-    array = np.zeros(layout.LIGHT_COLUMNS)
-    for start, colour in (
-        (layout.SUN_DIRECTION, light.sun_direction),
-        (layout.SUN_RGB, light.sun_rgb),
-        (layout.ZENITH_RGB, light.zenith_rgb),
-        (layout.HORIZON_RGB, light.horizon_rgb),
-        (layout.GROUND_RGB, light.ground_rgb),
-    ):
-        array[start : start + 3] = colour
-    array[layout.HAZE_PER_M] = light.haze_per_m
-    array[layout.CLOUD_TEXTURE] = light.cloud_texture
-    array[layout.EXPOSURE] = light.exposure
-    array[layout.CLOUD_OFFSET : layout.CLOUD_OFFSET + 2] = light.cloud_offset
-    return array
 
 
 def _tone_curve() -> np.ndarray:

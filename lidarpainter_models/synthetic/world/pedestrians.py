@@ -4,12 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarpainter_models.synthetic.textures.surfaces import (
-    StreetClass,
-    Surface,
-    SurfaceSet,
-    tint_from_bytes,
-)
+from lidarpainter_models.synthetic.textures.surfaces import StreetClass, SurfaceSet
 from lidarpainter_models.synthetic.world.meshes import Mesh, MeshBuilder
 from lidarpainter_models.synthetic.world.solids import add_ball, add_tube
 
@@ -92,8 +87,7 @@ def draw_person(surfaces: SurfaceSet, rng: np.random.Generator) -> Person:
     """Somebody of 1.6 to 1.9 m."""
 
     def cloth(colours: tuple[tuple[int, int, int], ...]) -> int:
-        tint = tint_from_bytes(colours[int(rng.integers(len(colours)))])
-        return surfaces.add(Surface(semantics=StreetClass.PEDESTRIAN, tint=tint))
+        return surfaces.plain(colours[int(rng.integers(len(colours)))], StreetClass.PEDESTRIAN)
 
     return Person(  # in this order: the street of a seed stays what it is
         coat=cloth(CLOTHES),

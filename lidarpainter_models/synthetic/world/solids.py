@@ -4,8 +4,6 @@ import numpy as np
 
 from lidarpainter_models.synthetic.world.meshes import MeshBuilder, Vector
 
-FACES = ("front", "back", "left", "right", "top", "bottom")
-
 
 def add_box(
     builder: MeshBuilder,
@@ -15,12 +13,10 @@ def add_box(
     *,
     yaw_rad: float = 0.0,
     faces: dict[str, int] | None = None,
-    uv_per_m: float | None = None,
 ) -> None:
-    """An upright box; `faces` gives single faces another surface (-1: leave it out).
+    """An upright box; `faces` gives single faces another surface.
 
-    Front looks along +x, left along +y. Each face shows its whole texture upright, or
-    `uv_per_m` repeats of it per metre.
+    Front looks along +x, left along +y. Each face shows its whole texture upright.
     """
     cosine, sine = np.cos(yaw_rad), np.sin(yaw_rad)
     axis_x = np.array([cosine, sine, 0.0]) * size[0]
@@ -30,21 +26,15 @@ def add_box(
     low, high = np.asarray(centre) - half, np.asarray(centre) + half
     # corner at the upper left as seen from outside, then along the texture's rows, then down
     layout = {
-        "front": (low + axis_x + axis_z, axis_y, -axis_z, (size[1], size[2])),
-        "back": (low + axis_y + axis_z, -axis_y, -axis_z, (size[1], size[2])),
-        "left": (high, -axis_x, -axis_z, (size[0], size[2])),
-        "right": (low + axis_z, axis_x, -axis_z, (size[0], size[2])),
-        "top": (low + axis_y + axis_z, -axis_y, axis_x, (size[1], size[0])),
-        "bottom": (low, axis_x, axis_y, (size[0], size[1])),
+        "front": (low + axis_x + axis_z, axis_y, -axis_z),
+        "back": (low + axis_y + axis_z, -axis_y, -axis_z),
+        "left": (high, -axis_x, -axis_z),
+        "right": (low + axis_z, axis_x, -axis_z),
+        "top": (low + axis_y + axis_z, -axis_y, axis_x),
+        "bottom": (low, axis_x, axis_y),
     }
-    for face in FACES:
-        chosen = (faces or {}).get(face, surface)
-        if chosen < 0:
-            continue
-        corner, first, second, extent = layout[face]
-        across = extent[0] * uv_per_m if uv_per_m else 1.0
-        down = extent[1] * uv_per_m if uv_per_m else 1.0
-        builder.quad(corner, first, second, chosen, uv=((0, 0), (across, 0), (0, down)))
+    for face, (corner, first, second) in layout.items():
+        builder.quad(corner, first, second, (faces or {}).get(face, surface))
 
 
 def add_tube(

@@ -5,10 +5,11 @@ stay outside of all cars.
 """
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from lidarpainter_models.synthetic.plan.car_kinds import SHAPES
+from lidarpainter_models.synthetic.plan.car_kinds import SHAPES, CarShape
 from lidarpainter_models.synthetic.plan.ego_motion import EgoMotion, Pace
 from lidarpainter_models.synthetic.plan.layout import (
     KERB_HEIGHT_M,
@@ -20,7 +21,7 @@ from lidarpainter_models.synthetic.plan.layout import (
 from lidarpainter_models.synthetic.plan.street_line import StreetLine
 from lidarpainter_models.synthetic.textures.cars import CarAtlas, add_car_surfaces
 from lidarpainter_models.synthetic.textures.surfaces import SurfaceSet
-from lidarpainter_models.synthetic.world.brake_lenses import brake_lens_surface, with_brake_lenses
+from lidarpainter_models.synthetic.world.brake_lenses import with_brake_lenses
 from lidarpainter_models.synthetic.world.car_shapes import build_car
 from lidarpainter_models.synthetic.world.lamps import Lens, SwitchingLamps
 from lidarpainter_models.synthetic.world.meshes import Mesh
@@ -88,7 +89,7 @@ class Traffic:
     are_people_walking: bool = False
     lamps: SwitchingLamps = field(default_factory=SwitchingLamps)
     actors: list[StreetActor] = field(default_factory=list)
-    _painted: list[tuple[str, CarAtlas]] = field(default_factory=list)
+    _painted: list[tuple[CarShape, CarAtlas]] = field(default_factory=list)
     _meshes: dict[tuple[int, bool], tuple[Mesh, np.ndarray]] = field(default_factory=dict)
 
     def draw(self) -> list[StreetActor]:
@@ -97,9 +98,8 @@ class Traffic:
         self._add_oncoming()
         self._add_walkers()
         for _ in range(NUM_PAINTED):
-            kind = KINDS[int(self.rng.integers(len(KINDS)))]
-            atlas = add_car_surfaces(self.surfaces, SHAPES[kind], self.rng)
-            self._painted.append((kind, atlas))
+            shape = SHAPES[KINDS[int(self.rng.integers(len(KINDS)))]]
+            self._painted.append((shape, add_car_surfaces(self.surfaces, shape, self.rng)))
         for side in (0, 1):
             self._park_row(side)
         self._add_waiting()
@@ -113,20 +113,13 @@ class Traffic:
         lenses: tuple[Lens, ...] = ()
         lamp = self.lamps.add_brakes()
         if lamp >= 0:
-            surface = brake_lens_surface(self.surfaces, lamp)
-            mesh, lenses = with_brake_lenses(mesh, size, shape, surface, lamp)
-        name = f"car-{len(self.actors):03d}"
-        self.actors.append(
-            StreetActor(
-                actor_id=name,
-                category=shape.category,
-                size_m=size,
-                meshes=(mesh,),
-                pace=pace,
-                lenses=lenses,
-                **way,
-            )
-        )
+            mesh, lenses = with_brake_lenses(mesh, size, shape, self.surfaces, lamp)
+        of_car = {"category": shape.category, "size_m": size, "meshes": (mesh,), "lenses": lenses}
+        self._add("car", **of_car, pace=pace, **way)
+
+    def _add(self, kind: str, **known: Any) -> None:  # noqa: ANN401 - fields of `StreetActor`
+        """The next actor, named by its kind."""
+        self.actors.append(StreetActor(actor_id=f"{kind}-{len(self.actors):03d}", **known))
 
     def _add_same_direction(self) -> None:
         """Cars ahead in the ego lane and, where it is a lane, in the one to its left."""
@@ -179,44 +172,27 @@ class Traffic:
             speed = float(rng.choice([-1.0, 1.0])) * rng.uniform(1.0, 1.6)
             if self.are_people_walking:
                 speed = np.sign(speed) * person.cycle_m * WALKING_CYCLES_PER_S
-            self.actors.append(
-                StreetActor(
-                    actor_id=f"person-{len(self.actors):03d}",
-                    category="pedestrian",
-                    size_m=size,
-                    meshes=meshes,
-                    start_s_m=rng.uniform(7, 44),
-                    d_m=kerb + side * rng.uniform(1.1, SIDEWALK_M - 0.7),
-                    pace=Pace(speed, speed),
-                    yaw_rad=0.0 if speed > 0 else np.pi,
-                    ground_m=KERB_HEIGHT_M,
-                    cycle_m=person.cycle_m,
-                )
+            self._add(
+                "person",
+                category="pedestrian",
+                size_m=size,
+                meshes=meshes,
+                start_s_m=rng.uniform(7, 44),
+                d_m=kerb + side * rng.uniform(1.1, SIDEWALK_M - 0.7),
+                pace=Pace(speed, speed),
+                yaw_rad=0.0 if speed > 0 else np.pi,
+                ground_m=KERB_HEIGHT_M,
+                cycle_m=person.cycle_m,
             )
-
-    def _parked_mesh(self, index: int, *, is_near: bool) -> tuple[Mesh, np.ndarray]:
-        if (index, is_near) not in self._meshes:
-            kind, atlas = self._painted[index]
-            stations = 34 if is_near else 12
-            self._meshes[index, is_near] = build_car(SHAPES[kind], atlas, stations)
-        return self._meshes[index, is_near]
 
     def _park(self, s_m: float, d_m: float, yaw_rad: float) -> None:
-        rng = self.rng
-        index = int(rng.integers(NUM_PAINTED))
-        mesh, size = self._parked_mesh(index, is_near=-20 < s_m < NEAR_M)
-        category = SHAPES[self._painted[index][0]].category
-        self.actors.append(
-            StreetActor(
-                actor_id=f"parked-{len(self.actors):03d}",
-                category=category,
-                size_m=size,
-                meshes=(mesh,),
-                start_s_m=s_m,
-                d_m=d_m,
-                yaw_rad=yaw_rad,
-            )
-        )
+        index, is_near = int(self.rng.integers(NUM_PAINTED)), -20 < s_m < NEAR_M
+        shape, atlas = self._painted[index]
+        if (index, is_near) not in self._meshes:
+            self._meshes[index, is_near] = build_car(shape, atlas, 34 if is_near else 12)
+        mesh, size = self._meshes[index, is_near]
+        of_car = {"category": shape.category, "size_m": size, "meshes": (mesh,)}
+        self._add("parked", **of_car, start_s_m=s_m, d_m=d_m, yaw_rad=yaw_rad)
 
     def _park_row(self, side: int) -> None:
         """Parked cars along one kerb, most places taken."""
@@ -233,13 +209,11 @@ class Traffic:
         """Cars in the cross street that wait for green."""
         plan, rng = self.plan, self.rng
         middle = (plan.cross_start_m + plan.cross_end_m) / 2
-        for side, kerb, yaw in (
-            (-1, plan.right_kerb_m, np.pi / 2),
-            (1, plan.left_kerb_m, -np.pi / 2),
-        ):
+        offset = 0.25 * (plan.cross_end_m - plan.cross_start_m)
+        sides = ((-1, plan.right_kerb_m, np.pi / 2), (1, plan.left_kerb_m, -np.pi / 2))
+        for side, kerb, yaw in sides:
             reach = 6.5
             for _ in range(int(rng.integers(1, 3))):
-                offset = 0.25 * (plan.cross_end_m - plan.cross_start_m)
                 lane = middle - side * -offset
                 self._park(lane, kerb + side * (reach + PARKING_M), yaw + rng.normal(0, 0.02))
                 reach += rng.uniform(6.3, 7.5)

@@ -1,6 +1,6 @@
 """Street trees and hedges: trunks, branches, and crowns of leafy cards with cut-out leaves."""
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,28 +13,19 @@ from lidarpainter_models.synthetic.world.solids import add_tube
 
 SPECIES = ((58, 92, 34), (76, 104, 40), (44, 78, 40), (104, 112, 44), (66, 88, 52))
 DEPTHS = (0.42, 0.72, 1.0)
-
-
-@dataclass(frozen=True)
-class LeafSurfaces:
-    """Surfaces of the leaves of one species, from the shaded inside to the outside."""
-
-    shades: tuple[int, ...]
+LeafSurfaces = tuple[int, ...]
+"""Surfaces of the leaves of one species, from the shaded inside to the outside."""
 
 
 def draw_leaves(rng: np.random.Generator, colour: tuple[int, int, int]) -> np.ndarray:
     """A bunch of leaves as a cut-out."""
     size = 160
-    image = np.zeros((size, size, 3), np.float32)
-    image[:] = np.array(colour) * 0.7
+    image = np.full((size, size, 3), np.array(colour) * 0.7, np.float32)
     opacity = np.zeros((size, size), np.uint8)
     for _ in range(120):
         radius = 0.44 * size * np.sqrt(rng.random())
         angle = rng.uniform(0, 2 * np.pi)
-        centre = (
-            int(size / 2 + radius * np.cos(angle)),
-            int(size / 2 + radius * np.sin(angle)),
-        )
+        centre = int(size / 2 + radius * np.cos(angle)), int(size / 2 + radius * np.sin(angle))
         axes = int(rng.uniform(6, 11)), int(rng.uniform(3, 5))
         turn = float(np.rad2deg(angle) + rng.normal(0, 40))
         tone = np.array(colour) * rng.uniform(0.62, 1.3) + rng.normal(0, 6, 3)
@@ -49,20 +40,10 @@ def add_species(
 ) -> LeafSurfaces:
     """Textures and surfaces of one kind of leaves."""
     texture = surfaces.add_texture(draw_leaves(rng, colour))
-    return LeafSurfaces(
-        tuple(
-            surfaces.add(
-                Surface(
-                    semantics=StreetClass.VEGETATION,
-                    texture=texture,
-                    tint=(depth, depth, depth),
-                    kind=KIND_CUT_OUT,
-                    translucency=0.55,
-                )
-            )
-            for depth in DEPTHS
-        )
+    leaf = Surface(
+        semantics=StreetClass.VEGETATION, texture=texture, kind=KIND_CUT_OUT, translucency=0.55
     )
+    return tuple(surfaces.add(replace(leaf, tint=(depth, depth, depth))) for depth in DEPTHS)
 
 
 def bark_surface(surfaces: SurfaceSet, rng: np.random.Generator) -> int:
@@ -106,7 +87,7 @@ def add_crown(
     low = 0.55 * np.minimum(depth, 1.0) + 0.3 * (spots[:, 2] + 1) / 2
     shade = np.clip((low + rng.normal(0, 0.08, num_cards)) * 3.4 - 0.6, 0, 2.99).astype(int)
     normals = np.repeat(outward[:, None], 3, axis=1)
-    surface = np.array(leaves.shades)[shade]
+    surface = np.array(leaves)[shade]
     builder.primitives(corners, uv, surface, normals=normals, is_parallelogram=True)
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from lidarpainter_models.errors import DataError, LidarPainterError
-from lidarpainter_models.readers import ingest_scene
 from lidarpainter_models.readers.nuscenes.reader import list_nuscenes_scenes
 from lidarpainter_models.readers.nuscenes.tables import MAX_ROW_BYTES, NuscenesTable
 
@@ -39,18 +38,14 @@ NAN, ENDLESS = float("nan"), 10**400
 CASES = [
     ("sample_data", set_in("ego_pose_token", "f" * 32), "refers to token 'fff"),
     ("sample_data", set_in("calibrated_sensor_token", "f" * 32), "refers to token 'fff"),
-    ("calibrated_sensor", set_in("sensor_token", "f" * 32), "refers to token 'fff"),
     ("sample_annotation", set_in("instance_token", "gone"), "refers to token 'gone'"),
-    ("instance", set_in("category_token", "gone"), "refers to token 'gone'"),
     ("ego_pose", lambda rows: rows + rows[:1], "stands in 2 rows"),
-    ("instance", lambda rows: rows + rows[:1], "stands in 2 rows"),
     ("scene", lambda rows: rows + rows[:1], "name 'scene-0061' stands in 2 rows"),
     ("sample_data", lambda rows: rows + rows[:1], "has another row of the same time"),
     ("sample_annotation", lambda rows: rows + rows[:1], "has another box of instance"),
     ("sample", lambda rows: rows[:1], "states 2 samples"),
     ("scene", set_in("nbr_samples", 0), "states 0 samples"),
     ("sample", set_in("timestamp", -5), "timestamp is -5, expected whole microseconds"),
-    ("sample", set_in("timestamp", 1.5), "timestamp is 1.5, expected whole microseconds"),
     ("sample", set_in("timestamp", True), "timestamp is True, expected whole microseconds"),
     ("sample", set_in("timestamp", 2**62), "expected whole microseconds"),
     ("ego_pose", set_in("translation", [NAN, 0, 0]), "translation is [nan, 0, 0], expected 3"),
@@ -66,11 +61,9 @@ CASES = [
     ("calibrated_sensor", set_in("camera_intrinsic", [[1, 0, 1]] * 3, 2), "and no skew"),
     ("sample_data", set_in("filename", "../../../etc/passwd"), "expected a path below the root"),
     ("sample_data", set_in("filename", "/etc/passwd"), "expected a path below the root"),
-    ("sample_data", set_in("filename", "samples/../../x"), "expected a path below the root"),
     ("sample_data", set_in("filename", "a\x00b"), "expected a path below the root"),
     ("sample_data", set_in("filename", "\ud800"), "expected a path below the root"),
     ("sample_data", set_in("filename", "x" * 5000), "cannot be read (File name too long)"),
-    ("sample_data", set_sweep("filename", "x" * 256), "cannot be read (File name too long)"),
     ("sample_data", set_in("filename", "samples"), "/log/samples: "),
     ("sample_data", set_in("filename", "samples/none.jpg"), "none.jpg: the file is missing"),
     ("sample_data", set_in("is_key_frame", "yes"), "is_key_frame is 'yes', expected true or"),
@@ -128,14 +121,6 @@ def test_table_that_breaks_off_is_named_with_what_was_expected(log, store, conte
         assert str(raised.value) == line
 
 
-@pytest.mark.parametrize(
-    "table", ["sample_data", "ego_pose", "sample_annotation", "instance", "log"]
-)
-def test_missing_table(log, store, table):
-    (log.folder / f"{table}.json").unlink()
-    assert refusal(log, store).endswith(f"{table}.json: the table is missing")
-
-
 def test_table_that_never_ends(log, store):
     path = log.folder / "category.json"
     path.unlink()
@@ -182,9 +167,8 @@ def test_empty_sweep(log, store):
     assert "zero points beyond 1.0 m, expected at least one" in refusal(log, store)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("column", range(5))
-def test_sweep_of_no_numbers(log, store, value, column):
+@pytest.mark.parametrize(("column", "value"), [(0, np.nan), (3, np.inf), (4, -np.inf)])
+def test_sweep_of_no_numbers(log, store, column, value):
     def change(rows):
         rows[7, column] = value
 
@@ -207,23 +191,6 @@ def test_senseless_point(log, store, column, value, expected):
 
     write_points(sweep_file(log), change)
     assert expected in refusal(log, store)
-
-
-@pytest.mark.parametrize("kept", [0, 2, 100, -2])
-def test_truncated_image(log, store, kept):
-    name = log.rows_of("CAM_FRONT")[1]["filename"]
-    file = log.root / name
-    file.write_bytes(file.read_bytes()[:kept])
-    message = refusal(log, store)
-    assert name in message
-    assert "JPEG" in message
-
-
-def test_unknown_scene_and_root_without_tables(log, store, tmp_path):
-    with pytest.raises(DataError, match=r"no scene 'scene-0001' in v1\.0-mini"):
-        ingest_scene("nuscenes", log.root, "scene-0001", store)
-    with pytest.raises(DataError, match=r"no folder v1\.0-\* with a scene\.json"):
-        ingest_scene("nuscenes", tmp_path, "scene-0001", store)
 
 
 @pytest.mark.parametrize("blank", ["", " \n\t\r"])

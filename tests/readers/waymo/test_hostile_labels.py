@@ -1,12 +1,8 @@
 """Bad labels of Waymo, and names that are not there or lead elsewhere, get one clear line."""
 
 import pytest
-from waymo_damage import joined, split
-from waymo_edits import LABELS, with_frame
+from waymo_edits import LABELS, joined, split, with_frame
 from waymo_records import double, message, text
-
-from lidarpainter_models.errors import DataError
-from lidarpainter_models.readers import ingest_scene
 
 
 @pytest.mark.parametrize("name", ["../../x", "/etc/passwd", "", "a b", "x\ny", "\u202e", ".."])
@@ -53,8 +49,3 @@ def test_actor_that_stands_twice_in_a_frame(refusal, messages):
     line = refusal([messages[0], messages[1] + joined([first])])
     assert "record 1 at byte" in line
     assert "given twice, expected once a frame" in line
-
-
-def test_segment_that_is_not_there(records, tmp_path):
-    with pytest.raises(DataError, match="no segment other, expected a TFRecord or Parquet file"):
-        ingest_scene("waymo", records.root, "other", tmp_path / "store")

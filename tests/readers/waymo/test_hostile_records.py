@@ -5,16 +5,7 @@ import re
 import struct
 
 import pytest
-from waymo_damage import joined
-from waymo_edits import (
-    CONTEXT,
-    FILE,
-    POSE,
-    TIME,
-    edited,
-    refused_line,
-    with_frame,
-)
+from waymo_edits import CONTEXT, FILE, POSE, TIME, edited, joined, refused_line, with_frame
 from waymo_records import tfrecord, whole
 
 from lidarpainter_models.readers.waymo.tfrecord import (

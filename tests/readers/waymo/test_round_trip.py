@@ -23,16 +23,7 @@ from lidarpainter_models.scenes.records import Distortion
 def test_scene_comes_back(truth, scene):
     found = scene_differences(truth.scene, scene)
     # far below the millimetre that is asked for: what is left is float32 and whole microseconds
-    assert found.camera_centre_m < 1e-5
-    assert found.camera_rotation_deg < 1e-5
-    assert found.intrinsics == 0
-    assert found.num_other_images == 0
-    assert found.point_m < 5e-4
-    assert found.num_unpaired_boxes == 0
-    assert found.box_centre_m < 1e-6
-    assert found.box_rotation_deg < 1e-6
-    assert found.box_size_m == 0
-    assert found.num_points_in_other_boxes == 0
+    found.require_rounding(metres=1e-5, point_m=5e-4, degrees=1e-5)
 
 
 def test_no_point_is_lost_or_made(truth, scene):

@@ -1,5 +1,6 @@
-"""One frame as a reader hands it to the writer."""
+"""One frame on its way to the writer: from a reader, or from a scene that is written anew."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from jaxtyping import Float, UInt8
@@ -40,9 +41,9 @@ class FrameContent:
     """File or folder and frame, to name in errors."""
     timestamp_ns: int
     world_from_ego: Float[Tensor, "4 4"]
-    images: list[SourceImage]
-    sweeps: list[SourceSweep]
-    boxes: list[BoxRecord]
+    images: Sequence[SourceImage]
+    sweeps: Sequence[SourceSweep]
+    boxes: Sequence[BoxRecord]
 
     def write(self, writer: SceneWriter) -> None:
         """Add the frame to a scene."""
