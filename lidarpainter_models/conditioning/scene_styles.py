@@ -23,12 +23,10 @@ from lidarpainter_models.painter.styles.night import POWER, RADIANCE, place_of, 
 from lidarpainter_models.painter.styles.view import fit_ground
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import sampled_views
-from lidarpainter_models.weather.darkness import HEADLAMP_AHEAD_M, HEADLAMP_HEIGHT_M
+from lidarpainter_models.weather.darkness import HEADLAMP_AHEAD_M, HEADLAMP_HEIGHT_M, LIT_SHARE
 from lidarpainter_models.weather.mix import StyleMix
 
 MOST_VIEWS = 24
-LIT_SHARE = 0.4
-"""Of the windows."""
 LEAST_FINDS = 2
 """What one view alone finds is no lamp, where there are several views."""
 MERGED_M: dict[LampKind, float] = {"signal": 0.8, "window": 1.2, "street": 2.0}
