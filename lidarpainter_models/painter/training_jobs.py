@@ -9,9 +9,9 @@ from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.painter.nano.job import NanoJob
 from lidarpainter_models.painter.nano.painter import NanoPainter
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
+from lidarpainter_models.painter.one_step.config import PRESETS
 from lidarpainter_models.painter.one_step.job import NO_FILES, OneStepJob, OneStepRecipe
 from lidarpainter_models.painter.one_step.loading import SUFFIX, split_preset
-from lidarpainter_models.painter.one_step.presets import preset_named
 from lidarpainter_models.painter.one_step.training import OneStepTrainingConfig
 from lidarpainter_models.painter.one_step.weights import read_trained
 from lidarpainter_models.painter.selection import PainterChoice
@@ -60,7 +60,7 @@ def recipe_for(start: str) -> OneStepTrainingConfig:
     """
     if start.endswith(SUFFIX):
         return OneStepTrainingConfig(network=read_trained(Path(start)).config)
-    return OneStepTrainingConfig(network=preset_named(split_preset(start)[1]))
+    return OneStepTrainingConfig(network=PRESETS[split_preset(start)[1]])
 
 
 def _first_nano(start: Path) -> NanoPainter:

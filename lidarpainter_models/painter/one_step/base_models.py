@@ -81,12 +81,10 @@ def open_base(name: str, *, may_download: bool = False) -> BaseModel:
     hub_id = SD_TURBO_HUB if name == SD_TURBO else name
     folder = find_folder(hub_id, may_download=may_download)
     unet, vae = read_config(folder, "unet"), read_config(folder, "vae")
-    has_text = (folder / "text_encoder").is_dir()
-    text = read_config(folder, "text_encoder") if has_text else {}
     tiny = read_config(folder, TAESD_FOLDER) if (folder / TAESD_FOLDER).is_dir() else {}
     if not isinstance(unet.get("cross_attention_dim"), int):
         raise WeightsError(f"{folder}/unet/config.json names no cross_attention_dim")
-    architecture = Architecture(unet=unet, vae=vae, text=text, tiny=tiny)
+    architecture = Architecture(unet=unet, vae=vae, tiny=tiny)
     licence = read_licence(folder, hub_id, unet)
     return BaseModel(name=name, folder=folder, architecture=architecture, licence=licence)
 

@@ -25,10 +25,9 @@ from lidarpainter_models.painter.one_step.base_models import (
     model_files,
     open_base,
 )
-from lidarpainter_models.painter.one_step.config import OneStepConfig
+from lidarpainter_models.painter.one_step.config import PRESETS, OneStepConfig
 from lidarpainter_models.painter.one_step.network import OneStepNetwork
 from lidarpainter_models.painter.one_step.painter import OneStepPainter
-from lidarpainter_models.painter.one_step.presets import PRESETS, preset_named
 from lidarpainter_models.painter.one_step.prompts import PromptBook
 from lidarpainter_models.painter.one_step.weights import TrainedFile, apply_trained, read_trained
 from lidarpainter_models.painter.precision import faster_type
@@ -66,7 +65,7 @@ def load_one_step(
         return trained.to(device)
     model, preset = split_preset(name)
     base = open_base(model, may_download=may_download)
-    config = preset_named(preset)
+    config = PRESETS[preset]
     prompts = _open_prompts(base, {})
     parts = load_parts(base, config, dtype=dtype)
     network = assemble(config, parts.unet, parts.autoencoder, has_adapters=not merges)
@@ -172,7 +171,7 @@ def painter_files(name: str) -> list[Path]:
         base = _base_of(file)
         return [file.path, *model_files(base, file.config.autoencoder)]
     model, preset = split_preset(name)
-    return model_files(open_base(model), preset_named(preset).autoencoder)
+    return model_files(open_base(model), PRESETS[preset].autoencoder)
 
 
 def split_preset(name: str) -> tuple[str, str]:

@@ -22,12 +22,8 @@ from lidarpainter_models.painter.one_step.assembly import (
 )
 from lidarpainter_models.painter.one_step.config import OneStepConfig
 from lidarpainter_models.painter.one_step.network import OneStepNetwork
-from lidarpainter_models.painter.one_step.tensor_files import (
-    check_finite,
-    check_shapes,
-    open_weights,
-)
-from lidarpainter_models.storage.tensor_files import read_tensors, write_tensors
+from lidarpainter_models.painter.one_step.tensor_files import check_finite, check_shapes
+from lidarpainter_models.storage.tensor_files import open_tensors, read_tensors, write_tensors
 
 WEIGHTS_FORMAT = "lidarpainter-one-step/1"
 PROMPT = "prompt:"
@@ -69,8 +65,9 @@ def save_trained(
         WriteError: the file cannot be written.
     """
     state = dict(network.named_parameters())
-    tensors = {name: _stored(name, state[name]) for name in trained_names(network)}
-    tensors |= {PROMPT + name: _stored(PROMPT, text) for name, text in prompts.items()}
+    tensors = {name: state[name] for name in trained_names(network)}
+    tensors |= {PROMPT + name: text for name, text in prompts.items()}
+    tensors = {name: tensor.to(stored_type(name)) for name, tensor in tensors.items()}
     for name, tensor in tensors.items():
         check_finite(path, name, tensor)
     header = {
@@ -84,10 +81,6 @@ def save_trained(
     write_tensors(path, tensors, header)
 
 
-def _stored(name: str, tensor: Tensor) -> Tensor:
-    return tensor.detach().cpu().to(stored_type(name)).contiguous()
-
-
 def stored_type(name: str) -> torch.dtype:
     """The type in which a weight is stored."""
     return torch.float32 if name.startswith(IN_FLOAT32) else torch.bfloat16
@@ -99,7 +92,10 @@ def read_trained(path: Path) -> TrainedFile:
     Raises:
         WeightsError: it is missing, damaged, or of another format.
     """
-    header = read_header(path)
+    stored, header = read_tensors(path, damaged=WeightsError)
+    found = header.get("format", "no format mark")
+    if found != WEIGHTS_FORMAT:
+        raise WeightsError(f"weights file {path} has {found!r}, expected {WEIGHTS_FORMAT!r}")
     missing = {"config", "base", "mark", "licence", "provenance"} - header.keys()
     if missing:
         raise WeightsError(f"weights file {path} lacks {sorted(missing)} in its header")
@@ -111,7 +107,7 @@ def read_trained(path: Path) -> TrainedFile:
         raise WeightsError(f"weights file {path} has unusable settings: {error}") from None
     tensors: dict[str, Tensor] = {}
     prompts: dict[str, Tensor] = {}
-    for name, tensor in read_tensors(path, damaged=WeightsError)[0].items():
+    for name, tensor in stored.items():
         check_finite(path, name, tensor)
         kept = prompts if name.startswith(PROMPT) else tensors
         kept[name.removeprefix(PROMPT)] = tensor.clone()
@@ -127,35 +123,13 @@ def read_trained(path: Path) -> TrainedFile:
     )
 
 
-def read_header(path: Path) -> dict[str, Any]:
-    """The header of a weights file of this format.
-
-    Raises:
-        WeightsError: it is missing, damaged, or of another format.
-    """
-    header = painter_header(path)
-    if header.get("format") != WEIGHTS_FORMAT:
-        found = header.get("format", "no format mark")
-        raise WeightsError(f"weights file {path} has {found!r}, expected {WEIGHTS_FORMAT!r}")
-    return header
-
-
 def is_trained_file(path: Path) -> bool:
     """Whether a file says that it is one of ours; a missing or damaged one says nothing."""
     try:
-        return painter_header(path).get("format") == WEIGHTS_FORMAT
+        with open_tensors(path, damaged=WeightsError) as (_, header):
+            return header.get("format") == WEIGHTS_FORMAT
     except WeightsError:
         return False
-
-
-def painter_header(path: Path) -> dict[str, Any]:
-    """What any painter's weights file says of itself.
-
-    Raises:
-        WeightsError: the file is missing or damaged.
-    """
-    with open_weights(path) as (_, header):
-        return header
 
 
 @torch.no_grad()

@@ -16,12 +16,12 @@ from lidarpainter_models.painter import selection
 from lidarpainter_models.painter.baselines import UnpaintedPainter
 from lidarpainter_models.painter.one_step import loading
 from lidarpainter_models.painter.one_step.assembly import trained_names
+from lidarpainter_models.painter.one_step.config import PRESETS
 from lidarpainter_models.painter.one_step.loading import load_one_step
-from lidarpainter_models.painter.one_step.presets import PRESETS
-from lidarpainter_models.painter.one_step.weights import read_header, save_trained
+from lidarpainter_models.painter.one_step.weights import save_trained
 from lidarpainter_models.painter.precision import faster_type
 from lidarpainter_models.painter.selection import load_painter
-from lidarpainter_models.storage.tensor_files import HEADER_KEY
+from lidarpainter_models.storage.tensor_files import HEADER_KEY, read_tensors
 
 FLOAT = torch.float32
 ROOT = Path(__file__).resolve().parents[3]
@@ -137,7 +137,7 @@ def test_a_model_that_moved_is_found_beside_its_weights(trained, tmp_path):
 
 def respell(path, change):
     """Change a weights file's header and tensors."""
-    header, tensors = read_header(path), load_file(path)
+    tensors, header = read_tensors(path)
     change(header, tensors)
     save_file(tensors, path, {HEADER_KEY: json.dumps(header)})
 

@@ -21,7 +21,7 @@ from lidarpainter_models.metrics.lpips import Lpips
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.painter.losses import PaperLossWeights
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
-from lidarpainter_models.painter.one_step.presets import fast
+from lidarpainter_models.painter.one_step.config import FAST
 from lidarpainter_models.painter.one_step.training import OneStepTrainingConfig
 from lidarpainter_models.painter.one_step.weights import read_trained
 from lidarpainter_models.painter.selection import load_painter
@@ -37,7 +37,7 @@ from tasks.painter.train import (
 from tasks.progress import listening
 
 CONFIG = OneStepTrainingConfig(
-    network=fast(),
+    network=FAST,
     augmentation=replace(QUIET, crop_px=64),
     loss=PaperLossWeights(lpips=0, adversarial=0),
     steps=2,
@@ -89,7 +89,7 @@ def test_a_one_step_painter_is_trained_judged_published_and_trained_on(pairs, st
     assert json.loads(row["record"])["training_digest"] == record["training_digest"]
 
     on = recipe_for(str(weights))
-    assert on.network == fast()
+    assert on.network == FAST
     further = replace(CONFIG, steps=1)
     then = train.fn(store.root, "train", request(pairs, further, 0.3, weights))
     told = load_painter(weights_path(store, then.ref)).provenance
@@ -129,7 +129,7 @@ def test_a_changed_pair_stops_the_training(pairs, store, model):
         ({}, "MODEL", {"lpips": LpipsFiles(heads=Path("h.pth"))}, "a backbone not given"),
         ({}, None, {}, "is trained on a model"),
         ({}, "/nowhere/model", {}, "no such folder"),
-        ({}, "gone.safetensors", {}, "no weights at gone.safetensors"),
+        ({}, "gone.safetensors", {}, "gone.safetensors is not there"),
         ({"max_cpu_s": 5.0}, "MODEL", {"num_processes": 2}, "cannot share a budget"),
         ({}, "MODEL", {"num_processes": 0}, "cannot share a budget"),
     ],
