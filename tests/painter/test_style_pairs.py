@@ -9,10 +9,13 @@ from quiet_augmentation import QUIET
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.augmentation import draw_batch, styled_pair, target_view
 from lidarpainter_models.painter.examples import Window
-from lidarpainter_models.painter.nano.more_prompts import with_more_prompts
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.nano.painter import NanoPainter
-from lidarpainter_models.painter.nano.training import NanoTrainingConfig, train_nano
+from lidarpainter_models.painter.nano.training import (
+    NanoTrainingConfig,
+    train_nano,
+    with_more_prompts,
+)
 from lidarpainter_models.painter.nano.weights import load_weights, save_weights
 
 SMALL = NanoConfig(widths=(8, 16, 16), blocks=(1, 1, 1))
@@ -159,7 +162,7 @@ def test_a_short_training_learns_that_a_prompt_for_night_means_night(make_pair, 
         average_decay=0.8,
         half_precision=False,
     )
-    painter = NanoPainter(train_nano([source], config).network, precision=torch.float32)
+    painter = NanoPainter(train_nano([source], config)[0], precision=torch.float32)
     pair = deep_pair(make_pair, 1)
     dark = styled_pair(pair, "night", generator_of(0))
     for shown, own, other in ((pair, pair, dark), (dark, dark, pair)):

@@ -16,7 +16,7 @@ from lidarpainter_models.painter.one_step.training import (
     train_one_step,
 )
 from lidarpainter_models.painter.training.loop import ALONE
-from lidarpainter_models.painter.training.processes import DistributedProcesses
+from lidarpainter_models.painter.training.processes import Processes
 from lidarpainter_models.training_data.pairs import PairFolder
 
 CONTEST = OneStepTrainingConfig(
@@ -65,7 +65,7 @@ def train_as_one_of_two(index, port, pairs, config, out):
     torch.distributed.init_process_group(
         "gloo", init_method=f"tcp://127.0.0.1:{port}", rank=index, world_size=2
     )
-    processes = DistributedProcesses(torch.device("cpu"))
+    processes = Processes(device=torch.device("cpu"))
     weights, record = train_small(pairs, config, out, processes)
     torch.save({"weights": weights, "history": record["history"]}, out / f"trained-{index}.pt")
     processes.meet()

@@ -22,7 +22,7 @@ from lidarpainter_models.painter.one_step.assembly import (
 )
 from lidarpainter_models.painter.one_step.config import OneStepConfig
 from lidarpainter_models.painter.one_step.network import OneStepNetwork
-from lidarpainter_models.painter.one_step.tensor_files import check_finite, check_shapes
+from lidarpainter_models.painter.tensor_files import check_finite, check_header, check_shapes
 from lidarpainter_models.storage.tensor_files import open_tensors, read_tensors, write_tensors
 
 WEIGHTS_FORMAT = "lidarpainter-one-step/1"
@@ -93,12 +93,7 @@ def read_trained(path: Path) -> TrainedFile:
         WeightsError: it is missing, damaged, or of another format.
     """
     stored, header = read_tensors(path, damaged=WeightsError)
-    found = header.get("format", "no format mark")
-    if found != WEIGHTS_FORMAT:
-        raise WeightsError(f"weights file {path} has {found!r}, expected {WEIGHTS_FORMAT!r}")
-    missing = {"config", "base", "mark", "licence", "provenance"} - header.keys()
-    if missing:
-        raise WeightsError(f"weights file {path} lacks {sorted(missing)} in its header")
+    check_header(path, header, WEIGHTS_FORMAT, {"config", "base", "mark", "licence", "provenance"})
     try:
         config = OneStepConfig.from_dict(header["config"])
         mark = [float(value) for value in header["mark"]]

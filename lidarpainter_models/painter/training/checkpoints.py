@@ -17,7 +17,6 @@ import torch
 from torch import Tensor, nn
 
 from lidarpainter_models.errors import ConfigError, DataError
-from lidarpainter_models.painter.training.trainee import Trainee
 from lidarpainter_models.storage.whole_files import write_whole
 
 CHECKPOINT_NAME = "training.pt"
@@ -41,13 +40,13 @@ class TrainingState:
     history: list[dict[str, float]] = field(default_factory=list)
 
     @classmethod
-    def start(cls, trainee: Trainee) -> "TrainingState":
+    def start(
+        cls, trained: Mapping[str, nn.Parameter], opponent: nn.Module | None
+    ) -> "TrainingState":
         """The state before the first step."""
-        trained = dict(trainee.trained)
         averaged = {name: parameter.detach().clone() for name, parameter in trained.items()}
-        opponent = trainee.opponent
         return cls(
-            trained=trained,
+            trained=dict(trained),
             averaged=averaged,
             optimiser=_optimiser(list(trained.values())),
             opponent=opponent,

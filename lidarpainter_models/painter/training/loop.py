@@ -10,15 +10,15 @@ step that one process takes with two accumulated batches, up to the order of a s
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lidarpainter_models.errors import ConfigError, DataError, TrainingError
 from lidarpainter_models.painter.augmentation import TrainingBatch, draw_batch
@@ -30,11 +30,44 @@ from lidarpainter_models.painter.training.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from lidarpainter_models.painter.training.processes import OneProcess, Processes
+from lidarpainter_models.painter.training.processes import Processes
 from lidarpainter_models.painter.training.settings import TrainingConfig
-from lidarpainter_models.painter.training.trainee import Trainee
 
-ALONE = OneProcess()
+ALONE = Processes()
+
+
+@runtime_checkable
+class Trainee(Protocol):
+    """A network in training: some of its weights change, and it knows what to lower.
+
+    The loop owns optimisers, schedule, averages and checkpoints; it never sees how the network is
+    built.
+    """
+
+    trained: Mapping[str, nn.Parameter]
+    """The weights that change, in float32, by names that stay the same between runs."""
+    opponent: nn.Module | None
+    """A discriminator with an optimiser of its own; trained beside, averaged never."""
+    num_warps: int
+    """Warped images that a sample has."""
+    prompts: tuple[str, ...]
+    """What the painter learns: the first restores, the others are styles."""
+
+    def learn(self, batch: TrainingBatch, *, step: int, share: float) -> dict[str, float]:
+        """Add the gradients of a batch to those of the trained weights and of the opponent.
+
+        `share` is how much the batch counts among those of the step. Returns what enters the
+        history; `total` is the loss, and has to be finite.
+        """
+        ...
+
+    def check(self, step: int, means: Mapping[str, float]) -> None:
+        """Look at an entry of the history.
+
+        Raises:
+            TrainingError: the network has died.
+        """
+        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,7 +113,7 @@ def run_training(
     if processes.count > 1 and config.max_cpu_s is not None:
         raise ConfigError("several processes need a number of steps, not a budget of CPU seconds")
     shares = source_shares(sources, config)
-    state = TrainingState.start(trainee)
+    state = TrainingState.start(trainee.trained, trainee.opponent)
     path = checkpoint_folder / CHECKPOINT_NAME if checkpoint_folder else None
     if path and path.exists():
         read_checkpoint(path, state, digest)

@@ -164,12 +164,6 @@ def test_impossible_settings_are_refused(settings, expected):
         replace(SHORT, **settings)
 
 
-def test_another_wiring_than_the_recipes_is_refused(make_network):
-    network = make_network(FAST, has_adapters=True)
-    with pytest.raises(ConfigError, match="wired otherwise"):
-        OneStepTrainee(network, TEXTS, SHORT)
-
-
 def gradients(network, config, pair):
     trainee = OneStepTrainee(network, TEXTS, config)
     losses = trainee.learn(batch_pairs([pair], trainee.num_warps), step=0, share=1.0)

@@ -5,8 +5,9 @@ go, so a float32 file never lies beside the bfloat16 weights that it becomes.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Set
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -98,3 +99,16 @@ def check_finite(path: Path, name: str, tensor: Tensor) -> None:
     """
     if not tensor.is_floating_point() or not bool(tensor.isfinite().all()):
         raise WeightsError(f"weights file {path}: tensor {name!r} holds values that are no number")
+
+
+def check_header(path: Path, header: Mapping[str, Any], form: str, named: Set[str]) -> None:
+    """Refuse a weights file of another form, or one that does not say what it is.
+
+    Raises:
+        WeightsError: it is one of these.
+    """
+    found = header.get("format", "no format mark")
+    if found != form:
+        raise WeightsError(f"weights file {path} has {found!r}, expected {form!r}")
+    if missing := named - header.keys():
+        raise WeightsError(f"weights file {path} lacks {sorted(missing)} in its header")
