@@ -18,10 +18,15 @@ import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidarpainter_models.conditioning.references import WarpTarget, warped_references
 from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.conditioning.surface_depth import surface_depth
-from lidarpainter_models.conditioning.warping import SKY_ALPHA, SourceImage, source_costs_m
+from lidarpainter_models.conditioning.warping import (
+    SKY_ALPHA,
+    SourceImage,
+    WarpTarget,
+    source_costs_m,
+    warped_references,
+)
 from lidarpainter_models.gaussians.model.drawing import SceneRender
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera

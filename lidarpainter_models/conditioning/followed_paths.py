@@ -92,10 +92,6 @@ class FollowedPath:
             [self._found(view, fit_camera(view, self.observation)) for view in self.views],
         )
 
-    def image(self, camera: Camera, view: RecordedView) -> Float[Tensor, "height width 3"]:
-        """What is seen there, painted if asked for; in [0, 1]."""
-        return self.shown(camera, view).rgb
-
     def shown(self, camera: Camera, view: RecordedView) -> ShownMoment:
         """What is seen there, and what is known beside it."""
         if self.painter is not None:

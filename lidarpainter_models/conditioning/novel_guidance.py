@@ -8,7 +8,7 @@ forward, y left, z up; metres.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import torch
@@ -17,7 +17,6 @@ from torch import Tensor
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.confidence import (
-    GuidanceGate,
     departure_weight,
     geometric_confidence,
     guidance_gate,
@@ -65,8 +64,8 @@ class NovelPainting:
 
     novel: NovelCamera
     guidance: GuidanceView
-    """Its weight is 0 everywhere if the gate refused the painting."""
-    gate: GuidanceGate
+    is_refused: bool
+    """Whether the gate let nothing of it count."""
     images: dict[str, UInt8[Tensor, "height width 3"]]
     """Of one view of each shift, by name: render, lidar, warp, painted, confidence."""
 
@@ -189,7 +188,7 @@ def _one_per_shift(cameras: Sequence[NovelCamera]) -> list[NovelCamera]:
 
 def guidance_views(paintings: Sequence[NovelPainting]) -> list[GuidanceView]:
     """What the fit is given: every painting that was not refused."""
-    return [painting.guidance for painting in paintings if not painting.gate.is_refused]
+    return [painting.guidance for painting in paintings if not painting.is_refused]
 
 
 def _paint(
@@ -208,7 +207,7 @@ def _paint(
     )
     seen = is_seen(novel.camera, depth_m, builder.recorded_cameras)
     geometric = geometric_confidence(conditions, novel.camera, seen)
-    trust = (painting.confidence * geometric * gate.weight).clamp(0, 1)
+    trust = (painting.confidence * geometric * gate).clamp(0, 1)
     guidance = GuidanceView.of(
         novel.camera,
         novel.timestamp_ns,
@@ -219,8 +218,12 @@ def _paint(
     home = torch.device("cpu")  # where paintings of a whole log have room
     images = _images(conditions, painting, trust) if is_shown else {}
     images = {name: rgb.to(home) for name, rgb in images.items()}
-    gate = replace(gate, weight=gate.weight.to(home))
-    return NovelPainting(novel=novel, guidance=guidance.to(home), gate=gate, images=images)
+    return NovelPainting(
+        novel=novel,
+        guidance=guidance.to(home),
+        is_refused=bool((gate.to(home) == 0).all()),
+        images=images,
+    )
 
 
 def _images(

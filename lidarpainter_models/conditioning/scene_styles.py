@@ -8,13 +8,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
-from lidarpainter_models.conditioning.style_views import style_view
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.styling.scene_style import SceneStyle, StyledPlace
+from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
 from lidarpainter_models.painter.styles import StyleView
 from lidarpainter_models.painter.styles.fog import airlight
@@ -86,6 +86,33 @@ def styled_scene(
     lamp, heading = _ego_lamps(recorded, looked_at[0], height_m)
     place = _place(looks, lamp, heading, recorded.frame_timestamps_ns, seed)
     return replace(clear, style=SceneStyle(mix=mix, seed=seed, place=place.to(scene.device)))
+
+
+def style_view(
+    builder: ConditionBuilder,
+    camera: Camera,
+    timestamp_ns: int,
+    image: Float[Tensor, "height width 3"],
+    sky_mask: Bool[Tensor, "height width"] | None = None,
+) -> tuple[StyleView, Float[Tensor, "height width"]]:
+    """An image of the scene with what styles it, and the LiDAR depth that supports it.
+
+    `sky_mask` is that of a recorded image; by default what the Gaussians leave open is sky.
+
+    Returns:
+        The view, its depth that of the render corrected by LiDAR; and camera z in metres where the
+        LiDAR hit, 0 elsewhere. All on the CPU, where styles are made.
+    """
+    render = builder.scene.render(camera, timestamp_ns)
+    lidar = builder.lidar_image(camera, camera.taken_ns(timestamp_ns))
+    sky = 1 - render.alpha.clamp(0, 1).cpu() if sky_mask is None else sky_mask.float()
+    view = StyleView(
+        rgb=image.cpu(),
+        depth_m=builder.surface_m(render, lidar, camera).detach().cpu(),
+        sky=sky.detach(),
+        camera=camera,
+    )
+    return view, lidar.depth_m.cpu()
 
 
 def _place(

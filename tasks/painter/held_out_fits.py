@@ -15,7 +15,7 @@ from lidarpainter_models.evaluation.held_out_pairs import HeldOutPairs, held_out
 from lidarpainter_models.evaluation.painting import ScoringPairs
 from lidarpainter_models.evaluation.scene_evaluation import known_street
 from lidarpainter_models.evaluation.settings import EvaluationConfig
-from lidarpainter_models.training_data.pair_sets import PairSet, open_sets
+from lidarpainter_models.training_data.pairs import PairSet, open_sets
 from tasks.opened import open_split
 from tasks.specs import FittedRef, SplitSpec
 from tasks.stored import load_observations, load_scene

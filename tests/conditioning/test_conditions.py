@@ -225,7 +225,7 @@ def test_a_painter_that_makes_things_worse_gives_no_guidance(builder, views):
     config = NovelGuidanceConfig(shifts=(Shift(lateral_m=1),), every_nth=5)
     novel = novel_cameras(views, range(10), ego_path(), config=config)
     paintings = paint_novel_views(builder, NegativePainter(), novel, config=config)
-    assert [painting.gate.is_refused for painting in paintings] == [True]
+    assert [painting.is_refused for painting in paintings] == [True]
     assert guidance_views(paintings) == []
     assert paintings[0].mean_weight == 0
 

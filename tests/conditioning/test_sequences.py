@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from lidarpainter_models.conditioning.novel_guidance import novel_cameras, paint_novel_views
-from lidarpainter_models.conditioning.references import WarpTarget
+from lidarpainter_models.conditioning.scene_styles import style_view
 from lidarpainter_models.conditioning.sequences import SequencePainter
 from lidarpainter_models.conditioning.settings import NovelGuidanceConfig, SequenceConfig
-from lidarpainter_models.conditioning.style_views import style_view
+from lidarpainter_models.conditioning.warping import WarpTarget
 from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.painter.protocol import Painting

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from lidarpainter_models.errors import WeightsError
+from lidarpainter_models.metrics.backbones import squeezenet_stack
 from lidarpainter_models.metrics.squeezenet import (
     SqueezeNetDistance,
     load_squeezenet_distance,
@@ -36,7 +37,7 @@ def test_wrong_weights_are_refused_in_one_line(tmp_path, fault):
 
 
 def test_own_weights_round_trip(tmp_path):
-    network = SqueezeNetDistance()
+    network = SqueezeNetDistance(squeezenet_stack())
     path = tmp_path / "weights.pth"
     state = {key.removeprefix("layers."): value for key, value in network.state_dict().items()}
     torch.save(state, path)

@@ -26,7 +26,7 @@ from lidarpainter_models.painter.one_step.training import OneStepTrainingConfig
 from lidarpainter_models.painter.one_step.weights import read_trained
 from lidarpainter_models.painter.selection import load_painter
 from lidarpainter_models.painter.training_jobs import job_for, recipe_for
-from lidarpainter_models.training_data.pair_sets import PairSet
+from lidarpainter_models.training_data.pairs import PairSet
 from tasks.painter.evaluate import load_painting_scores, samples_path, score_held_back
 from tasks.painter.train import (
     publish_painter,
