@@ -1,6 +1,7 @@
 """Questions about painters that are answered here and now; nothing is stored."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -85,9 +86,7 @@ def benchmark_painter(
             {
                 "precision": precision and type_name(precision),
                 "is_chosen": precision == chosen,
-                "cpu_ms": times.cpu_ms,
-                "wall_ms": times.wall_ms,
-                "peak_memory_bytes": times.peak_memory_bytes,
+                **asdict(times),
             }
         )
     return {

@@ -1,6 +1,6 @@
 """What a painter learns from: conditions beside the true image, and where such pairs come from.
 
-Painters know the shape of a pair and how to ask for one; `conditioning.pairs` stores and makes
+Painters know the shape of a pair and how to ask for one; `training_data` makes and stores
 them.
 """
 

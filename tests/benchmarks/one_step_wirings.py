@@ -48,7 +48,7 @@ def build_wiring(wiring: Wiring, architecture: WholeModel = SD_TURBO) -> Paint:
         images: Float[Tensor, "inputs batch 3 height width"],
     ) -> Float[Tensor, "batch 3 height width"]:
         with torch.inference_mode():
-            return network(images, text).rgb
+            return network(images, text)
 
     return paint
 
@@ -66,7 +66,7 @@ def _plain(architecture: WholeModel) -> Paint:
         images: Float[Tensor, "inputs batch 3 height width"],
     ) -> Float[Tensor, "batch 3 height width"]:
         with torch.no_grad():
-            return network(images, _text(encoder), encodes_at_once=False).rgb
+            return network(images, _text(encoder), encodes_at_once=False)
 
     return paint
 

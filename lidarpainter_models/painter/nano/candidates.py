@@ -122,9 +122,7 @@ def build_candidates(
         made["reference"] = given_reference(conditions)
     base = base_candidate(inputs)
     exists.pop(base, None)
-    names = candidate_names(inputs, num_sources)
-    images = tuple(made[name] for name in names)
-    return Candidates(names=names, images=images, exists=exists, base=base)
+    return Candidates(names=tuple(made), images=tuple(made.values()), exists=exists, base=base)
 
 
 def given_reference(conditions: ConditionBatch) -> Float[Tensor, "batch 3 height width"]:

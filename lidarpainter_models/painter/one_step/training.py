@@ -176,7 +176,7 @@ class OneStepTrainee:
         with torch.autocast(
             self.device.type, dtype=torch.bfloat16, enabled=self.config.half_precision
         ):
-            return self.network(images, text, masks).rgb
+            return self.network(images, text, masks)
 
     def check(self, step: int, means: Mapping[str, float]) -> None:
         """A frozen model cannot die; that the loss is a number is checked at every step."""

@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 
 from lidarpainter_models.errors import ConfigError, ShapeError
+from lidarpainter_models.painter import input_hull as hulls
 from lidarpainter_models.painter.batches import in_planes, stack_conditions
 from lidarpainter_models.painter.filters import fill_push_pull
 from lidarpainter_models.painter.input_hull import HULL_MARGIN, input_hull
@@ -214,9 +215,12 @@ def test_the_first_convolution_runs_over_cells_of_pixels():
 
 
 @pytest.mark.parametrize(("height_px", "width_px"), [(1, 1), (3, 20), (24, 40)])
-def test_the_hull_is_the_range_within_nine_pixels(height_px, width_px, make_conditions):
+def test_the_hull_is_the_range_within_nine_pixels(
+    height_px, width_px, make_conditions, monkeypatch
+):
+    monkeypatch.setattr(hulls, "HULL_MARGIN", 0.0)
     conditions = make_conditions(height_px, width_px)
-    hull = input_hull(conditions, margin=0.0)
+    hull = input_hull(conditions)
     shown = torch.stack([conditions.render_rgb, conditions.lidar_rgb, *conditions.warp_rgb])
     exists = torch.stack([conditions.lidar_hit, *conditions.warp_valid])
     exists = torch.cat([torch.ones_like(exists[:1]), exists])

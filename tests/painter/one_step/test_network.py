@@ -64,9 +64,7 @@ def test_trusting_the_render_alone_is_pix2pix_turbo_bit_for_bit(
     network.fusion.layers[-1].bias.fill_(1000.0)  # a share of exactly one
     images, text = make_inputs()
     # one image at a time: a batch of two may be summed in another order
-    output = network(images, text, encodes_at_once=False)
-    assert bool((output.weights[0] == 1).all())
-    actual = output.rgb
+    actual = network(images, text, encodes_at_once=False)
     narrowed(network)
     expected = pix2pix_turbo(network, images[0], text, timestep)
     assert torch.equal(actual, expected)
@@ -79,10 +77,10 @@ def test_nothing_random_is_drawn(preset, make_network, make_inputs):
     images, text = make_inputs(len(network.config.inputs))
     generator = torch.Generator().manual_seed(3)
     before, own = torch.get_rng_state(), generator.get_state()
-    first = network(images, text).rgb
+    first = network(images, text)
     assert torch.equal(torch.get_rng_state(), before)
     assert torch.equal(generator.get_state(), own)
-    assert torch.equal(network(images, text).rgb, first)
+    assert torch.equal(network(images, text), first)
     assert first.shape == images.shape[1:]
     assert bool(first.isfinite().all())
 
@@ -103,16 +101,14 @@ def test_merged_adapters_do_the_same_in_fewer_layers(make_network, make_inputs):
     images, text = make_inputs()
     expected = network(images, text)
     plain = make_network(PAPER)(images, text)
-    assert not torch.allclose(expected.rgb, plain.rgb, atol=1e-2)  # they do something
+    assert not torch.allclose(expected, plain, atol=1e-2)  # they do something
     num_layers = len(list(network.modules()))
     merge_lora(network)
     actual = network(images, text)
     assert not any(is_adapted(module) for module in network.modules())
     assert len(list(network.modules())) < num_layers / 2
     assert not any("lora" in name for name, _ in network.named_parameters())
-    # the latent at t = 999 is 14.6 times the prediction
-    torch.testing.assert_close(actual.latent / 14.6, expected.latent / 14.6, rtol=0, atol=1e-5)
-    torch.testing.assert_close(actual.rgb, expected.rgb, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("skips", ["render", "fused", "none"])
@@ -123,11 +119,11 @@ def test_encoding_at_once_and_one_by_one_agree(skips, make_network, make_inputs)
         for conv in network.autoencoder.decoder.skip_convs:
             conv.weight.normal_(std=0.1, generator=torch.Generator().manual_seed(0))
     images, text = make_inputs(3, batch=2)
-    at_once = network(images, text).rgb
-    one_by_one = network(images, text, encodes_at_once=False).rgb
+    at_once = network(images, text)
+    one_by_one = network(images, text, encodes_at_once=False)
     torch.testing.assert_close(at_once, one_by_one, rtol=1e-4, atol=1e-4)
     # views of a batch do not see each other
-    alone = network(images[:, 1:], text[1:]).rgb
+    alone = network(images[:, 1:], text[1:])
     torch.testing.assert_close(at_once[1:], alone, rtol=1e-4, atol=1e-4)
 
 
@@ -140,7 +136,7 @@ def test_fused_skips_with_the_whole_share_are_the_renders(make_network, make_inp
         network.fusion.layers[-1].bias.fill_(1000.0)
         for conv in network.autoencoder.decoder.skip_convs:
             conv.weight.normal_(std=0.1, generator=torch.Generator().manual_seed(0))
-        found.append(network(images, text).rgb)
+        found.append(network(images, text))
     torch.testing.assert_close(found[0], found[1], rtol=1e-5, atol=1e-5)
 
 
@@ -151,9 +147,9 @@ def test_lidar_changes_the_image_only_through_fusion_at_the_start(make_network, 
     other = images.clone()
     other[1] = 1 - other[1]
     network = make_network(dataclasses.replace(PAPER, fusion=None))
-    assert not torch.equal(network(images, text).rgb, network(other, text).rgb)
+    assert not torch.equal(network(images, text), network(other, text))
     network.denoiser.unet.conv_in.weight[:, 4:] = 0
-    assert torch.equal(network(images, text).rgb, network(other, text).rgb)
+    assert torch.equal(network(images, text), network(other, text))
 
 
 @pytest.mark.parametrize("inputs", [("render",), ("lidar",), ("render", "warp")])
@@ -163,7 +159,7 @@ def test_ablations_of_the_inputs_run(inputs, make_network, make_inputs):
     network = make_network(OneStepConfig(inputs=inputs, fusion=fusion))
     assert network.denoiser.unet.conv_in.in_channels == 4 * len(inputs)
     images, text = make_inputs(len(inputs))
-    assert network(images, text).rgb.shape == images[0].shape
+    assert network(images, text).shape == images[0].shape
 
 
 @torch.no_grad()
@@ -171,7 +167,7 @@ def test_a_denoiser_that_sees_the_mix_has_four_channels(make_network, make_input
     network = make_network(dataclasses.replace(PAPER, denoiser_sees="fused"))
     assert network.denoiser.unet.conv_in.in_channels == 4
     images, text = make_inputs()
-    assert network(images, text).rgb.shape == images[0].shape
+    assert network(images, text).shape == images[0].shape
 
 
 @pytest.mark.parametrize(("inputs", "channels"), [(2, 10), (3, 14)])
@@ -182,7 +178,7 @@ def test_masks_are_two_more_channels(inputs, channels, make_network, make_inputs
     assert network.denoiser.unet.conv_in.in_channels == channels
     images, text = make_inputs(inputs)
     empty, full = torch.zeros(1, 2, 8, 16), torch.ones(1, 2, 8, 16)
-    found = [network(images, text, masks).rgb for masks in (empty, full)]
+    found = [network(images, text, masks) for masks in (empty, full)]
     assert not torch.equal(*found)
 
 
@@ -197,7 +193,7 @@ def test_the_last_layer_and_the_step_stay_in_float32(make_inputs):
     types = {parameter.dtype for parameter in network.denoiser.unet.conv_out.parameters()}
     assert types == {torch.float32}
     assert network.denoiser.unet.conv_in.weight.dtype == torch.bfloat16
-    assert output.latent.dtype == output.rgb.dtype == torch.float32
+    assert output.dtype == torch.float32
     seen = network.denoiser(torch.zeros(1, 8, 8, 16), text)
     assert seen.dtype == torch.float32
     assert not torch.equal(seen, seen.bfloat16().float())  # nothing rounded it on the way
