@@ -84,17 +84,6 @@ def test_r1_of_a_linear_discriminator_is_the_square_of_its_weights():
     assert steep == pytest.approx(1.25**2 * expected, rel=1e-5)
 
 
-def test_r1_teaches_the_discriminator():
-    slope = torch.tensor(3.0, requires_grad=True)
-
-    def linear(images):
-        return [slope * images.mean(dim=(1, 2, 3), keepdim=True)]
-
-    gradient_penalty(linear, noise(0)).backward()
-    # |slope / n|^2 summed over n numbers is slope^2 / n
-    assert float(slope.grad) == pytest.approx(2 * 3.0 / (3 * 24 * 32), rel=1e-5)
-
-
 def test_every_convolution_that_is_trained_has_unit_spectral_norm(discriminator):
     discriminator.train()
     for _ in range(50):
@@ -112,13 +101,6 @@ def test_every_convolution_that_is_trained_has_unit_spectral_norm(discriminator)
     for layer in trained:
         largest = torch.linalg.matrix_norm(layer.weight.detach().flatten(1), ord=2)
         assert float(largest) == pytest.approx(1.0, abs=0.02)
-
-
-def test_scales_and_depths_each_give_a_map_of_logits(discriminator):
-    found = discriminator(noise(0, batch=2))
-    assert len(found) == 2
-    assert all(one.shape[:2] == (2, 1) for one in found)
-    assert found[0].shape[2] > found[1].shape[2]
 
 
 def test_features_stay_frozen_and_let_gradients_through():

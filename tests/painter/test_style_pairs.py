@@ -107,15 +107,6 @@ def test_a_styled_target_never_passes_for_a_perfect_render(make_pair, memory_pai
     assert torch.equal(same, ~batch.restyled)
 
 
-def test_without_styles_batches_are_what_they_were(make_pair, memory_pairs):
-    source = memory_pairs([make_pair(48, seed) for seed in range(3)])
-    settings = {"batch_size": 4, "num_warps": 2, "config": QUIET}
-    plain = draw_batch([source], [1.0], generator=generator_of(5), **settings)
-    one = draw_batch([source], [1.0], generator=generator_of(5), prompts=("clear",), **settings)
-    assert torch.equal(plain.target, one.target)
-    assert not bool(plain.restyled.any())
-
-
 def test_more_prompts_leave_what_is_known_as_it_was(make_conditions):
     torch.manual_seed(0)
     network = NanoNetwork(SMALL).eval()

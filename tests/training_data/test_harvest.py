@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from lidarpainter_models.errors import ConfigError, SceneError
-from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -178,9 +177,3 @@ def test_settings_that_make_no_pairs_are_refused():
         StreetPlan(num_views=0)
     with pytest.raises(ConfigError):
         HarvestConfig(corrupted_per_view=-1)
-
-
-def test_weak_fits_take_poses_as_they_are():
-    assert isinstance(weak_fit(), FitConfig)
-    assert not weak_fit().refinement.cameras
-    assert not weak_fit().refinement.actors
