@@ -39,7 +39,6 @@ class DiscriminatorConfig:
     """The image itself, half of it, ..."""
 
     def __post_init__(self) -> None:
-        """Refuse shapes that cannot be built."""
         for name in ("width", "num_layers", "num_scales"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")

@@ -41,7 +41,6 @@ class PaintingPair:
     """Where the target may be learnt from."""
 
     def __post_init__(self) -> None:
-        """Refuse a target on another pixel grid."""
         size = self.conditions.height_width_px
         if self.target_rgb.shape[:2] != size or self.target_valid.shape != size:
             raise ShapeError(

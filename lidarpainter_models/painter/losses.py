@@ -40,7 +40,6 @@ class PaperLossWeights:
     """Of the generator's hinge loss; 0 trains without a discriminator."""
 
     def __post_init__(self) -> None:
-        """Refuse negative weights."""
         refuse_negative(self)
 
 

@@ -5,8 +5,7 @@ from typing import Any
 
 from torch import nn
 
-from lidarpainter_models.painter.one_step.architectures import Architecture
-from lidarpainter_models.painter.one_step.packages import diffusion_package
+from lidarpainter_models.painter.one_step.architectures import Architecture, diffusion_package
 
 TURBO_UNET: dict[str, Any] = {
     "sample_size": 64,

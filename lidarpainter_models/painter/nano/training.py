@@ -42,7 +42,6 @@ class NanoTrainingConfig(TrainingConfig):
     weight_decay: float = 1e-4
 
     def __post_init__(self) -> None:
-        """Refuse schedules that cannot run, and prompts that no pair can have."""
         TrainingConfig.__post_init__(self)
         check_prompts(self.network.prompts)
 

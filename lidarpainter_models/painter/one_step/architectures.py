@@ -1,15 +1,17 @@
 """Shapes of the networks that the painter stands on, as a model's folder declares them.
 
-A folder has diffusers' layout: `unet/config.json`, `vae/config.json`, `text_encoder/config.json`.
+A folder has diffusers' layout: `unet/config.json`, `vae/config.json`. The packages of the
+extra `diffusion` take 10 to 20 seconds to import, so no module imports them at its top.
 """
 
 import json
+import warnings
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from lidarpainter_models.errors import WeightsError
-from lidarpainter_models.painter.one_step.packages import diffusion_package
+from lidarpainter_models.errors import MissingPackageError, WeightsError
 
 TEXT_TOKENS = 77
 
@@ -27,6 +29,23 @@ class Architecture:
     def text_width(self) -> int:
         """Features of a token."""
         return int(self.unet["cross_attention_dim"])
+
+
+def diffusion_package(name: str) -> Any:  # noqa: ANN401 - a module without type stubs
+    """Import `diffusers`, `transformers`, `peft` or `huggingface_hub`.
+
+    Raises:
+        MissingPackageError: the package is not installed or cannot be imported.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # advice to their authors, not to our users
+            return import_module(name)
+    except ImportError as error:
+        raise MissingPackageError(
+            f"the one-step painter needs the package {name} ({error}): "
+            "pip install 'lidarpainter[diffusion]'"
+        ) from None
 
 
 def build_unet(architecture: Architecture, num_channels: int) -> Any:  # noqa: ANN401

@@ -18,11 +18,11 @@ from lidarpainter_models.painter.one_step.architectures import (
     build_tiny,
     build_unet,
     build_vae,
+    diffusion_package,
     read_config,
 )
 from lidarpainter_models.painter.one_step.config import AutoencoderKind, OneStepConfig
 from lidarpainter_models.painter.one_step.denoiser import widen_first_layer
-from lidarpainter_models.painter.one_step.packages import diffusion_package
 from lidarpainter_models.painter.tensor_files import fill_from_file
 
 SD_TURBO = "sd-turbo"
@@ -131,14 +131,7 @@ def load_parts(base: BaseModel, config: OneStepConfig, *, dtype: torch.dtype) ->
             unet = build_unet(base.architecture, config.first_layer_channels)
             build = build_vae if config.autoencoder == "sd" else build_tiny
             autoencoder = build(base.architecture)
-    except (
-        TypeError,
-        ValueError,
-        KeyError,
-        IndexError,
-        RuntimeError,
-        NotImplementedError,
-    ) as error:
+    except (TypeError, ValueError, LookupError, RuntimeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise WeightsError(
             f"the configurations in {base.folder} make no network: {reason}"

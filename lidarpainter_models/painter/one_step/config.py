@@ -70,7 +70,6 @@ class OneStepConfig:
     """Rank of the autoencoder's LoRA; 0 for none."""
 
     def __post_init__(self) -> None:
-        """Refuse wirings that cannot be built."""
         if not self.inputs or tuple(name for name in INPUTS if name in self.inputs) != self.inputs:
             raise ConfigError(f"inputs must be some of {INPUTS} in this order, got {self.inputs}")
         if self.fusion is not None and len(self.inputs) == 1:

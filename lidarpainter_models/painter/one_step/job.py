@@ -16,7 +16,7 @@ from lidarpainter_models.painter.adversarial import FrozenFeatures
 from lidarpainter_models.painter.examples import PairSource
 from lidarpainter_models.painter.known_painters import DIGEST_LENGTH, WEIGHTS_SUFFIX
 from lidarpainter_models.painter.one_step.base_models import open_base
-from lidarpainter_models.painter.one_step.loading import Trainable, load_trainable, split_preset
+from lidarpainter_models.painter.one_step.loading import load_trainable, split_preset
 from lidarpainter_models.painter.one_step.processes import run_in_processes
 from lidarpainter_models.painter.one_step.training import (
     Judges,
@@ -24,7 +24,7 @@ from lidarpainter_models.painter.one_step.training import (
     OneStepTrainingConfig,
     train_one_step,
 )
-from lidarpainter_models.painter.one_step.weights import read_trained, save_trained
+from lidarpainter_models.painter.one_step.weights import Trainable, read_trained, save_trained
 from lidarpainter_models.painter.selection import PainterChoice, file_digest
 from lidarpainter_models.painter.training.job import TrainingJob
 from lidarpainter_models.painter.training.loop import Told
@@ -136,12 +136,4 @@ class OneStepJob(TrainingJob):
 
     def save(self, path: Path, *, licence: str, provenance: dict[str, Any]) -> None:
         """See `TrainingJob`."""
-        save_trained(
-            self._made.network,
-            path,
-            prompts=self._made.texts,
-            base=self._made.base,
-            mark=self._made.mark,
-            licence=licence,
-            provenance=provenance,
-        )
+        save_trained(self._made, path, licence=licence, provenance=provenance)

@@ -7,9 +7,8 @@ model itself; where that folder has moved, one of the same name beside the file 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -27,10 +26,14 @@ from lidarpainter_models.painter.one_step.base_models import (
     open_base,
 )
 from lidarpainter_models.painter.one_step.config import PRESETS, OneStepConfig
-from lidarpainter_models.painter.one_step.network import OneStepNetwork
 from lidarpainter_models.painter.one_step.painter import OneStepPainter
 from lidarpainter_models.painter.one_step.prompts import PromptBook
-from lidarpainter_models.painter.one_step.weights import TrainedFile, apply_trained, read_trained
+from lidarpainter_models.painter.one_step.weights import (
+    Trainable,
+    TrainedFile,
+    apply_trained,
+    read_trained,
+)
 from lidarpainter_models.painter.precision import faster_type
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
 
@@ -75,21 +78,6 @@ def load_one_step(
         apply_trained(network, file)
         origin = file.provenance | origin | {"licence": file.licence}
     return OneStepPainter(made_lean(network), prompts, origin).to(device)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Trainable:
-    """A network with its adapters, ready to be trained, and what its weights file has to say."""
-
-    network: OneStepNetwork
-    texts: dict[str, torch.Tensor]
-    """The encoded prompts."""
-    base: str
-    mark: list[float]
-    licence: str
-    """Of the model."""
-    provenance: dict[str, Any]
-    """Of the weights that the training goes on from; empty for a model."""
 
 
 def load_trainable(

@@ -13,8 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lidarpainter_models.errors import ConfigError, WeightsError
-from lidarpainter_models.painter.one_step.architectures import TEXT_TOKENS
-from lidarpainter_models.painter.one_step.packages import diffusion_package
+from lidarpainter_models.painter.one_step.architectures import TEXT_TOKENS, diffusion_package
 
 STYLE_TEXTS = MappingProxyType(
     {

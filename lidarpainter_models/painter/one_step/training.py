@@ -71,7 +71,6 @@ class OneStepTrainingConfig(TrainingConfig):
     weight_decay: float = 1e-2
 
     def __post_init__(self) -> None:
-        """Refuse schedules that cannot run, and windows that the network cannot halve."""
         TrainingConfig.__post_init__(self)
         check_prompts(self.prompts)
         if self.augmentation.crop_px % STRIDE_PX:

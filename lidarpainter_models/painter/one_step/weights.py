@@ -5,7 +5,6 @@ and last layer and the fusion in float32, and the encoded prompts. The model its
 the header names it, with a few of its biases by which another model is found out.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,36 +44,40 @@ class TrainedFile:
     prompts: dict[str, Tensor]
 
 
-def save_trained(
-    network: OneStepNetwork,
-    path: Path,
-    *,
-    prompts: Mapping[str, Tensor],
-    base: str,
-    mark: list[float],
-    licence: str,
-    provenance: dict[str, Any],
-) -> None:
-    """Write what training changed, aside and renamed whole.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trainable:
+    """A network with its adapters, ready to be trained, and what its weights file has to say."""
 
-    The network has its adapters, not merged. `mark` holds biases of the model underneath
-    (`base_models.BaseParts`); `provenance` holds JSON types.
+    network: OneStepNetwork
+    texts: dict[str, Tensor]
+    """The encoded prompts."""
+    base: str
+    mark: list[float]
+    """Biases of the model; see `base_models.BaseParts`."""
+    licence: str
+    """Of the model."""
+    provenance: dict[str, Any]
+    """Of the weights that the training goes on from; empty for a model."""
+
+
+def save_trained(made: Trainable, path: Path, *, licence: str, provenance: dict[str, Any]) -> None:
+    """Write what training changed, aside and renamed whole; `provenance` holds JSON types.
 
     Raises:
         WeightsError: a weight is not finite.
         WriteError: the file cannot be written.
     """
-    state = dict(network.named_parameters())
-    tensors = {name: state[name] for name in trained_names(network)}
-    tensors |= {PROMPT + name: text for name, text in prompts.items()}
+    state = dict(made.network.named_parameters())
+    tensors = {name: state[name] for name in trained_names(made.network)}
+    tensors |= {PROMPT + name: text for name, text in made.texts.items()}
     tensors = {name: tensor.to(stored_type(name)) for name, tensor in tensors.items()}
     for name, tensor in tensors.items():
         check_finite(path, name, tensor)
     header = {
         "format": WEIGHTS_FORMAT,
-        "config": network.config.to_dict(),
-        "base": base,
-        "mark": mark,
+        "config": made.network.config.to_dict(),
+        "base": made.base,
+        "mark": made.mark,
         "licence": licence,
         "provenance": provenance,
     }

@@ -44,7 +44,6 @@ class StyleView:
     ground or above the horizon is unknown."""
 
     def __post_init__(self) -> None:
-        """Refuse maps of another size."""
         size = tuple(self.rgb.shape[:2])
         camera = self.camera
         sizes = {size, tuple(self.depth_m.shape), tuple(self.sky.shape)}

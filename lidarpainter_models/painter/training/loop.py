@@ -220,7 +220,7 @@ def _step(
     norms = [_clipped_norm(optimiser, config, processes) for optimiser in optimisers]
     if not math.isfinite(losses["total"]) or not all(map(math.isfinite, norms)):
         raise TrainingError(
-            f"loss {losses['total']} with gradient norm {max(norms, key=_badness)} at step "
+            f"loss {losses['total']} with gradient norms {norms} at step "
             f"{state.step}: the training stops, its last checkpoint is kept; try a lower "
             "learning_rate"
         )
@@ -231,11 +231,6 @@ def _step(
         optimiser.step()
     _average(state, config.average_decay)
     return losses
-
-
-def _badness(norm: float) -> float:
-    """Orders norms so that one that is no number comes last."""
-    return norm if math.isfinite(norm) else math.inf
 
 
 def _clipped_norm(

@@ -50,15 +50,8 @@ def training(model_folder, tmp_path_factory):
             state[name].add_(0.02 * torch.randn(state[name].shape, generator=generator))
             state[name].copy_(state[name].to(stored_type(name)))
     path = tmp_path_factory.mktemp("trained") / "trained.safetensors"
-    save_trained(
-        made.network,
-        path,
-        prompts=made.texts,
-        base=str(model_folder),
-        mark=made.mark,
-        licence="see the model",
-        provenance={"steps": 3, "trained_targets": ["a"]},
-    )
+    provenance = {"steps": 3, "trained_targets": ["a"]}
+    save_trained(made, path, licence="see the model", provenance=provenance)
     return made, path
 
 
@@ -290,7 +283,7 @@ def test_a_float32_file_never_lies_beside_its_bfloat16_weights(tmp_path):
 
 
 def test_a_missing_extra_names_itself(monkeypatch, model_folder):
-    import lidarpainter_models.painter.one_step.packages as packages
+    import lidarpainter_models.painter.one_step.architectures as packages
 
     def absent(name):
         raise ImportError(f"No module named {name!r}")

@@ -197,15 +197,8 @@ def test_what_was_trained_is_saved_loaded_and_trained_on(model_folder, source, t
     assert made.licence == "unknown"
     record = train_one_step(OneStepTrainee(made.network, made.texts, config), [source])
     path = tmp_path / "own.safetensors"
-    save_trained(
-        made.network,
-        path,
-        prompts=made.texts,
-        base=made.base,
-        mark=made.mark,
-        licence="own",
-        provenance={"steps": record["steps"], "trained_targets": []},
-    )
+    provenance = {"steps": record["steps"], "trained_targets": []}
+    save_trained(made, path, licence="own", provenance=provenance)
     painted = load_painter(path).paint(source.pairs[0].conditions).rgb
     untrained = load_painter(model_folder).paint(source.pairs[0].conditions).rgb
     assert not torch.equal(painted, untrained)
