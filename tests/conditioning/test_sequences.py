@@ -86,11 +86,6 @@ def test_unused_frames_change_nothing(builder, path):
     assert all(torch.equal(one, other) for one, other in zip(found, expected, strict=True))
 
 
-def test_a_sequence_is_painted_the_same_twice(builder, path):
-    first, second = (paint_path(builder, FlickeringPainter(), MIXED, path) for _ in range(2))
-    assert all(torch.equal(one, other) for one, other in zip(first, second, strict=True))
-
-
 def test_mixing_calms_noise_and_keeps_the_image(builder, path):
     plain = paint_path(builder, FlickeringPainter(), SequenceConfig(), path)
     mixed = paint_path(builder, FlickeringPainter(), MIXED, path)

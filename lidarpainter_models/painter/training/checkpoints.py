@@ -30,9 +30,9 @@ class TrainingState:
 
     trained: dict[str, nn.Parameter]
     averaged: dict[str, Tensor]
-    optimiser: torch.optim.AdamW
+    optimisers: dict[str, torch.optim.AdamW]
+    """Of the trained weights, and of the opponent if there is one, as a checkpoint calls them."""
     opponent: nn.Module | None = None
-    opponent_optimiser: torch.optim.AdamW | None = None
     step: int = 0
     cpu_s: float = 0.0
     running: dict[str, float] = field(default_factory=dict)
@@ -45,12 +45,11 @@ class TrainingState:
     ) -> "TrainingState":
         """The state before the first step."""
         averaged = {name: parameter.detach().clone() for name, parameter in trained.items()}
+        optimisers = {"optimiser": _optimiser(list(trained.values()))}
+        if opponent is not None:
+            optimisers["opponent_optimiser"] = _optimiser(list(opponent.parameters()))
         return cls(
-            trained=dict(trained),
-            averaged=averaged,
-            optimiser=_optimiser(list(trained.values())),
-            opponent=opponent,
-            opponent_optimiser=_optimiser(list(opponent.parameters())) if opponent else None,
+            trained=dict(trained), averaged=averaged, optimisers=optimisers, opponent=opponent
         )
 
     @property
@@ -95,15 +94,14 @@ def write_checkpoint(path: Path, state: TrainingState, digest: str) -> None:
         "digest": digest,
         "trained": {name: parameter.detach() for name, parameter in state.trained.items()},
         "averaged": state.averaged,
-        "optimiser": state.optimiser.state_dict(),
         "step": state.step,
         "cpu_s": state.cpu_s,
         "running": state.running,
         "history": state.history,
+        **{name: optimiser.state_dict() for name, optimiser in state.optimisers.items()},
     }
-    if state.opponent is not None and state.opponent_optimiser is not None:
+    if state.opponent is not None:
         saved["opponent"] = state.opponent.state_dict()
-        saved["opponent_optimiser"] = state.opponent_optimiser.state_dict()
     content = io.BytesIO()
     torch.save(saved, content)
     write_whole(path, content.getvalue())
@@ -144,10 +142,10 @@ def _restore(state: TrainingState, saved: Mapping[str, Any]) -> None:
                 )
         for name, tensor in kept.items():
             tensor.copy_(saved[kind][name])
-    state.optimiser.load_state_dict(saved["optimiser"])
-    if state.opponent is not None and state.opponent_optimiser is not None:
+    for name, optimiser in state.optimisers.items():
+        optimiser.load_state_dict(saved[name])
+    if state.opponent is not None:
         state.opponent.load_state_dict(saved["opponent"])
-        state.opponent_optimiser.load_state_dict(saved["opponent_optimiser"])
     state.step, state.cpu_s = int(saved["step"]), float(saved["cpu_s"])
     state.running, state.history = dict(saved["running"]), list(saved["history"])
 

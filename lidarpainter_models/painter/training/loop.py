@@ -206,7 +206,7 @@ def _step(
     processes: Processes,
 ) -> dict[str, float]:
     """One optimiser step; refuses to take one that is not finite. Returns the mean losses."""
-    optimisers = [one for one in (state.optimiser, state.opponent_optimiser) if one is not None]
+    optimisers = list(state.optimisers.values())
     for optimiser in optimisers:
         optimiser.zero_grad(set_to_none=True)
     parts = config.accumulated_batches

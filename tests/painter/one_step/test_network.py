@@ -152,21 +152,20 @@ def test_lidar_changes_the_image_only_through_fusion_at_the_start(make_network, 
     assert torch.equal(network(images, text), network(other, text))
 
 
-@pytest.mark.parametrize("inputs", [("render",), ("lidar",), ("render", "warp")])
+@pytest.mark.parametrize(
+    ("config", "channels"),
+    [
+        (OneStepConfig(inputs=("render",), fusion=None), 4),
+        (OneStepConfig(inputs=("lidar",), fusion=None), 4),
+        (OneStepConfig(inputs=("render", "warp")), 8),
+        (dataclasses.replace(PAPER, denoiser_sees="fused"), 4),
+    ],
+)
 @torch.no_grad()
-def test_ablations_of_the_inputs_run(inputs, make_network, make_inputs):
-    fusion = FusionConfig() if len(inputs) > 1 else None
-    network = make_network(OneStepConfig(inputs=inputs, fusion=fusion))
-    assert network.denoiser.unet.conv_in.in_channels == 4 * len(inputs)
-    images, text = make_inputs(len(inputs))
-    assert network(images, text).shape == images[0].shape
-
-
-@torch.no_grad()
-def test_a_denoiser_that_sees_the_mix_has_four_channels(make_network, make_inputs):
-    network = make_network(dataclasses.replace(PAPER, denoiser_sees="fused"))
-    assert network.denoiser.unet.conv_in.in_channels == 4
-    images, text = make_inputs()
+def test_ablations_run(config, channels, make_network, make_inputs):
+    network = make_network(config)
+    assert network.denoiser.unet.conv_in.in_channels == channels
+    images, text = make_inputs(len(config.inputs))
     assert network(images, text).shape == images[0].shape
 
 

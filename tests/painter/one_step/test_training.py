@@ -179,16 +179,6 @@ def test_in_half_precision_what_is_trained_stays_in_float32(make_network, make_p
     assert rounded == pytest.approx(loss, rel=0.05)  # eight bits, and a step that scales by 14.6
 
 
-def test_accumulated_batches_are_averaged(make_network, make_pair):
-    pairs = [make_pair(64), make_pair(64, seed=1)]
-    _, whole = gradients(make_network(FAST, has_adapters=True), BRIEF, pairs[0])
-    trainee = OneStepTrainee(make_network(FAST, has_adapters=True), TEXTS, BRIEF)
-    for pair in (pairs[0], pairs[0]):
-        trainee.learn(batch_pairs([pair], trainee.num_warps), step=0, share=0.5)
-    for name, gradient in whole.items():
-        torch.testing.assert_close(trainee.trained[name].grad, gradient)
-
-
 def test_what_was_trained_is_saved_loaded_and_trained_on(model_folder, source, tmp_path):
     config = replace(SHORT, steps=2)
     made = load_trainable(

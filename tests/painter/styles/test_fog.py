@@ -8,16 +8,8 @@ import torch
 
 from lidarpainter_models.painter.styles.fog import add_fog, airlight, fog_transmittance
 from lidarpainter_models.painter.styles.view import StyleView, distances
-from lidarpainter_models.weather.air import FOG_BRIGHTNESS, FOG_GREYNESS, FOG_LAYER_M, transmittance
+from lidarpainter_models.weather.air import FOG_BRIGHTNESS, FOG_GREYNESS, FOG_LAYER_M
 from lidarpainter_models.weather.light import luminance, to_linear
-
-
-def test_transmittance_is_the_exponential_of_distance():
-    distance_m = torch.tensor([[0.0, 1.0, 50.0, 100.0]], dtype=torch.float64)
-    beta = log(50) / 100
-    expected = [[1.0, exp(-beta), exp(-50 * beta), 0.02]]  # 2 % are left at the visibility
-    found = transmittance(distance_m, 100.0)
-    torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64))
 
 
 def test_light_is_that_of_the_law_in_every_surface_pixel(street):
@@ -26,26 +18,6 @@ def test_light_is_that_of_the_law_in_every_surface_pixel(street):
     expected = to_linear(street.rgb) * through + air * (1 - through)
     found = to_linear(add_fog(street, 80.0))
     torch.testing.assert_close(found[street.surface], expected[street.surface], atol=1e-5, rtol=0)
-
-
-def test_contrast_falls_with_distance(street):
-    """Along the road, between the same scene with a darker and a brighter road."""
-    dark, light = (
-        replace(street, rgb=torch.where(street.surface[..., None], grey, street.rgb))
-        for grey in (0.3, 0.5)
-    )
-    gap = luminance(to_linear(add_fog(light)) - to_linear(add_fog(dark)))
-    # the airlight is the sky's, which is the same in both
-    along = gap[48:, 80]
-    assert bool((along[1:] >= along[:-1] - 1e-6).all())  # rows downwards come nearer
-    assert float(along[-1]) > 5 * float(along[0])
-
-
-def test_thicker_fog_leaves_less(street):
-    spread = [
-        float(add_fog(street, visibility_m).std()) for visibility_m in (1000.0, 200.0, 60.0, 20.0)
-    ]
-    assert spread == sorted(spread, reverse=True)
 
 
 def test_the_zenith_is_seen_through_less_fog_than_the_horizon(street):
