@@ -4,6 +4,7 @@ What names there are, `known_painters.py` says.
 """
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -22,7 +23,11 @@ from lidarpainter_models.painter.known_painters import (
 )
 from lidarpainter_models.painter.protocol import Painter
 
-RULES: tuple[type[Painter], ...] = (UnpaintedPainter, OverlayPainter, WarpPainter)
+RULES: dict[str, Callable[[], Painter]] = {
+    UnpaintedPainter.name: UnpaintedPainter,
+    OverlayPainter.name: OverlayPainter,
+    WarpPainter.name: WarpPainter,
+}
 _loaded: dict[tuple[str, str, torch.dtype | None], Painter] = {}
 """The painter that was loaded last, by its digest, device and precision."""
 
@@ -110,7 +115,7 @@ class PainterChoice:
 
     def _new(self, device: torch.device, precision: torch.dtype | None) -> Painter:
         if self.kind == "rule":
-            return next(rule for rule in RULES if rule.name == self.name)()
+            return RULES[self.name]()
         if self.kind == "nano":
             from lidarpainter_models.painter.nano.weights import load_weights
 

@@ -28,8 +28,6 @@ def apply_style(
         ConfigError: there is no such style.
     """
     check_prompt(prompt)
-    if strength == 0:
-        return view.rgb
     if prompt == "foggy":
         return add_fog(view, visibility_m / strength)
     if prompt == "night":

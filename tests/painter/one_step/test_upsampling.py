@@ -34,11 +34,6 @@ def test_one_pixel_is_worked_by_hand():
     assert torch.equal(found[0, 0], expected)
 
 
-def test_another_size_than_double_is_refused():
-    with pytest.raises(ValueError, match="expected twice"):
-        PhasedUpsampling(conv_of(1, 1))(torch.ones(1, 1, 4, 4), (7, 8))
-
-
 @pytest.mark.parametrize("config", [PAPER, FAST])
 @torch.no_grad()
 def test_a_lean_network_paints_the_same(config, make_network, make_inputs):
