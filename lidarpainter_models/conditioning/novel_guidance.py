@@ -80,7 +80,7 @@ def novel_cameras(
     frame_indices: Sequence[int],
     world_from_ego: Float[Tensor, "frames 4 4"],
     *,
-    config: NovelGuidanceConfig | None = None,
+    config: NovelGuidanceConfig,
     start: int = 0,
 ) -> list[NovelCamera]:
     """The training cameras of every n-th training frame, at every shift.
@@ -93,7 +93,6 @@ def novel_cameras(
         ConfigError: a view's frame is not among `frame_indices`, or a camera named in the config
             has no training view.
     """
-    config = config or NovelGuidanceConfig()
     directions = dict(zip(frame_indices, road_directions(world_from_ego), strict=True))
     _check_names(config.camera_names, training_views)
     unknown = sorted({view.key[0] for view in training_views} - set(directions))
@@ -141,14 +140,13 @@ def paint_novel_views(
     painter: Painter,
     cameras: Sequence[NovelCamera],
     *,
-    config: NovelGuidanceConfig | None = None,
+    config: NovelGuidanceConfig,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[NovelPainting]:
     """Paint every view that has room to stand in, several at once where nothing leans on another.
 
     Results do not depend on the number of threads.
     """
-    config = config or NovelGuidanceConfig()
     standing = [one for one in cameras if has_room(one, builder.lidar_map, builder.boxes)]
     shown = _one_per_shift(standing)
     device = builder.scene.device

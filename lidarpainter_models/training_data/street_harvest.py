@@ -51,8 +51,8 @@ def harvest_shifted_street(
     plans: Sequence[StreetPlan],
     writer: PairWriter,
     *,
-    config: HarvestConfig | None = None,
-    progress: HarvestProgress | None = None,
+    config: HarvestConfig,
+    progress: HarvestProgress,
 ) -> int:
     """Fit a street several times and pair shifted renders with the truth.
 
@@ -66,7 +66,6 @@ def harvest_shifted_street(
     Raises:
         SceneError: the scene is no recording of this street, or all views stand inside things.
     """
-    config = config or HarvestConfig()
     _check_recording(street, scene)
     added = 0
     for number, plan in enumerate(plans):
@@ -76,8 +75,7 @@ def harvest_shifted_street(
             observations = prepare_observations(scene, split, config.observations)
             fitted = fit_gaussians(observations, plan.fit).scene
             added += harvest_targets(fitted, observations, targets, writer, config)
-        if progress is not None:
-            progress(number + 1, len(plans))
+        progress(number + 1, len(plans))
     return added
 
 

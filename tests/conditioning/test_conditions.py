@@ -169,7 +169,7 @@ def test_of_a_standing_car_an_image_each_half_second_is_painted(views):
 
 def test_a_frame_without_an_ego_pose_is_refused(views):
     with pytest.raises(ConfigError, match="no ego pose"):
-        novel_cameras(views, range(3), ego_path(3))
+        novel_cameras(views, range(3), ego_path(3), config=NovelGuidanceConfig())
 
 
 def test_an_unknown_camera_is_refused(views):

@@ -105,13 +105,10 @@ def run_training(
 
     Raises:
         DataError: no pairs, or a damaged pair.
-        ConfigError: shares that do not fit the sources, a checkpoint of another training, or a time
-            limit for several processes, which would not end at the same step.
+        ConfigError: shares that do not fit the sources, or a checkpoint of another training.
         TrainingError: the loss is no longer finite or the network has died; the last checkpoint
             stays as it was.
     """
-    if processes.count > 1 and config.max_cpu_s is not None:
-        raise ConfigError("several processes need a number of steps, not a budget of CPU seconds")
     shares = source_shares(sources, config)
     state = TrainingState.start(trainee.trained, trainee.opponent)
     path = checkpoint_folder / CHECKPOINT_NAME if checkpoint_folder else None
