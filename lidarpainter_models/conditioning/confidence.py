@@ -123,6 +123,15 @@ def geometric_confidence(
     return (1 - doubt * (1 - SURFACE_WEIGHT * surface)) * seen
 
 
+def view_support(
+    conditions: PaintingConditions, camera: Camera, recorded_cameras: Iterable[Camera]
+) -> Float[Tensor, "height width"]:
+    """`geometric_confidence` of what the render shows, or the LiDAR where it shows nothing."""
+    render_m, lidar_m = conditions.render_depth_m, conditions.lidar_depth_m
+    seen = is_seen(camera, torch.where(render_m > 0, render_m, lidar_m), recorded_cameras)
+    return geometric_confidence(conditions, camera, seen)
+
+
 def _distance_px(
     hit: Bool[Tensor, "height width"], reach_px: float
 ) -> Float[Tensor, "height width"]:

@@ -18,9 +18,8 @@ from torch import Tensor
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.confidence import (
     departure_weight,
-    geometric_confidence,
     guidance_gate,
-    is_seen,
+    view_support,
 )
 from lidarpainter_models.conditioning.sequences import SequencePainter
 from lidarpainter_models.conditioning.settings import NovelGuidanceConfig
@@ -200,11 +199,7 @@ def _paint(
         builder.forget_sources()
     conditions, painting = path.paint(novel.camera, novel.timestamp_ns)
     gate = guidance_gate(painting, conditions)
-    depth_m = torch.where(
-        conditions.render_depth_m > 0, conditions.render_depth_m, conditions.lidar_depth_m
-    )
-    seen = is_seen(novel.camera, depth_m, builder.recorded_cameras)
-    geometric = geometric_confidence(conditions, novel.camera, seen)
+    geometric = view_support(conditions, novel.camera, builder.recorded_cameras)
     trust = (painting.confidence * geometric * gate).clamp(0, 1)
     guidance = GuidanceView.of(
         novel.camera,

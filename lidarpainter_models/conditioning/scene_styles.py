@@ -20,7 +20,7 @@ from lidarpainter_models.painter.styles import StyleView
 from lidarpainter_models.painter.styles.fog import airlight
 from lidarpainter_models.painter.styles.lamps import Lamp, LampKind, find_lamps
 from lidarpainter_models.painter.styles.night import POWER, RADIANCE, place_of, sunlit_white
-from lidarpainter_models.painter.styles.view import fit_ground
+from lidarpainter_models.painter.styles.view import fit_ground, quantile
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import sampled_views
 from lidarpainter_models.weather.darkness import HEADLAMP_AHEAD_M, HEADLAMP_HEIGHT_M, LIT_SHARE
@@ -187,13 +187,9 @@ def _find(lamp: Lamp, points_world: Float[Tensor, "pixels 3"]) -> _Find:
     along = torch.zeros(3)
     along[:2] = torch.linalg.eigh(spread.double()).eigenvectors[:, -1].float()
     sideways = (offset @ along).abs()
-    half_m = torch.stack([_reach(sideways), _reach(offset[:, 2].abs())])
+    # single pixels lie far off
+    half_m = torch.stack([quantile(away, 0.9) for away in (sideways, offset[:, 2].abs())])
     return _Find(kind=lamp.kind, centre=centre, along=along, half_m=half_m, rgb=lamp.colour)
-
-
-def _reach(distance_m: Float[Tensor, " pixels"]) -> Float[Tensor, ""]:
-    """What nine tenths stay within: single pixels lie far off."""
-    return distance_m.kthvalue(max(1, round(0.9 * len(distance_m)))).values
 
 
 def _agreed(looks: Sequence[_Look], *, least: int) -> tuple[list[_Find], list[_Find]]:

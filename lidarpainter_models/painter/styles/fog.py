@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.painter.styles.view import StyleView, distances, elevations
+from lidarpainter_models.painter.styles.view import StyleView, distances, elevations, quantile
 from lidarpainter_models.weather.air import FOG_BRIGHTNESS, FOG_GREYNESS, FOG_LAYER_M, transmittance
 from lidarpainter_models.weather.light import luminance, to_display, to_linear
 from lidarpainter_models.weather.mix import FOG_VISIBILITY_M
@@ -55,13 +55,8 @@ def airlight(view: StyleView, *, greyness: float) -> Float[Tensor, "3"]:
         found = light[horizon].mean(dim=0)
     else:
         distance_m = distances(view).flatten()
-        far = distance_m >= _quantile(distance_m, 0.9)
+        far = distance_m >= quantile(distance_m, 0.9)
         dark = light.amin(dim=-1).flatten()
-        hazy = far & (dark >= _quantile(dark[far], 0.9))
+        hazy = far & (dark >= quantile(dark[far], 0.9))
         found = light.reshape(-1, 3)[hazy].mean(dim=0)
     return found + greyness * (luminance(found) - found)
-
-
-def _quantile(values: Float[Tensor, " pixels"], share: float) -> Float[Tensor, ""]:
-    """A value that so large a share does not reach; `torch.quantile` takes no large images."""
-    return values.kthvalue(max(1, round(share * len(values)))).values

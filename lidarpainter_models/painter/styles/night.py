@@ -22,6 +22,7 @@ from lidarpainter_models.painter.styles.view import (
     elevations,
     fit_ground,
     open_sky,
+    quantile,
     ray_directions,
     surface_points,
 )
@@ -89,7 +90,7 @@ def sunlit_white(view: StyleView) -> float:
     """Daylight of the brightest tenth of the surfaces."""
     grey = luminance(to_linear(view.rgb))
     seen = grey[view.surface] if bool(view.surface.any()) else grey.flatten()
-    return max(float(seen.kthvalue(max(1, round(0.9 * len(seen)))).values), 1e-3)
+    return max(float(quantile(seen, 0.9)), 1e-3)
 
 
 def _relit(

@@ -123,6 +123,11 @@ def surface_points(
     return ray_directions(camera) * distance_m.clamp_max(SKY_M)[..., None]
 
 
+def quantile(values: Float[Tensor, " pixels"], share: float) -> Float[Tensor, ""]:
+    """A value that so large a share does not reach; `torch.quantile` takes no large images."""
+    return values.kthvalue(max(1, round(share * len(values)))).values
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ground:
     """A plane z = a x + b y + c under the camera, in metres from its centre."""
