@@ -34,10 +34,8 @@ class ConditionBatch:
 
     def map(self, change: Callable[[Tensor], Tensor]) -> "ConditionBatch":
         """Every image and mask changed alike."""
-        found: dict[str, Tensor | None] = vars(self)
-        return replace(
-            self, **{name: change(one) for name, one in found.items() if one is not None}
-        )
+        found = {name: one for name, one in vars(self).items() if one is not None}
+        return replace(self, **{name: change(one) for name, one in found.items()})
 
     def to(self, device: torch.device) -> "ConditionBatch":
         """The same batch on another device; the host waits for it only on the CPU."""

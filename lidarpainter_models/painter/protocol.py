@@ -5,7 +5,7 @@ camera z in metres with 0 where there is none.
 """
 
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -41,13 +41,11 @@ class PaintingConditions:
 
     def cropped(self, rows: slice, columns: slice) -> "PaintingConditions":
         """What is known inside a rectangle."""
-        cut = {}
-        for name, image in vars(self).items():
-            if isinstance(image, Tensor):
-                has_channels = name.endswith("rgb")
-                cut[name] = (
-                    image[..., rows, columns, :] if has_channels else image[..., rows, columns]
-                )
+        images = {name: one for name, one in vars(self).items() if isinstance(one, Tensor)}
+        cut: dict[str, Any] = {
+            name: one[..., rows, columns, :] if name.endswith("rgb") else one[..., rows, columns]
+            for name, one in images.items()
+        }
         return replace(self, **cut)
 
 
