@@ -132,10 +132,29 @@ def test_a_checkpoint_of_another_training_is_refused(make_pair, memory_pairs, tm
         train_nano([memory_pairs(pairs, "others")], config, checkpoint_folder=tmp_path)
 
 
-def test_a_damaged_checkpoint_is_one_clear_line(make_pair, memory_pairs, tmp_path):
-    (tmp_path / "training.pt").write_bytes(b"not a checkpoint")
-    with pytest.raises(DataError, match="not a readable training checkpoint") as caught:
-        train_nano([memory_pairs([make_pair(32)])], SHORT, checkpoint_folder=tmp_path)
+def unreadable(path):
+    path.write_bytes(b"not a checkpoint")
+
+
+def misshapen(path):
+    saved = torch.load(path, weights_only=True)
+    saved["averaged"]["head.bias"] = torch.zeros(3)
+    torch.save(saved, path)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (unreadable, "not a readable training checkpoint"),
+        (misshapen, r"'head.bias' has shape \(3,\)"),
+    ],
+)
+def test_a_damaged_checkpoint_is_one_clear_line(spoil, message, make_pair, memory_pairs, tmp_path):
+    source, config = memory_pairs([make_pair(32)]), replace(SHORT, steps=1)
+    train_nano([source], config, checkpoint_folder=tmp_path)
+    spoil(tmp_path / "training.pt")
+    with pytest.raises(DataError, match=message) as caught:
+        train_nano([source], config, checkpoint_folder=tmp_path)
     assert "\n" not in str(caught.value)
 
 

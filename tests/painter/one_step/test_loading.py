@@ -272,6 +272,7 @@ print(loading.peak_memory_bytes - nothing.peak_memory_bytes)
 """
 
 
+@pytest.mark.slow
 def test_a_float32_file_never_lies_beside_its_bfloat16_weights(tmp_path):
     path = tmp_path / "large.safetensors"
     save_file({f"{index}.weight": torch.ones(2048, 2048) for index in range(24)}, path)
