@@ -18,7 +18,7 @@ from lidarpainter_models.painter.baselines import OverlayPainter, UnpaintedPaint
 from lidarpainter_models.painter.nano.ablations import REFERENCE, ablation_tables
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.painter.training_jobs import PainterTraining, job_for
-from lidarpainter_models.training_data.pair_sets import named_sets, open_sets
+from lidarpainter_models.training_data.pairs import named_sets, open_sets
 from tasks.painter.evaluate import score_painters
 from tasks.painter.train import train, weights_path
 

@@ -1,6 +1,7 @@
 """Questions about painters that are answered here and now; nothing is stored."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from lidarpainter_models.painter.description import describe_painter
 from lidarpainter_models.painter.precision import faster_type, type_name
 from lidarpainter_models.painter.selection import PainterChoice
 from lidarpainter_models.painter.speed import time_views
-from lidarpainter_models.training_data.pair_sets import named_sets
+from lidarpainter_models.training_data.pairs import named_sets
 from tasks.painter.evaluate import score_painters
 from tasks.painter.held_out_fits import HeldOutFit
 from tasks.runs import open_run
@@ -66,7 +67,7 @@ def describe(name: str) -> dict[str, Any]:
     """What a painter is, what it is made of and how it was trained."""
     choice = PainterChoice.of(name)
     found = describe_painter(choice.load(torch.device("cpu")))
-    num_bytes = sum(path.stat().st_size for path in choice.row.files(name))
+    num_bytes = sum(path.stat().st_size for path in choice.files)
     return {"painter": name, "digest": choice.digest, "num_bytes": num_bytes, **found}
 
 
@@ -85,9 +86,7 @@ def benchmark_painter(
             {
                 "precision": precision and type_name(precision),
                 "is_chosen": precision == chosen,
-                "cpu_ms": times.cpu_ms,
-                "wall_ms": times.wall_ms,
-                "peak_memory_bytes": times.peak_memory_bytes,
+                **asdict(times),
             }
         )
     return {

@@ -21,7 +21,7 @@ from lidarpainter_models.evaluation.painter_training import TrainingRequest
 from lidarpainter_models.painter.known_painters import WEIGHTS_SUFFIX
 from lidarpainter_models.painter.training_jobs import job_for
 from lidarpainter_models.storage.whole_files import write_whole
-from lidarpainter_models.training_data.pair_sets import PairSet, named_sets
+from lidarpainter_models.training_data.pairs import PairSet, named_sets
 from tasks.ingest.ingest import has_street
 from tasks.opened import open_split
 from tasks.painter.evaluate import (

@@ -25,8 +25,6 @@ would hold the scene to what it was when it was painted, while recorded views st
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
@@ -62,23 +60,6 @@ DEPARTURE_RANGE = (0.01, 0.04)
 the weight is left, which gives up 0.1 to 0.2 dB beside the path
 (docs/decisions/what-guides-a-fit.md)."""
 MIN_EVIDENCE = 0.02  # share of pixels with evidence under which no view is gated as a whole
-
-
-@dataclass(frozen=True, eq=False)
-class GuidanceGate:
-    """What the comparison with recorded pixels says about one painting."""
-
-    weight: Float[Tensor, "height width"]
-    """Factor on the confidence, in [0, 1]; all 0 when refused."""
-    painted_difference: float
-    """Mean absolute difference from the evidence; NaN without evidence."""
-    render_difference: float
-    """The same for the render before painting."""
-
-    @cached_property
-    def is_refused(self) -> bool:
-        """Whether nothing of the painting counts."""
-        return bool((self.weight == 0).all())
 
 
 def is_seen(
@@ -142,6 +123,15 @@ def geometric_confidence(
     return (1 - doubt * (1 - SURFACE_WEIGHT * surface)) * seen
 
 
+def view_support(
+    conditions: PaintingConditions, camera: Camera, recorded_cameras: Iterable[Camera]
+) -> Float[Tensor, "height width"]:
+    """`geometric_confidence` of what the render shows, or the LiDAR where it shows nothing."""
+    render_m, lidar_m = conditions.render_depth_m, conditions.lidar_depth_m
+    seen = is_seen(camera, torch.where(render_m > 0, render_m, lidar_m), recorded_cameras)
+    return geometric_confidence(conditions, camera, seen)
+
+
 def _distance_px(
     hit: Bool[Tensor, "height width"], reach_px: float
 ) -> Float[Tensor, "height width"]:
@@ -180,25 +170,29 @@ def _vouched(conditions: PaintingConditions) -> Float[Tensor, "height width"]:
     return torch.where(num_valid >= 2, agreement, vouched)
 
 
-def guidance_gate(painting: Painting, conditions: PaintingConditions) -> GuidanceGate:
-    """Weigh a painting down where it departs from recorded pixels more than the render did."""
+def guidance_gate(
+    painting: Painting, conditions: PaintingConditions
+) -> Float[Tensor, "height width"]:
+    """Factor on a painting's weight, in [0, 1]; all 0 where it is refused.
+
+    It falls where the painting departs from recorded pixels more than the render did.
+    """
     evidence, known = _evidence(conditions)
     share = float(known.to(torch.float32).mean())
     painted = (painting.rgb - evidence).abs().mean(dim=-1) * known
     rendered = (conditions.render_rgb - evidence).abs().mean(dim=-1) * known
     if share == 0:
-        return GuidanceGate(torch.ones_like(painted), float("nan"), float("nan"))
+        return torch.ones_like(painted)
     count = known.sum()
-    painted_mean, render_mean = float(painted.sum() / count), float(rendered.sum() / count)
     view_weight = 1.0
     if share >= MIN_EVIDENCE:
-        excess = painted_mean - render_mean
+        excess = float(painted.sum() / count) - float(rendered.sum() / count)
         view_weight = 0.0 if excess > REFUSE_EXCESS else _falloff(excess)
     local = _box_sum(painted - rendered, GATE_WINDOW_PX) / _box_sum(
         known.to(torch.float32), GATE_WINDOW_PX
     ).clamp(min=1.0)
     fall = torch.exp(-(local - GATE_SLACK).clamp(min=0) / GATE_SCALE)
-    return GuidanceGate(view_weight * fall, painted_mean, render_mean)
+    return view_weight * fall
 
 
 def departure_weight(

@@ -12,7 +12,7 @@ from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.moved_cameras import MovedCameras
 from lidarpainter_models.conditioning.sequences import SequencePainter
 from lidarpainter_models.conditioning.view_evidence import EvidenceGatherer
-from lidarpainter_models.errors import SceneError
+from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.trajectory_specs import Trajectory
 from lidarpainter_models.lidar.collisions import Collision
@@ -74,7 +74,11 @@ class FollowedPath:
         Raises:
             ConfigError: it leads into points of the street.
         """
-        self._moving.refuse_walls(self.collisions())
+        if walls := [one for one in self.collisions() if one.is_wall]:
+            raise ConfigError(
+                f"trajectory {self.trajectory.spec!r} leads the camera into a wall: {walls[0]} "
+                "within half a metre; --allow-collisions goes through"
+            )
 
     @cached_property
     def _moving(self) -> MovedCameras:
@@ -91,10 +95,6 @@ class FollowedPath:
             self.views,
             [self._found(view, fit_camera(view, self.observation)) for view in self.views],
         )
-
-    def image(self, camera: Camera, view: RecordedView) -> Float[Tensor, "height width 3"]:
-        """What is seen there, painted if asked for; in [0, 1]."""
-        return self.shown(camera, view).rgb
 
     def shown(self, camera: Camera, view: RecordedView) -> ShownMoment:
         """What is seen there, and what is known beside it."""

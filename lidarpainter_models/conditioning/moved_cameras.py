@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.geometry.trajectory_parts import Moments
@@ -70,18 +69,6 @@ class MovedCameras:
         )
         start_ns = int(self.road.timestamps_ns[0])
         return find_collisions(body, street, self.tracks, start_ns=start_ns)
-
-    def refuse_walls(self, found: Sequence[Collision]) -> None:
-        """Refuse cameras in a wall.
-
-        Raises:
-            ConfigError: they run into points of the street.
-        """
-        if walls := [one for one in found if one.is_wall]:
-            raise ConfigError(
-                f"trajectory {self.trajectory.spec!r} leads the camera into a wall: {walls[0]} "
-                "within half a metre; --allow-collisions goes through"
-            )
 
     def _road_of(self, views: Sequence[RecordedView]) -> DrivenPath:
         """The way that a trajectory leads off.

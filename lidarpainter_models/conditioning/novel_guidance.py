@@ -8,7 +8,7 @@ forward, y left, z up; metres.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import torch
@@ -17,11 +17,9 @@ from torch import Tensor
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
 from lidarpainter_models.conditioning.confidence import (
-    GuidanceGate,
     departure_weight,
-    geometric_confidence,
     guidance_gate,
-    is_seen,
+    view_support,
 )
 from lidarpainter_models.conditioning.sequences import SequencePainter
 from lidarpainter_models.conditioning.settings import NovelGuidanceConfig
@@ -65,8 +63,8 @@ class NovelPainting:
 
     novel: NovelCamera
     guidance: GuidanceView
-    """Its weight is 0 everywhere if the gate refused the painting."""
-    gate: GuidanceGate
+    is_refused: bool
+    """Whether the gate let nothing of it count."""
     images: dict[str, UInt8[Tensor, "height width 3"]]
     """Of one view of each shift, by name: render, lidar, warp, painted, confidence."""
 
@@ -81,7 +79,7 @@ def novel_cameras(
     frame_indices: Sequence[int],
     world_from_ego: Float[Tensor, "frames 4 4"],
     *,
-    config: NovelGuidanceConfig | None = None,
+    config: NovelGuidanceConfig,
     start: int = 0,
 ) -> list[NovelCamera]:
     """The training cameras of every n-th training frame, at every shift.
@@ -94,7 +92,6 @@ def novel_cameras(
         ConfigError: a view's frame is not among `frame_indices`, or a camera named in the config
             has no training view.
     """
-    config = config or NovelGuidanceConfig()
     directions = dict(zip(frame_indices, road_directions(world_from_ego), strict=True))
     _check_names(config.camera_names, training_views)
     unknown = sorted({view.key[0] for view in training_views} - set(directions))
@@ -142,14 +139,13 @@ def paint_novel_views(
     painter: Painter,
     cameras: Sequence[NovelCamera],
     *,
-    config: NovelGuidanceConfig | None = None,
+    config: NovelGuidanceConfig,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[NovelPainting]:
     """Paint every view that has room to stand in, several at once where nothing leans on another.
 
     Results do not depend on the number of threads.
     """
-    config = config or NovelGuidanceConfig()
     standing = [one for one in cameras if has_room(one, builder.lidar_map, builder.boxes)]
     shown = _one_per_shift(standing)
     device = builder.scene.device
@@ -189,7 +185,7 @@ def _one_per_shift(cameras: Sequence[NovelCamera]) -> list[NovelCamera]:
 
 def guidance_views(paintings: Sequence[NovelPainting]) -> list[GuidanceView]:
     """What the fit is given: every painting that was not refused."""
-    return [painting.guidance for painting in paintings if not painting.gate.is_refused]
+    return [painting.guidance for painting in paintings if not painting.is_refused]
 
 
 def _paint(
@@ -203,12 +199,8 @@ def _paint(
         builder.forget_sources()
     conditions, painting = path.paint(novel.camera, novel.timestamp_ns)
     gate = guidance_gate(painting, conditions)
-    depth_m = torch.where(
-        conditions.render_depth_m > 0, conditions.render_depth_m, conditions.lidar_depth_m
-    )
-    seen = is_seen(novel.camera, depth_m, builder.recorded_cameras)
-    geometric = geometric_confidence(conditions, novel.camera, seen)
-    trust = (painting.confidence * geometric * gate.weight).clamp(0, 1)
+    geometric = view_support(conditions, novel.camera, builder.recorded_cameras)
+    trust = (painting.confidence * geometric * gate).clamp(0, 1)
     guidance = GuidanceView.of(
         novel.camera,
         novel.timestamp_ns,
@@ -219,8 +211,12 @@ def _paint(
     home = torch.device("cpu")  # where paintings of a whole log have room
     images = _images(conditions, painting, trust) if is_shown else {}
     images = {name: rgb.to(home) for name, rgb in images.items()}
-    gate = replace(gate, weight=gate.weight.to(home))
-    return NovelPainting(novel=novel, guidance=guidance.to(home), gate=gate, images=images)
+    return NovelPainting(
+        novel=novel,
+        guidance=guidance.to(home),
+        is_refused=bool((gate.to(home) == 0).all()),
+        images=images,
+    )
 
 
 def _images(

@@ -8,27 +8,25 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
-from lidarpainter_models.conditioning.style_views import style_view
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.styling.scene_style import SceneStyle, StyledPlace
+from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.observations.views import SceneObservations, TrainingView
 from lidarpainter_models.painter.styles import StyleView
 from lidarpainter_models.painter.styles.fog import airlight
 from lidarpainter_models.painter.styles.lamps import Lamp, LampKind, find_lamps
 from lidarpainter_models.painter.styles.night import POWER, RADIANCE, place_of, sunlit_white
-from lidarpainter_models.painter.styles.view import fit_ground
+from lidarpainter_models.painter.styles.view import fit_ground, quantile
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.splits import sampled_views
-from lidarpainter_models.weather.darkness import HEADLAMP_AHEAD_M, HEADLAMP_HEIGHT_M
+from lidarpainter_models.weather.darkness import HEADLAMP_AHEAD_M, HEADLAMP_HEIGHT_M, LIT_SHARE
 from lidarpainter_models.weather.mix import StyleMix
 
 MOST_VIEWS = 24
-LIT_SHARE = 0.4
-"""Of the windows."""
 LEAST_FINDS = 2
 """What one view alone finds is no lamp, where there are several views."""
 MERGED_M: dict[LampKind, float] = {"signal": 0.8, "window": 1.2, "street": 2.0}
@@ -88,6 +86,33 @@ def styled_scene(
     lamp, heading = _ego_lamps(recorded, looked_at[0], height_m)
     place = _place(looks, lamp, heading, recorded.frame_timestamps_ns, seed)
     return replace(clear, style=SceneStyle(mix=mix, seed=seed, place=place.to(scene.device)))
+
+
+def style_view(
+    builder: ConditionBuilder,
+    camera: Camera,
+    timestamp_ns: int,
+    image: Float[Tensor, "height width 3"],
+    sky_mask: Bool[Tensor, "height width"] | None = None,
+) -> tuple[StyleView, Float[Tensor, "height width"]]:
+    """An image of the scene with what styles it, and the LiDAR depth that supports it.
+
+    `sky_mask` is that of a recorded image; by default what the Gaussians leave open is sky.
+
+    Returns:
+        The view, its depth that of the render corrected by LiDAR; and camera z in metres where the
+        LiDAR hit, 0 elsewhere. All on the CPU, where styles are made.
+    """
+    render = builder.scene.render(camera, timestamp_ns)
+    lidar = builder.lidar_image(camera, camera.taken_ns(timestamp_ns))
+    sky = 1 - render.alpha.clamp(0, 1).cpu() if sky_mask is None else sky_mask.float()
+    view = StyleView(
+        rgb=image.cpu(),
+        depth_m=builder.surface_m(render, lidar, camera).detach().cpu(),
+        sky=sky.detach(),
+        camera=camera,
+    )
+    return view, lidar.depth_m.cpu()
 
 
 def _place(
@@ -162,13 +187,9 @@ def _find(lamp: Lamp, points_world: Float[Tensor, "pixels 3"]) -> _Find:
     along = torch.zeros(3)
     along[:2] = torch.linalg.eigh(spread.double()).eigenvectors[:, -1].float()
     sideways = (offset @ along).abs()
-    half_m = torch.stack([_reach(sideways), _reach(offset[:, 2].abs())])
+    # single pixels lie far off
+    half_m = torch.stack([quantile(away, 0.9) for away in (sideways, offset[:, 2].abs())])
     return _Find(kind=lamp.kind, centre=centre, along=along, half_m=half_m, rgb=lamp.colour)
-
-
-def _reach(distance_m: Float[Tensor, " pixels"]) -> Float[Tensor, ""]:
-    """What nine tenths stay within: single pixels lie far off."""
-    return distance_m.kthvalue(max(1, round(0.9 * len(distance_m)))).values
 
 
 def _agreed(looks: Sequence[_Look], *, least: int) -> tuple[list[_Find], list[_Find]]:

@@ -12,9 +12,8 @@ from typing import NamedTuple
 import torch
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
-from lidarpainter_models.conditioning.references import WarpTarget, warped_references
 from lidarpainter_models.conditioning.settings import SequenceConfig
-from lidarpainter_models.conditioning.warping import SourceImage
+from lidarpainter_models.conditioning.warping import SourceImage, WarpTarget, warped_references
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.painter.one_step.painter import OneStepPainter
 from lidarpainter_models.painter.protocol import (

@@ -18,7 +18,6 @@ class ConditionConfig:
     """Recorded images they are patched together from: the nearest, then ever sparser ones."""
 
     def __post_init__(self) -> None:
-        """Refuse fewer sources than references."""
         if not 1 <= self.num_references <= self.num_sources:
             raise ConfigError(
                 f"need 1 <= num_references <= num_sources, got {self.num_references} and "
@@ -64,7 +63,6 @@ class NovelGuidanceConfig:
     """What becomes of the frame painted before along the same path."""
 
     def __post_init__(self) -> None:
-        """Refuse to paint nothing."""
         if not self.shifts:
             raise ConfigError("novel guidance needs at least one shift")
         if self.every_nth < 1:

@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarpainter_models.conditioning.conditions import ConditionBuilder
-from lidarpainter_models.conditioning.confidence import geometric_confidence, is_seen
+from lidarpainter_models.conditioning.confidence import view_support
 from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
@@ -84,11 +84,7 @@ class EvidenceGatherer:
         """What speaks for the image of a camera, taken as it stands, at a time."""
         camera = camera.no_wider(EVIDENCE_WIDTH_PX)
         conditions = self.builder.conditions(camera, timestamp_ns, camera_name=camera_name)
-        depth_m = torch.where(
-            conditions.render_depth_m > 0, conditions.render_depth_m, conditions.lidar_depth_m
-        )
-        seen = is_seen(camera, depth_m, self.builder.recorded_cameras)
-        support = geometric_confidence(conditions, camera, seen)
+        support = view_support(conditions, camera, self.builder.recorded_cameras)
         return ViewEvidence(
             recorded_db=self._measured_db(camera_name),
             expected_db=_decibels(_difference(conditions).mean()),

@@ -13,8 +13,7 @@ from statistics import fmean
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lidarpainter_models.conditioning.references import WarpTarget, warped_references
-from lidarpainter_models.conditioning.warping import SourceImage
+from lidarpainter_models.conditioning.warping import SourceImage, WarpTarget, warped_references
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.moving_boxes import BACKGROUND, MovingBoxes
 from lidarpainter_models.metrics.images import psnr_from_error, squared_error

@@ -22,8 +22,7 @@ from lidarpainter_models.painter.training.job import TrainingJob
 from lidarpainter_models.painter.training.loop import Told
 from lidarpainter_models.painter.training_jobs import PainterTraining, job_for
 from lidarpainter_models.readers.pandaset.reader import LICENCE as PANDASET_LICENCE
-from lidarpainter_models.training_data.pair_sets import PairSet, open_sets
-from lidarpainter_models.training_data.pairs import PairFolder
+from lidarpainter_models.training_data.pairs import PairFolder, PairSet, open_sets
 
 LICENCE = "Apache-2.0"
 ATTRIBUTIONS = {

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from lidarpainter_models.conditioning.followed_paths import FollowedPath, image_record
-from lidarpainter_models.conditioning.style_views import style_view
+from lidarpainter_models.conditioning.scene_styles import style_view
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.export.images import write_png
 from lidarpainter_models.export.view_files import recorded_u8
@@ -101,7 +101,7 @@ def _view(
 ) -> tuple[StyleView, torch.Tensor]:
     """The clear image with depth and sky, and its LiDAR depth."""
     if images == "rendered":
-        rgb, sky = path.image(camera, moment), None
+        rgb, sky = path.shown(camera, moment).rgb, None
     else:
         rgb_u8 = recorded_u8(path, camera, moment)
         points_world = path.recorded.read_positions(moment.frame_index)

@@ -39,7 +39,8 @@ class Lpips(nn.Module):
         """Take a frozen backbone and the weights of its channels at every compared depth."""
         super().__init__()
         self.backbone = backbone
-        self.num_heads = len(heads)
+        self.channels = tuple(len(head) for head in heads)
+        """Numbers of channels of the backbone at every compared depth."""
         for index, head in enumerate(heads):
             self.register_buffer(f"head_{index}", head[:, None, None])
         self.register_buffer("shift", torch.tensor(SHIFT_RGB)[:, None, None])
@@ -74,23 +75,12 @@ class Lpips(nn.Module):
             total = total + weighed.sum(dim=1).mean(dim=(1, 2))
         return total
 
-    @property
-    def channels(self) -> tuple[int, ...]:
-        """Numbers of channels of the backbone at every compared depth."""
-        heads = [self.get_buffer(f"head_{index}") for index in range(self.num_heads)]
-        return tuple(len(head) for head in heads)
-
     def features(
         self, images: Float[Tensor, "batch 3 height width"]
     ) -> list[Float[Tensor, "batch channels rows columns"]]:
         """What the backbone sees in images with rgb in [0, 1], at every compared depth."""
-        return self.backbone.compared_features(self._normalised(images))
-
-    def _normalised(
-        self, views: Float[Tensor, "batch 3 height width"]
-    ) -> Float[Tensor, "batch 3 height width"]:
-        """Images as the backbone expects them."""
-        return (2 * views - 1 - self.get_buffer("shift")) / self.get_buffer("scale")
+        shifted = 2 * images - 1 - self.get_buffer("shift")
+        return self.backbone.compared_features(shifted / self.get_buffer("scale"))
 
 
 def load_lpips(files: LpipsFiles, device: torch.device | None = None) -> Lpips | None:

@@ -18,7 +18,6 @@ from lidarpainter_models.metrics.backbones import (
     FeatureStack,
     is_published,
     load_stack,
-    squeezenet_stack,
 )
 
 CHANNEL_MEAN_BGR = (103.939, 116.779, 123.68)
@@ -28,9 +27,9 @@ CHANNEL_MEAN_BGR = (103.939, 116.779, 123.68)
 class SqueezeNetDistance(nn.Module):
     """Distance between two images in the feature spaces of SqueezeNet 1.1."""
 
-    def __init__(self, layers: FeatureStack | None = None) -> None:
+    def __init__(self, layers: FeatureStack) -> None:
         super().__init__()
-        self.layers = layers or squeezenet_stack()
+        self.layers = layers
 
     def features(
         self, rgb: Float[Tensor, "height width 3"]

@@ -39,7 +39,6 @@ class DiscriminatorConfig:
     """The image itself, half of it, ..."""
 
     def __post_init__(self) -> None:
-        """Refuse shapes that cannot be built."""
         for name in ("width", "num_layers", "num_scales"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be positive, got {getattr(self, name)}")
@@ -96,41 +95,21 @@ class FeatureDiscriminator(nn.Module):
         return [head(values) for head, values in zip(self.heads, seen, strict=True)]
 
 
-def build_discriminator(
-    config: DiscriminatorConfig, features: FrozenFeatures | None = None
-) -> PatchDiscriminator | FeatureDiscriminator:
-    """Heads on frozen features where there are any, patches of the image otherwise."""
-    if features is None:
-        return PatchDiscriminator(config)
-    return FeatureDiscriminator(features, config)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class DiscriminatorLoss:
-    """What a discriminator is trained to lower."""
-
-    hinge: Float[Tensor, ""]
-    gradient_penalty: Float[Tensor, ""]
-    total: Float[Tensor, ""]
-
-
 def discriminator_loss(
     discriminator: Discriminator,
     true: Float[Tensor, "batch 3 height width"],
     painted: Float[Tensor, "batch 3 height width"],
     *,
-    penalty_weight: float = 1.0,
-) -> DiscriminatorLoss:
+    penalty_weight: float,
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
     """Hinge and gradient penalty; the painter gets no gradient from it.
 
     `penalty_weight` is gamma of R1, half of which counts; 0 saves its second backward pass.
     """
     hinge = discriminator_hinge_loss(discriminator(true), discriminator(painted.detach()))
-    penalty = hinge.new_zeros(())
-    if penalty_weight > 0:
-        penalty = gradient_penalty(discriminator, true)
-    total = hinge + 0.5 * penalty_weight * penalty
-    return DiscriminatorLoss(hinge=hinge, gradient_penalty=penalty, total=total)
+    if penalty_weight == 0:
+        return hinge, hinge.new_zeros(())
+    return hinge, gradient_penalty(discriminator, true)
 
 
 def discriminator_hinge_loss(

@@ -48,7 +48,6 @@ class AugmentationConfig:
     """Samples whose target is in a style, where the network has prompts for any."""
 
     def __post_init__(self) -> None:
-        """Refuse shares outside [0, 1] and windows of broken cells."""
         if self.crop_px < 32 or self.crop_px % 16:
             raise ConfigError(f"crop_px must be a multiple of 16 and >= 32, got {self.crop_px}")
         for name in self.__slots__:

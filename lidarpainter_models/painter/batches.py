@@ -5,9 +5,8 @@ where there is none; masks are float, 1 where true. Warps beyond those a view ha
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -35,9 +34,8 @@ class ConditionBatch:
 
     def map(self, change: Callable[[Tensor], Tensor]) -> "ConditionBatch":
         """Every image and mask changed alike."""
-        found: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
-        changed = {name: change(value) for name, value in found.items() if value is not None}
-        return type(self)(**changed)
+        found = {name: one for name, one in vars(self).items() if one is not None}
+        return replace(self, **{name: change(one) for name, one in found.items()})
 
     def to(self, device: torch.device) -> "ConditionBatch":
         """The same batch on another device; the host waits for it only on the CPU."""
@@ -61,20 +59,12 @@ def in_planes(conditions: PaintingConditions) -> PaintingConditions:
 
     A batch and a hull need them so; a view that is given to both is converted but once.
     """
-    reference = conditions.reference_rgb
-    return replace(
-        conditions,
-        render_rgb=_apart(conditions.render_rgb),
-        lidar_rgb=_apart(conditions.lidar_rgb),
-        warp_rgb=_apart(conditions.warp_rgb),
-        reference_rgb=None if reference is None else _apart(reference),
-    )
-
-
-def _apart(
-    rgb: Float[Tensor, "*sources height width 3"],
-) -> Float[Tensor, "*sources height width 3"]:
-    return rgb.movedim(-1, -3).contiguous().movedim(-3, -1)
+    apart = {
+        name: rgb.movedim(-1, -3).contiguous().movedim(-3, -1)
+        for name, rgb in vars(conditions).items()
+        if name.endswith("rgb") and rgb is not None
+    }
+    return replace(conditions, **apart)
 
 
 def stack_conditions(views: Sequence[PaintingConditions], *, num_sources: int) -> ConditionBatch:

@@ -1,6 +1,6 @@
 """What a painter learns from: conditions beside the true image, and where such pairs come from.
 
-Painters know the shape of a pair and how to ask for one; `conditioning.pairs` stores and makes
+Painters know the shape of a pair and how to ask for one; `training_data` makes and stores
 them.
 """
 
@@ -41,7 +41,6 @@ class PaintingPair:
     """Where the target may be learnt from."""
 
     def __post_init__(self) -> None:
-        """Refuse a target on another pixel grid."""
         size = self.conditions.height_width_px
         if self.target_rgb.shape[:2] != size or self.target_valid.shape != size:
             raise ShapeError(

@@ -28,16 +28,10 @@ class InputHull(NamedTuple):
     upper: Float[Tensor, "height width 3"]
 
 
-def input_hull(
-    conditions: PaintingConditions,
-    *,
-    inputs: Set[str] = ALL_INPUTS,
-    margin: float = HULL_MARGIN,
-) -> InputHull:
+def input_hull(conditions: PaintingConditions, *, inputs: Set[str] = ALL_INPUTS) -> InputHull:
     """The hull of render, LiDAR hits and valid warps around every pixel.
 
-    `inputs` are those that count beside the render, of `lidar`, `warp` and `reference`; the margin
-    is added on both sides.
+    `inputs` are those that count beside the render, of `lidar`, `warp` and `reference`.
     """
     render = conditions.render_rgb.permute(2, 0, 1).contiguous()
     lower = upper = render
@@ -46,8 +40,8 @@ def input_hull(
         rgb_or_render = torch.lerp(render, rgb.permute(2, 0, 1).contiguous(), known.to(render))
         lower, upper = torch.minimum(lower, rgb_or_render), torch.maximum(upper, rgb_or_render)
     return InputHull(
-        lower=_most_nearby(lower, torch.minimum, torch.inf).sub_(margin).permute(1, 2, 0),
-        upper=_most_nearby(upper, torch.maximum, -torch.inf).add_(margin).permute(1, 2, 0),
+        lower=_most_nearby(lower, torch.minimum, torch.inf).sub_(HULL_MARGIN).permute(1, 2, 0),
+        upper=_most_nearby(upper, torch.maximum, -torch.inf).add_(HULL_MARGIN).permute(1, 2, 0),
     )
 
 

@@ -4,8 +4,8 @@ All images of one request share the camera's pixel grid; rgb is float32 in [0, 1
 camera z in metres with 0 where there is none.
 """
 
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -41,19 +41,12 @@ class PaintingConditions:
 
     def cropped(self, rows: slice, columns: slice) -> "PaintingConditions":
         """What is known inside a rectangle."""
-        reference = self.reference_rgb
-        return PaintingConditions(
-            render_rgb=self.render_rgb[rows, columns],
-            render_depth_m=self.render_depth_m[rows, columns],
-            render_alpha=self.render_alpha[rows, columns],
-            lidar_rgb=self.lidar_rgb[rows, columns],
-            lidar_depth_m=self.lidar_depth_m[rows, columns],
-            lidar_hit=self.lidar_hit[rows, columns],
-            warp_rgb=self.warp_rgb[:, rows, columns],
-            warp_valid=self.warp_valid[:, rows, columns],
-            reference_rgb=None if reference is None else reference[rows, columns],
-            prompt=self.prompt,
-        )
+        images = {name: one for name, one in vars(self).items() if isinstance(one, Tensor)}
+        cut: dict[str, Any] = {
+            name: one[..., rows, columns, :] if name.endswith("rgb") else one[..., rows, columns]
+            for name, one in images.items()
+        }
+        return replace(self, **cut)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

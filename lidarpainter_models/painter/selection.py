@@ -1,9 +1,10 @@
 """The painter that a user named: its kind, its digest, and the painter in memory.
 
-What a name stands for is a row of `known_painters.py`.
+What names there are, `known_painters.py` says.
 """
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -11,14 +12,22 @@ from pathlib import Path
 import torch
 
 from lidarpainter_models.errors import WeightsError
+from lidarpainter_models.painter.baselines import OverlayPainter, UnpaintedPainter, WarpPainter
 from lidarpainter_models.painter.known_painters import (
+    BUNDLED_NANO,
+    DIGEST_LENGTH,
     PAINTER_NAMES,
-    KnownPainter,
+    PAINTERS,
+    WEIGHTS_SUFFIX,
     PainterKind,
-    known_painter,
 )
 from lidarpainter_models.painter.protocol import Painter
 
+RULES: dict[str, Callable[[], Painter]] = {
+    UnpaintedPainter.name: UnpaintedPainter,
+    OverlayPainter.name: OverlayPainter,
+    WarpPainter.name: WarpPainter,
+}
 _loaded: dict[tuple[str, str, torch.dtype | None], Painter] = {}
 """The painter that was loaded last, by its digest, device and precision."""
 
@@ -28,9 +37,9 @@ class PainterChoice:
     """A painter that was named; nothing of it is in memory before it is loaded."""
 
     name: str
-    """The name as the user gave it."""
-    row: KnownPainter
-    """What the name stands for."""
+    """As the user gave it."""
+    kind: PainterKind
+    """Whether it is a rule, and else which painter network it is."""
 
     @classmethod
     def of(cls, name_or_path: str | Path) -> "PainterChoice":
@@ -40,17 +49,35 @@ class PainterChoice:
             WeightsError: it cannot be the name of a painter.
         """
         name = str(name_or_path)
-        if (row := known_painter(name)) is not None:
-            return cls(name=name, row=row)
+        for row in PAINTERS:
+            if row.name == name:
+                return cls(name=name, kind=row.kind)
+        from lidarpainter_models.painter.one_step.loading import is_model_name
+        from lidarpainter_models.painter.one_step.weights import is_trained_file
+
+        if name.endswith(WEIGHTS_SUFFIX):
+            return cls(name=name, kind="one-step" if is_trained_file(Path(name)) else "nano")
+        if is_model_name(name):
+            return cls(name=name, kind="one-step")
         raise WeightsError(
             f"no painter {name!r}: expected one of {', '.join(PAINTER_NAMES)}, a .safetensors file "
             "or a folder in diffusers' layout"
         )
 
     @property
-    def kind(self) -> PainterKind:
-        """Whether it is a rule, and else which painter network it is."""
-        return self.row.kind
+    def files(self) -> list[Path]:
+        """The files that it is made of; none for a rule.
+
+        Raises:
+            WeightsError: the model or the weights file is not there.
+        """
+        if self.kind == "rule":
+            return []
+        if self.kind == "nano":
+            return [BUNDLED_NANO if self.name == "nano" else Path(self.name)]
+        from lidarpainter_models.painter.one_step.loading import painter_files
+
+        return painter_files(self.name)
 
     @property
     def digest(self) -> str:
@@ -61,7 +88,15 @@ class PainterChoice:
         Raises:
             WeightsError: the weights are missing.
         """
-        return self.row.digest(self.name, [file_digest(path) for path in self.row.files(self.name)])
+        if self.kind == "rule":
+            return self.name
+        digests = [file_digest(path) for path in self.files]
+        if self.kind == "nano":
+            return digests[0][:DIGEST_LENGTH]
+        from lidarpainter_models.painter.one_step.loading import split_preset
+
+        joined = "\n".join([split_preset(self.name)[1], *digests])
+        return hashlib.sha256(joined.encode()).hexdigest()[:DIGEST_LENGTH]
 
     def load(self, device: torch.device, precision: torch.dtype | None = None) -> Painter:
         """The painter on a device; whoever asks for the same one again gets the one in memory.
@@ -75,8 +110,19 @@ class PainterChoice:
         key = (self.digest, str(device), precision)
         if key not in _loaded:
             _loaded.clear()  # before the next is read: two of full size do not fit into memory
-            _loaded[key] = self.row.load(self.name, device, precision)
+            _loaded[key] = self._new(device, precision)
         return _loaded[key]
+
+    def _new(self, device: torch.device, precision: torch.dtype | None) -> Painter:
+        if self.kind == "rule":
+            return RULES[self.name]()
+        if self.kind == "nano":
+            from lidarpainter_models.painter.nano.weights import load_weights
+
+            return load_weights(self.files[0], device=device, precision=precision)
+        from lidarpainter_models.painter.one_step.loading import load_one_step
+
+        return load_one_step(self.name, device=device, dtype=precision)
 
 
 def load_painter(name_or_path: str | Path, device: torch.device | None = None) -> Painter:

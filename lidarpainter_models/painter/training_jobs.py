@@ -6,18 +6,16 @@ import torch
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
-from lidarpainter_models.painter.nano.job import NanoJob
+from lidarpainter_models.painter.known_painters import WEIGHTS_SUFFIX
 from lidarpainter_models.painter.nano.painter import NanoPainter
-from lidarpainter_models.painter.nano.training import NanoTrainingConfig
-from lidarpainter_models.painter.one_step.job import NO_FILES, OneStepJob, OneStepRecipe
-from lidarpainter_models.painter.one_step.loading import SUFFIX, split_preset
-from lidarpainter_models.painter.one_step.presets import preset_named
+from lidarpainter_models.painter.nano.training import NanoJob, NanoTrainingConfig
+from lidarpainter_models.painter.one_step.config import PRESETS
+from lidarpainter_models.painter.one_step.job import CPU, NO_FILES, OneStepJob
+from lidarpainter_models.painter.one_step.loading import split_preset
 from lidarpainter_models.painter.one_step.training import OneStepTrainingConfig
 from lidarpainter_models.painter.one_step.weights import read_trained
 from lidarpainter_models.painter.selection import PainterChoice
 from lidarpainter_models.painter.training.job import TrainingJob
-
-CPU = torch.device("cpu")
 
 PainterTraining = NanoTrainingConfig | OneStepTrainingConfig
 
@@ -48,8 +46,7 @@ def job_for(
         return NanoJob(config, None if start is None else _first_nano(Path(start)), device)
     if start is None:
         raise ConfigError("the one-step painter is trained on a model: give --base")
-    recipe = OneStepRecipe(start=str(start), config=config, lpips=lpips)
-    return OneStepJob(recipe, device, num_processes)
+    return OneStepJob(str(start), config, lpips, device=device, num_processes=num_processes)
 
 
 def recipe_for(start: str) -> OneStepTrainingConfig:
@@ -58,9 +55,9 @@ def recipe_for(start: str) -> OneStepTrainingConfig:
     Raises:
         WeightsError: it is not there.
     """
-    if start.endswith(SUFFIX):
+    if start.endswith(WEIGHTS_SUFFIX):
         return OneStepTrainingConfig(network=read_trained(Path(start)).config)
-    return OneStepTrainingConfig(network=preset_named(split_preset(start)[1]))
+    return OneStepTrainingConfig(network=PRESETS[split_preset(start)[1]])
 
 
 def _first_nano(start: Path) -> NanoPainter:

@@ -8,6 +8,7 @@ damage needs no place.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -57,7 +58,7 @@ def fade_balls(
     """Make balls translucent."""
     inside = random_balls(gaussians, around_world, generator)
     loss = _between((1.0, 4.0), generator)
-    return _with(gaussians, opacity_logit=gaussians.opacity_logit - loss * inside)
+    return replace(gaussians, opacity_logit=gaussians.opacity_logit - loss * inside)
 
 
 def thin_balls(
@@ -66,7 +67,7 @@ def thin_balls(
     """Shrink the Gaussians of some balls, so that a surface shows gaps as from nearby."""
     inside = random_balls(gaussians, around_world, generator)
     loss = _between((0.3, 0.9), generator)
-    return _with(gaussians, log_scale=gaussians.log_scale - loss * inside[:, None])
+    return replace(gaussians, log_scale=gaussians.log_scale - loss * inside[:, None])
 
 
 def shake_balls(
@@ -76,7 +77,7 @@ def shake_balls(
     inside = random_balls(gaussians, around_world, generator)
     spread_m = _between(JITTER_M, generator)
     noise = spread_m * torch.randn(gaussians.means.shape, generator=generator)
-    return _with(gaussians, means=gaussians.means + noise * inside[:, None])
+    return replace(gaussians, means=gaussians.means + noise * inside[:, None])
 
 
 def grow_needles(
@@ -92,7 +93,7 @@ def grow_needles(
     change = stretch * (is_longest - 0.25 * (1 - is_longest)) * chosen[:, None]
     turned = torch.randn(gaussians.rotation_wxyz.shape, generator=generator)
     rotation = torch.where(chosen[:, None], turned, gaussians.rotation_wxyz)
-    return _with(gaussians, log_scale=gaussians.log_scale + change, rotation_wxyz=rotation)
+    return replace(gaussians, log_scale=gaussians.log_scale + change, rotation_wxyz=rotation)
 
 
 def recolour(
@@ -106,7 +107,7 @@ def recolour(
         gaussians.sh_dc.shape, generator=generator
     )
     change = noise / SH_CONSTANT * chosen[:, None, None]
-    return _with(gaussians, sh_dc=gaussians.sh_dc + change)
+    return replace(gaussians, sh_dc=gaussians.sh_dc + change)
 
 
 def tear_lane_paint(
@@ -124,7 +125,7 @@ def tear_lane_paint(
     along_m = gaussians.means[:, 0] * angle.cos() + gaussians.means[:, 1] * angle.sin()
     torn = paint & ((along_m / period_m) % 1 < _between((0.3, 0.7), generator))
     grey = road.median(dim=0).values
-    return _with(gaussians, sh_dc=torch.where(torn[:, None, None], grey, gaussians.sh_dc))
+    return replace(gaussians, sh_dc=torch.where(torn[:, None, None], grey, gaussians.sh_dc))
 
 
 def random_balls(
@@ -172,10 +173,6 @@ _KINDS: tuple[Callable[..., GaussianSet], ...] = (
     recolour,
     tear_lane_paint,
 )
-
-
-def _with(gaussians: GaussianSet, **columns: Tensor) -> GaussianSet:
-    return GaussianSet(**gaussians.columns() | columns)
 
 
 def _some(

@@ -78,8 +78,8 @@ def harvest_left_out(
     plans: Sequence[LeftOutPlan],
     writer: PairWriter,
     *,
-    config: HarvestConfig | None = None,
-    progress: HarvestProgress | None = None,
+    config: HarvestConfig,
+    progress: HarvestProgress,
 ) -> int:
     """Judge weak fits at training frames left out of them, and store the pairs.
 
@@ -93,7 +93,6 @@ def harvest_left_out(
     Raises:
         ConfigError: a plan names a frame outside the training frames, or judges a frame it fits.
     """
-    config = config or HarvestConfig()
     for plan in plans:
         check_plan(plan, split)
     labels = [harvest_label(scene, plan, config) for plan in plans]
@@ -117,8 +116,7 @@ def harvest_left_out(
             fitted = fit_gaussians(known, plan.fit).scene
             targets = _left_out_targets(aligned, plan, scene, label)
             added += harvest_targets(fitted, known, targets, writer, config)
-        if progress is not None:
-            progress(number + 1, len(plans))
+        progress(number + 1, len(plans))
     return added
 
 

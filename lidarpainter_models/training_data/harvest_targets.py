@@ -80,9 +80,7 @@ def harvest_targets(
         Number of pairs added.
     """
     added = 0
-    pristine = ConditionBuilder(
-        scene, observations.lidar_map, observations.views, config=config.conditions
-    )
+    pristine = _builder(scene, observations, config)
     for target in targets:
         for copy in range(1 + config.corrupted_per_view):
             name = pair_name(target.name, copy)
@@ -91,45 +89,31 @@ def harvest_targets(
             builder, seed = pristine, None
             if copy:
                 seed = _seed_of(name, config.seed)
-                builder = _damaged_builder(scene, observations, target, seed, config)
+                around = target.camera.centre_world.float()
+                damaged = corrupt_gaussians(scene.gaussians, around, seed=seed)
+                builder = _builder(scene.with_gaussians(damaged), observations, config)
             provenance = target.provenance | {"corruption_seed": seed}
-            writer.add(name, make_pair(builder, target), provenance)
+            writer.add(name, _pair(builder, target), provenance)
             added += 1
     return added
 
 
-def make_pair(builder: ConditionBuilder, target: Target) -> PaintingPair:
+def _builder(
+    scene: GaussianScene, observations: SceneObservations, config: HarvestConfig
+) -> ConditionBuilder:
+    return ConditionBuilder(
+        scene, observations.lidar_map, observations.views, config=config.conditions
+    )
+
+
+def _pair(builder: ConditionBuilder, target: Target) -> PaintingPair:
     """The conditions at a target beside its true image."""
     conditions = builder.conditions(
         target.camera, target.timestamp_ns, camera_name=target.camera_name
     )
     everywhere = torch.ones(conditions.height_width_px, dtype=torch.bool)
     known = everywhere if target.hidden is None else ~target.hidden
-    return PaintingPair(
-        conditions=conditions,
-        target_rgb=target.true_rgb,
-        target_valid=known,
-    )
-
-
-def _damaged_builder(
-    scene: GaussianScene,
-    observations: SceneObservations,
-    target: Target,
-    seed: int,
-    config: HarvestConfig,
-) -> ConditionBuilder:
-    damaged = corrupt_gaussians(
-        scene.gaussians,
-        target.camera.centre_world.float(),
-        seed=seed,
-    )
-    return ConditionBuilder(
-        scene.with_gaussians(damaged),
-        observations.lidar_map,
-        observations.views,
-        config=config.conditions,
-    )
+    return PaintingPair(conditions=conditions, target_rgb=target.true_rgb, target_valid=known)
 
 
 def _seed_of(name: str, seed: int) -> int:

@@ -9,13 +9,15 @@ and can be continued.
 import hashlib
 import json
 import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from lidarpainter_models.errors import DataError
+from lidarpainter_models.errors import ConfigError, DataError
 from lidarpainter_models.painter.examples import PaintingPair, Window
 from lidarpainter_models.painter.protocol import PaintingConditions
 from lidarpainter_models.storage.tensor_files import open_tensors, pack_tensors
@@ -103,6 +105,46 @@ class PairFolder:
                 )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairSet:
+    """A folder of pairs and what tables call it."""
+
+    name: str
+    folder: Path
+
+    def open(self) -> PairFolder:
+        """The pairs.
+
+        Raises:
+            DataError: there are none.
+        """
+        return PairFolder(self.folder)
+
+
+def named_sets(folders: Iterable[Path]) -> tuple[PairSet, ...]:
+    """Folders of pairs under the shortest ends of their paths that tell them apart."""
+    paths = [folder.absolute() for folder in folders]
+    if len(set(paths)) != len(paths):
+        raise ConfigError("a folder of pairs is given twice")
+    depth = 1
+    while len({path.parts[-depth:] for path in paths}) < len(paths):
+        depth += 1
+    return tuple(PairSet(name="/".join(path.parts[-depth:]), folder=path) for path in paths)
+
+
+def open_sets(sets: Sequence[PairSet]) -> dict[str, PairFolder]:
+    """Every set by its name.
+
+    Raises:
+        ConfigError: no set, or two of one name.
+    """
+    folders = {one.name: one.open() for one in sets}
+    if not sets or len(folders) != len(sets):
+        names = ", ".join(one.name for one in sets)
+        raise ConfigError(f"need pairs under names of their own, got {names or 'none'}")
+    return folders
+
+
 class PairWriter:
     """Adds pairs to a folder, which is created if need be."""
 
@@ -163,13 +205,6 @@ def load_pair(path: Path, window: Window | None = None) -> PaintingPair:
     return PaintingPair(conditions=conditions, target_rgb=target_rgb, target_valid=target_valid)
 
 
-@runtime_checkable
-class _Slice(Protocol):
-    """A stored tensor that is read where it is indexed."""
-
-    def __getitem__(self, index: slice | tuple[slice, ...]) -> Tensor: ...
-
-
 _KINDS = {
     "render_rgb": "byte",
     "render_depth_m": "depth",
@@ -214,11 +249,10 @@ def _decode(stored: Tensor, kind: str) -> Tensor:
     return stored.float() / 255 if kind == "byte" else stored.float()
 
 
-def _cut(stored: _Slice, name: str, window: Window | None) -> Tensor:
+def _cut(stored: Any, name: str, window: Window | None) -> Tensor:  # noqa: ANN401 - safetensors'
     if window is None:
         return stored[:]
-    rows = slice(window.top_px, window.top_px + window.height_px)
-    columns = slice(window.left_px, window.left_px + window.width_px)
+    rows, columns = window.slices
     return stored[:, rows, columns] if name.startswith("warp") else stored[rows, columns]
 
 

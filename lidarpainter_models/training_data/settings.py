@@ -39,7 +39,6 @@ class HarvestConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse a negative number of pairs."""
         if self.corrupted_per_view < 0:
             raise ConfigError(f"corrupted_per_view must be >= 0, got {self.corrupted_per_view}")
 
@@ -56,7 +55,6 @@ class StreetPlan:
     num_views: int = 20
 
     def __post_init__(self) -> None:
-        """Refuse a plan without a camera or a view."""
         if not self.cameras or self.num_views < 1:
             raise ConfigError("a street plan needs a camera and at least one view")
 

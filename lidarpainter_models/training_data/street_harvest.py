@@ -5,11 +5,11 @@ have other seeds than those of the demo and of the tests. World frame, z up; met
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Generator
+from jaxtyping import Float
+from torch import Generator, Tensor
 
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
@@ -51,8 +51,8 @@ def harvest_shifted_street(
     plans: Sequence[StreetPlan],
     writer: PairWriter,
     *,
-    config: HarvestConfig | None = None,
-    progress: HarvestProgress | None = None,
+    config: HarvestConfig,
+    progress: HarvestProgress,
 ) -> int:
     """Fit a street several times and pair shifted renders with the truth.
 
@@ -66,7 +66,6 @@ def harvest_shifted_street(
     Raises:
         SceneError: the scene is no recording of this street, or all views stand inside things.
     """
-    config = config or HarvestConfig()
     _check_recording(street, scene)
     added = 0
     for number, plan in enumerate(plans):
@@ -76,8 +75,7 @@ def harvest_shifted_street(
             observations = prepare_observations(scene, split, config.observations)
             fitted = fit_gaussians(observations, plan.fit).scene
             added += harvest_targets(fitted, observations, targets, writer, config)
-        if progress is not None:
-            progress(number + 1, len(plans))
+        progress(number + 1, len(plans))
     return added
 
 
@@ -113,17 +111,20 @@ def _draw_targets(
         row = scene.frame_indices.index(view.frame_index)
         found = _clear_view(street, view, directions[row], generator, config)
         if found is not None:
-            targets.append(_target(found, view, scene, plan, f"{label}-{index:03d}"))
+            camera, shift, true_rgb = found
+            targets.append(
+                Target(
+                    name=f"{label}-{index:03d}",
+                    camera=camera,
+                    timestamp_ns=view.timestamp_ns,
+                    camera_name=view.camera_name,
+                    true_rgb=true_rgb,
+                    provenance=_provenance(scene, plan, view, shift),
+                )
+            )
     if not targets:
         raise SceneError(f"{scene.path}: every shifted view stands inside things")
     return targets
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _ClearView:
-    camera: Camera
-    shift: Shift
-    true_rgb: torch.Tensor
 
 
 def _clear_view(
@@ -132,8 +133,8 @@ def _clear_view(
     road_direction: torch.Tensor,
     generator: Generator,
     config: HarvestConfig,
-) -> _ClearView | None:
-    """A shifted view that does not stand inside something, or None."""
+) -> tuple[Camera, Shift, Float[Tensor, "height width 3"]] | None:
+    """A shifted view that does not stand inside something and its truth, or None."""
     recorded = fit_camera(view, config.observations)
     for _ in range(MOST_DRAWS):
         shift = draw_shift(generator)
@@ -141,32 +142,24 @@ def _clear_view(
         truth = street.render(camera, view.timestamp_ns)
         near = (truth.depth_m > 0) & (truth.depth_m < CLEAR_M)
         if float(near.float().mean()) <= CROWDED_SHARE:
-            return _ClearView(camera=camera, shift=shift, true_rgb=truth.rgb.clamp(0, 1))
+            return camera, shift, truth.rgb.clamp(0, 1)
     return None
 
 
-def _target(
-    found: _ClearView, view: RecordedView, scene: DrivingScene, plan: StreetPlan, name: str
-) -> Target:
-    provenance: dict[str, Any] = {
+def _provenance(
+    scene: DrivingScene, plan: StreetPlan, view: RecordedView, shift: Shift
+) -> dict[str, Any]:
+    return {
         "kind": "shifted street",
         "dataset": scene.dataset,
         "sequence": scene.sequence,
         "scene_digest": scene.content_digest,
         "frame": view.frame_index,
-        "shift": found.shift.name,
+        "shift": shift.name,
         "split": plan.split,
         "cameras": list(plan.cameras),
         "fit_steps": plan.fit.steps,
     }
-    return Target(
-        name=name,
-        camera=found.camera,
-        timestamp_ns=view.timestamp_ns,
-        camera_name=view.camera_name,
-        true_rgb=found.true_rgb,
-        provenance=provenance,
-    )
 
 
 def _check_recording(street: SyntheticStreet, scene: DrivingScene) -> None:

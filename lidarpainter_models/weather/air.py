@@ -5,7 +5,7 @@ and airlight A (Koschmieder, 1924). The visibility V is where a black object kee
 against the horizon: beta = ln(50) / V = 3.912 / V.
 """
 
-from math import inf, log
+from math import log
 
 import torch
 from jaxtyping import Float
@@ -29,15 +29,14 @@ COLOUR_WITHOUT_SUN = 0.75
 
 def extinction_per_m(visibility_m: float) -> float:
     """Koschmieder's beta."""
-    return 0.0 if visibility_m == inf else -log(LEAST_CONTRAST) / visibility_m
+    return -log(LEAST_CONTRAST) / visibility_m
 
 
 def transmittance(
     distance_m: Float[Tensor, "*grid"], visibility_m: float
 ) -> Float[Tensor, "*grid"]:
     """exp(-beta d)."""
-    beta = extinction_per_m(visibility_m)
-    return torch.exp(-beta * distance_m) if beta else torch.ones_like(distance_m)
+    return torch.exp(-extinction_per_m(visibility_m) * distance_m)
 
 
 def rain_extinction_per_m(rain_mm_per_h: float) -> float:

@@ -23,6 +23,8 @@ WARM_RGB = (1.0, 0.72, 0.38)
 """A lamp of about 2900 kelvin, brightest channel 1."""
 WINDOW_RADIANCE, WINDOW_POWER = 0.55, 0.25
 """Of a lit window, and its irradiance a metre away, in units of display white."""
+LIT_SHARE = 0.4
+"""Of the windows."""
 HEADLAMP_HEIGHT_M = 0.65
 HEADLAMP_AHEAD_M = 1.2
 """Of a camera behind the windscreen."""

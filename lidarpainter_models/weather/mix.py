@@ -40,11 +40,6 @@ class StyleShare:
     last: float = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse a style that is none, and strengths out of range.
-
-        Raises:
-            ConfigError: one of these.
-        """
         check_prompt(self.prompt)
         for strength in (self.first, self.last):
             if not 0 <= strength <= 1:
@@ -62,11 +57,6 @@ class StyleMix:
     """In fog of strength 1; extinction grows in proportion to strength."""
 
     def __post_init__(self) -> None:
-        """Refuse a style that is named twice and fog that nobody sees in.
-
-        Raises:
-            ConfigError: one of these.
-        """
         names = [share.prompt for share in self.shares]
         if len(set(names)) != len(names):
             raise ConfigError(f"{self.text!r} names a style twice")

@@ -20,7 +20,7 @@ from lidarpainter_models.painter.nano.painter import NanoPainter
 from lidarpainter_models.painter.precision import precision_of
 from lidarpainter_models.painter.protocol import Painter
 from lidarpainter_models.painter.selection import PainterChoice
-from lidarpainter_models.training_data.pair_sets import PairSet, open_sets
+from lidarpainter_models.training_data.pairs import PairSet, open_sets
 from tasks.json_files import read_json, write_json
 from tasks.measuring import measured
 from tasks.painter.held_out_fits import HeldOutFit, unseen_sources

@@ -18,8 +18,7 @@ from lidarpainter_models.scenes.splits import ViewSplit
 from lidarpainter_models.synthetic.config import SyntheticStreetConfig
 from lidarpainter_models.synthetic.street import SyntheticStreet
 from lidarpainter_models.training_data.harvest import default_plans, harvest_left_out
-from lidarpainter_models.training_data.pair_sets import PairSet
-from lidarpainter_models.training_data.pairs import PairFolder, PairWriter
+from lidarpainter_models.training_data.pairs import PairFolder, PairSet, PairWriter
 from lidarpainter_models.training_data.settings import HarvestConfig, StreetPlan
 from lidarpainter_models.training_data.street_harvest import harvest_shifted_street
 from tasks.ingest.ingest import has_street, ingest_street

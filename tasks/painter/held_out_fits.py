@@ -15,7 +15,7 @@ from lidarpainter_models.evaluation.held_out_pairs import HeldOutPairs, held_out
 from lidarpainter_models.evaluation.painting import ScoringPairs
 from lidarpainter_models.evaluation.scene_evaluation import known_street
 from lidarpainter_models.evaluation.settings import EvaluationConfig
-from lidarpainter_models.training_data.pair_sets import PairSet, open_sets
+from lidarpainter_models.training_data.pairs import PairSet, open_sets
 from tasks.opened import open_split
 from tasks.specs import FittedRef, SplitSpec
 from tasks.stored import load_observations, load_scene
@@ -31,8 +31,12 @@ class HeldOutFit:
     fitted: FittedRef
     settings: EvaluationConfig
 
-    def open(self, trained: AbstractSet[str]) -> "OpenedFit":
-        """Its pairs, by scene and trajectory, without frames that painters were trained on."""
+    def open(self, trained: AbstractSet[str]) -> tuple[dict[str, HeldOutPairs], int]:
+        """Its pairs, by scene and trajectory, without frames that painters were trained on.
+
+        Returns:
+            The pairs, and how many held-out views of each trajectory were left out.
+        """
         store = open_store(self.store_path)
         recorded, views = open_split(store, self.split)
         unseen = unseen_views(views.test, self.split.scene_id, trained)
@@ -44,34 +48,8 @@ class HeldOutFit:
             known_street(recorded),
             self.settings.scoring.shifts,
         )
-        return OpenedFit(
-            run_id=self.run_id,
-            pairs={f"{self.split.scene_id} {name}": pairs for name, pairs in found.items()},
-            num_left_out=len(views.test) - len(unseen),
-        )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class OpenedFit:
-    """Pairs of a run that judge."""
-
-    run_id: str
-    pairs: dict[str, HeldOutPairs]
-    num_left_out: int
-    """Held-out views of each trajectory that a painter was trained on."""
-
-
-def open_fits(fits: Sequence[HeldOutFit], trained: AbstractSet[str]) -> list[OpenedFit]:
-    """Every fit, each of a scene of its own.
-
-    Raises:
-        ConfigError: two runs of one scene, whose figures would bear one name.
-    """
-    scenes = [fit.split.scene_id for fit in fits]
-    twice = sorted({scene for scene in scenes if scenes.count(scene) > 1})
-    if twice:
-        raise ConfigError(f"judge by one run of each scene, got two of {', '.join(twice)}")
-    return [fit.open(trained) for fit in fits]
+        named = {f"{self.split.scene_id} {name}": pairs for name, pairs in found.items()}
+        return named, len(views.test) - len(unseen)
 
 
 def unseen_sources(
@@ -80,9 +58,14 @@ def unseen_sources(
     """Pairs that no painter was trained on, and how many of every set those are.
 
     Raises:
-        ConfigError: neither pairs nor runs.
+        ConfigError: neither pairs nor runs, or two runs of one scene, whose figures would bear one
+            name.
         DataError: a painter was trained on all of them.
     """
+    scenes = [fit.split.scene_id for fit in fits]
+    twice = sorted({scene for scene in scenes if scenes.count(scene) > 1})
+    if twice:
+        raise ConfigError(f"judge by one run of each scene, got two of {', '.join(twice)}")
     sources: dict[str, ScoringPairs] = {}
     counts: dict[str, Any] = {}
     if sets or not fits:
@@ -92,9 +75,10 @@ def unseen_sources(
         for name, folder in folders.items():
             judged = len(unseen.get(name, ()))
             counts[name] = _counted(judged, len(folder) - judged, folder=str(folder.folder))
-    for fit in open_fits(fits, frozenset().union(*learnt)):
-        for name, views in fit.pairs.items():
-            counts[name] = _counted(len(views), fit.num_left_out, run_id=fit.run_id)
+    for fit in fits:
+        found, num_left_out = fit.open(frozenset().union(*learnt))
+        for name, views in found.items():
+            counts[name] = _counted(len(views), num_left_out, run_id=fit.run_id)
             if len(views):
                 sources[name] = views
     if not sources:

@@ -91,7 +91,7 @@ def _build(
 
 
 def _summary(paintings: list[NovelPainting], num_cameras: int) -> dict[str, Any]:
-    used = [painting for painting in paintings if not painting.gate.is_refused]
+    used = [painting for painting in paintings if not painting.is_refused]
     weights = [painting.mean_weight for painting in used]
     return {
         "num_cameras": num_cameras,

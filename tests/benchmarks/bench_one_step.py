@@ -25,8 +25,8 @@ from one_step_costs import describe_wiring
 from one_step_training_step import build_training_step
 from one_step_wirings import WIRINGS, build_wiring
 
+from lidarpainter_models.painter.one_step.config import PRESETS
 from lidarpainter_models.painter.one_step.painter import STRIDE_PX
-from lidarpainter_models.painter.one_step.presets import PRESETS, preset_named
 from tasks.measuring import measured
 
 SLOWEST = "plain"
@@ -81,7 +81,7 @@ def compare_wirings(height_px, width_px, rounds):
 def measure_training(preset, height_px, width_px):
     """Seconds of one training step with one view and peak memory, in this process."""
     with measured() as whole:
-        step = build_training_step(preset_named(preset), *_padded(height_px, width_px))
+        step = build_training_step(PRESETS[preset], *_padded(height_px, width_px))
         started, cpu_started = time.perf_counter(), time.process_time()
         loss = step()
         cpu_s, wall_s = time.process_time() - cpu_started, time.perf_counter() - started
@@ -147,9 +147,7 @@ def main():
     else:
         width_px, height_px = map(int, options.size.split("x"))
         if options.kind == "costs":
-            found = describe_wiring(
-                preset_named(options.preset), height_px=height_px, width_px=width_px
-            )
+            found = describe_wiring(PRESETS[options.preset], height_px=height_px, width_px=width_px)
         elif options.kind == "views":
             found = compare_wirings(height_px, width_px, options.rounds)
         else:

@@ -198,11 +198,12 @@ def one_step_painter(preset, device, model):
             raise WeightsError(f"{model}: {error}") from None
     from random_diffusion import random_network
     from tiny_diffusion import TINY
+    from turbo_shapes import SD_TURBO
 
-    from lidarpainter_models.painter.one_step.architectures import SD_TURBO, TEXT_TOKENS
+    from lidarpainter_models.painter.one_step.architectures import TEXT_TOKENS
     from lidarpainter_models.painter.one_step.assembly import made_lean
+    from lidarpainter_models.painter.one_step.config import PRESETS
     from lidarpainter_models.painter.one_step.painter import OneStepPainter
-    from lidarpainter_models.painter.one_step.presets import preset_named
     from lidarpainter_models.painter.one_step.prompts import PromptBook
     from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
 
@@ -210,7 +211,7 @@ def one_step_painter(preset, device, model):
     architecture = SD_TURBO if is_gpu else TINY
     dtype = torch.bfloat16 if is_gpu else torch.float32
     network = random_network(
-        preset_named(preset), architecture=architecture, dtype=dtype, has_adapters=True
+        PRESETS[preset], architecture=architecture, dtype=dtype, has_adapters=True
     )
     text = torch.zeros(TEXT_TOKENS, architecture.text_width, dtype=dtype)
     painter = OneStepPainter(made_lean(network), PromptBook({DEFAULT_PROMPT: text}), {})

@@ -12,14 +12,10 @@ import torch
 from random_diffusion import empty_network
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
+from turbo_shapes import SD_TURBO, WholeModel, build_text_encoder
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.painter.one_step.architectures import (
-    SD_TURBO,
-    TEXT_TOKENS,
-    Architecture,
-    build_text_encoder,
-)
+from lidarpainter_models.painter.one_step.architectures import TEXT_TOKENS
 from lidarpainter_models.painter.one_step.assembly import (
     FIRST_LAYER,
     FUSION,
@@ -39,9 +35,7 @@ META = torch.device("meta")
 TERA = 1e12
 
 
-def count_parameters(
-    config: OneStepConfig, architecture: Architecture = SD_TURBO
-) -> dict[str, int]:
+def count_parameters(config: OneStepConfig, architecture: WholeModel = SD_TURBO) -> dict[str, int]:
     """Parameters of every part.
 
     `unet` and `autoencoder` are those of the model underneath; `first_layer_added` is what further
@@ -83,7 +77,7 @@ def count_tflop(
     *,
     height_px: int,
     width_px: int,
-    architecture: Architecture = SD_TURBO,
+    architecture: WholeModel = SD_TURBO,
 ) -> dict[str, float]:
     """Arithmetic for one view in 10^12 operations, adapters merged; the text is encoded before.
 
@@ -109,7 +103,7 @@ def count_tflop(
     }
 
 
-def count_bytes(config: OneStepConfig, architecture: Architecture = SD_TURBO) -> dict[str, int]:
+def count_bytes(config: OneStepConfig, architecture: WholeModel = SD_TURBO) -> dict[str, int]:
     """Bytes of the weights in bfloat16, and of the tensors in a weights file of ours.
 
     The file is counted with the prompts of all styles.
@@ -141,7 +135,7 @@ def describe_wiring(config: OneStepConfig, *, height_px: int, width_px: int) -> 
 
 @lru_cache(maxsize=8)
 def _shapes(
-    config: OneStepConfig, architecture: Architecture, *, has_adapters: bool
+    config: OneStepConfig, architecture: WholeModel, *, has_adapters: bool
 ) -> OneStepNetwork:
     """A network without weights, kept because building a thousand layers takes a second."""
     return empty_network(config, architecture=architecture, has_adapters=has_adapters)

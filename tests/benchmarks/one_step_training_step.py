@@ -9,14 +9,11 @@ from dataclasses import replace
 
 import torch
 from random_diffusion import random_network
+from turbo_shapes import SD_TURBO, WholeModel
 
 from lidarpainter_models.painter.augmentation import TrainingBatch
 from lidarpainter_models.painter.batches import ConditionBatch
-from lidarpainter_models.painter.one_step.architectures import (
-    SD_TURBO,
-    TEXT_TOKENS,
-    Architecture,
-)
+from lidarpainter_models.painter.one_step.architectures import TEXT_TOKENS
 from lidarpainter_models.painter.one_step.config import OneStepConfig
 from lidarpainter_models.painter.one_step.painter import NUM_WARPS
 from lidarpainter_models.painter.one_step.training import OneStepTrainee, OneStepTrainingConfig
@@ -27,7 +24,7 @@ _SEED = 0
 
 
 def build_training_step(
-    network: OneStepConfig, height_px: int, width_px: int, architecture: Architecture = SD_TURBO
+    network: OneStepConfig, height_px: int, width_px: int, architecture: WholeModel = SD_TURBO
 ) -> Callable[[], float]:
     """A function that takes one step and returns its loss.
 

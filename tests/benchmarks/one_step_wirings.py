@@ -15,15 +15,11 @@ import torch
 from jaxtyping import Float
 from random_diffusion import fill_randomly, random_network
 from torch import Tensor, nn
+from turbo_shapes import SD_TURBO, WholeModel, build_text_encoder
 
-from lidarpainter_models.painter.one_step.architectures import (
-    SD_TURBO,
-    TEXT_TOKENS,
-    Architecture,
-    build_text_encoder,
-)
+from lidarpainter_models.painter.one_step.architectures import TEXT_TOKENS
 from lidarpainter_models.painter.one_step.assembly import made_lean
-from lidarpainter_models.painter.one_step.presets import fast, paper
+from lidarpainter_models.painter.one_step.config import FAST, PAPER
 from lidarpainter_models.painter.one_step.prompts import run_text_encoder
 
 Wiring = Literal["plain", "lean", "taesd"]
@@ -35,12 +31,12 @@ Paint = Callable[
 ]
 
 
-def build_wiring(wiring: Wiring, architecture: Architecture = SD_TURBO) -> Paint:
+def build_wiring(wiring: Wiring, architecture: WholeModel = SD_TURBO) -> Paint:
     """A function that paints images in [0, 1] whose sides are multiples of 64."""
     if wiring == "plain":
         return _plain(architecture)
     # the tiny autoencoder has no adapters; time and fusion are those of `paper` in all three
-    config = paper() if wiring == "lean" else replace(fast(), timestep=paper().timestep)
+    config = PAPER if wiring == "lean" else replace(FAST, timestep=PAPER.timestep)
     network = made_lean(
         random_network(config, architecture=architecture, seed=_SEED, has_adapters=True)
     )
@@ -52,14 +48,14 @@ def build_wiring(wiring: Wiring, architecture: Architecture = SD_TURBO) -> Paint
         images: Float[Tensor, "inputs batch 3 height width"],
     ) -> Float[Tensor, "batch 3 height width"]:
         with torch.inference_mode():
-            return network(images, text).rgb
+            return network(images, text)
 
     return paint
 
 
-def _plain(architecture: Architecture) -> Paint:
+def _plain(architecture: WholeModel) -> Paint:
     network = random_network(
-        paper(), architecture=architecture, dtype=torch.float32, seed=_SEED, has_adapters=True
+        PAPER, architecture=architecture, dtype=torch.float32, seed=_SEED, has_adapters=True
     )
     for part in (network.autoencoder, network.denoiser):
         nn.Module.to(part, torch.bfloat16)
@@ -70,12 +66,12 @@ def _plain(architecture: Architecture) -> Paint:
         images: Float[Tensor, "inputs batch 3 height width"],
     ) -> Float[Tensor, "batch 3 height width"]:
         with torch.no_grad():
-            return network(images, _text(encoder), encodes_at_once=False).rgb
+            return network(images, _text(encoder), encodes_at_once=False)
 
     return paint
 
 
-def _text_encoder(architecture: Architecture, dtype: torch.dtype) -> nn.Module:
+def _text_encoder(architecture: WholeModel, dtype: torch.dtype) -> nn.Module:
     before = torch.get_default_dtype()
     torch.set_default_dtype(dtype)
     try:

@@ -5,13 +5,9 @@ from functools import lru_cache
 
 import torch
 from torch import nn
+from turbo_shapes import SD_TURBO
 
-from lidarpainter_models.painter.one_step.architectures import (
-    SD_TURBO,
-    build_tiny,
-    build_unet,
-    build_vae,
-)
+from lidarpainter_models.painter.one_step.architectures import build_tiny, build_unet, build_vae
 from lidarpainter_models.painter.one_step.assembly import assemble
 from lidarpainter_models.painter.one_step.lora import ADAPTER_MARK
 

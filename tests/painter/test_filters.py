@@ -4,7 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812 - the name everyone knows
 
-from lidarpainter_models.painter.filters import _halved, blur, fill_push_pull, masked_blur
+from lidarpainter_models.painter.filters import blur, fill_push_pull, masked_blur
 
 
 @pytest.mark.parametrize("sigma_px", [1.5, 3.0])
@@ -26,13 +26,6 @@ def test_filling_keeps_known_pixels_and_reaches_everywhere():
     filled = fill_push_pull(image, known)
     torch.testing.assert_close(filled, torch.full_like(filled, 0.75))
     assert float(fill_push_pull(image, torch.zeros_like(known)).abs().max()) == 0
-
-
-@pytest.mark.parametrize("size_px", [(1, 2), (5, 8), (8, 5), (7, 7)])
-def test_a_pyramid_averages_the_pixels_that_there_are(size_px):
-    image = torch.rand(2, 4, *size_px, generator=torch.Generator().manual_seed(0))
-    expected = F.avg_pool2d(image, 2, ceil_mode=True)
-    torch.testing.assert_close(_halved(image), expected, rtol=0, atol=1e-6)
 
 
 def test_filling_a_full_image_changes_nothing():

@@ -15,8 +15,6 @@ from lidarpainter_models.painter.one_step.training import (
     OneStepTrainingConfig,
     train_one_step,
 )
-from lidarpainter_models.painter.training.loop import ALONE
-from lidarpainter_models.painter.training.processes import DistributedProcesses
 from lidarpainter_models.training_data.pairs import PairFolder
 
 CONTEST = OneStepTrainingConfig(
@@ -36,37 +34,13 @@ CONTEST = OneStepTrainingConfig(
 )
 
 
-def small_trainee(config):
-    """A small network before its training."""
+def train_small(pairs, config, checkpoints=None):
+    """Train a small network on a folder of pairs; returns the weights by name and the record."""
+    torch.set_num_threads(1)
     network = random_network(
         config.network, architecture=TINY, dtype=torch.float32, has_adapters=True
     )
     text = torch.randn(77, TEXT_WIDTH, generator=torch.Generator().manual_seed(0))
-    return OneStepTrainee(network, {"clear": text}, config)
-
-
-def untrained_weights(config):
-    """What training starts from, by name."""
-    return {name: one.detach().clone() for name, one in small_trainee(config).trained.items()}
-
-
-def train_small(pairs, config, checkpoints=None, processes=ALONE):
-    """Train on a folder of pairs; returns the weights by name and the record."""
-    torch.set_num_threads(1)
-    trainee = small_trainee(config)
-    record = train_one_step(
-        trainee, [PairFolder(pairs)], checkpoint_folder=checkpoints, processes=processes
-    )
+    trainee = OneStepTrainee(network, {"clear": text}, config)
+    record = train_one_step(trainee, [PairFolder(pairs)], checkpoint_folder=checkpoints)
     return {name: one.detach().clone() for name, one in trainee.trained.items()}, record
-
-
-def train_as_one_of_two(index, port, pairs, config, out):
-    """Train together with another process; writes the weights and the record."""
-    torch.distributed.init_process_group(
-        "gloo", init_method=f"tcp://127.0.0.1:{port}", rank=index, world_size=2
-    )
-    processes = DistributedProcesses(torch.device("cpu"))
-    weights, record = train_small(pairs, config, out, processes)
-    torch.save({"weights": weights, "history": record["history"]}, out / f"trained-{index}.pt")
-    processes.meet()
-    torch.distributed.destroy_process_group()

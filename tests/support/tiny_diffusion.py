@@ -4,17 +4,12 @@ import json
 
 import torch
 from random_diffusion import fill_randomly
+from turbo_shapes import WholeModel, build_text_encoder
 
-from lidarpainter_models.painter.one_step.architectures import (
-    Architecture,
-    build_text_encoder,
-    build_tiny,
-    build_unet,
-    build_vae,
-)
+from lidarpainter_models.painter.one_step.architectures import build_tiny, build_unet, build_vae
 
 TEXT_WIDTH = 16
-TINY = Architecture(
+TINY = WholeModel(
     unet={
         "in_channels": 4,
         "out_channels": 4,

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from lidarpainter_models.errors import ConfigError, SceneError
-from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -29,6 +28,12 @@ TINY = HarvestConfig(
     observations=ObservationConfig(width_px=64),
     reference_fit=replace(TINY_FIT, refinement=AS_GIVEN),
 )
+
+
+def untold(_done, _total):
+    pass
+
+
 PLAN = LeftOutPlan(fit_frames=(0, 4), target_frames=(2,), fit=TINY_FIT, with_all_sweeps=True)
 
 
@@ -117,7 +122,8 @@ def test_the_true_image_never_reaches_the_conditions(write_wall, tmp_path):
     for name, black in (("wall", ()), ("dark", (2,))):
         scene = write_wall(name, black)
         split = split_views(scene, "alternate")
-        harvest_left_out(scene, split, [PLAN], PairWriter(tmp_path / name), config=TINY)
+        writer = PairWriter(tmp_path / name)
+        harvest_left_out(scene, split, [PLAN], writer, config=TINY, progress=untold)
         pairs[name] = PairFolder(tmp_path / name).read(0)
     assert float(pairs["dark"].target_rgb.max()) < 0.02
     for field in ("render_rgb", "render_depth_m", "lidar_rgb", "lidar_hit", "warp_rgb"):
@@ -170,7 +176,14 @@ def test_a_log_is_not_taken_for_a_street(write_wall, tmp_path):
     world = object.__new__(street.SyntheticStreet)  # building the world is not what is tested
     world.config = config
     with pytest.raises(SceneError, match="no recording of the street with seed 1"):
-        harvest_shifted_street(world, write_wall("wall"), [StreetPlan()], PairWriter(tmp_path))
+        harvest_shifted_street(
+            world,
+            write_wall("wall"),
+            [StreetPlan()],
+            PairWriter(tmp_path),
+            config=TINY,
+            progress=untold,
+        )
 
 
 def test_settings_that_make_no_pairs_are_refused():
@@ -178,9 +191,3 @@ def test_settings_that_make_no_pairs_are_refused():
         StreetPlan(num_views=0)
     with pytest.raises(ConfigError):
         HarvestConfig(corrupted_per_view=-1)
-
-
-def test_weak_fits_take_poses_as_they_are():
-    assert isinstance(weak_fit(), FitConfig)
-    assert not weak_fit().refinement.cameras
-    assert not weak_fit().refinement.actors

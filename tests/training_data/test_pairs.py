@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from random_conditions import random_conditions
 
 from lidarpainter_models.errors import DataError, ShapeError, WriteError
 from lidarpainter_models.painter.examples import PaintingPair, PairSource, Window
@@ -13,27 +14,13 @@ from lidarpainter_models.training_data.pairs import PairFolder, PairWriter, load
 
 
 def make_pair(height_px=12, width_px=20, num_sources=2, seed=0, with_reference=True):
-    generator = torch.Generator().manual_seed(seed)
-
-    def draw(*shape):
-        return torch.rand(*shape, generator=generator)
-
-    valid = draw(num_sources, height_px, width_px) < 0.5
-    conditions = PaintingConditions(
-        render_rgb=draw(height_px, width_px, 3),
-        render_depth_m=80 * draw(height_px, width_px),
-        render_alpha=draw(height_px, width_px),
-        lidar_rgb=draw(height_px, width_px, 3),
-        lidar_depth_m=80 * draw(height_px, width_px),
-        lidar_hit=draw(height_px, width_px) < 0.3,
-        warp_rgb=draw(num_sources, height_px, width_px, 3) * valid[..., None],
-        warp_valid=valid,
-        reference_rgb=draw(height_px, width_px, 3) if with_reference else None,
-    )
+    conditions = random_conditions(height_px, width_px, num_sources, seed)
+    if not with_reference:
+        conditions = replace(conditions, reference_rgb=None)
     return PaintingPair(
         conditions=conditions,
-        target_rgb=draw(height_px, width_px, 3),
-        target_valid=draw(height_px, width_px) < 0.9,
+        target_rgb=1 - conditions.render_rgb,
+        target_valid=conditions.render_alpha < 0.9,
     )
 
 

@@ -32,15 +32,10 @@ CHANGES: dict[str, tuple[str, dict[str, Any]]] = {
 
 def ablation_tables(network: NanoConfig) -> dict[str, dict[str, NanoConfig]]:
     """The variants of each table by their label; variants of one label are the same."""
-    return {"inputs": _inputs(network)} | {name: _changed(network, name) for name in CHANGES}
-
-
-def _inputs(network: NanoConfig) -> dict[str, NanoConfig]:
-    return {"+".join(row): replace(network, inputs=frozenset(row)) for row in INPUT_ROWS}
-
-
-def _changed(network: NanoConfig, name: str) -> dict[str, NanoConfig]:
-    label, change = CHANGES[name]
-    whole = replace(network, inputs=frozenset(INPUT_ROWS[-1]))
-    full_label = "+".join(INPUT_ROWS[-1])
-    return {full_label: whole, f"{full_label}, {label}": replace(whole, **change)}
+    inputs = {"+".join(row): replace(network, inputs=frozenset(row)) for row in INPUT_ROWS}
+    full, whole = list(inputs.items())[-1]
+    changed = {
+        name: {full: whole, f"{full}, {label}": replace(whole, **change)}
+        for name, (label, change) in CHANGES.items()
+    }
+    return {"inputs": inputs} | changed

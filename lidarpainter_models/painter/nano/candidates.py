@@ -5,7 +5,7 @@ render and warps, and blurred copies that trade detail for less noise.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -122,9 +122,7 @@ def build_candidates(
         made["reference"] = given_reference(conditions)
     base = base_candidate(inputs)
     exists.pop(base, None)
-    names = candidate_names(inputs, num_sources)
-    images = tuple(made[name] for name in names)
-    return Candidates(names=names, images=images, exists=exists, base=base)
+    return Candidates(names=tuple(made), images=tuple(made.values()), exists=exists, base=base)
 
 
 def given_reference(conditions: ConditionBatch) -> Float[Tensor, "batch 3 height width"]:
@@ -150,11 +148,11 @@ def with_flat_colour(
     """One more candidate: a colour of its own for every view, or none for views without."""
     flat = rgb[..., None, None].expand_as(candidates.base_image)
     somewhere = torch.ones_like(flat[:, 0]) * exists[:, None, None]
-    return Candidates(
+    return replace(
+        candidates,
         names=(*candidates.names, name),
         images=(*candidates.images, flat),
         exists=candidates.exists | {name: somewhere},
-        base=candidates.base,
     )
 
 

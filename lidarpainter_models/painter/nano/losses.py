@@ -49,7 +49,6 @@ class NanoLossWeights:
     pixels are many and their errors small, so the plain errors let them pay for damaged ones."""
 
     def __post_init__(self) -> None:
-        """Refuse negative weights."""
         refuse_negative(self)
 
 

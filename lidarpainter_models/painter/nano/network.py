@@ -76,7 +76,6 @@ class NanoConfig:
     styles, and may mix in a flat colour of their own: the white of fog, the black of night."""
 
     def __post_init__(self) -> None:
-        """Refuse shapes that cannot be built."""
         check_inputs(self.inputs)
         counts = (*self.widths, *self.blocks, self.num_sources, len(self.prompts))
         if len(self.widths) != 3 or len(self.blocks) != 3 or min(counts) < 1:

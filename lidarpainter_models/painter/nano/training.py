@@ -1,22 +1,25 @@
-"""Train the small painter on harvested pairs (`painter.training` has the loop)."""
+"""Train the small painter on harvested pairs, from nothing or from weights (`painter.training`)."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import nn
 
-from lidarpainter_models.errors import TrainingError
+from lidarpainter_models.errors import ConfigError, TrainingError
 from lidarpainter_models.painter.augmentation import TrainingBatch
 from lidarpainter_models.painter.examples import PairSource
+from lidarpainter_models.painter.known_painters import DIGEST_LENGTH
 from lidarpainter_models.painter.losses import as_numbers
 from lidarpainter_models.painter.nano.losses import NanoLossWeights, painting_loss
-from lidarpainter_models.painter.nano.more_prompts import with_more_prompts
-from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
+from lidarpainter_models.painter.nano.network import CELL_PX, NanoConfig, NanoNetwork
+from lidarpainter_models.painter.nano.painter import NanoPainter
+from lidarpainter_models.painter.nano.weights import save_weights
 from lidarpainter_models.painter.training.checkpoints import training_digest
-from lidarpainter_models.painter.training.loop import TrainingProgress, run_training
+from lidarpainter_models.painter.training.job import TrainingJob
+from lidarpainter_models.painter.training.loop import Told, run_training
 from lidarpainter_models.painter.training.settings import TrainingConfig, check_prompts
 
 CPU = torch.device("cpu")
@@ -39,7 +42,6 @@ class NanoTrainingConfig(TrainingConfig):
     weight_decay: float = 1e-4
 
     def __post_init__(self) -> None:
-        """Refuse schedules that cannot run, and prompts that no pair can have."""
         TrainingConfig.__post_init__(self)
         check_prompts(self.network.prompts)
 
@@ -48,20 +50,10 @@ class NanoTrainingConfig(TrainingConfig):
         return asdict(self) | {"network": self.network.to_dict()}
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TrainingResult:
-    """A trained network and how it came to be."""
-
-    network: NanoNetwork
-    """With the averaged weights."""
-    record: dict[str, Any]
-    """Settings, pairs, steps, losses and duration as JSON types."""
-
-
 class NanoTrainee:
     """The small network in training: all of its weights change."""
 
-    opponent = None
+    opponent: nn.Module | None = None
 
     def __init__(self, network: NanoNetwork, config: NanoTrainingConfig) -> None:
         self.network = network.train()
@@ -115,12 +107,15 @@ def train_nano(
     *,
     start: NanoNetwork | None = None,
     checkpoint_folder: Path | None = None,
-    progress: Callable[[TrainingProgress], None] | None = None,
+    progress: Told | None = None,
     device: torch.device = CPU,
-) -> TrainingResult:
+) -> tuple[NanoNetwork, dict[str, Any]]:
     """Train the small painter, continuing from a checkpoint of the same training if there is one.
 
     Without a `start` it begins with nothing; `progress` is called at every entry of the history.
+
+    Returns:
+        The network with the averaged weights, and how it came to be as JSON types.
 
     Raises:
         DataError: no pairs, or a damaged pair.
@@ -140,7 +135,7 @@ def train_nano(
         checkpoint_folder=checkpoint_folder,
         progress=progress,
     )
-    return TrainingResult(network=trainee.network.eval(), record=record)
+    return trainee.network.eval(), record
 
 
 def first_network(config: NanoTrainingConfig, start: NanoNetwork | None) -> NanoNetwork:
@@ -155,3 +150,77 @@ def first_network(config: NanoTrainingConfig, start: NanoNetwork | None) -> Nano
         network = NanoNetwork(shape) if start is None else with_more_prompts(start, shape)
     # torch's stub lacks memory_format
     return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
+@torch.no_grad()
+def with_more_prompts(network: NanoNetwork, config: NanoConfig) -> NanoNetwork:
+    """A network of the given shape that paints every known prompt as before, bit for bit.
+
+    New prompts start as the first; where the network had no tint, its head starts without a
+    preference for it.
+
+    Raises:
+        ConfigError: the shapes differ by more than prompts.
+    """
+    known = network.config
+    num_known = len(known.prompts)
+    differs = replace(known, prompts=config.prompts) != config
+    if differs or config.prompts[:num_known] != known.prompts:
+        raise ConfigError(
+            f"cannot start a network {config.to_dict()} from the weights of {known.to_dict()}"
+        )
+    extended = NanoNetwork(config)
+    state = extended.state_dict()
+    num_old, num_new = len(known.candidates), len(config.candidates)
+    for name, tensor in network.state_dict().items():
+        if name in ("prompt.weight", "style.weight"):
+            state[name][:num_known] = tensor
+            state[name][num_known:] = tensor[0]
+        elif name.startswith("head.") and num_new > num_old:
+            cells = CELL_PX**2
+            state[name][: num_old * cells] = tensor[: num_old * cells]
+            state[name][num_old * cells : num_new * cells] = 0
+            state[name][num_new * cells :] = tensor[num_old * cells :]
+        else:
+            state[name] = tensor
+    extended.load_state_dict(state)
+    return extended
+
+
+class NanoJob(TrainingJob):
+    """The small painter as a training job."""
+
+    name = "nano"
+
+    def __init__(
+        self, config: NanoTrainingConfig, first: NanoPainter | None, device: torch.device
+    ) -> None:
+        """Take the recipe, the painter to go on from, and where to train."""
+        self._config, self._device = config, device
+        self._start: NanoNetwork | None = None
+        if first is not None:
+            self._start, self.first_provenance = first.network, first.provenance
+
+    @property
+    def inputs(self) -> dict[str, str]:
+        """See `TrainingJob`."""
+        if self._start is None:
+            return {}
+        known = training_digest({}, [], self._start.state_dict())
+        return {"first weights": known[:DIGEST_LENGTH]}
+
+    def train(self, sources: Sequence[PairSource], folder: Path, told: Told) -> dict[str, Any]:
+        """See `TrainingJob`."""
+        self._trained, record = train_nano(
+            sources,
+            self._config,
+            start=self._start,
+            checkpoint_folder=folder,
+            progress=told,
+            device=self._device,
+        )
+        return record
+
+    def save(self, path: Path, *, licence: str, provenance: dict[str, Any]) -> None:
+        """See `TrainingJob`."""
+        save_weights(self._trained, path, licence=licence, provenance=provenance)

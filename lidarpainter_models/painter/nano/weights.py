@@ -13,7 +13,8 @@ from torch import Tensor
 from lidarpainter_models.errors import WeightsError
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.nano.painter import NanoPainter
-from lidarpainter_models.storage.tensor_files import read_tensors, write_tensors
+from lidarpainter_models.painter.tensor_files import check_header, fill_from_file
+from lidarpainter_models.storage.tensor_files import open_tensors, write_tensors
 
 WEIGHTS_FORMAT = "lidarpainter-nano/1"
 CPU = torch.device("cpu")
@@ -51,39 +52,12 @@ def load_weights(
     Raises:
         WeightsError: the file is missing, damaged, or holds another network.
     """
-    header, tensors = _read(path)
-    config = _config_of(header, path)
-    network = NanoNetwork(config)
-    expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
-    found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-    for name in sorted(expected.keys() | found.keys()):
-        if expected.get(name) != found.get(name):
-            raise WeightsError(
-                f"weights file {path}: tensor {name!r} has shape {found.get(name)}, "
-                f"expected {expected.get(name)}"
-            )
-    if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
-        raise WeightsError(f"weights file {path} holds values that are not finite")
-    network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
-    provenance = header["provenance"] | {"licence": header["licence"]}
-    return NanoPainter(network.to(device), provenance=provenance, precision=precision)
-
-
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    if not path.is_file():
-        raise WeightsError(f"no painter weights at {path}: expected a .safetensors file")
-    tensors, header = read_tensors(path, damaged=WeightsError)
-    found = header.get("format", "no format mark")
-    if found != WEIGHTS_FORMAT:
-        raise WeightsError(f"weights file {path} has {found!r}, expected {WEIGHTS_FORMAT!r}")
-    return header, tensors
-
-
-def _config_of(header: dict[str, Any], path: Path) -> NanoConfig:
-    missing = {"config", "licence", "provenance"} - header.keys()
-    if missing:
-        raise WeightsError(f"weights file {path} lacks {sorted(missing)} in its header")
+    with open_tensors(path, damaged=WeightsError) as (_, header):
+        check_header(path, header, WEIGHTS_FORMAT, {"config", "licence", "provenance"})
     try:
-        return NanoConfig.from_dict(header["config"])
+        network = NanoNetwork(NanoConfig.from_dict(header["config"]))
     except (KeyError, TypeError, ValueError) as error:  # a ConfigError is a ValueError
         raise WeightsError(f"weights file {path} has unusable settings: {error}") from None
+    fill_from_file(network, path, dtype=torch.float32)
+    provenance = header["provenance"] | {"licence": header["licence"]}
+    return NanoPainter(network.to(device), provenance=provenance, precision=precision)

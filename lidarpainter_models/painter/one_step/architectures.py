@@ -1,59 +1,29 @@
-"""Shapes of the networks that the painter stands on: SD-Turbo's, and those a folder declares.
+"""Shapes of the networks that the painter stands on, as a model's folder declares them.
 
-A folder has diffusers' layout: `unet/config.json`, `vae/config.json`, `text_encoder/config.json`.
+A folder has diffusers' layout: `unet/config.json`, `vae/config.json`. The packages of the
+extra `diffusion` take 10 to 20 seconds to import, so no module imports them at its top.
 """
 
 import json
-from dataclasses import dataclass, field
+import warnings
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from torch import nn
+from lidarpainter_models.errors import MissingPackageError, WeightsError
 
-from lidarpainter_models.errors import WeightsError
-from lidarpainter_models.painter.one_step.packages import diffusion_package
-
-TURBO_UNET: dict[str, Any] = {
-    "sample_size": 64,
-    "in_channels": 4,
-    "out_channels": 4,
-    "block_out_channels": (320, 640, 1280, 1280),
-    "attention_head_dim": (5, 10, 20, 20),
-    "cross_attention_dim": 1024,
-    "use_linear_projection": True,
-}
-"""Stable Diffusion 2.1's U-Net, which SD-Turbo has kept (Sauer et al., 2024)."""
-TURBO_VAE: dict[str, Any] = {
-    "in_channels": 3,
-    "out_channels": 3,
-    "down_block_types": ("DownEncoderBlock2D",) * 4,
-    "up_block_types": ("UpDecoderBlock2D",) * 4,
-    "block_out_channels": (128, 256, 512, 512),
-    "layers_per_block": 2,
-    "latent_channels": 4,
-    "scaling_factor": 0.18215,
-}
-TURBO_TEXT: dict[str, Any] = {
-    "vocab_size": 49408,
-    "hidden_size": 1024,
-    "intermediate_size": 4096,
-    "num_hidden_layers": 23,
-    "num_attention_heads": 16,
-    "hidden_act": "gelu",
-    "projection_dim": 512,
-}
 TEXT_TOKENS = 77
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Architecture:
-    """Configurations of the parts, as diffusers and transformers write them."""
+    """Configurations of the parts, as diffusers writes them."""
 
-    unet: dict[str, Any] = field(default_factory=lambda: dict(TURBO_UNET))
-    vae: dict[str, Any] = field(default_factory=lambda: dict(TURBO_VAE))
-    tiny: dict[str, Any] = field(default_factory=dict)
+    unet: dict[str, Any]
+    vae: dict[str, Any]
+    tiny: dict[str, Any]
     """Of TAESD; its defaults are diffusers'."""
-    text: dict[str, Any] = field(default_factory=lambda: dict(TURBO_TEXT))
 
     @property
     def text_width(self) -> int:
@@ -61,7 +31,21 @@ class Architecture:
         return int(self.unet["cross_attention_dim"])
 
 
-SD_TURBO = Architecture()
+def diffusion_package(name: str) -> Any:  # noqa: ANN401 - a module without type stubs
+    """Import `diffusers`, `transformers`, `peft` or `huggingface_hub`.
+
+    Raises:
+        MissingPackageError: the package is not installed or cannot be imported.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # advice to their authors, not to our users
+            return import_module(name)
+    except ImportError as error:
+        raise MissingPackageError(
+            f"the one-step painter needs the package {name} ({error}): "
+            "pip install 'lidarpainter[diffusion]'"
+        ) from None
 
 
 def build_unet(architecture: Architecture, num_channels: int) -> Any:  # noqa: ANN401
@@ -80,12 +64,6 @@ def build_vae(architecture: Architecture) -> Any:  # noqa: ANN401
 def build_tiny(architecture: Architecture) -> Any:  # noqa: ANN401
     """The tiny autoencoder."""
     return diffusion_package("diffusers").AutoencoderTiny.from_config(dict(architecture.tiny))
-
-
-def build_text_encoder(architecture: Architecture) -> nn.Module:
-    """The CLIP text encoder."""
-    transformers = diffusion_package("transformers")
-    return transformers.CLIPTextModel(transformers.CLIPTextConfig(**architecture.text))
 
 
 def read_config(folder: Path, part: str) -> dict[str, Any]:

@@ -18,12 +18,12 @@ from lidarpainter_models.painter.one_step.architectures import (
     build_tiny,
     build_unet,
     build_vae,
+    diffusion_package,
     read_config,
 )
 from lidarpainter_models.painter.one_step.config import AutoencoderKind, OneStepConfig
 from lidarpainter_models.painter.one_step.denoiser import widen_first_layer
-from lidarpainter_models.painter.one_step.packages import diffusion_package
-from lidarpainter_models.painter.one_step.tensor_files import fill_from_file
+from lidarpainter_models.painter.tensor_files import fill_from_file
 
 SD_TURBO = "sd-turbo"
 SD_TURBO_HUB = "stabilityai/sd-turbo"
@@ -81,12 +81,10 @@ def open_base(name: str, *, may_download: bool = False) -> BaseModel:
     hub_id = SD_TURBO_HUB if name == SD_TURBO else name
     folder = find_folder(hub_id, may_download=may_download)
     unet, vae = read_config(folder, "unet"), read_config(folder, "vae")
-    has_text = (folder / "text_encoder").is_dir()
-    text = read_config(folder, "text_encoder") if has_text else {}
     tiny = read_config(folder, TAESD_FOLDER) if (folder / TAESD_FOLDER).is_dir() else {}
     if not isinstance(unet.get("cross_attention_dim"), int):
         raise WeightsError(f"{folder}/unet/config.json names no cross_attention_dim")
-    architecture = Architecture(unet=unet, vae=vae, text=text, tiny=tiny)
+    architecture = Architecture(unet=unet, vae=vae, tiny=tiny)
     licence = read_licence(folder, hub_id, unet)
     return BaseModel(name=name, folder=folder, architecture=architecture, licence=licence)
 
@@ -133,14 +131,7 @@ def load_parts(base: BaseModel, config: OneStepConfig, *, dtype: torch.dtype) ->
             unet = build_unet(base.architecture, config.first_layer_channels)
             build = build_vae if config.autoencoder == "sd" else build_tiny
             autoencoder = build(base.architecture)
-    except (
-        TypeError,
-        ValueError,
-        KeyError,
-        IndexError,
-        RuntimeError,
-        NotImplementedError,
-    ) as error:
+    except (TypeError, ValueError, LookupError, RuntimeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise WeightsError(
             f"the configurations in {base.folder} make no network: {reason}"

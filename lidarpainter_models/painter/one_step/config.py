@@ -1,6 +1,12 @@
-"""Settings of the one-step painter: which inputs it sees and how its parts are wired."""
+"""Settings of the one-step painter: which inputs it sees, how its parts are wired, named wirings.
 
+`paper` is what the paper says, `as-shipped` what its authors' program does (they differ in time,
+fusion, first layer, LiDAR image and ranges), `fast` our own trade.
+"""
+
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from types import MappingProxyType
 from typing import Any, Literal, get_args
 
 from lidarpainter_models.errors import ConfigError
@@ -64,7 +70,6 @@ class OneStepConfig:
     """Rank of the autoencoder's LoRA; 0 for none."""
 
     def __post_init__(self) -> None:
-        """Refuse wirings that cannot be built."""
         if not self.inputs or tuple(name for name in INPUTS if name in self.inputs) != self.inputs:
             raise ConfigError(f"inputs must be some of {INPUTS} in this order, got {self.inputs}")
         if self.fusion is not None and len(self.inputs) == 1:
@@ -109,3 +114,23 @@ class OneStepConfig:
         if config.to_dict() != values:
             raise ConfigError(f"not the settings of a one-step painter: {values}")
         return config
+
+
+PAPER = OneStepConfig()
+"""Render and LiDAR at t = 999, attention fusion, skips of the render."""
+AS_SHIPPED = OneStepConfig(
+    timestep=200,
+    fusion=FusionConfig(kind="as-shipped", channels=4),
+    skip_bias=True,
+    first_layer="copy",
+    lidar="bright-over-render",
+    is_signed=False,
+)
+"""The authors' program: t = 200, copied first layer, 1x1 fusion, LiDAR laid over the render."""
+FAST = OneStepConfig(autoencoder="taesd", timestep=199, skips="none", autoencoder_rank=0)
+"""The tiny autoencoder, and t = 199, which bfloat16 hardly harms."""
+WITH_REFERENCE = OneStepConfig(inputs=("render", "lidar", "warp"), timestep=199, skips="fused")
+"""Ours: the warped recorded images as a third latent, three-way fusion, fused skips."""
+PRESETS: Mapping[str, OneStepConfig] = MappingProxyType(
+    {"paper": PAPER, "as-shipped": AS_SHIPPED, "fast": FAST, "with-reference": WITH_REFERENCE}
+)

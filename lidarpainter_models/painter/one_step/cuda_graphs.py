@@ -31,7 +31,7 @@ class GraphedNetwork:
     ) -> Float[Tensor, "batch 3 height width"]:
         """The repaired images, not clamped."""
         if images.device.type != "cuda":
-            return self._network(images, text, masks).rgb
+            return self._network(images, text, masks)
         shapes = tuple(tuple(one.shape) for one in (images, text, masks) if one is not None)
         if shapes not in self._graphs:
             self._graphs[shapes] = _Captured(self._network, (images, text, masks))
@@ -51,7 +51,7 @@ class _Captured:
         torch.cuda.current_stream().wait_stream(stream)
         self._graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(self._graph):
-            self._output = network(*self._inputs).rgb
+            self._output = network(*self._inputs)
 
     def replay(self, inputs: _Inputs) -> Tensor:
         for kept, given in zip(self._inputs, inputs, strict=True):

@@ -32,7 +32,6 @@ class FusionConfig:
     """Weights per latent position: 1, or one for each of the four latent channels."""
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be built."""
         if self.channels not in (1, LATENT_CHANNELS):
             raise ConfigError(f"fusion channels must be 1 or 4, got {self.channels}")
         if self.kind == "as-shipped" and self.channels != LATENT_CHANNELS:

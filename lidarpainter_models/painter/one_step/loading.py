@@ -7,13 +7,13 @@ model itself; where that folder has moved, one of the same name beside the file 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from lidarpainter_models.errors import ConfigError, WeightsError
+from lidarpainter_models.painter.known_painters import WEIGHTS_SUFFIX
 from lidarpainter_models.painter.one_step.architectures import TEXT_TOKENS
 from lidarpainter_models.painter.one_step.assembly import assemble, made_lean, trained_in_float32
 from lidarpainter_models.painter.one_step.base_models import (
@@ -25,17 +25,19 @@ from lidarpainter_models.painter.one_step.base_models import (
     model_files,
     open_base,
 )
-from lidarpainter_models.painter.one_step.config import OneStepConfig
-from lidarpainter_models.painter.one_step.network import OneStepNetwork
+from lidarpainter_models.painter.one_step.config import PRESETS, OneStepConfig
 from lidarpainter_models.painter.one_step.painter import OneStepPainter
-from lidarpainter_models.painter.one_step.presets import PRESETS, preset_named
 from lidarpainter_models.painter.one_step.prompts import PromptBook
-from lidarpainter_models.painter.one_step.weights import TrainedFile, apply_trained, read_trained
+from lidarpainter_models.painter.one_step.weights import (
+    Trainable,
+    TrainedFile,
+    apply_trained,
+    read_trained,
+)
 from lidarpainter_models.painter.precision import faster_type
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
 
 CPU = torch.device("cpu")
-SUFFIX = ".safetensors"
 UNTRAINED = "none for repairing renders: the model as it comes"
 MARK_TOLERANCE = 1e-2
 """Biases of one model agree to this share in float32, float16 and bfloat16."""
@@ -46,14 +48,12 @@ def load_one_step(
     *,
     device: torch.device = CPU,
     dtype: torch.dtype | None = None,
-    merges: bool = True,
     may_download: bool = False,
 ) -> OneStepPainter:
-    """A painter on a device.
+    """A painter on a device, its adapters merged into the model.
 
     `dtype` is that of the weights, None what the device computes faster; the step, the fusion and
-    the U-Net's last layer stay float32. `merges` merges adapters into
-    the model and makes it lean; without, it can be trained on.
+    the U-Net's last layer stay float32.
 
     Raises:
         WeightsError: model or weights are missing, damaged, or do not belong together.
@@ -61,55 +61,23 @@ def load_one_step(
         MissingPackageError: the extra `diffusion` is not installed.
     """
     dtype = dtype or faster_type(device)
-    if name.endswith(SUFFIX):
-        trained = load_trained(Path(name), dtype=dtype, merges=merges, may_download=may_download)
-        return trained.to(device)
-    model, preset = split_preset(name)
-    base = open_base(model, may_download=may_download)
-    config = preset_named(preset)
-    prompts = _open_prompts(base, {})
+    file = _file_of(name)
+    if file is None:
+        model, preset = split_preset(name)
+        base, config = open_base(model, may_download=may_download), PRESETS[preset]
+    else:
+        base, config = _base_of(file, may_download=may_download), file.config
+    prompts = _open_prompts(base, file)
     parts = load_parts(base, config, dtype=dtype)
-    network = assemble(config, parts.unet, parts.autoencoder, has_adapters=not merges)
-    if merges:
-        made_lean(network)
-    untrained = {"training": UNTRAINED, "trained_targets": []}
-    return OneStepPainter(network, prompts, _origin(base, parts) | untrained).to(device)
-
-
-def load_trained(
-    path: Path, *, dtype: torch.dtype, merges: bool, may_download: bool = False
-) -> OneStepPainter:
-    """A painter from a weights file of ours and the model that it names.
-
-    Raises:
-        WeightsError: the file or its model are missing, damaged, or do not belong together.
-    """
-    file = read_trained(path)
-    base = _base_of(file, may_download=may_download)
-    prompts = _open_prompts(base, file.prompts)
-    parts = load_parts(base, file.config, dtype=dtype)
-    check_mark(file, parts)
-    network = assemble(file.config, parts.unet, parts.autoencoder, has_adapters=True)
-    apply_trained(network, file)
-    if merges:
-        made_lean(network)
-    origin = _origin(base, parts) | {"licence": file.licence}
-    return OneStepPainter(network, prompts, file.provenance | origin)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Trainable:
-    """A network with its adapters, ready to be trained, and what its weights file has to say."""
-
-    network: OneStepNetwork
-    texts: dict[str, torch.Tensor]
-    """The encoded prompts."""
-    base: str
-    mark: list[float]
-    licence: str
-    """Of the model."""
-    provenance: dict[str, Any]
-    """Of the weights that the training goes on from; empty for a model."""
+    network = assemble(config, parts.unet, parts.autoencoder, has_adapters=file is not None)
+    origin = {"base": base.name, "mark": parts.mark, "licence": base.licence}
+    if file is None:
+        origin |= {"training": UNTRAINED, "trained_targets": []}
+    else:
+        _check_mark(file, parts)
+        apply_trained(network, file)
+        origin = file.provenance | origin | {"licence": file.licence}
+    return OneStepPainter(made_lean(network), prompts, origin).to(device)
 
 
 def load_trainable(
@@ -131,19 +99,19 @@ def load_trainable(
         ConfigError: a weights file of another wiring.
         MissingPackageError: the extra `diffusion` is not installed.
     """
-    file = read_trained(Path(name)) if name.endswith(SUFFIX) else None
+    file = _file_of(name)
     if file is not None and file.config != config:
         raise ConfigError(
             f"{name} is wired otherwise than the training: leave its network as it is"
         )
     base = open_base(split_preset(name)[0]) if file is None else _base_of(file)
-    book = _open_prompts(base, {} if file is None else file.prompts)
+    book = _open_prompts(base, file)
     texts = {prompt: book.encode(prompt) for prompt in prompts}
     parts = load_parts(base, config, dtype=dtype)
     network = assemble(config, parts.unet, parts.autoencoder, has_adapters=True, seed=seed)
     trained_in_float32(network)
     if file is not None:
-        check_mark(file, parts)
+        _check_mark(file, parts)
         apply_trained(network, file)
     return Trainable(
         network=network,
@@ -167,12 +135,10 @@ def painter_files(name: str) -> list[Path]:
     Raises:
         WeightsError: the model or the weights file is not there.
     """
-    if name.endswith(SUFFIX):
-        file = read_trained(Path(name))
-        base = _base_of(file)
-        return [file.path, *model_files(base, file.config.autoencoder)]
+    if (file := _file_of(name)) is not None:
+        return [file.path, *model_files(_base_of(file), file.config.autoencoder)]
     model, preset = split_preset(name)
-    return model_files(open_base(model), preset_named(preset).autoencoder)
+    return model_files(open_base(model), PRESETS[preset].autoencoder)
 
 
 def split_preset(name: str) -> tuple[str, str]:
@@ -181,12 +147,13 @@ def split_preset(name: str) -> tuple[str, str]:
     return (model, preset) if model and preset in PRESETS else (name, "paper")
 
 
-def check_mark(file: TrainedFile, parts: BaseParts) -> None:
-    """Refuse weights that were trained on another model.
+def _file_of(name: str) -> TrainedFile | None:
+    """A weights file of ours; None for the name of a model."""
+    return read_trained(Path(name)) if name.endswith(WEIGHTS_SUFFIX) else None
 
-    Raises:
-        WeightsError: the model's biases are others than the file says.
-    """
+
+def _check_mark(file: TrainedFile, parts: BaseParts) -> None:
+    """Refuse weights of a model whose biases are others than the file says."""
     fits = len(file.mark) == len(parts.mark) and all(
         math.isclose(found, kept, rel_tol=MARK_TOLERANCE, abs_tol=1e-4)
         for found, kept in zip(parts.mark, file.mark, strict=True)
@@ -207,9 +174,9 @@ def _base_of(file: TrainedFile, *, may_download: bool = False) -> BaseModel:
     return replace(base, name=file.base)
 
 
-def _open_prompts(base: BaseModel, encoded: dict[str, torch.Tensor]) -> PromptBook:
+def _open_prompts(base: BaseModel, file: TrainedFile | None) -> PromptBook:
     """The prompts, the default one encoded now: before the U-Net is there, memory is free."""
-    prompts = PromptBook(encoded, base.folder)
+    prompts = PromptBook({} if file is None else file.prompts, base.folder)
     prompts.encode(DEFAULT_PROMPT)
     expected = (TEXT_TOKENS, base.architecture.text_width)
     for prompt, text in prompts.encoded.items():
@@ -219,7 +186,3 @@ def _open_prompts(base: BaseModel, encoded: dict[str, torch.Tensor]) -> PromptBo
                 f"expects {expected}"
             )
     return prompts
-
-
-def _origin(base: BaseModel, parts: BaseParts) -> dict[str, Any]:
-    return {"base": base.name, "mark": parts.mark, "licence": base.licence}

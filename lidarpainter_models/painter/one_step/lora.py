@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from lidarpainter_models.painter.one_step.packages import diffusion_package
+from lidarpainter_models.painter.one_step.architectures import diffusion_package
 
 UNET_TARGETS = (
     "to_k",

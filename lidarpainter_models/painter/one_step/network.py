@@ -5,8 +5,6 @@ trusts the render alone and a first layer that is zero for the LiDAR latent it *
 the render, bit for bit. Nothing random is drawn and nothing is kept between calls.
 """
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -21,18 +19,6 @@ from lidarpainter_models.painter.one_step.config import OneStepConfig
 from lidarpainter_models.painter.one_step.denoiser import Denoiser
 from lidarpainter_models.painter.one_step.latent_fusion import LatentFusion, mix
 from lidarpainter_models.painter.one_step.schedule import denoise, denoising_step
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class OneStepOutput:
-    """What the network makes of a batch of views."""
-
-    rgb: Float[Tensor, "batch 3 height width"]
-    """In [0, 1] where the decoder keeps to its range; not clamped, so that gradients pass."""
-    latent: Float[Tensor, "batch 4 rows columns"]
-    """The denoised latent, in float32."""
-    weights: Float[Tensor, "inputs batch weights rows columns"]
-    """Shares of the inputs in the latent that the step starts from."""
 
 
 class OneStepNetwork(nn.Module):
@@ -60,12 +46,16 @@ class OneStepNetwork(nn.Module):
         masks: Float[Tensor, "batch masks rows columns"] | None = None,
         *,
         encodes_at_once: bool = True,
-    ) -> OneStepOutput:
+    ) -> Float[Tensor, "batch 3 height width"]:
         """Repair every view.
 
         Images are the inputs in the configured order, rgb in [0, 1], height and width multiples of
         64; masks are shares of hits per latent position, if the configuration has them. Encoding
         one input after the other needs less memory and more time.
+
+        Returns:
+            Images in [0, 1] where the decoder keeps to its range; not clamped, so that gradients
+            pass.
         """
         latents, skips = self._encode(images, encodes_at_once=encodes_at_once)
         weights = self._weights(latents)
@@ -78,7 +68,7 @@ class OneStepNetwork(nn.Module):
         if self.config.skips == "fused":
             skips = mix_skips(skips, weights)
         decoded = self.autoencoder.decode(clean.to(latents.dtype), skips)
-        return OneStepOutput(rgb=0.5 * decoded.float() + 0.5, latent=clean, weights=weights)
+        return 0.5 * decoded.float() + 0.5
 
     def _encode(
         self, images: Float[Tensor, "inputs batch 3 height width"], *, encodes_at_once: bool

@@ -25,10 +25,10 @@ from lidarpainter_models import errors
 from lidarpainter_models.errors import ConfigError, LidarPainterError, TrainingError
 from lidarpainter_models.painter.examples import PairSource
 from lidarpainter_models.painter.training.loop import Told, TrainingProgress
-from lidarpainter_models.painter.training.processes import DistributedProcesses
+from lidarpainter_models.painter.training.processes import Processes
 
 if TYPE_CHECKING:
-    from lidarpainter_models.painter.one_step.job import OneStepRecipe
+    from lidarpainter_models.painter.one_step.job import OneStepJob
 
 JOB_FILE = "job.pickle"
 LOG_FILE = "processes.log"
@@ -40,7 +40,7 @@ INTERRUPTED_GRACE_S = 0.5
 
 
 def run_in_processes(
-    recipe: "OneStepRecipe",
+    training: "OneStepJob",
     sources: Sequence[PairSource],
     folder: Path,
     num_processes: int,
@@ -59,7 +59,7 @@ def run_in_processes(
         )
     folder.mkdir(parents=True, exist_ok=True)
     job = folder / JOB_FILE
-    job.write_bytes(pickle.dumps((recipe, tuple(sources), folder)))
+    job.write_bytes(pickle.dumps((training, tuple(sources), folder)))
     torchrun = ["-m", "torch.distributed.run", "--standalone", "--local-addr", "127.0.0.1"]
     command = [*torchrun, "--nproc-per-node", str(num_processes), "-m", main.__module__, str(job)]
     with (folder / LOG_FILE).open("wb") as log:
@@ -118,17 +118,17 @@ def _end(running: "subprocess.Popen[bytes]", grace_s: float) -> None:
 def main(job: Path) -> None:
     """Train as the process that torchrun's environment says this is."""
     threading.Thread(target=_end_with_starter, daemon=True).start()
-    recipe, sources, folder = pickle.loads(job.read_bytes())  # noqa: S301 - we have written it
+    training, sources, folder = pickle.loads(job.read_bytes())  # noqa: S301 - we have written it
     has_gpu = torch.cuda.is_available()
     device = torch.device("cpu")
     if has_gpu:
         device = torch.device("cuda", torch.distributed.get_node_local_rank())
         torch.cuda.set_device(device)
     torch.distributed.init_process_group("nccl" if has_gpu else "gloo")
-    processes = DistributedProcesses(device)
+    processes = Processes(device=device)
     told = _say_progress if processes.index == 0 else None
     try:
-        recipe.train(sources, folder, device=device, processes=processes, told=told)
+        training.train_as_one(sources, folder, device=device, processes=processes, told=told)
     except LidarPainterError as error:
         _say({"error": type(error).__name__, "message": str(error)})
         raise SystemExit(1) from None

@@ -6,15 +6,13 @@ never part of the painter. Weights files carry the prompts they were trained for
 
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from lidarpainter_models.errors import ConfigError, WeightsError
-from lidarpainter_models.painter.one_step.architectures import TEXT_TOKENS
-from lidarpainter_models.painter.one_step.packages import diffusion_package
+from lidarpainter_models.painter.one_step.architectures import TEXT_TOKENS, diffusion_package
 
 STYLE_TEXTS = MappingProxyType(
     {
@@ -83,7 +81,14 @@ def encode_text(folder: Path, text: str) -> Float[Tensor, "tokens features"]:
             dtype=torch.bfloat16,
             output_loading_info=True,
         )
-        text_features = run_text_encoder(encoder, tokenize(tokenizer, text))
+        tokens = tokenizer(
+            text,
+            max_length=TEXT_TOKENS,
+            padding="max_length",
+            truncation=True,
+            return_tensors="pt",
+        ).input_ids
+        text_features = run_text_encoder(encoder, tokens)
     except Exception as error:  # noqa: BLE001 - many kinds for one thing: the files do not fit
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise WeightsError(f"the text encoder of {folder} cannot be used: {reason}") from None
@@ -92,17 +97,6 @@ def encode_text(folder: Path, text: str) -> Float[Tensor, "tokens features"]:
             name = sorted(map(str, found[kind]))[0]
             raise WeightsError(f"the text encoder of {folder} has {kind.replace('_', ' ')}: {name}")
     return text_features
-
-
-def tokenize(tokenizer: Any, text: str) -> Tensor:  # noqa: ANN401 - transformers' CLIPTokenizer
-    """Token numbers of a text, padded and cut to CLIP's length."""
-    return tokenizer(
-        text,
-        max_length=TEXT_TOKENS,
-        padding="max_length",
-        truncation=True,
-        return_tensors="pt",
-    ).input_ids
 
 
 @torch.inference_mode()

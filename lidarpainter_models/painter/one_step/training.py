@@ -5,7 +5,7 @@ are float32, under autocast. The U-Net and the autoencoder compute their inner a
 the backward pass, which saves most of the memory. `painter.training` has the loop.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,9 @@ from torch import Tensor, nn
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.adversarial import (
     DiscriminatorConfig,
+    FeatureDiscriminator,
     FrozenFeatures,
-    build_discriminator,
+    PatchDiscriminator,
     discriminator_loss,
 )
 from lidarpainter_models.painter.augmentation import AugmentationConfig, TrainingBatch
@@ -38,7 +39,7 @@ from lidarpainter_models.painter.one_step.network import OneStepNetwork
 from lidarpainter_models.painter.one_step.painter import NUM_WARPS, STRIDE_PX, painter_inputs
 from lidarpainter_models.painter.protocol import DEFAULT_PROMPT
 from lidarpainter_models.painter.training.checkpoints import training_digest
-from lidarpainter_models.painter.training.loop import ALONE, TrainingProgress, run_training
+from lidarpainter_models.painter.training.loop import ALONE, Told, run_training
 from lidarpainter_models.painter.training.processes import Processes
 from lidarpainter_models.painter.training.settings import TrainingConfig, check_prompts
 
@@ -70,7 +71,6 @@ class OneStepTrainingConfig(TrainingConfig):
     weight_decay: float = 1e-2
 
     def __post_init__(self) -> None:
-        """Refuse schedules that cannot run, and windows that the network cannot halve."""
         TrainingConfig.__post_init__(self)
         check_prompts(self.prompts)
         if self.augmentation.crop_px % STRIDE_PX:
@@ -124,19 +124,17 @@ class OneStepTrainee:
         `texts` holds every prompt of the recipe.
 
         Raises:
-            ConfigError: a loss without what it weighs, or another wiring than the recipe's.
+            ConfigError: a loss without what it weighs.
         """
         judges = judges or Judges()
         judges.check(config.loss)
-        if network.config != config.network:
-            raise ConfigError("the network is wired otherwise than its training says")
         self.network = network
         self.config = config
         self.judges = judges
-        self.prompts = config.prompts
+        self.prompts: tuple[str, ...] = config.prompts
         self.device = network.denoiser.timestep.device
         self.texts = {prompt: texts[prompt].to(self.device) for prompt in config.prompts}
-        self.trained = made_trainable(network, config)
+        self.trained: Mapping[str, nn.Parameter] = made_trainable(network, config)
         self.opponent = _opponent(config, judges, self.device)
 
     def learn(self, batch: TrainingBatch, *, step: int, share: float) -> dict[str, float]:
@@ -162,11 +160,13 @@ class OneStepTrainee:
         seen = known_image(image.detach(), batch.target, batch.target_valid)
         every = self.config.penalty_every_steps
         weight = 0.0 if step % every else every * self.config.penalty_weight
-        verdict = discriminator_loss(self.opponent, batch.target, seen, penalty_weight=weight)
-        (share * verdict.total).backward()
+        hinge, penalty = discriminator_loss(
+            self.opponent, batch.target, seen, penalty_weight=weight
+        )
+        (share * (hinge + 0.5 * weight * penalty)).backward()
         return as_numbers(terms) | {
-            "discriminator": float(verdict.hinge.detach()),
-            "gradient_penalty": every * float(verdict.gradient_penalty.detach()),
+            "discriminator": float(hinge.detach()),
+            "gradient_penalty": every * float(penalty.detach()),
         }
 
     def _painted(self, batch: TrainingBatch) -> Float[Tensor, "batch 3 height width"]:
@@ -175,7 +175,7 @@ class OneStepTrainee:
         with torch.autocast(
             self.device.type, dtype=torch.bfloat16, enabled=self.config.half_precision
         ):
-            return self.network(images, text, masks).rgb
+            return self.network(images, text, masks)
 
     def check(self, step: int, means: Mapping[str, float]) -> None:
         """A frozen model cannot die; that the loss is a number is checked at every step."""
@@ -215,7 +215,9 @@ def _opponent(
         return None
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        return build_discriminator(config.discriminator, judges.features).to(device)
+        if judges.features is None:
+            return PatchDiscriminator(config.discriminator).to(device)
+        return FeatureDiscriminator(judges.features, config.discriminator).to(device)
 
 
 def train_one_step(
@@ -223,7 +225,7 @@ def train_one_step(
     sources: Sequence[PairSource],
     *,
     checkpoint_folder: Path | None = None,
-    progress: Callable[[TrainingProgress], None] | None = None,
+    progress: Told | None = None,
     processes: Processes = ALONE,
 ) -> dict[str, Any]:
     """Train a network in place; afterwards it holds the averaged weights.

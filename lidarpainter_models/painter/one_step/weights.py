@@ -5,7 +5,6 @@ and last layer and the fusion in float32, and the encoded prompts. The model its
 the header names it, with a few of its biases by which another model is found out.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,12 +21,8 @@ from lidarpainter_models.painter.one_step.assembly import (
 )
 from lidarpainter_models.painter.one_step.config import OneStepConfig
 from lidarpainter_models.painter.one_step.network import OneStepNetwork
-from lidarpainter_models.painter.one_step.tensor_files import (
-    check_finite,
-    check_shapes,
-    open_weights,
-)
-from lidarpainter_models.storage.tensor_files import read_tensors, write_tensors
+from lidarpainter_models.painter.tensor_files import check_finite, check_header, check_shapes
+from lidarpainter_models.storage.tensor_files import open_tensors, read_tensors, write_tensors
 
 WEIGHTS_FORMAT = "lidarpainter-one-step/1"
 PROMPT = "prompt:"
@@ -49,43 +44,44 @@ class TrainedFile:
     prompts: dict[str, Tensor]
 
 
-def save_trained(
-    network: OneStepNetwork,
-    path: Path,
-    *,
-    prompts: Mapping[str, Tensor],
-    base: str,
-    mark: list[float],
-    licence: str,
-    provenance: dict[str, Any],
-) -> None:
-    """Write what training changed, aside and renamed whole.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trainable:
+    """A network with its adapters, ready to be trained, and what its weights file has to say."""
 
-    The network has its adapters, not merged. `mark` holds biases of the model underneath
-    (`base_models.BaseParts`); `provenance` holds JSON types.
+    network: OneStepNetwork
+    texts: dict[str, Tensor]
+    """The encoded prompts."""
+    base: str
+    mark: list[float]
+    """Biases of the model; see `base_models.BaseParts`."""
+    licence: str
+    """Of the model."""
+    provenance: dict[str, Any]
+    """Of the weights that the training goes on from; empty for a model."""
+
+
+def save_trained(made: Trainable, path: Path, *, licence: str, provenance: dict[str, Any]) -> None:
+    """Write what training changed, aside and renamed whole; `provenance` holds JSON types.
 
     Raises:
         WeightsError: a weight is not finite.
         WriteError: the file cannot be written.
     """
-    state = dict(network.named_parameters())
-    tensors = {name: _stored(name, state[name]) for name in trained_names(network)}
-    tensors |= {PROMPT + name: _stored(PROMPT, text) for name, text in prompts.items()}
+    state = dict(made.network.named_parameters())
+    tensors = {name: state[name] for name in trained_names(made.network)}
+    tensors |= {PROMPT + name: text for name, text in made.texts.items()}
+    tensors = {name: tensor.to(stored_type(name)) for name, tensor in tensors.items()}
     for name, tensor in tensors.items():
         check_finite(path, name, tensor)
     header = {
         "format": WEIGHTS_FORMAT,
-        "config": network.config.to_dict(),
-        "base": base,
-        "mark": mark,
+        "config": made.network.config.to_dict(),
+        "base": made.base,
+        "mark": made.mark,
         "licence": licence,
         "provenance": provenance,
     }
     write_tensors(path, tensors, header)
-
-
-def _stored(name: str, tensor: Tensor) -> Tensor:
-    return tensor.detach().cpu().to(stored_type(name)).contiguous()
 
 
 def stored_type(name: str) -> torch.dtype:
@@ -99,10 +95,8 @@ def read_trained(path: Path) -> TrainedFile:
     Raises:
         WeightsError: it is missing, damaged, or of another format.
     """
-    header = read_header(path)
-    missing = {"config", "base", "mark", "licence", "provenance"} - header.keys()
-    if missing:
-        raise WeightsError(f"weights file {path} lacks {sorted(missing)} in its header")
+    stored, header = read_tensors(path, damaged=WeightsError)
+    check_header(path, header, WEIGHTS_FORMAT, {"config", "base", "mark", "licence", "provenance"})
     try:
         config = OneStepConfig.from_dict(header["config"])
         mark = [float(value) for value in header["mark"]]
@@ -111,7 +105,7 @@ def read_trained(path: Path) -> TrainedFile:
         raise WeightsError(f"weights file {path} has unusable settings: {error}") from None
     tensors: dict[str, Tensor] = {}
     prompts: dict[str, Tensor] = {}
-    for name, tensor in read_tensors(path, damaged=WeightsError)[0].items():
+    for name, tensor in stored.items():
         check_finite(path, name, tensor)
         kept = prompts if name.startswith(PROMPT) else tensors
         kept[name.removeprefix(PROMPT)] = tensor.clone()
@@ -127,35 +121,13 @@ def read_trained(path: Path) -> TrainedFile:
     )
 
 
-def read_header(path: Path) -> dict[str, Any]:
-    """The header of a weights file of this format.
-
-    Raises:
-        WeightsError: it is missing, damaged, or of another format.
-    """
-    header = painter_header(path)
-    if header.get("format") != WEIGHTS_FORMAT:
-        found = header.get("format", "no format mark")
-        raise WeightsError(f"weights file {path} has {found!r}, expected {WEIGHTS_FORMAT!r}")
-    return header
-
-
 def is_trained_file(path: Path) -> bool:
     """Whether a file says that it is one of ours; a missing or damaged one says nothing."""
     try:
-        return painter_header(path).get("format") == WEIGHTS_FORMAT
+        with open_tensors(path, damaged=WeightsError) as (_, header):
+            return header.get("format") == WEIGHTS_FORMAT
     except WeightsError:
         return False
-
-
-def painter_header(path: Path) -> dict[str, Any]:
-    """What any painter's weights file says of itself.
-
-    Raises:
-        WeightsError: the file is missing or damaged.
-    """
-    with open_weights(path) as (_, header):
-        return header
 
 
 @torch.no_grad()

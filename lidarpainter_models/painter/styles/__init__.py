@@ -5,9 +5,9 @@ from dataclasses import replace
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from lidarpainter_models.painter.styles.fog import FogConfig, add_fog
-from lidarpainter_models.painter.styles.night import NightConfig, turn_to_night
-from lidarpainter_models.painter.styles.rain import RainConfig, add_rain
+from lidarpainter_models.painter.styles.fog import add_fog
+from lidarpainter_models.painter.styles.night import turn_to_night
+from lidarpainter_models.painter.styles.rain import add_rain
 from lidarpainter_models.painter.styles.view import StyleView
 from lidarpainter_models.weather.mix import FOG_VISIBILITY_M, STYLE_PROMPTS, StyleMix, check_prompt
 
@@ -28,14 +28,12 @@ def apply_style(
         ConfigError: there is no such style.
     """
     check_prompt(prompt)
-    if strength == 0:
-        return view.rgb
     if prompt == "foggy":
-        return add_fog(view, FogConfig(visibility_m=visibility_m / strength))
+        return add_fog(view, visibility_m / strength)
     if prompt == "night":
-        return turn_to_night(view, generator, NightConfig(strength=strength))
+        return turn_to_night(view, generator, strength)
     if prompt == "rain":
-        return add_rain(view, generator, RainConfig(strength=strength))
+        return add_rain(view, generator, strength)
     return view.rgb
 
 

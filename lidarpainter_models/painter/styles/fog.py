@@ -3,55 +3,40 @@
 Light from a surface at distance d arrives as L t + A (1 - t), with transmittance t = exp(-beta d)
 and airlight A. The visibility V is where a black object keeps 2 % contrast against the horizon:
 beta = ln(50) / V = 3.912 / V. The airlight is that of the image's own horizon: fog droplets are
-large against the wavelength and scatter all colours alike, so it is nearly grey.
+large against the wavelength and scatter all colours alike, so it is nearly grey. Sky at elevation e
+is seen through layer / sin e of fog, so that it may shine through at the zenith.
 """
 
-from dataclasses import dataclass
 from math import inf
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.painter.styles.view import StyleView, distances, elevations
+from lidarpainter_models.painter.styles.view import StyleView, distances, elevations, quantile
 from lidarpainter_models.weather.air import FOG_BRIGHTNESS, FOG_GREYNESS, FOG_LAYER_M, transmittance
 from lidarpainter_models.weather.light import luminance, to_display, to_linear
 from lidarpainter_models.weather.mix import FOG_VISIBILITY_M
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FogConfig:
-    """A bank of fog on the ground."""
-
-    visibility_m: float = FOG_VISIBILITY_M
-    """Where contrast has fallen to 2 %; below 1000 m it is called fog. Infinity leaves the image
-    as it is."""
-    layer_m: float = FOG_LAYER_M
-    """Height of the fog above the camera: sky at elevation e is seen through layer / sin e of it,
-    so that it may shine through at the zenith."""
-    greyness: float = FOG_GREYNESS
-    """How far the airlight's colour goes from that of the sky to grey."""
-    brightness: float = FOG_BRIGHTNESS
-    """Airlight against the light of the horizon in the clear image."""
-
-
-def add_fog(view: StyleView, config: FogConfig | None = None) -> Float[Tensor, "height width 3"]:
-    """The view in fog, as displayed."""
-    config = config or FogConfig()
+def add_fog(
+    view: StyleView, visibility_m: float = FOG_VISIBILITY_M
+) -> Float[Tensor, "height width 3"]:
+    """The view in a bank of fog on the ground, as displayed."""
     clear = to_linear(view.rgb)
-    through = fog_transmittance(view, config)[..., None]
-    air = config.brightness * airlight(view, greyness=config.greyness)
+    through = fog_transmittance(view, visibility_m)[..., None]
+    air = FOG_BRIGHTNESS * airlight(view, greyness=FOG_GREYNESS)
     return to_display(clear * through + air * (1 - through))
 
 
-def fog_transmittance(view: StyleView, config: FogConfig) -> Float[Tensor, "height width"]:
+def fog_transmittance(view: StyleView, visibility_m: float) -> Float[Tensor, "height width"]:
     """What comes through of each pixel's light; a pixel at an edge mixes surface and sky."""
-    surface = transmittance(distances(view), config.visibility_m)
+    surface = transmittance(distances(view), visibility_m)
     if view.camera is None:
         upward = torch.full_like(surface, inf)
     else:
-        upward = config.layer_m / elevations(view.camera).clamp_min(1e-3).sin()
-    sky = transmittance(upward, config.visibility_m)
+        upward = FOG_LAYER_M / elevations(view.camera).clamp_min(1e-3).sin()
+    sky = transmittance(upward, visibility_m)
     surface = torch.where(view.surface, surface, sky)
     return view.sky * sky + (1 - view.sky) * surface
 
@@ -70,13 +55,8 @@ def airlight(view: StyleView, *, greyness: float) -> Float[Tensor, "3"]:
         found = light[horizon].mean(dim=0)
     else:
         distance_m = distances(view).flatten()
-        far = distance_m >= _quantile(distance_m, 0.9)
+        far = distance_m >= quantile(distance_m, 0.9)
         dark = light.amin(dim=-1).flatten()
-        hazy = far & (dark >= _quantile(dark[far], 0.9))
+        hazy = far & (dark >= quantile(dark[far], 0.9))
         found = light.reshape(-1, 3)[hazy].mean(dim=0)
     return found + greyness * (luminance(found) - found)
-
-
-def _quantile(values: Float[Tensor, " pixels"], share: float) -> Float[Tensor, ""]:
-    """A value that so large a share does not reach; `torch.quantile` takes no large images."""
-    return values.kthvalue(max(1, round(share * len(values)))).values

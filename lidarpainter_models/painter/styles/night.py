@@ -9,8 +9,6 @@ shot and read noise. Shadows of the sun stay where they are, only weaker: nothin
 and shadow apart.
 """
 
-from dataclasses import dataclass
-
 import cv2
 import torch
 from jaxtyping import Float
@@ -24,6 +22,7 @@ from lidarpainter_models.painter.styles.view import (
     elevations,
     fit_ground,
     open_sky,
+    quantile,
     ray_directions,
     surface_points,
 )
@@ -34,6 +33,7 @@ from lidarpainter_models.weather.darkness import (
     HEADLAMP_AHEAD_M,
     HEADLAMP_HEIGHT_M,
     LEAST_GRAZING,
+    LIT_SHARE,
     NEAREST_M2,
     WINDOW_POWER,
     WINDOW_RADIANCE,
@@ -52,30 +52,20 @@ RADIANCE: dict[LampKind, float] = {"signal": 1.6, "window": WINDOW_RADIANCE, "st
 POWER: dict[LampKind, float] = {"signal": 0.02, "window": WINDOW_POWER, "street": 4.0}
 """Irradiance a metre away, in the same units."""
 MOST_SOURCES = 60
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NightConfig:
-    """A clear night in a town."""
-
-    strength: float = 1.0
-    """0 is day and leaves the image as it is; between, day and night light are mixed."""
-    beam: float = BEAM
-    """Irradiance of the low beam at a metre, in the same units; 0 turns it off."""
-    lit_windows: float = 0.4
-    """Share of the windows found that are lit."""
-    noise: float = 0.012
-    """Deviation of the sensor's noise at a tenth of display white."""
+NOISE = 0.012
+"""Deviation of the sensor's noise at a tenth of display white."""
 
 
 def turn_to_night(
-    view: StyleView, generator: Generator, config: NightConfig | None = None
+    view: StyleView, generator: Generator, strength: float = 1.0
 ) -> Float[Tensor, "height width 3"]:
-    """The view at night, as displayed; the generator lights windows and draws noise."""
-    config = config or NightConfig()
+    """The view at night, as displayed; the generator lights windows and draws noise.
+
+    Between the strengths 0, which is day, and 1, the light of both is mixed.
+    """
     day = to_linear(view.rgb)
-    night = _relit(view, day, generator, config)
-    return to_display(day + config.strength * (night - day))
+    night = _relit(view, day, generator)
+    return to_display(day + strength * (night - day))
 
 
 def place_of(view: StyleView) -> tuple[Place, Float[Tensor, "height width 3"] | None]:
@@ -100,28 +90,25 @@ def sunlit_white(view: StyleView) -> float:
     """Daylight of the brightest tenth of the surfaces."""
     grey = luminance(to_linear(view.rgb))
     seen = grey[view.surface] if bool(view.surface.any()) else grey.flatten()
-    return max(float(seen.kthvalue(max(1, round(0.9 * len(seen)))).values), 1e-3)
+    return max(float(quantile(seen, 0.9)), 1e-3)
 
 
 def _relit(
-    view: StyleView,
-    day: Float[Tensor, "height width 3"],
-    generator: Generator,
-    config: NightConfig,
+    view: StyleView, day: Float[Tensor, "height width 3"], generator: Generator
 ) -> Float[Tensor, "height width 3"]:
     """Night light of the whole view, with glare and noise."""
     place, points_m = place_of(view)
-    lamps = find_lamps(place, lit_share=config.lit_windows, generator=generator)
+    lamps = find_lamps(place, lit_share=LIT_SHARE, generator=generator)
     reflectance = night_reflectance(day, sunlit_white(view))
     surface = by_skylight(reflectance)
     irradiance = torch.zeros_like(day)
     if view.camera is not None and points_m is not None and place.height_m is not None:
-        irradiance += config.beam * low_beam(view.camera, points_m, place.height_m)
+        irradiance += BEAM * low_beam(view.camera, points_m, place.height_m)
     irradiance += lamp_irradiance(lamps, points_m, place)
     surface = surface + reflectance * irradiance
     light = surface + open_sky(view)[..., None] * (_night_sky(view) - surface)
     glowing = add_glare(light + _emission(lamps, day), view.focal_px)
-    return _with_noise(glowing, config.noise, generator)
+    return _with_noise(glowing, generator)
 
 
 def _without_specks(
@@ -214,9 +201,9 @@ def add_glare(
 
 
 def _with_noise(
-    light: Float[Tensor, "height width 3"], deviation: float, generator: Generator
+    light: Float[Tensor, "height width 3"], generator: Generator
 ) -> Float[Tensor, "height width 3"]:
     """Shot noise that grows with the root of light, over a third as much read noise."""
     drawn = torch.randn(light.shape, generator=generator)
     shot = (light.clamp_min(0) / 0.1 + 0.1).sqrt()
-    return light + deviation * 0.1 * shot * drawn
+    return light + NOISE * 0.1 * shot * drawn

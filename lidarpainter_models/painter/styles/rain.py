@@ -8,7 +8,6 @@ their mean. `wet_ground.py` wets the road.
 """
 
 import math
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -57,28 +56,16 @@ WIND = 0.06
 _LINE_BITS = 3  # of a pixel's fraction in drawn lines
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RainConfig:
-    """Steady rain by day."""
-
-    strength: float = 1.0
-    """0 leaves the image as it is; between, dry and wet light are mixed."""
-    rain_mm_per_h: float = RAIN_MM_PER_H
-    """Heavy rain; veil and number of streaks follow it."""
-    wetness: float = WETNESS
-    """How far surfaces darken like wet ones; the road wholly, walls half as much."""
-    puddle_share: float = PUDDLE_SHARE
-    """Part of the road where water stands still and mirrors clearly."""
-
-
 def add_rain(
-    view: StyleView, generator: Generator, config: RainConfig | None = None
+    view: StyleView, generator: Generator, strength: float = 1.0
 ) -> Float[Tensor, "height width 3"]:
-    """The view in rain, as displayed; the generator draws puddles and drops."""
-    config = config or RainConfig()
+    """The view in steady rain by day, as displayed; the generator draws puddles and drops.
+
+    Between the strengths 0, which is dry, and 1, the light of both is mixed.
+    """
     dry = to_linear(view.rgb)
-    rain = _streaked(_wet(view, dry, generator, config), view, generator, config)
-    return to_display(dry + config.strength * (rain - dry))
+    rain = _streaked(_wet(view, dry, generator), view, generator)
+    return to_display(dry + strength * (rain - dry))
 
 
 def fall_speed_mps(diameter_mm: Float[Tensor, " drops"]) -> Float[Tensor, " drops"]:
@@ -87,20 +74,17 @@ def fall_speed_mps(diameter_mm: Float[Tensor, " drops"]) -> Float[Tensor, " drop
 
 
 def _wet(
-    view: StyleView,
-    dry: Float[Tensor, "height width 3"],
-    generator: Generator,
-    config: RainConfig,
+    view: StyleView, dry: Float[Tensor, "height width 3"], generator: Generator
 ) -> Float[Tensor, "height width 3"]:
     """Everything but the streaks."""
     tint = torch.tensor(OVERCAST_TINT)
     grey = luminance(dry)[..., None]
     dull = OVERCAST * (grey + COLOUR_WITHOUT_SUN * (dry - grey)) * tint
-    walls = wet_reflectance(dull, 0.5 * config.wetness)
+    walls = wet_reflectance(dull, 0.5 * WETNESS)
     light = walls + open_sky(view)[..., None] * (CLOUD_LIGHT * tint - walls)
     distance_m = distances(view)
-    light = _with_wet_road(light, dull, view, distance_m, generator, config)
-    through = torch.exp(-rain_extinction_per_m(config.rain_mm_per_h) * distance_m)
+    light = _with_wet_road(light, dull, view, distance_m, generator)
+    through = torch.exp(-rain_extinction_per_m(RAIN_MM_PER_H) * distance_m)
     through = torch.where(view.surface, through, 1.0)[..., None]
     return light * through + CLOUD_LIGHT * tint * (1 - through)
 
@@ -111,7 +95,6 @@ def _with_wet_road(
     view: StyleView,
     distance_m: Float[Tensor, "height width"],
     generator: Generator,
-    config: RainConfig,
 ) -> Float[Tensor, "height width 3"]:
     """Darker ground that mirrors what stands on it; the view as it is where no ground is seen."""
     camera = view.camera
@@ -123,27 +106,26 @@ def _with_wet_road(
     points_m = ground.flattened(points_m)
     cloud = CLOUD_LIGHT * torch.tensor(OVERCAST_TINT)
     mirror = mirrored(light, cloud, camera, points_m, share > 0.01)
-    still = puddles(points_m, generator, share=config.puddle_share)
+    still = puddles(points_m, generator, share=PUDDLE_SHARE)
     shine = fresnel(-ray_directions(camera)[..., 2])
-    shine = shine * (FILM_SHINE + (1 - FILM_SHINE) * still) * config.wetness
-    road = wet_reflectance(dull, config.wetness)
+    shine = shine * (FILM_SHINE + (1 - FILM_SHINE) * still) * WETNESS
+    road = wet_reflectance(dull, WETNESS)
     wet_road = road + shine[..., None] * (mirror - road)
     return light + share[..., None] * (wet_road - light)
 
 
 def _streaked(
-    light: Float[Tensor, "height width 3"],
-    view: StyleView,
-    generator: Generator,
-    config: RainConfig,
+    light: Float[Tensor, "height width 3"], view: StyleView, generator: Generator
 ) -> Float[Tensor, "height width 3"]:
     """Streaks of drops drawn evenly over the volume before the lens."""
     near_m, far_m = STREAK_RANGE_M
     height_px, width_px = light.shape[:2]
     cubes = far_m**3 - near_m**3
     volume_m3 = cubes / 3 * height_px * width_px / view.focal_px**2
-    slope = 4.1 * max(config.rain_mm_per_h, 1e-3) ** -0.21
-    count = round(volume_m3 * drops_per_m3(config.rain_mm_per_h))
+    slope = 4.1 * RAIN_MM_PER_H**-0.21
+    # drops large enough to be seen singly, after Marshall and Palmer (1948)
+    drops_per_m3 = 8000 / slope * math.exp(-slope * DROP_RANGE_MM[0])
+    count = round(volume_m3 * drops_per_m3)
     drawn = torch.rand(count, 4, generator=generator)
     depth_m = (near_m**3 + drawn[:, 0] * cubes) ** (1 / 3)
     diameter_mm = DROP_RANGE_MM[0] - torch.log1p(-0.999 * drawn[:, 1]) / slope
@@ -164,14 +146,6 @@ def _streaked(
     )
     covered = _lines(streaks, height_px, width_px)[..., None]
     return light + covered * (STREAK_BRIGHTNESS * light.reshape(-1, 3).mean(dim=0) - light)
-
-
-def drops_per_m3(rain_mm_per_h: float) -> float:
-    """Drops large enough to be seen singly, after Marshall and Palmer (1948)."""
-    if rain_mm_per_h == 0:
-        return 0.0
-    slope = 4.1 * rain_mm_per_h**-0.21
-    return 8000 / slope * math.exp(-slope * DROP_RANGE_MM[0])
 
 
 def _lines(

@@ -44,7 +44,6 @@ class StyleView:
     ground or above the horizon is unknown."""
 
     def __post_init__(self) -> None:
-        """Refuse maps of another size."""
         size = tuple(self.rgb.shape[:2])
         camera = self.camera
         sizes = {size, tuple(self.depth_m.shape), tuple(self.sky.shape)}
@@ -122,6 +121,11 @@ def surface_points(
     Sky lies at `SKY_M`.
     """
     return ray_directions(camera) * distance_m.clamp_max(SKY_M)[..., None]
+
+
+def quantile(values: Float[Tensor, " pixels"], share: float) -> Float[Tensor, ""]:
+    """A value that so large a share does not reach; `torch.quantile` takes no large images."""
+    return values.kthvalue(max(1, round(share * len(values)))).values
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -17,7 +17,6 @@ import torch
 from torch import Tensor, nn
 
 from lidarpainter_models.errors import ConfigError, DataError
-from lidarpainter_models.painter.training.trainee import Trainee
 from lidarpainter_models.storage.whole_files import write_whole
 
 CHECKPOINT_NAME = "training.pt"
@@ -31,9 +30,9 @@ class TrainingState:
 
     trained: dict[str, nn.Parameter]
     averaged: dict[str, Tensor]
-    optimiser: torch.optim.AdamW
+    optimisers: dict[str, torch.optim.AdamW]
+    """Of the trained weights, and of the opponent if there is one, as a checkpoint calls them."""
     opponent: nn.Module | None = None
-    opponent_optimiser: torch.optim.AdamW | None = None
     step: int = 0
     cpu_s: float = 0.0
     running: dict[str, float] = field(default_factory=dict)
@@ -41,17 +40,16 @@ class TrainingState:
     history: list[dict[str, float]] = field(default_factory=list)
 
     @classmethod
-    def start(cls, trainee: Trainee) -> "TrainingState":
+    def start(
+        cls, trained: Mapping[str, nn.Parameter], opponent: nn.Module | None
+    ) -> "TrainingState":
         """The state before the first step."""
-        trained = dict(trainee.trained)
         averaged = {name: parameter.detach().clone() for name, parameter in trained.items()}
-        opponent = trainee.opponent
+        optimisers = {"optimiser": _optimiser(list(trained.values()))}
+        if opponent is not None:
+            optimisers["opponent_optimiser"] = _optimiser(list(opponent.parameters()))
         return cls(
-            trained=trained,
-            averaged=averaged,
-            optimiser=_optimiser(list(trained.values())),
-            opponent=opponent,
-            opponent_optimiser=_optimiser(list(opponent.parameters())) if opponent else None,
+            trained=dict(trained), averaged=averaged, optimisers=optimisers, opponent=opponent
         )
 
     @property
@@ -96,15 +94,14 @@ def write_checkpoint(path: Path, state: TrainingState, digest: str) -> None:
         "digest": digest,
         "trained": {name: parameter.detach() for name, parameter in state.trained.items()},
         "averaged": state.averaged,
-        "optimiser": state.optimiser.state_dict(),
         "step": state.step,
         "cpu_s": state.cpu_s,
         "running": state.running,
         "history": state.history,
+        **{name: optimiser.state_dict() for name, optimiser in state.optimisers.items()},
     }
-    if state.opponent is not None and state.opponent_optimiser is not None:
+    if state.opponent is not None:
         saved["opponent"] = state.opponent.state_dict()
-        saved["opponent_optimiser"] = state.opponent_optimiser.state_dict()
     content = io.BytesIO()
     torch.save(saved, content)
     write_whole(path, content.getvalue())
@@ -145,10 +142,10 @@ def _restore(state: TrainingState, saved: Mapping[str, Any]) -> None:
                 )
         for name, tensor in kept.items():
             tensor.copy_(saved[kind][name])
-    state.optimiser.load_state_dict(saved["optimiser"])
-    if state.opponent is not None and state.opponent_optimiser is not None:
+    for name, optimiser in state.optimisers.items():
+        optimiser.load_state_dict(saved[name])
+    if state.opponent is not None:
         state.opponent.load_state_dict(saved["opponent"])
-        state.opponent_optimiser.load_state_dict(saved["opponent_optimiser"])
     state.step, state.cpu_s = int(saved["step"]), float(saved["cpu_s"])
     state.running, state.history = dict(saved["running"]), list(saved["history"])
 

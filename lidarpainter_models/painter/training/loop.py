@@ -10,15 +10,15 @@ step that one process takes with two accumulated batches, up to the order of a s
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lidarpainter_models.errors import ConfigError, DataError, TrainingError
 from lidarpainter_models.painter.augmentation import TrainingBatch, draw_batch
@@ -30,11 +30,44 @@ from lidarpainter_models.painter.training.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
-from lidarpainter_models.painter.training.processes import OneProcess, Processes
+from lidarpainter_models.painter.training.processes import Processes
 from lidarpainter_models.painter.training.settings import TrainingConfig
-from lidarpainter_models.painter.training.trainee import Trainee
 
-ALONE = OneProcess()
+ALONE = Processes()
+
+
+@runtime_checkable
+class Trainee(Protocol):
+    """A network in training: some of its weights change, and it knows what to lower.
+
+    The loop owns optimisers, schedule, averages and checkpoints; it never sees how the network is
+    built.
+    """
+
+    trained: Mapping[str, nn.Parameter]
+    """The weights that change, in float32, by names that stay the same between runs."""
+    opponent: nn.Module | None
+    """A discriminator with an optimiser of its own; trained beside, averaged never."""
+    num_warps: int
+    """Warped images that a sample has."""
+    prompts: tuple[str, ...]
+    """What the painter learns: the first restores, the others are styles."""
+
+    def learn(self, batch: TrainingBatch, *, step: int, share: float) -> dict[str, float]:
+        """Add the gradients of a batch to those of the trained weights and of the opponent.
+
+        `share` is how much the batch counts among those of the step. Returns what enters the
+        history; `total` is the loss, and has to be finite.
+        """
+        ...
+
+    def check(self, step: int, means: Mapping[str, float]) -> None:
+        """Look at an entry of the history.
+
+        Raises:
+            TrainingError: the network has died.
+        """
+        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,15 +105,12 @@ def run_training(
 
     Raises:
         DataError: no pairs, or a damaged pair.
-        ConfigError: shares that do not fit the sources, a checkpoint of another training, or a time
-            limit for several processes, which would not end at the same step.
+        ConfigError: shares that do not fit the sources, or a checkpoint of another training.
         TrainingError: the loss is no longer finite or the network has died; the last checkpoint
             stays as it was.
     """
-    if processes.count > 1 and config.max_cpu_s is not None:
-        raise ConfigError("several processes need a number of steps, not a budget of CPU seconds")
     shares = source_shares(sources, config)
-    state = TrainingState.start(trainee)
+    state = TrainingState.start(trainee.trained, trainee.opponent)
     path = checkpoint_folder / CHECKPOINT_NAME if checkpoint_folder else None
     if path and path.exists():
         read_checkpoint(path, state, digest)
@@ -173,7 +203,7 @@ def _step(
     processes: Processes,
 ) -> dict[str, float]:
     """One optimiser step; refuses to take one that is not finite. Returns the mean losses."""
-    optimisers = [one for one in (state.optimiser, state.opponent_optimiser) if one is not None]
+    optimisers = list(state.optimisers.values())
     for optimiser in optimisers:
         optimiser.zero_grad(set_to_none=True)
     parts = config.accumulated_batches
@@ -187,7 +217,7 @@ def _step(
     norms = [_clipped_norm(optimiser, config, processes) for optimiser in optimisers]
     if not math.isfinite(losses["total"]) or not all(map(math.isfinite, norms)):
         raise TrainingError(
-            f"loss {losses['total']} with gradient norm {max(norms, key=_badness)} at step "
+            f"loss {losses['total']} with gradient norms {norms} at step "
             f"{state.step}: the training stops, its last checkpoint is kept; try a lower "
             "learning_rate"
         )
@@ -198,11 +228,6 @@ def _step(
         optimiser.step()
     _average(state, config.average_decay)
     return losses
-
-
-def _badness(norm: float) -> float:
-    """Orders norms so that one that is no number comes last."""
-    return norm if math.isfinite(norm) else math.inf
 
 
 def _clipped_norm(

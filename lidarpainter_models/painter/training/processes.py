@@ -6,71 +6,30 @@ exchange a step does what a wrapper around the network would do, and leaves the 
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol, runtime_checkable
 
 import torch
 import torch.distributed
 from torch import Tensor
 
 
-@runtime_checkable
-class Processes(Protocol):
-    """Who trains, and which of them this is."""
+class Processes:
+    """Who trains, and which of them this is; alone nothing is exchanged or rounded on the way."""
 
-    @property
-    def index(self) -> int:
-        """Of this process; the first one writes checkpoints."""
-        ...
+    def __init__(self, count: int = 1, device: torch.device | None = None) -> None:
+        """Train alone, or go on alone with what `count` processes have trained.
 
-    @property
-    def count(self) -> int:
-        """How many there are."""
-        ...
-
-    def average(self, tensors: Sequence[Tensor]) -> None:
-        """Replace tensors, in place, by their means over the processes."""
-        ...
-
-    def mean(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Means of named numbers over the processes."""
-        ...
-
-    def meet(self) -> None:
-        """Wait until every process is here."""
-        ...
-
-
-class OneProcess:
-    """Trains alone: nothing is exchanged, and nothing is rounded on the way."""
-
-    index = 0
-
-    def __init__(self, count: int = 1) -> None:
-        """Take up what so many processes have trained."""
-        self.count = count
-
-    def average(self, tensors: Sequence[Tensor]) -> None:
-        """Leave them."""
-
-    def mean(self, values: Mapping[str, float]) -> dict[str, float]:
-        """The numbers as they are."""
-        return dict(values)
-
-    def meet(self) -> None:
-        """Go on."""
-
-
-class DistributedProcesses:
-    """The processes of torch's process group, which has been opened before."""
-
-    def __init__(self, device: torch.device) -> None:
-        """Take the device of this process, on which numbers are exchanged."""
+        With a device this is one of torch's process group, which has been opened before; numbers
+        are exchanged on that device.
+        """
         self._device = device
-        self.index = torch.distributed.get_rank()
-        self.count = torch.distributed.get_world_size()
+        self.count = count if device is None else torch.distributed.get_world_size()
+        self.index = 0 if device is None else torch.distributed.get_rank()
+        """The first one writes checkpoints."""
 
     def average(self, tensors: Sequence[Tensor]) -> None:
-        """Replace tensors by their means, all in one exchange."""
+        """Replace tensors, in place, by their means over the processes, all in one exchange."""
+        if self._device is None:
+            return
         flat = torch.cat([tensor.flatten() for tensor in tensors])
         torch.distributed.all_reduce(flat)
         parts = (flat / self.count).split([tensor.numel() for tensor in tensors])
@@ -78,11 +37,14 @@ class DistributedProcesses:
             tensor.copy_(part.view(tensor.shape))
 
     def mean(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Means of named numbers, taken in float32."""
+        """Means of named numbers over the processes, taken in float32."""
+        if self._device is None:
+            return dict(values)
         found = torch.tensor(list(values.values()), device=self._device)
         self.average([found])
         return dict(zip(values, found.tolist(), strict=True))
 
     def meet(self) -> None:
         """Wait until every process is here."""
-        torch.distributed.barrier()
+        if self._device is not None:
+            torch.distributed.barrier()

@@ -42,7 +42,6 @@ class TrainingConfig:
     """Steps that one entry of the history averages over."""
 
     def __post_init__(self) -> None:
-        """Refuse schedules that cannot run."""
         positive = ("steps", "batch_size", "accumulated_batches", "log_every_steps")
         for name in (*positive, "max_gradient_norm"):
             if not getattr(self, name) > 0:

@@ -89,7 +89,7 @@ def not_finite(path):
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda path: path.unlink(), "no painter weights at"),
+        (lambda path: path.unlink(), "is not there"),
         (damaged, "not a readable safetensors file"),
         (foreign, "has 'other/3', expected 'lidarpainter-nano/1'"),
         (settings_of_nothing, "unusable settings"),
@@ -97,7 +97,7 @@ def not_finite(path):
         (unlicensed, "lacks"),
         (unmarked, "has 'no format mark'"),
         (incomplete, "tensor 'head.bias' has shape None"),
-        (not_finite, "not finite"),
+        (not_finite, "values that are no number"),
     ],
 )
 def test_wrong_weights_files_are_one_clear_line(saved, spoil, message):

@@ -7,10 +7,14 @@ import torch
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.painter.batches import stack_conditions
-from lidarpainter_models.painter.one_step.config import OneStepConfig
+from lidarpainter_models.painter.one_step.config import (
+    AS_SHIPPED,
+    PAPER,
+    WITH_REFERENCE,
+    OneStepConfig,
+)
 from lidarpainter_models.painter.one_step.loading import load_one_step
 from lidarpainter_models.painter.one_step.painter import painter_inputs, support
-from lidarpainter_models.painter.one_step.presets import as_shipped, paper, with_reference
 from lidarpainter_models.painter.protocol import Painter
 
 
@@ -33,7 +37,7 @@ def test_a_view_of_any_size_keeps_it(painter, size, num_sources, make_conditions
 
 def test_edges_are_repeated_below_and_to_the_right(make_conditions):
     batch = stack_conditions([make_conditions(70, 130)], num_sources=2)
-    images, masks = painter_inputs(batch, paper())
+    images, masks = painter_inputs(batch, PAPER)
     assert masks is None
     assert images.shape == (2, 1, 3, 128, 192)
     assert torch.equal(images[0, ..., :70, :130], batch.render)
@@ -45,7 +49,7 @@ def test_lidar_enters_pure_or_over_the_render(make_conditions):
     conditions = make_conditions(64, 64)
     batch = stack_conditions([conditions], num_sources=2)
     found = {
-        kind: painter_inputs(batch, replace(paper(), lidar=kind))[0][1, 0].permute(1, 2, 0)
+        kind: painter_inputs(batch, replace(PAPER, lidar=kind))[0][1, 0].permute(1, 2, 0)
         for kind in ("pure", "over-render", "bright-over-render")
     }
     hit = conditions.lidar_hit
@@ -56,13 +60,13 @@ def test_lidar_enters_pure_or_over_the_render(make_conditions):
     assert bool((hit & ~bright).any())
     assert torch.equal(found["bright-over-render"][bright], conditions.lidar_rgb[bright])
     assert torch.equal(found["bright-over-render"][~bright], conditions.render_rgb[~bright])
-    assert as_shipped().lidar == "bright-over-render"
+    assert AS_SHIPPED.lidar == "bright-over-render"
 
 
 def test_the_reference_is_the_first_valid_warp_else_the_render(make_conditions):
     conditions = make_conditions(64, 64, 2)
     batch = stack_conditions([conditions], num_sources=2)
-    warp = painter_inputs(batch, with_reference())[0][2, 0].permute(1, 2, 0)
+    warp = painter_inputs(batch, WITH_REFERENCE)[0][2, 0].permute(1, 2, 0)
     first, second = conditions.warp_valid
     assert torch.equal(warp[first], conditions.warp_rgb[0][first])
     assert torch.equal(warp[second & ~first], conditions.warp_rgb[1][second & ~first])

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from lidarpainter_models.painter.styles import night
 from lidarpainter_models.painter.styles.lamps import Place, find_lamps
 from lidarpainter_models.painter.styles.night import (
-    NightConfig,
     add_glare,
     lamp_irradiance,
     low_beam,
@@ -16,7 +16,12 @@ from lidarpainter_models.painter.styles.night import (
 from lidarpainter_models.painter.styles.view import distances, fit_ground, surface_points
 from lidarpainter_models.weather.light import luminance, to_linear
 
-DARK = NightConfig(beam=0, lit_windows=0, noise=0)
+
+@pytest.fixture
+def _dark(monkeypatch):
+    """No beam, no window lit, no noise."""
+    for name in ("BEAM", "LIT_SHARE", "NOISE"):
+        monkeypatch.setattr(night, name, 0)
 
 
 def generator_of(seed=0):
@@ -49,25 +54,26 @@ def brightness(rgb):
     return luminance(to_linear(rgb))
 
 
+@pytest.mark.usefixtures("_dark")
 def test_night_is_dark_and_its_sky_darker_than_by_day(street):
-    night = turn_to_night(street, generator_of(), DARK)
-    assert float(brightness(night).mean()) < 0.15 * float(brightness(street.rgb).mean())
-    sky = street.sky > 0
-    assert float(brightness(night)[sky].max()) < 0.1
+    found = brightness(turn_to_night(street, generator_of()))
+    assert float(found.mean()) < 0.15 * float(brightness(street.rgb).mean())
+    assert float(found[street.sky > 0].max()) < 0.1
 
 
+@pytest.mark.usefixtures("_dark")
 def test_skylight_turns_colours_blue(street):
-    night = to_linear(turn_to_night(street, generator_of(), DARK))[street.surface].mean(dim=0)
+    found = to_linear(turn_to_night(street, generator_of()))[street.surface].mean(dim=0)
     day = to_linear(street.rgb)[street.surface].mean(dim=0)
-    assert float(night[2] / night[0]) > 1.5 * float(day[2] / day[0])
+    assert float(found[2] / found[0]) > 1.5 * float(day[2] / day[0])
 
 
+@pytest.mark.usefixtures("_dark")
 def test_a_red_patch_of_the_size_of_a_tail_light_shines(street_with_tail_light):
     place, _ = place_of(street_with_tail_light)
     lamps = find_lamps(place, lit_share=0.0, generator=generator_of())
     assert [(lamp.kind, lamp.top_px, lamp.left_px) for lamp in lamps] == [("signal", 52, 20)]
-    night = to_linear(turn_to_night(street_with_tail_light, generator_of(), DARK))
-    red, green, _ = night[53, 21]
+    red, green, _ = to_linear(turn_to_night(street_with_tail_light, generator_of()))[53, 21]
     assert float(red) > 0.5
     assert float(red) > 5 * float(green)
 
@@ -143,7 +149,8 @@ def test_glare_spreads_light_and_keeps_its_sum():
     assert torch.equal(add_glare(dim, focal_px=100.0), dim)
 
 
+@pytest.mark.usefixtures("_dark")
 def test_half_of_the_night_lies_between_day_and_night(street):
-    day, night = to_linear(street.rgb), to_linear(turn_to_night(street, generator_of(), DARK))
-    half = to_linear(turn_to_night(street, generator_of(), replace(DARK, strength=0.5)))
-    torch.testing.assert_close(half, (day + night) / 2, atol=2e-3, rtol=0)
+    day, whole = to_linear(street.rgb), to_linear(turn_to_night(street, generator_of()))
+    half = to_linear(turn_to_night(street, generator_of(), 0.5))
+    torch.testing.assert_close(half, (day + whole) / 2, atol=2e-3, rtol=0)

@@ -15,7 +15,7 @@ from lidarpainter_models.painter.augmentation import AugmentationConfig
 from lidarpainter_models.painter.nano.network import NanoConfig
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.painter.nano.weights import load_weights
-from lidarpainter_models.training_data.pair_sets import PairSet
+from lidarpainter_models.training_data.pairs import PairSet
 from tasks.painter.evaluate import load_painting_scores, score_held_back, score_painters
 from tasks.painter.train import (
     publish_painter,

@@ -5,8 +5,7 @@ go, so a float32 file never lies beside the bfloat16 weights that it becomes.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Set
 from pathlib import Path
 from typing import Any
 
@@ -42,12 +41,14 @@ def fill_from_file(
         WeightsError: a weight is missing, too many, of a wrong shape, or not finite.
     """
     expected = {name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
-    stored = {renamed(name): (name, shape) for name, shape in stored_shapes(path).items()}
+    with open_tensors(path, damaged=WeightsError) as (file, _):
+        shapes = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
+    stored = {renamed(name): (name, shape) for name, shape in shapes.items()}
     check_shapes(path, {name: shape for name, (_, shape) in stored.items()}, expected, widened)
     # all of it before the first read: read buffers between them would leave holes behind
     weights = {name: torch.empty(shape, dtype=dtype) for name, shape in expected.items()}
     for names in _portions({name: shape for name, (_, shape) in stored.items()}):
-        with open_weights(path) as (file, _):
+        with open_tensors(path, damaged=WeightsError) as (file, _):
             for name in names:
                 tensor = file.get_tensor(stored[name][0])
                 check_finite(path, name, tensor)
@@ -100,24 +101,14 @@ def check_finite(path: Path, name: str, tensor: Tensor) -> None:
         raise WeightsError(f"weights file {path}: tensor {name!r} holds values that are no number")
 
 
-def stored_shapes(path: Path) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of all tensors of a file.
+def check_header(path: Path, header: Mapping[str, Any], form: str, named: Set[str]) -> None:
+    """Refuse a weights file of another form, or one that does not say what it is.
 
     Raises:
-        WeightsError: the file cannot be read.
+        WeightsError: it is one of these.
     """
-    with open_weights(path) as (file, _):
-        return {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
-
-
-@contextmanager
-def open_weights(path: Path) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """Open a safetensors file and read its header, which is empty in a file of someone else.
-
-    Raises:
-        WeightsError: it is missing or damaged.
-    """
-    if not path.is_file():
-        raise WeightsError(f"no weights at {path}: expected a .safetensors file")
-    with open_tensors(path, damaged=WeightsError) as opened:
-        yield opened
+    found = header.get("format", "no format mark")
+    if found != form:
+        raise WeightsError(f"weights file {path} has {found!r}, expected {form!r}")
+    if missing := named - header.keys():
+        raise WeightsError(f"weights file {path} lacks {sorted(missing)} in its header")
