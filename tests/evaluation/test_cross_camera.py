@@ -13,8 +13,13 @@ from gaussian_world import scene_trained_on
 from tiny_street import FRONT, NUM_FRAMES, SIDE, SIDE_GAIN, tiny_street
 
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.strip_views import StripEvaluation, strip_views
-from lidarpainter_models.evaluation.strips import calibrate_strip, score_strips, strip_mask
+from lidarpainter_models.evaluation.strips import (
+    StripEvaluation,
+    calibrate_strip,
+    score_strips,
+    strip_mask,
+    strip_views,
+)
 from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_tangent
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene

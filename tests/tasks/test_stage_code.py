@@ -83,7 +83,6 @@ def test_evaluation_follows_the_scores_and_no_reader():
     modules = modules_of(*builds_in("evaluation.views"))
     assert {
         f"{LIBRARY}.evaluation.scene_evaluation",
-        f"{LIBRARY}.evaluation.scene_scores",
         f"{LIBRARY}.metrics.images",
         f"{LIBRARY}.kernels.point_blend.cpu",
     } <= modules.keys()

@@ -179,7 +179,7 @@ def _follow(plan: FitPlan, state: FitState, inputs: _Inputs) -> FitResult:
         if look is not None and state.step >= state.steps * FIRST_LOOK:
             look(state.caught_up())
             look = None
-        if inputs.checkpoints is not None and inputs.checkpoints.is_due(state.step):
+        if inputs.checkpoints is not None and inputs.checkpoints.is_due:
             inputs.checkpoints.save(*state.keep())
     return FitResult(
         scene=_finished(state),

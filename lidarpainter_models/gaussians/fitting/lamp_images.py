@@ -8,11 +8,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.gaussians.fitting.images import FitImage
-from lidarpainter_models.gaussians.model.drawing import OPAQUE
+from lidarpainter_models.gaussians.model.drawing import OPAQUE, draw_gaussians
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import SH_CONSTANT
+from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.kernels.gaussian_raster import Splats, render_gaussians
 
 LEAST_PX = 1.0
 """A place of which an image shows less than so many pixels is not seen by it."""
@@ -93,19 +93,8 @@ def lacking(
     harmonics = gaussians.sh.clone().requires_grad_(True)
     ones = torch.ones(len(gaussians), 1, device=scene.device, requires_grad=True)
     with torch.enable_grad():
-        drawn = render_gaussians(
-            Splats(
-                means=gaussians.means,
-                rotation_wxyz=gaussians.rotation_wxyz,
-                scale_m=gaussians.scale_m,
-                opacity=gaussians.opacity,
-                sh=harmonics,
-                body_index=gaussians.body_index,
-            ),
-            posed.bodies.to(scene.device),
-            camera,
-            features=ones,
-        )
+        coloured = SeenGaussians.of(gaussians, harmonics)
+        drawn = draw_gaussians(coloured, posed.bodies, camera, channels=ones)
         alpha = drawn.alpha.detach()
         sky_rgb = scene.sky.sample(scene.sky.rays(camera, alpha < OPAQUE))
         shown = drawn.rgb.detach() + (1 - alpha)[..., None] * sky_rgb

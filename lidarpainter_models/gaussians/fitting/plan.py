@@ -12,13 +12,12 @@ from typing import Any
 
 import torch
 
-from lidarpainter_models.gaussians.fitting.config import FitConfig
+from lidarpainter_models.gaussians.fitting.config import START_SHARE, FitConfig
 from lidarpainter_models.gaussians.fitting.memory import (
     FitMemory,
     gaussians_within_limit,
     planned_memory,
 )
-from lidarpainter_models.gaussians.fitting.number_of_gaussians import START_SHARE
 from lidarpainter_models.gaussians.fitting.seen_surface import (
     SeenSurface,
     seen_surface,

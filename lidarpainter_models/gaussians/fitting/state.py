@@ -13,11 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.gaussians.fitting.checkpoint import (
-    generator_from,
-    group_tensors,
-    ungroup_tensors,
-)
+from lidarpainter_models.gaussians.fitting.checkpoint import group_tensors, ungroup_tensors
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.densification import GradientTally, SetChange
 from lidarpainter_models.gaussians.fitting.gaussian_adam import GaussianAdam, most_sigmas
@@ -205,7 +201,7 @@ class FitState:
         state.hidden = HiddenGaussians.from_tensors(kept_hidden, state.scene.device)
         tally = ungroup_tensors(tensors, "tally")
         state.tally = GradientTally(**{name: value.to(device) for name, value in tally.items()})
-        state.generator = generator_from(tensors["random/state"])
+        state.generator.set_state(tensors["random/state"])
         state.waiting = list(numbers["waiting"])
         state.step, state.cpu_s = numbers["step"], numbers["cpu_s"]
         state.sought_lamps = numbers.get("sought_lamps", False)

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lidarpainter_models.gaussians.model.bending import knots_around
 from lidarpainter_models.gaussians.model.gaussian_set import SH_CONSTANT, GaussianSet
 from lidarpainter_models.gaussians.model.seen_gaussians import AnyGaussians
 from lidarpainter_models.geometry.lattices import lattice_values
@@ -111,13 +112,8 @@ class Blinking:
 
     def lit_at(self, timestamp_ns: int) -> Float[Tensor, " lamps"]:
         """How much each lamp is on at a time; before and after all knots as at the nearest."""
-        after = int(torch.searchsorted(self.knots_ns, timestamp_ns))
-        last = len(self.knots_ns) - 1
-        if after == 0 or after > last:
-            return self.is_lit[min(after, last)]
-        start_ns, end_ns = self.knots_ns[after - 1 : after + 1].tolist()
-        weight = (timestamp_ns - start_ns) / (end_ns - start_ns)
-        return (1 - weight) * self.is_lit[after - 1] + weight * self.is_lit[after]
+        before, after, weight = knots_around(self.knots_ns, timestamp_ns)
+        return (1 - weight) * self.is_lit[before] + weight * self.is_lit[after]
 
     def lit(self, gaussians: AnyGaussians, timestamp_ns: int) -> AnyGaussians:
         """The Gaussians in the light of their own lamps at a time; differentiable in colours."""

@@ -29,7 +29,6 @@ from lidarpainter_models.gaussians.model.seen_gaussians import AnyGaussians, Dra
 from lidarpainter_models.gaussians.model.sky import SkyTexture
 from lidarpainter_models.gaussians.model.spatial_blocks import View
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.kernels.backends import Backend
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
 
 
@@ -150,13 +149,11 @@ class DrawableScene:
     lens: Callable[[SceneRender], SceneRender] | None = None
     """What happens in the lens: the glare of lamps at night."""
 
-    def render(self, *, camera_name: str | None = None, backend: Backend = "auto") -> SceneRender:
+    @torch.no_grad()
+    def render(self, *, camera_name: str | None = None) -> SceneRender:
         """Draw it over its sky, with colours exposed as those of `camera_name`, if there is one."""
-        with torch.no_grad():
-            posed = self.posed
-            drawn = draw_over_sky(
-                self.gaussians, posed.bodies, self.sky, posed.camera, backend=backend
-            )
-            drawn = drawn if self.lens is None else self.lens(drawn)
-            rgb = self.exposure.apply(drawn.rgb, camera_name, posed.taken_ns)
-            return replace(drawn, rgb=rgb)
+        posed = self.posed
+        drawn = draw_over_sky(self.gaussians, posed.bodies, self.sky, posed.camera)
+        drawn = drawn if self.lens is None else self.lens(drawn)
+        rgb = self.exposure.apply(drawn.rgb, camera_name, posed.taken_ns)
+        return replace(drawn, rgb=rgb)

@@ -10,6 +10,7 @@ from lidarpainter_models.gaussians.fitting import fit as fit_module
 from lidarpainter_models.gaussians.fitting import learning_rates, step
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import (
+    DensificationConfig,
     FitConfig,
     GuidanceConfig,
     RefinementConfig,
@@ -18,7 +19,6 @@ from lidarpainter_models.gaussians.fitting.config import (
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.gaussians.fitting.images import full_image
 from lidarpainter_models.gaussians.fitting.learning_rates import LearningRates
-from lidarpainter_models.gaussians.fitting.number_of_gaussians import DensificationConfig
 from lidarpainter_models.gaussians.fitting.seen_surface import seen_surface
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import add_guidance_gradients, fit_step
@@ -140,7 +140,7 @@ def test_equal_fits_are_equal_bit_for_bit(world, undisturbed):
 
 @pytest.mark.parametrize("killed_at", [6, 15, 30])
 def test_resumed_fit_is_the_undisturbed_one_bit_for_bit(world, undisturbed, tmp_path, killed_at):
-    folder = CheckpointFolder(path=tmp_path, every_steps=5, every_seconds=None)
+    folder = CheckpointFolder(path=tmp_path, every_seconds=0.0)
     with pytest.raises(KilledError):
         fit_gaussians(
             world.observations, short_fit(), checkpoints=folder, progress=kill_at(killed_at)
@@ -151,7 +151,7 @@ def test_resumed_fit_is_the_undisturbed_one_bit_for_bit(world, undisturbed, tmp_
 
 
 def test_checkpoint_of_another_fit_is_refused(world, tmp_path):
-    mine = CheckpointFolder(path=tmp_path, identity="mine", every_steps=2, every_seconds=None)
+    mine = CheckpointFolder(path=tmp_path, identity="mine", every_seconds=0.0)
     with pytest.raises(KilledError):
         fit_gaussians(world.observations, short_fit(), checkpoints=mine, progress=kill_at(4))
     other = replace(mine, identity="other")

@@ -7,9 +7,12 @@ import torch
 from gaussian_world import FRAME_NS
 
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.gaussians.fitting.config import FitConfig, RefinementConfig
+from lidarpainter_models.gaussians.fitting.config import (
+    DensificationConfig,
+    FitConfig,
+    RefinementConfig,
+)
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
-from lidarpainter_models.gaussians.fitting.number_of_gaussians import DensificationConfig
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import add_guidance_gradients
 from lidarpainter_models.gaussians.initialisation import scene as first_scene
