@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lidarpainter_models.devices import on_device
 from lidarpainter_models.gaussians.model.seen_gaussians import AnyGaussians
 from lidarpainter_models.geometry.lattices import lattice_values
 
@@ -56,12 +57,7 @@ class Bending:
 
     def to(self, device: torch.device) -> "Bending":
         """The same on another device, but for the times."""
-        return replace(
-            self,
-            bodies=self.bodies.to(device),
-            size_m=self.size_m.to(device),
-            offset_m=self.offset_m.to(device),
-        )
+        return on_device(self, device, stays=("knots_ns",))
 
     def strain(self, timestamp_ns: int) -> Float[Tensor, ""]:
         """How far nodes are taken at a time, and how differently their neighbours; square metres.

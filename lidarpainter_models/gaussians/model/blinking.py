@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lidarpainter_models.devices import on_device
 from lidarpainter_models.gaussians.model.bending import knots_around
 from lidarpainter_models.gaussians.model.gaussian_set import SH_CONSTANT, GaussianSet
 from lidarpainter_models.gaussians.model.seen_gaussians import AnyGaussians
@@ -78,13 +79,7 @@ class Blinking:
 
     def to(self, device: torch.device) -> "Blinking":
         """The same on another device, but for what changes over time."""
-        return replace(
-            self,
-            bodies=self.bodies.to(device),
-            centre_m=self.centre_m.to(device),
-            size_m=self.size_m.to(device),
-            lit_rgb=self.lit_rgb.to(device),
-        )
+        return on_device(self, device, stays=("knots_ns", "is_lit"))
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything to be stored."""

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lidarpainter_models.devices import on_device
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.weather.mix import StyleMix, StyleShare
 
@@ -73,9 +74,9 @@ class StyledPlace:
         """Everything to be stored."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
-    def to(self, device: torch.device | str) -> "StyledPlace":
+    def to(self, device: torch.device) -> "StyledPlace":
         """The same on another device."""
-        return type(self)(**{name: value.to(device) for name, value in self.tensors().items()})
+        return on_device(self, device)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -93,7 +94,7 @@ class SceneStyle:
         """The strength of every style that changes anything at a time."""
         return self.mix.strengths(self.place.progress(timestamp_ns))
 
-    def to(self, device: torch.device | str) -> "SceneStyle":
+    def to(self, device: torch.device) -> "SceneStyle":
         """The same on another device."""
         return replace(self, place=self.place.to(device))
 
