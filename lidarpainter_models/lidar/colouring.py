@@ -191,12 +191,8 @@ class MapColouring:
     ) -> PointSamples:
         """What the recorded image of one of the views gives; nothing of hidden pixels.
 
-        Nothing is changed, so that images may be looked at beside each other.
-
-        Args:
-            view: which one.
-            image: as it was recorded.
-            hidden: what shows nothing of the map, on any grid over the image.
+        Nothing is changed, so that images may be looked at beside each other. `hidden` is on any
+        grid over the image.
         """
         actors = self._placed[view.key]
         image = _shrunk(image)

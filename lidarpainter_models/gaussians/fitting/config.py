@@ -114,10 +114,7 @@ class DensificationConfig:
     def allowed_now(self, num_gaussians: int, fraction: float, steps: int) -> int:
         """Return how many Gaussians there may be after a splitting: even steps up to the budget.
 
-        Args:
-            num_gaussians: there are now.
-            fraction: part of the fit that is done, 0 to 1.
-            steps: of the fit in all.
+        `fraction` is the part that is done, 0 to 1, of a fit of so many steps.
         """
         first = min(num_gaussians, self.budget)
         progress = (fraction - self.start) / max(self.stop - self.start, 1e-9)

@@ -157,11 +157,9 @@ def _begun(plan: FitPlan, inputs: _Inputs, start: GaussianScene | None) -> FitSt
 
 
 def _follow(plan: FitPlan, state: FitState, inputs: _Inputs) -> FitResult:
-    """Make all steps that are left."""
     cpu_before_s = time.process_time() - state.cpu_s
     config, views = plan.settings, inputs.observations.views
-    half_too = config.half_resolution > 0
-    full, half = fit_images(views, state.scene.sky.layout, half_too=half_too)
+    full, half = fit_images(views, state.scene.sky.layout, half_too=config.half_resolution > 0)
     guidance = inputs.guidance
     if plan.keeps_images:
         full, half = ([image.to(plan.device) for image in images] for images in (full, half))
@@ -224,7 +222,6 @@ def _advance(
 
 
 def _change_set(state: FitState, config: FitConfig) -> None:
-    """Split and prune when it is time."""
     settings, fraction = config.densification, state.fraction
     if state.step % settings.every or fraction < settings.start or state.step == state.steps:
         return
@@ -238,7 +235,6 @@ def _change_set(state: FitState, config: FitConfig) -> None:
 
 
 def _seek_lamps(state: FitState, images: Sequence[FitImage]) -> None:
-    """Look for lamps that go on and off when it is time."""
     if state.step < LAMPS_AT * state.steps:
         return
     cameras = [

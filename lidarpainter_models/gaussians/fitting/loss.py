@@ -60,14 +60,7 @@ def recorded_loss(
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "height width 3"]]:
     """Return the loss of a recorded view without its actors' term, and what the view shows.
 
-    Args:
-        splat: the drawn Gaussians.
-        sky_rgb: the sky behind them.
-        image: what was recorded; nothing is learnt from its hidden pixels.
-        facts: the same as floats.
-        weights: how much each term counts.
-        exposure: how the camera shows colours, if that is fitted.
-        perceptual: distance of images, where one has a weight.
+    Nothing is learnt from hidden pixels of the image, whose `facts` are the same as floats.
     """
     terms = pixel_terms(splat, sky_rgb, facts, RULES, exposure=exposure)
     shown = terms.shown
@@ -90,13 +83,6 @@ def painted_loss(
 
     What LiDAR hit is opaque there as on recorded views. The depth term alone is content with ever
     less of what is there, and wears away what recorded views do not hold.
-
-    Args:
-        splat: the drawn Gaussians.
-        sky_rgb: the sky behind them.
-        view: what was painted, and how far each pixel is trusted.
-        config: of the fit; its guidance and the weight of its sky count.
-        perceptual: distance of images, where one has a weight.
     """
     settings = config.guidance
     shown = splat.rgb + (1 - splat.alpha)[..., None] * sky_rgb

@@ -158,10 +158,7 @@ class Refinement:
     def step(self, step: int, fraction: float, image: FitImage) -> None:
         """Move the corrections that are refined by the gradients they received; drop these.
 
-        Args:
-            step: how many steps were made before.
-            fraction: which part of the fit these are, 0 to 1.
-            image: the recorded view of this step.
+        So many steps, a fraction of the fit, were made before this one of a recorded view.
         """
         if self.refines_cameras(step):
             table = self.scene.cameras.view_tangent
@@ -253,7 +250,6 @@ def pose_prior(
 
 
 def _gradient(table: Tensor) -> Tensor:
-    """Return the gradient that the backward pass left."""
     if table.grad is None:
         raise RuntimeError(f"no gradient reached a table of shape {tuple(table.shape)}")
     return table.grad

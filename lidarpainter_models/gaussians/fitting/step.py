@@ -53,15 +53,7 @@ def fit_step(
     config: FitConfig,
     perceptual: Perceptual | None,
 ) -> Float[Tensor, "2"]:
-    """Step everything by one recorded view and a painted one if it is given.
-
-    Args:
-        state: the running fit.
-        image: the recorded view.
-        row: its place among all of them.
-        guidance: a painted view and its place among all of them.
-        config: settings of the fit.
-        perceptual: distance of images, where one has a weight.
+    """Step everything by one recorded view and a painted one, if given; each at its place.
 
     Returns:
         The loss and the mean squared error of the recorded image, where the scene lies.
@@ -117,7 +109,6 @@ def _recorded_gradients(  # noqa: PLR0913 - what a step is made of
     perceptual: Perceptual | None,
     probe: Float[Tensor, "seen 1"] | None,
 ) -> _OfRecorded:
-    """Collect the gradients of a recorded view."""
     weights, sky = config.losses, state.scene.sky
     facts = image.facts()
     with_actors = _wants_actor_term(state, config)

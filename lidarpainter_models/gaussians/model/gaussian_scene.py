@@ -162,14 +162,9 @@ class GaussianScene:
     def refined_camera(
         self, view: TrainingView | RecordedView, camera: Camera | None = None
     ) -> Camera:
-        """The camera of a recorded view at its refined pose.
+        """The camera of a recorded view at its refined pose; see `CameraCorrections.refined`.
 
-        A training view has a pose of its own; at any other time it is blended from those of the
-        same camera (see `pose_blending`). A camera never trained on stays as it was recorded.
-
-        Args:
-            view: which view.
-            camera: its camera at another size; None takes the view's own.
+        `camera` is the view's at another size.
         """
         taken = view.camera if camera is None else camera
         return self.cameras.refined(taken, view.key, view.timestamp_ns)

@@ -35,14 +35,10 @@ from lidarpainter_models.kernels.gaussian_raster import SplatImage
 def gaussians_at(
     gaussians: AnyGaussians, actors: Actors, blinking: Blinking, timestamp_ns: int | None
 ) -> AnyGaussians:
-    """The Gaussians of a scene at a time, each still in the frame of its own body.
+    """Gaussians of a scene at a time, each still in the frame of its own body.
 
-    Args:
-        gaussians: those of the scene or some of them; differentiable in centres and colours.
-        actors: how they bend.
-        blinking: the lamps that light some of them.
-        timestamp_ns: when; None is for what holds many moments and cannot change Gaussians from
-            one to the next: lamps are lit as on average, and nobody bends.
+    Differentiable in centres and colours. None is for what holds many moments and cannot change
+    Gaussians from one to the next: lamps are lit as on average, and nobody bends.
     """
     if timestamp_ns is None:
         return blinking.lit_on_average(gaussians)
