@@ -117,10 +117,6 @@ def test_sweeps_that_met_nothing_give_no_points(frames):
     assert (len(nothing.street), nothing.actors) == (0, {})
 
 
-def test_no_parts_make_no_points():
-    assert len(MapPoints.concatenate([])) == 0
-
-
 def test_motion_goes_on_for_a_sweep_beyond_the_last_box(street):
     track = street.tracks[0]
     end_ns = int(track.timestamps_ns[-1])

@@ -13,7 +13,6 @@ from lidarpainter_models.gaussians.model.blinking import NUM_NODES, Blinking, wi
 from lidarpainter_models.gaussians.model.drawing import OPAQUE, draw_gaussians
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import SH_CONSTANT
-from lidarpainter_models.gaussians.model.seen_gaussians import SeenGaussians
 from lidarpainter_models.geometry.cameras import Camera
 
 LEAST_PX = 1.0
@@ -95,7 +94,7 @@ def lacking(
     harmonics = gaussians.sh.clone().requires_grad_(True)
     ones = torch.ones(len(gaussians), 1, device=scene.device, requires_grad=True)
     with torch.enable_grad():
-        coloured = SeenGaussians.of(gaussians, harmonics)
+        coloured = replace(gaussians, sh_dc=harmonics[:, :1], sh_rest=harmonics[:, 1:])
         drawn = draw_gaussians(coloured, posed.bodies, camera, channels=ones)
         alpha = drawn.alpha.detach()
         sky_rgb = scene.sky.sample(scene.sky.rays(camera, alpha < OPAQUE))

@@ -1,7 +1,5 @@
 """What a view's image does not show is left out of its next steps, and nothing else is."""
 
-import copy
-
 import pytest
 import torch
 from gaussian_world import HEIGHT_PX, WIDTH_PX, camera_at, round_gaussians, scene_of
@@ -213,13 +211,3 @@ def test_measuring_moves_nothing():
         state.step += 1
     for name, value in state.caught_up().gaussians.columns().items():
         torch.testing.assert_close(value.detach(), before[name], rtol=0, atol=1e-5)
-
-
-def test_a_fit_that_is_taken_up_again_leaves_out_the_same():
-    scene, camera, bodies = wall_and_what_is_behind()
-    state, config = begun(scene)
-    fit_step(state, image_of(camera), 0, None, config, None)
-    state.step += 1
-    again = FitState.resume(*copy.deepcopy(state.keep()), config, WIDTH_PX * HEIGHT_PX)
-    looks = {0: [(camera, bodies)]}
-    assert state.seen(looks).rows.tolist() == again.seen(looks).rows.tolist() == [0, 1, 3]

@@ -26,6 +26,7 @@ def test_numbers_left_open_follow_what_is_seen():
     assert planned.steps == 250
     assert planned.densification.budget == 100_000
     assert planned.initialisation.num_gaussians == round(START_SHARE * 100_000)
+    assert planned.learning_rates == CONFIG.learning_rates.over(100)
     longer = replace(SURFACE, num_detailed=800_000.0, whole_views=10.0)
     assert planned_settings(CONFIG, longer).steps == 1000
     assert planned_settings(CONFIG, longer).densification.budget == 400_000
