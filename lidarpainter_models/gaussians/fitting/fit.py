@@ -145,7 +145,9 @@ def _begun(plan: FitPlan, inputs: _Inputs, start: GaussianScene | None) -> FitSt
     """Return the fit as a checkpoint kept it, or before its first step."""
     kept = inputs.checkpoints.load() if inputs.checkpoints is not None else None
     if kept is not None:
-        return FitState.resume(*kept, plan.settings, plan.pixels_per_view, plan.device)
+        return FitState.resume(
+            *kept, plan.settings, plan.pixels_per_view, plan.device, inputs.perceptual
+        )
     if start is None:
         return_freed_memory()  # of what prepared the observations
         start = initialise_scene(
@@ -153,7 +155,9 @@ def _begun(plan: FitPlan, inputs: _Inputs, start: GaussianScene | None) -> FitSt
             plan.settings.initialisation,
             progress=lambda share: inputs.progress(FitProgress(plan=plan, placed=share)),
         )
-    return FitState.begin(start.to(plan.device), plan.settings, plan.pixels_per_view)
+    return FitState.begin(
+        start.to(plan.device), plan.settings, plan.pixels_per_view, inputs.perceptual
+    )
 
 
 def _follow(plan: FitPlan, state: FitState, inputs: _Inputs) -> FitResult:
@@ -168,7 +172,7 @@ def _follow(plan: FitPlan, state: FitState, inputs: _Inputs) -> FitResult:
     while state.step < state.steps:
         is_half = state.step < config.half_resolution * state.steps
         row = state.next_view(plan.surface.groups)
-        _advance(state, half if is_half else full, row, guidance, config, inputs.perceptual)
+        _advance(state, half if is_half else full, row, guidance)
         state.cpu_s = time.process_time() - cpu_before_s
         if state.step % config.log_every == 0 or state.step == state.steps:
             state.steps = clock.steps_in_time(state.step, state.steps)
@@ -195,24 +199,19 @@ def _tell(progress: Progress, plan: FitPlan, state: FitState) -> None:
 
 
 def _advance(
-    state: FitState,
-    images: Sequence[FitImage],
-    row: int,
-    guidance: Sequence[GuidanceView],
-    config: FitConfig,
-    perceptual: Perceptual | None,
+    state: FitState, images: Sequence[FitImage], row: int, guidance: Sequence[GuidanceView]
 ) -> None:
     """Make one step: gradients, optimisers, and at their times what changes the set."""
-    painted = None
+    painted, config = None, state.config
     takes_part = state.step < config.guidance.until * state.steps
     if guidance and takes_part and state.random() < config.guidance.probability:
         place = int(torch.randint(len(guidance), (), generator=state.generator))
         painted = (place, guidance[place].to(state.scene.device))
     image = images[row].to(state.scene.device)
-    told = fit_step(state, image, row, painted, config, perceptual)
+    told = fit_step(state, image, row, painted)
     state.step += 1
     state.recent.append(told)
-    _change_set(state, config)
+    _change_set(state)
     if config.refinement.lamps and not state.sought_lamps and not len(state.scene.blinking):
         _seek_lamps(state, images)
     if state.step % LIMITS_EVERY == 0:
@@ -221,8 +220,8 @@ def _advance(
         state.blocks.refresh(scene.gaussians)
 
 
-def _change_set(state: FitState, config: FitConfig) -> None:
-    settings, fraction = config.densification, state.fraction
+def _change_set(state: FitState) -> None:
+    settings, fraction = state.config.densification, state.fraction
     if state.step % settings.every or fraction < settings.start or state.step == state.steps:
         return
     sizes = [track.size_m for track in state.scene.actors.recorded_tracks]

@@ -46,11 +46,6 @@ class FitImage:
             rgb=self.rgb_u8.float() / 255, kind=self.kind, lidar_depth_m=self.lidar_depth_m
         )
 
-    @property
-    def is_open(self) -> Bool[Tensor, "height width"]:
-        """Pixels that may be sky without being in its mask."""
-        return self.kind == OPEN
-
 
 def fit_images(
     views: Sequence[TrainingView], sky: SkyLayout, *, half_too: bool

@@ -84,10 +84,6 @@ class Bending:
         rest = self.rigid(body)
         return replace(rest, bodies=rest.bodies - (rest.bodies > body).long())
 
-    def tensors(self) -> dict[str, Tensor]:
-        """Everything to be stored."""
-        return dict(vars(self))
-
     def weights_at(self, timestamp_ns: int) -> tuple[slice, list[float]]:
         """Which knots say how the nodes stand at a time, and how much each of them counts."""
         before, after, _ = knots_around(self.knots_ns, timestamp_ns)

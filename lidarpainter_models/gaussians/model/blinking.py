@@ -81,10 +81,6 @@ class Blinking:
         """The same on another device, but for what changes over time."""
         return on_device(self, device, stays=("knots_ns", "is_lit"))
 
-    def tensors(self) -> dict[str, Tensor]:
-        """Everything to be stored."""
-        return dict(vars(self))
-
     def kept(self, chosen: Bool[Tensor, " lamps"]) -> "Blinking":
         """Some of the lamps."""
         return replace(

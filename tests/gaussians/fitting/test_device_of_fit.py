@@ -91,7 +91,7 @@ def test_a_step_makes_the_host_wait_no_oftener_than_it_says(world, device, bent)
         views = 1 if guidance is None else 2
         at_everything = sum(state.hidden.is_due(view) for view in (0, ~0)[:views])
         waits.clear()
-        fit_step(state, image, 0, guidance, CONFIG, None)
+        fit_step(state, image, 0, guidance)
         state.step += 1
         # of plain torch: no other kernel runs on this device
         assert waits.total() <= WAITS + views * len(bent) + at_everything, waits

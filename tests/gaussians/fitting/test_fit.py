@@ -106,7 +106,7 @@ def test_a_step_sees_what_only_the_first_row_shows(world):
     read = as_read(world.scene.gaussians, bodies, view.camera, actors, view.timestamp_ns)
     shown = draw_gaussians(read, bodies, view.camera).visible
     state = FitState.begin(world.scene, short_fit(), WIDTH_PX * HEIGHT_PX)
-    fit_step(state, full_image(view), 0, None, short_fit(), None)
+    fit_step(state, full_image(view), 0)
     assert torch.equal(state.tally.visits > 0, shown)
 
 
@@ -179,10 +179,10 @@ def test_pose_refinement_recovers_a_known_rotation(world):
 
 def with_guidance_gradients(world, view, config, perceptual=None):
     """A state and its leaves after the gradients of one painted view."""
-    state = FitState.begin(world.scene, config, WIDTH_PX * HEIGHT_PX)
+    state = FitState.begin(world.scene, config, WIDTH_PX * HEIGHT_PX, perceptual)
     posed = state.scene.posed_in_fit(view.camera, view.timestamp_ns)
     seen = state.seen({~0: posed.looks()})
-    add_guidance_gradients(state, seen, view, posed, config, perceptual)
+    add_guidance_gradients(state, seen, view, posed)
     return state, seen
 
 
@@ -203,7 +203,7 @@ def test_the_threads_of_a_step_share_no_leaf(world, monkeypatch):
     monkeypatch.setattr(step, "both", one_after_the_other)
     state = FitState.begin(world.scene, short_fit(), WIDTH_PX * HEIGHT_PX)
     image = full_image(world.observations.views[0])
-    fit_step(state, image, 0, (0, painted_view(world)), short_fit(), None)
+    fit_step(state, image, 0, (0, painted_view(world)))
     ours, theirs = made
     for name, value in ours.values().items():
         assert getattr(ours, name) is not getattr(theirs, name)

@@ -171,16 +171,16 @@ def image_of(camera, **changes):
 
 def begun(scene):
     config = FitConfig(steps=100, refinement=RefinementConfig(start_step=100))
-    return FitState.begin(scene, config, WIDTH_PX * HEIGHT_PX), config
+    return FitState.begin(scene, config, WIDTH_PX * HEIGHT_PX)
 
 
 def test_steps_leave_out_what_is_behind_a_wall_until_everything_is_looked_at():
     scene, camera, bodies = wall_and_what_is_behind()
-    state, config = begun(scene)
+    state = begun(scene)
     looked_at = []
     for _ in range(FIRST_LOOKS[1] + 1):
         looked_at.append(len(state.seen({0: [(camera, bodies)]})))
-        fit_step(state, image_of(camera), 0, None, config, None)
+        fit_step(state, image_of(camera), 0)
         state.step += 1
     assert looked_at == [4, *[3] * (FIRST_LOOKS[1] - 1), 4]
     assert len(state.seen({1: [(camera, bodies)]})) == 4
@@ -188,14 +188,14 @@ def test_steps_leave_out_what_is_behind_a_wall_until_everything_is_looked_at():
 
 def test_a_painted_view_keeps_a_list_of_its_own():
     scene, camera, _ = wall_and_what_is_behind()
-    state, config = begun(scene)
+    state = begun(scene)
     aside = camera_at(1.0)
     whole = torch.ones(HEIGHT_PX, WIDTH_PX)
     painted = GuidanceView.of(
         aside, 0, rgb=whole[..., None].expand(-1, -1, 3), weight=whole, lidar_depth_m=0 * whole
     )
-    fit_step(state, image_of(camera), 0, None, config, None)
-    fit_step(state, image_of(camera), 0, (7, painted), config, None)
+    fit_step(state, image_of(camera), 0)
+    fit_step(state, image_of(camera), 0, (7, painted))
     assert state.hidden.looks == {0: 2, ~7: 1}
     assert state.hidden.left_out[0].tolist() == state.hidden.left_out[~7].tolist() == [2]
 
@@ -203,11 +203,11 @@ def test_a_painted_view_keeps_a_list_of_its_own():
 def test_measuring_moves_nothing():
     """Adam makes whole steps of the smallest gradient that stands alone."""
     scene, camera, _ = wall_and_what_is_behind()
-    state, config = begun(scene)
+    state = begun(scene)
     before = {name: value.clone() for name, value in scene.gaussians.columns().items()}
     everything = torch.ones(HEIGHT_PX, WIDTH_PX, dtype=torch.bool)
     for _ in range(3):
-        fit_step(state, image_of(camera, hidden=everything), 0, None, config, None)
+        fit_step(state, image_of(camera, hidden=everything), 0)
         state.step += 1
     for name, value in state.caught_up().gaussians.columns().items():
         torch.testing.assert_close(value.detach(), before[name], rtol=0, atol=1e-5)

@@ -58,7 +58,7 @@ def test_painted_views_leave_no_gradient_to_how_somebody_moves(world):
     state = FitState.begin(with_lattice(world.scene), config, painted.weight_u8.numel())
     posed = state.scene.posed_in_fit(view.camera, FRAME_NS)
     seen = state.seen({~0: posed.looks()})
-    add_guidance_gradients(state, seen, painted, posed, config)
+    add_guidance_gradients(state, seen, painted, posed)
     assert state.scene.actors.bending.offset_m.grad is None
 
 

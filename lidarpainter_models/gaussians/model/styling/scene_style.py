@@ -4,7 +4,7 @@ Everything else follows from the Gaussians as they are, so an edited scene keeps
 z up, metres; light is linear, in units of display white.
 """
 
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, get_args
 
 import torch
@@ -69,10 +69,6 @@ class StyledPlace:
         """Share of the log's time that has passed."""
         first_ns, last_ns = int(self.ego_times_ns[0]), int(self.ego_times_ns[-1])
         return (timestamp_ns - first_ns) / max(last_ns - first_ns, 1)
-
-    def tensors(self) -> dict[str, Tensor]:
-        """Everything to be stored."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def to(self, device: torch.device) -> "StyledPlace":
         """The same on another device."""
