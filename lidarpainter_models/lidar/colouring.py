@@ -139,7 +139,6 @@ EDGE_RAD = 0.004  # nearer surface within this angle spoils a sample: errors of 
 RIM_RAD = 0.008  # a surface that ends within this angle may show what is beyond it
 STANDING_BOX_SHARE = 0.85
 """Share of each side of a standing actor's box that hides what is behind it."""
-NEAR_M = 0.5  # points nearer to the camera plane than this are not sampled
 WIDTH_PX = 960  # images are shrunk to this width before they are sampled
 
 
@@ -200,9 +199,7 @@ class MapColouring:
         grid = CellGrid.over(camera, GRID_RAD)
         visibility = self._visibility(view, grid, camera)
         pieces = [PointsInView.none()]
-        for inside in points_in_view(
-            self._bodies, camera, view.timestamp_ns, actors, near_m=NEAR_M
-        ):
+        for inside in points_in_view(self._bodies, camera, view.timestamp_ns, actors):
             asked = inside.keep(self._may_gain(inside, camera))
             is_shown = _is_shown(asked, visibility, grid, hidden)
             pieces.append(asked.keep(is_shown.nonzero()[:, 0]))
@@ -216,7 +213,7 @@ class MapColouring:
     def _visibility(self, view: RecordedView, grid: CellGrid, camera: Camera) -> Visibility:
         """What stood before and around each cell when the image was taken."""
         actors = self._placed[view.key]
-        near = points_in_view(self._surfaces, camera, view.timestamp_ns, actors, near_m=NEAR_M)
+        near = points_in_view(self._surfaces, camera, view.timestamp_ns, actors)
         solid = [inside.keep(_is_solid(inside).nonzero()[:, 0]) for inside in near]
         return _visibility(PointsInView.joined([PointsInView.none(), *solid]), grid, actors)
 

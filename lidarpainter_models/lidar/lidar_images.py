@@ -50,7 +50,6 @@ GAP_WIDENING = 2.5  # discs grow by this factor where covered pixels surround a 
 GAP_DIRECTIONS = 6  # of the 8 directions, how many must meet covered pixels to make a gap
 GAP_DEPTH_RANGE = 0.15
 """The pixels met around a gap differ in depth by at most this share: one surface."""
-NEAR_M = 0.5  # points nearer to the camera plane than this are dropped
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -178,7 +177,6 @@ class _Projected(NamedTuple):
             camera.camera_from_world @ world_from_body.to(torch.float64),
             camera,
             stand_still=stand_still,
-            near_m=NEAR_M,
             margin_px=margin_px,
         )
         age_ns = (body.timestamp_ns.index_select(0, rows) - timestamp_ns).abs()

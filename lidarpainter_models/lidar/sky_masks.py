@@ -74,7 +74,7 @@ def sky_from_returns(
     sure &= _texture(image) < MOST_TEXTURE
     around_px = AROUND_RAD * camera.fx_px
     pieces = _large_pieces(sure, LEAST_AREA * sure.size)
-    sky = _like_the_largest(image, pieces, around_px, PIECE_TOLERANCE)
+    sky = _like_the_largest(image, pieces, around_px)
     candidates = above & (_grown(returns, 1) == 0)
     for _ in range(_GROWTH_ROUNDS):
         if not sky.any():
@@ -133,16 +133,14 @@ def _large_pieces(mask: np.ndarray, least_px: float) -> np.ndarray:
     return is_large[labels] if count > 1 else np.zeros_like(mask)
 
 
-def _like_the_largest(
-    image: np.ndarray, pieces: np.ndarray, sigma_px: float, tolerance: float
-) -> np.ndarray:
+def _like_the_largest(image: np.ndarray, pieces: np.ndarray, sigma_px: float) -> np.ndarray:
     """The largest connected piece, and those whose median colour continues it."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(pieces.astype(np.uint8))
     if count <= 2:
         return pieces
     largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
     differs = _differs(image, labels == largest, sigma_px)
-    alike = [np.median(differs[labels == label]) < tolerance for label in range(1, count)]
+    alike = [np.median(differs[labels == label]) < PIECE_TOLERANCE for label in range(1, count)]
     alike[largest - 1] = True
     return np.array([False, *alike])[labels]
 

@@ -7,9 +7,7 @@ from gaussian_world import camera_at
 
 from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.lidar.lidar_map import MapPoints
-from lidarpainter_models.lidar.points_in_view import Body, PointsInView, points_in_view
-
-NEAR_M = 0.5
+from lidarpainter_models.lidar.points_in_view import NEAR_M, Body, PointsInView, points_in_view
 
 
 def test_a_rolling_shutter_shows_the_points_that_it_reads_and_no_others():
@@ -31,9 +29,7 @@ def test_a_rolling_shutter_shows_the_points_that_it_reads_and_no_others():
     standing = at_once.contains(*at_once.project(xyz_m.double()), near_m=NEAR_M)
     assert bool((is_shown & ~standing).any())
     assert bool((standing & ~is_shown).any())
-    found = PointsInView.joined(
-        list(points_in_view([Body(None, points)], camera, 0, {}, near_m=NEAR_M))
-    )
+    found = PointsInView.joined(list(points_in_view([Body(None, points)], camera, 0, {})))
     assert torch.equal(found.rows, is_shown.nonzero()[:, 0])
     assert torch.allclose(found.pixels_uv.double(), pixels_uv[is_shown], atol=1e-3)
     assert torch.allclose(found.depth_m.double(), depth_m[is_shown], atol=1e-4)

@@ -177,13 +177,9 @@ class FitConfig:
 
 
 def continuation(
-    config: FitConfig,
-    *,
-    steps: int = 0,
-    looks: float | None = None,
-    guidance: GuidanceConfig | None = None,
+    config: FitConfig, *, looks: float | None = None, guidance: GuidanceConfig | None = None
 ) -> FitConfig:
-    """Return how a fit is continued from a fitted scene, for so many steps or looks.
+    """Return how a fit is continued from a fitted scene, for so many looks.
 
     Full images and actors free to move from the first step; growth and rates as in the first fit.
     Rates started lower held nothing better and took in a fifth less of what was painted. Cameras
@@ -193,7 +189,7 @@ def continuation(
     return replace(
         config,
         effort=replace(config.effort, looks=looks or config.effort.looks),
-        steps=steps,
+        steps=0,
         half_resolution=0.0,
         refinement=replace(config.refinement, cameras=False, lamps=False, start_step=0),
         guidance=guidance or config.guidance,

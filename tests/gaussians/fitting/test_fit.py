@@ -224,8 +224,8 @@ def test_gradients_of_both_views_count(world):
 
 
 def test_painted_views_pull_the_scene_towards_them(world):
-    guided = continuation(
-        short_fit(), steps=60, guidance=GuidanceConfig(probability=1.0, weight=3.0)
+    guided = replace(
+        continuation(short_fit(), guidance=GuidanceConfig(probability=1.0, weight=3.0)), steps=60
     )
     start = world.scene
     painted = painted_view(world)
@@ -239,8 +239,8 @@ def test_painted_views_pull_the_scene_towards_them(world):
 
 
 def test_painted_and_recorded_views_beside_each_other_make_the_fit_of_one_thread(world):
-    guided = continuation(
-        short_fit(), steps=20, guidance=GuidanceConfig(probability=1.0, weight=3.0)
+    guided = replace(
+        continuation(short_fit(), guidance=GuidanceConfig(probability=1.0, weight=3.0)), steps=20
     )
     before, fitted = numba.get_num_threads(), []
     try:
@@ -259,11 +259,11 @@ def test_painted_and_recorded_views_beside_each_other_make_the_fit_of_one_thread
 def test_the_last_steps_fit_recorded_views_alone(world):
     def fitted(until):
         guidance = GuidanceConfig(until=until, weight=3.0)
-        config = continuation(short_fit(), steps=20, guidance=guidance)
+        config = replace(continuation(short_fit(), guidance=guidance), steps=20)
         views = [painted_view(world)]
         return fit_gaussians(world.observations, config, start=world.scene, guidance=views).scene
 
-    unguided = continuation(short_fit(), steps=20)
+    unguided = replace(continuation(short_fit()), steps=20)
     alone = fit_gaussians(world.observations, unguided, start=world.scene).scene
     assert_same_scene(fitted(0.0), alone)
     some, all_along = fitted(0.5).gaussians.means, fitted(1.0).gaussians.means

@@ -6,6 +6,7 @@ from wall_images import image_of_wall, sideways_cameras
 
 from lidarpainter_models.gaussians.initialisation import unreached
 from lidarpainter_models.gaussians.initialisation.unreached import (
+    FARTHEST_M,
     depth_from_below,
     unreached_gaussians,
 )
@@ -16,8 +17,8 @@ from lidarpainter_models.observations.views import TrainingView
 
 def test_depth_goes_straight_up_over_gaps():
     depth_m = torch.tensor([[0.0, 0.0], [0.0, 7.0], [5.0, 0.0], [0.0, 0.0]])
-    filled = depth_from_below(depth_m, fallback_m=99.0)
-    assert filled.tolist() == [[5.0, 7.0], [5.0, 7.0], [5.0, 99.0], [99.0, 99.0]]
+    filled = depth_from_below(depth_m)
+    assert filled.tolist() == [[5.0, 7.0], [5.0, 7.0], [5.0, FARTHEST_M], [FARTHEST_M, FARTHEST_M]]
 
 
 def test_actors_are_where_they_were_when_a_late_image_was_taken():
