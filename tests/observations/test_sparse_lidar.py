@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from gaussian_world import bare_points
 from toy_street import CAR_X_M, SKY, ToyStreet, car_y_m
 from wall_drive import WALL_X_M, WallDrive
 
@@ -66,14 +67,8 @@ class LorryBeforeSky(SweptWall):
         return torch.cartesian_prod(x_m, along_m, z_m)
 
 
-def points(xyz_m, range_m=10.0):
-    count = len(xyz_m)
-    return MapPoints.uncoloured(
-        xyz_m=torch.tensor(xyz_m),
-        frame_index=torch.zeros(count, dtype=torch.int64),
-        timestamp_ns=torch.zeros(count, dtype=torch.int64),
-        range_m=torch.full((count,), range_m),
-    )
+def points(xyz_m):
+    return bare_points(torch.tensor(xyz_m), range_m=10.0)
 
 
 def every_tenth(sweep):

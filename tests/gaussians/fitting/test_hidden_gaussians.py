@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from gaussian_world import HEIGHT_PX, WIDTH_PX, camera_at, round_gaussians, scene_of
+from gaussian_world import HEIGHT_PX, WIDTH_PX, camera_at, round_gaussians, scene_of, training_view
 
 from lidarpainter_models.gaussians.fitting.config import FitConfig, RefinementConfig
 from lidarpainter_models.gaussians.fitting.hidden_gaussians import (
@@ -17,7 +17,7 @@ from lidarpainter_models.gaussians.fitting.images import full_image
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import fit_step
 from lidarpainter_models.gaussians.model.drawing import camera_from_body, draw_gaussians
-from lidarpainter_models.observations.views import GuidanceView, TrainingView
+from lidarpainter_models.observations.views import GuidanceView
 
 CPU = torch.device("cpu")
 SHOWN, HIDDEN = 10.0, 0.0
@@ -156,17 +156,8 @@ def test_a_probe_beside_the_actors_changes_no_image():
 
 
 def image_of(camera, **changes):
-    plain = torch.zeros(HEIGHT_PX, WIDTH_PX)
-    view = TrainingView(
-        key=(0, "front"),
-        camera=camera,
-        timestamp_ns=0,
-        rgb_u8=torch.full((HEIGHT_PX, WIDTH_PX, 3), 99, dtype=torch.uint8),
-        sky_mask=plain > 0,
-        lidar_depth_m=plain,
-        **changes,
-    )
-    return full_image(view)
+    grey = torch.full((HEIGHT_PX, WIDTH_PX, 3), 99, dtype=torch.uint8)
+    return full_image(training_view(camera, rgb_u8=grey, **changes))
 
 
 def begun(scene):

@@ -10,6 +10,7 @@ from gaussian_world import (
     car_track,
     map_points,
     scene_of,
+    training_view,
 )
 
 from lidarpainter_models.errors import ConfigError
@@ -33,7 +34,6 @@ from lidarpainter_models.gaussians.initialisation.surfels import (
 )
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 from lidarpainter_models.lidar.lidar_map import LidarMap
-from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.scenes.camera_faults import CameraFault
 
 
@@ -135,14 +135,7 @@ def test_a_wire_hides_no_tower_behind_it():
     surface = torch.zeros(64, 96, dtype=torch.bool)
     surface[row] = True
     surface[row - 15 :, 40:56] = True
-    view = TrainingView(
-        key=(0, "front"),
-        camera=camera,
-        timestamp_ns=0,
-        rgb_u8=torch.zeros(64, 96, 3, dtype=torch.uint8),
-        sky_mask=~surface,
-        lidar_depth_m=torch.zeros(64, 96),
-    )
+    view = training_view(camera, sky_mask=~surface)
     discs = surfels_from_points(wire_m, torch.full((7, 3), 0.3))
     within = within_outlines(discs, [view])
     tower = surface.clone()
