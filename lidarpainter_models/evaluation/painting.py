@@ -8,10 +8,10 @@ never count; for SSIM and features they show the target.
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import reduce
 from statistics import fmean, median
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -105,10 +105,6 @@ class PaintingScores:
     sources: dict[str, SourceScores]
     total: SourceScores
     """Over the pairs of all sources."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """The figures as JSON types."""
-        return asdict(self)
 
 
 def score_painter(

@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.geometry.cameras import Camera
 
 _GROWTH_ROUNDS = 3
@@ -52,19 +51,7 @@ def sky_from_returns(
     has_return: Bool[Tensor, "height width"],
     camera: Camera,
 ) -> Bool[Tensor, "height width"]:
-    """Sky in an image whose LiDAR returns are known.
-
-    The camera is on the same grid; the world's z is up.
-
-    Raises:
-        ShapeError: image, returns and camera differ in size.
-    """
-    size = (camera.height_px, camera.width_px)
-    if tuple(rgb_u8.shape) != (*size, 3) or tuple(has_return.shape) != size:
-        raise ShapeError(
-            f"need image and returns of {size}, got {tuple(rgb_u8.shape)} and "
-            f"{tuple(has_return.shape)}"
-        )
+    """Sky in an image whose LiDAR returns are known; the camera is on the same grid."""
     image, returns = rgb_u8.numpy(), has_return.numpy().astype(np.uint8)
     above = _elevation(camera) > LEAST_ELEVATION_RAD
     clear_px = max(1, round(CLEAR_RAD * camera.fx_px))
