@@ -26,6 +26,13 @@ def shown_by(
     return partial(shown_scene, this.store, fitted, config.conditions, painter, this.device)
 
 
+def painted_by(
+    this: OpenedRun, fitted: FittedRef, conditions: ConditionConfig
+) -> Callable[[], ViewTimePainting]:
+    """Gathers what the run's painter needs to paint a fitted scene at view time."""
+    return partial(view_time_painting, this.store, fitted, conditions, this.painter, this.device)
+
+
 def shown_scene(
     store: Store,
     fitted: FittedRef,

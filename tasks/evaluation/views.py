@@ -19,7 +19,7 @@ from lidarpainter_models.evaluation.score_tables import FLICKER, Scores
 from lidarpainter_models.evaluation.settings import EvaluationConfig
 from lidarpainter_models.evaluation.shown import ShownScene, ViewTimePainting
 from lidarpainter_models.evaluation.strips import StripEvaluation
-from tasks.evaluation.shown import shown_by, view_time_painting
+from tasks.evaluation.shown import painted_by, shown_by
 from tasks.json_files import read_json, write_json
 from tasks.opened import OpenedRun, opened
 from tasks.progress import Progress
@@ -125,14 +125,7 @@ def evaluate_flicker(
                 shifts=shifts,
                 previous=previous,
             ),
-            painting=partial(
-                view_time_painting,
-                this.store,
-                fitted,
-                config.conditions,
-                this.painter,
-                this.device,
-            ),
+            painting=painted_by(this, fitted, config.conditions),
         ),
     )
 

@@ -9,7 +9,7 @@ those of `refinement`.
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.gaussians.fitting.config import FitConfig, FitLossWeights
@@ -102,19 +102,15 @@ def painted_loss(
 
 
 def actor_loss(splat: SplatImage, posed: PosedScene) -> Float[Tensor, ""]:
-    """Return how far actors show outside their projected boxes; the splat has their channel."""
+    """Return how far actors show outside their projected boxes; the splat has their channel.
+
+    The mean of -log(1 - alpha) of the actors outside, of the entropy of alpha inside.
+    """
     world_from_actors, present = posed.poses
     sizes = [track.size_m for track in posed.actors.recorded_tracks]
     in_boxes = project_boxes(posed.camera, world_from_actors.detach(), sizes, present > 0)
     in_boxes = in_boxes.to(splat.alpha.device, non_blocking=True)
-    return actor_boundary_loss(splat.features[..., 0], in_boxes)
-
-
-def actor_boundary_loss(
-    actor_alpha: Float[Tensor, "height width"], in_boxes: Bool[Tensor, "height width"]
-) -> Float[Tensor, ""]:
-    """Return the mean of -log(1 - actor_alpha) outside projected boxes, of its entropy inside."""
-    inside = actor_alpha.clamp(_EDGE, 1 - _EDGE)
+    inside = splat.features[..., 0].clamp(_EDGE, 1 - _EDGE)
     log_clear = torch.log1p(-inside)
     entropy = -(inside * inside.log() + (1 - inside) * log_clear)
     return torch.where(in_boxes, entropy, -log_clear).mean()
