@@ -10,9 +10,7 @@ from flows.parameters import ViewParameters, view_parameters
 from lidarpainter_models.conditioning.settings import SequenceConfig
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.evaluation.score_tables import FLICKER, Scores, fitted_on, flicker_by_image
-from tasks.evaluation.flicker import evaluate_flicker
-from tasks.evaluation.strips import evaluate_strips
-from tasks.evaluation.views import evaluate, load_scores
+from tasks.evaluation.views import evaluate, evaluate_flicker, evaluate_strips, load_scores
 from tasks.reconstruction.publish import record_scores
 from tasks.runs import FinishedRun, open_run
 from tasks.specs import FittedRef

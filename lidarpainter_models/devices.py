@@ -3,8 +3,9 @@
 import ctypes
 import os
 import re
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Literal, TypeVar
+from collections.abc import Callable, Collection
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from lidarpainter_models.errors import ConfigError, DeviceMemoryError
 
@@ -85,3 +86,18 @@ def return_freed_memory() -> None:
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
     if trim is not None:
         trim(0)
+
+
+def on_device(value: Made, device: "torch.device", *, stays: Collection[str] = ()) -> Made:
+    """A dataclass with its tensors on another device, but for the fields that are to stay."""
+    import torch
+
+    found: Any = value
+    columns = {part.name: getattr(found, part.name) for part in fields(found)}
+    is_late = device.type != "cpu"  # what is copied to the host must be whole when it is read
+    sent = {
+        name: column.to(device, non_blocking=is_late)
+        for name, column in columns.items()
+        if isinstance(column, torch.Tensor) and name not in stays
+    }
+    return replace(found, **sent)

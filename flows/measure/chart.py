@@ -8,7 +8,7 @@ from typing import Any
 from catalog.points import Point
 from flows.measure.configurations import DEFAULT, Factor
 from flows.measure.figures import COSTS, LABELS, QUALITIES, Group, groups_of
-from lidarpainter_models.evaluation.fronts import Gain, beats, knee, paired_gain, pareto_front
+from lidarpainter_models.evaluation.fronts import Spread, beats, knee, paired_gain, pareto_front
 from lidarpainter_models.export.charts import Chart, Mark, draw_chart, write_chart_page
 
 DRAWN = ("recorded_psnr", "aside_psnr", "aside_depth")
@@ -126,11 +126,11 @@ def _returns(groups: Sequence[Group], factor: Factor, quality: str) -> list[str]
     return says
 
 
-def _gain(after: Group, before: Group, quality: str) -> Gain:
+def _gain(after: Group, before: Group, quality: str) -> Spread:
     seeds = sorted(after.trials.keys() & before.trials.keys())
     ours, theirs = ([one.trials[seed][quality] for seed in seeds] for one in (after, before))
     return paired_gain(ours, theirs)
 
 
-def _told(gain: Gain) -> str:
+def _told(gain: Spread) -> str:
     return f"{gain.mean:+.3g}{'' if gain.is_sure else ' (within the noise)'}"

@@ -60,11 +60,9 @@ def judged_frames(held_out: HeldOut, gatherer: EvidenceGatherer) -> Iterator[Jud
     return side_by_side(judged, showing, scene.device)
 
 
-def predicted_and_measured(
-    frames: Iterable[JudgedFrame], calibration: Calibration = BUNDLED
-) -> list[tuple[float, float]]:
-    """PSNR of each frame as predicted, and as it is."""
-    return [(calibration.of(frame.evidence).predicted_db, frame.psnr_db) for frame in frames]
+def predicted_and_measured(frames: Iterable[JudgedFrame]) -> list[tuple[float, float]]:
+    """PSNR of each frame as predicted by `BUNDLED`, and as it is."""
+    return [(BUNDLED.of(frame.evidence).predicted_db, frame.psnr_db) for frame in frames]
 
 
 def what_frames_say(held_out_db: Sequence[tuple[float, float]]) -> dict[str, Any]:

@@ -113,16 +113,6 @@ class MovedViews:
         )
         return moved if has_room(novel, builder.lidar_map, builder.boxes) else None
 
-    def said(
-        self, view: RecordedView, step: ConstantStep, calibration: Calibration
-    ) -> FrameConfidence | None:
-        """What is said about the frame there; None where nobody can stand."""
-        camera = self.camera(view, step)
-        if camera is None:
-            return None
-        name = view.camera_name
-        return calibration.of(self.gatherer.of(camera, view.timestamp_ns, name))
-
 
 def trust_envelope(
     views: MovedViews,
@@ -215,10 +205,12 @@ class _Walk:
         return said is not None and said.is_promised
 
     def _said(self, view: RecordedView, step: ConstantStep) -> FrameConfidence | None:
-        found = self._views.said(view, step, self._calibration)
-        if found is not None:
-            self.said.append(found)
-        return found
+        camera = self._views.camera(view, step)
+        if camera is None:
+            return None
+        evidence = self._views.gatherer.of(camera, view.timestamp_ns, view.camera_name)
+        self.said.append(self._calibration.of(evidence))
+        return self.said[-1]
 
 
 def _moments(

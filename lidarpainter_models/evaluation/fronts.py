@@ -30,30 +30,15 @@ class Spread:
         reach = float(t.ppf((1 + CONFIDENCE) / 2, len(values) - 1))
         return cls(float(np.mean(values)), reach * error)
 
-
-@dataclass(frozen=True, slots=True)
-class Gain:
-    """How much more one way gives than another, over pairs of equal scene and seed."""
-
-    mean: float
-    low: float
-    high: float
-    """The 95 % interval."""
-
     @property
     def is_sure(self) -> bool:
         """Whether the interval leaves zero out."""
-        return self.low > 0 or self.high < 0
+        return abs(self.mean) > self.half_width
 
 
-def paired_gain(ours: Sequence[float], theirs: Sequence[float]) -> Gain:
-    """The mean difference of pairs and its interval (paired t)."""
-    difference = Spread.of(np.subtract(ours, theirs).tolist())
-    return Gain(
-        difference.mean,
-        difference.mean - difference.half_width,
-        difference.mean + difference.half_width,
-    )
+def paired_gain(ours: Sequence[float], theirs: Sequence[float]) -> Spread:
+    """How much more one way gives than another, over pairs of equal scene and seed (paired t)."""
+    return Spread.of(np.subtract(ours, theirs).tolist())
 
 
 def pareto_front(costs: Sequence[float], qualities: Sequence[float]) -> list[int]:

@@ -183,8 +183,8 @@ def hold_back(
     """Part the pairs into those to learn from and those to judge by; no target is in both.
 
     Of every folder's targets the same share is held back, chosen by a digest of their names, so
-    neither the order nor the other folders matter. The share is in [0, 1). Targets `known` from
-    before judge nothing if they are held back.
+    neither the order nor the other folders matter. Targets `known` from before judge nothing if
+    they are held back.
 
     Returns:
         Pairs to learn from and pairs to judge by, by name; empty sets are left out.

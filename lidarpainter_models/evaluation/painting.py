@@ -7,10 +7,11 @@ never count; for SSIM and features they show the target.
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from functools import reduce
 from statistics import fmean, median
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -105,10 +106,6 @@ class PaintingScores:
     total: SourceScores
     """Over the pairs of all sources."""
 
-    def to_dict(self) -> dict[str, Any]:
-        """The figures as JSON types."""
-        return asdict(self)
-
 
 def score_painter(
     painter: Painter,
@@ -126,8 +123,8 @@ def score_painter(
     tallies: dict[str, _SourceTally] = {}
     for name, source in sources.items():
         tally = tallies[name] = _SourceTally()
-        for pair in _pairs_of(source):
-            _score_pair(painter, pair, tally, feature_distance)
+        for index in range(len(source)):
+            _score_pair(painter, source.read(index), tally, feature_distance)
             done += 1
             if progress is not None:
                 progress(done, num_pairs)
@@ -138,7 +135,7 @@ def score_painter(
     return PaintingScores(
         painter=painter.name,
         sources={name: tally.scores() for name, tally in tallies.items()},
-        total=_joined(list(tallies.values())).scores(),
+        total=reduce(_joined, tallies.values()).scores(),
     )
 
 
@@ -251,9 +248,7 @@ class _SourceTally:
         )
 
 
-def _pairs_of(source: ScoringPairs) -> Iterator[PaintingPair]:
-    for index in range(len(source)):
-        yield source.read(index)
+_Tally = TypeVar("_Tally", _ImageTally, _SourceTally)
 
 
 def _score_pair(
@@ -283,30 +278,14 @@ def _score_pair(
         one.add(image, pair, damaged, feature_distance)
 
 
-def _joined(tallies: Sequence[_SourceTally]) -> _SourceTally:
-    """One tally over the pairs of several sources."""
-    return _SourceTally(
-        input=_joined_images([tally.input for tally in tallies]),
-        warp_mean=_joined_images([tally.warp_mean for tally in tallies]),
-        painted=_joined_images([tally.painted for tally in tallies]),
-        num_known=sum(tally.num_known for tally in tallies),
-        num_damaged=sum(tally.num_damaged for tally in tallies),
-        num_right=torch.stack([tally.num_right for tally in tallies]).sum(dim=0),
-        num_wrong=torch.stack([tally.num_wrong for tally in tallies]).sum(dim=0),
-        cpu_s=[seconds for tally in tallies for seconds in tally.cpu_s],
-        kept_shares=[share for tally in tallies for share in tally.kept_shares],
-    )
-
-
-def _joined_images(tallies: Sequence[_ImageTally]) -> _ImageTally:
-    return _ImageTally(
-        psnr=[value for tally in tallies for value in tally.psnr],
-        ssim=[value for tally in tallies for value in tally.ssim],
-        feature_distance=[value for tally in tallies for value in tally.feature_distance],
-        damaged_error=sum(tally.damaged_error for tally in tallies),
-        undamaged_error=sum(tally.undamaged_error for tally in tallies),
-        num_outside=sum(tally.num_outside for tally in tallies),
-    )
+def _joined(first: _Tally, second: _Tally) -> _Tally:
+    """Everything counted in either: sums, and lists one after the other."""
+    found = {}
+    for part in fields(first):
+        one, other = getattr(first, part.name), getattr(second, part.name)
+        is_tally = isinstance(one, _ImageTally)
+        found[part.name] = _joined(one, other) if is_tally else one + other
+    return replace(first, **found)
 
 
 def _absolute_error(

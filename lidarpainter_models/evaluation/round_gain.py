@@ -43,14 +43,7 @@ def round_gain(
     observations: SceneObservations,
     guidance: Sequence[GuidanceView],
 ) -> RoundGain:
-    """What a round gained.
-
-    Args:
-        before: the scene that the views were painted of.
-        after: the one that was fitted on with them.
-        observations: what was recorded.
-        guidance: painted views, one at least.
-    """
+    """What a scene gained by being fitted on with views, one at least, that were painted of it."""
     chosen = evenly_taken(guidance, MOST_VIEWS)
     views = [(view.camera, view.timestamp_ns) for view in chosen[::2]]
     views += [(_halfway(view, observations.views), view.timestamp_ns) for view in chosen[1::2]]

@@ -1,30 +1,40 @@
-"""Every figure of one fitted scene under one way of rendering it, camera by camera."""
+"""Every figure of one fitted scene under one way of rendering it, camera by camera.
+
+Each figure stands under the truth that it was taken against.
+"""
 
 import itertools
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache, partial
 from typing import Any
 
+from jaxtyping import Float
+from torch import Tensor
+
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.scene_scores import (
-    score_geometry,
-    score_recorded,
-    score_synthetic,
-)
 from lidarpainter_models.evaluation.score_tables import DEPTH, Scores
 from lidarpainter_models.evaluation.settings import EvaluationConfig
 from lidarpainter_models.evaluation.shown import ShownScene
+from lidarpainter_models.evaluation.view_scores import ScoredView, ViewScores, score_views
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
+from lidarpainter_models.geometry.shifts import Shift
+from lidarpainter_models.kernels.side_by_side import side_by_side
+from lidarpainter_models.lidar.sparse_depth import FramePoints
+from lidarpainter_models.metrics.depth import DepthScores, pooled_inlier_fraction, score_depth
 from lidarpainter_models.metrics.images import psnr_from_error
 from lidarpainter_models.metrics.perceptual import PerceptualDistances, load_distances
 from lidarpainter_models.scenes.driving_scene import DrivingScene
+from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.synthetic.street import SyntheticStreet
 
 GENERATOR_ENTRY = "generator"
 """Entry of a scene's manifest by which the synthetic street is built again."""
 NO_IMAGES = "nobody took images there"
 NO_INCEPTION = "Inception weights are user-supplied and none were given"
+Scored = Callable[[Sequence[ScoredView]], ViewScores | None]
+"""Renders views as the judged scene is shown and scores them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,15 +84,76 @@ class SceneEvaluation:
         shifts = self.config.scoring.shifts
         views = [view for view in held_out.test_views if view.camera_name == name]
         part = replace(held_out, test_views=views)
-        fitted = shown.scene
+        fitted, street = shown.scene, known_street(part.scene)
         render = shown.renderer(name)
-        recorded = score_recorded(render, part, fitted, distances=distances, told=told)
-        street = known_street(part.scene)
+        scored = partial(score_views, render, distances=distances, device=fitted.device, told=told)
+        recorded = score_recorded(scored, part, fitted)
         if street is None:
             return recorded, {shift.name: _unknown(len(views)) for shift in shifts}
-        return recorded, score_synthetic(
-            render, part, fitted, street, shifts, distances=distances, told=told
-        )
+        return recorded, score_synthetic(scored, part, fitted, street, shifts)
+
+
+def _view_scores(scores: ViewScores | None) -> dict[str, Any]:
+    """Scores as the report's JSON names them; absent perceptual figures say why."""
+    if scores is None:
+        return {"psnr": None, "ssim": None, "num_views": 0}
+    found = asdict(scores)
+    if scores.lpips is not None:
+        found.pop("lpips_reason")
+    return found
+
+
+def score_recorded(scored: Scored, held_out: HeldOut, fitted: GaussianScene) -> dict[str, Any]:
+    """Held-out images with interpolated poses, and beside them with recorded poses."""
+    interpolated = scored(held_out.recorded_views(fitted, "interpolated"))
+    recorded = scored(held_out.recorded_views(fitted, "recorded"))
+    return {**_view_scores(interpolated), "recorded_poses": _view_scores(recorded)}
+
+
+def score_synthetic(
+    scored: Scored,
+    held_out: HeldOut,
+    fitted: GaussianScene,
+    street: SyntheticStreet,
+    shifts: Sequence[Shift],
+) -> dict[str, Any]:
+    """Exact truth beside the path, per trajectory."""
+    return {
+        shift.name: _view_scores(scored(held_out.synthetic_views(fitted, street, shift)))
+        for shift in shifts
+    }
+
+
+def score_geometry(
+    held_out: HeldOut,
+    fitted: GaussianScene,
+    shifts: Sequence[Shift],
+    *,
+    told: Callable[[], None],
+) -> dict[str, float | None]:
+    """Part of held-out LiDAR pixels that the rendered depth meets within 5 %, per trajectory.
+
+    `told` is called after every render.
+    """
+    moves = {shift.name: shift for shift in (Shift(), *shifts)}
+    scores: dict[str, list[DepthScores]] = {name: [] for name in moves}
+    lidar = FramePoints(held_out.scene)
+
+    def scored(seen: tuple[RecordedView, Float[Tensor, "points 3"]]) -> dict[str, DepthScores]:
+        view, points = seen
+        found = {}
+        for name, shift in moves.items():
+            camera = held_out.shifted_camera(fitted, view, shift)
+            depth_m = fitted.render(camera, view.timestamp_ns).depth_m.cpu()
+            found[name] = score_depth(depth_m, camera, points)
+        return found
+
+    views = ((view, lidar.at_exposure(view)) for view in held_out.test_views)
+    for found in side_by_side(scored, views, fitted.device):
+        for name, score in found.items():
+            scores[name].append(score)
+            told()
+    return {name: pooled_inlier_fraction(found) for name, found in scores.items()}
 
 
 @lru_cache(maxsize=1)

@@ -6,8 +6,10 @@ about half a degree) and an affine colour (exposures differ). Then held-out fram
 the strip: pixels whose LiDAR surface the fitted camera sees as well.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,9 +19,18 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from lidarpainter_models.errors import DataError
+from lidarpainter_models.evaluation.held_out import HeldOut
+from lidarpainter_models.evaluation.shown import ShownScene
+from lidarpainter_models.evaluation.view_scores import Renderer
+from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.geometry.transforms import rigid_from_tangent, rotation_from_vector
+from lidarpainter_models.geometry.transforms import (
+    invert_rigid,
+    rigid_from_tangent,
+    rotation_from_vector,
+)
 from lidarpainter_models.kernels.point_splat import splat_points
+from lidarpainter_models.lidar.sparse_depth import FramePoints
 from lidarpainter_models.metrics.depth import visible_points
 from lidarpainter_models.metrics.images import (
     MIN_PIXELS,
@@ -28,6 +39,8 @@ from lidarpainter_models.metrics.images import (
     psnr_from_error,
     squared_error,
 )
+from lidarpainter_models.observations.fit_size import fit_camera
+from lidarpainter_models.scenes.splits import ViewSplit, evenly_taken
 
 GROW_PX = 1
 """The strip mask is grown by this much around its LiDAR pixels."""
@@ -37,6 +50,8 @@ DIFFERENCE_STEP_RAD = 5e-4
 """Slopes are taken over about a quarter pixel: bilinear images are not smooth below that."""
 MAX_ROTATION_RAD = 0.03
 """A fitted rotation at this bound means that the fit failed."""
+COMPARED_FRAMES = 3
+"""Frames in which a judging camera looks for its neighbour: the rig does not change."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,9 +119,7 @@ def strip_mask(view: StripView) -> Bool[Tensor, "height width"]:
     return torch.from_numpy(cv2.dilate(mask, kernel).astype(bool))
 
 
-def render_at_fitted_detail(
-    render: Callable[[Camera, int], Tensor], view: StripView
-) -> Float[Tensor, "height width 3"]:
+def render_at_fitted_detail(render: Renderer, view: StripView) -> Float[Tensor, "height width 3"]:
     """Render the judging camera, box-averaged from about as many pixels a degree as were fitted.
 
     Gaussians are made for the pixels they were fitted to: finer ones cost 1.5 dB (a synthetic
@@ -139,9 +152,7 @@ def rotate_image(
     )
 
 
-def calibrate_strip(
-    render: Callable[[Camera, int], Tensor], views: Sequence[StripView]
-) -> StripCalibration:
+def calibrate_strip(render: Renderer, views: Sequence[StripView]) -> StripCalibration:
     """Fit one rotation and one affine colour on training frames.
 
     Raises:
@@ -181,13 +192,12 @@ def calibrate_strip(
     affine = fit_affine_colour(turned_pixels(best.x), truth)
     about_x, about_y, about_z = best.x.tolist()
     return StripCalibration(
-        rotation_rad=(about_x, about_y, about_z),
-        affine=tuple(tuple(float(value) for value in row) for row in affine),
+        rotation_rad=(about_x, about_y, about_z), affine=tuple(map(tuple, affine.tolist()))
     )
 
 
 def score_strips(
-    render: Callable[[Camera, int], Tensor],
+    render: Renderer,
     views: Sequence[StripView],
     calibration: StripCalibration,
 ) -> StripScores:
@@ -220,3 +230,104 @@ def score_strips(
         num_pixels=num_pixels,
         calibration=calibration,
     )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StripEvaluation:
+    """How fitted scenes are held against the cameras that their fit did not see."""
+
+    held_out: HeldOut
+    views: ViewSplit
+
+    @property
+    def fitted_cameras(self) -> tuple[str, ...]:
+        """The scene's cameras that the fit has seen."""
+        fitted = {view.camera_name for view in self.views.train}
+        return tuple(name for name in self.held_out.scene.camera_names if name in fitted)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The scene's cameras that no fit has seen."""
+        fitted = self.fitted_cameras
+        return tuple(name for name in self.held_out.scene.camera_names if name not in fitted)
+
+    def scores(self, shown: ShownScene, progress: Callable[[int, int], None]) -> dict[str, Any]:
+        """Every camera's scores in the colours of its neighbour, or why there are none."""
+        scores = {}
+        for done, name in enumerate(self.cameras, start=1):
+            scores[name] = self._score(shown, name)
+            progress(done, len(self.cameras))
+        return scores
+
+    def neighbour(self, fitted: GaussianScene, camera: str) -> str:
+        """The fitted camera that sees most of what a judging camera sees, in a few frames."""
+        frames = tuple(evenly_taken(self.views.train_frames, COMPARED_FRAMES))
+
+        def num_shared(name: str) -> int:
+            views = strip_views(
+                self.held_out, fitted, judging_camera=camera, fitted_camera=name, frames=frames
+            )
+            return sum(int(strip_mask(view).sum()) for view in views)
+
+        return max(self.fitted_cameras, key=num_shared)
+
+    def _score(self, shown: ShownScene, camera: str) -> dict[str, Any]:
+        neighbour = self.neighbour(shown.scene, camera)
+        shows = shown.renderer(neighbour)
+
+        def render(camera: Camera, timestamp_ns: int) -> Float[Tensor, "height width 3"]:
+            return shows(camera, timestamp_ns).cpu()  # strips are cut and turned there
+
+        views_of = partial(
+            strip_views,
+            self.held_out,
+            shown.scene,
+            judging_camera=camera,
+            fitted_camera=neighbour,
+        )
+        try:
+            calibration = calibrate_strip(render, views_of(frames=self.views.train_frames))
+            scores = score_strips(render, views_of(frames=self.views.test_frames), calibration)
+        except DataError as error:
+            return {"psnr": None, "psnr_reason": str(error), "fitted_camera": neighbour}
+        return asdict(scores) | {"fitted_camera": neighbour}
+
+
+def strip_views(
+    held_out: HeldOut,
+    fitted: GaussianScene,
+    *,
+    judging_camera: str,
+    fitted_camera: str,
+    frames: Iterable[int],
+) -> list[StripView]:
+    """One camera's images at some frames, beside the fitted camera of the same frames.
+
+    The fitted camera stands where the fit found it: at its own pose in training frames, between
+    its neighbours' in others. The judging camera, at fit size, rides on the same rig: it stands
+    where the log says, moved as the fit moved the other camera, for the jitter of logged poses is
+    the rig's. Frames that one of the two lacks, or that have no sweep, are left out.
+    """
+    scene, lidar = held_out.scene, FramePoints(held_out.scene)
+    judging = {view.frame_index: view for view in scene.views_of(judging_camera)}
+    fitting = {view.frame_index: view for view in scene.views_of(fitted_camera)}
+    views = []
+    for frame in frames:
+        if frame not in judging or frame not in fitting or not scene.sweeps_of(frame):
+            continue
+        own, other = judging[frame], fitting[frame]
+        logged = fit_camera(other, held_out.observation)
+        found = fitted.refined_camera(other, logged)
+        found_from_logged = found.world_from_camera @ invert_rigid(logged.world_from_camera)
+        camera = fit_camera(own, held_out.observation)
+        camera = camera.refined(found_from_logged @ camera.world_from_camera)
+        views.append(
+            StripView(
+                camera=camera,
+                timestamp_ns=own.timestamp_ns,
+                truth_rgb=held_out.image_of(own),
+                fitted_camera=found,
+                points_world=lidar.at_exposure(own),
+            )
+        )
+    return views

@@ -133,14 +133,10 @@ def calibrated(
     names: Sequence[str],
     record: str,
 ) -> Calibration:
-    """Fit the numbers to frames whose truth is known.
+    """Fit the numbers to frames whose PSNR against the true image is known.
 
-    Args:
-        evidence: of every frame.
-        psnr_db: of every frame against its true image.
-        streets: which street each frame is of; no street is predicted by weights that saw it.
-        names: the parts of the evidence that count.
-        record: what the frames were.
+    No street is predicted by weights that saw it. The named parts of the evidence count; `record`
+    says what the frames were.
     """
     measured = np.array([[getattr(one, name) for name in names] for one in evidence])
     truth, groups = np.asarray(psnr_db, float), np.asarray(streets)
@@ -160,16 +156,14 @@ def calibrated(
     )
 
 
-def expected_calibration_error(
-    confidences: Sequence[float], is_good: Sequence[bool], *, num_bins: int = NUM_BINS
-) -> float:
+def expected_calibration_error(confidences: Sequence[float], is_good: Sequence[bool]) -> float:
     """Mean distance of confidence from the share of good frames, over bins of equal width.
 
     Guo et al., "On calibration of modern neural networks" (2017); each bin counts by its frames.
     """
     said, true = np.asarray(confidences, float), np.asarray(is_good, float)
-    place = np.minimum((said * num_bins).astype(int), num_bins - 1)
-    gaps = [abs(said[place == one].sum() - true[place == one].sum()) for one in range(num_bins)]
+    place = np.minimum((said * NUM_BINS).astype(int), NUM_BINS - 1)
+    gaps = [abs(said[place == one].sum() - true[place == one].sum()) for one in range(NUM_BINS)]
     return float(sum(gaps) / len(said))
 
 

@@ -109,31 +109,32 @@ def score_views(
     """
     if not views:
         return None
-    scores: list[ImageScores] = []
-    features: list[float] = []
-    lpips: list[float] = []
+    found: list[_Scored] = []
     of_actors: dict[str, list[Tensor]] = {}
     judged = partial(_one_scored, render, distances=distances)
     for one in side_by_side(judged, views, device):
-        scores.append(one.image)
+        found.append(one)
         for actor_id, errors in one.actor_errors.items():
             of_actors.setdefault(actor_id, []).append(errors)
-        if one.feature_distance is not None:
-            features.append(one.feature_distance)
-        if one.lpips is not None:
-            lpips.append(one.lpips)
         told()
+    scores = [one.image for one in found]
     return ViewScores(
         psnr=sum(score.psnr_db for score in scores) / len(scores),
         ssim=sum(score.ssim for score in scores) / len(scores),
         actors_psnr=pooled_psnr(scores),
-        feature_distance=sum(features) / len(features) if features else None,
-        lpips=sum(lpips) / len(lpips) if lpips else None,
+        feature_distance=_mean([one.feature_distance for one in found]),
+        lpips=_mean([one.lpips for one in found]),
         lpips_reason=distances.lpips_missing,
         num_views=len(scores),
         psnr_by_view={view.name: score.psnr_db for view, score in zip(views, scores, strict=True)},
-        psnr_by_actor={name: _actor_score(torch.cat(found)) for name, found in of_actors.items()},
+        psnr_by_actor={name: _actor_score(torch.cat(own)) for name, own in of_actors.items()},
     )
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """None where the distance was not asked for."""
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
 
 
 class _Scored(NamedTuple):

@@ -5,8 +5,7 @@ World: z up; metres.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -74,10 +73,6 @@ class Collision:
         """For one line."""
         what = f"{self.num_points} LiDAR points" if self.is_wall else f"actor {self.obstacle}"
         return f"{what} from {self.from_s:.1f} to {self.to_s:.1f} s"
-
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON types."""
-        return asdict(self)
 
 
 def find_collisions(

@@ -19,7 +19,13 @@ from torch import Tensor
 
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.kernels.colour_sampling import BestSamples, combine_samples, insert_samples
+from lidarpainter_models.kernels.colour_sampling import (
+    BestSamples,
+    combine_samples,
+    insert_samples,
+    sample_levels,
+    steps_inside,
+)
 from lidarpainter_models.kernels.side_by_side import side_by_side
 from lidarpainter_models.lidar.exposure_matching import match_exposure
 from lidarpainter_models.lidar.lidar_map import LidarMap
@@ -39,10 +45,84 @@ from lidarpainter_models.lidar.points_in_view import (
     place_actors,
     points_in_view,
 )
-from lidarpainter_models.lidar.rim_colours import EDGE_TOLERANCE, ImageLevels, rim_samples
 from lidarpainter_models.scenes.driving_scene import DrivingScene
 from lidarpainter_models.scenes.records import RecordedView
 from lidarpainter_models.scenes.tracks import ActorTrack
+
+EDGE_TOLERANCE = 0.15  # a neighbour nearer or further by this share of the depth makes an edge
+BEHIND_EDGE_WEIGHT = 0.2  # weight of a sample beside a nearer surface
+RIM_WEIGHT = 0.4  # weight of a sample on the rim of a surface
+FOREIGN_LIKENESS = 30.0
+"""A rim's colour is foreign when nearer than this (RGB distance of 255) to that beyond..."""
+FOREIGN_CONTRAST = 60.0
+"""... and further than this from that inside."""
+INNER_REACH = 6  # how many cells away the inner part of a surface is looked for from its rim
+
+
+class ImageLevels:
+    """An image at three sizes, and at which of them each point is sampled."""
+
+    def __init__(
+        self, image: UInt8[Tensor, "height width 3"], footprint_px: Float[Tensor, " points"]
+    ) -> None:
+        height_px, width_px = image.shape[:2]
+        self._images = [image.numpy()]
+        for shrink in (2, 4):
+            size = (max(1, width_px // shrink), max(1, height_px // shrink))
+            self._images.append(cv2.resize(image.numpy(), size, interpolation=cv2.INTER_AREA))
+        self._level = (footprint_px >= 1.5).int() + (footprint_px >= 3.0).int()
+
+    def sample(
+        self, pixels_uv: Float[Tensor, "rows 2"], rows: Int[Tensor, " rows"] | None = None
+    ) -> UInt8[Tensor, "rows 3"]:
+        """Colours at positions; `rows` says which points they belong to if not all."""
+        level = self._level if rows is None else self._level[rows]
+        return torch.from_numpy(
+            sample_levels(pixels_uv.contiguous().numpy(), level.numpy(), *self._images)
+        )
+
+
+def rim_samples(
+    levels: ImageLevels,
+    points: PointsInView,
+    visibility: Visibility,
+    grid: CellGrid,
+) -> tuple[UInt8[Tensor, "points 3"], Float[Tensor, " points"]]:
+    """Colours of visible points, and how far the place of each is to be trusted.
+
+    On the rim of a surface a small error of pose takes the colour of what is beside it. Where the
+    colour there is more like that beyond the rim than like that of the nearest inner cell, the
+    inner one is taken. `points` are those that nothing hides; `grid` is that of the visibility.
+    """
+    rgb = levels.sample(points.pixels_uv)
+    trust = torch.ones_like(points.depth_m)
+    cells_uv = grid.cells_of(points.pixels_uv)
+    column, row = cells_uv.unbind(-1)
+    nearest_m, furthest_m = visibility.nearest_m[row, column], visibility.furthest_m[row, column]
+    is_behind = nearest_m < points.depth_m * (1 - EDGE_TOLERANCE)
+    is_before = furthest_m > points.depth_m * (1 + EDGE_TOLERANCE)
+    trust[is_behind] = BEHIND_EDGE_WEIGHT
+    on_rim = is_before.nonzero()[:, 0]
+    trust[on_rim] *= RIM_WEIGHT
+    steps, has_inner = map(
+        torch.from_numpy,
+        steps_inside(
+            cells_uv[on_rim].numpy(),
+            points.depth_m[on_rim].numpy(),
+            visibility.inner_m.numpy(),
+            INNER_REACH,
+            EDGE_TOLERANCE,
+        ),
+    )
+    moved, steps_px = on_rim[has_inner], steps[has_inner] / grid.cells_per_pixel
+    own = rgb[moved].float()
+    inner = levels.sample(points.pixels_uv[moved] + steps_px, moved)
+    beyond = levels.sample(points.pixels_uv[moved] - steps_px, moved)
+    to_inner, to_beyond = (own - inner.float()).norm(dim=-1), (own - beyond.float()).norm(dim=-1)
+    is_foreign = (to_beyond < FOREIGN_LIKENESS) & (to_inner > FOREIGN_CONTRAST)
+    rgb[moved[is_foreign]] = inner[is_foreign]
+    return rgb, trust
+
 
 _FINE_ENOUGH_PX = 2.0
 """An image with more pixels than this across a point's footprint is no better for it."""
@@ -59,7 +139,6 @@ EDGE_RAD = 0.004  # nearer surface within this angle spoils a sample: errors of 
 RIM_RAD = 0.008  # a surface that ends within this angle may show what is beyond it
 STANDING_BOX_SHARE = 0.85
 """Share of each side of a standing actor's box that hides what is behind it."""
-NEAR_M = 0.5  # points nearer to the camera plane than this are not sampled
 WIDTH_PX = 960  # images are shrunk to this width before they are sampled
 
 
@@ -111,12 +190,8 @@ class MapColouring:
     ) -> PointSamples:
         """What the recorded image of one of the views gives; nothing of hidden pixels.
 
-        Nothing is changed, so that images may be looked at beside each other.
-
-        Args:
-            view: which one.
-            image: as it was recorded.
-            hidden: what shows nothing of the map, on any grid over the image.
+        Nothing is changed, so that images may be looked at beside each other. `hidden` is on any
+        grid over the image.
         """
         actors = self._placed[view.key]
         image = _shrunk(image)
@@ -124,9 +199,7 @@ class MapColouring:
         grid = CellGrid.over(camera, GRID_RAD)
         visibility = self._visibility(view, grid, camera)
         pieces = [PointsInView.none()]
-        for inside in points_in_view(
-            self._bodies, camera, view.timestamp_ns, actors, near_m=NEAR_M
-        ):
+        for inside in points_in_view(self._bodies, camera, view.timestamp_ns, actors):
             asked = inside.keep(self._may_gain(inside, camera))
             is_shown = _is_shown(asked, visibility, grid, hidden)
             pieces.append(asked.keep(is_shown.nonzero()[:, 0]))
@@ -140,7 +213,7 @@ class MapColouring:
     def _visibility(self, view: RecordedView, grid: CellGrid, camera: Camera) -> Visibility:
         """What stood before and around each cell when the image was taken."""
         actors = self._placed[view.key]
-        near = points_in_view(self._surfaces, camera, view.timestamp_ns, actors, near_m=NEAR_M)
+        near = points_in_view(self._surfaces, camera, view.timestamp_ns, actors)
         solid = [inside.keep(_is_solid(inside).nonzero()[:, 0]) for inside in near]
         return _visibility(PointsInView.joined([PointsInView.none(), *solid]), grid, actors)
 

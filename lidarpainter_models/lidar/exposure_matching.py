@@ -46,7 +46,8 @@ def _departures(
     pairs = [
         (view[rows, 0], view[rows, slot], log_rgb[rows, slot] - log_rgb[rows, 0])
         for slot in range(1, view.shape[1])
-        for rows in [_pairs(view_camera[view], usable, 0, slot)]
+        for same in [view_camera[view[:, 0]] == view_camera[view[:, slot]]]
+        for rows in [np.flatnonzero(usable[:, 0] & usable[:, slot] & same)]
     ]
     whose = np.concatenate([number for first, second, _ in pairs for number in (first, second)])
     order = np.argsort(whose, kind="stable")
@@ -64,12 +65,6 @@ def _departures(
         gains[own] -= np.median(gains[own], axis=0)
     gains[np.abs(gains).max(axis=1) < SMALLEST_DEPARTURE] = 0
     return gains
-
-
-def _pairs(camera: np.ndarray, usable: np.ndarray, slot: int, other: int) -> np.ndarray:
-    """Rows whose two slots are usable and of one camera."""
-    same = camera[:, slot] == camera[:, other]
-    return np.flatnonzero(usable[:, slot] & usable[:, other] & same)
 
 
 def _camera_gains(

@@ -12,6 +12,7 @@ from torch import Tensor
 
 NEIGHBOURS = 24
 OUTLIER_M = 0.2
+CELL_M, QUANTILE = 1.0, 0.1
 
 
 class GroundHeights:
@@ -21,18 +22,15 @@ class GroundHeights:
         self,
         xyz_m: Float[Tensor, "points 3"],
         *,
-        cell_m: float = 1.0,
-        quantile: float = 0.1,
         least_points: int = 4,
     ) -> None:
         """Sort points into square cells and take a quantile of each cell with enough of them."""
-        self._cell_m = cell_m
         keys = self._keys(xyz_m[:, :2])
         by_height = torch.argsort(xyz_m[:, 2])
         order = by_height[torch.argsort(keys[by_height], stable=True)]
         self._cells, counts = torch.unique_consecutive(keys[order], return_counts=True)
         starts = counts.cumsum(0) - counts
-        low = order[starts + (quantile * (counts - 1)).long()]
+        low = order[starts + (QUANTILE * (counts - 1)).long()]
         self._height_m = torch.where(counts >= least_points, xyz_m[low, 2], torch.nan)
 
     def at(self, xy_m: Float[Tensor, "points 2"]) -> Float[Tensor, " points"]:
@@ -58,14 +56,14 @@ class GroundHeights:
         distance_m, nearest = tree.query(xy_m.numpy(), k=[*range(1, count + 1)])
         z = known_m[torch.from_numpy(nearest)]
         is_ground = z <= z.quantile(0.25, dim=1, keepdim=True) + OUTLIER_M
-        weight = is_ground / (torch.from_numpy(distance_m).float() + 0.1 * self._cell_m) ** 2
+        weight = is_ground / (torch.from_numpy(distance_m).float() + 0.1 * CELL_M) ** 2
         return (weight * z).sum(dim=1) / weight.sum(dim=1)
 
     def _centres(self, cells: Int[Tensor, " cells"]) -> Float[Tensor, "cells 2"]:
         row = (cells + (1 << 30)) % (1 << 31) - (1 << 30)
         column = (cells - row) // (1 << 31)
-        return (torch.stack([column, row], dim=1).float() + 0.5) * self._cell_m
+        return (torch.stack([column, row], dim=1).float() + 0.5) * CELL_M
 
     def _keys(self, xy_m: Float[Tensor, "points 2"]) -> Tensor:
-        column, row = (xy_m / self._cell_m).floor().long().unbind(-1)
+        column, row = (xy_m / CELL_M).floor().long().unbind(-1)
         return column * (1 << 31) + row

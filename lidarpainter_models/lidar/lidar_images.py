@@ -8,7 +8,8 @@ Visibility takes three steps. A z-buffer of discs as large as the beams are apar
 surface. A point is hidden when nearer surface surrounds it in all directions around its pixel
 (after Pintus et al. 2011, who open a cone instead), which culls background between the scan lines
 of a foreground yet keeps a road seen at a grazing angle. The points left are blended where they
-meet the nearest direct hit of a pixel, so silhouettes stay sharp and discs do not show.
+meet the nearest direct hit of a pixel, so silhouettes stay sharp and discs do not show. A surface
+holds infinity, a depth image 0, where there is nothing.
 """
 
 import math
@@ -23,9 +24,9 @@ from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.point_blend import blend_points
+from lidarpainter_models.kernels.point_splat import splat_points
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.lidar.moving_boxes import MovingBoxes
-from lidarpainter_models.lidar.point_surfaces import curtain, disc_surface, spread, surface_gaps
 from lidarpainter_models.lidar.points_in_view import read_in_image, with_margin
 
 WINDOW_S = 1.0
@@ -49,7 +50,6 @@ GAP_WIDENING = 2.5  # discs grow by this factor where covered pixels surround a 
 GAP_DIRECTIONS = 6  # of the 8 directions, how many must meet covered pixels to make a gap
 GAP_DEPTH_RANGE = 0.15
 """The pixels met around a gap differ in depth by at most this share: one surface."""
-NEAR_M = 0.5  # points nearer to the camera plane than this are dropped
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -177,7 +177,6 @@ class _Projected(NamedTuple):
             camera.camera_from_world @ world_from_body.to(torch.float64),
             camera,
             stand_still=stand_still,
-            near_m=NEAR_M,
             margin_px=margin_px,
         )
         age_ns = (body.timestamp_ns.index_select(0, rows) - timestamp_ns).abs()
@@ -224,7 +223,7 @@ def _fill_gaps(
 ) -> Float[Tensor, "height width 6"]:
     """What wider discs give in the gaps of a surface; 0 elsewhere."""
     reach_px = math.ceil(GAP_WIDENING * MAX_RADIUS_RAD * camera.fx_px)
-    gaps = surface_gaps(depth_m, reach_px, GAP_DIRECTIONS, depth_range=GAP_DEPTH_RANGE)
+    gaps = surface_gaps(depth_m, reach_px)
     around = spread(gaps, reach_px)
     wide = ViewPoints.concatenate(
         [part.keep(_at(around, part) & part.depth_m.isfinite()) for part in parts]
@@ -238,8 +237,15 @@ def _surface(
     points: ViewPoints, camera: Camera, radius_px: Float[Tensor, " points"]
 ) -> Float[Tensor, "height width"]:
     """Depth of the nearest disc in each pixel, infinity where there is none."""
-    size = {"height_px": camera.height_px, "width_px": camera.width_px}
-    return disc_surface(points.positions_uv, points.depth_m, radius_px.to(torch.int64), **size)
+    nearest = splat_points(
+        points.positions_uv,
+        points.depth_m,
+        height_px=camera.height_px,
+        width_px=camera.width_px,
+        radius_px=radius_px.to(torch.int64),
+    ).to(torch.int64)
+    beyond = points.depth_m.new_full((1,), torch.inf)
+    return torch.cat([points.depth_m, beyond])[nearest]  # index -1 takes infinity
 
 
 def _at(image: Shaped[Tensor, "height width"], points: ViewPoints) -> Shaped[Tensor, " points"]:
@@ -267,3 +273,62 @@ def _means_on(
         tolerance=SURFACE_TOLERANCE,
     )
     return image
+
+
+DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
+"""The 8 directions around a pixel, as steps in (rows, columns)."""
+
+
+def curtain(surface: Float[Tensor, "height width"], reach_px: int) -> Float[Tensor, "height width"]:
+    """The depth beyond which each of the 8 directions meets nearer surface.
+
+    A direction is a wedge, not a ray: beyond its first pixel it is three pixels wide, so that it
+    does not slip between the points of a sparse surface.
+    """
+    height_px, width_px = surface.shape
+    wide = -torch.nn.functional.max_pool2d(-surface[None], 3, 1, 1)[0]
+    narrow = torch.nn.functional.pad(surface, [reach_px] * 4, value=torch.inf)
+    wide = torch.nn.functional.pad(wide, [reach_px] * 4, value=torch.inf)
+    behind = torch.zeros_like(surface)
+    for step_v, step_u in DIRECTIONS:
+        best = torch.full_like(surface, torch.inf)
+        for step in range(1, reach_px + 1):
+            top, left = reach_px + step * step_v, reach_px + step * step_u
+            layer = narrow if step == 1 else wide
+            torch.minimum(best, layer[top : top + height_px, left : left + width_px], out=best)
+        torch.maximum(behind, best, out=behind)
+    return behind
+
+
+def surface_gaps(
+    depth_m: Float[Tensor, "height width"], reach_px: int
+) -> Bool[Tensor, "height width"]:
+    """Pixels without depth that one surface surrounds.
+
+    In `GAP_DIRECTIONS` a pixel with depth is met within reach, and all depths met differ by at most
+    `GAP_DEPTH_RANGE`.
+    """
+    row, column = ((depth_m == 0) & spread(depth_m > 0, reach_px)).nonzero().unbind(-1)
+    padded = torch.nn.functional.pad(depth_m, [reach_px] * 4).reshape(-1)
+    row_px = depth_m.shape[1] + 2 * reach_px
+    place = (row + reach_px) * row_px + column + reach_px
+    met = []
+    for step_v, step_u in DIRECTIONS:
+        first = torch.zeros_like(depth_m[row, column])
+        for step in range(reach_px, 0, -1):
+            here = padded[place + step * (step_v * row_px + step_u)]
+            first = torch.where(here > 0, here, first)
+        met.append(first)
+    ascending = torch.stack(met).sort(dim=0).values
+    near, far = ascending[len(DIRECTIONS) - GAP_DIRECTIONS], ascending[-1]
+    gaps = torch.zeros_like(depth_m, dtype=torch.bool)
+    gaps[row, column] = (near > 0) & (far <= near * (1 + GAP_DEPTH_RANGE))
+    return gaps
+
+
+def spread(mask: Bool[Tensor, "height width"], reach_px: int) -> Bool[Tensor, "height width"]:
+    """Pixels with a marked one in the square around them."""
+    pool = torch.nn.functional.max_pool2d
+    side_px = 2 * reach_px + 1
+    along_rows = pool(mask.float()[None], (1, side_px), 1, (0, reach_px))
+    return pool(along_rows, (side_px, 1), 1, (reach_px, 0))[0] > 0

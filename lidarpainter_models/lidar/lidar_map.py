@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from lidarpainter_models.devices import on_device
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MapPoints:
@@ -39,9 +41,7 @@ class MapPoints:
 
     def to(self, device: torch.device) -> "MapPoints":
         """The same points on another device."""
-        return type(self)(
-            **{field.name: getattr(self, field.name).to(device) for field in fields(self)}
-        )
+        return on_device(self, device)
 
     def to_arrays(self) -> dict[str, Tensor]:
         """Columns by name, for storage."""

@@ -29,7 +29,7 @@ class MovingBoxes:
         """Take the tracks; their order gives the actor indices."""
         self.tracks = tuple(tracks)
         self._poses = TrackPoses.of(tracks)
-        self._size_m = torch.stack([track.size_m for track in tracks]) if tracks else None
+        self._size_m = torch.stack([torch.zeros(3), *(track.size_m for track in tracks)])[1:]
 
     def placed(self, timestamp_ns: int) -> list[tuple[ActorTrack, Float[Tensor, "4 4"]]]:
         """The actors that are there at a time, each with its `world_from_box` (float64)."""
@@ -49,7 +49,7 @@ class MovingBoxes:
         than `FLOOR_M` over the bottom of a box must be inside the true box.
         """
         present = self._poses.present(timestamp_ns).nonzero()[:, 0]
-        if self._size_m is None or not len(present):
+        if not len(present):
             return torch.full(points_world.shape[:1], BACKGROUND, device=points_world.device)
         boxes = box_owners(
             points_world,
@@ -63,8 +63,6 @@ class MovingBoxes:
 
     def pixels(self, camera: Camera, timestamp_ns: int) -> Bool[Tensor, "height width"]:
         """The pixels in which a box, slightly grown, is seen at a time."""
-        if self._size_m is None:
-            return torch.zeros(camera.height_px, camera.width_px, dtype=torch.bool)
         present = self._poses.present(timestamp_ns)
         return project_boxes(camera, self._poses.all_at(timestamp_ns), self._size_m, present)
 

@@ -24,6 +24,7 @@ from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses
 MOST_AGE_NS = 3_000_000_000
 """Images further in time from a point of the street than this are not asked for its colour: where a
 nearer one shows it, it counts for less than half a percent beside that."""
+NEAR_M = 0.5  # points nearer to the camera plane than this are left out
 POINTS_AT_ONCE = 1 << 16
 """Points of the map that are looked at before those that matter of them are kept: all that an image
 of a long log holds are many times as many."""
@@ -162,8 +163,6 @@ def points_in_view(
     camera: Camera,
     timestamp_ns: int,
     actors: PlacedActors,
-    *,
-    near_m: float,
 ) -> Iterator[PointsInView]:
     """Where the points of all bodies stand in an image taken at a time; absent actors have none.
 
@@ -186,7 +185,6 @@ def points_in_view(
                     camera_from_points,
                     camera,
                     stand_still=body.track is None,
-                    near_m=near_m,
                 )
                 rows = inside + piece.start
                 age_ns = (body.points.timestamp_ns[rows] - timestamp_ns).abs()
@@ -206,7 +204,6 @@ def read_in_image(
     camera: Camera,
     *,
     stand_still: bool,
-    near_m: float,
     margin_px: int = 0,
 ) -> tuple[Int[Tensor, " rows"], Float[Tensor, "rows 2"], Float[Tensor, " rows"]]:
     """What falls into an image with a margin: rows, pixels from the margin's corner, and depth.
@@ -227,12 +224,12 @@ def read_in_image(
         dtype=torch.float64,
     )
     rows, pixels_uv, depth_m = project_inside(
-        xyz_m, lens @ camera_from_points[:3], window.width_px, window.height_px, near_m
+        xyz_m, lens @ camera_from_points[:3], window.width_px, window.height_px, NEAR_M
     )
     if rolls:
         read_uv, read_m = camera.project(xyz_m[rows].double())
         read_uv, read_m = (read_uv + margin_px).to(pixels_uv), read_m.to(depth_m)
-        is_read = image.contains(read_uv, read_m, near_m=near_m)
+        is_read = image.contains(read_uv, read_m, near_m=NEAR_M)
         rows, pixels_uv, depth_m = rows[is_read], read_uv[is_read], read_m[is_read]
     return rows, pixels_uv, depth_m
 

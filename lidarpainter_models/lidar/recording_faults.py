@@ -62,15 +62,10 @@ def find_faults(
     views: Sequence[RecordedView],
     own_bodies: Mapping[str, Bool[np.ndarray, "rows columns"]] | None = None,
 ) -> dict[str, CameraFault]:
-    """What is wrong about the cameras of some views, by name.
+    """What is wrong about the cameras of some views, each camera's in order of time, by name.
 
-    Args:
-        scene: where images and points are read from.
-        views: each camera's in order of time.
-        own_bodies: what of a camera's images is the recording car (on any grid), by its name.
-
-    Returns:
-        Nothing of cameras that are sound or that `cannot_be_told` names.
+    Nothing of cameras that are sound or that `cannot_be_told` names. `own_bodies` are what of a
+    camera's images is the recording car (on any grid), by its name.
     """
     names = sorted({view.camera_name for view in views})
     moved = [_comparable([view for view in views if view.camera_name == name]) for name in names]

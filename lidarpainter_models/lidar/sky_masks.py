@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.geometry.cameras import Camera
 
 _GROWTH_ROUNDS = 3
@@ -52,19 +51,7 @@ def sky_from_returns(
     has_return: Bool[Tensor, "height width"],
     camera: Camera,
 ) -> Bool[Tensor, "height width"]:
-    """Sky in an image whose LiDAR returns are known.
-
-    The camera is on the same grid; the world's z is up.
-
-    Raises:
-        ShapeError: image, returns and camera differ in size.
-    """
-    size = (camera.height_px, camera.width_px)
-    if tuple(rgb_u8.shape) != (*size, 3) or tuple(has_return.shape) != size:
-        raise ShapeError(
-            f"need image and returns of {size}, got {tuple(rgb_u8.shape)} and "
-            f"{tuple(has_return.shape)}"
-        )
+    """Sky in an image whose LiDAR returns are known; the camera is on the same grid."""
     image, returns = rgb_u8.numpy(), has_return.numpy().astype(np.uint8)
     above = _elevation(camera) > LEAST_ELEVATION_RAD
     clear_px = max(1, round(CLEAR_RAD * camera.fx_px))
@@ -74,7 +61,7 @@ def sky_from_returns(
     sure &= _texture(image) < MOST_TEXTURE
     around_px = AROUND_RAD * camera.fx_px
     pieces = _large_pieces(sure, LEAST_AREA * sure.size)
-    sky = _like_the_largest(image, pieces, around_px, PIECE_TOLERANCE)
+    sky = _like_the_largest(image, pieces, around_px)
     candidates = above & (_grown(returns, 1) == 0)
     for _ in range(_GROWTH_ROUNDS):
         if not sky.any():
@@ -133,16 +120,14 @@ def _large_pieces(mask: np.ndarray, least_px: float) -> np.ndarray:
     return is_large[labels] if count > 1 else np.zeros_like(mask)
 
 
-def _like_the_largest(
-    image: np.ndarray, pieces: np.ndarray, sigma_px: float, tolerance: float
-) -> np.ndarray:
+def _like_the_largest(image: np.ndarray, pieces: np.ndarray, sigma_px: float) -> np.ndarray:
     """The largest connected piece, and those whose median colour continues it."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(pieces.astype(np.uint8))
     if count <= 2:
         return pieces
     largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
     differs = _differs(image, labels == largest, sigma_px)
-    alike = [np.median(differs[labels == label]) < tolerance for label in range(1, count)]
+    alike = [np.median(differs[labels == label]) < PIECE_TOLERANCE for label in range(1, count)]
     alike[largest - 1] = True
     return np.array([False, *alike])[labels]
 

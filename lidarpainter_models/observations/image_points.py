@@ -73,12 +73,8 @@ def points_from_images(
 ) -> LidarMap:
     """Points of the street where images show it, and of moving actors on their boxes.
 
-    None of the street where the images show no parallax that could be measured.
-
-    Args:
-        scene: where images and tracks are read from.
-        views: images that may be used: those of the training set, no others.
-        own_bodies: what of a camera's images is the recording car, on any grid.
+    None of the street where the images show no parallax that could be measured. Only images of
+    these views are used; `own_bodies` are what of a camera's is the recording car, on any grid.
     """
     tracks = [track for track in scene.tracks if track.is_moving]
     boxes = MovingBoxes(tracks)

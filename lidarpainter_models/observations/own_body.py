@@ -68,12 +68,7 @@ def own_bodies(
 ) -> dict[str, Bool[np.ndarray, "height width"]]:
     """Pixels of the recording car, `WIDTH_PX` wide, by the cameras that show any of it.
 
-    Args:
-        scene: where images and tracks are read from.
-        views: those that may be looked at.
-
-    Returns:
-        Nothing for cameras that `cannot_be_told` names.
+    Nothing for cameras that `cannot_be_told` names.
     """
     moving = MovingBoxes([track for track in scene.tracks if track.is_moving])
     names = sorted({view.camera_name for view in views})

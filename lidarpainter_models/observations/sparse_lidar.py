@@ -40,12 +40,8 @@ def share_told(
 ) -> float:
     """Of the cells of the images below the horizon, the part that holds a point of the street.
 
-    Cells of the recording car itself are left out; 1 where no image looks below the horizon.
-
-    Args:
-        street: in the world; of many points an even part is looked at.
-        views: each camera's in order of time; of many some of each camera are looked at.
-        own_bodies: what of a camera's images is the recording car, by its name, on any grid.
+    Cells of the recording car itself are left out; 1 where no image looks below the horizon. Of
+    many points an even part is looked at, of many views, each camera's in order of time, some.
     """
     step = max(1, -(-len(street) // _MOST_POINTS))
     points_world = street.xyz_m[::step]
@@ -83,12 +79,8 @@ def completed(measured: LidarMap, estimated: LidarMap) -> LidarMap:
     """What was measured, and of what was estimated from images that which lies not beside it.
 
     Beside means within `CELL_RAD` of a measured point, at the range of the estimate. An actor has
-    its returns alone from `LEAST_ON_ACTOR` of them on, else its estimated points alone.
-
-    Args:
-        measured: what the LiDAR told; its street may be empty.
-        estimated: what images tell, with points of every moving actor; its street must not be
-            empty.
+    its returns alone from `LEAST_ON_ACTOR` of them on, else its estimated points alone. The street
+    that was estimated must not be empty.
     """
     street = estimated.street
     nearest_m, _ = cKDTree(measured.street.xyz_m.numpy()).query(

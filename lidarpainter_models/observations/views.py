@@ -4,12 +4,13 @@ Frames: world (z up) and camera (x right, y down, z forward); metres.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float, Float16, UInt8
 from torch import Tensor
 
+from lidarpainter_models.devices import on_device
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.lidar.lidar_map import LidarMap
 from lidarpainter_models.scenes.camera_faults import CameraFault
@@ -98,14 +99,7 @@ class GuidanceView:
 
     def to(self, device: torch.device) -> "GuidanceView":
         """The same view on another device, as far as it is not there."""
-        if self.rgb_u8.device == device:
-            return self
-        return replace(
-            self,
-            rgb_u8=self.rgb_u8.to(device, non_blocking=True),
-            weight_u8=self.weight_u8.to(device, non_blocking=True),
-            lidar_depth_f16=self.lidar_depth_f16.to(device, non_blocking=True),
-        )
+        return self if self.rgb_u8.device == device else on_device(self, device)
 
 
 def _bytes(values: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:

@@ -4,8 +4,11 @@ from dataclasses import dataclass, field
 
 from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.gaussians.fitting.config import FitConfig, RefinementConfig
-from lidarpainter_models.gaussians.fitting.number_of_gaussians import DensificationConfig
+from lidarpainter_models.gaussians.fitting.config import (
+    DensificationConfig,
+    FitConfig,
+    RefinementConfig,
+)
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.observations.settings import ObservationConfig
 

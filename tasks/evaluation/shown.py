@@ -22,24 +22,27 @@ def shown_by(
     this: OpenedRun, fitted: FittedRef, config: EvaluationConfig, *, view_time: bool
 ) -> Callable[[], ShownScene]:
     """Opens a fitted scene as it is, or as the run's painter paints it at view time."""
-    if not view_time:
-        return partial(unpainted_scene, this.store, fitted, this.device)
-    return partial(painted_scene, this.store, fitted, config.conditions, this.painter, this.device)
+    painter = this.painter if view_time else None
+    return partial(shown_scene, this.store, fitted, config.conditions, painter, this.device)
 
 
-def unpainted_scene(store: Store, fitted: FittedRef, device: torch.device) -> ShownScene:
-    """A fitted scene as it is."""
-    return ShownScene(scene=load_scene(store, fitted.gaussians).to(device))
+def painted_by(
+    this: OpenedRun, fitted: FittedRef, conditions: ConditionConfig
+) -> Callable[[], ViewTimePainting]:
+    """Gathers what the run's painter needs to paint a fitted scene at view time."""
+    return partial(view_time_painting, this.store, fitted, conditions, this.painter, this.device)
 
 
-def painted_scene(
+def shown_scene(
     store: Store,
     fitted: FittedRef,
     conditions: ConditionConfig,
-    painter: PainterChoice,
+    painter: PainterChoice | None,
     device: torch.device,
 ) -> ShownScene:
-    """A fitted scene as a painter paints it at view time."""
+    """A fitted scene as it is, or as a painter paints it at view time."""
+    if painter is None:
+        return ShownScene(scene=load_scene(store, fitted.gaussians).to(device))
     painting = view_time_painting(store, fitted, conditions, painter, device)
     return ShownScene(scene=painting.conditions.scene, painting=painting)
 

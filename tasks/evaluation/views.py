@@ -1,4 +1,8 @@
-"""Judge a fitted scene on views it never saw, as it is or painted at view time."""
+"""Judge a fitted scene, as it is or painted at view time, by what its fit never saw.
+
+Held-out views and views beside the path, cameras left out where they overlap one that was fitted,
+and neighbouring frames of shifted paths, which should not flicker.
+"""
 
 from collections.abc import Callable
 from dataclasses import asdict
@@ -7,11 +11,15 @@ from typing import Any
 
 from catalog.artefacts import ArtefactRef, Workplace
 from catalog.store import Store
+from lidarpainter_models.conditioning.settings import SequenceConfig
+from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.evaluation.flicker import FlickerEvaluation
 from lidarpainter_models.evaluation.scene_evaluation import SceneEvaluation
-from lidarpainter_models.evaluation.score_tables import Scores
+from lidarpainter_models.evaluation.score_tables import FLICKER, Scores
 from lidarpainter_models.evaluation.settings import EvaluationConfig
-from lidarpainter_models.evaluation.shown import ShownScene
-from tasks.evaluation.shown import shown_by
+from lidarpainter_models.evaluation.shown import ShownScene, ViewTimePainting
+from lidarpainter_models.evaluation.strips import StripEvaluation
+from tasks.evaluation.shown import painted_by, shown_by
 from tasks.json_files import read_json, write_json
 from tasks.opened import OpenedRun, opened
 from tasks.progress import Progress
@@ -40,18 +48,94 @@ def evaluate(
         kind="evaluation",
         inputs=evaluation_inputs(this, fitted, view_time=view_time)
         | file_digests(config.weight_files),
-        config={
-            "split": run.split,
-            "observation": asdict(config.observation),
-            "scoring": asdict(config.scoring),
-            "conditions": asdict(config.conditions),
-        },
+        config=_settings(run, config) | {"scoring": asdict(config.scoring)},
         build=partial(
             _build,
             evaluation=SceneEvaluation(held_out=this.held_out(config.observation), config=config),
             shown=shown_by(this, fitted, config, view_time=view_time),
         ),
     )
+
+
+@stage_task
+def evaluate_strips(
+    run: RunSpec,
+    stage: str,
+    fitted: FittedRef,
+    config: EvaluationConfig,
+    *,
+    view_time: bool = False,
+) -> StageResult:
+    """Score held-out frames of every camera that the fit did not see.
+
+    Raises:
+        ConfigError: the fit saw every camera of the scene.
+    """
+    this = opened(run)
+    evaluation = StripEvaluation(held_out=this.held_out(config.observation), views=this.views)
+    if not evaluation.cameras:
+        raise ConfigError(
+            f"the fit saw every camera of {run.split.scene_id}; leave one out with --train-cameras"
+        )
+    return run_stage(
+        this.store,
+        kernels=run.kernels,
+        stage=stage,
+        kind="strips",
+        inputs=evaluation_inputs(this, fitted, view_time=view_time),
+        config=_settings(run, config),
+        build=partial(
+            _build_strips,
+            evaluation=evaluation,
+            shown=shown_by(this, fitted, config, view_time=view_time),
+        ),
+    )
+
+
+@stage_task
+def evaluate_flicker(
+    run: RunSpec,
+    stage: str,
+    fitted: FittedRef,
+    config: EvaluationConfig,
+    previous: tuple[SequenceConfig, ...],
+) -> StageResult:
+    """Compare neighbouring frames of the first trained camera at every judged shift.
+
+    `previous` says what else may become of the frame painted before.
+    """
+    this = opened(run)
+    shifts = config.scoring.shifts
+    return run_stage(
+        this.store,
+        kernels=run.kernels,
+        stage=stage,
+        kind="evaluation",
+        inputs=evaluation_inputs(this, fitted, view_time=True),
+        config=_settings(run, config)
+        | {
+            "shifts": [asdict(shift) for shift in shifts],
+            "previous": [asdict(use) for use in previous],
+        },
+        build=partial(
+            _build_flicker,
+            evaluation=FlickerEvaluation(
+                held_out=this.held_out(config.observation),
+                camera_name=this.views.train[0].camera_name,
+                shifts=shifts,
+                previous=previous,
+            ),
+            painting=painted_by(this, fitted, config.conditions),
+        ),
+    )
+
+
+def _settings(run: RunSpec, config: EvaluationConfig) -> dict[str, Any]:
+    return {
+        "split": run.split,
+        "observation": asdict(config.observation),
+        "conditions": asdict(config.conditions),
+    }
 
 
 def evaluation_inputs(this: OpenedRun, fitted: FittedRef, *, view_time: bool) -> dict[str, str]:
@@ -79,3 +163,25 @@ def _build(
     scores = evaluation.scores(shown(), progress)
     write_json(place.output / SCORES_FILE, scores)
     return {"psnr": scores["recorded"]["psnr"], "num_views": scores["recorded"]["num_views"]}
+
+
+def _build_strips(
+    place: Workplace,
+    progress: Progress,
+    *,
+    evaluation: StripEvaluation,
+    shown: Callable[[], ShownScene],
+) -> dict[str, Any]:
+    write_json(place.output / SCORES_FILE, evaluation.scores(shown(), progress))
+    return {"num_cameras": len(evaluation.cameras)}
+
+
+def _build_flicker(
+    place: Workplace,
+    progress: Progress,
+    *,
+    evaluation: FlickerEvaluation,
+    painting: Callable[[], ViewTimePainting],
+) -> dict[str, Any]:
+    write_json(place.output / SCORES_FILE, {FLICKER: evaluation.scores(painting(), progress)})
+    return {"num_shifts": len(evaluation.shifts)}

@@ -1,6 +1,7 @@
 """Judge painters on stored pairs and held-out views that none of them was trained on."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -172,4 +173,5 @@ def _scores(
     distance: SqueezeNetDistance | None,
     progress: Progress,
 ) -> dict[str, Any]:
-    return score_painter(painter, sources, feature_distance=distance, progress=progress).to_dict()
+    found = score_painter(painter, sources, feature_distance=distance, progress=progress)
+    return asdict(found)

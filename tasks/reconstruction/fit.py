@@ -26,7 +26,7 @@ from lidarpainter_models.gaussians.model.stored_scene import copy_scene
 from lidarpainter_models.metrics.lpips import load_lpips
 from lidarpainter_models.metrics.lpips_files import LpipsFiles
 from lidarpainter_models.observations.views import GuidanceView, SceneObservations
-from tasks.opened import OpenedRun, opened
+from tasks.opened import opened
 from tasks.progress import Progress
 from tasks.reconstruction.painted_views import load_guidance
 from tasks.specs import FittedRef, RunSpec
@@ -47,11 +47,9 @@ FIT_OF_ROUND = 0.7
 class _Sources:
     """What a fit is made from, read when its stage is built."""
 
-    digests: Mapping[str, str]
-    """Digests of the inputs, by the part they play."""
     store: Store
     refs: Mapping[str, ArtefactRef]
-    """The inputs that there are."""
+    """The inputs that there are, by the part they play."""
     perceptual: Callable[[], Perceptual | None] | None
     """Reads the distance of images that the loss weighs, if it weighs one; of its code nothing is
     part of a fit's key, its weights are among the digests."""
@@ -86,17 +84,8 @@ def fit(
     Without a `start` it begins with the LiDAR map; one that is continued is the control of one that
     is continued with painted views (`refine`).
     """
-    this = opened(run)
-    sources = _sources(this, config, lpips, {"observations": observations, "start": start})
-    return run_stage(
-        this.store,
-        kernels=run.kernels,
-        stage=stage,
-        kind="gaussians",
-        inputs=sources.digests,
-        config=asdict(config),
-        build=partial(_build, sources=sources),
-    )
+    inputs = {"observations": observations, "start": start}
+    return _stage(run, stage, config, lpips, inputs, _build)
 
 
 @stage_task
@@ -113,41 +102,42 @@ def refine(
 
     The summary's `gain` says whether the round is to be taken back; it is kept here all the same.
     """
-    this = opened(run)
     inputs = {
         "observations": fitted.observations,
         "start": fitted.gaussians,
         "guidance": guidance,
     }
-    sources = _sources(this, config, lpips, inputs)
-    return run_stage(
-        this.store,
-        kernels=run.kernels,
-        stage=stage,
-        kind="gaussians",
-        inputs=sources.digests,
-        config=asdict(config),
-        build=partial(_build_round, sources=sources),
-    )
+    return _stage(run, stage, config, lpips, inputs, _build_round)
 
 
-def _sources(
-    this: OpenedRun,
+def _stage(
+    run: RunSpec,
+    stage: str,
     config: FitConfig,
     lpips: LpipsFiles | None,
     inputs: Mapping[str, ArtefactRef | None],
-) -> _Sources:
-    """Return what a fit is made from, of stored inputs by the part they play."""
+    build: Callable[..., dict[str, Any]],
+) -> StageResult:
+    """Fit from stored inputs, by the part they play."""
+    this = opened(run)
     weighed = lpips if config.weighs_perceptual else None
     there = {name: ref for name, ref in inputs.items() if ref is not None}
-    digests = {name: ref.digest for name, ref in there.items()}
-    return _Sources(
-        digests=digests | (file_digests(weighed.named) if weighed is not None else {}),
+    sources = _Sources(
         store=this.store,
         refs=there,
         perceptual=partial(load_lpips, weighed, this.device) if weighed is not None else None,
         config=config,
         device=this.device,
+    )
+    digests = {name: ref.digest for name, ref in there.items()}
+    return run_stage(
+        this.store,
+        kernels=run.kernels,
+        stage=stage,
+        kind="gaussians",
+        inputs=digests | (file_digests(weighed.named) if weighed is not None else {}),
+        config=asdict(config),
+        build=partial(build, sources=sources),
     )
 
 

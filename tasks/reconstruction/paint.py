@@ -14,7 +14,7 @@ from lidarpainter_models.conditioning.novel_guidance import (
 from lidarpainter_models.conditioning.settings import ConditionConfig, NovelGuidanceConfig
 from lidarpainter_models.evaluation.shown import ViewTimePainting
 from lidarpainter_models.scenes.driving_scene import DrivingScene
-from tasks.evaluation.shown import view_time_painting
+from tasks.evaluation.shown import painted_by
 from tasks.opened import opened
 from tasks.progress import Progress
 from tasks.reconstruction.painted_views import save_guidance
@@ -52,9 +52,7 @@ def paint(
         build=partial(
             _build,
             scene=this.scene,
-            painting=partial(
-                view_time_painting, this.store, fitted, conditions, this.painter, this.device
-            ),
+            painting=painted_by(this, fitted, conditions),
             novel=novel,
             start_frame=start_frame,
         ),

@@ -23,7 +23,7 @@ from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.observations.own_body import in_words
 from lidarpainter_models.observations.views import SceneObservations
-from tasks.evaluation.shown import view_time_painting
+from tasks.evaluation.shown import painted_by
 from tasks.machine import machine
 from tasks.opened import OpenedRun, opened
 from tasks.progress import Progress
@@ -80,14 +80,7 @@ def write_report(run: RunSpec, inputs: ReportInputs, config: EvaluationConfig) -
             observations=partial(load_observations, this.store, inputs.final.observations),
             said=suspicions(stages[EXAMINE]) if EXAMINE in stages else (),
             unpainted=partial(load_scene, this.store, inputs.unpainted.gaussians),
-            painting=partial(
-                view_time_painting,
-                this.store,
-                inputs.final,
-                config.conditions,
-                this.painter,
-                this.device,
-            ),
+            painting=painted_by(this, inputs.final, config.conditions),
         ),
     )
 

@@ -1,7 +1,7 @@
 """Render a finished run along a trajectory, painted at view time if asked for."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -121,7 +121,7 @@ def write_paths(
         together=together,
         advanced=advanced,
     )
-    collisions = [[found.to_dict() for found in path.collisions()] for path in paths]
+    collisions = [[asdict(found) for found in path.collisions()] for path in paths]
     for path, folder, rows, met in zip(paths, folders, written.rows, collisions, strict=True):
         if kinds.semantics:
             write_json(folder / LEGEND_FILE, legend(path.builder.scene))

@@ -123,7 +123,7 @@ class Fit:
 
     def step(self):
         """What every step of a fit does, on one recorded view after the other."""
-        fit_step(self.state, self.images[self.view], self.view, None, self.config, None)
+        fit_step(self.state, self.images[self.view], self.view)
         self.state.step += 1
         self.view = (self.view + 1) % len(self.images)
 

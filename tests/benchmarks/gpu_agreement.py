@@ -12,9 +12,8 @@ from gaussian_world import build_world
 from gpu_findings import Agreement, Findings
 
 from lidarpainter_models import kernels
-from lidarpainter_models.gaussians.fitting.config import FitConfig
+from lidarpainter_models.gaussians.fitting.config import DensificationConfig, FitConfig
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
-from lidarpainter_models.gaussians.fitting.number_of_gaussians import DensificationConfig
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.kernels.backends import (
     Backend,

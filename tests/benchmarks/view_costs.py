@@ -19,7 +19,7 @@ import torch
 from catalog.store import open_store
 from flows.parameters import view_parameters
 from lidarpainter_models.geometry.shifts import Shift
-from tasks.evaluation.shown import painted_scene
+from tasks.evaluation.shown import shown_scene
 from tasks.opened import opened
 from tasks.runs import open_run
 
@@ -44,7 +44,7 @@ def main():
     parameters = view_parameters(finished)
     this = opened(parameters.run_spec(store.root, painter=options.painter))
     judged = parameters.evaluation_config
-    shown = painted_scene(store, finished.final, judged.conditions, this.painter, this.device)
+    shown = shown_scene(store, finished.final, judged.conditions, this.painter, this.device)
     held_out = this.held_out(judged.observation, or_train=True).sampled(options.views)
     views, beside = held_out.test_views, Shift(lateral_m=2.0)
     rendered, painted = [], []

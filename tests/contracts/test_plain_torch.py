@@ -3,9 +3,12 @@
 import pytest
 from drawn_streets import drawn_street
 
-from lidarpainter_models.gaussians.fitting.config import FitConfig, RefinementConfig
+from lidarpainter_models.gaussians.fitting.config import (
+    DensificationConfig,
+    FitConfig,
+    RefinementConfig,
+)
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
-from lidarpainter_models.gaussians.fitting.number_of_gaussians import DensificationConfig
 from lidarpainter_models.gaussians.initialisation.scene import initialise_scene
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.kernels.backends import kernels_chosen

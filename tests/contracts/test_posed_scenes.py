@@ -117,8 +117,8 @@ def test_a_fit_shows_the_image_on_recorded_and_on_painted_views(image):
         weight=torch.ones(image.shape[:2]),
         lidar_depth_m=torch.zeros(image.shape[:2]),
     )
-    state = FitState.begin(scene, config, image[..., 0].numel())
-    fit_step(state, fit_image(camera, image), 1, (0, painted), config, distance)
+    state = FitState.begin(scene, config, image[..., 0].numel(), distance)
+    fit_step(state, fit_image(camera, image), 1, (0, painted))
     expected = [scene.render(one, ON_NS).rgb for one in (camera, beside)]
     assert len(shown) == 2
     for one in expected:  # the two are drawn at once, in any order

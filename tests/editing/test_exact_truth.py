@@ -15,9 +15,8 @@ from lidarpainter_models.editing.filled_scenes import filled
 from lidarpainter_models.editing.motions import LogTimes
 from lidarpainter_models.editing.operations import parse_operations
 from lidarpainter_models.editing.worlds import EditedWorld
-from lidarpainter_models.gaussians.fitting.config import FitConfig
+from lidarpainter_models.gaussians.fitting.config import DensificationConfig, FitConfig
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
-from lidarpainter_models.gaussians.fitting.number_of_gaussians import DensificationConfig
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.geometry.driven_paths import DrivenPath
 from lidarpainter_models.observations.preparation import prepare_observations

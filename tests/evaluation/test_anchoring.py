@@ -121,7 +121,8 @@ def test_what_an_envelope_says_is_read_again():
 
 def test_frames_are_predicted_by_their_evidence():
     frame = JudgedFrame(name="front/1", evidence=evidence(20.0), psnr_db=17.0)
-    assert predicted_and_measured([frame], LINE) == [(pytest.approx(20.0), 17.0)]
+    expected = BUNDLED.of(frame.evidence).predicted_db
+    assert predicted_and_measured([frame]) == [(expected, 17.0)]
 
 
 class DarkTruth(HeldOut):

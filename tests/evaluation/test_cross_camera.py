@@ -12,9 +12,15 @@ from drawn_streets import drawn_street
 from gaussian_world import scene_trained_on
 from tiny_street import FRONT, NUM_FRAMES, SIDE, SIDE_GAIN, tiny_street
 
+from lidarpainter_models.errors import DataError
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.strip_views import StripEvaluation, strip_views
-from lidarpainter_models.evaluation.strips import calibrate_strip, score_strips, strip_mask
+from lidarpainter_models.evaluation.strips import (
+    StripEvaluation,
+    calibrate_strip,
+    score_strips,
+    strip_mask,
+    strip_views,
+)
 from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_tangent
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.scenes.driving_scene import DrivingScene
@@ -113,3 +119,12 @@ def test_a_camera_judges_beside_the_fitted_one_that_sees_most_of_what_it_does(tm
     evaluation = StripEvaluation(held_out=held_out, views=seen)
     assert evaluation.fitted_cameras == ("back_camera", "left_camera", FRONT)
     assert evaluation.neighbour(scene_trained_on(list(seen.train)), SIDE) == FRONT
+
+
+def test_cameras_that_share_nothing_are_refused(views):
+    elsewhere = views[0].fitted_camera.world_from_camera.clone()
+    elsewhere[1, 3] += 500.0
+    apart = replace(views[0], fitted_camera=views[0].fitted_camera.at(elsewhere))
+    assert not strip_mask(apart).any()
+    with pytest.raises(DataError, match="shares too few"):
+        calibrate_strip(lambda *_place: views[0].truth_rgb, [apart])

@@ -8,7 +8,7 @@ from gaussian_world import scene_trained_on
 from toy_street import ToyStreet
 
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.strip_views import StripEvaluation, strip_views
+from lidarpainter_models.evaluation.strips import StripEvaluation, strip_views
 from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.observations.settings import ObservationConfig

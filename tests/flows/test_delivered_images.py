@@ -13,7 +13,7 @@ from tiny_street import FRONT, NUM_FRAMES, SETTINGS, tiny_street
 from catalog.store import open_store
 from lidarpainter_models.evaluation import strips
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.evaluation.strip_views import strip_views
+from lidarpainter_models.evaluation.strips import strip_views
 from lidarpainter_models.metrics.images import psnr_from_error, squared_error
 from lidarpainter_models.observations.settings import ObservationConfig
 from lidarpainter_models.synthetic import RigCamera

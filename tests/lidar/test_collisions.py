@@ -1,22 +1,14 @@
 """What is in the way of a path is found, and when."""
 
 import torch
+from gaussian_world import bare_points as street
 
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.lidar.collisions import MovingBody, find_collisions
-from lidarpainter_models.lidar.lidar_map import MapPoints
 from lidarpainter_models.scenes.tracks import ActorTrack
 
 SECOND_NS = 1_000_000_000
 CAR_M = torch.tensor([4.0, 2.0, 1.5])
-
-
-def street(xyz_m):
-    count = len(xyz_m)
-    zeros = torch.zeros(count, dtype=torch.int64)
-    return MapPoints.uncoloured(
-        xyz_m=xyz_m, frame_index=zeros, timestamp_ns=zeros, range_m=torch.ones(count)
-    )
 
 
 def wall(x_m, *, low_m=0.0, high_m=3.0):

@@ -13,12 +13,6 @@ def sloping_road(*, without_hole=True):
     return xyz[~is_hole] if without_hole else xyz
 
 
-def test_a_cell_holds_a_low_height_and_no_other_place_is_known():
-    ground = GroundHeights(sloping_road())
-    assert abs(float(ground.at(torch.tensor([[5.5, 5.5]]))) - 0.05 * 5.0) < 0.05
-    assert bool(ground.at(HOLE).isnan())
-
-
 def test_heights_around_a_hole_close_it():
     found = float(GroundHeights(sloping_road()).around(HOLE))
     assert abs(found - 0.05 * 10.5) < 0.2

@@ -25,14 +25,8 @@ def points(xyz_m, rgb=RED, *, timestamp_ns=0, has_colour=True, range_m=None):
     )
 
 
-def joined(*parts):
-    return MapPoints(
-        **{name: torch.cat([getattr(part, name) for part in parts]) for name in vars(parts[0])}
-    )
-
-
 def street(*parts, actors=None):
-    return LidarMap(street=joined(*parts), actors=actors or {})
+    return LidarMap(street=MapPoints.concatenate(parts), actors=actors or {})
 
 
 def wall(x_m, *, left_m, right_m, bottom_m, top_m, spacing_m):

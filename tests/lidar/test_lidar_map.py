@@ -2,13 +2,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from gaussian_world import bare_points
 from toy_street import CAR_SIZE_M, CAR_X_M, WALL_X_M, ToyStreet
 
 from lidarpainter_models.errors import SceneError
 from lidarpainter_models.lidar import map_building
 from lidarpainter_models.lidar.actor_separation import CLEARANCE_M, ROAD_HEIGHT_M, poses_at
 from lidarpainter_models.lidar.ground_heights import GroundHeights
-from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
+from lidarpainter_models.lidar.lidar_map import LidarMap
 from lidarpainter_models.lidar.map_building import build_lidar_map, gather_points
 from lidarpainter_models.scenes.records import SweepPoints
 
@@ -117,10 +118,6 @@ def test_sweeps_that_met_nothing_give_no_points(frames):
     assert (len(nothing.street), nothing.actors) == (0, {})
 
 
-def test_no_parts_make_no_points():
-    assert len(MapPoints.concatenate([])) == 0
-
-
 def test_motion_goes_on_for_a_sweep_beyond_the_last_box(street):
     track = street.tracks[0]
     end_ns = int(track.timestamps_ns[-1])
@@ -142,12 +139,7 @@ def test_ground_is_a_low_quantile_and_unknown_where_nothing_fell():
 
 def test_points_near_a_place_are_those_nearer_than_the_radius():
     xyz_m = 4 * torch.rand(3_000, 3, generator=torch.Generator().manual_seed(0)) - 2
-    street = MapPoints.uncoloured(
-        xyz_m=xyz_m,
-        frame_index=torch.zeros(len(xyz_m), dtype=torch.int64),
-        timestamp_ns=torch.zeros(len(xyz_m), dtype=torch.int64),
-        range_m=torch.ones(len(xyz_m)),
-    )
+    street = bare_points(xyz_m)
     lidar_map = LidarMap(street=street, actors={})
     for place_m in (*xyz_m[:5], torch.tensor([9.0, 0.0, 0.0])):
         expected = int(((xyz_m - place_m).norm(dim=1) < 0.6).sum())

@@ -3,13 +3,10 @@
 from dataclasses import replace
 
 import torch
-from gaussian_world import camera_at
+from gaussian_world import bare_points, camera_at
 
 from lidarpainter_models.geometry.cameras import Shutter
-from lidarpainter_models.lidar.lidar_map import MapPoints
-from lidarpainter_models.lidar.points_in_view import Body, PointsInView, points_in_view
-
-NEAR_M = 0.5
+from lidarpainter_models.lidar.points_in_view import NEAR_M, Body, PointsInView, points_in_view
 
 
 def test_a_rolling_shutter_shows_the_points_that_it_reads_and_no_others():
@@ -19,21 +16,13 @@ def test_a_rolling_shutter_shows_the_points_that_it_reads_and_no_others():
     camera = replace(at_once, shutter=shutter)
     xyz_m = torch.rand(2000, 3, generator=torch.Generator().manual_seed(0))
     xyz_m = at_once.centre_world.float() + (xyz_m - 0.5) * 8.0
-    count = len(xyz_m)
-    points = MapPoints.uncoloured(
-        xyz_m=xyz_m,
-        frame_index=torch.zeros(count, dtype=torch.int64),
-        timestamp_ns=torch.zeros(count, dtype=torch.int64),
-        range_m=torch.ones(count),
-    )
+    points = bare_points(xyz_m)
     pixels_uv, depth_m = camera.project(xyz_m.double())
     is_shown = camera.contains(pixels_uv, depth_m, near_m=NEAR_M)
     standing = at_once.contains(*at_once.project(xyz_m.double()), near_m=NEAR_M)
     assert bool((is_shown & ~standing).any())
     assert bool((standing & ~is_shown).any())
-    found = PointsInView.joined(
-        list(points_in_view([Body(None, points)], camera, 0, {}, near_m=NEAR_M))
-    )
+    found = PointsInView.joined(list(points_in_view([Body(None, points)], camera, 0, {})))
     assert torch.equal(found.rows, is_shown.nonzero()[:, 0])
     assert torch.allclose(found.pixels_uv.double(), pixels_uv[is_shown], atol=1e-3)
     assert torch.allclose(found.depth_m.double(), depth_m[is_shown], atol=1e-4)

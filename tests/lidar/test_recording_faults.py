@@ -10,7 +10,7 @@ from toy_street import ToyStreet
 
 from lidarpainter_models.geometry.cameras import Shutter
 from lidarpainter_models.lidar import recording_faults
-from lidarpainter_models.lidar.contrast_images import ContrastImage
+from lidarpainter_models.lidar.hub_images import ContrastImage
 from lidarpainter_models.lidar.recording_faults import (
     Found,
     believed,

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from gaussian_world import bare_points
 from toy_street import CAR_X_M, SKY, ToyStreet, car_y_m
 from wall_drive import WALL_X_M, WallDrive
 
-from lidarpainter_models.errors import SceneError
 from lidarpainter_models.lidar.lidar_map import LidarMap, MapPoints
 from lidarpainter_models.lidar.map_building import gather_points
 from lidarpainter_models.observations import sparse_lidar
@@ -67,14 +67,8 @@ class LorryBeforeSky(SweptWall):
         return torch.cartesian_prod(x_m, along_m, z_m)
 
 
-def points(xyz_m, range_m=10.0):
-    count = len(xyz_m)
-    return MapPoints.uncoloured(
-        xyz_m=torch.tensor(xyz_m),
-        frame_index=torch.zeros(count, dtype=torch.int64),
-        timestamp_ns=torch.zeros(count, dtype=torch.int64),
-        range_m=torch.full((count,), range_m),
-    )
+def points(xyz_m):
+    return bare_points(torch.tensor(xyz_m), range_m=10.0)
 
 
 def every_tenth(sweep):
@@ -141,13 +135,6 @@ def test_a_lidar_that_met_nothing_leaves_the_street_to_the_images():
     assert blocked.is_estimated
     assert torch.equal(blocked.lidar_map.street.xyz_m, unswept.lidar_map.street.xyz_m)
     assert set(blocked.lidar_map.actors) == set(unswept.lidar_map.actors)
-
-
-def test_a_lidar_that_met_nothing_and_images_from_one_place_are_one_clear_error():
-    street = ToyStreet()
-    street.read_sweep = lambda _: SweepPoints.of(torch.zeros(0, 3))
-    with pytest.raises(SceneError, match="no LiDAR point within 300 m, and no depth in the images"):
-        prepare_observations(street, split_views(street, "all"), SIZE)
 
 
 def test_returns_from_an_actor_are_no_sky_where_images_complete_the_lidar():

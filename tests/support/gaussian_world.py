@@ -109,6 +109,28 @@ def scene_trained_on(views):
     return replace(scene, cameras=cameras)
 
 
+def training_view(camera, *, frame=0, **shown):
+    """A black view of a frame, without sky and LiDAR if nothing else is said."""
+    size = camera.height_px, camera.width_px
+    plain = {
+        "key": (frame, "front"),
+        "timestamp_ns": frame * FRAME_NS,
+        "rgb_u8": torch.zeros(*size, 3, dtype=torch.uint8),
+        "sky_mask": torch.zeros(size, dtype=torch.bool),
+        "lidar_depth_m": torch.zeros(size),
+    }
+    return TrainingView(camera=camera, **(plain | shown))
+
+
+def bare_points(xyz_m, *, range_m=1.0):
+    """Points without colour, of frame 0."""
+    nothing = torch.zeros(len(xyz_m), dtype=torch.int64)
+    ranges_m = torch.full((len(xyz_m),), range_m)
+    return MapPoints.uncoloured(
+        xyz_m=xyz_m, frame_index=nothing, timestamp_ns=nothing, range_m=ranges_m
+    )
+
+
 def map_points(xyz_m, rgb):
     """Coloured points of frame 0."""
     count = xyz_m.shape[0]
@@ -136,10 +158,9 @@ def observe(scene, cameras, wall, car):
     for frame, camera in enumerate(cameras):
         render = scene.render(camera, frame * FRAME_NS)
         views.append(
-            TrainingView(
-                key=(frame, "front"),
-                camera=camera,
-                timestamp_ns=frame * FRAME_NS,
+            training_view(
+                camera,
+                frame=frame,
                 rgb_u8=(render.rgb.clamp(0, 1) * 255).round().to(torch.uint8),
                 sky_mask=render.alpha < 0.05,
                 lidar_depth_m=torch.where(render.alpha > 0.9, render.depth_m, 0.0),

@@ -19,7 +19,7 @@ from lidarpainter_models.conditioning.novel_guidance import (
 from lidarpainter_models.conditioning.settings import NovelGuidanceConfig
 from lidarpainter_models.evaluation.held_out import HeldOut
 from lidarpainter_models.evaluation.shown import ShownScene, ViewTimePainting
-from lidarpainter_models.evaluation.strip_views import StripEvaluation
+from lidarpainter_models.evaluation.strips import StripEvaluation
 from lidarpainter_models.gaussians.fitting.config import (
     EffortConfig,
     FitConfig,

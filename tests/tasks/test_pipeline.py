@@ -28,8 +28,7 @@ from lidarpainter_models.geometry.shifts import Shift
 from lidarpainter_models.metrics import lpips
 from lidarpainter_models.metrics.backbones import SQUEEZENET
 from lidarpainter_models.storage.tensor_files import read_tensors
-from tasks.evaluation.flicker import evaluate_flicker
-from tasks.evaluation.views import evaluate, load_scores
+from tasks.evaluation.views import evaluate, evaluate_flicker, load_scores
 from tasks.opened import open_scene
 from tasks.painter.evaluate import score_painters
 from tasks.painter.held_out_fits import HeldOutFit

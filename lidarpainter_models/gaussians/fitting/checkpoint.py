@@ -9,10 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
-from lidarpainter_models.errors import ConfigError, SceneError
+from lidarpainter_models.errors import SceneError
 from lidarpainter_models.storage.tensor_files import read_tensors, write_tensors
 
 FILE_NAME = "fit.safetensors"
@@ -26,23 +25,14 @@ class CheckpointFolder:
     """A folder of this fit alone."""
     identity: str = ""
     """Names the fit (a digest of its inputs and settings); another fit's checkpoint is refused."""
-    every_steps: int | None = None
-    """Steps between two checkpoints, if given."""
-    every_seconds: float | None = 30.0
-    """Wall seconds between two checkpoints, if given."""
+    every_seconds: float = 30.0
+    """Wall seconds between two checkpoints."""
     _last_time: float = field(default_factory=time.monotonic, repr=False)
 
-    def __post_init__(self) -> None:
-        """Refuse a schedule without sense."""
-        if self.every_steps is not None and self.every_steps < 1:
-            raise ConfigError(f"every_steps must be positive, got {self.every_steps}")
-
-    def is_due(self, step: int) -> bool:
-        """Return whether a checkpoint should be written after this many steps."""
-        if self.every_steps is not None and step % self.every_steps == 0:
-            return True
-        is_late = self.every_seconds is not None
-        return is_late and time.monotonic() - self._last_time >= (self.every_seconds or 0.0)
+    @property
+    def is_due(self) -> bool:
+        """Whether it is time for a checkpoint."""
+        return time.monotonic() - self._last_time >= self.every_seconds
 
     def save(self, tensors: dict[str, Tensor], numbers: dict[str, Any]) -> None:
         """Replace the checkpoint.
@@ -88,10 +78,3 @@ def ungroup_tensors(tensors: dict[str, Tensor], group: str) -> dict[str, Tensor]
         for name, value in tensors.items()
         if name.startswith(prefix)
     }
-
-
-def generator_from(state: Tensor) -> torch.Generator:
-    """Return a random generator in a kept state."""
-    generator = torch.Generator()
-    generator.set_state(state)
-    return generator

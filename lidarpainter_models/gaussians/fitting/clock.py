@@ -10,13 +10,7 @@ smaller ones 0.72, as Gaussians cost more than pixels there (docs/decisions/leng
 
 
 def work_of(step: int, config: FitConfig, steps: int | None = None) -> float:
-    """Return what the first steps cost, in steps at full image size.
-
-    Args:
-        step: how many of them.
-        config: settings of the fit.
-        steps: of the fit in all; None is as planned.
-    """
+    """Return what the first `step` steps of so many in all cost, in steps at full image size."""
     steps = config.steps if steps is None else steps
     return step - (1 - HALF_STEP) * min(step, config.half_resolution * steps)
 

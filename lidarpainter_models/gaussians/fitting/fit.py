@@ -145,7 +145,9 @@ def _begun(plan: FitPlan, inputs: _Inputs, start: GaussianScene | None) -> FitSt
     """Return the fit as a checkpoint kept it, or before its first step."""
     kept = inputs.checkpoints.load() if inputs.checkpoints is not None else None
     if kept is not None:
-        return FitState.resume(*kept, plan.settings, plan.pixels_per_view, plan.device)
+        return FitState.resume(
+            *kept, plan.settings, plan.pixels_per_view, plan.device, inputs.perceptual
+        )
     if start is None:
         return_freed_memory()  # of what prepared the observations
         start = initialise_scene(
@@ -153,15 +155,15 @@ def _begun(plan: FitPlan, inputs: _Inputs, start: GaussianScene | None) -> FitSt
             plan.settings.initialisation,
             progress=lambda share: inputs.progress(FitProgress(plan=plan, placed=share)),
         )
-    return FitState.begin(start.to(plan.device), plan.settings, plan.pixels_per_view)
+    return FitState.begin(
+        start.to(plan.device), plan.settings, plan.pixels_per_view, inputs.perceptual
+    )
 
 
 def _follow(plan: FitPlan, state: FitState, inputs: _Inputs) -> FitResult:
-    """Make all steps that are left."""
     cpu_before_s = time.process_time() - state.cpu_s
     config, views = plan.settings, inputs.observations.views
-    half_too = config.half_resolution > 0
-    full, half = fit_images(views, state.scene.sky.layout, half_too=half_too)
+    full, half = fit_images(views, state.scene.sky.layout, half_too=config.half_resolution > 0)
     guidance = inputs.guidance
     if plan.keeps_images:
         full, half = ([image.to(plan.device) for image in images] for images in (full, half))
@@ -170,7 +172,7 @@ def _follow(plan: FitPlan, state: FitState, inputs: _Inputs) -> FitResult:
     while state.step < state.steps:
         is_half = state.step < config.half_resolution * state.steps
         row = state.next_view(plan.surface.groups)
-        _advance(state, half if is_half else full, row, guidance, config, inputs.perceptual)
+        _advance(state, half if is_half else full, row, guidance)
         state.cpu_s = time.process_time() - cpu_before_s
         if state.step % config.log_every == 0 or state.step == state.steps:
             state.steps = clock.steps_in_time(state.step, state.steps)
@@ -179,7 +181,7 @@ def _follow(plan: FitPlan, state: FitState, inputs: _Inputs) -> FitResult:
         if look is not None and state.step >= state.steps * FIRST_LOOK:
             look(state.caught_up())
             look = None
-        if inputs.checkpoints is not None and inputs.checkpoints.is_due(state.step):
+        if inputs.checkpoints is not None and inputs.checkpoints.is_due:
             inputs.checkpoints.save(*state.keep())
     return FitResult(
         scene=_finished(state),
@@ -197,24 +199,19 @@ def _tell(progress: Progress, plan: FitPlan, state: FitState) -> None:
 
 
 def _advance(
-    state: FitState,
-    images: Sequence[FitImage],
-    row: int,
-    guidance: Sequence[GuidanceView],
-    config: FitConfig,
-    perceptual: Perceptual | None,
+    state: FitState, images: Sequence[FitImage], row: int, guidance: Sequence[GuidanceView]
 ) -> None:
     """Make one step: gradients, optimisers, and at their times what changes the set."""
-    painted = None
+    painted, config = None, state.config
     takes_part = state.step < config.guidance.until * state.steps
     if guidance and takes_part and state.random() < config.guidance.probability:
         place = int(torch.randint(len(guidance), (), generator=state.generator))
         painted = (place, guidance[place].to(state.scene.device))
     image = images[row].to(state.scene.device)
-    told = fit_step(state, image, row, painted, config, perceptual)
+    told = fit_step(state, image, row, painted)
     state.step += 1
     state.recent.append(told)
-    _change_set(state, config)
+    _change_set(state)
     if config.refinement.lamps and not state.sought_lamps and not len(state.scene.blinking):
         _seek_lamps(state, images)
     if state.step % LIMITS_EVERY == 0:
@@ -223,9 +220,8 @@ def _advance(
         state.blocks.refresh(scene.gaussians)
 
 
-def _change_set(state: FitState, config: FitConfig) -> None:
-    """Split and prune when it is time."""
-    settings, fraction = config.densification, state.fraction
+def _change_set(state: FitState) -> None:
+    settings, fraction = state.config.densification, state.fraction
     if state.step % settings.every or fraction < settings.start or state.step == state.steps:
         return
     sizes = [track.size_m for track in state.scene.actors.recorded_tracks]
@@ -238,7 +234,6 @@ def _change_set(state: FitState, config: FitConfig) -> None:
 
 
 def _seek_lamps(state: FitState, images: Sequence[FitImage]) -> None:
-    """Look for lamps that go on and off when it is time."""
     if state.step < LAMPS_AT * state.steps:
         return
     cameras = [

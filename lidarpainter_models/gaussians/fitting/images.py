@@ -1,7 +1,7 @@
 """Training images at full and half size, kept as bytes until a step of the fit asks for one."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from lidarpainter_models.devices import on_device
 from lidarpainter_models.gaussians.model.sky import seen_as_sky
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.pixel_losses import NOTHING, OPEN, SKY, SOLID, PixelFacts
@@ -37,26 +38,13 @@ class FitImage:
 
     def to(self, device: torch.device) -> "FitImage":
         """Return the image on another device; itself if it is there."""
-        if self.rgb_u8.device == device:
-            return self
-        return replace(
-            self,
-            rgb_u8=self.rgb_u8.to(device, non_blocking=True),
-            kind=self.kind.to(device, non_blocking=True),
-            lidar_depth_m=self.lidar_depth_m.to(device, non_blocking=True),
-            hidden=None if self.hidden is None else self.hidden.to(device, non_blocking=True),
-        )
+        return self if self.rgb_u8.device == device else on_device(self, device)
 
     def facts(self) -> PixelFacts:
         """Return what a step reads, made anew each time: floats take four times the memory."""
         return PixelFacts(
             rgb=self.rgb_u8.float() / 255, kind=self.kind, lidar_depth_m=self.lidar_depth_m
         )
-
-    @property
-    def is_open(self) -> Bool[Tensor, "height width"]:
-        """Pixels that may be sky without being in its mask."""
-        return self.kind == OPEN
 
 
 def fit_images(

@@ -1,18 +1,19 @@
-"""What images have that a scene lacks, place by place, and whether it comes and goes."""
+"""What images have that a scene lacks, whether it comes and goes, and how lamps shine by it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidarpainter_models.gaussians.fitting.images import FitImage
-from lidarpainter_models.gaussians.model.drawing import OPAQUE
+from lidarpainter_models.gaussians.model.blinking import NUM_NODES, Blinking, with_added_colour
+from lidarpainter_models.gaussians.model.drawing import OPAQUE, draw_gaussians
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import SH_CONSTANT
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.kernels.gaussian_raster import Splats, render_gaussians
 
 LEAST_PX = 1.0
 """A place of which an image shows less than so many pixels is not seen by it."""
@@ -93,19 +94,8 @@ def lacking(
     harmonics = gaussians.sh.clone().requires_grad_(True)
     ones = torch.ones(len(gaussians), 1, device=scene.device, requires_grad=True)
     with torch.enable_grad():
-        drawn = render_gaussians(
-            Splats(
-                means=gaussians.means,
-                rotation_wxyz=gaussians.rotation_wxyz,
-                scale_m=gaussians.scale_m,
-                opacity=gaussians.opacity,
-                sh=harmonics,
-                body_index=gaussians.body_index,
-            ),
-            posed.bodies.to(scene.device),
-            camera,
-            features=ones,
-        )
+        coloured = replace(gaussians, sh_dc=harmonics[:, :1], sh_rest=harmonics[:, 1:])
+        drawn = draw_gaussians(coloured, posed.bodies, camera, channels=ones)
         alpha = drawn.alpha.detach()
         sky_rgb = scene.sky.sample(scene.sky.rays(camera, alpha < OPAQUE))
         shown = drawn.rgb.detach() + (1 - alpha)[..., None] * sky_rgb
@@ -120,3 +110,115 @@ def lacking(
 
 def _gradient(leaf: Tensor) -> Tensor:
     return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
+
+
+NEAREST_M = 0.2
+"""Depth below which a lamp does not count as before a camera."""
+STEADINESS = 0.3
+"""Pixels with no change that each node of a lattice starts with."""
+ROUNDS = 10
+"""Iterations in which a lattice is fitted to its Gaussians."""
+
+
+def with_measured_lamps(
+    scene: GaussianScene, lamps: Blinking, looks: Sequence[Look], most: int
+) -> GaussianScene:
+    """The scene with these lamps, as images that may show one tell when and how they shine.
+
+    Of more than `most` evenly chosen ones are looked at. A lamp that these do not show both on and
+    off is left out.
+    """
+    gaussians = scene.gaussians
+    every = torch.arange(len(lamps), device=scene.device)
+    rows, lamp = lamps.inside(gaussians.means, gaussians.body_index, every)
+    used = [look for look in looks if _may_show(scene, lamps, look)]
+    used = used[:: max(-(-len(used) // most), 1)]
+    if not used:
+        return scene
+    own = torch.full_like(gaussians.body_index, len(rows), dtype=torch.int64)
+    own[rows] = torch.arange(len(rows), device=scene.device)
+    pixels, error = (part[:-1] for part in series(scene, used, own, len(rows) + 1))
+    in_lamp = [
+        part.new_zeros(len(lamps), *part.shape[1:]).index_add(0, lamp, part)
+        for part in (pixels, error)
+    ]
+    levels = two_levels(*in_lamp)
+    is_seen = in_lamp[0] >= LEAST_PX
+    both = levels.is_high.any(dim=1) & (is_seen & ~levels.is_high).any(dim=1)
+    is_on, is_off = levels.is_high[lamp], (is_seen & ~levels.is_high & both[:, None])[lamp]
+    off_rgb, off_px = _mean(pixels, error, is_off)
+    on_rgb, on_px = _mean(pixels, error, is_on)
+    change_px = off_px * on_px / (off_px + on_px).clamp(min=1e-9)
+    dark = _fitted(lamps, gaussians.means[rows], lamp, off_rgb, off_px)
+    lit = _fitted(lamps, gaussians.means[rows], lamp, on_rgb - off_rgb, change_px)
+    darker = lamps.colours(dark, gaussians.means[rows], lamp)
+    shining = _over_time(replace(lamps, lit_rgb=lit), used, is_seen, levels).kept(both)
+    return replace(
+        scene.with_gaussians(with_added_colour(gaussians, rows, darker)), blinking=shining
+    )
+
+
+def _may_show(scene: GaussianScene, lamps: Blinking, look: Look) -> bool:
+    """Whether the middle of a lamp is in an image, or beside it by less than the lamp is wide."""
+    bodies = scene.posed(look.camera, look.image.timestamp_ns).bodies[lamps.bodies.cpu()]
+    x, y, z = (bodies[:, :3, :3] @ lamps.centre_m.cpu()[..., None] + bodies[:, :3, 3:])[..., 0].T
+    camera, depth_m = look.camera, z.clamp(min=NEAREST_M)
+    wide_px = lamps.size_m.cpu().amax(dim=1) * camera.fx_px / depth_m
+    u, v = x / depth_m * camera.fx_px + camera.cx_px, y / depth_m * camera.fy_px + camera.cy_px
+    is_shown = (z > NEAREST_M) & (u > -wide_px) & (u < camera.width_px + wide_px)
+    return bool((is_shown & (v > -wide_px) & (v < camera.height_px + wide_px)).any())
+
+
+def _mean(
+    pixels: Float[Tensor, "rows images"],
+    error: Float[Tensor, "rows images 3"],
+    taken: Bool[Tensor, "rows images"],
+) -> tuple[Float[Tensor, "rows 3"], Float[Tensor, " rows"]]:
+    """What some images have more of colour where each Gaussian is, and of how many pixels."""
+    total_px = torch.where(taken, pixels, 0.0).sum(dim=1)
+    total = torch.where(taken[..., None], error, 0.0).sum(dim=1)
+    return total / total_px.clamp(min=1e-6)[:, None], total_px
+
+
+def _fitted(
+    lamps: Blinking,
+    means: Float[Tensor, "rows 3"],
+    lamp: Int[Tensor, " rows"],
+    rgb: Float[Tensor, "rows 3"],
+    pixels: Float[Tensor, " rows"],
+) -> Float[Tensor, "lamps nodes 3"]:
+    """Lattices that have these colours where the Gaussians are, by how many pixels show them."""
+    leaf = torch.zeros(len(lamps), NUM_NODES, 3, device=means.device, requires_grad=True)
+
+    def at_nodes(of_rows: Float[Tensor, "rows 3"]) -> Float[Tensor, "lamps nodes 3"]:
+        """Sums of what Gaussians have, each parted among the nodes around it."""
+        with torch.enable_grad():
+            (sums,) = torch.autograd.grad((lamps.colours(leaf, means, lamp) * of_rows).sum(), leaf)
+        return sums
+
+    total = at_nodes(pixels[:, None].expand(-1, 3)) + STEADINESS
+    found = torch.zeros_like(total)
+    for _ in range(ROUNDS):
+        missing = rgb - lamps.colours(found, means, lamp)
+        found = found + (at_nodes(pixels[:, None] * missing) - STEADINESS * found) / total
+    return found
+
+
+def _over_time(
+    lamps: Blinking, looks: Sequence[Look], is_seen: Bool[Tensor, "lamps images"], levels: Levels
+) -> Blinking:
+    """The lamps with when they are on: as the images of a time say, in between where none does."""
+    times_ns = torch.tensor([look.image.timestamp_ns for look in looks])
+    knots_ns, at = torch.unique(times_ns, return_inverse=True)
+    is_seen, is_high = is_seen.cpu().float(), levels.is_high.cpu().float()
+    seen = torch.zeros(len(lamps), len(knots_ns)).index_add(1, at, is_seen)
+    high = torch.zeros(len(lamps), len(knots_ns)).index_add(1, at, is_high)
+    knots_s = (knots_ns - knots_ns[0]).numpy() * 1e-9
+    is_lit = [
+        np.interp(knots_s, knots_s[known], (high[row] / seen[row].clamp(min=1)).numpy()[known])
+        if known.any()
+        else np.zeros(len(knots_s))
+        for row in range(len(lamps))
+        for known in [(seen[row] > 0).numpy()]
+    ]
+    return replace(lamps, knots_ns=knots_ns, is_lit=torch.tensor(np.array(is_lit)).float().T)

@@ -20,8 +20,8 @@ from lidarpainter_models.gaussians.fitting.lamp_images import (
     Look,
     series,
     two_levels,
+    with_measured_lamps,
 )
-from lidarpainter_models.gaussians.fitting.lamp_light import with_measured_lamps
 from lidarpainter_models.gaussians.model.blinking import Blinking
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet

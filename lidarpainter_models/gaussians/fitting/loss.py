@@ -9,7 +9,7 @@ those of `refinement`.
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.gaussians.fitting.config import FitConfig, FitLossWeights
@@ -60,14 +60,7 @@ def recorded_loss(
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "height width 3"]]:
     """Return the loss of a recorded view without its actors' term, and what the view shows.
 
-    Args:
-        splat: the drawn Gaussians.
-        sky_rgb: the sky behind them.
-        image: what was recorded; nothing is learnt from its hidden pixels.
-        facts: the same as floats.
-        weights: how much each term counts.
-        exposure: how the camera shows colours, if that is fitted.
-        perceptual: distance of images, where one has a weight.
+    Nothing is learnt from hidden pixels of the image, whose `facts` are the same as floats.
     """
     terms = pixel_terms(splat, sky_rgb, facts, RULES, exposure=exposure)
     shown = terms.shown
@@ -90,13 +83,6 @@ def painted_loss(
 
     What LiDAR hit is opaque there as on recorded views. The depth term alone is content with ever
     less of what is there, and wears away what recorded views do not hold.
-
-    Args:
-        splat: the drawn Gaussians.
-        sky_rgb: the sky behind them.
-        view: what was painted, and how far each pixel is trusted.
-        config: of the fit; its guidance and the weight of its sky count.
-        perceptual: distance of images, where one has a weight.
     """
     settings = config.guidance
     shown = splat.rgb + (1 - splat.alpha)[..., None] * sky_rgb
@@ -116,19 +102,15 @@ def painted_loss(
 
 
 def actor_loss(splat: SplatImage, posed: PosedScene) -> Float[Tensor, ""]:
-    """Return how far actors show outside their projected boxes; the splat has their channel."""
+    """Return how far actors show outside their projected boxes; the splat has their channel.
+
+    The mean of -log(1 - alpha) of the actors outside, of the entropy of alpha inside.
+    """
     world_from_actors, present = posed.poses
     sizes = [track.size_m for track in posed.actors.recorded_tracks]
     in_boxes = project_boxes(posed.camera, world_from_actors.detach(), sizes, present > 0)
     in_boxes = in_boxes.to(splat.alpha.device, non_blocking=True)
-    return actor_boundary_loss(splat.features[..., 0], in_boxes)
-
-
-def actor_boundary_loss(
-    actor_alpha: Float[Tensor, "height width"], in_boxes: Bool[Tensor, "height width"]
-) -> Float[Tensor, ""]:
-    """Return the mean of -log(1 - actor_alpha) outside projected boxes, of its entropy inside."""
-    inside = actor_alpha.clamp(_EDGE, 1 - _EDGE)
+    inside = splat.features[..., 0].clamp(_EDGE, 1 - _EDGE)
     log_clear = torch.log1p(-inside)
     entropy = -(inside * inside.log() + (1 - inside) * log_clear)
     return torch.where(in_boxes, entropy, -log_clear).mean()

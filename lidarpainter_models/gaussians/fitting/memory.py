@@ -80,14 +80,8 @@ def planned_memory(
 ) -> FitMemory:
     """Return what a fit takes when it has as many Gaussians as it may have and all are in view.
 
-    Args:
-        observations: what was recorded.
-        config: planned settings.
-        sky: layout of the sky's texture.
-        start: Gaussians that are continued; they may be more than the budget.
-        guidance: painted views.
-        most_gaussians: there may be, at first and later, if they are fewer than planned.
-        keeps_images: whether images lie on the device, or are sent there one by one.
+    A `start` may have more than the budget of the planned settings. There may be `most_gaussians`,
+    at first and later; images lie on the device, or are sent there one by one.
     """
     most = math.inf if most_gaussians is None else most_gaussians
     first = min(config.initialisation.num_gaussians, most)

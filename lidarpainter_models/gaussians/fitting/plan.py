@@ -12,13 +12,12 @@ from typing import Any
 
 import torch
 
-from lidarpainter_models.gaussians.fitting.config import FitConfig
+from lidarpainter_models.gaussians.fitting.config import START_SHARE, FitConfig
 from lidarpainter_models.gaussians.fitting.memory import (
     FitMemory,
     gaussians_within_limit,
     planned_memory,
 )
-from lidarpainter_models.gaussians.fitting.number_of_gaussians import START_SHARE
 from lidarpainter_models.gaussians.fitting.seen_surface import (
     SeenSurface,
     seen_surface,
@@ -87,15 +86,10 @@ def plan_fit(
     device: torch.device,
     keeps_images: bool = True,
 ) -> FitPlan:
-    """Plan a fit from what its views show.
+    """Plan a fit from what its views show; a number of the settings that is 0 follows from them.
 
-    Args:
-        observations: what was recorded.
-        config: what is asked for; a number that is 0 follows from the views.
-        start: the scene that is continued, if any; it is not made smaller.
-        guidance: painted views, which show more surface and take memory.
-        device: where the fit runs; only a CPU has a limit of memory.
-        keeps_images: whether the images of the fit lie on the device.
+    A `start` is not made smaller. Painted views show more surface and take memory, of which only a
+    CPU has a limit; `keeps_images` says whether images lie on the device.
 
     Raises:
         ConfigError: the memory allowed holds no fit.
@@ -130,10 +124,7 @@ def planned_settings(
 ) -> FitConfig:
     """Return the settings with every number that was left open; what is set stays.
 
-    Args:
-        config: what is asked for.
-        surface: what the views show.
-        most_gaussians: there may be, at first and later, where memory is limited.
+    Where memory is limited there may be `most_gaussians`, at first and later.
     """
     effort, growth, start = config.effort, config.densification, config.initialisation
     budget = growth.budget or max(round(effort.gaussians_per_pixel * surface.num_detailed), 1)

@@ -25,6 +25,7 @@ BEND_PRIOR = 3e-6
 """Weight of the squared strain of lattices (`Bending.strain`), likewise."""
 BEND_NOISE_M = 0.1
 """Expected way of a node."""
+BETAS = (0.9, 0.99)
 
 
 class RowAdam:
@@ -34,9 +35,8 @@ class RowAdam:
     let a correction drift on momentum for the dozen steps until its view is drawn again.
     """
 
-    def __init__(self, table: Tensor, *, betas: tuple[float, float] = (0.9, 0.99)) -> None:
+    def __init__(self, table: Tensor) -> None:
         """Start with empty moments; rows are the first dimension (or the first two, flattened)."""
-        self.betas = betas
         self.first = torch.zeros_like(table)
         self.second = torch.zeros_like(table)
         self.count = torch.zeros(table.shape[0], dtype=torch.int64, device=table.device)
@@ -52,24 +52,19 @@ class RowAdam:
 
         Whoever knows these rows names them: to look for them, the host waits for the device.
         """
-        if rows is not None:
-            self._step(table, gradient, rate, rows)
-        elif (found := gradient.abs().sum(dim=1).nonzero()[:, 0]).numel():
-            self._step(table, gradient, rate, found)
-
-    def _step(
-        self, table: Tensor, gradient: Tensor, rate: Float[Tensor, "columns"], rows: slice | Tensor
-    ) -> None:
-        beta1, beta2 = self.betas
-        g = gradient[rows]
-        self.count[rows] += 1
-        count = self.count[rows, None].to(g.dtype)
-        first = beta1 * self.first[rows] + (1 - beta1) * g
-        second = beta2 * self.second[rows] + (1 - beta2) * g * g
-        self.first[rows], self.second[rows] = first, second
+        beta1, beta2 = BETAS
+        found = gradient.abs().sum(dim=1).nonzero()[:, 0] if rows is None else rows
+        if isinstance(found, Tensor) and not len(found):
+            return
+        g = gradient[found]
+        self.count[found] += 1
+        count = self.count[found, None].to(g.dtype)
+        first = beta1 * self.first[found] + (1 - beta1) * g
+        second = beta2 * self.second[found] + (1 - beta2) * g * g
+        self.first[found], self.second[found] = first, second
         spread = (second / (1 - beta2**count)).sqrt() + 1e-15
         with torch.no_grad():
-            table[rows] -= rate * (first / (1 - beta1**count)) / spread
+            table[found] -= rate * (first / (1 - beta1**count)) / spread
 
     def tensors(self) -> dict[str, Tensor]:
         """State to be kept in a checkpoint."""
@@ -158,10 +153,7 @@ class Refinement:
     def step(self, step: int, fraction: float, image: FitImage) -> None:
         """Move the corrections that are refined by the gradients they received; drop these.
 
-        Args:
-            step: how many steps were made before.
-            fraction: which part of the fit these are, 0 to 1.
-            image: the recorded view of this step.
+        So many steps, a fraction of the fit, were made before this one of a recorded view.
         """
         if self.refines_cameras(step):
             table = self.scene.cameras.view_tangent
@@ -253,7 +245,6 @@ def pose_prior(
 
 
 def _gradient(table: Tensor) -> Tensor:
-    """Return the gradient that the backward pass left."""
     if table.grad is None:
         raise RuntimeError(f"no gradient reached a table of shape {tuple(table.shape)}")
     return table.grad

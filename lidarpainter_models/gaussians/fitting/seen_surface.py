@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d
 
 from lidarpainter_models.gaussians.fitting.images import shrink_depth
-from lidarpainter_models.gaussians.initialisation.unreached import FARTHEST_M, depth_from_below
+from lidarpainter_models.gaussians.initialisation.unreached import depth_from_below
 from lidarpainter_models.geometry.cameras import Camera, outside_all
 from lidarpainter_models.lidar.sparse_depth import sparse_lidar_depth
 from lidarpainter_models.observations.views import GuidanceView, TrainingView
@@ -172,7 +172,7 @@ def _cells(
     depth_m = shrink_depth(view.lidar_depth_m, **grid)
     if street is not None:
         depth_m = sparse_lidar_depth(street, small)
-    depth_m = depth_from_below(depth_m, fallback_m=FARTHEST_M)
+    depth_m = depth_from_below(depth_m)
     size = (grid["height_px"], grid["width_px"])
     shown = adaptive_avg_pool2d(view.shows_surface.float()[None], size)[0]
     is_solid = shown > least_shown

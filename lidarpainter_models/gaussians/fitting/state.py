@@ -13,15 +13,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.gaussians.fitting.checkpoint import (
-    generator_from,
-    group_tensors,
-    ungroup_tensors,
-)
+from lidarpainter_models.gaussians.fitting.checkpoint import group_tensors, ungroup_tensors
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.densification import GradientTally, SetChange
 from lidarpainter_models.gaussians.fitting.gaussian_adam import GaussianAdam, most_sigmas
 from lidarpainter_models.gaussians.fitting.hidden_gaussians import HiddenGaussians
+from lidarpainter_models.gaussians.fitting.loss import Perceptual
 from lidarpainter_models.gaussians.fitting.refinement import Refinement
 from lidarpainter_models.gaussians.model.bending import REACH_M
 from lidarpainter_models.gaussians.model.gaussian_scene import GaussianScene
@@ -46,8 +43,11 @@ class FitState:
     refinement: Refinement
     tally: GradientTally
     generator: torch.Generator
+    config: FitConfig
     steps: int
     """Steps of the fit in all, as planned; a limit of time lowers them."""
+    perceptual: Perceptual | None = None
+    """Distance of images, where one has a weight."""
     waiting: list[int] = field(default_factory=list)
     """Groups of views still to be drawn from in this pass."""
     step: int = 0
@@ -61,7 +61,13 @@ class FitState:
     the host waits for the device whenever it reads."""
 
     @classmethod
-    def begin(cls, scene: GaussianScene, config: FitConfig, pixels_per_view: float) -> "FitState":
+    def begin(
+        cls,
+        scene: GaussianScene,
+        config: FitConfig,
+        pixels_per_view: float,
+        perceptual: Perceptual | None = None,
+    ) -> "FitState":
         """A fit before its first step; takes its own copy of the scene."""
         scene = copy_scene(scene)
         scene = scene.with_gaussians(scene.gaussians.as_leaves())
@@ -75,7 +81,9 @@ class FitState:
             refinement=Refinement.begin(scene, config),
             tally=GradientTally.zeros(scene.num_gaussians, scene.device),
             generator=generator,
+            config=config,
             steps=config.steps,
+            perceptual=perceptual,
         )
 
     @property
@@ -189,10 +197,12 @@ class FitState:
         config: FitConfig,
         pixels_per_view: float,
         device: torch.device | None = None,
+        perceptual: Perceptual | None = None,
     ) -> "FitState":
         """The state that `keep` described; where it was kept from does not matter."""
         scene = scene_from_arrays(ungroup_tensors(tensors, "scene"), numbers["scene"])
-        state = cls.begin(scene if device is None else scene.to(device), config, pixels_per_view)
+        scene = scene if device is None else scene.to(device)
+        state = cls.begin(scene, config, pixels_per_view, perceptual)
         state.gaussian_adam.load(ungroup_tensors(tensors, "gaussian_adam"))
         for name, adam in state.refinement.adams.items():
             adam.load(ungroup_tensors(tensors, name))
@@ -205,7 +215,7 @@ class FitState:
         state.hidden = HiddenGaussians.from_tensors(kept_hidden, state.scene.device)
         tally = ungroup_tensors(tensors, "tally")
         state.tally = GradientTally(**{name: value.to(device) for name, value in tally.items()})
-        state.generator = generator_from(tensors["random/state"])
+        state.generator.set_state(tensors["random/state"])
         state.waiting = list(numbers["waiting"])
         state.step, state.cpu_s = numbers["step"], numbers["cpu_s"]
         state.sought_lamps = numbers.get("sought_lamps", False)

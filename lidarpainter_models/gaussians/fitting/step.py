@@ -12,12 +12,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.fitting.hidden_gaussians import probed
 from lidarpainter_models.gaussians.fitting.images import FitImage
 from lidarpainter_models.gaussians.fitting.loss import (
     ACTOR_TERM_EVERY,
-    Perceptual,
     actor_loss,
     painted_loss,
     recorded_loss,
@@ -32,7 +30,7 @@ from lidarpainter_models.gaussians.model.sky import (
     MIN_TRANSMITTANCE,
 )
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
-from lidarpainter_models.kernels.pixel_losses import SKY
+from lidarpainter_models.kernels.pixel_losses import OPEN, SKY
 from lidarpainter_models.kernels.side_by_side import both
 from lidarpainter_models.kernels.sky_texture import SkyRays
 from lidarpainter_models.observations.views import GuidanceView
@@ -49,19 +47,9 @@ def fit_step(
     state: FitState,
     image: FitImage,
     row: int,
-    guidance: tuple[int, GuidanceView] | None,
-    config: FitConfig,
-    perceptual: Perceptual | None,
+    guidance: tuple[int, GuidanceView] | None = None,
 ) -> Float[Tensor, "2"]:
-    """Step everything by one recorded view and a painted one if it is given.
-
-    Args:
-        state: the running fit.
-        image: the recorded view.
-        row: its place among all of them.
-        guidance: a painted view and its place among all of them.
-        config: settings of the fit.
-        perceptual: distance of images, where one has a weight.
+    """Step everything by one recorded view and a painted one, if given; each at its place.
 
     Returns:
         The loss and the mean squared error of the recorded image, where the scene lies.
@@ -76,16 +64,12 @@ def fit_step(
         looks[~place] = beside.looks()
     seen = state.seen(looks)
     probes = [state.hidden.probe(name, len(seen)) for name in looks]
-    of_recorded = partial(
-        _recorded_gradients, state, seen, image, row, posed, config, perceptual, probes[0]
-    )
+    of_recorded = partial(_recorded_gradients, state, seen, image, row, posed, probes[0])
     if guidance is None:
         found = of_recorded()
     else:
         twin = seen.twin()
-        of_painted = partial(
-            add_guidance_gradients, state, twin, painted, beside, config, perceptual, probes[1]
-        )
+        of_painted = partial(add_guidance_gradients, state, twin, painted, beside, probes[1])
         found, _ = both(of_recorded, of_painted, state.scene.device)
         seen.take_gradients_of(twin)
     for name, probe in zip(looks, probes, strict=True):
@@ -107,20 +91,17 @@ class _OfRecorded(NamedTuple):
     sky_rays: SkyRays
 
 
-def _recorded_gradients(  # noqa: PLR0913 - what a step is made of
+def _recorded_gradients(
     state: FitState,
     seen: SeenGaussians,
     image: FitImage,
     row: int,
     posed: PosedScene,
-    config: FitConfig,
-    perceptual: Perceptual | None,
     probe: Float[Tensor, "seen 1"] | None,
 ) -> _OfRecorded:
-    """Collect the gradients of a recorded view."""
-    weights, sky = config.losses, state.scene.sky
+    weights, sky = state.config.losses, state.scene.sky
     facts = image.facts()
-    with_actors = _wants_actor_term(state, config)
+    with_actors = _wants_actor_term(state)
     screen_gradient = torch.zeros(len(seen), device=seen.means.device)
     splat = posed.draw(
         seen,
@@ -128,11 +109,11 @@ def _recorded_gradients(  # noqa: PLR0913 - what a step is made of
         channel=probe,
         screen_gradient_out=screen_gradient,
     )
-    rays = sky.rays(posed.camera, (splat.alpha.detach() < OPAQUE) | image.is_open)
+    rays = sky.rays(posed.camera, (splat.alpha.detach() < OPAQUE) | (image.kind == OPEN))
     sky_rgb = sky.sample(rays).requires_grad_(True)
     exposure = state.refinement.exposure(image)
     loss, shown = recorded_loss(
-        splat, sky_rgb, image, facts, weights, exposure=exposure, perceptual=perceptual
+        splat, sky_rgb, image, facts, weights, exposure=exposure, perceptual=state.perceptual
     )
     if with_actors:
         loss = loss + weights.actors * actor_loss(splat, posed)
@@ -151,23 +132,21 @@ def add_guidance_gradients(
     seen: SeenGaussians,
     view: GuidanceView,
     posed: PosedScene,
-    config: FitConfig,
-    perceptual: Perceptual | None = None,
     probe: Float[Tensor, "seen 1"] | None = None,
 ) -> None:
     """Add one painted view's gradients to the Gaussians; nothing else is changed by it."""
     sky = state.scene.sky
     splat = posed.held().draw(seen, channel=probe)
     sky_rgb = sky.sample(sky.rays(view.camera, splat.alpha.detach() < OPAQUE))
-    loss = painted_loss(splat, sky_rgb, view, config, perceptual)
+    loss = painted_loss(splat, sky_rgb, view, state.config, state.perceptual)
     if probe is not None:
         loss = loss + probed(splat)
     loss.backward()
 
 
-def _wants_actor_term(state: FitState, config: FitConfig) -> bool:
+def _wants_actor_term(state: FitState) -> bool:
     is_due = state.step % ACTOR_TERM_EVERY == 0
-    return is_due and config.losses.actors > 0 and bool(state.scene.actors.recorded_tracks)
+    return is_due and state.config.losses.actors > 0 and bool(state.scene.actors.recorded_tracks)
 
 
 def _step_sky(state: FitState, found: _OfRecorded, image: FitImage) -> None:

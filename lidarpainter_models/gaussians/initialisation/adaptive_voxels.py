@@ -14,6 +14,8 @@ from torch import Tensor
 
 from lidarpainter_models.lidar.lidar_map import MapPoints
 
+MOST_M = 2.0
+"""The largest edge of a voxel."""
 POINTS_AT_ONCE = 1 << 18
 """Points that are copied to float64 at a time: copies of all take more than the points."""
 
@@ -84,26 +86,20 @@ class Cloud:
             least_m=least_m,
         )
 
-    def sizes(self, factor: float, *, most_m: float) -> Float[Tensor, " points"]:
+    def sizes(self, factor: float) -> Float[Tensor, " points"]:
         """Voxel edge of each point: about `factor` spacings, as a power of two times the least."""
-        wanted = (self.spacing_m * factor).clamp(self.least_m, most_m)
+        wanted = (self.spacing_m * factor).clamp(self.least_m, MOST_M)
         return self.least_m * 2 ** torch.floor(torch.log2(wanted / self.least_m) + 0.5)
 
 
-def adaptive_voxels(
-    clouds: Sequence[Cloud], *, budget: int, most_m: float = 2.0
-) -> list[VoxelPoints]:
+def adaptive_voxels(clouds: Sequence[Cloud], *, budget: int) -> list[VoxelPoints]:
     """At most `budget` voxels of all clouds, of the smallest size that allows.
 
-    A spacing asks for the same detail on whatever body. Fewer come out if the clouds are smaller;
-    `most_m` is the largest edge.
+    A spacing asks for the same detail on whatever body. Fewer come out if the clouds are smaller.
     """
 
     def count(factor: float) -> int:
-        return sum(
-            _num_unique(voxel_keys(cloud.xyz_m, cloud.sizes(factor, most_m=most_m)))
-            for cloud in clouds
-        )
+        return sum(_num_unique(voxel_keys(one.xyz_m, one.sizes(factor))) for one in clouds)
 
     low, high = 0.25, 1024.0
     best = low
@@ -112,10 +108,7 @@ def adaptive_voxels(
             middle = (low * high) ** 0.5
             low, high = (low, middle) if count(middle) <= budget else (middle, high)
         best = high
-    voxels = [
-        mean_by_voxel(cloud.xyz_m, cloud.rgb_u8, cloud.has_colour, cloud.sizes(best, most_m=most_m))
-        for cloud in clouds
-    ]
+    voxels = [mean_by_voxel(cloud, cloud.sizes(best)) for cloud in clouds]
     share = budget / max(sum(part.size_m.numel() for part in voxels), 1)
     return voxels if share >= 1 else [_evenly_chosen(part, share) for part in voxels]
 
@@ -135,19 +128,14 @@ def _evenly_chosen(voxels: VoxelPoints, share: float) -> VoxelPoints:
     return voxels.keep(chosen)
 
 
-def mean_by_voxel(
-    xyz_m: Float[Tensor, "points 3"],
-    rgb_u8: UInt8[Tensor, "points 3"],
-    has_colour: Bool[Tensor, " points"],
-    size_m: Float[Tensor, " points"],
-) -> VoxelPoints:
+def mean_by_voxel(cloud: Cloud, size_m: Float[Tensor, " points"]) -> VoxelPoints:
     """Average points and colours inside every voxel."""
-    unique, voxel = torch.unique(voxel_keys(xyz_m, size_m), return_inverse=True)
+    unique, voxel = torch.unique(voxel_keys(cloud.xyz_m, size_m), return_inverse=True)
     count = torch.bincount(voxel, minlength=unique.numel())
-    coloured = torch.bincount(voxel[has_colour], minlength=unique.numel())
+    coloured = torch.bincount(voxel[cloud.has_colour], minlength=unique.numel())
     xyz = torch.zeros(unique.numel(), 3, dtype=torch.float64)
     colour = torch.zeros(unique.numel(), 3, dtype=torch.float64)
-    columns = (voxel, xyz_m, rgb_u8, has_colour)
+    columns = (voxel, cloud.xyz_m, cloud.rgb_u8, cloud.has_colour)
     for own, place, seen, has in zip(*(c.split(POINTS_AT_ONCE) for c in columns), strict=True):
         xyz.index_add_(0, own, place.double())
         colour.index_add_(0, own[has], (seen[has].float() / 255).double())

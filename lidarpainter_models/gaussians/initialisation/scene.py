@@ -84,10 +84,8 @@ def initialise_scene(
     as far as that is known.
 
     Raises:
-        ConfigError: no LiDAR point lies where a training camera could see it, or no start size.
+        ConfigError: no LiDAR point lies where a training camera could see it.
     """
-    if config.num_gaussians == 0:
-        raise ConfigError("the start needs num_gaussians, which `plan_fit` takes from the views")
     views = observations.views
     for_unreached = int(config.num_gaussians * MOST_SHARE)
     on_surfaces = max(config.num_gaussians - for_unreached, 1)

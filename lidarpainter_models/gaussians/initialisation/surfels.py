@@ -26,6 +26,7 @@ OPACITY = 0.7
 """Solid enough to hide what is behind, soft enough to be moved."""
 NEIGHBOURS = 10
 """Points that define a normal."""
+COLOUR_NEIGHBOURS = 4
 SPACING_NEIGHBOURS = 4
 """Points that define the spacing."""
 OUTLINE_SIGMA = 0.5
@@ -38,18 +39,14 @@ def fill_colours(
     xyz_m: Float[Tensor, "points 3"],
     rgb: Float[Tensor, "points 3"],
     has_colour: Bool[Tensor, " points"],
-    *,
-    neighbours: int = 4,
 ) -> Float[Tensor, "points 3"]:
     """Give points without colour the mean of their nearest coloured ones, or grey."""
     if bool(has_colour.all()):
         return rgb
-    filled = rgb.clone()
     if not bool(has_colour.any()):
-        filled[:] = 0.5
-        return filled
-    known = rgb[has_colour]
-    count = min(neighbours, known.shape[0])
+        return torch.full_like(rgb, 0.5)
+    filled, known = rgb.clone(), rgb[has_colour]
+    count = min(COLOUR_NEIGHBOURS, known.shape[0])
     tree = cKDTree(xyz_m[has_colour].numpy())
     _, nearest = tree.query(xyz_m[~has_colour].numpy(), k=[*range(1, count + 1)])
     filled[~has_colour] = known[torch.from_numpy(nearest)].mean(dim=1)

@@ -95,7 +95,7 @@ def _seeds_of_view(
     render = _render(scene, view)
     is_open = _open_places(scene, view, render)
     stride = max(STRIDE_PX, int((int(is_open.sum()) / budget) ** 0.5) + 1)
-    expected_m = depth_from_below(render.depth_m, fallback_m=FARTHEST_M)
+    expected_m = depth_from_below(render.depth_m)
     depth_m = choose_depth(cost, DEPTHS_M, expected_m, prior=PRIOR)
     grid = torch.zeros_like(is_open)
     grid[stride // 2 :: stride, stride // 2 :: stride] = True
@@ -122,14 +122,15 @@ def _above_ground(seeds: GaussianSet, ground: GroundHeights) -> GaussianSet:
     return seeds.select((~is_below).nonzero()[:, 0])
 
 
-def depth_from_below(
-    depth_m: Float[Tensor, "height width"], *, fallback_m: float
-) -> Float[Tensor, "height width"]:
-    """Continue each column's depth upwards over its gaps: walls go straight up."""
+def depth_from_below(depth_m: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+    """Continue each column's depth upwards over its gaps: walls go straight up.
+
+    Where nothing is below, it is very far.
+    """
     filled = depth_m.clone()
     for row in range(filled.shape[0] - 2, -1, -1):
         filled[row] = torch.where(filled[row] > 0, filled[row], filled[row + 1])
-    return torch.where(filled > 0, filled, torch.full_like(filled, fallback_m))
+    return torch.where(filled > 0, filled, FARTHEST_M)
 
 
 def _facing_discs(

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lidarpainter_models.gaussians.model.bending import Bending
+from lidarpainter_models.gaussians.model.bending import Bending, knots_around
 from lidarpainter_models.gaussians.model.pose_blending import RefinedTracks
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
 from lidarpainter_models.scenes.tracks import ActorTrack, TrackPoses
@@ -91,26 +91,16 @@ class Actors:
             bending=self.bending.without(body),
         )
 
-    def neighbours(self, timestamp_ns: int) -> tuple[int, int, float]:
-        """The knots before and after a time and the weight of the later one."""
-        after = int(torch.searchsorted(self.knots_ns, timestamp_ns))
-        last = self.knots_ns.numel() - 1
-        if after == 0 or after > last:
-            end = min(after, last)
-            return end, end, 0.0
-        start_ns, end_ns = int(self.knots_ns[after - 1]), int(self.knots_ns[after])
-        return after - 1, after, (timestamp_ns - start_ns) / (end_ns - start_ns)
-
     def knots_beside(self, timestamp_ns: int) -> set[int]:
         """The knots that a correction at a time is not made of and stands next to."""
-        before, after, weight = self.neighbours(timestamp_ns)
+        before, after, weight = knots_around(self.knots_ns, timestamp_ns)
         first = after if weight == 1 else before
         last = before if weight == 0 else after
         return {max(first - 1, 0), min(last + 1, self.knots_ns.numel() - 1)}
 
     def tangent_at(self, timestamp_ns: int) -> Float[Tensor, "actors 6"]:
         """Every actor's correction at a time; differentiable."""
-        before, after, weight = self.neighbours(timestamp_ns)
+        before, after, weight = knots_around(self.knots_ns, timestamp_ns)
         return (1 - weight) * self.tangent[:, before] + weight * self.tangent[:, after]
 
     def refined_poses_in_fit(self, timestamp_ns: int) -> ActorPoses:

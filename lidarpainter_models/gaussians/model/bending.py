@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lidarpainter_models.devices import on_device
 from lidarpainter_models.gaussians.model.seen_gaussians import AnyGaussians
 from lidarpainter_models.geometry.lattices import lattice_values
 
@@ -56,12 +57,7 @@ class Bending:
 
     def to(self, device: torch.device) -> "Bending":
         """The same on another device, but for the times."""
-        return replace(
-            self,
-            bodies=self.bodies.to(device),
-            size_m=self.size_m.to(device),
-            offset_m=self.offset_m.to(device),
-        )
+        return on_device(self, device, stays=("knots_ns",))
 
     def strain(self, timestamp_ns: int) -> Float[Tensor, ""]:
         """How far nodes are taken at a time, and how differently their neighbours; square metres.
@@ -88,18 +84,12 @@ class Bending:
         rest = self.rigid(body)
         return replace(rest, bodies=rest.bodies - (rest.bodies > body).long())
 
-    def tensors(self) -> dict[str, Tensor]:
-        """Everything to be stored."""
-        return dict(vars(self))
-
     def weights_at(self, timestamp_ns: int) -> tuple[slice, list[float]]:
         """Which knots say how the nodes stand at a time, and how much each of them counts."""
-        last = self.knots_ns.numel() - 1
-        after = int(torch.searchsorted(self.knots_ns, timestamp_ns))
-        if after == 0 or after > last:
-            end = min(after, last)
-            return slice(end, end + 1), [1.0]
-        first, past = max(after - 2, 0), min(after + 2, last + 1)
+        before, after, _ = knots_around(self.knots_ns, timestamp_ns)
+        if before == after:
+            return slice(after, after + 1), [1.0]
+        first, past = max(after - 2, 0), min(after + 2, len(self.knots_ns))
         times_s = (self.knots_ns[first:past] - self.knots_ns[after]).double() * 1e-9
         now_s = (timestamp_ns - int(self.knots_ns[after])) * 1e-9
         return slice(first, past), _cubic_weights(times_s.tolist(), after - first, now_s)
@@ -128,6 +118,19 @@ class Bending:
         along = gaussians.means[rows] / self.size_m[lattice] + 0.5
         moved = lattice_values(self.offset_at(timestamp_ns), lattice, along, NODES)
         return replace(gaussians, means=gaussians.means.index_add(0, rows, moved))
+
+
+def knots_around(knots_ns: Int[Tensor, " knots"], timestamp_ns: int) -> tuple[int, int, float]:
+    """The knots before and after a time, and the weight of the later one.
+
+    Up to the first knot and past the last one both are the knot at that end.
+    """
+    after, last = int(torch.searchsorted(knots_ns, timestamp_ns)), len(knots_ns) - 1
+    if after == 0 or after > last:
+        end = min(after, last)
+        return end, end, 0.0
+    start_ns, end_ns = knots_ns[after - 1 : after + 1].tolist()
+    return after - 1, after, (timestamp_ns - start_ns) / (end_ns - start_ns)
 
 
 def _cubic_weights(times_s: Sequence[float], after: int, now_s: float) -> list[float]:

@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lidarpainter_models.devices import on_device
+from lidarpainter_models.gaussians.model.bending import knots_around
 from lidarpainter_models.gaussians.model.gaussian_set import SH_CONSTANT, GaussianSet
 from lidarpainter_models.gaussians.model.seen_gaussians import AnyGaussians
 from lidarpainter_models.geometry.lattices import lattice_values
@@ -77,17 +79,7 @@ class Blinking:
 
     def to(self, device: torch.device) -> "Blinking":
         """The same on another device, but for what changes over time."""
-        return replace(
-            self,
-            bodies=self.bodies.to(device),
-            centre_m=self.centre_m.to(device),
-            size_m=self.size_m.to(device),
-            lit_rgb=self.lit_rgb.to(device),
-        )
-
-    def tensors(self) -> dict[str, Tensor]:
-        """Everything to be stored."""
-        return dict(vars(self))
+        return on_device(self, device, stays=("knots_ns", "is_lit"))
 
     def kept(self, chosen: Bool[Tensor, " lamps"]) -> "Blinking":
         """Some of the lamps."""
@@ -111,13 +103,8 @@ class Blinking:
 
     def lit_at(self, timestamp_ns: int) -> Float[Tensor, " lamps"]:
         """How much each lamp is on at a time; before and after all knots as at the nearest."""
-        after = int(torch.searchsorted(self.knots_ns, timestamp_ns))
-        last = len(self.knots_ns) - 1
-        if after == 0 or after > last:
-            return self.is_lit[min(after, last)]
-        start_ns, end_ns = self.knots_ns[after - 1 : after + 1].tolist()
-        weight = (timestamp_ns - start_ns) / (end_ns - start_ns)
-        return (1 - weight) * self.is_lit[after - 1] + weight * self.is_lit[after]
+        before, after, weight = knots_around(self.knots_ns, timestamp_ns)
+        return (1 - weight) * self.is_lit[before] + weight * self.is_lit[after]
 
     def lit(self, gaussians: AnyGaussians, timestamp_ns: int) -> AnyGaussians:
         """The Gaussians in the light of their own lamps at a time; differentiable in colours."""

@@ -15,7 +15,6 @@ from lidarpainter_models.gaussians.model.seen_gaussians import DrawableGaussians
 from lidarpainter_models.gaussians.model.sky import SkyTexture
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.geometry.transforms import invert_rigid
-from lidarpainter_models.kernels.backends import Backend
 from lidarpainter_models.kernels.gaussian_raster import SplatImage, Splats, render_gaussians
 
 OPAQUE = 1 - 1 / 512
@@ -64,7 +63,6 @@ def draw_gaussians(
     with_actor_alpha: bool = False,
     channels: Float[Tensor, "gaussians channels"] | None = None,
     screen_gradient_out: Float[Tensor, " gaussians"] | None = None,
-    backend: Backend = "auto",
 ) -> SplatImage:
     """Blend Gaussians whose bodies stand before the camera like this, without sky.
 
@@ -86,27 +84,24 @@ def draw_gaussians(
         camera,
         features=torch.cat(features, dim=1) if features else None,
         screen_gradient_out=screen_gradient_out,
-        backend=backend,
     )
 
 
+@torch.no_grad()
 def draw_over_sky(
     gaussians: DrawableGaussians,
     bodies: Float[Tensor, "bodies 4 4"],
     sky: SkyTexture,
     camera: Camera,
-    *,
-    backend: Backend = "auto",
 ) -> SceneRender:
     """The view of a camera, without gradient."""
-    with torch.no_grad():
-        image = draw_gaussians(gaussians, bodies, camera, with_actor_alpha=True, backend=backend)
-        clear = (1 - image.alpha)[..., None]
-        rgb = image.rgb + clear * sky.sample(sky.rays(camera, image.alpha < OPAQUE))
-        depth_m = image.depth_m / image.alpha.clamp(min=1e-4)
-        return SceneRender(
-            rgb=rgb,
-            depth_m=torch.where(image.alpha >= 0.5, depth_m, torch.zeros_like(depth_m)),
-            alpha=image.alpha,
-            actor_alpha=image.features[..., 0],
-        )
+    image = draw_gaussians(gaussians, bodies, camera, with_actor_alpha=True)
+    clear = (1 - image.alpha)[..., None]
+    rgb = image.rgb + clear * sky.sample(sky.rays(camera, image.alpha < OPAQUE))
+    depth_m = image.depth_m / image.alpha.clamp(min=1e-4)
+    return SceneRender(
+        rgb=rgb,
+        depth_m=torch.where(image.alpha >= 0.5, depth_m, 0.0),
+        alpha=image.alpha,
+        actor_alpha=image.features[..., 0],
+    )

@@ -25,7 +25,6 @@ from lidarpainter_models.gaussians.model.spatial_blocks import SpatialBlocks
 from lidarpainter_models.gaussians.model.styling.scene_style import SceneStyle
 from lidarpainter_models.gaussians.model.styling.styled_gaussians import StyledGaussians
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.kernels.backends import Backend
 from lidarpainter_models.kernels.frustum_culling import MOST_SIGMAS
 from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.scenes.driving_scene import ActorTrack
@@ -67,7 +66,6 @@ class GaussianScene:
         *,
         camera_name: str | None = None,
         view_key: ViewKey | None = None,
-        backend: Backend = "auto",
     ) -> SceneRender:
         """Draw the view of `camera`, taken as it stands, at a time.
 
@@ -76,41 +74,35 @@ class GaussianScene:
             timestamp_ns: of the image, as recorded.
             camera_name: whose exposure colours get; None leaves them as they are in the scene.
             view_key: a training view, whose refined pose the camera is first moved to.
-            backend: of the rasteriser.
         """
         row = None if view_key is None else self.cameras.row_of(view_key)
         if row is not None:
             with torch.no_grad():
                 camera = camera.refined(self.cameras.world_from_camera(row))
-        drawable = self.drawable(camera, timestamp_ns)
-        return drawable.render(camera_name=camera_name, backend=backend)
+        return self.drawable(camera, timestamp_ns).render(camera_name=camera_name)
 
+    @torch.no_grad()
     def drawable(self, camera: Camera, timestamp_ns: int) -> DrawableScene:
-        """What the image of a camera is made of; without gradient.
-
-        Args:
-            camera: as it stands.
-            timestamp_ns: of the image, as recorded.
+        """What the image of a camera, taken as it stands, is made of; without gradient.
 
         Raises:
             ShapeError: Gaussians belong to bodies that the scene does not have.
         """
-        with torch.no_grad():
-            posed = self.posed(camera, camera.taken_ns(timestamp_ns))
-            styled, strengths = self._styled_at(posed.taken_ns)
-            if styled is not None:
-                return styled.drawable(posed, strengths, self.exposure)
-            rows = self._in_view(posed)
-            seen = self.gaussians if rows is None else self.gaussians.select(rows)
-            if rows is None:
-                rows = torch.arange(len(seen), device=self.device)
-            return DrawableScene(
-                posed=posed,
-                gaussians=posed.shown(seen),
-                rows=rows,
-                sky=self.sky,
-                exposure=self.exposure,
-            )
+        posed = self.posed(camera, camera.taken_ns(timestamp_ns))
+        styled, strengths = self._styled_at(posed.taken_ns)
+        if styled is not None:
+            return styled.drawable(posed, strengths, self.exposure)
+        rows = self._in_view(posed)
+        seen = self.gaussians if rows is None else self.gaussians.select(rows)
+        if rows is None:
+            rows = torch.arange(len(seen), device=self.device)
+        return DrawableScene(
+            posed=posed,
+            gaussians=posed.shown(seen),
+            rows=rows,
+            sky=self.sky,
+            exposure=self.exposure,
+        )
 
     def posed(self, camera: Camera, taken_ns: int) -> PosedScene:
         """The scene before a camera at any time; see `Actors.refined_poses`."""
@@ -170,14 +162,9 @@ class GaussianScene:
     def refined_camera(
         self, view: TrainingView | RecordedView, camera: Camera | None = None
     ) -> Camera:
-        """The camera of a recorded view at its refined pose.
+        """The camera of a recorded view at its refined pose; see `CameraCorrections.refined`.
 
-        A training view has a pose of its own; at any other time it is blended from those of the
-        same camera (see `pose_blending`). A camera never trained on stays as it was recorded.
-
-        Args:
-            view: which view.
-            camera: its camera at another size; None takes the view's own.
+        `camera` is the view's at another size.
         """
         taken = view.camera if camera is None else camera
         return self.cameras.refined(taken, view.key, view.timestamp_ns)

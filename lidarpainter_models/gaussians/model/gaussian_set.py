@@ -23,8 +23,25 @@ def sh_from_rgb(rgb: Float[Tensor, "gaussians 3"]) -> Float[Tensor, "gaussians 1
     return ((rgb - 0.5) / SH_CONSTANT)[:, None]
 
 
+class Shapes:
+    """Sizes and opacities of Gaussians, kept as they are optimised."""
+
+    log_scale: Tensor
+    opacity_logit: Tensor
+
+    @property
+    def scale_m(self) -> Float[Tensor, "gaussians 3"]:
+        """Standard deviations along the Gaussian's own axes."""
+        return self.log_scale.exp()
+
+    @property
+    def opacity(self) -> Float[Tensor, " gaussians"]:
+        """Opacities in (0, 1)."""
+        return self.opacity_logit.sigmoid()
+
+
 @dataclass(eq=False, kw_only=True)
-class GaussianSet:
+class GaussianSet(Shapes):
     """All Gaussians, row by row; the parameters may be leaves of an autograd graph."""
 
     means: Float[Tensor, "gaussians 3"]
@@ -50,16 +67,6 @@ class GaussianSet:
     def sh_degree(self) -> int:
         """Degree of the harmonics, 0 to 3."""
         return round((self.sh_rest.shape[1] + 1) ** 0.5) - 1
-
-    @property
-    def scale_m(self) -> Float[Tensor, "gaussians 3"]:
-        """Standard deviations along the Gaussian's own axes."""
-        return self.log_scale.exp()
-
-    @property
-    def opacity(self) -> Float[Tensor, " gaussians"]:
-        """Opacities in (0, 1)."""
-        return self.opacity_logit.sigmoid()
 
     @property
     def sh(self) -> Float[Tensor, "gaussians coefficients 3"]:

@@ -29,21 +29,16 @@ from lidarpainter_models.gaussians.model.seen_gaussians import AnyGaussians, Dra
 from lidarpainter_models.gaussians.model.sky import SkyTexture
 from lidarpainter_models.gaussians.model.spatial_blocks import View
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.kernels.backends import Backend
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
 
 
 def gaussians_at(
     gaussians: AnyGaussians, actors: Actors, blinking: Blinking, timestamp_ns: int | None
 ) -> AnyGaussians:
-    """The Gaussians of a scene at a time, each still in the frame of its own body.
+    """Gaussians of a scene at a time, each still in the frame of its own body.
 
-    Args:
-        gaussians: those of the scene or some of them; differentiable in centres and colours.
-        actors: how they bend.
-        blinking: the lamps that light some of them.
-        timestamp_ns: when; None is for what holds many moments and cannot change Gaussians from
-            one to the next: lamps are lit as on average, and nobody bends.
+    Differentiable in centres and colours. None is for what holds many moments and cannot change
+    Gaussians from one to the next: lamps are lit as on average, and nobody bends.
     """
     if timestamp_ns is None:
         return blinking.lit_on_average(gaussians)
@@ -150,13 +145,11 @@ class DrawableScene:
     lens: Callable[[SceneRender], SceneRender] | None = None
     """What happens in the lens: the glare of lamps at night."""
 
-    def render(self, *, camera_name: str | None = None, backend: Backend = "auto") -> SceneRender:
+    @torch.no_grad()
+    def render(self, *, camera_name: str | None = None) -> SceneRender:
         """Draw it over its sky, with colours exposed as those of `camera_name`, if there is one."""
-        with torch.no_grad():
-            posed = self.posed
-            drawn = draw_over_sky(
-                self.gaussians, posed.bodies, self.sky, posed.camera, backend=backend
-            )
-            drawn = drawn if self.lens is None else self.lens(drawn)
-            rgb = self.exposure.apply(drawn.rgb, camera_name, posed.taken_ns)
-            return replace(drawn, rgb=rgb)
+        posed = self.posed
+        drawn = draw_over_sky(self.gaussians, posed.bodies, self.sky, posed.camera)
+        drawn = drawn if self.lens is None else self.lens(drawn)
+        rgb = self.exposure.apply(drawn.rgb, camera_name, posed.taken_ns)
+        return replace(drawn, rgb=rgb)

@@ -12,13 +12,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
+from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet, Shapes
 
 LEAVES = ("means", "rotation_wxyz", "log_scale", "opacity_logit", "sh")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SeenGaussians:
+class SeenGaussians(Shapes):
     """Some rows of a Gaussian set, in order; all harmonics in one tensor, constant first."""
 
     rows: Int[Tensor, " seen"]
@@ -61,16 +61,6 @@ class SeenGaussians:
 
     def __len__(self) -> int:
         return self.rows.shape[0]
-
-    @property
-    def scale_m(self) -> Float[Tensor, "seen 3"]:
-        """Standard deviations along the Gaussian's own axes."""
-        return self.log_scale.exp()
-
-    @property
-    def opacity(self) -> Float[Tensor, " seen"]:
-        """Opacities in (0, 1)."""
-        return self.opacity_logit.sigmoid()
 
     def twin(self) -> "SeenGaussians":
         """The same values as leaves of their own, for another thread.

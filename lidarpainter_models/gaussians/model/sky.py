@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from lidarpainter_models.devices import on_device
 from lidarpainter_models.geometry.cameras import Camera
 from lidarpainter_models.kernels.sky_texture import (
     SkyLayout,
@@ -75,17 +76,7 @@ class SkyTexture:
 
     def to(self, device: torch.device) -> "SkyTexture":
         """The same sky on another device."""
-        moments = self.moments
-        return replace(
-            self,
-            rgb=self.rgb.to(device),
-            weight=self.weight.to(device),
-            moments=TexelMoments(
-                first=moments.first.to(device),
-                second=moments.second.to(device),
-                visits=moments.visits.to(device),
-            ),
-        )
+        return replace(on_device(self, device), moments=on_device(self.moments, device))
 
     def rays(self, camera: Camera, wanted: Bool[Tensor, "height width"] | None = None) -> SkyRays:
         """Where the camera's rays (of the wanted pixels) meet the texture."""

@@ -38,14 +38,14 @@ def scene_to_arrays(scene: GaussianScene) -> tuple[dict[str, Tensor], dict[str, 
         "cameras": cameras.tensors(),
         "own_body": dict(cameras.own_bodies),
         "actors": {"knots_ns": scene.actors.knots_ns, "tangent": scene.actors.tangent},
-        "bending": scene.actors.bending.tensors(),
-        "blinking": scene.blinking.tensors(),
+        "bending": vars(scene.actors.bending),
+        "blinking": vars(scene.blinking),
         "exposure": {
             "matrix": scene.exposure.matrix,
             "knots_ns": scene.exposure.knots_ns,
             "log_gain": scene.exposure.log_gain,
         },
-        "style": {} if scene.style is None else scene.style.place.tensors(),
+        "style": {} if scene.style is None else vars(scene.style.place),
     }
     arrays = {
         f"{group}.{name}": value.detach().cpu().contiguous()

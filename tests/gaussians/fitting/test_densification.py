@@ -3,13 +3,13 @@ import torch
 from gaussian_world import CAR_SIZE_M, round_gaussians
 
 from lidarpainter_models.errors import ConfigError
+from lidarpainter_models.gaussians.fitting.config import DensificationConfig
 from lidarpainter_models.gaussians.fitting.densification import (
     GradientTally,
     densify,
     prune,
     split_along_longest_axis,
 )
-from lidarpainter_models.gaussians.fitting.number_of_gaussians import DensificationConfig
 
 
 def ten(*, body=0):

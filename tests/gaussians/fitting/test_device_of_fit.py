@@ -11,6 +11,7 @@ from lidarpainter_models.errors import DeviceMemoryError
 from lidarpainter_models.gaussians.fitting import fit as fit_module
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import (
+    DensificationConfig,
     FitConfig,
     GuidanceConfig,
     RefinementConfig,
@@ -18,7 +19,6 @@ from lidarpainter_models.gaussians.fitting.config import (
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.gaussians.fitting.images import full_image
 from lidarpainter_models.gaussians.fitting.memory import planned_memory
-from lidarpainter_models.gaussians.fitting.number_of_gaussians import DensificationConfig
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import WAITS, fit_step
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
@@ -64,7 +64,7 @@ def test_a_fit_runs_on_its_device_and_is_that_of_the_cpu(world, device):
 
 
 def test_a_fit_is_taken_up_on_another_device_than_it_was_left_on(world, device, tmp_path):
-    folder = CheckpointFolder(path=tmp_path, every_steps=5, every_seconds=None)
+    folder = CheckpointFolder(path=tmp_path, every_seconds=0.0)
 
     def stop(now):
         if now.step == 6:
@@ -91,7 +91,7 @@ def test_a_step_makes_the_host_wait_no_oftener_than_it_says(world, device, bent)
         views = 1 if guidance is None else 2
         at_everything = sum(state.hidden.is_due(view) for view in (0, ~0)[:views])
         waits.clear()
-        fit_step(state, image, 0, guidance, CONFIG, None)
+        fit_step(state, image, 0, guidance)
         state.step += 1
         # of plain torch: no other kernel runs on this device
         assert waits.total() <= WAITS + views * len(bent) + at_everything, waits

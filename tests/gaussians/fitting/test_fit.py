@@ -7,9 +7,10 @@ from gaussian_world import FRAME_NS, HEIGHT_PX, WIDTH_PX, scene_of
 
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.gaussians.fitting import fit as fit_module
-from lidarpainter_models.gaussians.fitting import learning_rates, step
+from lidarpainter_models.gaussians.fitting import step
 from lidarpainter_models.gaussians.fitting.checkpoint import CheckpointFolder
 from lidarpainter_models.gaussians.fitting.config import (
+    DensificationConfig,
     FitConfig,
     GuidanceConfig,
     RefinementConfig,
@@ -18,8 +19,6 @@ from lidarpainter_models.gaussians.fitting.config import (
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
 from lidarpainter_models.gaussians.fitting.images import full_image
 from lidarpainter_models.gaussians.fitting.learning_rates import LearningRates
-from lidarpainter_models.gaussians.fitting.number_of_gaussians import DensificationConfig
-from lidarpainter_models.gaussians.fitting.seen_surface import seen_surface
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import add_guidance_gradients, fit_step
 from lidarpainter_models.gaussians.initialisation.scene import initialise_scene
@@ -107,7 +106,7 @@ def test_a_step_sees_what_only_the_first_row_shows(world):
     read = as_read(world.scene.gaussians, bodies, view.camera, actors, view.timestamp_ns)
     shown = draw_gaussians(read, bodies, view.camera).visible
     state = FitState.begin(world.scene, short_fit(), WIDTH_PX * HEIGHT_PX)
-    fit_step(state, full_image(view), 0, None, short_fit(), None)
+    fit_step(state, full_image(view), 0)
     assert torch.equal(state.tally.visits > 0, shown)
 
 
@@ -117,30 +116,15 @@ def test_fit_gets_closer_to_the_images(world, undisturbed):
     assert undisturbed.history[-1]["step"] == STEPS
 
 
-def test_colours_of_a_longer_fit_move_slower(world, undisturbed, monkeypatch):
-    first, last = LearningRates().sh_dc
-    slower = short_fit(learning_rates=LearningRates(sh_dc=(first / 4, last / 4)))
-    expected = fit_gaussians(world.observations, slower).scene
-    looks = STEPS / max(seen_surface(world.observations.views).whole_views, 1.0)
-    monkeypatch.setattr(learning_rates, "COLOUR_LOOKS", looks / 4)
-    longer = fit_gaussians(world.observations, short_fit()).scene
-    assert_same_scene(longer, expected)
-    assert not torch.equal(longer.gaussians.sh_dc, undisturbed.scene.gaussians.sh_dc)
-
-
 def test_budget_is_never_exceeded(undisturbed):
     numbers = [entry["num_gaussians"] for entry in undisturbed.history]
     assert max(numbers) <= 900
     assert max(numbers) > numbers[0]
 
 
-def test_equal_fits_are_equal_bit_for_bit(world, undisturbed):
-    assert_same_scene(fit_gaussians(world.observations, short_fit()).scene, undisturbed.scene)
-
-
 @pytest.mark.parametrize("killed_at", [6, 15, 30])
 def test_resumed_fit_is_the_undisturbed_one_bit_for_bit(world, undisturbed, tmp_path, killed_at):
-    folder = CheckpointFolder(path=tmp_path, every_steps=5, every_seconds=None)
+    folder = CheckpointFolder(path=tmp_path, every_seconds=0.0)
     with pytest.raises(KilledError):
         fit_gaussians(
             world.observations, short_fit(), checkpoints=folder, progress=kill_at(killed_at)
@@ -151,7 +135,7 @@ def test_resumed_fit_is_the_undisturbed_one_bit_for_bit(world, undisturbed, tmp_
 
 
 def test_checkpoint_of_another_fit_is_refused(world, tmp_path):
-    mine = CheckpointFolder(path=tmp_path, identity="mine", every_steps=2, every_seconds=None)
+    mine = CheckpointFolder(path=tmp_path, identity="mine", every_seconds=0.0)
     with pytest.raises(KilledError):
         fit_gaussians(world.observations, short_fit(), checkpoints=mine, progress=kill_at(4))
     other = replace(mine, identity="other")
@@ -195,10 +179,10 @@ def test_pose_refinement_recovers_a_known_rotation(world):
 
 def with_guidance_gradients(world, view, config, perceptual=None):
     """A state and its leaves after the gradients of one painted view."""
-    state = FitState.begin(world.scene, config, WIDTH_PX * HEIGHT_PX)
+    state = FitState.begin(world.scene, config, WIDTH_PX * HEIGHT_PX, perceptual)
     posed = state.scene.posed_in_fit(view.camera, view.timestamp_ns)
     seen = state.seen({~0: posed.looks()})
-    add_guidance_gradients(state, seen, view, posed, config, perceptual)
+    add_guidance_gradients(state, seen, view, posed)
     return state, seen
 
 
@@ -219,7 +203,7 @@ def test_the_threads_of_a_step_share_no_leaf(world, monkeypatch):
     monkeypatch.setattr(step, "both", one_after_the_other)
     state = FitState.begin(world.scene, short_fit(), WIDTH_PX * HEIGHT_PX)
     image = full_image(world.observations.views[0])
-    fit_step(state, image, 0, (0, painted_view(world)), short_fit(), None)
+    fit_step(state, image, 0, (0, painted_view(world)))
     ours, theirs = made
     for name, value in ours.values().items():
         assert getattr(ours, name) is not getattr(theirs, name)
@@ -240,8 +224,8 @@ def test_gradients_of_both_views_count(world):
 
 
 def test_painted_views_pull_the_scene_towards_them(world):
-    guided = continuation(
-        short_fit(), steps=60, guidance=GuidanceConfig(probability=1.0, weight=3.0)
+    guided = replace(
+        continuation(short_fit(), guidance=GuidanceConfig(probability=1.0, weight=3.0)), steps=60
     )
     start = world.scene
     painted = painted_view(world)
@@ -255,8 +239,8 @@ def test_painted_views_pull_the_scene_towards_them(world):
 
 
 def test_painted_and_recorded_views_beside_each_other_make_the_fit_of_one_thread(world):
-    guided = continuation(
-        short_fit(), steps=20, guidance=GuidanceConfig(probability=1.0, weight=3.0)
+    guided = replace(
+        continuation(short_fit(), guidance=GuidanceConfig(probability=1.0, weight=3.0)), steps=20
     )
     before, fitted = numba.get_num_threads(), []
     try:
@@ -275,11 +259,11 @@ def test_painted_and_recorded_views_beside_each_other_make_the_fit_of_one_thread
 def test_the_last_steps_fit_recorded_views_alone(world):
     def fitted(until):
         guidance = GuidanceConfig(until=until, weight=3.0)
-        config = continuation(short_fit(), steps=20, guidance=guidance)
+        config = replace(continuation(short_fit(), guidance=guidance), steps=20)
         views = [painted_view(world)]
         return fit_gaussians(world.observations, config, start=world.scene, guidance=views).scene
 
-    unguided = continuation(short_fit(), steps=20)
+    unguided = replace(continuation(short_fit()), steps=20)
     alone = fit_gaussians(world.observations, unguided, start=world.scene).scene
     assert_same_scene(fitted(0.0), alone)
     some, all_along = fitted(0.5).gaussians.means, fitted(1.0).gaussians.means
@@ -336,22 +320,23 @@ def test_perceptual_weight_without_a_distance_is_refused(world):
         fit_gaussians(world.observations, config)
 
 
-def test_a_fit_out_of_time_ends_early_and_is_whole(world):
+def test_a_fit_out_of_time_ends_early_with_schedules_of_as_many_steps(world, monkeypatch):
+    ends, end = [], fit_module._finished
+    monkeypatch.setattr(fit_module, "_finished", lambda state: ends.append(state) or end(state))
     found = fit_gaussians(world.observations, short_fit(log_every=4, time_limit_s=1e-9))
     assert found.history[-1]["step"] == 4
     assert found.scene.num_gaussians > 0
-
-
-def test_all_schedules_are_those_of_as_many_steps_as_the_time_allows(world, monkeypatch):
-    ends, end = [], fit_module._finished
-    monkeypatch.setattr(fit_module, "_finished", lambda state: ends.append(state) or end(state))
-    fit_gaussians(world.observations, short_fit(log_every=4, time_limit_s=1e-9))
     assert ends[0].steps == ends[0].step == 4
 
 
-def test_the_plan_is_told_first_and_the_share_never_falls(world, undisturbed):
-    told = []
-    found = fit_gaussians(world.observations, short_fit(), progress=told.append)
+def test_a_fit_tells_its_plan_first_and_how_far_it_is(world, undisturbed):
+    told, looks = [], []
+
+    def look(scene):
+        looks.append((told[-1].step, scene.num_gaussians > 0))
+
+    found = fit_gaussians(world.observations, short_fit(), progress=told.append, first_look=look)
+    assert looks == [(STEPS // 10, True)]
     assert told[0].step == told[0].share == 0.0
     assert {now.plan for now in told} == {found.plan}
     assert found.plan.numbers()["most_gaussians"] == 900
@@ -365,17 +350,4 @@ def test_the_plan_is_told_first_and_the_share_never_falls(world, undisturbed):
 
 def test_a_limit_that_is_not_reached_changes_nothing(world, undisturbed):
     found = fit_gaussians(world.observations, short_fit(time_limit_s=1e9))
-    assert_same_scene(found.scene, undisturbed.scene)
-
-
-def test_the_first_look_comes_once_after_a_tenth_of_the_steps(world, undisturbed):
-    looks, steps = [], []
-    found = fit_gaussians(
-        world.observations,
-        short_fit(),
-        progress=lambda now: steps.append(now.step),
-        first_look=lambda scene: looks.append((steps[-1], scene.num_gaussians)),
-    )
-    assert looks == [(STEPS // 10, looks[0][1])]
-    assert looks[0][1] > 0
     assert_same_scene(found.scene, undisturbed.scene)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from fitted_street import FittedStreet
-from gaussian_world import FRAME_NS, camera_at, map_points, round_gaussians, scene_of
+from gaussian_world import FRAME_NS, camera_at, map_points, round_gaussians, scene_of, training_view
 from strict_device import NAME, strict_runs
 
 from lidarpainter_models.gaussians.fitting import lamp_search
@@ -17,7 +17,7 @@ from lidarpainter_models.gaussians.fitting.lamp_search import with_lamps_found
 from lidarpainter_models.gaussians.model.blinking import NUM_NODES, Blinking
 from lidarpainter_models.kernels.pixel_losses import SOLID
 from lidarpainter_models.lidar.lidar_map import LidarMap
-from lidarpainter_models.observations.views import SceneObservations, TrainingView
+from lidarpainter_models.observations.views import SceneObservations
 from lidarpainter_models.synthetic import SyntheticStreet, SyntheticStreetConfig
 from lidarpainter_models.synthetic.config import DEFAULT_CAMERAS
 
@@ -210,14 +210,7 @@ def test_a_fit_keeps_the_lamps_it_finds_and_a_continuation_does_not_look(wall):
     scene, cameras = wall
     images = images_of(with_lamp(scene, FLASHES), cameras)
     views = tuple(
-        TrainingView(
-            key=(frame, "front"),
-            camera=image.camera,
-            timestamp_ns=image.timestamp_ns,
-            rgb_u8=image.rgb_u8,
-            sky_mask=torch.zeros(image.rgb_u8.shape[:2], dtype=torch.bool),
-            lidar_depth_m=image.lidar_depth_m,
-        )
+        training_view(image.camera, frame=frame, rgb_u8=image.rgb_u8)
         for frame, image in enumerate(images)
     )
     points = map_points(scene.gaussians.means, scene.gaussians.base_rgb)

@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from lidarpainter_models.errors import ConfigError
-from lidarpainter_models.gaussians.fitting.config import FitConfig
+from lidarpainter_models.gaussians.fitting.config import DensificationConfig, FitConfig
 from lidarpainter_models.gaussians.fitting.memory import planned_memory
-from lidarpainter_models.gaussians.fitting.number_of_gaussians import DensificationConfig
 from lidarpainter_models.gaussians.fitting.plan import plan_fit
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet

@@ -4,12 +4,14 @@ import pytest
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.fitting.clock import HALF_STEP, steps_within, work_of
-from lidarpainter_models.gaussians.fitting.config import EffortConfig, FitConfig, continuation
-from lidarpainter_models.gaussians.fitting.learning_rates import COLOUR_LOOKS, LearningRates
-from lidarpainter_models.gaussians.fitting.number_of_gaussians import (
+from lidarpainter_models.gaussians.fitting.config import (
     START_SHARE,
     DensificationConfig,
+    EffortConfig,
+    FitConfig,
+    continuation,
 )
+from lidarpainter_models.gaussians.fitting.learning_rates import COLOUR_LOOKS, LearningRates
 from lidarpainter_models.gaussians.fitting.plan import planned_settings
 from lidarpainter_models.gaussians.fitting.seen_surface import SeenSurface
 
@@ -24,6 +26,7 @@ def test_numbers_left_open_follow_what_is_seen():
     assert planned.steps == 250
     assert planned.densification.budget == 100_000
     assert planned.initialisation.num_gaussians == round(START_SHARE * 100_000)
+    assert planned.learning_rates == CONFIG.learning_rates.over(100)
     longer = replace(SURFACE, num_detailed=800_000.0, whole_views=10.0)
     assert planned_settings(CONFIG, longer).steps == 1000
     assert planned_settings(CONFIG, longer).densification.budget == 400_000

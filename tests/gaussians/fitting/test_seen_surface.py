@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from gaussian_world import camera_at, training_view
 
 from lidarpainter_models.gaussians.fitting.seen_surface import (
     CELL_PX,
@@ -11,13 +12,11 @@ from lidarpainter_models.gaussians.fitting.seen_surface import (
     seen_surface,
     with_shown_beside,
 )
-from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.observations.views import GuidanceView, TrainingView
+from lidarpainter_models.observations.views import GuidanceView
 
 WIDTH_PX, HEIGHT_PX, FOCAL_PX = 240, 120, 200.0
 PIXELS = WIDTH_PX * HEIGHT_PX
 WALL_M = 40.0
-FRAME_NS = 100_000_000
 
 
 def view_at(forward_m, frame=0, *, camera="front", yaw_rad=0.0, sky=False):
@@ -26,19 +25,13 @@ def view_at(forward_m, frame=0, *, camera="front", yaw_rad=0.0, sky=False):
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = torch.tensor([[sin, 0, cos], [-cos, 0, sin], [0, -1, 0]], dtype=torch.float64)
     pose[0, 3] = forward_m
-    return TrainingView(
+    seen_from = replace(
+        camera_at(0.0, width_px=WIDTH_PX, height_px=HEIGHT_PX), fx_px=FOCAL_PX, fy_px=FOCAL_PX
+    )
+    return training_view(
+        seen_from.at(pose),
+        frame=frame,
         key=(frame, camera),
-        camera=Camera(
-            world_from_camera=pose,
-            fx_px=FOCAL_PX,
-            fy_px=FOCAL_PX,
-            cx_px=WIDTH_PX / 2,
-            cy_px=HEIGHT_PX / 2,
-            width_px=WIDTH_PX,
-            height_px=HEIGHT_PX,
-        ),
-        timestamp_ns=frame * FRAME_NS,
-        rgb_u8=torch.zeros(HEIGHT_PX, WIDTH_PX, 3, dtype=torch.uint8),
         sky_mask=torch.full((HEIGHT_PX, WIDTH_PX), sky),
         lidar_depth_m=torch.full((HEIGHT_PX, WIDTH_PX), WALL_M - forward_m),
     )

@@ -7,9 +7,12 @@ import torch
 from gaussian_world import FRAME_NS
 
 from lidarpainter_models.evaluation.held_out import HeldOut
-from lidarpainter_models.gaussians.fitting.config import FitConfig, RefinementConfig
+from lidarpainter_models.gaussians.fitting.config import (
+    DensificationConfig,
+    FitConfig,
+    RefinementConfig,
+)
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
-from lidarpainter_models.gaussians.fitting.number_of_gaussians import DensificationConfig
 from lidarpainter_models.gaussians.fitting.state import FitState
 from lidarpainter_models.gaussians.fitting.step import add_guidance_gradients
 from lidarpainter_models.gaussians.initialisation import scene as first_scene
@@ -55,7 +58,7 @@ def test_painted_views_leave_no_gradient_to_how_somebody_moves(world):
     state = FitState.begin(with_lattice(world.scene), config, painted.weight_u8.numel())
     posed = state.scene.posed_in_fit(view.camera, FRAME_NS)
     seen = state.seen({~0: posed.looks()})
-    add_guidance_gradients(state, seen, painted, posed, config)
+    add_guidance_gradients(state, seen, painted, posed)
     assert state.scene.actors.bending.offset_m.grad is None
 
 

@@ -10,6 +10,7 @@ from gaussian_world import (
     car_track,
     map_points,
     scene_of,
+    training_view,
 )
 
 from lidarpainter_models.errors import ConfigError
@@ -33,7 +34,6 @@ from lidarpainter_models.gaussians.initialisation.surfels import (
 )
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 from lidarpainter_models.lidar.lidar_map import LidarMap
-from lidarpainter_models.observations.views import TrainingView
 from lidarpainter_models.scenes.camera_faults import CameraFault
 
 
@@ -47,7 +47,8 @@ def test_points_of_one_voxel_become_their_mean():
     xyz_m = torch.tensor([[0.01, 0.0, 0.0], [0.03, 0.0, 0.0], [0.15, 0.0, 0.0]])
     rgb_u8 = torch.tensor([[255, 0, 0], [0, 255, 0], [0, 0, 255]], dtype=torch.uint8)
     has_colour = torch.tensor([True, False, True])
-    voxels = mean_by_voxel(xyz_m, rgb_u8, has_colour, torch.full((3,), 0.1))
+    cloud = Cloud(xyz_m=xyz_m, rgb_u8=rgb_u8, has_colour=has_colour, spacing_m=torch.ones(3))
+    voxels = mean_by_voxel(cloud, torch.full((3,), 0.1))
     order = voxels.xyz_m[:, 0].argsort()
     assert torch.allclose(voxels.xyz_m[order][:, 0], torch.tensor([0.02, 0.15]))
     assert torch.allclose(voxels.rgb[order], torch.tensor([[1.0, 0, 0], [0, 0, 1.0]]))
@@ -57,10 +58,10 @@ def test_points_of_one_voxel_become_their_mean():
 @pytest.mark.parametrize("count", [0, 1, 50])
 def test_pieces_of_a_cloud_change_no_bit(count, monkeypatch):
     cloud = cloud_of(plane(count), 0.3)
-    sizes = cloud.sizes(1.0, most_m=2.0)
+    sizes = cloud.sizes(1.0)
 
     def found():
-        voxels = mean_by_voxel(cloud.xyz_m, cloud.rgb_u8, cloud.has_colour, sizes)
+        voxels = mean_by_voxel(cloud, sizes)
         return [voxel_keys(cloud.xyz_m, sizes), *(getattr(voxels, f.name) for f in fields(voxels))]
 
     whole = found()
@@ -80,7 +81,7 @@ def cloud_of(xyz_m, spacing_m):
 
 @pytest.mark.parametrize("budget", [1, 50, 300, 10_000])
 def test_voxel_budget_is_kept(budget):
-    (voxels,) = adaptive_voxels([cloud_of(plane(2000), 0.01)], budget=budget, most_m=8.0)
+    (voxels,) = adaptive_voxels([cloud_of(plane(2000), 0.01)], budget=budget)
     assert 1 <= len(voxels.xyz_m) <= budget
 
 
@@ -134,14 +135,7 @@ def test_a_wire_hides_no_tower_behind_it():
     surface = torch.zeros(64, 96, dtype=torch.bool)
     surface[row] = True
     surface[row - 15 :, 40:56] = True
-    view = TrainingView(
-        key=(0, "front"),
-        camera=camera,
-        timestamp_ns=0,
-        rgb_u8=torch.zeros(64, 96, 3, dtype=torch.uint8),
-        sky_mask=~surface,
-        lidar_depth_m=torch.zeros(64, 96),
-    )
+    view = training_view(camera, sky_mask=~surface)
     discs = surfels_from_points(wire_m, torch.full((7, 3), 0.3))
     within = within_outlines(discs, [view])
     tower = surface.clone()
@@ -165,8 +159,8 @@ def test_points_without_colour_take_that_of_their_neighbours():
     xyz_m = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [0.9, 0, 0]])
     rgb = torch.tensor([[1.0, 0, 0], [0, 1.0, 0], [9.0, 9, 9]])
     has_colour = torch.tensor([True, True, False])
-    filled = fill_colours(xyz_m, rgb, has_colour, neighbours=1)
-    assert filled[2].tolist() == [0.0, 1.0, 0.0]
+    filled = fill_colours(xyz_m, rgb, has_colour)
+    assert filled[2].tolist() == [0.5, 0.5, 0.0]
     grey = fill_colours(xyz_m, rgb, torch.zeros(3, dtype=torch.bool))
     assert torch.equal(grey, torch.full((3, 3), 0.5))
 

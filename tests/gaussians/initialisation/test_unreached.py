@@ -1,23 +1,23 @@
 from dataclasses import replace
 
 import torch
-from gaussian_world import FRAME_NS, camera_at, car_track, round_gaussians, scene_of
+from gaussian_world import FRAME_NS, camera_at, car_track, round_gaussians, scene_of, training_view
 from wall_images import image_of_wall, sideways_cameras
 
 from lidarpainter_models.gaussians.initialisation import unreached
 from lidarpainter_models.gaussians.initialisation.unreached import (
+    FARTHEST_M,
     depth_from_below,
     unreached_gaussians,
 )
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.geometry.cameras import Shutter
-from lidarpainter_models.observations.views import TrainingView
 
 
 def test_depth_goes_straight_up_over_gaps():
     depth_m = torch.tensor([[0.0, 0.0], [0.0, 7.0], [5.0, 0.0], [0.0, 0.0]])
-    filled = depth_from_below(depth_m, fallback_m=99.0)
-    assert filled.tolist() == [[5.0, 7.0], [5.0, 7.0], [5.0, 99.0], [99.0, 99.0]]
+    filled = depth_from_below(depth_m)
+    assert filled.tolist() == [[5.0, 7.0], [5.0, 7.0], [5.0, FARTHEST_M], [FARTHEST_M, FARTHEST_M]]
 
 
 def test_actors_are_where_they_were_when_a_late_image_was_taken():
@@ -26,35 +26,18 @@ def test_actors_are_where_they_were_when_a_late_image_was_taken():
     nothing = GaussianSet.empty(sh_degree=1)
     scene = scene_of(nothing, [camera] * 4, [car_track(4)])
     of_late, before, then = (
-        unreached._moving(scene, view_of(camera, time_ns))
-        for camera, time_ns in ((late, FRAME_NS), (camera, FRAME_NS), (camera, 2 * FRAME_NS))
+        unreached._moving(scene, training_view(camera, frame=frame))
+        for camera, frame in ((late, 1), (camera, 1), (camera, 2))
     )
     assert then.any()
     assert not torch.equal(before, then)
     assert torch.equal(of_late, then)
 
 
-def view_of(camera, timestamp_ns):
-    size = camera.height_px, camera.width_px
-    return TrainingView(
-        key=(0, "front"),
-        camera=camera,
-        timestamp_ns=timestamp_ns,
-        rgb_u8=torch.zeros(*size, 3, dtype=torch.uint8),
-        sky_mask=torch.zeros(size, dtype=torch.bool),
-        lidar_depth_m=torch.zeros(size),
-    )
-
-
 def views_of_wall(cameras):
     return [
-        TrainingView(
-            key=(frame, "front"),
-            camera=camera,
-            timestamp_ns=frame * FRAME_NS,
-            rgb_u8=(image_of_wall(camera, 10.0) * 255).to(torch.uint8),
-            sky_mask=torch.zeros(64, 96, dtype=torch.bool),
-            lidar_depth_m=torch.zeros(64, 96),
+        training_view(
+            camera, frame=frame, rgb_u8=(image_of_wall(camera, 10.0) * 255).to(torch.uint8)
         )
         for frame, camera in enumerate(cameras)
     ]
@@ -97,17 +80,11 @@ def test_nothing_is_put_under_the_ground(monkeypatch):
     road = road[(road[:, 0] < 3) | (road[:, 0] > 12)]  # the gap
     gaussians = round_gaussians(road, torch.full_like(road, 0.4), sigma_m=0.3)
     cameras = [camera.at(pose) for pose in _poses_ahead(camera, 3)]
-    images = [torch.full((64, 96, 3), 0.4) for _ in cameras]
+    grey = torch.full((64, 96, 3), 102, dtype=torch.uint8)
+    sky_mask = torch.arange(64)[:, None].expand(64, 96) < 34
     views = [
-        TrainingView(
-            key=(index, "front"),
-            camera=one,
-            timestamp_ns=index * FRAME_NS,
-            rgb_u8=(image * 255).to(torch.uint8),
-            sky_mask=torch.arange(64)[:, None].expand(64, 96) < 34,
-            lidar_depth_m=torch.zeros(64, 96),
-        )
-        for index, (one, image) in enumerate(zip(cameras, images, strict=True))
+        training_view(one, frame=frame, rgb_u8=grey, sky_mask=sky_mask)
+        for frame, one in enumerate(cameras)
     ]
     scene = scene_of(gaussians, cameras)
     put = unreached_gaussians(scene, views, budget=500)

@@ -113,9 +113,6 @@ def test_lamps_are_drawn_and_stored_as_they_are_then(world):
     assert float((lit - world.scene.render(camera, FRAME_NS).rgb).max()) > 0.2
     again = scene_from_arrays(*scene_to_arrays(scene))
     assert torch.equal(again.render(camera, FRAME_NS).rgb, lit)
-    arrays, metadata = scene_to_arrays(world.scene)
-    older = {name: value for name, value in arrays.items() if not name.startswith("blinking.")}
-    assert not len(scene_from_arrays(older, metadata).blinking)
 
 
 def test_colour_is_added_to_the_constant_harmonic_alone():

@@ -48,7 +48,7 @@ def test_what_is_carried_looks_the_same_to_a_camera_that_is_carried_along():
 
     def drawn(some, pose):
         bodies = camera_from_body(pose, torch.zeros(0, 4, 4, dtype=torch.float64), NOBODY)
-        return draw_gaussians(some, bodies, camera, backend="reference").rgb
+        return draw_gaussians(some, bodies, camera).rgb
 
     here = drawn(gaussians, camera.world_from_camera)
     there = drawn(carried_gaussians(gaussians, POSE), POSE @ camera.world_from_camera)

@@ -168,10 +168,3 @@ def test_a_style_is_stored_with_its_scene(clear):
     assert again.style.mix == scene.style.mix
     assert again.style.lamps == scene.style.lamps
     assert torch.equal(again.render(camera, 0).rgb, scene.render(camera, 0).rgb)
-
-
-def test_a_scene_stored_before_there_were_styles_is_read(clear):
-    arrays, metadata = scene_to_arrays(clear)
-    assert "style" not in metadata
-    assert not any(name.startswith("style") for name in arrays)
-    assert scene_from_arrays(arrays, metadata).style is None

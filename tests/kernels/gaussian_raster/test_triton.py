@@ -15,9 +15,8 @@ from splat_drawing import TRITON, WITHOUT_TRITON, home_of, render
 from splat_errors import CASES, image_errors, relative_errors
 
 from lidarpainter_models.errors import BackendError
-from lidarpainter_models.gaussians.fitting.config import FitConfig
+from lidarpainter_models.gaussians.fitting.config import DensificationConfig, FitConfig
 from lidarpainter_models.gaussians.fitting.fit import fit_gaussians
-from lidarpainter_models.gaussians.fitting.number_of_gaussians import DensificationConfig
 from lidarpainter_models.gaussians.initialisation.settings import InitialisationConfig
 from lidarpainter_models.kernels import gaussian_raster, gpu_packages
 

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.gaussians.model.actors import Actors
+from lidarpainter_models.gaussians.model.bending import knots_around
 from lidarpainter_models.gaussians.model.styling.scene_style import LampChange, StyledPlace
 from lidarpainter_models.kernels.scene_light import Lamps
 from lidarpainter_models.weather.darkness import (
@@ -207,12 +208,7 @@ def ego_beam(
     place: StyledPlace, timestamp_ns: int
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
     """Place between the headlamps and heading of the car that recorded, at a time."""
-    times = place.ego_times_ns
-    after = int(torch.searchsorted(times, timestamp_ns).clamp(1, max(len(times) - 1, 1)))
-    after = min(after, len(times) - 1)
-    before = max(after - 1, 0)
-    span_ns = max(int(times[after] - times[before]), 1)
-    weight = min(max((timestamp_ns - int(times[before])) / span_ns, 0.0), 1.0)
+    before, after, weight = knots_around(place.ego_times_ns, timestamp_ns)
     position = torch.lerp(place.ego_lamp[before], place.ego_lamp[after], weight)
     heading = torch.lerp(place.ego_heading[before], place.ego_heading[after], weight)
     return position, _level(heading[None])[0]

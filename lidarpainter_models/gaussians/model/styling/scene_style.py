@@ -4,13 +4,14 @@ Everything else follows from the Gaussians as they are, so an edited scene keeps
 z up, metres; light is linear, in units of display white.
 """
 
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, get_args
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lidarpainter_models.devices import on_device
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.weather.mix import StyleMix, StyleShare
 
@@ -69,13 +70,9 @@ class StyledPlace:
         first_ns, last_ns = int(self.ego_times_ns[0]), int(self.ego_times_ns[-1])
         return (timestamp_ns - first_ns) / max(last_ns - first_ns, 1)
 
-    def tensors(self) -> dict[str, Tensor]:
-        """Everything to be stored."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
-    def to(self, device: torch.device | str) -> "StyledPlace":
+    def to(self, device: torch.device) -> "StyledPlace":
         """The same on another device."""
-        return type(self)(**{name: value.to(device) for name, value in self.tensors().items()})
+        return on_device(self, device)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -93,7 +90,7 @@ class SceneStyle:
         """The strength of every style that changes anything at a time."""
         return self.mix.strengths(self.place.progress(timestamp_ns))
 
-    def to(self, device: torch.device | str) -> "SceneStyle":
+    def to(self, device: torch.device) -> "SceneStyle":
         """The same on another device."""
         return replace(self, place=self.place.to(device))
 
