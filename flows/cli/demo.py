@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flows.cli.output import print_json, say_status
-from flows.cli.shared_options import AsJson, Painter, Settings, check_painter
+from flows.cli.shared_options import AsJson, Painter, Settings, check_painter, described
 
 if TYPE_CHECKING:
     from catalog.store import Store
@@ -19,20 +19,17 @@ REPORT_NAME = "report.html"
 PAGE_NAME = "drive.html"
 STORE_NAME = "store"
 
+WORDS = """
+out: Folder that the report and the store are written to.
+seed: Number from 0 to 999 that decides which street is drawn; painters train on streets of other
+  seeds.
+"""
 
+
+@described(WORDS)
 def demo(
-    out: Annotated[
-        Path, typer.Option(help="Folder that the report and the store are written to.")
-    ] = Path("demo"),
-    seed: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            max=999,
-            help="Number from 0 to 999 that decides which street is drawn; painters train on "
-            "streets of other seeds.",
-        ),
-    ] = 1,
+    out: Path = Path("demo"),
+    seed: Annotated[int, typer.Option(min=0, max=999)] = 1,
     painter: Painter = None,
     settings: Settings = None,
     as_json: AsJson = False,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flows.cli.output import Cell, format_bytes, print_json, print_pairs, print_table, say_status
-from flows.cli.shared_options import AsJson
+from flows.cli.shared_options import AsJson, described
 
 if TYPE_CHECKING:
     from catalog.deletion import Doomed
@@ -17,22 +17,28 @@ DAMAGED = 1
 MOST_LISTED = 200
 """Rows of a table on the terminal; --json has all."""
 
+Days = Annotated[float, typer.Option(min=0.0, max=36500.0)]
+ForReal = Annotated[bool, typer.Option("--delete")]
+
 app = typer.Typer()
 
-Days = Annotated[
-    float,
-    typer.Option(
-        min=0.0, max=36500.0, help="Number of days that count as recent; 0.5 is half a day."
-    ),
-]
-ForReal = Annotated[
-    bool,
-    typer.Option("--delete", help="Delete it; otherwise what would be deleted is only listed."),
-]
+WORDS = """
+days: Number of days that count as recent; 0.5 is half a day.
+for_real: Delete it; otherwise what would be deleted is only listed.
+selection: What is taken along: run ids, latest (the newest run of all), scenes, or kind/digest of
+  artefacts; or the beginnings of ids.
+out: The tar file to write.
+archive: A tar file that `catalog export` wrote.
+"""
 
 
 @app.command("gc")
-def collect(days: Days = 30.0, for_real: ForReal = False, as_json: AsJson = False) -> None:
+@described(WORDS)
+def collect(
+    days: Days = 30.0,
+    for_real: ForReal = False,
+    as_json: AsJson = False,
+) -> None:
     """List, or delete, what nothing recent needs: no run, no fleet, no asset, no work.
 
     Runs of the last days stay, runs of wanted sequences and of assets, trained painters, all that
@@ -78,6 +84,7 @@ def print_doomed(what: str, doomed: "Sequence[Doomed]", note: str = "") -> None:
 
 
 @app.command("compact")
+@described(WORDS)
 def compact_tables(as_json: AsJson = False) -> None:
     """Write the many small files of each table together: reading them gets faster.
 
@@ -103,7 +110,12 @@ def compact_tables(as_json: AsJson = False) -> None:
 
 
 @app.command("vacuum")
-def vacuum_tables(days: Days = 30.0, for_real: ForReal = False, as_json: AsJson = False) -> None:
+@described(WORDS)
+def vacuum_tables(
+    days: Days = 30.0,
+    for_real: ForReal = False,
+    as_json: AsJson = False,
+) -> None:
     """Delete the files of tables that only versions older than some days need.
 
     `catalog list TABLE --as-of` reaches back so far and no further then.
@@ -127,6 +139,7 @@ def vacuum_tables(days: Days = 30.0, for_real: ForReal = False, as_json: AsJson 
 
 
 @app.command("verify")
+@described(WORDS)
 def verify_store(as_json: AsJson = False) -> None:
     """Read every byte of the store and name what is not as it was written; then exit with 1.
 
@@ -162,15 +175,10 @@ def verify_store(as_json: AsJson = False) -> None:
 
 
 @app.command("export")
+@described(WORDS)
 def export_selection(
-    selection: Annotated[
-        list[str],
-        typer.Argument(
-            help="What is taken along: run ids, latest (the newest run of all), scenes, or "
-            "kind/digest of artefacts; or the beginnings of ids."
-        ),
-    ],
-    out: Annotated[Path, typer.Option(help="The tar file to write.")],
+    selection: list[str],
+    out: Annotated[Path, typer.Option()],
     as_json: AsJson = False,
 ) -> None:
     """Write runs with all that they need, or scenes, or artefacts, into one tar.
@@ -192,8 +200,9 @@ def export_selection(
 
 
 @app.command("import")
+@described(WORDS)
 def import_selection(
-    archive: Annotated[Path, typer.Argument(help="A tar file that `catalog export` wrote.")],
+    archive: Path,
     as_json: AsJson = False,
 ) -> None:
     """Take what `catalog export` wrote into this store; what is there already stays.
@@ -212,6 +221,7 @@ def import_selection(
 
 
 @app.command("stale")
+@described(WORDS)
 def stale(as_json: AsJson = False) -> None:
     """Show which runs today's code would make otherwise, why, and what redoing them takes.
 
@@ -257,8 +267,9 @@ def stale(as_json: AsJson = False) -> None:
 
 
 @app.command("cost")
+@described(WORDS)
 def cost(
-    scene: Annotated[str, typer.Argument(help="Scene as dataset/sequence, such as pandaset/002.")],
+    scene: str,
     as_json: AsJson = False,
 ) -> None:
     """Show what a scene has cost: attempts of fleets by cause, and stages as computed.

@@ -12,8 +12,8 @@ from tiny_diffusion import write_model
 
 from catalog.store import STORE_ENVIRONMENT, open_store
 from flows.cli.main import main
-from flows.cli.painter_options import parse_seeds
-from flows.painter_recipes import shaped
+from flows.cli.painter import parse_seeds
+from flows.painter_parameters import shaped
 from lidarpainter_models.painter.nano.network import NanoConfig, NanoNetwork
 from lidarpainter_models.painter.nano.training import NanoTrainingConfig
 from lidarpainter_models.painter.nano.weights import load_weights, save_weights
