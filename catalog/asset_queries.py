@@ -106,13 +106,11 @@ def _of_category(sql: CatalogSql, asked: str, values: dict[str, Any]) -> Iterato
     if word == SEDAN:
         word = "car"
         yield _SEDAN
-    values["categories"] = [name for name in known if word in (name.lower(), _last_part(name))]
+    values["categories"] = [
+        name for name in known if word in (name.lower(), name.lower().rpartition(".")[2])
+    ]
     if not values["categories"]:
         raise UnknownRecordError(
             f"no asset of category {asked!r}; there are {', '.join(sorted(known)) or 'none'}"
         )
     yield "list_contains($categories, category)"
-
-
-def _last_part(category: str) -> str:
-    return category.lower().rpartition(".")[2]

@@ -152,9 +152,15 @@ class CatalogTables:
         if shutil.disk_usage(folder).free < LEAST_ROOM_BYTES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    def rows(self, table: str, *, as_of: int | datetime | None = None) -> list[Row]:
-        """All rows of a table, by id, as it is or was; see `arrow`."""
-        arrow = self.arrow(table, as_of=as_of)
+    def rows(
+        self,
+        table: str,
+        *,
+        where: Mapping[str, Collection[str]] | None = None,
+        as_of: int | datetime | None = None,
+    ) -> list[Row]:
+        """Rows of a table, by id, as it is or was; see `arrow`."""
+        arrow = self.arrow(table, where=where, as_of=as_of)
         return arrow.sort_by(_schema(table).key).to_pylist()
 
     def arrow(
@@ -211,8 +217,7 @@ class CatalogTables:
 
     def find(self, table: str, row_id: str) -> Row | None:
         """The row with exactly this id, or None."""
-        found = self.arrow(table, where={_schema(table).key: [row_id]})
-        return found.to_pylist()[0] if found.num_rows else None
+        return next(iter(self.rows(table, where={_schema(table).key: [row_id]})), None)
 
     def row(self, table: str, id_or_prefix: str) -> Row:
         """The one row with this id, or whose id starts with it.

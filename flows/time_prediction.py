@@ -264,13 +264,10 @@ class Clock:
         return self.compiled() - self._compiled_before[stage]
 
 
-def _is_fit(stage: str) -> bool:
-    return _kind(stage) in ("fit", "refine")
-
-
 def _group(stage: str) -> str:
     """Stages that tell of one another's pace; to examine takes as long as a recording is large."""
-    return "fit" if _is_fit(stage) else "examine" if stage == "examine" else "rest"
+    is_fit = _kind(stage) in ("fit", "refine")
+    return "fit" if is_fit else "examine" if stage == "examine" else "rest"
 
 
 def as_clock(seconds: float) -> str:

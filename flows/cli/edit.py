@@ -68,15 +68,14 @@ def edit(
     run_id = named_run(run)
     check_painter(painter)
     from flows.cli.progress import shown_progress
-    from flows.edit import EditRequest, edit_run, shown_edit
+    from flows.edit import edit_run, shown_edit
 
-    request = EditRequest(
-        run=run_id, operations=known, painter=painter, allows_collisions=allow_collisions
-    )
+    store = existing_store()
+    how: dict[str, Any] = {"painter": painter, "allows_collisions": allow_collisions}
     with shown_progress():
-        result = edit_run(existing_store(), request)
+        result = edit_run(store, run_id, known, **how)
         if out is not None:
-            result["images"] = shown_edit(existing_store(), request, result, out.absolute())
+            result["images"] = shown_edit(store, result, out.absolute(), **how)
     print_json(result) if as_json else _show(result)
 
 

@@ -1,7 +1,6 @@
 """`lidarpainter chart`, `size`, `stress`, `figures`: measured, drawn and put into pages."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,8 +12,7 @@ from lidarpainter_models.errors import ConfigError
 
 if TYPE_CHECKING:
     from catalog.points import Point
-    from flows.fleet.manifest import Configuration
-    from flows.measure.sweep import Sweep
+    from flows.fleet.manifest import Configuration, Manifest
     from flows.parameters import ReconstructParameters
 
 NOT_OVER = 2
@@ -140,9 +138,9 @@ def stress(  # noqa: PLR0913 - the options of a command
     from flows.measure.sweep import foretold, was_asked
     from lidarpainter_models.stress.causes import CAUSES
 
-    def sweep(names: Sequence[str]) -> "Sweep":
+    def sweep(names: Sequence[str], **more: Any) -> "Manifest":  # noqa: ANN401 - fields of it
         asked = _sweep("stress", names, WAYS, preset, train_cameras, seeds, settings)
-        return replace(asked, publish=PUBLISHED)
+        return asked.model_copy(update={"publish": PUBLISHED, **more})
 
     store, causes = existing_store(), _known(only, list(CAUSES))
     trials = trials_of(store, scenes, causes, levels)
@@ -158,7 +156,7 @@ def stress(  # noqa: PLR0913 - the options of a command
         tell(f"painting seems to harm {len(doubted)} recordings: {SEEDS_IN_DOUBT} seeds of them")
         # a fleet of their own: one that is asked for less forgets the rest
         more = tuple(range(seeds, SEEDS_IN_DOUBT))
-        again = replace(sweep(doubted), name="stress-in-doubt", seeds=more)
+        again = sweep(doubted, name="stress-in-doubt", fit_seeds=more)
         points += _made(again, workers=workers, accept_stale=accept_stale)
     _show(stress_of(points, trials, out), as_json=as_json)
 
@@ -229,26 +227,28 @@ def _sweep(
     train_cameras: str | None,
     seeds: int,
     settings: Sequence[str] | None,
-) -> "Sweep":
-    from flows.measure.sweep import Sweep
+) -> "Manifest":
+    from flows.fleet.manifest import STORED, Manifest, Source
 
-    return Sweep(
+    cameras = parse_names(train_cameras, "--train-cameras")
+    return Manifest(
         name=name,
-        scenes=tuple(scenes),
-        cameras=parse_names(train_cameras, "--train-cameras"),
         preset=preset,
-        settings=tuple(settings or ()),
-        configurations=tuple(configurations),
-        seeds=tuple(range(seeds)),
+        set=tuple(settings or ()),
+        source=(Source(dataset=STORED, scenes=tuple(scenes), cameras=cameras),),
+        configuration=tuple(configurations),
+        fit_seeds=tuple(range(seeds)),
+        publish=("scores",),
     )
 
 
-def _made(sweep: "Sweep", *, workers: int, accept_stale: bool) -> list["Point"]:
+def _made(sweep: "Manifest", *, workers: int, accept_stale: bool) -> list["Point"]:
     from catalog.store import existing_store
     from flows.measure.sweep import run_sweep
 
-    ways = len(sweep.configurations) * len(sweep.seeds)
-    tell(f"{len(sweep.scenes) * ways} points: {len(sweep.scenes)} scenes in {ways} ways")
+    ways = len(sweep.configuration) * len(sweep.fit_seeds)
+    number = len(sweep.source[0].scenes or ())
+    tell(f"{number * ways} points: {number} scenes in {ways} ways")
     return run_sweep(sweep, existing_store(), workers=workers, accept_stale=accept_stale, say=tell)
 
 

@@ -60,8 +60,7 @@ class FleetRecord:
         """Figures of held-out views after the last round, by run and name."""
         runs = {row["run_id"] for row in self.rows if row["run_id"]}
         found: dict[str, dict[str, float]] = {}
-        judged = self.ledger.store.tables.arrow("metrics", where={"run_id": runs})
-        for row in judged.to_pylist():
+        for row in self.ledger.store.tables.rows("metrics", where={"run_id": runs}):
             is_shown = row["protocol"] == "recorded" and row["variant"] in FINAL_VARIANTS
             if is_shown and row["name"] in QUALITY and row["value"] is not None:
                 found.setdefault(row["run_id"], {})[row["name"]] = row["value"]
