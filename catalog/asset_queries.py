@@ -96,11 +96,7 @@ def find_assets(sql: CatalogSql, wanted: AssetFilter, *, sort: Sort, most: int) 
 
 
 def _of_category(sql: CatalogSql, asked: str, values: dict[str, Any]) -> Iterator[str]:
-    """The conditions of a category: its words as the data sets have them, which files can skip by.
-
-    Raises:
-        UnknownRecordError: no data set has the word.
-    """
+    """The conditions of a category: by its words in the data sets, files can be skipped."""
     known = [row["category"] for row in sql.ask("SELECT DISTINCT category FROM assets").rows]
     word = asked.lower()
     if word == SEDAN:

@@ -46,9 +46,7 @@ ENTRY_PARTS = 3
 def plan_collection(store: Store, since: datetime) -> list[Doomed]:
     """All that may go, rows with their files and leftovers alike.
 
-    Args:
-        store: where to look.
-        since: what ran or was made later stays, with all that it needs.
+    What ran or was made after `since` stays, with all that it needs.
     """
     needs = Needs(store)
     kept = needs.kept_since(since)

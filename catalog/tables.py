@@ -141,11 +141,7 @@ class CatalogTables:
         )
 
     def _require_room(self) -> None:
-        """Refuse to begin a commit that the disk would not take: Delta's writer may never return.
-
-        Raises:
-            OSError: less is free than `LEAST_ROOM_BYTES`.
-        """
+        """Refuse to begin a commit that the disk would not take: Delta's writer may not return."""
         folder = Path(self.root)
         if "://" in self.root or not folder.is_dir():
             return
@@ -240,12 +236,7 @@ class CatalogTables:
         return f"{self.root}/{schema.name}"
 
     def _past(self, schema: TableSchema, as_of: int | datetime) -> DeltaTable:
-        """The table as it was.
-
-        Raises:
-            TableNotFoundError: nothing was ever written.
-            UnknownRecordError: there is no such version.
-        """
+        """The table as it was."""
         found = DeltaTable(self._uri(schema), storage_options=self.storage_options)
         try:
             found.load_as_version(as_of)
@@ -313,11 +304,7 @@ class CatalogTables:
         return table
 
     def _current(self, schema: TableSchema) -> DeltaTable:
-        """The table as it is now.
-
-        Raises:
-            TableNotFoundError: nothing was ever written.
-        """
+        """The table as it is now."""
         handles = {} if self._handles is None else self._handles
         known = handles.pop(schema.name, None)
         if known is not None:

@@ -37,14 +37,8 @@ def edit_run(
     """Make an edited run of a finished one.
 
     An edited run, styled since or not, is edited anew from where it came from, with both lists
-    one after the other: what was uncovered is filled once, from what was recorded.
-
-    Args:
-        store: where the run is.
-        run: its id, a unique prefix of one, or `latest`.
-        added: what is done to it.
-        painter: who paints what nobody saw; None takes the run's own.
-        allows_collisions: whether actors may go through walls.
+    one after the other: what was uncovered is filled once, from what was recorded. Who paints what
+    nobody saw is the run's own painter if None is named.
 
     Returns:
         As `derive_run`, with `trajectory`: where the script drives, `recorded` if it does not say.

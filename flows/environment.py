@@ -60,9 +60,6 @@ def keep_prefect_in(store: str) -> None:
     stores. Where there is no home folder, or it cannot be written, the database lies in the store,
     or for a bucket in the cache in front of it. A folder that the user has chosen by `PREFECT_HOME`
     stays, and so do profiles. Nothing is made before a server is started.
-
-    Args:
-        store: folder of the store, or its address `s3://BUCKET/PREFIX`.
     """
     if os.environ.get(PREFECT_HOME, "") not in {"", *_chosen_homes}:
         return

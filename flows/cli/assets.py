@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from flows.cli.output import print_json, print_pairs, print_table, say_status
+from flows.cli.output import print_json, print_pairs, print_result, print_table, say_status
 from flows.cli.rows import opened_row, row_cell, told_explanation
 from flows.cli.shared_options import AsJson, described, named_run, parse_names
 
@@ -56,10 +56,7 @@ gallery.out: Folder that the gallery is written to: a new one, or an older galle
 
 @app.command()
 @described(WORDS)
-def publish(
-    runs: list[str],
-    as_json: AsJson = False,
-) -> None:
+def publish(runs: list[str], as_json: AsJson = False) -> None:
     """Take actors, street, sky and trajectories out of finished runs into the library.
 
     Example: lidarpainter assets publish latest
@@ -159,10 +156,7 @@ def show(name: str, as_json: AsJson = False) -> None:
 
 @app.command()
 @described(WORDS)
-def query(
-    sql: str,
-    as_json: AsJson = False,
-) -> None:
+def query(sql: str, as_json: AsJson = False) -> None:
     """Ask all tables of the catalog by SQL, which can read them and nothing else.
 
     Example: lidarpainter assets query "SELECT category, count(*) FROM assets GROUP BY category"
@@ -199,7 +193,7 @@ def export(
     from tasks.exports.asset import export_asset
 
     result = export_asset(store, asset, format_, out.absolute())
-    print_json(result) if as_json else print_pairs(f"asset {asset['name']}", result)
+    print_result(f"asset {asset['name']}", result, as_json=as_json)
 
 
 @app.command()
@@ -224,7 +218,7 @@ def gallery(
     from tasks.exports.asset import export_gallery
 
     result = {**export_gallery(store, found.rows, out.absolute()), "is_cut": found.is_cut}
-    print_json(result) if as_json else print_pairs("gallery", result)
+    print_result("gallery", result, as_json=as_json)
 
 
 def _library() -> "tuple[Store, CatalogSql]":

@@ -137,10 +137,7 @@ def _version_or_time(text: str) -> "int | datetime":
 
 @app.command("show")
 @described(WORDS)
-def show_record(
-    name: str,
-    as_json: AsJson = False,
-) -> None:
+def show_record(name: str, as_json: AsJson = False) -> None:
     """Show everything known about one scene, run or artefact.
 
     Example: lidarpainter catalog show latest
@@ -156,10 +153,7 @@ def show_record(
 
 @app.command("explain")
 @described(WORDS)
-def explain(
-    name: str,
-    as_json: AsJson = False,
-) -> None:
+def explain(name: str, as_json: AsJson = False) -> None:
     """Say whether a run or an artefact is up to date, or what makes it stale.
 
     With --verbose also all that it was made from: inputs, settings and code.

@@ -12,7 +12,7 @@ from flows.cli.output import print_json, say_status
 from flows.cli.shared_options import AsJson, Painter, Settings, check_painter, described
 
 if TYPE_CHECKING:
-    from catalog.store import Store
+    pass
 
 FIRST_IMAGE_NAME = "street.png"
 REPORT_NAME = "report.html"
@@ -47,7 +47,6 @@ def demo(
     from catalog.errors import storage_errors
     from catalog.store import open_store
     from flows.cli.reconstruct import show
-    from flows.cli.running import run_demo
     from flows.overrides import with_changes, with_overrides
     from flows.presets import brief
     from tasks.specs import street_id
@@ -59,13 +58,23 @@ def demo(
     say_status(f"drawing the street of seed {seed}")
     check_painter(painter)
     store = open_store(out / STORE_NAME)
+    from flows.cli.progress import shown_progress
+    from flows.cli.running import run_demo
+    from flows.exports import export_run
+    from lidarpainter_models.export.view_requests import ViewRequest
+    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+    from lidarpainter_models.geometry.trajectory_words import RECORDED
+
     result = run_demo(parameters, seed, store, out.absolute() / FIRST_IMAGE_NAME)
     if result["report"] is not None:
         report = out.absolute() / REPORT_NAME
         with storage_errors(f"cannot write {report}"):
             shutil.copyfile(result["report"], report)
         result = {**result, "report": str(report)}
-    page = _written_page(store, result["run_id"], out.absolute() / PAGE_NAME)
+    page = out.absolute() / PAGE_NAME
+    with shown_progress():
+        recorded = ViewRequest(trajectory=parse_trajectory(RECORDED))
+        export_run(store, result["run_id"], "page", recorded, page)
     result = {**result, "page": str(page)}
     if as_json:
         print_json(result)
@@ -73,16 +82,3 @@ def demo(
         show(result)
         line = f"lidarpainter --store {shlex.quote(str(out / STORE_NAME))} view latest"
         sys.stdout.write(f"A lane aside: open {page}, or drive it live: {line}\n")
-
-
-def _written_page(store: "Store", run_id: str, out: Path) -> Path:
-    """The drive and a lane beside it in one file."""
-    from flows.cli.progress import shown_progress
-    from flows.exports import export_run
-    from lidarpainter_models.export.view_requests import ViewRequest
-    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
-    from lidarpainter_models.geometry.trajectory_words import RECORDED
-
-    with shown_progress():
-        export_run(store, run_id, "page", ViewRequest(trajectory=parse_trajectory(RECORDED)), out)
-    return out

@@ -118,11 +118,7 @@ def export(  # noqa: PLR0913 - the options of a command
 
 
 def _refuse_unread(row: ExportFormat, given: Sequence[object]) -> None:
-    """Refuse options, in the order of `OPTIONS`, that are given and that the format does not read.
-
-    Raises:
-        ConfigError: naming the first of them.
-    """
+    """Refuse options, in the order of `OPTIONS`, that are given and the format does not read."""
     values = zip(OPTIONS, given, strict=True)
     unread = {
         name: value is not None and value is not False

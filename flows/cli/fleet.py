@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flows.cli.output import print_json, print_pairs, print_table, say_status, tell
+from flows.cli.output import print_json, print_result, print_table, say_status, tell
 from flows.cli.shared_options import AsJson, described
 from lidarpainter_models.errors import ConfigError
 
@@ -62,12 +62,18 @@ def run(  # noqa: PLR0913 - the options of a command
 
     asked = read_manifest(manifest)
     if deploys:
-        parameters = {
+        parameters: dict[str, Any] = {
             "manifest": str(manifest.absolute()),
             "workers": workers,
             "accept_stale": accept_stale,
         }
-        _deploy(asked.name, parameters, threads, cron=cron, pool=pool, as_json=as_json)
+        say_status(f"deploying {asked.name}")
+        from catalog.store import open_store
+        from flows.fleet.deployed import POOL, deploy
+
+        parameters["store"] = open_store().name
+        made = deploy(asked.name, parameters, pool=pool or POOL, cron=cron, threads=threads)
+        print_result(f"fleet {asked.name}, deployed", made, as_json=as_json)
         return
     if cron is not None or pool is not None:
         raise ConfigError(f"{'--pool' if cron is None else '--cron'} needs --deploy")
@@ -134,9 +140,7 @@ def cancel(fleet: Annotated[str | None, typer.Argument()] = None, as_json: AsJso
 
 @app.command("work")
 @described(WORDS)
-def work(
-    fleet: str,
-) -> None:
+def work(fleet: str) -> None:
     """Work on a fleet that was asked for, beside all others who do; `fleet run` starts these.
 
     Example: lidarpainter fleet work night-of-monday
@@ -212,28 +216,6 @@ def _run_here(
     _show(status, as_json=as_json)
     if not is_over(status):
         raise typer.Exit(NOT_OVER)
-
-
-def _deploy(
-    name: str,
-    parameters: dict[str, Any],
-    threads: int,
-    *,
-    cron: str | None,
-    pool: str | None,
-    as_json: bool,
-) -> None:
-    say_status(f"deploying {name}")
-    from catalog.store import open_store
-    from flows.fleet.deployed import POOL, deploy
-
-    store = open_store().name
-    asked = {**parameters, "store": store}
-    made = deploy(name, asked, pool=pool or POOL, cron=cron, threads=threads)
-    if as_json:
-        print_json(made)
-    else:
-        print_pairs(f"fleet {name}, deployed", made)
 
 
 def _closed(ledger: "FleetLedger") -> list[str]:

@@ -93,7 +93,7 @@ def harvest(
 
     check_harvest(parameters, open_store().address)
     result = _run(harvest_pairs, parameters)
-    _print(result, lambda found: tables.show_pairs(found["pairs"]), as_json=as_json)
+    (print_json if as_json else tables.show_pairs)(result)
 
 
 @app.command("train")
@@ -153,7 +153,7 @@ def train(  # noqa: PLR0913 - the options of a command
     )
     parameters = parameters.model_copy(update={"training": training})
     parameters = with_overrides(parameters, settings or [])
-    _print(_trained(parameters, out), tables.show_training, as_json=as_json)
+    (print_json if as_json else tables.show_training)(_trained(parameters, out))
 
 
 def _trained(parameters: "TrainPainterParameters", out: Path | None) -> dict[str, Any]:
@@ -203,15 +203,12 @@ def evaluate(
             keep_below=keep_below,
             device=device,
         )
-    _print(found, tables.show_scores, as_json=as_json)
+    (print_json if as_json else tables.show_scores)(found)
 
 
 @app.command("info")
 @described(WORDS)
-def info(
-    painter: str = "nano",
-    as_json: AsJson = False,
-) -> None:
+def info(painter: str = "nano", as_json: AsJson = False) -> None:
     """Say what a painter is, in which precision it runs here, and how it was trained.
 
     Example: lidarpainter painter info --painter nano
@@ -220,7 +217,7 @@ def info(
     check_painter(painter)
     from flows.evaluate_painter import describe
 
-    _print(describe(painter), tables.show_info, as_json=as_json)
+    (print_json if as_json else tables.show_info)(describe(painter))
 
 
 @app.command("benchmark")
@@ -241,7 +238,7 @@ def benchmark(
     from flows.evaluate_painter import benchmark_painter
 
     found = benchmark_painter(painter, parse_size(size), repeats, device)
-    _print(found, tables.show_times, as_json=as_json)
+    (print_json if as_json else tables.show_times)(found)
 
 
 @app.command("ablate")
@@ -275,7 +272,7 @@ def ablate(  # noqa: PLR0913 - the options of a command
     )
     parameters = with_overrides(parameters, settings or [])
     check_ablation(parameters)
-    _print(_run(ablate_painter, parameters), tables.show_scores, as_json=as_json)
+    (print_json if as_json else tables.show_scores)(_run(ablate_painter, parameters))
 
 
 def _run(flow: Callable[..., dict[str, Any]], parameters: "BaseModel") -> dict[str, Any]:
@@ -289,13 +286,6 @@ def _run(flow: Callable[..., dict[str, Any]], parameters: "BaseModel") -> dict[s
     say_status("starting Prefect's server")
     with prefect_server(store.root / "logs" / "prefect.log"), shown_progress():
         return flow(parameters, store.address)
-
-
-def _print(found: dict[str, Any], show: Callable[[dict[str, Any]], None], *, as_json: bool) -> None:
-    if as_json:
-        print_json(found)
-    else:
-        show(found)
 
 
 def parse_seeds(text: str | None) -> tuple[int, ...]:

@@ -34,11 +34,7 @@ archive: A tar file that `catalog export` wrote.
 
 @app.command("gc")
 @described(WORDS)
-def collect(
-    days: Days = 30.0,
-    for_real: ForReal = False,
-    as_json: AsJson = False,
-) -> None:
+def collect(days: Days = 30.0, for_real: ForReal = False, as_json: AsJson = False) -> None:
     """List, or delete, what nothing recent needs: no run, no fleet, no asset, no work.
 
     Runs of the last days stay, runs of wanted sequences and of assets, trained painters, all that
@@ -58,10 +54,16 @@ def collect(
         delete(store, doomed)
     if as_json:
         print_json(doomed_as_json(doomed, is_deleted=for_real))
-        return
-    note = "" if for_real or not doomed else "nothing was deleted: --delete does"
-    what = "deleted from" if for_real else "not needed in"
-    print_doomed(f"{what} {store.name}", doomed, note)
+    else:
+        what, note = _fate(for_real=for_real)
+        print_doomed(f"{what} {store.name}", doomed, note if doomed else "")
+
+
+def _fate(*, for_real: bool) -> tuple[str, str]:
+    """What became of what is listed, and a note."""
+    if for_real:
+        return "deleted from", ""
+    return "not needed in", "nothing was deleted: --delete does"
 
 
 def doomed_as_json(doomed: "Sequence[Doomed]", *, is_deleted: bool) -> dict[str, Any]:
@@ -75,12 +77,10 @@ def print_doomed(what: str, doomed: "Sequence[Doomed]", note: str = "") -> None:
     """A table of what goes out of a store, the largest first."""
     largest = sorted(doomed, key=lambda one: -one.num_bytes)[:MOST_LISTED]
     left = len(doomed) - len(largest)
-    notes = [*([f"and {left} smaller ones"] if left else []), *([note] if note else [])]
-    rows: list[list[Cell]] = [
-        [one.table[:-1], one.row_id, format_bytes(one.num_bytes)] for one in largest
-    ]
+    notes = "\n".join(filter(None, [f"and {left} smaller ones" if left else "", note]))
+    rows = [[one.table[:-1], one.row_id, format_bytes(one.num_bytes)] for one in largest]
     title = f"{format_bytes(sum(one.num_bytes for one in doomed))} {what}"
-    print_table(title, ["what", "name", "size"], rows, "\n".join(notes), num_text_columns=2)
+    print_table(title, ["what", "name", "size"], rows, notes, num_text_columns=2)
 
 
 @app.command("compact")
@@ -111,11 +111,7 @@ def compact_tables(as_json: AsJson = False) -> None:
 
 @app.command("vacuum")
 @described(WORDS)
-def vacuum_tables(
-    days: Days = 30.0,
-    for_real: ForReal = False,
-    as_json: AsJson = False,
-) -> None:
+def vacuum_tables(days: Days = 30.0, for_real: ForReal = False, as_json: AsJson = False) -> None:
     """Delete the files of tables that only versions older than some days need.
 
     `catalog list TABLE --as-of` reaches back so far and no further then.
@@ -133,8 +129,7 @@ def vacuum_tables(
     if as_json:
         print_json({"is_deleted": for_real, "num_files": counts})
     else:
-        note = "" if for_real else "nothing was deleted: --delete does"
-        what = "deleted from" if for_real else "not needed in"
+        what, note = _fate(for_real=for_real)
         print_pairs(f"files {what} tables of {store.name}", counts, note)
 
 
@@ -201,10 +196,7 @@ def export_selection(
 
 @app.command("import")
 @described(WORDS)
-def import_selection(
-    archive: Path,
-    as_json: AsJson = False,
-) -> None:
+def import_selection(archive: Path, as_json: AsJson = False) -> None:
     """Take what `catalog export` wrote into this store; what is there already stays.
 
     Example: lidarpainter catalog import night.tar
@@ -268,10 +260,7 @@ def stale(as_json: AsJson = False) -> None:
 
 @app.command("cost")
 @described(WORDS)
-def cost(
-    scene: str,
-    as_json: AsJson = False,
-) -> None:
+def cost(scene: str, as_json: AsJson = False) -> None:
     """Show what a scene has cost: attempts of fleets by cause, and stages as computed.
 
     Money follows from money_per_hour in the table `budget` of the fleet's manifest.

@@ -75,11 +75,7 @@ def make_points(
 
 
 def _require_asked(wanted: Sequence[Wish], ledger: FleetLedger) -> None:
-    """See that a fleet is still asked for as it was.
-
-    Raises:
-        ConflictError: it is not.
-    """
+    """See that a fleet is still asked for as it was."""
     fleet, store = wanted[0].fleet, ledger.store
     asked = {(wish.sequence_id, wish.asked_digest) for wish in wanted}
     found = {(row["sequence_id"], row["asked_digest"]) for row in ledger.rows(fleet)}
