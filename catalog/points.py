@@ -1,6 +1,6 @@
 """What the sequences of a fleet came to: their cost and every number of their runs."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -36,7 +36,7 @@ class Point:
     """Numbers of the scene at the end."""
     by_variant: dict[str, dict[MetricName, float]] = field(default_factory=dict)
     """Numbers of every variant that was scored, by its name in the catalog."""
-    suspicions: tuple[str, ...] | None = None
+    suspicions: Sequence[str] | None = None
     """What is wrong about the recording, in sentences; None where nobody looked."""
 
 
@@ -74,7 +74,7 @@ def points_of(store: Store, fleet: str) -> tuple[list[Point], list[Row]]:
                 for name, value in judged[row["run_id"]].get(variant, {}).items()
             },
             by_variant=judged[row["run_id"]],
-            suspicions=_suspicions(results[row["run_id"]]),
+            suspicions=results[row["run_id"]].get("suspicions"),
         )
         for row in ended
     ]
@@ -89,11 +89,6 @@ def _scenes(run: Row) -> list[str]:
 def _at_end(run: Row) -> tuple[str, ...]:
     """Variants of numbers that are of its last scene; without a round that is the first fit."""
     return (UNPAINTED, *FINAL) if len(_scenes(run)) == 1 else FINAL
-
-
-def _suspicions(result: Mapping[str, Any]) -> tuple[str, ...] | None:
-    said = result.get("suspicions")
-    return None if said is None else tuple(said)
 
 
 def _cost(result: Mapping[str, Any], scene_bytes: int) -> dict[str, float]:
