@@ -44,11 +44,7 @@ def select(store: Store, named: Iterable[tuple[str, Row]]) -> Selection:
     """Choose runs with all that they need, or scenes and artefacts by themselves.
 
     A run needs its scene, its artefacts and metrics, and the run that it was changed from. From a
-    bucket all of it is fetched.
-
-    Args:
-        store: where they are.
-        named: tables and rows.
+    bucket all of it is fetched. What is `named` are rows with their tables.
 
     Raises:
         UnknownRecordError: what is named is neither a run nor an artefact nor a scene.
@@ -118,11 +114,7 @@ def write_archive(store: Store, selection: Selection, out: Path) -> int:
 
 
 def _files(folder: Path) -> list[Path]:
-    """The files of a folder, hidden ones of writers left out.
-
-    Raises:
-        UnknownRecordError: it is gone.
-    """
+    """The files of a folder, hidden ones of writers left out."""
     if not folder.is_dir():
         raise UnknownRecordError(f"{folder} is gone, though the catalog has it")
     return sorted(path for path in folder.rglob("*") if path.is_file())

@@ -96,23 +96,17 @@ def find_assets(sql: CatalogSql, wanted: AssetFilter, *, sort: Sort, most: int) 
 
 
 def _of_category(sql: CatalogSql, asked: str, values: dict[str, Any]) -> Iterator[str]:
-    """The conditions of a category: its words as the data sets have them, which files can skip by.
-
-    Raises:
-        UnknownRecordError: no data set has the word.
-    """
+    """The conditions of a category: by its words in the data sets, files can be skipped."""
     known = [row["category"] for row in sql.ask("SELECT DISTINCT category FROM assets").rows]
     word = asked.lower()
     if word == SEDAN:
         word = "car"
         yield _SEDAN
-    values["categories"] = [name for name in known if word in (name.lower(), _last_part(name))]
+    values["categories"] = [
+        name for name in known if word in (name.lower(), name.lower().rpartition(".")[2])
+    ]
     if not values["categories"]:
         raise UnknownRecordError(
             f"no asset of category {asked!r}; there are {', '.join(sorted(known)) or 'none'}"
         )
     yield "list_contains($categories, category)"
-
-
-def _last_part(category: str) -> str:
-    return category.lower().rpartition(".")[2]

@@ -215,7 +215,7 @@ def _stored(
     store: Store, column: str, values: Iterable[str], table: str = SIGHTINGS.name
 ) -> list[Row]:
     """The rows of a table in the store with one of these values in a column."""
-    return store.tables.arrow(table, where={column: set(values)}).to_pylist()
+    return store.tables.rows(table, where={column: set(values)})
 
 
 def _where(table: pa.Table, column: str, values: Iterable[str]) -> list[Row]:

@@ -46,9 +46,7 @@ ENTRY_PARTS = 3
 def plan_collection(store: Store, since: datetime) -> list[Doomed]:
     """All that may go, rows with their files and leftovers alike.
 
-    Args:
-        store: where to look.
-        since: what ran or was made later stays, with all that it needs.
+    What ran or was made after `since` stays, with all that it needs.
     """
     needs = Needs(store)
     kept = needs.kept_since(since)
@@ -85,7 +83,8 @@ def _leftovers(store: Store, known: set[str], since: datetime) -> Iterator[Doome
         if (
             changed_at(folder) < settled
             and not _is_locked(store, owner)
-            and not _is_written(folder)
+            # of a scene, see the library's `storage.whole_folders`
+            and not is_held(folder / ".writing")
         ):
             yield _leftover(store, folder)
 
@@ -127,8 +126,3 @@ def _leftover(store: Store, folder: Path) -> Doomed:
 def _is_locked(store: Store, name: str) -> bool:
     """Whether somebody makes the artefact of an id or a digest just now."""
     return is_held(store.root / "locks" / f"{name.rpartition('/')[2]}.lock")
-
-
-def _is_written(folder: Path) -> bool:
-    """Whether somebody writes a scene there, see the library's `storage.whole_folders`."""
-    return is_held(folder / ".writing")

@@ -129,11 +129,7 @@ def doomed_rows(store: Store, table: str, names: Iterable[str]) -> list[Doomed]:
 
 
 def _folder(store: Store, table: str, name: str) -> Path:
-    """Where the files lie; the name comes from a table that anybody may have written.
-
-    Raises:
-        CatalogError: that is not in the store.
-    """
+    """Where the files lie; the name comes from a table that anybody may have written."""
     parts = name.split("/")
     if len(parts) != 2 or (table == "artefacts" and not all(map(_PLAIN.fullmatch, parts))):
         raise CatalogError(f"{table} name {name!r} is no place in the store, nothing was deleted")

@@ -49,8 +49,9 @@ class Explanation:
         """One sentence: that it is up to date, or what of it is stale and why."""
         if not self.stale:
             return f"{self.name} is up to date: today's code would make it again as it is."
-        parts = [part for part, made in self.inputs.items() if made.stale]
-        what = f" in {', '.join(_kinds(parts))}" if parts else ""
+        # of a run the kinds of its artefacts
+        parts = [part.partition("/")[0] for part, made in self.inputs.items() if made.stale]
+        what = f" in {', '.join(dict.fromkeys(parts))}" if parts else ""
         return f"{self.name} is stale{what}: {'; '.join(dict.fromkeys(self._causes()))}."
 
     def _causes(self) -> Iterator[str]:
@@ -197,7 +198,11 @@ class Explainer:
             for row in self._artefacts
             if row["kind"] == ref.kind and row["artefact_id"] not in beside
         ]
-        alike = [row for row in rows if _share_an_input(json_of(row, "inputs"), manifest.inputs)]
+        ours, alike = manifest.inputs, []
+        for row in rows:
+            theirs = json_of(row, "inputs")
+            if ours.keys() == theirs.keys() and ours.items() & theirs.items():
+                alike.append(row)
         newest = max(alike, key=lambda row: row["created_at"], default=None)
         if newest is None or newest["digest"] == ref.digest:
             return None
@@ -210,21 +215,12 @@ class Explainer:
         }
 
 
-def _kinds(parts: Iterable[str]) -> list[str]:
-    """Parts by what they are, each kind once: of a run the kinds of its artefacts."""
-    return list(dict.fromkeys(part.partition("/")[0] for part in parts))
-
-
 def _stale_inputs(inputs: Mapping[str, Explanation]) -> Iterator[str]:
     for part, made in inputs.items():
         if made.stale:
             yield f"input changed: {part} ({made.name} {FOLLOWS})"
         elif part == SCENE and not made.facts:
             yield f"input changed: no scene has the content {made.name[:DIGEST_LENGTH]} any more"
-
-
-def _share_an_input(ours: Mapping[str, str], theirs: Mapping[str, str]) -> bool:
-    return ours.keys() == theirs.keys() and bool(ours.items() & theirs.items())
 
 
 def changed_modules(before: Mapping[str, str], after: Mapping[str, str]) -> list[str]:

@@ -11,7 +11,6 @@ on it goes on.
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
-from functools import cached_property
 from typing import Any
 
 from catalog.digests import canonical_json, digest_text
@@ -102,7 +101,7 @@ class FleetLedger:
 
     def attempts(self, fleet: str) -> list[Row]:
         """All attempts at sequences of a fleet, by the time of their end."""
-        found = self.store.tables.arrow(ATTEMPTS, where={"fleet": [fleet]}).to_pylist()
+        found = self.store.tables.rows(ATTEMPTS, where={"fleet": [fleet]})
         return sorted(found, key=lambda row: row["ended_at"])
 
     def ask(self, wishes: Sequence[Wish], *, accept_stale: bool = False) -> None:
@@ -116,7 +115,8 @@ class FleetLedger:
         rows = self.store.tables.rows(TABLE)
         known = {row["sequence_id"]: row for row in rows if row["fleet"] == fleet}
         wanted = {wish.sequence_id: wish.row() for wish in wishes}
-        standing = _StandingRuns(self.store)
+        is_any_done = any(row["state"] == "done" for row in known.values())
+        standing = _standing_runs(self.store) if is_any_done else set()
         changed, moved = [], []
         for sequence_id in wanted.keys() & known.keys():
             new, old = wanted[sequence_id], known[sequence_id]
@@ -249,26 +249,17 @@ class FleetLedger:
         return replace(took, reason=f"the worker {lease.holder.name} {what}")
 
 
-class _StandingRuns:
-    """Complete runs, all there, of scenes as the store has them now; reads each listing once."""
-
-    def __init__(self, store: Store) -> None:
-        self._store = store
-
-    def __contains__(self, run_id: object) -> bool:
-        return run_id in self._ids
-
-    @cached_property
-    def _ids(self) -> set[str]:
-        there, tables = self._store.artefacts.ids(), self._store.tables
-        now = {row["scene_id"]: row["content_digest"] for row in tables.rows("scenes")}
-        return {
-            row["run_id"]
-            for row in tables.rows("runs")
-            if row["status"] == "complete"
-            and there.issuperset(row["artefacts"])
-            and now.get(row["scene_id"], row["scene_digest"]) == row["scene_digest"]
-        }
+def _standing_runs(store: Store) -> set[str]:
+    """Complete runs, all there, of scenes as the store has them now."""
+    there, tables = store.artefacts.ids(), store.tables
+    now = {row["scene_id"]: row["content_digest"] for row in tables.rows("scenes")}
+    return {
+        row["run_id"]
+        for row in tables.rows("runs")
+        if row["status"] == "complete"
+        and there.issuperset(row["artefacts"])
+        and now.get(row["scene_id"], row["scene_digest"]) == row["scene_digest"]
+    }
 
 
 def _latest_of(rows: Sequence[Row]) -> str | None:
@@ -276,7 +267,7 @@ def _latest_of(rows: Sequence[Row]) -> str | None:
     return max(rows, key=lambda row: row["asked_at"])["fleet"] if rows else None
 
 
-def _is_to_redo(new: Row, old: Row, standing: _StandingRuns, *, accept_stale: bool) -> bool:
+def _is_to_redo(new: Row, old: Row, standing: Set[str], *, accept_stale: bool) -> bool:
     if new["asked_digest"] != old["asked_digest"] or old["cause"] == "cancelled":
         return True
     if new["code_digest"] != old["code_digest"] and not accept_stale:

@@ -115,11 +115,7 @@ def _read_manifest(tar: tarfile.TarFile, path: Path) -> _Declared:
 
 
 def _parsed(content: Mapping[str, Any]) -> _Declared:
-    """What a manifest says, if it is one.
-
-    Raises:
-        ValueError: it is not; other shapes of JSON end in what `MALFORMED` lists.
-    """
+    """What a manifest says, if it is one."""
     if content["version"] > ARCHIVE_VERSION:
         raise ValueError("a newer lidarpainter wrote it: update this one")
     files = content["files"]
@@ -163,11 +159,7 @@ def _rows(table: str, rows: Sequence[Mapping[str, Any]]) -> list[Row]:
 
 
 def _require_inside(table: str, row: Mapping[str, Any]) -> None:
-    """See that no name in a row leads out of the store.
-
-    Raises:
-        ValueError: one does.
-    """
+    """See that no name in a row leads out of the store."""
     ids: list[str] = []
     if table == "runs":
         made = json.loads(row["result"])["artefacts"].values()
@@ -269,11 +261,7 @@ def _require_artefact(staged: ArtefactStore, ref: ArtefactRef, names: set[str], 
 
 
 def _has_scene(staged: Store, store: Store, scene_id: str, path: Path) -> bool:
-    """Whether the store has a scene with this content.
-
-    Raises:
-        ArchiveError: it has one of the same name with another content.
-    """
+    """Whether the store has a scene with this content."""
     ours, theirs = (one.scene_digest(scene_id) for one in (store, staged))
     if theirs is None:
         raise ArchiveError(f"{path}: the scene {scene_id} has no manifest")

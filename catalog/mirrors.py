@@ -141,9 +141,7 @@ class Mirror:
     def publish(self, entry: str, *, replacing: str | None) -> bool:
         """Publish the folder of an entry; False, with nothing changed, if another came first.
 
-        Args:
-            entry: its name; its files lie in the mirror.
-            replacing: version of the listing that it takes the place of, or None.
+        `replacing` is the version of the listing that it takes the place of, or None.
         """
         folder, place = self.root / entry, secrets.token_hex(8)
         files = {

@@ -1,6 +1,6 @@
 """What the sequences of a fleet came to: their cost and every number of their runs."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -36,7 +36,7 @@ class Point:
     """Numbers of the scene at the end."""
     by_variant: dict[str, dict[MetricName, float]] = field(default_factory=dict)
     """Numbers of every variant that was scored, by its name in the catalog."""
-    suspicions: tuple[str, ...] | None = None
+    suspicions: Sequence[str] | None = None
     """What is wrong about the recording, in sentences; None where nobody looked."""
 
 
@@ -49,12 +49,13 @@ def points_of(store: Store, fleet: str) -> tuple[list[Point], list[Row]]:
     """
     sequences = FleetLedger(store).rows(fleet)
     done = {row["run_id"]: row for row in sequences if row["state"] == "done"}
-    runs = {row["run_id"]: row for row in _chosen(store, "runs", "run_id", done)}
-    scenes = {run_id: _last_scene(run) for run_id, run in runs.items()}
-    made = _chosen(store, "artefacts", "artefact_id", scenes.values())
+    rows = store.tables.rows
+    runs = {row["run_id"]: row for row in rows("runs", where={"run_id": done})}
+    scenes = {run_id: _scenes(run)[-1] for run_id, run in runs.items()}
+    made = rows("artefacts", where={"artefact_id": set(scenes.values())})
     sizes = {row["artefact_id"]: row["num_bytes"] for row in made}
     judged: dict[str, dict[str, dict[MetricName, float]]] = {run_id: {} for run_id in runs}
-    for row in _chosen(store, "metrics", "run_id", runs):
+    for row in rows("metrics", where={"run_id": runs}):
         if row["value"] is not None:
             name = row["protocol"], row["trajectory"], row["name"]
             judged[row["run_id"]].setdefault(row["variant"], {})[name] = row["value"]
@@ -73,7 +74,7 @@ def points_of(store: Store, fleet: str) -> tuple[list[Point], list[Row]]:
                 for name, value in judged[row["run_id"]].get(variant, {}).items()
             },
             by_variant=judged[row["run_id"]],
-            suspicions=_suspicions(results[row["run_id"]]),
+            suspicions=results[row["run_id"]].get("suspicions"),
         )
         for row in ended
     ]
@@ -81,27 +82,13 @@ def points_of(store: Store, fleet: str) -> tuple[list[Point], list[Row]]:
     return points, [row for row in sequences if row["sequence_id"] not in names]
 
 
-def _chosen(store: Store, table: str, column: str, values: Iterable[str]) -> list[Row]:
-    """The rows of a table with one of some values in a column."""
-    return store.tables.arrow(table, where={column: set(values)}).to_pylist()
-
-
 def _scenes(run: Row) -> list[str]:
     return [one for one in run["artefacts"] if ArtefactRef.of_id(one).kind == "gaussians"]
-
-
-def _last_scene(run: Row) -> str:
-    return _scenes(run)[-1]
 
 
 def _at_end(run: Row) -> tuple[str, ...]:
     """Variants of numbers that are of its last scene; without a round that is the first fit."""
     return (UNPAINTED, *FINAL) if len(_scenes(run)) == 1 else FINAL
-
-
-def _suspicions(result: Mapping[str, Any]) -> tuple[str, ...] | None:
-    said = result.get("suspicions")
-    return None if said is None else tuple(said)
 
 
 def _cost(result: Mapping[str, Any], scene_bytes: int) -> dict[str, float]:

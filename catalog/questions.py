@@ -79,13 +79,14 @@ def cost_of(store: Store, scene_id: str) -> dict[str, Any]:
     Raises:
         UnknownRecordError: neither a run nor an attempt was about this scene.
     """
-    attempts = _of_scene(store, "attempts", scene_id)
-    runs = _of_scene(store, "runs", scene_id)
+    attempts, runs = (
+        store.tables.rows(table, where={"scene_id": [scene_id]}) for table in ("attempts", "runs")
+    )
     if not attempts and not runs:
         raise UnknownRecordError(f"no run and no attempt of a scene {scene_id!r}")
     prices = _prices(store)
     names = {name for run in runs for name in run["artefacts"] or ()}
-    made = [row for row in store.tables.rows("artefacts") if row["artefact_id"] in names]
+    made = store.tables.rows("artefacts", where={"artefact_id": names})
     kinds = sorted({row["kind"] for row in made})
     return {
         "scene": scene_id,
@@ -169,10 +170,6 @@ def _history(run: Row, by_id: Mapping[str, Row]) -> tuple[str, ...]:
         if row is None:
             found.append(source)
     return tuple(found)
-
-
-def _of_scene(store: Store, table: str, scene_id: str) -> list[Row]:
-    return store.tables.arrow(table, where={"scene_id": [scene_id]}).to_pylist()
 
 
 def _prices(store: Store) -> dict[str, float]:

@@ -2,7 +2,6 @@
 
 import json
 import platform
-from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, Literal
@@ -18,30 +17,6 @@ RUN_ID_LENGTH = 16
 def run_id_of(scene_digest: str, parameters: Any, source_digest: str) -> str:  # noqa: ANN401
     """The id of a run: the same scene content, parameters and code make the same run."""
     return digest_text(canonical_json([scene_digest, parameters, source_digest]))[:RUN_ID_LENGTH]
-
-
-@dataclass(frozen=True, kw_only=True)
-class SceneRecord:
-    """A row of the table `scenes`; the columns say what each field means."""
-
-    scene_id: str
-    dataset: str
-    sequence: str
-    content_digest: str
-    licence: str
-    num_frames: int
-    num_views: int
-    cameras: tuple[str, ...]
-    num_points: int
-    num_actors: int
-    num_moving_actors: int
-    duration_s: float
-    num_bytes: int
-    software_version: str
-
-    def row(self) -> dict[str, Any]:
-        """The row."""
-        return {**asdict(self), "cameras": list(self.cameras)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,26 +56,11 @@ class RunRecord:
         }
 
 
-@dataclass(frozen=True, kw_only=True)
-class MetricRecord:
-    """A row of the table `metrics`; the columns say what each field means."""
-
-    run_id: str
-    scene_id: str
-    protocol: str
-    trajectory: str
-    variant: str
-    name: str
-    value: float | None
-    reason: str | None = None
-    by_view: Mapping[str, float | None] | None = None
-
-    def row(self) -> dict[str, Any]:
-        """The row."""
-        names = [self.run_id, self.protocol, self.trajectory, self.variant, self.name]
-        by_view = None if self.by_view is None else canonical_json(self.by_view)
-        row = {**asdict(self), "by_view": by_view}
-        return {"metric_id": digest_text(canonical_json(names)), **row}
+def metric_row(run_id: str, scene_id: str, variant: str, **measured: Any) -> dict[str, Any]:  # noqa: ANN401
+    """The row of the table `metrics` for a number; `measured` has its other columns."""
+    names = [run_id, measured["protocol"], measured["trajectory"], variant, measured["name"]]
+    row = {"run_id": run_id, "scene_id": scene_id, "variant": variant, **measured}
+    return {"metric_id": digest_text(canonical_json(names)), **row}
 
 
 def artefact_row(ref: ArtefactRef, manifest: Manifest) -> dict[str, Any]:
@@ -119,11 +79,6 @@ def artefact_row(ref: ArtefactRef, manifest: Manifest) -> dict[str, Any]:
         "summary": canonical_json(manifest.summary),
         "software_version": manifest.software_version,
     }
-
-
-def metric_rows(records: Iterable[MetricRecord]) -> list[dict[str, Any]]:
-    """Rows of many metrics."""
-    return [record.row() for record in records]
 
 
 def json_of(row: dict[str, Any], column: str) -> Any:  # noqa: ANN401 - any JSON value

@@ -6,7 +6,7 @@ interruption are nobody's fault and do not count; after a full disk it is later 
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any, Literal
 
@@ -47,7 +47,7 @@ LONGEST_PAUSE_S = 1800.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ending:
-    """How an attempt ended and what it took."""
+    """How an attempt ended and what it took: columns of `attempts`."""
 
     cause: Cause
     reason: str | None = None
@@ -116,19 +116,10 @@ def attempt_row(lease: Lease, ending: Ending) -> dict[str, Any]:
         "attempt_id": attempt_id(lease),
         "sequence_id": lease.name,
         **{name: lease.facts.get(name) for name in facts},
-        "run_id": ending.run_id,
         "worker": lease.holder.name,
         "started_at": started_at,
         "ended_at": started_at + timedelta(seconds=ending.seconds),
-        "seconds": ending.seconds,
-        "cpu_seconds": ending.cpu_seconds,
-        "compile_seconds": ending.compile_seconds,
-        "peak_memory_bytes": ending.peak_memory_bytes,
-        "num_bytes": ending.num_bytes,
-        "cause": ending.cause,
-        "reason": ending.reason,
-        "effort": ending.effort,
-        "software_version": ending.software_version,
+        **asdict(ending),
     }
 
 

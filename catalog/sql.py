@@ -111,11 +111,7 @@ class CatalogSql:
         )
 
     def _check(self, sql: str) -> None:
-        """Refuse everything but one SELECT; take in the tables that it names.
-
-        Raises:
-            CatalogError: it is something else.
-        """
+        """Refuse everything but one SELECT; take in the tables that it names."""
         import duckdb
 
         statements = self._connection.extract_statements(sql)
@@ -128,11 +124,7 @@ class CatalogSql:
                 self._waiting.remove(name)
 
     def _show(self, schema: TableSchema, files: Sequence[str]) -> None:
-        """Give a table its name; columns that its files lack are null.
-
-        Raises:
-            StorageError: a file is damaged.
-        """
+        """Give a table its name; columns that its files lack are null."""
         import duckdb
 
         if not files:

@@ -141,20 +141,22 @@ class CatalogTables:
         )
 
     def _require_room(self) -> None:
-        """Refuse to begin a commit that the disk would not take: Delta's writer may never return.
-
-        Raises:
-            OSError: less is free than `LEAST_ROOM_BYTES`.
-        """
+        """Refuse to begin a commit that the disk would not take: Delta's writer may not return."""
         folder = Path(self.root)
         if "://" in self.root or not folder.is_dir():
             return
         if shutil.disk_usage(folder).free < LEAST_ROOM_BYTES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    def rows(self, table: str, *, as_of: int | datetime | None = None) -> list[Row]:
-        """All rows of a table, by id, as it is or was; see `arrow`."""
-        arrow = self.arrow(table, as_of=as_of)
+    def rows(
+        self,
+        table: str,
+        *,
+        where: Mapping[str, Collection[str]] | None = None,
+        as_of: int | datetime | None = None,
+    ) -> list[Row]:
+        """Rows of a table, by id, as it is or was; see `arrow`."""
+        arrow = self.arrow(table, where=where, as_of=as_of)
         return arrow.sort_by(_schema(table).key).to_pylist()
 
     def arrow(
@@ -211,8 +213,7 @@ class CatalogTables:
 
     def find(self, table: str, row_id: str) -> Row | None:
         """The row with exactly this id, or None."""
-        found = self.arrow(table, where={_schema(table).key: [row_id]})
-        return found.to_pylist()[0] if found.num_rows else None
+        return next(iter(self.rows(table, where={_schema(table).key: [row_id]})), None)
 
     def row(self, table: str, id_or_prefix: str) -> Row:
         """The one row with this id, or whose id starts with it.
@@ -235,12 +236,7 @@ class CatalogTables:
         return f"{self.root}/{schema.name}"
 
     def _past(self, schema: TableSchema, as_of: int | datetime) -> DeltaTable:
-        """The table as it was.
-
-        Raises:
-            TableNotFoundError: nothing was ever written.
-            UnknownRecordError: there is no such version.
-        """
+        """The table as it was."""
         found = DeltaTable(self._uri(schema), storage_options=self.storage_options)
         try:
             found.load_as_version(as_of)
@@ -308,11 +304,7 @@ class CatalogTables:
         return table
 
     def _current(self, schema: TableSchema) -> DeltaTable:
-        """The table as it is now.
-
-        Raises:
-            TableNotFoundError: nothing was ever written.
-        """
+        """The table as it is now."""
         handles = {} if self._handles is None else self._handles
         known = handles.pop(schema.name, None)
         if known is not None:

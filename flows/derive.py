@@ -25,7 +25,7 @@ A style, say, is one module-level function and one call:
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 from catalog.artefacts import Workplace
 from catalog.digests import canonical_json, digest_text, plain
@@ -112,14 +112,7 @@ def derive_run(
             change=told,
         )
         with early_end_recorded(store.address, record):
-            return _derive(store, source, record, builds, _StageInputs(inputs, told))
-
-
-class _StageInputs(NamedTuple):
-    """What every stage of a change is keyed on, beside its code."""
-
-    inputs: Mapping[str, str]
-    told: Mapping[str, Any]
+            return _derive(store, source, record, builds, inputs, told)
 
 
 def _derive(
@@ -127,18 +120,19 @@ def _derive(
     source: FinishedRun,
     record: RunRecord,
     builds: Mapping[str, Build],
-    keyed: _StageInputs,
+    inputs: Mapping[str, str],
+    told: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Go through the stages and enter what came of them."""
+    """Go through the stages, keyed on inputs and change, and enter what came of them."""
     started = time.perf_counter()
-    kind = keyed.told["kind"]
+    kind = told["kind"]
     stages = {
         stage: run_stage(
             store,
             stage=stage,
             kind="gaussians" if stage == kind else "observations",
-            inputs=keyed.inputs,
-            config=keyed.told,
+            inputs=inputs,
+            config=told,
             build=build,
         )
         for stage, build in builds.items()
@@ -154,7 +148,7 @@ def _derive(
         "painter": record.painter,
         "device": record.device,
         "derived_from": record.derived_from,
-        "change": keyed.told,
+        "change": told,
         "seconds": {name: stage.seconds for name, stage in stages.items()}
         | {"total": time.perf_counter() - started},
         "cpu_seconds": {name: stage.cpu_seconds for name, stage in stages.items()},

@@ -1,7 +1,8 @@
 """Edit a finished run into a new one; a query like `render`, so no server is needed."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
+from functools import partial
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -12,42 +13,32 @@ from flows.parameters import view_parameters
 from flows.style_run import STYLE
 from flows.views import render_run
 from lidarpainter_models.devices import chosen_device
-from lidarpainter_models.editing.edits import refuse_walls
+from lidarpainter_models.editing.edits import encounters, refuse_walls
 from lidarpainter_models.editing.operations import Drive, Operation, parse_operations
 from lidarpainter_models.export.view_requests import ViewRequest
 from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
 from lidarpainter_models.painter.selection import PainterChoice
 from lidarpainter_models.scenes.tracks import ActorTrack
 from tasks.editing.donors import opened_world
-from tasks.editing.edit import (
-    Edits,
-    checked_encounters,
-    edit_build,
-    observations_build,
-)
+from tasks.editing.edit import Edits, build_edited, build_observations
 from tasks.runs import FinishedRun, lineage, open_run
 
 EDIT = "edit"
 
 
-@dataclass(frozen=True, kw_only=True)
-class EditRequest:
-    """Which run is edited, and how."""
-
-    run: str
-    """A run id, a unique prefix of one, or `latest`."""
-    operations: tuple[Operation, ...]
-    painter: str | None = None
-    """Who paints what nobody saw; None takes the run's own."""
-    allows_collisions: bool = False
-    """Whether actors may go through walls."""
-
-
-def edit_run(store: Store, request: EditRequest) -> dict[str, Any]:
+def edit_run(
+    store: Store,
+    run: str,
+    added: Sequence[Operation],
+    *,
+    painter: str | None = None,
+    allows_collisions: bool = False,
+) -> dict[str, Any]:
     """Make an edited run of a finished one.
 
     An edited run, styled since or not, is edited anew from where it came from, with both lists
-    one after the other: what was uncovered is filled once, from what was recorded.
+    one after the other: what was uncovered is filled once, from what was recorded. Who paints what
+    nobody saw is the run's own painter if None is named.
 
     Returns:
         As `derive_run`, with `trajectory`: where the script drives, `recorded` if it does not say.
@@ -55,34 +46,35 @@ def edit_run(store: Store, request: EditRequest) -> dict[str, Any]:
     Raises:
         ConfigError: an operation cannot be done, or leads into a wall.
     """
-    source, before = _origin(store, open_run(store, request.run))
-    operations = (*before, *request.operations)
+    source, before = _origin(store, open_run(store, run))
+    operations = (*before, *added)
     parameters = view_parameters(source)
-    painter = PainterChoice.of(request.painter or parameters.painter)
+    chosen = PainterChoice.of(painter or parameters.painter)
     edits = Edits(store=store, source=source, operations=operations)
     told = {
         "operations": [one.model_dump(exclude_defaults=True) for one in operations],
-        "painter": painter.name,
+        "painter": chosen.name,
         "conditions": asdict(parameters.conditions),
-        "allows_collisions": request.allows_collisions,
+        "allows_collisions": allows_collisions,
     }
 
     def check() -> None:
-        found = checked_encounters(edits)
-        if not request.allows_collisions:
+        found = encounters(edits.world)  # done once: it is kept for the builds
+        if not allows_collisions:
             refuse_walls(found)
 
     result = derive_run(
         store,
         source,
-        Change(kind=EDIT, parameters=told, inputs=edits.inputs | {"painter": painter.digest}),
-        build=edit_build(
-            edits,
-            parameters.conditions,
-            painter,
-            chosen_device(parameters.device),
+        Change(kind=EDIT, parameters=told, inputs=edits.inputs | {"painter": chosen.digest}),
+        build=partial(
+            build_edited,
+            edits=edits,
+            conditions=parameters.conditions,
+            painter=chosen,
+            device=chosen_device(parameters.device),
         ),
-        build_observations=observations_build(edits),
+        build_observations=partial(build_observations, edits=edits),
         check=check,
     )
     drives = [one.trajectory for one in operations if isinstance(one, Drive)]
@@ -90,14 +82,19 @@ def edit_run(store: Store, request: EditRequest) -> dict[str, Any]:
 
 
 def shown_edit(
-    store: Store, request: EditRequest, result: dict[str, Any], out: Path
+    store: Store,
+    result: dict[str, Any],
+    out: Path,
+    *,
+    painter: str | None = None,
+    allows_collisions: bool = False,
 ) -> dict[str, Any]:
     """Images of an edited run where its script drives; painted by clear day."""
     shown = ViewRequest(
         trajectory=parse_trajectory(result["trajectory"]),
         is_painted=result["summary"]["style"] is None,  # painters know clear days
-        painter=request.painter,
-        allows_collisions=request.allows_collisions,
+        painter=painter,
+        allows_collisions=allows_collisions,
     )
     return render_run(store, result["run_id"], shown, out)
 

@@ -63,9 +63,6 @@ def keep_prefect_in(store: str) -> None:
     stores. Where there is no home folder, or it cannot be written, the database lies in the store,
     or for a bucket in the cache in front of it. A folder that the user has chosen by `PREFECT_HOME`
     stays, and so do profiles. Nothing is made before a server is started.
-
-    Args:
-        store: folder of the store, or its address `s3://BUCKET/PREFIX`.
     """
     if os.environ.get(PREFECT_HOME, "") not in {"", *_chosen_homes}:
         return
@@ -77,8 +74,9 @@ def keep_prefect_in(store: str) -> None:
     os.environ[PREFECT_HOME] = str(place / "prefect")
     _chosen_homes.add(os.environ[PREFECT_HOME])
     profiles = (home or place) / ".prefect" / "profiles.toml"
-    if _is_file(profiles):
-        os.environ.setdefault("PREFECT_PROFILES_PATH", str(profiles))
+    with suppress(OSError):  # the home folder is another user's
+        if profiles.is_file():
+            os.environ.setdefault("PREFECT_PROFILES_PATH", str(profiles))
     # Prefect would make the folder when it is imported, be there a store or not
     warnings.filterwarnings("ignore", message="Failed to create the Prefect home directory")
 
@@ -127,12 +125,6 @@ def _has_cache_folder() -> bool:
     home, chosen = home_folder(), os.environ.get("XDG_CACHE_HOME")
     user = Path(chosen) if chosen else home and home / ".cache"
     return _can_write(package / "__pycache__") or (user is not None and _can_write(user / "numba"))
-
-
-def _is_file(path: Path) -> bool:
-    with suppress(OSError):  # the home folder is another user's
-        return path.is_file()
-    return False
 
 
 def _can_write(folder: Path) -> bool:

@@ -26,15 +26,10 @@ def export_run(
     *,
     scene: SceneRequest | None = None,
 ) -> dict[str, Any]:
-    """Write a run in one format.
+    """Write a run in one format, by its name, to a file or a new folder.
 
-    Args:
-        store: where the run is.
-        run: its id, a unique prefix of one, its scene, or `latest`.
-        wanted: name of a format, a row of `lidarpainter_models.export.formats.FORMATS`.
-        request: where to look from, for images, films and data sets.
-        out: the file, or a new folder.
-        scene: what a format that holds the scene takes of it; None takes all, at its beginning.
+    The request says where to look from, for images, films and data sets; `scene` what a format that
+    holds the scene takes of it: None takes all, at its beginning.
 
     Returns:
         What `export --json` prints.
@@ -70,13 +65,13 @@ def _export(
     viewed = viewed_run(store, finished, request)
     match row.kind:
         case "scene":
-            return export_scene.fn(viewed.run, finished.final, row, scene, out)
+            return export_scene(viewed.run, finished.final, row, scene, out)
         case "sweeps":
-            return export_sweeps.fn(viewed.run, row, request.frames, out)
+            return export_sweeps(viewed.run, row, request.frames, out)
         case "dataset":
-            return export_dataset.fn(viewed, request, row, out)
+            return export_dataset(viewed, request, row, out)
         case "page":
-            return write_page.fn(viewed, request, out)
+            return write_page(viewed, request, out)
         case "views":
             kinds = ViewKinds(
                 images=False,
@@ -86,4 +81,4 @@ def _export(
                 fps=request.kinds.fps,
             )
             task = export_video if kinds.video else export_images
-            return task.fn(viewed, replace(request, kinds=kinds), out)
+            return task(viewed, replace(request, kinds=kinds), out)

@@ -94,11 +94,8 @@ def _interrupt(number: int, _frame: FrameType | None) -> None:
 
 def _remember(number: int) -> None:
     _caught.append(number)
-    sys.unraisablehook = threading.excepthook = _pass_over  # what breaks on the way out is no news
-
-
-def _pass_over(_what: object) -> None:
-    pass
+    # what breaks on the way out is no news
+    sys.unraisablehook = threading.excepthook = lambda _what: None
 
 
 def _end_in_time(told: int) -> None:

@@ -66,7 +66,8 @@ def _assigned(owner: Any, names: list[str], text: str, path: str) -> Any:  # noq
         value = _assigned(getattr(owner, name), names[1:], text, path)
     else:
         value = _parsed(get_type_hints(type(owner))[name], text, path)
-    return _replaced(owner, name, value)
+    is_model = isinstance(owner, BaseModel)
+    return with_changes(owner, {name: value}) if is_model else replace(owner, **{name: value})
 
 
 def field_names(owner: Any) -> list[str]:  # noqa: ANN401 - a model, a dataclass or a plain value
@@ -76,12 +77,6 @@ def field_names(owner: Any) -> list[str]:  # noqa: ANN401 - a model, a dataclass
     if is_dataclass(owner):
         return [field.name for field in fields(owner) if field.init]
     return []
-
-
-def _replaced(owner: Any, name: str, value: Any) -> Any:  # noqa: ANN401
-    if not isinstance(owner, BaseModel):
-        return replace(owner, **{name: value})
-    return with_changes(owner, {name: value})
 
 
 def _parsed(expected: Any, text: str, path: str) -> Any:  # noqa: ANN401 - any type of a setting

@@ -84,10 +84,7 @@ def paper(scene: str) -> ReconstructParameters:
 
 
 PRESETS: dict[str, Callable[[str], ReconstructParameters]] = {
-    "brief": brief,
-    "preview": preview,
-    "balanced": balanced,
-    "paper": paper,
+    one.__name__: one for one in (brief, preview, balanced, paper)
 }
 
 

@@ -64,10 +64,6 @@ def reconstruct(parameters: ReconstructParameters, store_path: Path) -> dict[str
 
     A run that is complete and unchanged is recalled: nothing is computed or written.
 
-    Args:
-        parameters: of the run.
-        store_path: folder or address of the store.
-
     Returns:
         What `lidarpainter reconstruct --json` prints.
 

@@ -53,14 +53,10 @@ def _settings(owner: Any, place: str) -> Iterator[Setting]:  # noqa: ANN401 - mo
         if isinstance(value, BaseModel) or is_dataclass(value):
             yield from _settings(value, f"{place}{name}.")
             continue
-        shown = _choices(types[name]) or annotation
+        hint = types[name]
+        shown = "|".join(map(str, get_args(hint))) if get_origin(hint) is Literal else annotation
         default = json.loads(json.dumps(plain(value)))
         yield Setting(path=f"{place}{name}", type=shown, default=default, reason=reason)
-
-
-def _choices(hint: Any) -> str:  # noqa: ANN401 - any type
-    """The values that a type lists, if it does."""
-    return "|".join(map(str, get_args(hint))) if get_origin(hint) is Literal else ""
 
 
 def _described(owner: type) -> dict[str, tuple[str, str]]:

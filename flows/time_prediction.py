@@ -44,11 +44,7 @@ def reference_seconds(parameters: "ReconstructParameters", num_views: float) -> 
     """Return what every stage of a run takes on one core of the reference machine, in order.
 
     Weights were measured on PandaSet 002 and a synthetic street, 160 and 480 pixels wide, 6 and 14
-    training views; kernels are compiled already.
-
-    Args:
-        parameters: of the run.
-        num_views: recorded images of its cameras.
+    training views; kernels are compiled already. `num_views` are recorded images of its cameras.
     """
     pixels = parameters.observation.width_px**2 * 9 / 16
     train = num_views if parameters.split == "all" else num_views / 2
@@ -81,11 +77,8 @@ def expected_seconds(
 ) -> tuple[dict[str, float], bool]:
     """Return what every stage of a run will take here, and whether a past run tells.
 
-    Args:
-        parameters: of the run that begins.
-        num_views: recorded images of its cameras.
-        past: rows of the table `runs`, each with the `num_views` of its scene and cameras; the
-            newest complete one with parameters of this version tells of each kind of stage.
+    Past runs are rows of the table `runs`, each with the `num_views` of its scene and cameras; the
+    newest complete one with parameters of this version tells of each kind of stage.
     """
     from pydantic import ValidationError
 
@@ -264,13 +257,10 @@ class Clock:
         return self.compiled() - self._compiled_before[stage]
 
 
-def _is_fit(stage: str) -> bool:
-    return _kind(stage) in ("fit", "refine")
-
-
 def _group(stage: str) -> str:
     """Stages that tell of one another's pace; to examine takes as long as a recording is large."""
-    return "fit" if _is_fit(stage) else "examine" if stage == "examine" else "rest"
+    is_fit = _kind(stage) in ("fit", "refine")
+    return "fit" if is_fit else "examine" if stage == "examine" else "rest"
 
 
 def as_clock(seconds: float) -> str:

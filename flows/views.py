@@ -26,13 +26,7 @@ BEFORE_PAINTING = "before painting"
 
 
 def render_run(store: Store, run: str, request: ViewRequest, out: Path) -> dict[str, Any]:
-    """Render a finished run where nobody drove.
-
-    Args:
-        store: where the run is.
-        run: its id, a unique prefix of one, its scene, or `latest`.
-        request: where to look from, and what is written.
-        out: folder for the files.
+    """Render a finished run where nobody drove, into a folder.
 
     Returns:
         What `render --json` prints.
@@ -43,7 +37,7 @@ def render_run(store: Store, run: str, request: ViewRequest, out: Path) -> dict[
     """
     finished = open_run(store, run)
     viewed = viewed_run(store, finished, request)
-    made = render.fn(viewed, request, out)
+    made = render(viewed, request, out)
     return {
         "run_id": finished.run_id,
         "scene": finished.scene_id,
@@ -67,7 +61,7 @@ def stylize_run(
         ConfigError: see `viewed_run`, or what is asked for cannot be put in a style.
     """
     finished = open_run(store, run)
-    made = stylize.fn(viewed_run(store, finished, request), request, style, out)
+    made = stylize(viewed_run(store, finished, request), request, style, out)
     return {
         "run_id": finished.run_id,
         "scene": finished.scene_id,
@@ -124,16 +118,7 @@ def view_run(
     opened_at: Callable[[str], None],
     stopped: threading.Event,
 ) -> None:
-    """Show a run in a browser on this machine until stopped.
-
-    Args:
-        store: where the run is.
-        run: its id, a unique prefix of one, its scene, or `latest`.
-        request: the camera and the frames that are followed.
-        port: where to listen; None takes a free one.
-        opened_at: told the address.
-        stopped: ends the viewer when it is set.
-    """
+    """Show a run in a browser on this machine until stopped; see `tasks.views.drive.view_live`."""
     finished = open_run(store, run)
     viewed = viewed_run(store, finished, request)
     scenes = {SHOWN: finished.final} | _other_scenes(store, finished)

@@ -7,7 +7,6 @@ import os
 import platform
 import shutil
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
@@ -37,18 +36,8 @@ class Finding:
 
 def check_environment(store_path: Path) -> list[Finding]:
     """Check everything a reconstruction needs here."""
-    packages: list[Callable[[], Finding]] = [
-        _python,
-        *(_package_check(name) for name in REQUIRED),
-        _open3d,
-        _numba,
-    ]
-    rest: list[Callable[[], Finding]] = [_memory, lambda: _disk(store_path), _painter]
-    return [
-        *(check() for check in packages),
-        *gpu_findings(),
-        *(check() for check in rest),
-    ]
+    packages = [_python(), *map(_package, REQUIRED), _open3d(), _numba()]
+    return [*packages, *gpu_findings(), _memory(), _disk(store_path), _painter()]
 
 
 def _python() -> Finding:
@@ -58,14 +47,11 @@ def _python() -> Finding:
     return Finding("python", "ok" if is_fit else "fail", detail)
 
 
-def _package_check(name: str) -> Callable[[], Finding]:
-    def check() -> Finding:
-        try:
-            return Finding(name, "ok", version(name))
-        except PackageNotFoundError:
-            return Finding(name, "fail", f"not installed: pip install {name}")
-
-    return check
+def _package(name: str) -> Finding:
+    try:
+        return Finding(name, "ok", version(name))
+    except PackageNotFoundError:
+        return Finding(name, "fail", f"not installed: pip install {name}")
 
 
 def _open3d() -> Finding:

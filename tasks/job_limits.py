@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 CGROUPS = Path("/sys/fs/cgroup")
+"""Where control groups are mounted."""
 MEMBERSHIP = Path("/proc/self/cgroup")
 """A line for each hierarchy: its number, controllers (none in version 2), the path of the group."""
 V1_FOLDERS = {"memory": ("memory",), "cpu": ("cpu", "cpu,cpuacct", "cpuacct,cpu")}
@@ -19,12 +20,7 @@ V1_FOLDERS = {"memory": ("memory",), "cpu": ("cpu", "cpu,cpuacct", "cpuacct,cpu"
 
 
 def usable_memory_bytes(cgroups: Path = CGROUPS, membership: Path = MEMBERSHIP) -> float:
-    """Return the bytes of memory that this process and its job may take together.
-
-    Args:
-        cgroups: where control groups are mounted.
-        membership: file that names the groups of this process.
-    """
+    """Return the bytes of memory that this process and its job may take together."""
     limits = [float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))]
     for folder in _groups("memory", cgroups, membership):
         for name in ("memory.max", "memory.limit_in_bytes"):
@@ -33,12 +29,7 @@ def usable_memory_bytes(cgroups: Path = CGROUPS, membership: Path = MEMBERSHIP) 
 
 
 def usable_cores(cgroups: Path = CGROUPS, membership: Path = MEMBERSHIP) -> int:
-    """Return the number of cores that this process may keep busy; a quota is rounded up.
-
-    Args:
-        cgroups: where control groups are mounted.
-        membership: file that names the groups of this process.
-    """
+    """Return the number of cores that this process may keep busy; a quota is rounded up."""
     has_affinity = hasattr(os, "sched_getaffinity")  # it knows cpusets too
     cores = [len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1]
     for folder in _groups("cpu", cgroups, membership):

@@ -13,11 +13,10 @@ def file_digests(files: Mapping[str, Path]) -> dict[str, str]:
     Raises:
         WeightsError: a file is not there.
     """
-    return {name: _digest_of(path) for name, path in files.items()}
-
-
-def _digest_of(path: Path) -> str:
-    try:
-        return digest_file(path)[:DIGEST_LENGTH]
-    except OSError as error:
-        raise WeightsError(f"no weights at {path}: {error.strerror}") from None
+    found = {}
+    for name, path in files.items():
+        try:
+            found[name] = digest_file(path)[:DIGEST_LENGTH]
+        except OSError as error:
+            raise WeightsError(f"no weights at {path}: {error.strerror}") from None
+    return found

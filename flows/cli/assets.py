@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from flows.cli.output import print_json, print_pairs, print_table, say_status
+from flows.cli.output import print_json, print_pairs, print_result, print_table, say_status
 from flows.cli.rows import opened_row, row_cell, told_explanation
-from flows.cli.shared_options import AsJson, named_run, parse_names
+from flows.cli.shared_options import AsJson, described, named_run, parse_names
 
 if TYPE_CHECKING:
     from catalog.sql import CatalogSql
@@ -19,36 +19,44 @@ ID_LENGTH = 12
 """Characters of an asset's id in a table, which name it to `assets show` too."""
 MOST_SHOWN = 1000
 """Rows of a query's answer."""
-AssetName = Annotated[
-    str, typer.Argument(help="The asset: its id, or the beginning of it.", show_default=False)
-]
-Category = Annotated[
-    str | None,
-    typer.Option(
-        help="Category of the assets, as the data sets call it: car, truck, pedestrian, ...; or "
-        "sedan, a car of a sedan's size. All if absent."
-    ),
-]
-MinScore = Annotated[float | None, typer.Option(help="The minimum score, from 0 to 1.")]
 SortName = Literal[  # `catalog.asset_queries.Sort`, known before anything is imported
     "score", "coverage", "psnr_db", "length_m", "num_views", "num_points", "created_at"
 ]
 
 app = typer.Typer(help="Actors, streets and skies for use elsewhere.", no_args_is_help=True)
 
+WORDS = """
+runs: Runs, each by its id or the beginning of it, a scene such as pandaset/002 (its newest run), or
+  latest (the newest run of all).
+kind: Kind of the assets: actor, street, sky or trajectory; all if absent.
+category: Category of the assets, as the data sets call it: car, truck, pedestrian, ...; or sedan, a
+  car of a sedan's size. All if absent.
+dataset: Dataset that the log comes from, such as pandaset; all if absent.
+licence: Part of the name of the licence, such as CC BY; all if absent.
+style: Word of the style that the asset was seen in, such as night, or recorded for none; all if
+  absent.
+scene: Scene that the asset was seen in, as dataset/sequence; all if absent.
+sides: Sides that must all have been seen, with commas between: front, rear, left, right or top.
+min_sides: The minimum number of sides that were seen, up to 5.
+min_length: The minimum length in metres.
+min_score: The minimum score, from 0 to 1.
+min_coverage: The minimum share of directions that were seen, from 0 to 1.
+max_lpips: The maximum LPIPS, where it was measured.
+sort: Column whose highest values come first: score, coverage, psnr_db, length_m, num_views,
+  num_points or created_at.
+limit: The maximum number of rows.
+gallery.limit: The maximum number of assets, of which the best are taken.
+name: The asset: its id, or the beginning of it.
+sql: One SELECT over the tables of the catalog, in DuckDB's SQL.
+format_: Format of the file: ply, spz or gltf (a .glb file).
+out: File that the asset is written to.
+gallery.out: Folder that the gallery is written to: a new one, or an older gallery.
+"""
+
 
 @app.command()
-def publish(
-    runs: Annotated[
-        list[str],
-        typer.Argument(
-            help="Runs, each by its id or the beginning of it, a scene such as pandaset/002 (its "
-            "newest run), or latest (the newest run of all).",
-            show_default=False,
-        ),
-    ],
-    as_json: AsJson = False,
-) -> None:
+@described(WORDS)
+def publish(runs: list[str], as_json: AsJson = False) -> None:
     """Take actors, street, sky and trajectories out of finished runs into the library.
 
     Example: lidarpainter assets publish latest
@@ -68,66 +76,23 @@ def publish(
     print_table("published", columns, [[one[name] for name in columns] for one in results])
 
 
-Style = Annotated[
-    str | None,
-    typer.Option(
-        help="Word of the style that the asset was seen in, such as night, or recorded for "
-        "none; all if absent."
-    ),
-]
-Sides = Annotated[
-    str | None,
-    typer.Option(
-        help="Sides that must all have been seen, with commas between: front, rear, left, "
-        "right or top."
-    ),
-]
-Sort = Annotated[
-    SortName,
-    typer.Option(
-        help="Column whose highest values come first: score, coverage, psnr_db, length_m, "
-        "num_views, num_points or created_at."
-    ),
-]
-Kind = Annotated[
-    str | None,
-    typer.Option(help="Kind of the assets: actor, street, sky or trajectory; all if absent."),
-]
-Dataset = Annotated[
-    str | None,
-    typer.Option(help="Dataset that the log comes from, such as pandaset; all if absent."),
-]
-
-
 @app.command("list")
+@described(WORDS)
 def list_assets(  # noqa: PLR0913 - the options of a command
-    kind: Kind = None,
-    category: Category = None,
-    dataset: Dataset = None,
-    licence: Annotated[
-        str | None,
-        typer.Option(help="Part of the name of the licence, such as CC BY; all if absent."),
-    ] = None,
-    style: Style = None,
-    scene: Annotated[
-        str | None,
-        typer.Option(help="Scene that the asset was seen in, as dataset/sequence; all if absent."),
-    ] = None,
-    sides: Sides = None,
-    min_sides: Annotated[
-        int | None, typer.Option(help="The minimum number of sides that were seen, up to 5.")
-    ] = None,
-    min_length: Annotated[float | None, typer.Option(help="The minimum length in metres.")] = None,
-    min_score: MinScore = None,
-    min_coverage: Annotated[
-        float | None,
-        typer.Option(help="The minimum share of directions that were seen, from 0 to 1."),
-    ] = None,
-    max_lpips: Annotated[
-        float | None, typer.Option(help="The maximum LPIPS, where it was measured.")
-    ] = None,
-    sort: Sort = "score",
-    limit: Annotated[int, typer.Option(min=1, help="The maximum number of rows.")] = 50,
+    kind: str | None = None,
+    category: str | None = None,
+    dataset: str | None = None,
+    licence: str | None = None,
+    style: str | None = None,
+    scene: str | None = None,
+    sides: str | None = None,
+    min_sides: int | None = None,
+    min_length: float | None = None,
+    min_score: float | None = None,
+    min_coverage: float | None = None,
+    max_lpips: float | None = None,
+    sort: SortName = "score",
+    limit: Annotated[int, typer.Option(min=1)] = 50,
     as_json: AsJson = False,
 ) -> None:
     """List assets: all filters that are given must hold.
@@ -161,7 +126,8 @@ def list_assets(  # noqa: PLR0913 - the options of a command
 
 
 @app.command()
-def show(name: AssetName, as_json: AsJson = False) -> None:
+@described(WORDS)
+def show(name: str, as_json: AsJson = False) -> None:
     """Show everything about an asset: each sighting, and what it was made from.
 
     Example: lidarpainter assets show 3f2a
@@ -189,15 +155,8 @@ def show(name: AssetName, as_json: AsJson = False) -> None:
 
 
 @app.command()
-def query(
-    sql: Annotated[
-        str,
-        typer.Argument(
-            help="One SELECT over the tables of the catalog, in DuckDB's SQL.", show_default=False
-        ),
-    ],
-    as_json: AsJson = False,
-) -> None:
+@described(WORDS)
+def query(sql: str, as_json: AsJson = False) -> None:
     """Ask all tables of the catalog by SQL, which can read them and nothing else.
 
     Example: lidarpainter assets query "SELECT category, count(*) FROM assets GROUP BY category"
@@ -214,12 +173,11 @@ def query(
 
 
 @app.command("export")
+@described(WORDS)
 def export(
-    name: AssetName,
-    format_: Annotated[
-        str, typer.Option("--format", help="Format of the file: ply, spz or gltf (a .glb file).")
-    ],
-    out: Annotated[Path, typer.Option(help="File that the asset is written to.")],
+    name: str,
+    format_: Annotated[str, typer.Option("--format")],
+    out: Annotated[Path, typer.Option()],
     as_json: AsJson = False,
 ) -> None:
     """Write an actor or a block of street for other programs, in its own frame.
@@ -235,20 +193,16 @@ def export(
     from tasks.exports.asset import export_asset
 
     result = export_asset(store, asset, format_, out.absolute())
-    print_json(result) if as_json else print_pairs(f"asset {asset['name']}", result)
+    print_result(f"asset {asset['name']}", result, as_json=as_json)
 
 
 @app.command()
+@described(WORDS)
 def gallery(
-    out: Annotated[
-        Path,
-        typer.Option(help="Folder that the gallery is written to: a new one, or an older gallery."),
-    ],
-    category: Category = None,
-    min_score: MinScore = None,
-    limit: Annotated[
-        int, typer.Option(min=1, help="The maximum number of assets, of which the best are taken.")
-    ] = 10_000,
+    out: Annotated[Path, typer.Option()],
+    category: str | None = None,
+    min_score: float | None = None,
+    limit: Annotated[int, typer.Option(min=1)] = 10_000,
     as_json: AsJson = False,
 ) -> None:
     """Write a page to leaf through the assets, which opens from the disk.
@@ -264,7 +218,7 @@ def gallery(
     from tasks.exports.asset import export_gallery
 
     result = {**export_gallery(store, found.rows, out.absolute()), "is_cut": found.is_cut}
-    print_json(result) if as_json else print_pairs("gallery", result)
+    print_result("gallery", result, as_json=as_json)
 
 
 def _library() -> "tuple[Store, CatalogSql]":

@@ -16,7 +16,7 @@ from flows.cli.output import (
     print_table,
 )
 from flows.cli.rows import opened_row, row_cell, told_explanation
-from flows.cli.shared_options import AsJson, tell_run
+from flows.cli.shared_options import AsJson, described, tell_run
 from flows.cli.tables import heading_of
 
 if TYPE_CHECKING:
@@ -44,23 +44,28 @@ NEWEST_FIRST = {
     "assets": "created_at",
 }
 
+WORDS = """
+table: Table of the catalog: scenes, runs, artefacts, metrics, painters, sequences, attempts, assets
+  or sightings.
+as_of: Version of the table, such as 3, or a time in UTC, such as 2026-11-22T08:00; as it is now if
+  absent.
+name: A scene, a run id, latest (the newest run of all), or kind/digest of an artefact; or the
+  beginning of an id.
+explain.name: A run id, a scene (its newest run), latest (the newest run of all), or kind/digest of
+  an artefact; or the beginning of an id.
+delete_record.name: A run id, latest (the newest run of all), kind/digest of an artefact, or a
+  scene; or the beginning of an id.
+with_dependents: Also delete what was made from it.
+dry_run: Only list what would be deleted, and its size.
+yes: Delete without asking.
+"""
+
 
 @app.command("list")
+@described(WORDS)
 def list_table(
-    table: Annotated[
-        str,
-        typer.Argument(
-            help="Table of the catalog: scenes, runs, artefacts, metrics, painters, sequences, "
-            "attempts, assets or sightings."
-        ),
-    ] = "runs",
-    as_of: Annotated[
-        str | None,
-        typer.Option(
-            help="Version of the table, such as 3, or a time in UTC, such as 2026-11-22T08:00; as "
-            "it is now if absent."
-        ),
-    ] = None,
+    table: Annotated[str, typer.Argument()] = "runs",
+    as_of: str | None = None,
     as_json: AsJson = False,
 ) -> None:
     """List a table of the catalog: runs, artefacts and painters from the newest on.
@@ -96,6 +101,7 @@ def list_table(
 
 
 @app.command("tables")
+@described(WORDS)
 def describe_tables(as_json: AsJson = False) -> None:
     """Describe every table and column: type, unit and meaning, as Markdown.
 
@@ -130,16 +136,8 @@ def _version_or_time(text: str) -> "int | datetime":
 
 
 @app.command("show")
-def show_record(
-    name: Annotated[
-        str,
-        typer.Argument(
-            help="A scene, a run id, latest (the newest run of all), or kind/digest of an "
-            "artefact; or the beginning of an id."
-        ),
-    ],
-    as_json: AsJson = False,
-) -> None:
+@described(WORDS)
+def show_record(name: str, as_json: AsJson = False) -> None:
     """Show everything known about one scene, run or artefact.
 
     Example: lidarpainter catalog show latest
@@ -154,16 +152,8 @@ def show_record(
 
 
 @app.command("explain")
-def explain(
-    name: Annotated[
-        str,
-        typer.Argument(
-            help="A run id, a scene (its newest run), latest (the newest run of all), or "
-            "kind/digest of an artefact; or the beginning of an id."
-        ),
-    ],
-    as_json: AsJson = False,
-) -> None:
+@described(WORDS)
+def explain(name: str, as_json: AsJson = False) -> None:
     """Say whether a run or an artefact is up to date, or what makes it stale.
 
     With --verbose also all that it was made from: inputs, settings and code.
@@ -202,21 +192,12 @@ def explain(
 
 
 @app.command("delete")
+@described(WORDS)
 def delete_record(
-    name: Annotated[
-        str,
-        typer.Argument(
-            help="A run id, latest (the newest run of all), kind/digest of an artefact, or a "
-            "scene; or the beginning of an id."
-        ),
-    ],
-    with_dependents: Annotated[
-        bool, typer.Option("--with-dependents", help="Also delete what was made from it.")
-    ] = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only list what would be deleted, and its size.")
-    ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Delete without asking.")] = False,
+    name: str,
+    with_dependents: bool = False,
+    dry_run: bool = False,
+    yes: bool = False,
     as_json: AsJson = False,
 ) -> None:
     """Delete a run with the artefacts no other run needs, or an artefact, or a scene.

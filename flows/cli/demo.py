@@ -9,30 +9,27 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flows.cli.output import print_json, say_status
-from flows.cli.shared_options import AsJson, Painter, Settings, check_painter
+from flows.cli.shared_options import AsJson, Painter, Settings, check_painter, described
 
 if TYPE_CHECKING:
-    from catalog.store import Store
+    pass
 
 FIRST_IMAGE_NAME = "street.png"
 REPORT_NAME = "report.html"
 PAGE_NAME = "drive.html"
 STORE_NAME = "store"
 
+WORDS = """
+out: Folder that the report and the store are written to.
+seed: Number from 0 to 999 that decides which street is drawn; painters train on streets of other
+  seeds.
+"""
 
+
+@described(WORDS)
 def demo(
-    out: Annotated[
-        Path, typer.Option(help="Folder that the report and the store are written to.")
-    ] = Path("demo"),
-    seed: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            max=999,
-            help="Number from 0 to 999 that decides which street is drawn; painters train on "
-            "streets of other seeds.",
-        ),
-    ] = 1,
+    out: Path = Path("demo"),
+    seed: Annotated[int, typer.Option(min=0, max=999)] = 1,
     painter: Painter = None,
     settings: Settings = None,
     as_json: AsJson = False,
@@ -50,7 +47,6 @@ def demo(
     from catalog.errors import storage_errors
     from catalog.store import open_store
     from flows.cli.reconstruct import show
-    from flows.cli.running import run_demo
     from flows.overrides import with_changes, with_overrides
     from flows.presets import brief
     from tasks.specs import street_id
@@ -62,13 +58,23 @@ def demo(
     say_status(f"drawing the street of seed {seed}")
     check_painter(painter)
     store = open_store(out / STORE_NAME)
+    from flows.cli.progress import shown_progress
+    from flows.cli.running import run_demo
+    from flows.exports import export_run
+    from lidarpainter_models.export.view_requests import ViewRequest
+    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
+    from lidarpainter_models.geometry.trajectory_words import RECORDED
+
     result = run_demo(parameters, seed, store, out.absolute() / FIRST_IMAGE_NAME)
     if result["report"] is not None:
         report = out.absolute() / REPORT_NAME
         with storage_errors(f"cannot write {report}"):
             shutil.copyfile(result["report"], report)
         result = {**result, "report": str(report)}
-    page = _written_page(store, result["run_id"], out.absolute() / PAGE_NAME)
+    page = out.absolute() / PAGE_NAME
+    with shown_progress():
+        recorded = ViewRequest(trajectory=parse_trajectory(RECORDED))
+        export_run(store, result["run_id"], "page", recorded, page)
     result = {**result, "page": str(page)}
     if as_json:
         print_json(result)
@@ -76,16 +82,3 @@ def demo(
         show(result)
         line = f"lidarpainter --store {shlex.quote(str(out / STORE_NAME))} view latest"
         sys.stdout.write(f"A lane aside: open {page}, or drive it live: {line}\n")
-
-
-def _written_page(store: "Store", run_id: str, out: Path) -> Path:
-    """The drive and a lane beside it in one file."""
-    from flows.cli.progress import shown_progress
-    from flows.exports import export_run
-    from lidarpainter_models.export.view_requests import ViewRequest
-    from lidarpainter_models.geometry.trajectory_specs import parse_trajectory
-    from lidarpainter_models.geometry.trajectory_words import RECORDED
-
-    with shown_progress():
-        export_run(store, run_id, "page", ViewRequest(trajectory=parse_trajectory(RECORDED)), out)
-    return out

@@ -7,32 +7,23 @@ from typing import Annotated
 import typer
 
 from flows.cli.output import loudness, print_json, print_table, say_status
-from flows.cli.shared_options import AsJson
+from flows.cli.shared_options import AsJson, described
 
 UNFIT = 2
 
+WORDS = """
+subject: A stored scene (dataset/sequence), or the name of a dataset; if absent, the setup of this
+  machine is checked.
+root: The folder of that dataset, as downloaded; only with a dataset's name.
+out: File that the overlay image is written to; if absent, one in the store's folder doctor.
+"""
 
+
+@described(WORDS)
 def doctor(
-    subject: Annotated[
-        str | None,
-        typer.Argument(
-            help="A stored scene (dataset/sequence), or the name of a dataset; if absent, the "
-            "setup of this machine is checked."
-        ),
-    ] = None,
-    root: Annotated[
-        Path | None,
-        typer.Argument(
-            help="The folder of that dataset, as downloaded; only with a dataset's name."
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="File that the overlay image is written to; if absent, one in the store's folder "
-            "doctor."
-        ),
-    ] = None,
+    subject: Annotated[str | None, typer.Argument()] = None,
+    root: Annotated[Path | None, typer.Argument()] = None,
+    out: Path | None = None,
     as_json: AsJson = False,
 ) -> None:
     """Check the setup, a stored scene, or a dataset on disk.

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from flows.cli.output import Cell, print_json, print_pairs, print_table
-from flows.cli.shared_options import AsJson, RunName, check_painter, named_run
+from flows.cli.shared_options import AsJson, check_painter, described, named_run
 from lidarpainter_models.errors import ConfigError
 
 ACTORS = "actors"
@@ -25,49 +25,25 @@ _WHOLE_NUMBER = "seed"
 LEAST_NAME = 8
 """Characters of an actor's id in a table, which name it to `edit` too."""
 
-
-Words = Annotated[
-    list[str] | None,
-    typer.Argument(
-        help="The word actors, which lists them; or an operation of docs/editing.md (remove, "
-        "insert, move, swap, ...), the actor, and field=value. An actor is its id, the "
-        "beginning of it, or nearest-ahead.",
-        show_default=False,
-    ),
-]
-Painter = Annotated[
-    str | None,
-    typer.Option(
-        help="Painter of what no camera saw: none, overlay, warp, nano, a .safetensors file, "
-        "or a model. The run's own if absent."
-    ),
-]
+WORDS = """
+words: The word actors, which lists them; or an operation of docs/editing.md (remove, insert, move,
+  swap, ...), the actor, and field=value. An actor is its id, the beginning of it, or nearest-ahead.
+script: File with a JSON list of operations; several files are done one after the other.
+painter: Painter of what no camera saw: none, overlay, warp, nano, a .safetensors file, or a model.
+  The run's own if absent.
+allow_collisions: Let actors and the camera go through what LiDAR saw standing there.
+out: Folder that images along the script's `drive` are written to, painted where it is a clear day.
+"""
 
 
+@described(WORDS)
 def edit(
-    run: RunName,
-    words: Words = None,
-    script: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="File with a JSON list of operations; several files are done one after the other."
-        ),
-    ] = None,
-    painter: Painter = None,
-    allow_collisions: Annotated[
-        bool,
-        typer.Option(
-            "--allow-collisions",
-            help="Let actors and the camera go through what LiDAR saw standing there.",
-        ),
-    ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder that images along the script's `drive` are written to, painted where it "
-            "is a clear day."
-        ),
-    ] = None,
+    run: str,
+    words: Annotated[list[str] | None, typer.Argument(show_default=False)] = None,
+    script: list[Path] | None = None,
+    painter: str | None = None,
+    allow_collisions: bool = False,
+    out: Path | None = None,
     as_json: AsJson = False,
 ) -> None:
     """Edit a finished run: who is where. Makes a new run; the old one stays as it is.
@@ -92,15 +68,14 @@ def edit(
     run_id = named_run(run)
     check_painter(painter)
     from flows.cli.progress import shown_progress
-    from flows.edit import EditRequest, edit_run, shown_edit
+    from flows.edit import edit_run, shown_edit
 
-    request = EditRequest(
-        run=run_id, operations=known, painter=painter, allows_collisions=allow_collisions
-    )
+    store = existing_store()
+    how: dict[str, Any] = {"painter": painter, "allows_collisions": allow_collisions}
     with shown_progress():
-        result = edit_run(existing_store(), request)
+        result = edit_run(store, run_id, known, **how)
         if out is not None:
-            result["images"] = shown_edit(existing_store(), request, result, out.absolute())
+            result["images"] = shown_edit(store, result, out.absolute(), **how)
     print_json(result) if as_json else _show(result)
 
 

@@ -1,15 +1,13 @@
 """`lidarpainter evaluate`: judge a finished run again, or under another protocol."""
 
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from flows.cli.output import print_json, print_table
 from flows.cli.shared_options import (
     AsJson,
-    RunName,
     check_painter,
+    described,
     named_run,
     parse_previous,
     refuse_unused,
@@ -27,65 +25,34 @@ PROTOCOLS = ("paper", "truth", CROSS_CAMERA, FLICKER)
 WEIGHTS = ("--feature-weights", "--lpips-backbone", "--lpips-heads")
 VARIANTS = ("unpainted", "painted", "refined", "view-time")
 FLICKER_COLUMNS = ("flicker", "moving_flicker", "valid_share", "psnr", "num_pairs")
-ViewTimePainter = Annotated[
-    str | None,
-    typer.Option(
-        help="Painter at view time: overlay, warp, nano, a .safetensors file, or a model; the "
-        "run's own if absent. Scores of another one are printed, but not entered into the "
-        "catalog."
-    ),
-]
+
+WORDS = """
+protocol: How the run is scored: paper (held-out views, and views beside the path where they are
+  known), truth (views beside the path of a synthetic street, against exact images), cross-camera
+  (cameras that no fit saw), or flicker (neighbouring frames against each other).
+postpaint: Also score what is painted at view time.
+painter: Painter at view time: overlay, warp, nano, a .safetensors file, or a model; the run's own
+  if absent. Scores of another one are printed, but not entered into the catalog.
+lpips_backbone: File with torchvision's weights of VGG-16, AlexNet or SqueezeNet, for LPIPS; it is
+  left out if absent.
+lpips_heads: File with the LPIPS heads (version 0.1) of the same network.
+all_views: Score every held-out view in place of a sample of them.
+previous: With --protocol flicker: also score painting that uses the image painted before: mixed
+  (into what the next one is painted from), shown (to the painter), or both with a comma between.
+"""
 
 
-Protocol = Annotated[
-    str,
-    typer.Option(
-        help="How the run is scored: paper (held-out views, and views beside the path where "
-        "they are known), truth (views beside the path of a synthetic street, against exact "
-        "images), cross-camera (cameras that no fit saw), or flicker (neighbouring frames "
-        "against each other)."
-    ),
-]
-Previous = Annotated[
-    str | None,
-    typer.Option(
-        help="With --protocol flicker: also score painting that uses the image painted before: "
-        "mixed (into what the next one is painted from), shown (to the painter), or both "
-        "with a comma between."
-    ),
-]
-
-
+@described(WORDS)
 def evaluate(  # noqa: PLR0913 - the options of a command
-    run: RunName,
-    protocol: Protocol = "paper",
-    postpaint: Annotated[
-        bool, typer.Option("--postpaint", help="Also score what is painted at view time.")
-    ] = False,
-    painter: ViewTimePainter = None,
-    feature_weights: Annotated[
-        Path | None,
-        typer.Option(
-            help="File with weights of SqueezeNet 1.1, for the feature distance; it is left out if "
-            "absent."
-        ),
-    ] = None,
-    lpips_backbone: Annotated[
-        Path | None,
-        typer.Option(
-            help="File with torchvision's weights of VGG-16, AlexNet or SqueezeNet, for LPIPS; it "
-            "is left out if absent."
-        ),
-    ] = None,
-    lpips_heads: Annotated[
-        Path | None,
-        typer.Option(help="File with the LPIPS heads (version 0.1) of the same network."),
-    ] = None,
-    all_views: Annotated[
-        bool,
-        typer.Option("--all-views", help="Score every held-out view in place of a sample of them."),
-    ] = False,
-    previous: Previous = None,
+    run: str,
+    protocol: str = "paper",
+    postpaint: bool = False,
+    painter: str | None = None,
+    feature_weights: Path | None = None,
+    lpips_backbone: Path | None = None,
+    lpips_heads: Path | None = None,
+    all_views: bool = False,
+    previous: str | None = None,
     as_json: AsJson = False,
 ) -> None:
     """Judge a finished run on views it never saw.

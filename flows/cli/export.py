@@ -9,17 +9,10 @@ import typer
 
 from flows.cli.output import print_result
 from flows.cli.shared_options import (
-    AllowCollisions,
     AsJson,
-    BesideWhat,
-    FollowedCameras,
-    FollowedFrames,
-    Fps,
-    ImageWidth,
-    PostpaintPainter,
-    RunName,
     TrajectorySpec,
     checked_words,
+    described,
     parse_frames,
     parse_names,
     refuse_unused,
@@ -48,51 +41,38 @@ SPZ_VERSION = 3
 Format = Annotated[
     str, typer.Option("--format", help=f"Format of the file or folder. {formats_help()}")
 ]
-Moment = Annotated[
-    str,
-    typer.Option(
-        help="Moment at which actors stand where they are: seconds since the first image, such "
-        "as 1.5, or frame:N, counted from 0."
-    ),
-]
-ActorNames = Annotated[
-    str | None,
-    typer.Option(
-        help="Ids of the actors to take along, with commas between, or none; all if absent."
-    ),
-]
-PerActor = Annotated[
-    bool,
-    typer.Option(
-        "--per-actor",
-        help="Write the street and every actor as PLY files of their own, into a new folder.",
-    ),
-]
-Sky = Annotated[bool, typer.Option("--sky", help="Take the sky along, as far Gaussians.")]
-SpzVersionOption = Annotated[
-    int, typer.Option(help="Version of SPZ: 3 or 4; fewer programs read 4.")
-]
-Postpaint = Annotated[bool, typer.Option("--postpaint", help="Paint every image that is rendered.")]
+
+WORDS = """
+out: The file to write, or a new folder.
+time: Moment at which actors stand where they are: seconds since the first image, such as 1.5, or
+  frame:N, counted from 0.
+actors: Ids of the actors to take along, with commas between, or none; all if absent.
+per_actor: Write the street and every actor as PLY files of their own, into a new folder.
+sky: Take the sky along, as far Gaussians.
+spz_version: Version of SPZ: 3 or 4; fewer programs read 4.
+postpaint: Paint every image that is rendered.
+"""
 
 
+@described(WORDS)
 def export(  # noqa: PLR0913 - the options of a command
-    run: RunName,
+    run: str,
     format_: Format,
-    out: Annotated[Path, typer.Option(help="The file to write, or a new folder.")],
-    time: Moment = "0",
-    actors: ActorNames = None,
-    per_actor: PerActor = False,
-    sky: Sky = False,
-    spz_version: SpzVersionOption = SPZ_VERSION,
+    out: Annotated[Path, typer.Option()],
+    time: str = "0",
+    actors: str | None = None,
+    per_actor: bool = False,
+    sky: bool = False,
+    spz_version: int = SPZ_VERSION,
     trajectory: TrajectorySpec = RECORDED,
-    camera: FollowedCameras = None,
-    frames: FollowedFrames = None,
-    width: ImageWidth = None,
-    postpaint: Postpaint = False,
-    painter: PostpaintPainter = None,
-    fps: Fps = None,
-    beside: BesideWhat = None,
-    allow_collisions: AllowCollisions = False,
+    camera: str | None = None,
+    frames: str | None = None,
+    width: int | None = None,
+    postpaint: bool = False,
+    painter: str | None = None,
+    fps: float | None = None,
+    beside: str | None = None,
+    allow_collisions: bool = False,
     as_json: AsJson = False,
 ) -> None:
     """Write a finished run in a format that others read.
@@ -138,11 +118,7 @@ def export(  # noqa: PLR0913 - the options of a command
 
 
 def _refuse_unread(row: ExportFormat, given: Sequence[object]) -> None:
-    """Refuse options, in the order of `OPTIONS`, that are given and that the format does not read.
-
-    Raises:
-        ConfigError: naming the first of them.
-    """
+    """Refuse options, in the order of `OPTIONS`, that are given and the format does not read."""
     values = zip(OPTIONS, given, strict=True)
     unread = {
         name: value is not None and value is not False

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flows.cli.output import print_json, print_pairs, print_table, say_status, tell
-from flows.cli.shared_options import AsJson
+from flows.cli.output import print_json, print_result, print_table, say_status, tell
+from flows.cli.shared_options import AsJson, described
 from lidarpainter_models.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -19,62 +19,37 @@ TOLD_APART_BY = ("configuration", "cameras", "fit_seed")
 """Shown of sequences where not all of a fleet have the same."""
 MOST_WORKERS = 150
 """Beyond 200 flow runs that wait, Prefect's queues starve (its issue 19403)."""
-Fleet = Annotated[
-    str | None,
-    typer.Argument(help="Name of the fleet; if absent, the one that was asked for last."),
-]
 
 app = typer.Typer(help="Many sequences from one manifest.", no_args_is_help=True)
 
-
-Workers = Annotated[
-    int,
-    typer.Option(
-        min=1,
-        max=MOST_WORKERS,
-        help="Number of sequences made at once, each in a process of its own.",
-    ),
-]
-RunManifest = Annotated[
-    Path,
-    typer.Argument(
-        help="TOML file that says which sequences are wanted and how, described in docs/fleet.md."
-    ),
-]
+WORDS = """
+manifest: TOML file that says which sequences are wanted and how, described in docs/fleet.md.
+workers: Number of sequences made at once, each in a process of its own.
+threads: Number of threads of each worker.
+deploys: Let workers of a Prefect work pool make the sequences, in place of this command.
+cron: With --deploy: when the manifest is looked at, in UTC, such as '0 3 * * *'; once now if
+  absent.
+pool: With --deploy: name of the work pool, which is made if it is not there.
+fleet: Name of the fleet; if absent, the one that was asked for last.
+work.fleet: Name of the fleet, as its manifest has it.
+failed: Show only what failed or was set aside, and why.
+metrics: File, such as fleet.prom, that figures are also written to in the text format of
+  Prometheus.
+scene: Only this scene, as dataset/sequence, even if it was set aside. May be repeated.
+out: HTML file that the page is written to.
+"""
 
 
 @app.command("run")
+@described(WORDS)
 def run(  # noqa: PLR0913 - the options of a command
-    manifest: RunManifest,
-    workers: Workers = 1,
-    threads: Annotated[int, typer.Option(min=1, help="Number of threads of each worker.")] = 1,
-    accept_stale: Annotated[
-        bool,
-        typer.Option(
-            "--accept-stale",
-            help="Take what older code has made as it is, in place of making it again.",
-        ),
-    ] = False,
-    deploys: Annotated[
-        bool,
-        typer.Option(
-            "--deploy",
-            help="Let workers of a Prefect work pool make the sequences, in place of this command.",
-        ),
-    ] = False,
-    cron: Annotated[
-        str | None,
-        typer.Option(
-            help="With --deploy: when the manifest is looked at, in UTC, such as '0 3 * * *'; once "
-            "now if absent."
-        ),
-    ] = None,
-    pool: Annotated[
-        str | None,
-        typer.Option(
-            help="With --deploy: name of the work pool, which is made if it is not there."
-        ),
-    ] = None,
+    manifest: Path,
+    workers: Annotated[int, typer.Option(min=1, max=MOST_WORKERS)] = 1,
+    threads: Annotated[int, typer.Option(min=1)] = 1,
+    accept_stale: bool = False,
+    deploys: Annotated[bool, typer.Option("--deploy")] = False,
+    cron: str | None = None,
+    pool: str | None = None,
     as_json: AsJson = False,
 ) -> None:
     """Make every sequence that a manifest asks for; what is done stays done.
@@ -87,12 +62,18 @@ def run(  # noqa: PLR0913 - the options of a command
 
     asked = read_manifest(manifest)
     if deploys:
-        parameters = {
+        parameters: dict[str, Any] = {
             "manifest": str(manifest.absolute()),
             "workers": workers,
             "accept_stale": accept_stale,
         }
-        _deploy(asked.name, parameters, threads, cron=cron, pool=pool, as_json=as_json)
+        say_status(f"deploying {asked.name}")
+        from catalog.store import open_store
+        from flows.fleet.deployed import POOL, deploy
+
+        parameters["store"] = open_store().name
+        made = deploy(asked.name, parameters, pool=pool or POOL, cron=cron, threads=threads)
+        print_result(f"fleet {asked.name}, deployed", made, as_json=as_json)
         return
     if cron is not None or pool is not None:
         raise ConfigError(f"{'--pool' if cron is None else '--cron'} needs --deploy")
@@ -101,18 +82,11 @@ def run(  # noqa: PLR0913 - the options of a command
 
 
 @app.command("status")
+@described(WORDS)
 def status(
-    fleet: Fleet = None,
-    failed: Annotated[
-        bool, typer.Option("--failed", help="Show only what failed or was set aside, and why.")
-    ] = False,
-    metrics: Annotated[
-        Path | None,
-        typer.Option(
-            help="File, such as fleet.prom, that figures are also written to in the text format of "
-            "Prometheus."
-        ),
-    ] = None,
+    fleet: Annotated[str | None, typer.Argument()] = None,
+    failed: bool = False,
+    metrics: Path | None = None,
     as_json: AsJson = False,
 ) -> None:
     """Show where every sequence of a fleet stands.
@@ -135,14 +109,10 @@ def status(
 
 
 @app.command("retry")
+@described(WORDS)
 def retry(
-    fleet: Fleet = None,
-    scene: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Only this scene, as dataset/sequence, even if it was set aside. May be repeated."
-        ),
-    ] = None,
+    fleet: Annotated[str | None, typer.Argument()] = None,
+    scene: list[str] | None = None,
     as_json: AsJson = False,
 ) -> None:
     """Let what failed wait for another attempt; `fleet run` makes it.
@@ -155,7 +125,8 @@ def retry(
 
 
 @app.command("cancel")
-def cancel(fleet: Fleet = None, as_json: AsJson = False) -> None:
+@described(WORDS)
+def cancel(fleet: Annotated[str | None, typer.Argument()] = None, as_json: AsJson = False) -> None:
     """Let nothing more of a fleet begin, and end what is running; what is done stays.
 
     Workers on any machine end within seconds. `fleet run` goes on later.
@@ -168,9 +139,8 @@ def cancel(fleet: Fleet = None, as_json: AsJson = False) -> None:
 
 
 @app.command("work")
-def work(
-    fleet: Annotated[str, typer.Argument(help="Name of the fleet, as its manifest has it.")],
-) -> None:
+@described(WORDS)
+def work(fleet: str) -> None:
     """Work on a fleet that was asked for, beside all others who do; `fleet run` starts these.
 
     Example: lidarpainter fleet work night-of-monday
@@ -187,11 +157,10 @@ def work(
 
 
 @app.command("report")
+@described(WORDS)
 def report(
-    fleet: Fleet = None,
-    out: Annotated[Path, typer.Option(help="HTML file that the page is written to.")] = Path(
-        "fleet.html"
-    ),
+    fleet: Annotated[str | None, typer.Argument()] = None,
+    out: Path = Path("fleet.html"),
     as_json: AsJson = False,
 ) -> None:
     """Write one page about a fleet: throughput, failures, cost, quality, worst scenes, planner.
@@ -247,28 +216,6 @@ def _run_here(
     _show(status, as_json=as_json)
     if not is_over(status):
         raise typer.Exit(NOT_OVER)
-
-
-def _deploy(
-    name: str,
-    parameters: dict[str, Any],
-    threads: int,
-    *,
-    cron: str | None,
-    pool: str | None,
-    as_json: bool,
-) -> None:
-    say_status(f"deploying {name}")
-    from catalog.store import open_store
-    from flows.fleet.deployed import POOL, deploy
-
-    store = open_store().name
-    asked = {**parameters, "store": store}
-    made = deploy(name, asked, pool=pool or POOL, cron=cron, threads=threads)
-    if as_json:
-        print_json(made)
-    else:
-        print_pairs(f"fleet {name}, deployed", made)
 
 
 def _closed(ledger: "FleetLedger") -> list[str]:

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from flows.cli.output import complain, format_bytes, print_json, print_table, say_status
-from flows.cli.shared_options import AsJson, parse_frames, parse_names
+from flows.cli.shared_options import AsJson, described, parse_frames, parse_names
 
 SOME_FAILED = 2
 COLUMNS = {
@@ -18,41 +18,27 @@ COLUMNS = {
     "num_moving_actors": "moving",
 }
 
+WORDS = """
+dataset: Form of the dataset: pandaset, nuscenes, waymo or canonical (scenes in the form that this
+  store has).
+root: The folder that holds the sequences, as downloaded.
+sequences: Names of the sequences to take; all that are found if none is named.
+frames: Frames to take as A:B, B excluded, such as 0:40; all if absent.
+cameras: Names of the cameras to take, with commas between; all if absent.
+jobs: Number of sequences read at once, each in a process of its own.
+again: Read everything anew, and replace what is in the store.
+"""
 
-Dataset = Annotated[
-    str,
-    typer.Argument(
-        help="Form of the dataset: pandaset, nuscenes, waymo or canonical (scenes in the form "
-        "that this store has)."
-    ),
-]
 
-
+@described(WORDS)
 def ingest(  # noqa: PLR0913 - one per option
-    dataset: Dataset,
-    root: Annotated[
-        Path, typer.Argument(help="The folder that holds the sequences, as downloaded.")
-    ],
-    sequences: Annotated[
-        list[str] | None,
-        typer.Argument(help="Names of the sequences to take; all that are found if none is named."),
-    ] = None,
-    frames: Annotated[
-        str | None,
-        typer.Option(help="Frames to take as A:B, B excluded, such as 0:40; all if absent."),
-    ] = None,
-    cameras: Annotated[
-        str | None,
-        typer.Option(help="Names of the cameras to take, with commas between; all if absent."),
-    ] = None,
-    jobs: Annotated[
-        int,
-        typer.Option(min=1, help="Number of sequences read at once, each in a process of its own."),
-    ] = 1,
-    again: Annotated[
-        bool,
-        typer.Option("--again", help="Read everything anew, and replace what is in the store."),
-    ] = False,
+    dataset: str,
+    root: Path,
+    sequences: Annotated[list[str] | None, typer.Argument()] = None,
+    frames: str | None = None,
+    cameras: str | None = None,
+    jobs: Annotated[int, typer.Option(min=1)] = 1,
+    again: bool = False,
     as_json: AsJson = False,
 ) -> None:
     """Bring sequences of a dataset into the store.

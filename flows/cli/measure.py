@@ -1,20 +1,18 @@
 """`lidarpainter chart`, `size`, `stress`, `figures`: measured, drawn and put into pages."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from flows.cli.output import print_json, print_table, say_status, tell
-from flows.cli.shared_options import AsJson, Settings, parse_names
+from flows.cli.shared_options import AsJson, Settings, described, parse_names
 from lidarpainter_models.errors import ConfigError
 
 if TYPE_CHECKING:
     from catalog.points import Point
-    from flows.fleet.manifest import Configuration
-    from flows.measure.sweep import Sweep
+    from flows.fleet.manifest import Configuration, Manifest
     from flows.parameters import ReconstructParameters
 
 NOT_OVER = 2
@@ -23,77 +21,38 @@ COLUMNS = ("scene", "configuration", "seed", "cpu_seconds", "num_gaussians")
 SHOWN = ("recorded_psnr", "aside_psnr", "aside_depth")
 """Qualities in the table."""
 
-Scenes = Annotated[
-    list[str], typer.Argument(help="Scene as dataset/sequence, such as pandaset/002.")
-]
-Out = Annotated[Path, typer.Option(help="Folder that the pictures are written to.")]
-Preset = Annotated[
-    str,
-    typer.Option(
-        help="Preset that is changed in one thing at a time: brief, preview, balanced or paper."
-    ),
-]
-Cameras = Annotated[
-    str | None,
-    typer.Option(help="Names of the cameras to fit to, with commas between; all if absent."),
-]
-Seeds = Annotated[
-    int,
-    typer.Option(
-        min=1,
-        max=100,
-        help="Number of seeds of the fit that each point is made with; bars show how far they "
-        "differ.",
-    ),
-]
-OnlyWays = Annotated[
-    str | None,
-    typer.Option(
-        "--only",
-        help="Ways to compare, with commas between: preset, no-painter, overlay, warp, first-fit, "
-        "one-round, steps-x0.25, steps-x0.5, steps-x2, painted-views-x0.5, gaussians-x0.5 or "
-        "gaussians-x2; all if absent.",
-    ),
-]
-OnlyFactors = Annotated[
-    str | None,
-    typer.Option(
-        "--only",
-        help="What is changed, with commas between: gaussians, harmonics, steps, rounds or "
-        "painted-views; all if absent.",
-    ),
-]
-OnlyCauses = Annotated[
-    str | None,
-    typer.Option(
-        "--only",
-        help="Causes of faults, with commas between: beams, reach, dropout, clutter, clock, "
-        "pose-noise, camera-yaw, focal-length, box-noise, missing-boxes, false-boxes, "
-        "wrong-classes, exposure, white-balance, motion-blur, darkness, dirt, swapped, "
-        "missing-cameras or frame-rate; all if absent.",
-    ),
-]
-Workers = Annotated[
-    int, typer.Option(min=1, help="Number of points made at once, each in a process of its own.")
-]
-Stale = Annotated[
-    bool,
-    typer.Option(
-        "--accept-stale",
-        help="Take what older code has made as it is, in place of making it again.",
-    ),
-]
+WORDS = """
+scenes: Scene as dataset/sequence, such as pandaset/002.
+out: Folder that the pictures are written to.
+preset: Preset that is changed in one thing at a time: brief, preview, balanced or paper.
+seeds: Number of seeds of the fit that each point is made with; bars show how far they differ.
+only: Ways to compare, with commas between: preset, no-painter, overlay, warp, first-fit, one-round,
+  steps-x0.25, steps-x0.5, steps-x2, painted-views-x0.5, gaussians-x0.5 or gaussians-x2; all if
+  absent.
+size.only: What is changed, with commas between: gaussians, harmonics, steps, rounds or
+  painted-views; all if absent.
+stress.only: Causes of faults, with commas between: beams, reach, dropout, clutter, clock,
+  pose-noise, camera-yaw, focal-length, box-noise, missing-boxes, false-boxes, wrong-classes,
+  exposure, white-balance, motion-blur, darkness, dirt, swapped, missing-cameras or frame-rate; all
+  if absent.
+figures.only: Names of the tables to write, as the manifest has them, with commas between; all if
+  absent.
+workers: Number of points made at once, each in a process of its own.
+levels: Number of levels of each cause, from mild on.
+manifest: TOML file with the tables and the fleets behind them, described in docs/measuring.md.
+"""
 
 
+@described(WORDS)
 def chart(  # noqa: PLR0913 - the options of a command
-    scenes: Scenes,
-    out: Out,
-    preset: Preset = "preview",
-    train_cameras: Cameras = None,
-    seeds: Seeds = 3,
-    only: OnlyWays = None,
-    workers: Workers = 1,
-    accept_stale: Stale = False,
+    scenes: list[str],
+    out: Annotated[Path, typer.Option()],
+    preset: str = "preview",
+    train_cameras: str | None = None,
+    seeds: Annotated[int, typer.Option(min=1, max=100)] = 3,
+    only: str | None = None,
+    workers: Annotated[int, typer.Option(min=1)] = 1,
+    accept_stale: bool = False,
     settings: Settings = None,
     as_json: AsJson = False,
 ) -> None:
@@ -114,15 +73,16 @@ def chart(  # noqa: PLR0913 - the options of a command
     _show(chart_of(points, out), as_json=as_json)
 
 
+@described(WORDS)
 def size(  # noqa: PLR0913 - the options of a command
-    scenes: Scenes,
-    out: Out,
-    preset: Preset = "preview",
-    train_cameras: Cameras = None,
-    seeds: Seeds = 3,
-    only: OnlyFactors = None,
-    workers: Workers = 1,
-    accept_stale: Stale = False,
+    scenes: list[str],
+    out: Annotated[Path, typer.Option()],
+    preset: str = "preview",
+    train_cameras: str | None = None,
+    seeds: Annotated[int, typer.Option(min=1, max=100)] = 3,
+    only: str | None = None,
+    workers: Annotated[int, typer.Option(min=1)] = 1,
+    accept_stale: bool = False,
     settings: Settings = None,
     as_json: AsJson = False,
 ) -> None:
@@ -144,18 +104,17 @@ def size(  # noqa: PLR0913 - the options of a command
     _show(sizes_of(points, factors, out), as_json=as_json)
 
 
+@described(WORDS)
 def stress(  # noqa: PLR0913 - the options of a command
-    scenes: Scenes,
-    out: Out,
-    preset: Preset = "preview",
-    train_cameras: Cameras = None,
-    seeds: Seeds = 1,
-    only: OnlyCauses = None,
-    levels: Annotated[
-        int, typer.Option(min=1, help="Number of levels of each cause, from mild on.")
-    ] = 4,
-    workers: Workers = 1,
-    accept_stale: Stale = False,
+    scenes: list[str],
+    out: Annotated[Path, typer.Option()],
+    preset: str = "preview",
+    train_cameras: str | None = None,
+    seeds: Annotated[int, typer.Option(min=1, max=100)] = 1,
+    only: str | None = None,
+    levels: Annotated[int, typer.Option(min=1)] = 4,
+    workers: Annotated[int, typer.Option(min=1)] = 1,
+    accept_stale: bool = False,
     settings: Settings = None,
     as_json: AsJson = False,
 ) -> None:
@@ -179,9 +138,9 @@ def stress(  # noqa: PLR0913 - the options of a command
     from flows.measure.sweep import foretold, was_asked
     from lidarpainter_models.stress.causes import CAUSES
 
-    def sweep(names: Sequence[str]) -> "Sweep":
+    def sweep(names: Sequence[str], **more: Any) -> "Manifest":  # noqa: ANN401 - fields of it
         asked = _sweep("stress", names, WAYS, preset, train_cameras, seeds, settings)
-        return replace(asked, publish=PUBLISHED)
+        return asked.model_copy(update={"publish": PUBLISHED, **more})
 
     store, causes = existing_store(), _known(only, list(CAUSES))
     trials = trials_of(store, scenes, causes, levels)
@@ -197,35 +156,18 @@ def stress(  # noqa: PLR0913 - the options of a command
         tell(f"painting seems to harm {len(doubted)} recordings: {SEEDS_IN_DOUBT} seeds of them")
         # a fleet of their own: one that is asked for less forgets the rest
         more = tuple(range(seeds, SEEDS_IN_DOUBT))
-        again = replace(sweep(doubted), name="stress-in-doubt", seeds=more)
+        again = sweep(doubted, name="stress-in-doubt", fit_seeds=more)
         points += _made(again, workers=workers, accept_stale=accept_stale)
     _show(stress_of(points, trials, out), as_json=as_json)
 
 
+@described(WORDS)
 def figures(
-    manifest: Annotated[
-        Path,
-        typer.Argument(
-            help="TOML file with the tables and the fleets behind them, described in "
-            "docs/measuring.md."
-        ),
-    ],
-    only: Annotated[
-        str | None,
-        typer.Option(
-            help="Names of the tables to write, as the manifest has them, with commas between; all "
-            "if absent."
-        ),
-    ] = None,
-    workers: Workers = 1,
-    feature_weights: Annotated[
-        Path | None,
-        typer.Option(
-            help="File with weights of SqueezeNet 1.1, for the feature distance; it is left out if "
-            "absent."
-        ),
-    ] = None,
-    accept_stale: Stale = False,
+    manifest: Path,
+    only: str | None = None,
+    workers: Annotated[int, typer.Option(min=1)] = 1,
+    feature_weights: Path | None = None,
+    accept_stale: bool = False,
     as_json: AsJson = False,
 ) -> None:
     """Write the tables of pages: make the runs that they lack, enter their figures into a record.
@@ -285,26 +227,28 @@ def _sweep(
     train_cameras: str | None,
     seeds: int,
     settings: Sequence[str] | None,
-) -> "Sweep":
-    from flows.measure.sweep import Sweep
+) -> "Manifest":
+    from flows.fleet.manifest import STORED, Manifest, Source
 
-    return Sweep(
+    cameras = parse_names(train_cameras, "--train-cameras")
+    return Manifest(
         name=name,
-        scenes=tuple(scenes),
-        cameras=parse_names(train_cameras, "--train-cameras"),
         preset=preset,
-        settings=tuple(settings or ()),
-        configurations=tuple(configurations),
-        seeds=tuple(range(seeds)),
+        set=tuple(settings or ()),
+        source=(Source(dataset=STORED, scenes=tuple(scenes), cameras=cameras),),
+        configuration=tuple(configurations),
+        fit_seeds=tuple(range(seeds)),
+        publish=("scores",),
     )
 
 
-def _made(sweep: "Sweep", *, workers: int, accept_stale: bool) -> list["Point"]:
+def _made(sweep: "Manifest", *, workers: int, accept_stale: bool) -> list["Point"]:
     from catalog.store import existing_store
     from flows.measure.sweep import run_sweep
 
-    ways = len(sweep.configurations) * len(sweep.seeds)
-    tell(f"{len(sweep.scenes) * ways} points: {len(sweep.scenes)} scenes in {ways} ways")
+    ways = len(sweep.configuration) * len(sweep.fit_seeds)
+    number = len(sweep.source[0].scenes or ())
+    tell(f"{number * ways} points: {number} scenes in {ways} ways")
     return run_sweep(sweep, existing_store(), workers=workers, accept_stale=accept_stale, say=tell)
 
 

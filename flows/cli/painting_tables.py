@@ -56,10 +56,10 @@ def _figures(label: str, image: Mapping[str, Any]) -> list[Cell]:
     return [label, *(image[name] for name in FIGURES), 100 * image["outside_hull"]]
 
 
-def show_pairs(pairs: list[dict[str, Any]]) -> None:
+def show_pairs(result: dict[str, Any]) -> None:
     """What was harvested."""
     columns = ("set", "num_pairs", "num_targets", "cpu_seconds", "folder")
-    rows = [[made[name] for name in columns] for made in pairs]
+    rows = [[made[name] for name in columns] for made in result["pairs"]]
     print_table("pairs", ["set", "pairs", "true images", "CPU s", "folder"], rows)
 
 

@@ -29,14 +29,8 @@ MOST_SHOWN = 0.99
 def how_far(clock: "Clock", stage: str, done: float, total: float | None, note: str = "") -> str:
     """Return what is known of a stage under way, such as `stage 4 of 11, 41 %, 0:31 gone, ...`.
 
-    What is left goes unsaid where a stage, or the last of a run, takes longer than was thought.
-
-    Args:
-        clock: that follows the run.
-        stage: its name.
-        done: how much of it is done.
-        total: of how much; None or 0 where that is not known.
-        note: a figure worth showing.
+    What is left goes unsaid where a stage, or the last of a run, takes longer than was thought, and
+    a share where the `total` is not known: None or 0. The `note` is a figure worth showing.
     """
     share = f"{100 * min(done / total, MOST_SHOWN):.0f} %" if total else ""
     if total and total > 1:
@@ -174,9 +168,7 @@ def shown_progress(
 ) -> Iterator[ProgressListener]:
     """Show the progress of every stage that runs inside the block, as loud as was chosen.
 
-    Args:
-        expected: seconds that every stage will take, in order, see `flows.time_prediction`.
-        is_told_by_past: whether past runs tell of them.
+    What is expected, and whether past runs tell of it: see `flows.time_prediction`.
     """
     from flows.time_prediction import Clock
 

@@ -9,9 +9,9 @@ import typer
 from flows.cli.output import Cell, format_bytes, print_json, print_pairs, print_table, say_status
 from flows.cli.shared_options import (
     AsJson,
-    DeviceName,
     Painter,
     Settings,
+    described,
     parse_bytes,
     parse_names,
     parse_seconds,
@@ -26,111 +26,52 @@ FILE_KEYS = {"preset": str, "painter": str, "set": list}
 """Keys of a file for --config, as in the manifest of a fleet, and what each holds."""
 FIRST_FIT_SHARE = 0.6
 """Part of a time limit for the first fit; its rounds share the rest, as the steps of a preset."""
-Preset = Annotated[
-    str | None,
-    typer.Option(
-        help="How much effort is made: brief (a minute or two), preview (minutes on a CPU), "
-        "balanced (the best trade), or paper (the effort of the paper); preview if absent."
-    ),
-]
-TrainCameras = Annotated[
-    str | None,
-    typer.Option(help="Names of the cameras to fit to, with commas between; all if absent."),
-]
-Seed = Annotated[
-    int | None,
-    typer.Option(min=0, help="Number that decides in which order the fit sees its views."),
-]
-Evaluate = Annotated[
-    bool,
-    typer.Option(
-        "--evaluate/--no-evaluate",
-        help="Score the scene on held-out views, or leave that to `lidarpainter evaluate`.",
-    ),
-]
-Report = Annotated[
-    bool,
-    typer.Option("--report/--no-report", help="Write the page about the run, or leave it out."),
-]
-Sideways = Annotated[
-    str | None,
-    typer.Option(
-        help="Metres to both sides of the path at which views are painted, such as 2,3; at most "
-        "8. The preset's if absent."
-    ),
-]
-Upwards = Annotated[
-    str | None,
-    typer.Option(
-        help="Metres above the path at which views are painted, such as 1.5; at most 8. The "
-        "preset's if absent."
-    ),
-]
-Rounds = Annotated[
-    int | None,
-    typer.Option(
-        help="Number of rounds, each one painting and the continued fit after it; 0 paints "
-        "nothing. The preset's if absent."
-    ),
-]
-Memory = Annotated[
-    str | None,
-    typer.Option(
-        help="The maximum memory of the process that fits on a CPU, such as 6GB or 800MB; the "
-        "scene gets fewer Gaussians where it would take more. No limit if absent."
-    ),
-]
-TimeLimit = Annotated[
-    str | None,
-    typer.Option(
-        help="The maximum time of all fits together, such as 90s, 10min or 2h; fits make fewer "
-        "steps where they would take longer. No limit if absent."
-    ),
-]
-Split = Annotated[
-    str | None,
-    typer.Option(
-        help="Which frames are fitted and which are held out for scoring: alternate (every "
-        "second one is held out), forward:17:8 (every second of the first 17 is fitted, the "
-        "last 8 are held out), or all"
-        " (none is held out). The preset's if absent."
-    ),
-]
-ConfigFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--config",
-        help="TOML file with preset, painter and set, as a fleet's manifest has them; options "
-        "given here count more.",
-    ),
-]
-TensorBoard = Annotated[
-    Path | None,
-    typer.Option(
-        help="Folder for TensorBoard event files with the losses of all fits; each fit's artefact "
-        "has them as history.csv anyway."
-    ),
-]
+
+WORDS = """
+preset: How much effort is made: brief (a minute or two), preview (minutes on a CPU), balanced (the
+  best trade), or paper (the effort of the paper); preview if absent.
+shift: Metres to both sides of the path at which views are painted, such as 2,3; at most 8. The
+  preset's if absent.
+up: Metres above the path at which views are painted, such as 1.5; at most 8. The preset's if
+  absent.
+rounds: Number of rounds, each one painting and the continued fit after it; 0 paints nothing. The
+  preset's if absent.
+split: Which frames are fitted and which are held out for scoring: alternate (every second one is
+  held out), forward:17:8 (every second of the first 17 is fitted, the last 8 are held out), or all
+  (none is held out). The preset's if absent.
+seed: Number that decides in which order the fit sees its views.
+memory: The maximum memory of the process that fits on a CPU, such as 6GB or 800MB; the scene gets
+  fewer Gaussians where it would take more. No limit if absent.
+time_limit: The maximum time of all fits together, such as 90s, 10min or 2h; fits make fewer steps
+  where they would take longer. No limit if absent.
+evaluate: Score the scene on held-out views, or leave that to `lidarpainter evaluate`.
+report: Write the page about the run, or leave it out.
+config: TOML file with preset, painter and set, as a fleet's manifest has them; options given here
+  count more.
+tensorboard: Folder for TensorBoard event files with the losses of all fits; each fit's artefact has
+  them as history.csv anyway.
+"""
 
 
+@described(WORDS)
 def reconstruct(  # noqa: PLR0913 - the options of a command
-    scene: Annotated[str, typer.Argument(help="Scene as dataset/sequence, such as pandaset/002.")],
-    preset: Preset = None,
+    scene: str,
+    preset: str | None = None,
     painter: Painter = None,
-    device: DeviceName = "auto",
-    shift: Sideways = None,
-    up: Upwards = None,
-    rounds: Rounds = None,
-    split: Split = None,
-    train_cameras: TrainCameras = None,
-    seed: Seed = None,
-    memory: Memory = None,
-    time_limit: TimeLimit = None,
-    evaluate: Evaluate = True,
-    report: Report = True,
+    device: str = "auto",
+    shift: str | None = None,
+    up: str | None = None,
+    rounds: int | None = None,
+    split: str | None = None,
+    train_cameras: str | None = None,
+    seed: Annotated[int | None, typer.Option(min=0)] = None,
+    memory: str | None = None,
+    time_limit: str | None = None,
+    evaluate: Annotated[bool, typer.Option("--evaluate/--no-evaluate")] = True,
+    report: Annotated[bool, typer.Option("--report/--no-report")] = True,
     settings: Settings = None,
-    config: ConfigFile = None,
-    tensorboard: TensorBoard = None,
+    config: Path | None = None,
+    tensorboard: Path | None = None,
     as_json: AsJson = False,
 ) -> None:
     """Turn a stored scene into a fitted, painted, evaluated and reported one.

@@ -7,76 +7,47 @@ import typer
 
 from flows.cli.output import print_json, print_pairs
 from flows.cli.shared_options import (
-    AllowCollisions,
     AsJson,
-    BesideWhat,
-    FollowedCameras,
-    FollowedFrames,
-    Fps,
-    ImageWidth,
-    PostpaintPainter,
-    RunName,
     TrajectorySpec,
     checked_words,
+    described,
     parse_frames,
     parse_previous,
     with_told_collisions,
 )
 from lidarpainter_models.errors import ConfigError
 
-Postpaint = Annotated[
-    bool,
-    typer.Option(
-        "--postpaint",
-        help="Paint every image; what it was painted from is written to `unpainted/`.",
-    ),
-]
-
-Prompt = Annotated[
-    str,
-    typer.Option(
-        help="What a painter that was trained for styles is asked for: clear, foggy, night or "
-        "rain; other painters know clear alone. Needs --postpaint or --painter."
-    ),
-]
-Previous = Annotated[
-    str | None,
-    typer.Option(
-        help="What becomes of the image painted before: unused, mixed (into what the next one is"
-        " painted from), or shown (to the painter). Needs --postpaint or --painter."
-    ),
-]
-Video = Annotated[
-    bool,
-    typer.Option(
-        "--video", help="Also write video.mp4, a film of each camera, and one of all together."
-    ),
-]
-Depth = Annotated[
-    bool, typer.Option("--depth", help="Also write depth as 16-bit PNG, in 256ths of a metre.")
-]
-Semantics = Annotated[
-    bool, typer.Option("--semantics", help="Also write who is where, as 16-bit PNG with a legend.")
-]
+WORDS = """
+out: Folder that the images are written to.
+postpaint: Paint every image; what it was painted from is written to `unpainted/`.
+prompt: What a painter that was trained for styles is asked for: clear, foggy, night or rain; other
+  painters know clear alone. Needs --postpaint or --painter.
+previous: What becomes of the image painted before: unused, mixed (into what the next one is painted
+  from), or shown (to the painter). Needs --postpaint or --painter.
+video: Also write video.mp4, a film of each camera, and one of all together.
+depth: Also write depth as 16-bit PNG, in 256ths of a metre.
+semantics: Also write who is where, as 16-bit PNG with a legend.
+"""
 
 
+@described(WORDS)
 def render(  # noqa: PLR0913 - the options of a command
-    run: RunName,
+    run: str,
     trajectory: TrajectorySpec,
-    out: Annotated[Path, typer.Option(help="Folder that the images are written to.")],
-    camera: FollowedCameras = None,
-    frames: FollowedFrames = None,
-    width: ImageWidth = None,
-    postpaint: Postpaint = False,
-    painter: PostpaintPainter = None,
-    prompt: Prompt = "clear",
-    previous: Previous = None,
-    video: Video = False,
-    fps: Fps = None,
-    depth: Depth = False,
-    semantics: Semantics = False,
-    beside: BesideWhat = None,
-    allow_collisions: AllowCollisions = False,
+    out: Annotated[Path, typer.Option()],
+    camera: str | None = None,
+    frames: str | None = None,
+    width: int | None = None,
+    postpaint: bool = False,
+    painter: str | None = None,
+    prompt: str = "clear",
+    previous: str | None = None,
+    video: bool = False,
+    fps: float | None = None,
+    depth: bool = False,
+    semantics: bool = False,
+    beside: str | None = None,
+    allow_collisions: bool = False,
     as_json: AsJson = False,
 ) -> None:
     """Render a finished run where nobody drove.

@@ -7,28 +7,21 @@ from typing import Annotated, Literal
 import typer
 
 from flows.cli.output import Cell, print_json, print_table
-from flows.cli.shared_options import AsJson
+from flows.cli.shared_options import AsJson, described
+
+WORDS = """
+prefix: Beginning of the settings to list, such as fit or fit.densification; all if absent.
+preset: Preset whose defaults are shown: brief, preview, balanced or paper.
+of: Commands whose settings are listed: reconstruct (and demo), or train (painter train and
+  harvest).
+"""
 
 
+@described(WORDS)
 def settings(
-    prefix: Annotated[
-        str,
-        typer.Argument(
-            help="Beginning of the settings to list, such as fit or fit.densification; all if "
-            "absent."
-        ),
-    ] = "",
-    preset: Annotated[
-        str,
-        typer.Option(help="Preset whose defaults are shown: brief, preview, balanced or paper."),
-    ] = "preview",
-    of: Annotated[
-        Literal["reconstruct", "train"],
-        typer.Option(
-            help="Commands whose settings are listed: reconstruct (and demo), or train (painter "
-            "train and harvest)."
-        ),
-    ] = "reconstruct",
+    prefix: Annotated[str, typer.Argument()] = "",
+    preset: str = "preview",
+    of: Literal["reconstruct", "train"] = "reconstruct",
     as_json: AsJson = False,
 ) -> None:
     """List what --set knows: path, type, default and reason.

@@ -1,8 +1,10 @@
-"""Options that several commands have, with the same meaning in each, and how they are read."""
+"""Options: how commands tell what theirs mean, and how those that several have are read."""
 
 import re
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from collections.abc import Callable, Mapping
+from copy import copy
+from inspect import Parameter, signature
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
 
 import typer
 
@@ -14,7 +16,9 @@ from lidarpainter_models.painter.known_painters import painter_help
 if TYPE_CHECKING:
     from lidarpainter_models.conditioning.settings import SequenceConfig
 
+Command = TypeVar("Command", bound=Callable[..., None])
 RANGE = re.compile(r"(\d*):(\d*)")
+PARAGRAPH = re.compile(r"^([\w.]+): (.*\n(?:  .*\n)*)", re.MULTILINE)
 
 Painter = Annotated[
     str | None,
@@ -22,78 +26,65 @@ Painter = Annotated[
         help=f"Painter of the views beside the path: {painter_help()}. The preset's if absent."
     ),
 ]
-DeviceName = Annotated[
-    str,
-    typer.Option(
-        help="Where fits and painters run: auto (a GPU if there is one), cpu, cuda, or cuda:N "
-        "for the N-th GPU."
-    ),
-]
-Settings = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        help="Changes one setting, such as fit.steps=500; `lidarpainter settings` lists them "
-        "all. May be repeated.",
-    ),
-]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object in place of tables.")]
-RunName = Annotated[
-    str,
-    typer.Argument(
-        help="The run: its id or the beginning of it, a scene such as pandaset/002 (its newest "
-        "run), or latest (the newest run of all)."
-    ),
-]
+Settings = Annotated[list[str] | None, typer.Option("--set")]
+AsJson = Annotated[bool, typer.Option("--json")]
 TrajectorySpec = Annotated[str, typer.Option(help=f"Where the camera goes: {trajectory_help()}")]
-AllowCollisions = Annotated[
-    bool,
-    typer.Option(
-        "--allow-collisions", help="Let the camera go through what LiDAR saw standing there."
-    ),
-]
-FollowedCamera = Annotated[
-    str | None,
-    typer.Option(help="Camera whose path is followed; the first one fitted to if absent."),
-]
-FollowedCameras = Annotated[
-    str | None,
-    typer.Option(
-        "--camera",
-        help="Camera whose path is followed, several with commas between, or all; also cameras "
-        "that no fit used. The first one fitted to if absent.",
-    ),
-]
-ImageWidth = Annotated[
-    int | None,
-    typer.Option(
-        "--width",
-        help="Width of the images in pixels, at most as recorded; that of the fit if absent.",
-    ),
-]
-Fps = Annotated[
-    float | None,
-    typer.Option(help="Images a second of the films; those of the recording if absent."),
-]
-PostpaintPainter = Annotated[
-    str | None,
-    typer.Option(
-        help="Painter of the images, which it paints without --postpaint too: overlay, warp, "
-        "nano, a .safetensors file, or a model. The run's own if absent."
-    ),
-]
-BesideWhat = Annotated[
-    str | None,
-    typer.Option(
-        "--beside",
-        help="What is shown to the left of every image: recorded, unpainted (before painting), "
-        "or another run of the same scene.",
-    ),
-]
-FollowedFrames = Annotated[
-    str | None,
-    typer.Option(help="Recorded frames to follow as A:B, B excluded, such as 0:40; all if absent."),
-]
+
+WORDS = """
+as_json: Print one JSON object in place of tables.
+scene: Scene as dataset/sequence, such as pandaset/002.
+train_cameras: Names of the cameras to fit to, with commas between; all if absent.
+accept_stale: Take what older code has made as it is, in place of making it again.
+feature_weights: File with weights of SqueezeNet 1.1, for the feature distance; it is left out if
+  absent.
+run: The run: its id or the beginning of it, a scene such as pandaset/002 (its newest run), or
+  latest (the newest run of all).
+camera: Camera whose path is followed, several with commas between, or all; also cameras that no fit
+  used. The first one fitted to if absent.
+frames: Recorded frames to follow as A:B, B excluded, such as 0:40; all if absent.
+width: Width of the images in pixels, at most as recorded; that of the fit if absent.
+painter: Painter of the images, which it paints without --postpaint too: overlay, warp, nano, a
+  .safetensors file, or a model. The run's own if absent.
+fps: Images a second of the films; those of the recording if absent.
+beside: What is shown to the left of every image: recorded, unpainted (before painting), or another
+  run of the same scene.
+allow_collisions: Let the camera go through what LiDAR saw standing there.
+device: Where fits and painters run: auto (a GPU if there is one), cpu, cuda, or cuda:N for the N-th
+  GPU.
+settings: Changes one setting, such as fit.steps=500; `lidarpainter settings` lists them all. May be
+  repeated.
+"""
+
+"""What a parameter of this name means in every command that says nothing else of it."""
+
+
+def described(words: str = "") -> Callable[[Command], Command]:
+    """Give the parameters of a command the help that a text has for them.
+
+    The text has a paragraph `name: What it is.` for each of them, or `function.name: What it is.`
+    where another command of the module means something else by the name. A parameter without a
+    default is an argument, one with a default an option, unless its annotation says otherwise; a
+    flag has no opposite.
+    """
+    known = {name: " ".join(text.split()) for name, text in PARAGRAPH.findall(WORDS + words)}
+
+    def change(command: Command) -> Command:
+        for name, parameter in signature(command).parameters.items():
+            if text := known.get(f"{command.__name__}.{name}", known.get(name)):
+                command.__annotations__[name] = _with_help(parameter, text)
+        return command
+
+    return change
+
+
+def _with_help(parameter: Parameter, text: str) -> Any:  # noqa: ANN401 - any annotation
+    hint, is_argument = parameter.annotation, parameter.default is Parameter.empty
+    names = [f"--{parameter.name.replace('_', '-')}"] if hint is bool else []
+    info = (typer.Argument if is_argument else typer.Option)(*names)
+    if hasattr(hint, "__metadata__"):
+        hint, info = hint.__origin__, copy(hint.__metadata__[0])
+    info.help = info.help or text
+    return Annotated[hint, info]
 
 
 def named_run(name: str) -> str:

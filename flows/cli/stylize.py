@@ -7,13 +7,10 @@ import typer
 
 from flows.cli.output import print_json, print_pairs, print_result
 from flows.cli.shared_options import (
-    AllowCollisions,
     AsJson,
-    FollowedCamera,
-    FollowedFrames,
-    RunName,
     TrajectorySpec,
     checked_words,
+    described,
     parse_frames,
     refuse_unused,
 )
@@ -21,73 +18,39 @@ from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.trajectory_words import RECORDED
 from lidarpainter_models.weather.mix import StyleMix
 
-Prompt = Annotated[
-    str,
-    typer.Option(
-        help="The style: clear, foggy, night or rain, or several; foggy:0.5+night:0..1 is half a"
-        " fog, and a night that falls while the log passes."
-    ),
-]
-ImageFolder = Annotated[
-    Path | None,
-    typer.Option("--out", help="Folder that the images are written to; not with --in-scene."),
-]
-InScene = Annotated[
-    bool,
-    typer.Option(
-        "--in-scene", help="Make a new run whose scene is in the style, in place of images."
-    ),
-]
-Strength = Annotated[
-    float, typer.Option(help="Strength of all styles of the prompt, from 0 (the clear scene) to 1.")
-]
-Visibility = Annotated[
-    float | None, typer.Option(help="Metres that one sees in a fog of strength 1; 120 if absent.")
-]
-ImageKind = Annotated[
-    Literal["rendered", "recorded"],
-    typer.Option(
-        help="Images to style: rendered (what the scene shows), or recorded (what the camera saw, "
-        "on the recorded path alone)."
-    ),
-]
-Width = Annotated[
-    int | None,
-    typer.Option(
-        help="Width of the images in pixels, at most as recorded; that of the fit if absent."
-    ),
-]
-ViewPainter = Annotated[
-    str | None,
-    typer.Option(
-        help="Painter that paints every image before it is styled: overlay, warp, nano, a "
-        ".safetensors file, or a model. None if absent."
-    ),
-]
-Seed = Annotated[
-    int,
-    typer.Option(
-        help="Number that decides which windows are lit, and where puddles, drops and noise are.",
-        min=0,
-    ),
-]
+WORDS = """
+stylize.camera: Camera whose path is followed; the first one fitted to if absent.
+prompt: The style: clear, foggy, night or rain, or several; foggy:0.5+night:0..1 is half a fog, and
+  a night that falls while the log passes.
+out: Folder that the images are written to; not with --in-scene.
+in_scene: Make a new run whose scene is in the style, in place of images.
+strength: Strength of all styles of the prompt, from 0 (the clear scene) to 1.
+visibility: Metres that one sees in a fog of strength 1; 120 if absent.
+images: Images to style: rendered (what the scene shows), or recorded (what the camera saw, on the
+  recorded path alone).
+width: Width of the images in pixels, at most as recorded; that of the fit if absent.
+painter: Painter that paints every image before it is styled: overlay, warp, nano, a .safetensors
+  file, or a model. None if absent.
+seed: Number that decides which windows are lit, and where puddles, drops and noise are.
+"""
 
 
+@described(WORDS)
 def stylize(  # noqa: PLR0913 - the options of a command
-    run: RunName,
-    prompt: Prompt,
-    out: ImageFolder = None,
-    in_scene: InScene = False,
-    strength: Strength = 1.0,
-    visibility: Visibility = None,
+    run: str,
+    prompt: Annotated[str, typer.Option()],
+    out: Path | None = None,
+    in_scene: bool = False,
+    strength: float = 1.0,
+    visibility: float | None = None,
     trajectory: TrajectorySpec = RECORDED,
-    images: ImageKind = "rendered",
-    camera: FollowedCamera = None,
-    frames: FollowedFrames = None,
-    width: Width = None,
-    painter: ViewPainter = None,
-    seed: Seed = 0,
-    allow_collisions: AllowCollisions = False,
+    images: Literal["rendered", "recorded"] = "rendered",
+    camera: str | None = None,
+    frames: str | None = None,
+    width: int | None = None,
+    painter: str | None = None,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    allow_collisions: bool = False,
     as_json: AsJson = False,
 ) -> None:
     """Show a finished run in another weather or at night, or make a run that lives in it.

@@ -128,7 +128,9 @@ def pair_lines(pairs: Mapping[str, str], *, width: int) -> Iterator[str]:
 
 def _fitting(columns: Sequence[Sequence[str]], width: int) -> list[int] | None:
     """How wide each column is so that all fit, the widest ones wrapped; None if they cannot."""
-    least = [max(_longest_word(cell) for cell in column) for column in columns]
+    least = [
+        max(len(word) for cell in column for word in ["", *cell.split()]) for column in columns
+    ]
     widths = [max(len(cell) for cell in column) for column in columns]
     excess = sum(widths) + len(GAP) * (len(columns) - 1) - width
     floors = [max(low, min(LEAST_TEXT, one)) for one, low in zip(widths, least, strict=True)]
@@ -142,10 +144,6 @@ def _fitting(columns: Sequence[Sequence[str]], width: int) -> list[int] | None:
         widths[max(wide, key=widths.__getitem__)] -= 1
         excess -= 1
     return widths
-
-
-def _longest_word(cell: str) -> int:
-    return max(map(len, cell.split()), default=0)
 
 
 def _row_lines(cells: Sequence[str], widths: Sequence[int], sides: Sequence[Side]) -> Iterator[str]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from flows.cli.output import Cell, format_bytes, print_json, print_pairs, print_table, say_status
-from flows.cli.shared_options import AsJson
+from flows.cli.shared_options import AsJson, described
 
 if TYPE_CHECKING:
     from catalog.deletion import Doomed
@@ -17,21 +17,23 @@ DAMAGED = 1
 MOST_LISTED = 200
 """Rows of a table on the terminal; --json has all."""
 
+Days = Annotated[float, typer.Option(min=0.0, max=36500.0)]
+ForReal = Annotated[bool, typer.Option("--delete")]
+
 app = typer.Typer()
 
-Days = Annotated[
-    float,
-    typer.Option(
-        min=0.0, max=36500.0, help="Number of days that count as recent; 0.5 is half a day."
-    ),
-]
-ForReal = Annotated[
-    bool,
-    typer.Option("--delete", help="Delete it; otherwise what would be deleted is only listed."),
-]
+WORDS = """
+days: Number of days that count as recent; 0.5 is half a day.
+for_real: Delete it; otherwise what would be deleted is only listed.
+selection: What is taken along: run ids, latest (the newest run of all), scenes, or kind/digest of
+  artefacts; or the beginnings of ids.
+out: The tar file to write.
+archive: A tar file that `catalog export` wrote.
+"""
 
 
 @app.command("gc")
+@described(WORDS)
 def collect(days: Days = 30.0, for_real: ForReal = False, as_json: AsJson = False) -> None:
     """List, or delete, what nothing recent needs: no run, no fleet, no asset, no work.
 
@@ -52,10 +54,16 @@ def collect(days: Days = 30.0, for_real: ForReal = False, as_json: AsJson = Fals
         delete(store, doomed)
     if as_json:
         print_json(doomed_as_json(doomed, is_deleted=for_real))
-        return
-    note = "" if for_real or not doomed else "nothing was deleted: --delete does"
-    what = "deleted from" if for_real else "not needed in"
-    print_doomed(f"{what} {store.name}", doomed, note)
+    else:
+        what, note = _fate(for_real=for_real)
+        print_doomed(f"{what} {store.name}", doomed, note if doomed else "")
+
+
+def _fate(*, for_real: bool) -> tuple[str, str]:
+    """What became of what is listed, and a note."""
+    if for_real:
+        return "deleted from", ""
+    return "not needed in", "nothing was deleted: --delete does"
 
 
 def doomed_as_json(doomed: "Sequence[Doomed]", *, is_deleted: bool) -> dict[str, Any]:
@@ -69,15 +77,14 @@ def print_doomed(what: str, doomed: "Sequence[Doomed]", note: str = "") -> None:
     """A table of what goes out of a store, the largest first."""
     largest = sorted(doomed, key=lambda one: -one.num_bytes)[:MOST_LISTED]
     left = len(doomed) - len(largest)
-    notes = [*([f"and {left} smaller ones"] if left else []), *([note] if note else [])]
-    rows: list[list[Cell]] = [
-        [one.table[:-1], one.row_id, format_bytes(one.num_bytes)] for one in largest
-    ]
+    notes = "\n".join(filter(None, [f"and {left} smaller ones" if left else "", note]))
+    rows = [[one.table[:-1], one.row_id, format_bytes(one.num_bytes)] for one in largest]
     title = f"{format_bytes(sum(one.num_bytes for one in doomed))} {what}"
-    print_table(title, ["what", "name", "size"], rows, "\n".join(notes), num_text_columns=2)
+    print_table(title, ["what", "name", "size"], rows, notes, num_text_columns=2)
 
 
 @app.command("compact")
+@described(WORDS)
 def compact_tables(as_json: AsJson = False) -> None:
     """Write the many small files of each table together: reading them gets faster.
 
@@ -103,6 +110,7 @@ def compact_tables(as_json: AsJson = False) -> None:
 
 
 @app.command("vacuum")
+@described(WORDS)
 def vacuum_tables(days: Days = 30.0, for_real: ForReal = False, as_json: AsJson = False) -> None:
     """Delete the files of tables that only versions older than some days need.
 
@@ -121,12 +129,12 @@ def vacuum_tables(days: Days = 30.0, for_real: ForReal = False, as_json: AsJson 
     if as_json:
         print_json({"is_deleted": for_real, "num_files": counts})
     else:
-        note = "" if for_real else "nothing was deleted: --delete does"
-        what = "deleted from" if for_real else "not needed in"
+        what, note = _fate(for_real=for_real)
         print_pairs(f"files {what} tables of {store.name}", counts, note)
 
 
 @app.command("verify")
+@described(WORDS)
 def verify_store(as_json: AsJson = False) -> None:
     """Read every byte of the store and name what is not as it was written; then exit with 1.
 
@@ -162,15 +170,10 @@ def verify_store(as_json: AsJson = False) -> None:
 
 
 @app.command("export")
+@described(WORDS)
 def export_selection(
-    selection: Annotated[
-        list[str],
-        typer.Argument(
-            help="What is taken along: run ids, latest (the newest run of all), scenes, or "
-            "kind/digest of artefacts; or the beginnings of ids."
-        ),
-    ],
-    out: Annotated[Path, typer.Option(help="The tar file to write.")],
+    selection: list[str],
+    out: Annotated[Path, typer.Option()],
     as_json: AsJson = False,
 ) -> None:
     """Write runs with all that they need, or scenes, or artefacts, into one tar.
@@ -192,10 +195,8 @@ def export_selection(
 
 
 @app.command("import")
-def import_selection(
-    archive: Annotated[Path, typer.Argument(help="A tar file that `catalog export` wrote.")],
-    as_json: AsJson = False,
-) -> None:
+@described(WORDS)
+def import_selection(archive: Path, as_json: AsJson = False) -> None:
     """Take what `catalog export` wrote into this store; what is there already stays.
 
     Example: lidarpainter catalog import night.tar
@@ -212,6 +213,7 @@ def import_selection(
 
 
 @app.command("stale")
+@described(WORDS)
 def stale(as_json: AsJson = False) -> None:
     """Show which runs today's code would make otherwise, why, and what redoing them takes.
 
@@ -257,10 +259,8 @@ def stale(as_json: AsJson = False) -> None:
 
 
 @app.command("cost")
-def cost(
-    scene: Annotated[str, typer.Argument(help="Scene as dataset/sequence, such as pandaset/002.")],
-    as_json: AsJson = False,
-) -> None:
+@described(WORDS)
+def cost(scene: str, as_json: AsJson = False) -> None:
     """Show what a scene has cost: attempts of fleets by cause, and stages as computed.
 
     Money follows from money_per_hour in the table `budget` of the fleet's manifest.

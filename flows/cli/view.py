@@ -9,30 +9,25 @@ import typer
 
 from flows.cli.output import clear_status
 from flows.cli.shared_options import (
-    FollowedCamera,
-    FollowedFrames,
-    RunName,
+    described,
     named_run,
     parse_frames,
 )
 
+WORDS = """
+view.camera: Camera whose path is followed; the first one fitted to if absent.
+port: Port to listen on, on this machine alone; a free one if absent.
+browser: Open a browser on it, or only print its address.
+"""
 
+
+@described(WORDS)
 def view(
-    run: RunName,
-    camera: FollowedCamera = None,
-    frames: FollowedFrames = None,
-    port: Annotated[
-        int | None,
-        typer.Option(
-            min=1, max=65535, help="Port to listen on, on this machine alone; a free one if absent."
-        ),
-    ] = None,
-    browser: Annotated[
-        bool,
-        typer.Option(
-            "--browser/--no-browser", help="Open a browser on it, or only print its address."
-        ),
-    ] = True,
+    run: str,
+    camera: str | None = None,
+    frames: str | None = None,
+    port: Annotated[int | None, typer.Option(min=1, max=65535)] = None,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser")] = True,
 ) -> None:
     """Look at a finished run in a browser, live, until Ctrl-C.
 

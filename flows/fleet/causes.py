@@ -25,7 +25,7 @@ LONGEST_REASON = 500
 
 def cause_of(error: Exception) -> tuple[Cause, str]:
     """Why an attempt ended, and one line about it."""
-    cause = _cause(error)
+    cause = next((cause for cause, fits in RULES if fits(error)), "error")
     text = " ".join(str(error).split())[:LONGEST_REASON]
     is_ours = isinstance(error, (LidarPainterError, CatalogError))
     name = type(error).__name__
@@ -48,10 +48,6 @@ def _is_of_system(error: Exception) -> bool:
 
 def _is_bad_input(error: Exception) -> bool:
     return isinstance(error, LidarPainterError) and not isinstance(error, OF_THIS_MACHINE)
-
-
-def _cause(error: Exception) -> Cause:
-    return next((cause for cause, fits in RULES if fits(error)), "error")
 
 
 RULES: tuple[tuple[Cause, Callable[[Exception], bool]], ...] = (

@@ -26,7 +26,6 @@ from flows.fleet.asked import wishes
 from flows.fleet.flow_runs import (
     FIRING,
     WORK,
-    alive,
     api_lost,
     close_lost_runs,
     open_runs,
@@ -68,7 +67,7 @@ def fleet(manifest: str, store: str, workers: int, accept_stale: bool = False) -
     found = open_store(store)
     found.make()
     ledger = FleetLedger(found)
-    with alive(ledger, this_run.id):
+    with ledger.flow_runs.kept(this_run.id):
         for line in [*ledger.reconcile(), *close_lost_runs(ledger)]:
             say(line)
         _drop_late_firings(ledger, asked.name)
@@ -94,7 +93,7 @@ def fleet_work(fleet: str, store: str) -> None:
     """
     prepare_environment(log_level=None)
     ledger = FleetLedger(open_store(store))
-    with alive(ledger, this_run.id):
+    with ledger.flow_runs.kept(this_run.id):
         Worker(ledger=ledger, fleet=fleet, work=make_sequence, say=get_run_logger().info).run()
 
 

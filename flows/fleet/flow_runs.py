@@ -17,11 +17,10 @@ from urllib.request import Request, urlopen
 
 import httpx
 
-from catalog.errors import CatalogError, ConflictError
+from catalog.errors import CatalogError
 from catalog.fleets import FleetLedger
 from catalog.leases import Lease, Leases
 from catalog.retries import attempt_id
-from flows.fleet.heartbeat import Heartbeat
 
 if TYPE_CHECKING:
     from prefect.client.schemas.objects import FlowRun
@@ -72,20 +71,6 @@ def is_of_lost_api(error: BaseException | None) -> bool:
             return True
         error = error.__cause__ or error.__context__
     return False
-
-
-@contextmanager
-def alive(ledger: FleetLedger, flow_run_id: str) -> Iterator[None]:
-    """Give a flow run's sign of life while the block runs."""
-    lease = ledger.flow_runs.take(flow_run_id, above=0, facts={})
-    if lease is None:
-        raise ConflictError(f"flow run {flow_run_id} is under way already")
-    beat = Heartbeat(ledger.flow_runs, lease, limit_s=None, on_lost=_nothing, on_late=_nothing)
-    try:
-        with beat:
-            yield
-    finally:
-        ledger.flow_runs.give_back(beat.lease)
 
 
 def close_lost_runs(ledger: FleetLedger) -> list[str]:
@@ -161,7 +146,3 @@ def _api_errors() -> Iterator[None]:
         if is_of_lost_api(error):
             raise ApiLostError(f"Prefect's API does not answer: {error}") from error
         raise
-
-
-def _nothing() -> None:
-    """What becomes of a worker whose flow run was closed: it works on, its leases count."""

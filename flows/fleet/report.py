@@ -60,8 +60,7 @@ class FleetRecord:
         """Figures of held-out views after the last round, by run and name."""
         runs = {row["run_id"] for row in self.rows if row["run_id"]}
         found: dict[str, dict[str, float]] = {}
-        judged = self.ledger.store.tables.arrow("metrics", where={"run_id": runs})
-        for row in judged.to_pylist():
+        for row in self.ledger.store.tables.rows("metrics", where={"run_id": runs}):
             is_shown = row["protocol"] == "recorded" and row["variant"] in FINAL_VARIANTS
             if is_shown and row["name"] in QUALITY and row["value"] is not None:
                 found.setdefault(row["run_id"], {})[row["name"]] = row["value"]
@@ -100,6 +99,9 @@ def fleet_page(ledger: FleetLedger, fleet: str) -> Report:
     slowest = sorted(made, key=lambda row: -(row["seconds"] or 0.0))
     shown = [("worst", row) for row in worst[:NUM_PICTURED]]
     shown += [("slowest", row) for row in slowest[:NUM_PICTURED]]
+    quality = {
+        name: [one[name] for one in record.quality.values() if name in one] for name in QUALITY
+    }
     pictures = [record.picture(row, f"{what}: {_facts(record, row)}") for what, row in shown]
     return Report(
         title=f"Fleet {fleet}",
@@ -110,7 +112,7 @@ def fleet_page(ledger: FleetLedger, fleet: str) -> Report:
         tables=[
             *_failures(record),
             _causes(record),
-            _distribution("Quality of held-out views", _quality_rows(record)),
+            _distribution("Quality of held-out views", quality),
             _distribution("The planner: how far off, as a share of what it took", _errors(record)),
             _scenes("Worst scenes", record, worst),
             _scenes("Slowest scenes", record, slowest),
@@ -217,10 +219,6 @@ def _causes(record: FleetRecord) -> Table:
         )
     columns = ["ended as", "attempts", "h", "CPU h", "most memory, GiB", "stored, GB", "money"]
     return _table("Attempts and what they cost", columns, cells)
-
-
-def _quality_rows(record: FleetRecord) -> dict[str, list[float]]:
-    return {name: [one[name] for one in record.quality.values() if name in one] for name in QUALITY}
 
 
 def _errors(record: FleetRecord) -> dict[str, list[float]]:

@@ -36,7 +36,9 @@ def fleet_status(ledger: FleetLedger, fleet: str) -> dict[str, Any]:
         "store": ledger.store.name,
         "counts": counts,
         "held_back": (over_budget(rows) or lacks_disk(ledger, budget)) if is_open else None,
-        "sequences": [_sequence(row) for row in rows],
+        "sequences": [
+            {"scene": row["scene_id"], **{name: row[name] for name in SHOWN}} for row in rows
+        ],
         "cost": {
             "seconds": sum(row["seconds"] or 0.0 for row in attempts),
             "cpu_seconds": sum(row["cpu_seconds"] or 0.0 for row in attempts),
@@ -54,7 +56,3 @@ def counts_of(rows: Sequence[Row]) -> dict[str, int]:
 def is_over(status: Mapping[str, Any]) -> bool:
     """Whether every sequence is done, or set aside with a reason."""
     return sum(status["counts"][state] for state in ENDED) == len(status["sequences"])
-
-
-def _sequence(row: Row) -> dict[str, Any]:
-    return {"scene": row["scene_id"], **{name: row[name] for name in SHOWN}}

@@ -193,7 +193,7 @@ class Worker:
 
 
 class EventLog(ProgressListener):
-    """Writes what a worker says and what its stages do as JSON lines.
+    """Writes what a worker says, and when stages begin and end, as JSON lines.
 
     {"time": "...", "fleet": "...", "worker": "...", "event": "stage-ended",
      "scene": "pandaset/002", "run": "...", "stage": "fit", "seconds": 61.2, "is_new": true}
@@ -210,9 +210,6 @@ class EventLog(ProgressListener):
     def started(self, stage: str) -> None:
         """Enter that a stage begins."""
         self._enter("stage-began", stage=stage)
-
-    def advanced(self, stage: str, done: float, total: float, note: str) -> None:
-        """Enter nothing: a stage says this many times a second."""
 
     def waiting(self, stage: str, process_id: str) -> None:
         """Enter that another process makes the same."""

@@ -101,15 +101,15 @@ def _fronts(groups: Sequence[Group], quality: str) -> list[str]:
         says.append(f"{scene}, {LABELS[quality]}: front {', '.join(names)}; knee {names[bend]}")
         preset = next((one for one in found if one.configuration == DEFAULT), None)
         if preset is not None:
-            better = [one.configuration for one in found if _beats(one, preset, quality)]
+            cost, value = preset.figures[TIME], preset.figures[quality]
+            better = [
+                one.configuration
+                for one in found
+                if beats(one.figures[TIME], one.figures[quality], cost, value)
+            ]
             told = ", ".join(better) or "nothing"
             says.append(f"{scene}, {LABELS[quality]}: faster and better than the preset: {told}")
     return says
-
-
-def _beats(one: Group, other: Group, quality: str) -> bool:
-    ours, theirs = one.figures, other.figures
-    return beats(ours[TIME], ours[quality], theirs[TIME], theirs[quality])
 
 
 def _returns(groups: Sequence[Group], factor: Factor, quality: str) -> list[str]:

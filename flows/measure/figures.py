@@ -132,11 +132,6 @@ def qualities(metrics: Mapping[MetricName, float]) -> dict[str, float]:
     }
 
 
-def figures_of(point: Point) -> dict[str, float]:
-    """Costs and qualities of one point."""
-    return {**point.cost, **qualities(point.metrics)}
-
-
 @dataclass(frozen=True, kw_only=True)
 class Group:
     """The points of one configuration on one scene, over all seeds."""
@@ -153,7 +148,7 @@ def groups_of(points: Sequence[Point]) -> list[Group]:
     found: dict[tuple[str, str], dict[int, dict[str, float]]] = {}
     for point in points:
         trials = found.setdefault((point.scene, point.configuration), {})
-        trials[point.seed] = figures_of(point)
+        trials[point.seed] = {**point.cost, **qualities(point.metrics)}
     return [
         Group(scene=scene, configuration=name, figures=_spreads(trials), trials=trials)
         for (scene, name), trials in found.items()

@@ -157,11 +157,7 @@ class Publisher:
         reasons: Mapping[str, str],
         known: Figures,
     ) -> Figures:
-        """What the record holds of a table.
-
-        Raises:
-            MissingFigureError: a figure is not there.
-        """
+        """What the record holds of a table."""
         figures: dict[str, dict[str, Any]] = {}
         for cell in cells:
             for name in cell.points:

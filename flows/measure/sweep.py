@@ -1,11 +1,10 @@
 """A sweep: configurations on scenes with seeds, each point a sequence of a fleet.
 
-So it has what a fleet has: what two points share is computed once, workers may die, the same
-command goes on, and further points join those that are done. Figures come from the catalog alone.
+It has what a fleet has: what two points share is computed once, workers may die, the same command
+goes on, and further points join those that are done. Figures come from the catalog alone.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from catalog.errors import CatalogError, ConflictError
@@ -16,7 +15,7 @@ from catalog.store import Store
 from catalog.tables import Row
 from flows.fleet.asked import Asked, wishes
 from flows.fleet.local_workers import run_workers, starter
-from flows.fleet.manifest import STORED, Configuration, Manifest, Publication, Source
+from flows.fleet.manifest import Manifest
 from flows.fleet.planner import Planner
 from flows.fleet.status import counts_of
 from tasks.opened import open_scene
@@ -25,37 +24,8 @@ THREADS = 1
 """Threads of a worker that makes points."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Sweep:
-    """What is to be compared, on what."""
-
-    name: str
-    """Name of the fleet."""
-    scenes: tuple[str, ...]
-    cameras: tuple[str, ...] | None
-    preset: str
-    settings: tuple[str, ...]
-    """Settings that all configurations have, as `key=value`."""
-    configurations: tuple[Configuration, ...]
-    seeds: tuple[int, ...]
-    publish: tuple[Publication, ...] = ("scores",)
-
-    @property
-    def manifest(self) -> Manifest:
-        """The sweep as the manifest of a fleet."""
-        return Manifest(
-            name=self.name,
-            preset=self.preset,
-            set=self.settings,
-            source=(Source(dataset=STORED, scenes=self.scenes, cameras=self.cameras),),
-            configuration=self.configurations,
-            fit_seeds=self.seeds,
-            publish=self.publish,
-        )
-
-
 def run_sweep(
-    sweep: Sweep, store: Store, *, workers: int, accept_stale: bool, say: Callable[[str], None]
+    sweep: Manifest, store: Store, *, workers: int, accept_stale: bool, say: Callable[[str], None]
 ) -> list[Point]:
     """Make the points that are not there yet; returns all.
 
@@ -64,9 +34,7 @@ def run_sweep(
     Raises:
         CatalogError: a point could not be made; the others are done.
     """
-    points, missing = make_points(
-        sweep.manifest, store, workers=workers, accept_stale=accept_stale, say=say
-    )
+    points, missing = make_points(sweep, store, workers=workers, accept_stale=accept_stale, say=say)
     if missing:
         raise CatalogError(undone(points, missing))
     return points
@@ -107,11 +75,7 @@ def make_points(
 
 
 def _require_asked(wanted: Sequence[Wish], ledger: FleetLedger) -> None:
-    """See that a fleet is still asked for as it was.
-
-    Raises:
-        ConflictError: it is not.
-    """
+    """See that a fleet is still asked for as it was."""
     fleet, store = wanted[0].fleet, ledger.store
     asked = {(wish.sequence_id, wish.asked_digest) for wish in wanted}
     found = {(row["sequence_id"], row["asked_digest"]) for row in ledger.rows(fleet)}
@@ -139,9 +103,9 @@ def was_asked(name: str, store: Store) -> bool:
     return any(row["fleet"] == name for row in store.tables.rows(SEQUENCES))
 
 
-def foretold(sweep: Sweep, store: Store, times: Mapping[str, int]) -> str:
+def foretold(sweep: Manifest, store: Store, times: Mapping[str, int]) -> str:
     """What the points of each scene take so many times over, in words."""
-    wanted = wishes(sweep.manifest, Path())
+    wanted = wishes(sweep, Path())
     return _took(store, [(wish.asked, times[wish.scene_id]) for wish in wanted])
 
 

@@ -61,9 +61,7 @@ Donor = FinishedRun | LibraryActor | Path
 def donor_of(store: Store, source: ActorSource) -> Donor | None:
     """What an actor is taken out of; None is the edited run itself.
 
-    Args:
-        store: the store that the source names, or that of the edited run.
-        source: which actor, of what.
+    The store is the one that the source names, or that of the edited run.
 
     Raises:
         ConfigError: a file is not there, an asset is no actor, or a store is named without a run.

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -13,7 +13,7 @@ from catalog.store import Store, open_store
 from lidarpainter_models.conditioning.scene_styles import styled_scene
 from lidarpainter_models.conditioning.settings import ConditionConfig
 from lidarpainter_models.editing.actor_models import ActorModel
-from lidarpainter_models.editing.edits import Encounter, edited, encounters
+from lidarpainter_models.editing.edits import edited, encounters
 from lidarpainter_models.editing.filled_scenes import filled, masked_observations
 from lidarpainter_models.editing.joins import OtherRun
 from lidarpainter_models.editing.operations import (
@@ -134,28 +134,7 @@ class Edits:
         return self.store if source.store is None else open_store(source.store)
 
 
-def checked_encounters(edits: Edits) -> list[Encounter]:
-    """Do the edits once, keep nothing, and say what those who were moved run into.
-
-    Raises:
-        ConfigError: an operation cannot be done.
-    """
-    return encounters(edits.world)
-
-
-def edit_build(
-    edits: Edits, conditions: ConditionConfig, painter: PainterChoice, device: torch.device
-) -> partial[dict[str, Any]]:
-    """Writes the edited scene."""
-    return partial(_build, edits=edits, conditions=conditions, painter=painter, device=device)
-
-
-def observations_build(edits: Edits) -> partial[dict[str, Any]]:
-    """Writes what may be seen of it."""
-    return partial(_build_observations, edits=edits)
-
-
-def _build(
+def build_edited(
     place: Workplace,
     _progress: Progress,
     *,
@@ -164,6 +143,7 @@ def _build(
     painter: PainterChoice,
     device: torch.device,
 ) -> dict[str, Any]:
+    """Write the edited scene."""
     world = edits.world
     paints = painter.name != NO_PAINTER
     found = filled(world, conditions, painter.load(device) if paints else None)
@@ -194,7 +174,8 @@ def _styled(scene: GaussianScene, edits: Edits, lamps: tuple[LampChange, ...]) -
     return replace(scene, style=replace(scene.style, lamps=(*known, *lamps)))
 
 
-def _build_observations(place: Workplace, _progress: Progress, *, edits: Edits) -> dict[str, Any]:
+def build_observations(place: Workplace, _progress: Progress, *, edits: Edits) -> dict[str, Any]:
+    """Write what may be seen of the edited scene."""
     world = edits.world
     seen = masked_observations(world)
     save_observations(place.output, seen)

@@ -16,14 +16,12 @@ from lidarpainter_models.storage.whole_files import write_whole
 from tasks.exports.places import new_folder
 from tasks.opened import opened
 from tasks.progress import listener
-from tasks.stages import stage_task
 from tasks.stored import load_observations
 from tasks.views.render import ViewedRun, followed_paths
 
 STAGE = "export"
 
 
-@stage_task
 def export_dataset(
     viewed: ViewedRun, request: ViewRequest, row: ExportFormat, out: Path
 ) -> dict[str, Any]:

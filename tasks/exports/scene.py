@@ -16,7 +16,6 @@ from tasks.exports.places import new_folder
 from tasks.opened import opened
 from tasks.progress import listener
 from tasks.specs import FittedRef, RunSpec
-from tasks.stages import stage_task
 from tasks.stored import load_observations, load_scene
 
 STAGE = "export"
@@ -62,7 +61,6 @@ class SceneRequest:
             raise ConfigError(f"{out.name}: expected a name in {', '.join(row.endings)}")
 
 
-@stage_task
 def export_scene(
     run: RunSpec, fitted: FittedRef, row: ExportFormat, request: SceneRequest, out: Path
 ) -> dict[str, Any]:

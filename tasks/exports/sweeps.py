@@ -10,7 +10,6 @@ from tasks.json_files import write_json
 from tasks.opened import opened
 from tasks.progress import listener
 from tasks.specs import RunSpec
-from tasks.stages import stage_task
 
 STAGE = "export"
 INDEX_FILE = "sweeps.json"
@@ -18,7 +17,6 @@ ENDINGS = {"lidar": ".pcd", "lidar-bin": ".pcd.bin"}
 """How the file of a sweep ends."""
 
 
-@stage_task
 def export_sweeps(
     run: RunSpec, row: ExportFormat, frames: slice | None, out: Path
 ) -> dict[str, Any]:

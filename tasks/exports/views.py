@@ -6,13 +6,11 @@ from typing import Any
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.export.view_requests import ViewRequest
 from tasks.exports.places import new_folder
-from tasks.stages import stage_task
 from tasks.views.render import ViewedRun, followed_paths, write_paths
 
 VIDEO_ENDING = ".mp4"
 
 
-@stage_task
 def export_video(viewed: ViewedRun, request: ViewRequest, out: Path) -> dict[str, Any]:
     """Write a film: to a name in `.mp4` all cameras together, else a folder with one of each.
 
@@ -36,7 +34,6 @@ def export_video(viewed: ViewedRun, request: ViewRequest, out: Path) -> dict[str
     return {"path": str(out), **_without_collisions(made)}
 
 
-@stage_task
 def export_images(viewed: ViewedRun, request: ViewRequest, out: Path) -> dict[str, Any]:
     """Write depth or semantics of every view into a new folder, a folder for each camera.
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import lidarpainter_models
-from catalog.records import SceneRecord
 from catalog.store import Store, open_store
 from lidarpainter_models.errors import ConfigError, SceneError
 from lidarpainter_models.readers import ingest_scene, scene_id_of
@@ -103,21 +102,21 @@ def record_scene(store: Store, path: Path) -> dict[str, Any]:
     """Enter the scene whose folder is at a path of the store into the catalog; returns its row."""
     scene = open_scene(store, f"{path.parent.name}/{path.name}")
     times_ns = scene.frame_timestamps_ns
-    row = SceneRecord(
-        scene_id=f"{scene.dataset}/{scene.sequence}",
-        dataset=scene.dataset,
-        sequence=scene.sequence,
-        content_digest=scene.content_digest,
-        licence=scene.manifest["licence"],
-        num_frames=len(scene.frame_indices),
-        num_views=len(scene.views),
-        cameras=scene.camera_names,
-        num_points=sum(sweep.num_points for sweep in scene.sweeps),
-        num_actors=len(scene.tracks),
-        num_moving_actors=sum(track.is_moving for track in scene.tracks),
-        duration_s=float(times_ns[-1] - times_ns[0]) / NS_PER_S,
-        num_bytes=sum(scene.manifest["files"].values()),
-        software_version=lidarpainter_models.__version__,
-    ).row()
+    row = {
+        "scene_id": f"{scene.dataset}/{scene.sequence}",
+        "dataset": scene.dataset,
+        "sequence": scene.sequence,
+        "content_digest": scene.content_digest,
+        "licence": scene.manifest["licence"],
+        "num_frames": len(scene.frame_indices),
+        "num_views": len(scene.views),
+        "cameras": list(scene.camera_names),
+        "num_points": sum(sweep.num_points for sweep in scene.sweeps),
+        "num_actors": len(scene.tracks),
+        "num_moving_actors": sum(track.is_moving for track in scene.tracks),
+        "duration_s": float(times_ns[-1] - times_ns[0]) / NS_PER_S,
+        "num_bytes": sum(scene.manifest["files"].values()),
+        "software_version": lidarpainter_models.__version__,
+    }
     store.tables.merge("scenes", [row])
     return row

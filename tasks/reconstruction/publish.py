@@ -9,7 +9,7 @@ from typing import Any
 import lidarpainter_models
 from catalog.artefacts import ArtefactRef
 from catalog.digests import canonical_json, plain
-from catalog.records import MetricRecord, RunRecord, RunStatus, metric_rows
+from catalog.records import RunRecord, RunStatus, metric_row
 from catalog.store import Store, open_store
 from lidarpainter_models.evaluation.score_tables import metric_values, values_by_view
 from tasks.json_files import finite_or_none
@@ -97,20 +97,21 @@ def record_scores(
     store: Store, run_id: str, scene_id: str, scores: Mapping[str, Mapping[str, Any]]
 ) -> None:
     """Enter every number of some evaluations, by variant (`unpainted`, `painted`, ...)."""
-    records = [
-        MetricRecord(
-            run_id=run_id,
-            scene_id=scene_id,
-            protocol=protocol,
-            trajectory=trajectory,
-            variant=variant,
-            name=name,
-            value=value,
-            reason=reason,
-            by_view=by_view.get((protocol, trajectory, name)),
-        )
-        for variant, found in scores.items()
-        for by_view in [values_by_view(found)]
-        for protocol, trajectory, name, value, reason in metric_values(found)
-    ]
-    store.tables.merge("metrics", metric_rows(records))
+    rows = []
+    for variant, found in scores.items():
+        by_view = values_by_view(found)
+        for protocol, trajectory, name, value, reason in metric_values(found):
+            views = by_view.get((protocol, trajectory, name))
+            row = metric_row(
+                run_id,
+                scene_id,
+                variant,
+                protocol=protocol,
+                trajectory=trajectory,
+                name=name,
+                value=value,
+                reason=reason,
+                by_view=None if views is None else canonical_json(views),
+            )
+            rows.append(row)
+    store.tables.merge("metrics", rows)

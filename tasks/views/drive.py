@@ -19,7 +19,6 @@ from tasks.evaluation.shown import view_time_painting
 from tasks.opened import opened
 from tasks.progress import listener
 from tasks.specs import FittedRef
-from tasks.stages import stage_task
 from tasks.stored import load_scene
 from tasks.views.render import ViewedRun, followed_paths
 
@@ -34,7 +33,6 @@ BESIDE = ("lateral:2", "lateral:-2", RECORDED)
 that leads into no wall."""
 
 
-@stage_task
 def write_page(viewed: ViewedRun, request: ViewRequest, out: Path) -> dict[str, Any]:
     """Write a page that drives the recorded path, then the one asked for or one beside it.
 

@@ -19,7 +19,6 @@ from tasks.json_files import write_json
 from tasks.opened import opened
 from tasks.progress import listener
 from tasks.specs import FittedRef, RunSpec
-from tasks.stages import stage_task
 from tasks.stored import load_observations, load_scene
 
 STAGE = "render"
@@ -44,7 +43,6 @@ class ViewedRun:
     """Another fitted scene of the same log, which is shown to the left."""
 
 
-@stage_task
 def render(viewed: ViewedRun, request: ViewRequest, out: Path) -> dict[str, Any]:
     """Write what is wanted for every recorded moment, and where each image was taken.
 

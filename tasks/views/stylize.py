@@ -7,13 +7,11 @@ from lidarpainter_models.export.styled_views import StyleRequest, write_styled
 from lidarpainter_models.export.view_requests import ViewRequest, only_path
 from tasks.json_files import write_json
 from tasks.progress import listener
-from tasks.stages import stage_task
 from tasks.views.render import POSES_FILE, ViewedRun, followed_paths
 
 STAGE = "stylize"
 
 
-@stage_task
 def stylize(
     viewed: ViewedRun, request: ViewRequest, style: StyleRequest, out: Path
 ) -> dict[str, Any]:

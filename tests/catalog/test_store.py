@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 import pytest
 
 from catalog.errors import CatalogError, UnknownRecordError
-from catalog.records import MetricRecord, RunRecord, run_id_of
+from catalog.records import RunRecord, metric_row, run_id_of
 from catalog.store import STORE_ENVIRONMENT, open_store
 
 
@@ -114,7 +114,7 @@ def test_a_metric_has_one_id_per_place_and_variant():
             "name": "psnr",
             "value": 21.5,
         }
-        return MetricRecord(**{**values, **changes}).row()
+        return metric_row(**{**values, **changes})
 
     assert row(value=3.0)["metric_id"] == row()["metric_id"]
     assert row(variant="unpainted")["metric_id"] != row()["metric_id"]

@@ -5,7 +5,7 @@ import signal
 
 import psutil
 import pytest
-from commands import settings
+from commands import SMALL_TRAINING, settings
 from process_ends import still_running
 from random_pairs import write_pairs
 from small_pandaset import PandasetFolder
@@ -17,12 +17,6 @@ from flows.interruption import MESSAGE
 
 LONGEST_S = 2.0
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
-SMALL_TRAINING = settings(
-    "training.network.widths=8,8,8",
-    "training.network.blocks=1,1,1",
-    "training.augmentation.crop_px=32",
-    "training.log_every_steps=1",
-)
 
 
 def reconstruction(*changes):

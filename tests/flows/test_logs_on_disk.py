@@ -1,7 +1,6 @@
 """Logs as downloaded come into the store by the command, and the doctor looks at them."""
 
 import json
-from pathlib import Path
 
 import cv2
 import pytest
@@ -77,24 +76,3 @@ def test_doctor_looks_at_a_dataset_a_scene_and_the_setup(store, tmp_path):
     assert setup["is_fit"]
     names = {one["name"] for one in setup["findings"]}
     assert {"python", "torch", "kernels", "device", "store", "painter nano"} <= names
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (("ingest", "kitti", "."), "dataset 'kitti' is not known"),
-        (("ingest", "pandaset", "gone"), "no such folder"),
-        (("ingest", "pandaset", "."), "no pandaset sequence found"),
-        (("doctor", "pandaset/404"), "no store at"),
-        (("doctor", "waymo", "gone"), "no such folder"),
-    ],
-)
-def test_what_is_not_on_disk_is_one_line_and_code_two(
-    words, expected, store, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    answer = call(*words, store=store)
-    assert (answer.code, answer.out) == (2, "")
-    assert expected in answer.err
-    assert answer.err.count("\n") == 1
-    assert list(Path.cwd().iterdir()) == []

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from commands import settings, succeed
+from commands import SMALL_TRAINING, settings, succeed
 from random_pairs import write_pairs
 from tiny_street import SCENE, WIDTH_PX
 
@@ -22,13 +22,6 @@ PLAN = {
 }
 HARVEST = settings(
     f"street_plans=[{json.dumps(PLAN)}]", f"harvest.observations.width_px={WIDTH_PX}"
-)
-TINY_NANO = settings(
-    "training.network.widths=8,8,8",
-    "training.network.blocks=1,1,1",
-    "training.augmentation.crop_px=32",
-    "training.batch_size=2",
-    "training.log_every_steps=1",
 )
 
 
@@ -49,7 +42,7 @@ def pairs(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def trained(tiny_run, pairs):
-    words = ("--pairs", pairs / "learn", "--steps", 2, "--held-back", 0.3, *TINY_NANO)
+    words = ("--pairs", pairs / "learn", "--steps", 2, "--held-back", 0.3, *SMALL_TRAINING)
     out = pairs / "trained"
     return succeed("painter", "train", *words, "--out", out, "--json", store=tiny_run.store).json
 
@@ -75,7 +68,14 @@ def test_train_learns_judges_itself_and_enters_the_catalog(tiny_run, trained, pa
     assert trained["record"]["steps"] == 2
     assert trained["held_back"]["total"]["num_pairs"] == 2  # 0.3 of four targets, rounded up
     rows = succeed("catalog", "list", "painters", "--json", store=tiny_run.store).json["rows"]
-    assert trained["painter_id"] in [row["painter_id"] for row in rows]
+    (row,) = [row for row in rows if row["painter_id"] == trained["painter_id"]]
+    record = json.loads(weights.with_suffix(".json").read_text("utf-8"))
+    assert row["record"]["training_digest"] == record["training_digest"]
+    assert record["held_back_scores"]["total"]["num_pairs"] == 2
+    # the pairs it learnt from judge it never
+    words = ("--painter", weights, "--pairs", pairs / "learn", "--json")
+    judged = succeed("painter", "evaluate", *words, store=tiny_run.store).json["pairs"]
+    assert (judged["learn"]["num_judged"], judged["learn"]["num_left_out"]) == (2, 2)
 
 
 def test_info_of_every_painter_that_needs_no_download(trained):
@@ -110,11 +110,14 @@ def test_evaluate_judges_painters_on_pairs_and_on_views_of_a_run(
 
 
 def test_ablate_trains_every_variant_and_judges_all_alike(tiny_run, pairs):
-    words = ("--pairs-train", pairs / "learn", "--pairs-test", pairs / "judge", "--table", "skips")
-    words = (*words, "--steps", 1, *TINY_NANO)
+    words = ("--pairs-train", pairs / "learn", "--pairs-test", pairs / "judge")
+    words = (*words, "--table", "skips,fusion", "--steps", 1, *SMALL_TRAINING)
     found = succeed("painter", "ablate", *words, "--json", store=tiny_run.store).json
-    rows = found["tables"]["skips"]
-    assert set(rows) > {"none", "overlay", "warp"}
+    rules, full = ["none", "overlay", "warp"], "render+lidar+warp"
+    assert list(found["tables"]["skips"]) == [*rules, full, f"{full}, no skips"]
+    assert list(found["tables"]["fusion"]) == [*rules, full, f"{full}, direct"]
+    shown = {label for rows in found["tables"].values() for label in rows.values()}
+    assert set(found["painters"]) == shown
     assert {one["total"]["num_pairs"] for one in found["painters"].values()} == {2}
     assert all(Path(path).is_file() for path in found["weights"].values())
     assert "no skips" in succeed("painter", "ablate", *words, store=tiny_run.store).out

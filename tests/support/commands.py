@@ -45,9 +45,29 @@ def succeed(*words, store=None):
     return answer
 
 
+def refuse(*words, store=None):
+    """Run a command that must end in one complaint and code 2, nothing else; the complaint."""
+    answer = call(*words, store=store)
+    assert (answer.code, answer.out) == (2, ""), answer
+    (line,) = [line for line in answer.err.splitlines() if line.startswith("lidarpainter: ")]
+    assert "unexpected" not in line
+    assert "Traceback" not in answer.err
+    return line
+
+
 def settings(*assignments):
     """The words of `--set`."""
     return [word for assignment in assignments for word in ("--set", assignment)]
+
+
+SMALL_TRAINING = settings(
+    "training.network.widths=8,8,8",
+    "training.network.blocks=1,1,1",
+    "training.augmentation.crop_px=32",
+    "training.batch_size=2",
+    "training.log_every_steps=1",
+)
+"""Of a small painter that learns in a moment."""
 
 
 def seen_image(path, width_px, height_px):

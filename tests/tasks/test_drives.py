@@ -284,7 +284,7 @@ def test_viser_that_would_let_other_pages_in_is_refused(monkeypatch):
 
 def test_page_drives_the_recorded_path_and_one_beside_it(viewed, tmp_path, capfd):
     out = tmp_path / "drive.html"
-    made = write_page.fn(viewed, RECORDED, out)
+    made = write_page(viewed, RECORDED, out)
     page = out.read_text("utf-8")
     assert made["bytes"] == len(page) < 2_000_000
     assert "<title>LidarPainter: toy/street</title>" in page

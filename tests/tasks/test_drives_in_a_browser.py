@@ -36,7 +36,7 @@ def drive(run, viewed):
 @pytest.fixture(scope="module")
 def page(viewed, tmp_path_factory):
     out = tmp_path_factory.mktemp("page") / "drive.html"
-    write_page.fn(viewed, RECORDED, out)
+    write_page(viewed, RECORDED, out)
     return out
 
 

@@ -40,7 +40,7 @@ PLY = export_format("ply")
 )
 def test_a_scene_is_written_and_says_what_is_lost(asked, tmp_path, wanted, ending, least_db):
     out = tmp_path / "made" / f"street.{ending}"
-    made = export_scene.fn(*asked, export_format(wanted), SceneRequest(frame=2), out)
+    made = export_scene(*asked, export_format(wanted), SceneRequest(frame=2), out)
     assert made["path"] == str(out)
     assert made["num_bytes"] == out.stat().st_size
     assert made["num_actors"] == 1
@@ -49,7 +49,7 @@ def test_a_scene_is_written_and_says_what_is_lost(asked, tmp_path, wanted, endin
 
 
 def test_actors_stand_in_files_of_their_own(store, asked, tmp_path):
-    export_scene.fn(*asked, PLY, SceneRequest(is_per_actor=True), tmp_path / "parts")
+    export_scene(*asked, PLY, SceneRequest(is_per_actor=True), tmp_path / "parts")
     names = sorted(path.name for path in (tmp_path / "parts").iterdir())
     assert names == ["actor-000.ply", "street.ply"]
     scene = load_scene(store, asked[1].gaussians)
@@ -60,7 +60,7 @@ def test_actors_stand_in_files_of_their_own(store, asked, tmp_path):
 
 
 def test_chosen_actors_are_not_called_a_loss(asked, tmp_path):
-    made = export_scene.fn(*asked, PLY, SceneRequest(actors=()), tmp_path / "a.ply")
+    made = export_scene(*asked, PLY, SceneRequest(actors=()), tmp_path / "a.ply")
     assert (made["num_actors"], made["psnr"]) == (0, None)
 
 
@@ -81,13 +81,13 @@ def test_what_cannot_be_written_is_refused(asked, tmp_path, changes, name, error
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "kept").touch()
     with pytest.raises(error, match=complaint):
-        export_scene.fn(*asked, PLY, SceneRequest(**changes), tmp_path / name)
+        export_scene(*asked, PLY, SceneRequest(**changes), tmp_path / name)
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "full", "kept"]
 
 
 @pytest.mark.parametrize("wanted", ["colmap", "nerfstudio"])
 def test_a_data_set_has_recorded_images_and_views_beside(viewed, tmp_path, wanted):
-    made = export_dataset.fn(viewed, VIEW, export_format(wanted), tmp_path / "set")
+    made = export_dataset(viewed, VIEW, export_format(wanted), tmp_path / "set")
     assert (made["num_recorded"], made["num_images"]) == (2, 4)
     if wanted == "colmap":
         found = pycolmap.Reconstruction(tmp_path / "set" / "sparse" / "0")
@@ -102,12 +102,12 @@ def test_a_data_set_has_recorded_images_and_views_beside(viewed, tmp_path, wante
         assert cv2.imread(str(tmp_path / "set" / "images" / name)) is not None
     render_recorded = replace(VIEW, trajectory=parse_trajectory("recorded"), is_painted=True)
     with pytest.raises(ConfigError, match="recorded images are taken as they are"):
-        export_dataset.fn(viewed, render_recorded, export_format(wanted), tmp_path / "other")
+        export_dataset(viewed, render_recorded, export_format(wanted), tmp_path / "other")
 
 
 def test_depth_and_semantics_say_the_same_of_the_sky(viewed, tmp_path):
     kinds = ViewKinds(images=False, depth=True, semantics=True)
-    made = export_images.fn(viewed, replace(VIEW, kinds=kinds), tmp_path / "maps")
+    made = export_images(viewed, replace(VIEW, kinds=kinds), tmp_path / "maps")
     assert made["num_images"] == 2
     depth = cv2.imread(str(tmp_path / "maps" / "depth" / "0001.png"), cv2.IMREAD_UNCHANGED)
     who = cv2.imread(str(tmp_path / "maps" / "semantics" / "0001.png"), cv2.IMREAD_UNCHANGED)
@@ -121,30 +121,30 @@ def test_depth_and_semantics_say_the_same_of_the_sky(viewed, tmp_path):
 def test_a_film_shows_the_recording_to_the_left(viewed, tmp_path):
     kinds = ViewKinds(images=False, video=True, fps=4.0)
     request = replace(VIEW, kinds=kinds, beside="recorded")
-    made = export_video.fn(viewed, request, tmp_path / "a.mp4")
+    made = export_video(viewed, request, tmp_path / "a.mp4")
     film = cv2.VideoCapture(str(tmp_path / "a.mp4"))
     assert (made["fps"], film.get(cv2.CAP_PROP_FRAME_COUNT)) == (4.0, 2)
     assert film.get(cv2.CAP_PROP_FRAME_WIDTH) == 240  # twice the width of the fit
     with pytest.raises(ConfigError, match=r"a\.avi: expected a name in \.mp4"):
-        export_video.fn(viewed, request, tmp_path / "a.avi")
+        export_video(viewed, request, tmp_path / "a.avi")
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
 
 
 @pytest.mark.parametrize(("wanted", "ending"), [("lidar", ".pcd"), ("lidar-bin", ".pcd.bin")])
 def test_recorded_sweeps_come_with_their_poses(asked, tmp_path, wanted, ending):
-    made = export_sweeps.fn(asked[0], export_format(wanted), slice(0, 2), tmp_path / "sweeps")
+    made = export_sweeps(asked[0], export_format(wanted), slice(0, 2), tmp_path / "sweeps")
     listed = json.loads((tmp_path / "sweeps" / "sweeps.json").read_text())["sweeps"]
     assert (made["num_sweeps"], len(listed)) == (2, 2)
     assert all((tmp_path / "sweeps" / row["file"]).name.endswith(ending) for row in listed)
     with pytest.raises(SceneError, match="no LiDAR sweep is left"):
-        export_sweeps.fn(asked[0], export_format(wanted), slice(90, 99), tmp_path / "none")
+        export_sweeps(asked[0], export_format(wanted), slice(90, 99), tmp_path / "none")
     assert not (tmp_path / "none").exists()
 
 
 def test_renders_come_with_film_depth_semantics_and_a_companion(viewed, tmp_path):
     kinds = ViewKinds(depth=True, semantics=True, video=True)
     with_other = replace(viewed, beside=viewed.fitted)
-    made = render.fn(with_other, replace(VIEW, kinds=kinds), tmp_path)
+    made = render(with_other, replace(VIEW, kinds=kinds), tmp_path)
     assert made["fps"] == pytest.approx(10, abs=0.1)
     row = json.loads((tmp_path / "trajectory.json").read_text())["images"][0]
     for kind in ("file", "depth", "semantics", "beside"):
@@ -162,10 +162,10 @@ def test_images_say_how_far_they_can_be_trusted_and_films_do_not_ask(viewed, tmp
     monkeypatch.setattr(
         EvidenceGatherer, "of", lambda *words, **named: asks.append(1) or gathered(*words, **named)
     )
-    render.fn(viewed, VIEW, tmp_path / "images")
+    render(viewed, VIEW, tmp_path / "images")
     rows = json.loads((tmp_path / "images" / "trajectory.json").read_text())["images"]
     assert len(asks) == len(rows)
     assert all(0 <= row["confidence"] <= 1 for row in rows)
     film = replace(VIEW, kinds=ViewKinds(images=False, video=True))
-    export_video.fn(viewed, film, tmp_path / "drive.mp4")
+    export_video(viewed, film, tmp_path / "drive.mp4")
     assert len(asks) == len(rows)

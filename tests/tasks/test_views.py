@@ -24,7 +24,7 @@ def test_a_run_is_rendered_where_nobody_drove(viewed, tmp_path, is_painted):
         frames=slice(1, 3),
         is_painted=is_painted,
     )
-    made = render.fn(viewed, request, tmp_path)
+    made = render(viewed, request, tmp_path)
     assert made["num_images"] == 2
     described = json.loads((tmp_path / "trajectory.json").read_text())
     assert [row["file"] for row in described["images"]] == ["0001.png", "0002.png"]
@@ -39,7 +39,7 @@ def test_what_is_said_of_frames_is_by_the_calibration_of_their_run(viewed, tmp_p
     request = ViewRequest(trajectory=parse_trajectory("recorded"), frames=slice(1, 2))
     said = []
     for calibration in (BUNDLED, replace(BUNDLED, intercept_db=BUNDLED.intercept_db + 10)):
-        render.fn(replace(viewed, calibration=calibration), request, tmp_path)
+        render(replace(viewed, calibration=calibration), request, tmp_path)
         described = json.loads((tmp_path / "trajectory.json").read_text())
         said.append(described["images"][0])
     first, second = said
@@ -54,7 +54,7 @@ def test_a_run_is_shown_in_fog_beside_the_clear_images(viewed, tmp_path, images)
         frames=slice(1, 3),
     )
     style = StyleRequest(mix=StyleMix.parse("foggy"), images=images)
-    made = stylize.fn(viewed, view, style, tmp_path / "a")
+    made = stylize(viewed, view, style, tmp_path / "a")
     assert made["num_images"] == 2
     assert 0.5 < made["edge_f1"] <= 1
     described = json.loads((tmp_path / "a" / "trajectory.json").read_text())
@@ -63,7 +63,7 @@ def test_a_run_is_shown_in_fog_beside_the_clear_images(viewed, tmp_path, images)
         cv2.imread(str(tmp_path / "a" / name)) for name in ("0001.png", "clear/0001.png")
     )
     assert float(foggy.std()) < float(clear.std())
-    stylize.fn(viewed, view, style, tmp_path / "b")
+    stylize(viewed, view, style, tmp_path / "b")
     again = (tmp_path / "b" / "0001.png").read_bytes()
     assert again == (tmp_path / "a" / "0001.png").read_bytes()
 
@@ -76,7 +76,7 @@ def test_a_painter_is_asked_for_the_prompt(viewed, tmp_path):
         prompt="foggy",
     )
     with pytest.raises(ConfigError, match="knows no prompt 'foggy', only: clear"):
-        render.fn(replace(viewed, run=replace(viewed.run, painter="nano")), request, tmp_path)
+        render(replace(viewed, run=replace(viewed.run, painter="nano")), request, tmp_path)
     with pytest.raises(ConfigError, match="prompt 'foggy' needs a painter"):
         replace(request, is_painted=False)
 
@@ -89,7 +89,7 @@ def test_a_path_is_painted_with_the_previous_image_mixed_in(viewed, tmp_path):
     )
     mixed = replace(plain, sequence=SequenceConfig(previous="mixed"))
     for name, request in (("plain", plain), ("mixed", mixed)):
-        render.fn(viewed, request, tmp_path / name)
+        render(viewed, request, tmp_path / name)
     same = [
         (tmp_path / "plain" / name).read_bytes() == (tmp_path / "mixed" / name).read_bytes()
         for name in ("0000.png", "0001.png", "0002.png")
@@ -113,7 +113,7 @@ def test_an_unknown_camera_is_named_before_anything_is_drawn(viewed, tmp_path):
         camera="back",
     )
     with pytest.raises(SceneError, match="has no camera 'back', it has front"):
-        render.fn(viewed, request, tmp_path)
+        render(viewed, request, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -125,9 +125,9 @@ def test_a_path_into_a_wall_is_refused_unless_that_is_wanted(viewed, tmp_path):
     )
     out = tmp_path / "out"
     with pytest.raises(ConfigError, match=r"leads the camera into a wall: \d+ LiDAR points from"):
-        render.fn(viewed, request, out)
+        render(viewed, request, out)
     assert not out.exists()
-    made = render.fn(viewed, replace(request, allows_collisions=True), out)
+    made = render(viewed, replace(request, allows_collisions=True), out)
     assert made["collisions"][0]["obstacle"] == "points"
     described = json.loads((out / "trajectory.json").read_text())
     assert described["collisions"] == made["collisions"]

@@ -14,7 +14,6 @@ from flows.fleet.flow_runs import (
     SEQUENCE,
     WORK,
     ApiLostError,
-    alive,
     api_lost,
     close_lost_runs,
     is_of_lost_api,
@@ -96,7 +95,7 @@ def test_what_nobody_works_on_is_closed_and_gives_back_its_slot(
         client.create_flow_from_name(WORK), "stub", concurrency_limit=1, tags=tags
     )
     worker, lost = (client.create_flow_run_from_deployment(deployment, name=n) for n in "ab")
-    with alive(ledger, str(worker.id)):
+    with ledger.flow_runs.kept(str(worker.id)):
         client.set_flow_run_state(worker.id, Running(), force=True)
         client.set_flow_run_state(lost.id, Pending())
         limit = client.read_deployment(deployment).global_concurrency_limit.name

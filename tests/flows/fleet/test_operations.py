@@ -8,7 +8,7 @@ from commands import call, succeed
 from prometheus_client.parser import text_string_to_metric_families
 from stub_fleet import behave, stub_ledger, stub_worker, write_stub_manifest
 
-from catalog.records import MetricRecord, metric_rows
+from catalog.records import metric_row
 from catalog.retries import Ending
 from catalog.store import open_store
 from flows.fleet.asked import wishes
@@ -101,16 +101,10 @@ def test_the_page_says_what_happened_and_stands_alone(worked, tmp_path):
     ledger, store, _lines = worked
     for number, row in enumerate(ledger.rows("stub")):
         if row["run_id"]:
-            record = MetricRecord(
-                run_id=row["run_id"],
-                scene_id=row["scene_id"],
-                protocol="recorded",
-                trajectory="recorded",
-                variant="refined",
-                name="psnr",
-                value=20.0 + number,
-            )
-            store.tables.merge("metrics", metric_rows([record]))
+            scored = {"protocol": "recorded", "trajectory": "recorded", "name": "psnr"}
+            scored |= {"value": 20.0 + number}
+            scored_row = metric_row(row["run_id"], row["scene_id"], "refined", **scored)
+            store.tables.merge("metrics", [scored_row])
     out = tmp_path / "night.html"
     answer = succeed("fleet", "report", "stub", "--out", out, "--json", store=store).json
     assert answer["num_bytes"] == out.stat().st_size < MOST_BYTES

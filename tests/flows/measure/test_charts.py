@@ -12,10 +12,11 @@ from catalog.errors import CatalogError, ConflictError
 from catalog.points import Point
 from catalog.store import open_store
 from flows.fleet.asked import wishes
+from flows.fleet.manifest import Manifest, Source
 from flows.measure.chart import chart_of, sizes_of
 from flows.measure.configurations import chart_ways, size_factors
 from flows.measure.figures import LANES, qualities
-from flows.measure.sweep import Sweep, run_sweep, was_asked
+from flows.measure.sweep import run_sweep, was_asked
 from flows.overrides import with_overrides
 from flows.presets import PRESETS, preview
 from lidarpainter_models.errors import SceneError
@@ -131,49 +132,37 @@ def test_one_thing_is_changed_at_a_time_from_what_is_given(preset):
         assert same == [factor.default]
 
 
+def sweep_of(scene, **changes):
+    """A scene in one way, as `chart` asks for it."""
+    way = next(way for way in chart_ways(preview(scene)) if way.name == "no-painter")
+    source = Source(dataset="stored", scenes=(scene,))
+    return Manifest(**{"name": "chart", "source": (source,), "configuration": (way,), **changes})
+
+
 def test_points_of_a_scene_that_is_not_there_are_not_asked_for(tmp_path):
     store = open_store(tmp_path)
     store.make()
-    sweep = Sweep(
-        name="chart",
-        scenes=("pandaset/404",),
-        cameras=None,
-        preset="preview",
-        settings=(),
-        configurations=chart_ways(preview("pandaset/404")),
-        seeds=(0,),
-    )
     with pytest.raises(SceneError, match="pandaset/404"):
-        run_sweep(sweep, store, workers=1, accept_stale=False, say=print)
+        run_sweep(sweep_of("pandaset/404"), store, workers=1, accept_stale=False, say=print)
     assert not was_asked("chart", store)
 
 
 @pytest.mark.parametrize(
     ("other", "left"),
-    [({"seeds": (0, 7)}, "1 of 2"), ({"settings": ("fit.steps=9",)}, "0 of 2"), ({}, None)],
+    [({"fit_seeds": (0, 7)}, "1 of 2"), ({"set": ("fit.steps=9",)}, "0 of 2"), ({}, None)],
 )
 def test_a_sweep_that_another_took_over_is_refused(tmp_path, monkeypatch, other, left):
     write_toy_scene(tmp_path)
-    store = open_store(tmp_path)
-    ways = tuple(way for way in chart_ways(preview(TOY_SCENE)) if way.name == "no-painter")
-    sweep = Sweep(
-        name="chart",
-        scenes=(TOY_SCENE,),
-        cameras=None,
-        preset="preview",
-        settings=(),
-        configurations=ways,
-        seeds=(0, 1),
-    )
+    store, asked = open_store(tmp_path), {"fit_seeds": (0, 1)}
 
     def another_asks(ledger, *_):
-        ledger.ask(wishes(replace(sweep, **other).manifest, Path()))
+        ledger.ask(wishes(sweep_of(TOY_SCENE, **(asked | other)), Path()))
 
     monkeypatch.setattr("flows.measure.sweep.run_workers", another_asks)
     problem = CatalogError if left is None else ConflictError
     said = "2 of 2 points are not done" if left is None else f"chart in .*: another .*, {left} are"
     with pytest.raises(problem, match=said):
-        run_sweep(sweep, store, workers=1, accept_stale=False, say=print)
+        run_sweep(sweep_of(TOY_SCENE, **asked), store, workers=1, accept_stale=False, say=print)
 
 
 def test_stress_says_where_painting_hurts(tmp_path):
@@ -245,9 +234,9 @@ def test_more_seeds_of_doubted_levels_join_all_other_points(tmp_path, monkeypatc
         asked.append(sweep)
         return [
             point(name, way.name, seed, 25.0 + gains[name] * (way.name == "painted"), 100)
-            for name in sweep.scenes
-            for way in sweep.configurations
-            for seed in sweep.seeds
+            for name in sweep.source[0].scenes
+            for way in sweep.configuration
+            for seed in sweep.fit_seeds
         ]
 
     monkeypatch.setattr("catalog.store.existing_store", lambda: None)
@@ -259,7 +248,7 @@ def test_more_seeds_of_doubted_levels_join_all_other_points(tmp_path, monkeypatc
     monkeypatch.setattr(measure, "_show", lambda result, **_: shown.append(result))
     measure.stress([SCENES[0]], tmp_path)
     first, again = asked
-    assert (again.scenes, again.seeds) == (("stress/beams-8",), (1, 2))
+    assert (again.source[0].scenes, again.fit_seeds) == (("stress/beams-8",), (1, 2))
     assert first.name != again.name  # a fleet forgets what it is no longer asked for
     drawn = {(one["scene"], one["configuration"], one["seed"]) for one in shown[0]["points"]}
     assert len(drawn) == len(shown[0]["points"]) == 3 * 2 + 2 * 2
