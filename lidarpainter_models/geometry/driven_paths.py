@@ -48,10 +48,8 @@ class DrivenPath:
 
     def at(self, times_ns: Int[Tensor, " queries"]) -> "DrivenPath":
         """The poses at other times; beyond its ends the end pose holds."""
-        last = len(self) - 1
         inside_ns = times_ns.clamp(int(self.timestamps_ns[0]), int(self.timestamps_ns[-1]))
-        after = torch.searchsorted(self.timestamps_ns, inside_ns).clamp(min=min(1, last), max=last)
-        before = (after - 1).clamp(min=0)
+        before, after = _neighbours(self.timestamps_ns, inside_ns)
         span_ns = (self.timestamps_ns[after] - self.timestamps_ns[before]).clamp(min=1)
         poses = interpolate_rigid(
             self.world_from_body[before],
@@ -83,9 +81,7 @@ class DrivenPath:
         """
         wanted_m = self.travelled_m[rows] + ahead_m
         inside_m = wanted_m.clamp(0, float(self.travelled_m[-1]))
-        last = len(self) - 1
-        after = torch.searchsorted(self.travelled_m, inside_m).clamp(min=min(1, last), max=last)
-        before = (after - 1).clamp(min=0)
+        before, after = _neighbours(self.travelled_m, inside_m)
         span_m = self.travelled_m[after] - self.travelled_m[before]
         fraction = torch.where(span_m > 0, (inside_m - self.travelled_m[before]) / span_m, 0)
         poses = interpolate_rigid(
@@ -102,3 +98,10 @@ class DrivenPath:
         """Height of the body's origin where the path comes nearest to each place."""
         nearest = torch.cdist(xy_m, self.world_from_body[:, :2, 3]).argmin(dim=1)
         return self.world_from_body[nearest, 2, 3]
+
+
+def _neighbours(ascending: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows of a table before and after each wanted value, which lies inside the table."""
+    last = len(ascending) - 1
+    after = torch.searchsorted(ascending, wanted).clamp(min=min(1, last), max=last)
+    return (after - 1).clamp(min=0), after

@@ -9,15 +9,15 @@ from torch import Tensor
 
 from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.geometry.shifts import Shift
-from lidarpainter_models.geometry.transforms import rigid_from_rotation
+from lidarpainter_models.geometry.transforms import rigid_from_rotation, rotation_about_up
+
+LEAST_TRAVEL_M = 1.0
 
 
-def road_directions(
-    world_from_ego: Float[Tensor, "frames 4 4"], *, min_travel_m: float = 1.0
-) -> Float[Tensor, "frames 3"]:
+def road_directions(world_from_ego: Float[Tensor, "frames 4 4"]) -> Float[Tensor, "frames 3"]:
     """Unit driving direction in the ground plane at every frame.
 
-    The direction is the chord over at least `min_travel_m` of path around the frame. A path that
+    The direction is the chord over at least `LEAST_TRAVEL_M` of path around the frame. A path that
     never travels so far (a car at a light) takes the heading of the ego frame itself (its x axis),
     so the result is defined when the car stands still.
     """
@@ -30,10 +30,10 @@ def road_directions(
     travelled = torch.cat([steps.new_zeros(1), steps.cumsum(0)])
     directions = heading.clone()
     for frame in range(len(positions)):
-        before = int(torch.searchsorted(travelled, travelled[frame] - min_travel_m / 2))
-        after = int(torch.searchsorted(travelled, travelled[frame] + min_travel_m / 2))
+        before = int(torch.searchsorted(travelled, travelled[frame] - LEAST_TRAVEL_M / 2))
+        after = int(torch.searchsorted(travelled, travelled[frame] + LEAST_TRAVEL_M / 2))
         chord = positions[min(after, len(positions) - 1)] - positions[max(before - 1, 0)]
-        if chord.norm() >= min_travel_m / 2:
+        if chord.norm() >= LEAST_TRAVEL_M / 2:
             direction = chord / chord.norm()
             # driving backwards keeps the side that is left of the car on the left
             directions[frame] = direction if direction @ heading[frame] >= 0 else -direction
@@ -51,8 +51,5 @@ def shift_pose(
     if left.norm() < 1e-6:
         raise ConfigError("the road direction is vertical: no lateral direction is defined")
     offset = shift.lateral_m * left / left.norm() + shift.up_m * up
-    yaw = torch.tensor(shift.yaw_rad, dtype=world_from_camera.dtype)
-    cosine, sine = torch.cos(yaw), torch.sin(yaw)
-    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
-    turn = torch.stack([cosine, -sine, zero, sine, cosine, zero, zero, zero, one]).reshape(3, 3)
+    turn = rotation_about_up(torch.tensor(shift.yaw_rad, dtype=world_from_camera.dtype))
     return rigid_from_rotation(turn @ world_from_camera[:3, :3], world_from_camera[:3, 3] + offset)

@@ -5,7 +5,6 @@ World: x forward, y left, z up. Offsets count in the road frame: along the path,
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -13,8 +12,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidarpainter_models.geometry.driven_paths import DrivenPath
-from lidarpainter_models.geometry.trajectory_words import ConstantStep, Step
-from lidarpainter_models.geometry.transforms import rigid_from_rotation
+from lidarpainter_models.geometry.trajectory_words import ConstantStep, PathWords, Step
+from lidarpainter_models.geometry.transforms import rigid_from_rotation, rotation_about_up
 from lidarpainter_models.geometry.waypoints import Waypoints
 
 FOLLOW_BEHIND_M = 10.0
@@ -78,52 +77,40 @@ def offsets_of(step: Step, moments: Moments, road: DrivenPath) -> Offsets:
     return found._replace(lateral_m=step.width_m * share, yaw_rad=torch.where(moves, yaw_rad, 0.0))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class OtherPath:
-    """Another path than the recorded one."""
+def other_poses(
+    path: PathWords,
+    waypoints: Waypoints | None,
+    moments: Moments,
+    own: DrivenPath,
+    path_of: PathOf,
+) -> Float[Tensor, "moments 4 4"]:
+    """Where a body is that follows another path than the recorded one, `own`.
 
-    looks: bool = False
-    """Whether it says where a single camera looks: along x of the poses."""
-    actor: str | None = None
-    waypoints: Waypoints | None = None
-    height_m: float = 0.0
-    """Of a bird's eye over the car."""
-
-    def poses(
-        self, moments: Moments, own: DrivenPath, path_of: PathOf
-    ) -> Float[Tensor, "moments 4 4"]:
-        """Where the body is at every moment; `own` is its recorded path."""
-        if self.waypoints is not None:
-            return _along_waypoints(self.waypoints, moments, own)
-        if self.actor is None:
-            places = own.world_from_body[moments.rows, :3, 3] + self.height_m * UP
-            return _looking(-UP, own.directions[moments.rows], places)
-        other = path_of(self.actor).at(own.timestamps_ns[moments.rows])
-        centres = other.world_from_body[:, :3, 3]
-        if not self.looks:
-            places = centres - FOLLOW_BEHIND_M * other.directions
-            places[:, 2] = own.height_near(places[:, :2])
-            return headed(places, torch.atan2(*other.directions[:, [1, 0]].unbind(1)))
-        angle = 2 * math.pi * moments.progress + math.pi
-        circle = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], dim=1)
-        away = ORBIT_RADIUS_M * circle + ORBIT_HEIGHT_M * UP
-        toward = torch.nn.functional.normalize(-away, dim=1)
-        return _looking(toward, UP.expand_as(toward), centres + away)
+    `waypoints` is what the path's file says.
+    """
+    if waypoints is not None:
+        return _along_waypoints(waypoints, moments, own)
+    if path.actor is None:
+        places = own.world_from_body[moments.rows, :3, 3] + path.height_m * UP
+        return _looking(-UP, own.directions[moments.rows], places)
+    other = path_of(path.actor).at(own.timestamps_ns[moments.rows])
+    centres = other.world_from_body[:, :3, 3]
+    if not path.looks:
+        places = centres - FOLLOW_BEHIND_M * other.directions
+        places[:, 2] = own.height_near(places[:, :2])
+        return headed(places, torch.atan2(*other.directions[:, [1, 0]].unbind(1)))
+    angle = 2 * math.pi * moments.progress + math.pi
+    circle = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], dim=1)
+    away = ORBIT_RADIUS_M * circle + ORBIT_HEIGHT_M * UP
+    toward = torch.nn.functional.normalize(-away, dim=1)
+    return _looking(toward, UP.expand_as(toward), centres + away)
 
 
 def headed(
     places: Float[Tensor, "moments 3"], yaw_rad: Float[Tensor, " moments"]
 ) -> Float[Tensor, "moments 4 4"]:
     """Level poses at some places with some headings."""
-    return rigid_from_rotation(turns(yaw_rad), places)
-
-
-def turns(yaw_rad: Float[Tensor, " moments"]) -> Float[Tensor, "moments 3 3"]:
-    """Rotations about the world's up axis, counter-clockwise."""
-    cosine, sine = yaw_rad.cos(), yaw_rad.sin()
-    zero, one = torch.zeros_like(yaw_rad), torch.ones_like(yaw_rad)
-    rows = [cosine, -sine, zero, sine, cosine, zero, zero, zero, one]
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    return rigid_from_rotation(rotation_about_up(yaw_rad), places)
 
 
 def _along_waypoints(

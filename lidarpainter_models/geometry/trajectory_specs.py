@@ -7,7 +7,7 @@ whole rig (body: ego) and an actor (body: box).
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -20,18 +20,22 @@ from lidarpainter_models.geometry.shifts import MAX_SHIFT_M
 from lidarpainter_models.geometry.trajectory_parts import (
     Moments,
     Offsets,
-    OtherPath,
     PathOf,
     offsets_of,
-    turns,
+    other_poses,
 )
 from lidarpainter_models.geometry.trajectory_words import (
     ConstantStep,
+    PathWords,
     Step,
     read_trajectory_words,
 )
-from lidarpainter_models.geometry.transforms import invert_rigid, rigid_from_rotation
-from lidarpainter_models.geometry.waypoints import read_waypoints
+from lidarpainter_models.geometry.transforms import (
+    invert_rigid,
+    rigid_from_rotation,
+    rotation_about_up,
+)
+from lidarpainter_models.geometry.waypoints import Waypoints, read_waypoints
 
 CAMERA_FROM_EGO = torch.tensor(
     [[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=torch.float64
@@ -46,17 +50,22 @@ class Trajectory:
     spec: str
     """As the user wrote it."""
     steps: tuple[Step, ...]
-    other: OtherPath | None = None
+    other: PathWords | None = None
     """The path that the steps lead off; None is the recorded one."""
     max_shift_m: float | None = MAX_SHIFT_M
     """How far the steps may lead off the recorded path; None sets no limit."""
-    files: tuple[Path, ...] = ()
-    """What was read beside the text."""
+    waypoints: Waypoints | None = None
+    """What the file of the other path says."""
 
     @property
     def name(self) -> str:
         """The spec as a file name."""
         return re.sub(r"[^A-Za-z0-9.-]+", "_", self.spec.replace(":", "-"))
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """What was read beside the text."""
+        return (Path(self.other.file),) if self.other and self.other.file else ()
 
     @property
     def is_recorded(self) -> bool:
@@ -71,10 +80,8 @@ class Trajectory:
     @property
     def tells_height(self) -> bool:
         """Whether it says how high the body is; other ways lead over the ground."""
-        other = self.other
-        if other is None:
-            return False
-        return other.looks or (other.waypoints is not None and other.waypoints.z_m is not None)
+        has_heights = self.waypoints is not None and self.waypoints.z_m is not None
+        return has_heights or (self.other is not None and self.other.looks)
 
     def placed(
         self,
@@ -95,7 +102,7 @@ class Trajectory:
                 not known.
         """
         if self.other is not None:
-            poses = self.other.poses(moments, road, path_of)
+            poses = other_poses(self.other, self.waypoints, moments, road, path_of)
             looks = is_camera and self.other.looks
             egos_from_bodies = invert_rigid(road.world_from_body[moments.rows]) @ bodies
             bodies = poses @ (invert_rigid(CAMERA_FROM_EGO) if looks else egos_from_bodies)
@@ -135,16 +142,9 @@ def parse_trajectory(spec: str, *, max_shift_m: float | None = MAX_SHIFT_M) -> T
     Raises:
         ConfigError: the text is no trajectory, or one that leads too far away.
     """
-    words = read_trajectory_words(spec, max_shift_m=max_shift_m)
-    path = words.path
-    files = (Path(path.file),) if path and path.file else ()
-    other = None
-    if path is not None:
-        waypoints = read_waypoints(files[0]) if files else None
-        other = OtherPath(
-            looks=path.looks, actor=path.actor, waypoints=waypoints, height_m=path.height_m
-        )
-    return Trajectory(spec, words.steps, other, max_shift_m, files)
+    steps, path = read_trajectory_words(spec, max_shift_m=max_shift_m)
+    found = Trajectory(spec, steps, path, max_shift_m)
+    return replace(found, waypoints=read_waypoints(found.files[0])) if found.files else found
 
 
 def _moved_aside(
@@ -159,4 +159,6 @@ def _moved_aside(
         raise ConfigError("the road direction is vertical: no lateral direction is defined")
     left = torch.nn.functional.normalize(left, dim=1)
     away = offsets.lateral_m[:, None] * left + offsets.up_m[:, None] * up
-    return rigid_from_rotation(turns(offsets.yaw_rad) @ bodies[:, :3, :3], bodies[:, :3, 3] + away)
+    return rigid_from_rotation(
+        rotation_about_up(offsets.yaw_rad) @ bodies[:, :3, :3], bodies[:, :3, 3] + away
+    )

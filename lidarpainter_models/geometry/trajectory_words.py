@@ -56,17 +56,12 @@ class PathWords:
     """Whether the path also says where a single camera looks."""
 
 
-@dataclass(frozen=True, slots=True)
-class TrajectoryWords:
-    """A trajectory as it was written."""
+def read_trajectory_words(
+    spec: str, *, max_shift_m: float | None = MAX_SHIFT_M
+) -> tuple[tuple[Step, ...], PathWords | None]:
+    """The steps of a trajectory and what they lead off, None being the recorded path.
 
-    steps: tuple[Step, ...]
-    path: PathWords | None
-    """What the steps lead off; None is the recorded path."""
-
-
-def read_trajectory_words(spec: str, *, max_shift_m: float | None = MAX_SHIFT_M) -> TrajectoryWords:
-    """Read a trajectory, but no file that it names; see `parse_trajectory`.
+    No file that it names is read; see `parse_trajectory`.
 
     Raises:
         ConfigError: the text is no trajectory, or one that leads too far away.
@@ -78,7 +73,7 @@ def read_trajectory_words(spec: str, *, max_shift_m: float | None = MAX_SHIFT_M)
         raise ConfigError(f"trajectory {spec!r}: expected at most one path beside the recorded one")
     if max_shift_m is not None and not paths:
         _check_reach(steps, spec)
-    return TrajectoryWords(tuple(steps), paths[0] if paths else None)
+    return tuple(steps), paths[0] if paths else None
 
 
 def _check_reach(steps: list[Step], spec: str) -> None:

@@ -99,6 +99,14 @@ def rotation_from_vector(
     return identity + torch.sinc(turns) * skew + 0.5 * half * half * (skew @ skew)
 
 
+def rotation_about_up(yaw_rad: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation about the world's up axis, counter-clockwise."""
+    cosine, sine = yaw_rad.cos(), yaw_rad.sin()
+    zero, one = torch.zeros_like(yaw_rad), torch.ones_like(yaw_rad)
+    rows = [cosine, -sine, zero, sine, cosine, zero, zero, zero, one]
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
 def rigid_from_tangent(tangent: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
     """Small transform from (rotation vector in radians, translation in metres)."""
     return rigid_from_rotation(rotation_from_vector(tangent[..., :3]), tangent[..., 3:])
@@ -165,10 +173,9 @@ def interpolate_rigid_track(
     )
 
 
-def is_rigid(
-    target_from_source: Float[Tensor, "*batch 4 4"], *, tolerance: float = 1e-4
-) -> Bool[Tensor, "*batch"]:
-    """Whether each matrix is finite, a right-handed rotation plus a translation."""
+def is_rigid(target_from_source: Float[Tensor, "*batch 4 4"]) -> Bool[Tensor, "*batch"]:
+    """Whether each matrix is finite, a right-handed rotation plus a translation, up to rounding."""
+    tolerance = 1e-4
     finite = torch.isfinite(target_from_source).all(-1).all(-1)
     rotation = target_from_source[..., :3, :3]
     gram = rotation @ rotation.transpose(-1, -2)

@@ -15,11 +15,10 @@ from importlib.util import find_spec
 from typing import Any, Literal, get_args
 
 import torch
-from torch import Tensor
 
 from lidarpainter_models.devices import KernelChoice
 from lidarpainter_models.errors import BackendError, ConfigError
-from lidarpainter_models.kernels.gpu_packages import why_no_gsplat, why_no_triton
+from lidarpainter_models.kernels.gpu_packages import is_interpreting, why_no_gsplat, why_no_triton
 
 Backend = Literal["auto", "reference", "cpu", "cuda", "triton"]
 FASTEST = {"cpu": ("cpu",), "cuda": ("triton",)}
@@ -65,18 +64,28 @@ def why_missing(kernel: str, backend: str) -> str | None:
 
 
 def implementation(
-    kernel: str, function: str, backend: Backend, device: torch.device
+    kernel: str,
+    function: str,
+    backend: Backend,
+    device: torch.device,
+    *,
+    dtype: torch.dtype = torch.float32,
 ) -> Callable[..., Any]:
-    """The function of a kernel's backend.
+    """The function of a kernel's backend, for numbers of a kind on a device.
 
-    `auto` takes numba on the CPU and Triton on a GPU, otherwise the plain reference. Where
-    `kernels_chosen` asks for `torch`, it takes the reference for all but the rasteriser; where it
-    asks for `gsplat`, that draws and everything else stays as it is.
+    `auto` takes numba on the CPU and Triton on a GPU, otherwise the plain reference, which alone
+    takes other numbers than float32. Where `kernels_chosen` asks for `torch`, it takes the
+    reference for all but the rasteriser; where it asks for `gsplat`, that draws and everything else
+    stays as it is.
 
     Raises:
-        BackendError: the backend does not exist for this kernel or cannot run here, or a GPU has
-            no rasteriser.
+        BackendError: the backend does not exist for this kernel, cannot run here or does not take
+            such numbers, or a GPU has no rasteriser.
     """
+    if dtype != torch.float32:
+        if backend in ("cpu", "triton"):
+            raise BackendError(f"the {backend} {kernel} takes float32, got {dtype}")
+        backend = "reference" if backend == "auto" else backend
     found = available_backends(kernel)
     chosen: str = _automatic(kernel, device, found) if backend == "auto" else backend
     if chosen not in found:
@@ -86,6 +95,8 @@ def implementation(
         )
     if chosen == "cpu" and device.type != "cpu":
         raise BackendError(f"the numba {kernel} runs on the CPU, got a tensor on {device}")
+    if chosen == "triton" and device.type != "cuda" and not is_interpreting():
+        raise BackendError(f"the triton backend needs tensors on a CUDA device, got {device}")
     return getattr(import_module(f"lidarpainter_models.kernels.{kernel}.{chosen}"), function)
 
 
@@ -120,16 +131,3 @@ def check_choice(choice: KernelChoice) -> None:
 def may_run_on_host(device: torch.device) -> bool:
     """Whether numbers of a device may be given to code of the CPU that is no kernel (OpenCV)."""
     return device.type == "cpu" and _choice.get() != "torch"
-
-
-def float32_backend(kernel: str, backend: Backend, like: Tensor) -> Backend:
-    """The backend of a kernel whose fast versions take float32 alone, for such numbers.
-
-    Raises:
-        BackendError: a fast version was asked for another kind of numbers.
-    """
-    if like.dtype == torch.float32:
-        return backend
-    if backend in ("cpu", "triton"):
-        raise BackendError(f"the {backend} {kernel} takes float32, got {like.dtype}")
-    return "reference" if backend == "auto" else backend

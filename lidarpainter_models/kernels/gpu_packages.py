@@ -37,7 +37,7 @@ def why_no_triton() -> str | None:
         triton = import_module("triton")
     except ImportError as error:
         return f"Triton is not installed ({error}); torch's builds for CUDA bring it along"
-    if triton.knobs.runtime.interpret:
+    if is_interpreting():
         return None
     if not torch.cuda.is_available():
         return "no CUDA device"
@@ -48,14 +48,9 @@ def why_no_triton() -> str | None:
     return None
 
 
-def check_triton_device(device: torch.device, kernel_function: object) -> None:
-    """Refuse tensors of a device that a Triton kernel cannot reach.
-
-    Raises:
-        BackendError: they are not on a CUDA device, nor does Triton interpret this kernel.
-    """
-    if device.type != "cuda" and isinstance(kernel_function, import_module("triton").JITFunction):
-        raise BackendError(f"the triton backend needs tensors on a CUDA device, got {device}")
+def is_interpreting() -> bool:
+    """Whether Triton's kernels run in its interpreter, on tensors of the CPU."""
+    return bool(import_module("triton").knobs.runtime.interpret)
 
 
 def import_gsplat() -> ModuleType:

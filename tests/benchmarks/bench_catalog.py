@@ -10,16 +10,14 @@ with LPIPS under 0.1, `one` for an asset by the beginning of its id, `by categor
 them.
 """
 
-import json
-import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
-from resource import RUSAGE_SELF, getrusage
 
 from asset_rows import ACTORS_A_SCENE, asset_id, asset_rows, sighting_rows
 from deltalake import DeltaTable, write_deltalake
+from own_process import in_own_process, peak_bytes
 from rich.console import Console
 from rich.table import Table
 
@@ -28,7 +26,6 @@ from catalog.assets import enter_sightings, find_asset
 from catalog.sql import CatalogSql
 from catalog.store import open_store
 from catalog.tables import FILE_BYTES
-from flows.interruption import leave
 
 TABLES = {"assets": asset_rows, "sightings": sighting_rows}
 MEASURED = ("new", "again", "ask")
@@ -49,9 +46,13 @@ def fill(root, count):
 
 
 def measure(what, root, count):
-    """CPU seconds by name, in this process."""
-    if what == "ask":
-        return ask(root, count)
+    """CPU seconds by name, and the largest memory of this process."""
+    found = ask(root, count) if what == "ask" else merge(what, root, count)
+    return found | {"MB": peak_bytes() / 1e6}
+
+
+def merge(what, root, count):
+    """One scene more, or one that is there."""
     first = count if what == "new" else count // 3 // ACTORS_A_SCENE * ACTORS_A_SCENE
     rows = sighting_rows(ACTORS_A_SCENE, first=first).to_pylist()
     store = open_store(root)
@@ -91,13 +92,6 @@ def sizes(root):
     return {path: Path(path).stat().st_size for name in TABLES for path in tables.files(name)}
 
 
-def measured_apart(what, root, count):
-    """The same in a process of its own, with its largest memory."""
-    command = [sys.executable, __file__, "--measure", what, root, str(count)]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    return json.loads(done.stdout)
-
-
 def main(counts):
     """Print a row for each size of the library."""
     heads = ("assets", "MB", "files", "new", "again", "rewritten", "merge MB", "open")
@@ -105,7 +99,7 @@ def main(counts):
     for count in counts:
         with tempfile.TemporaryDirectory() as root:
             fill(root, count)
-            found = {what: measured_apart(what, root, count) for what in MEASURED}
+            found = {what: in_own_process(measure, what, root, count) for what in MEASURED}
             stored = sizes(root)
         new, again, ask_ = (found[what] for what in MEASURED)
         shown.add_row(
@@ -123,11 +117,4 @@ def main(counts):
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--measure"]:
-        what, root, count = sys.argv[2], sys.argv[3], int(sys.argv[4])
-        found = measure(what, root, count)
-        peak_mb = getrusage(RUSAGE_SELF).ru_maxrss / 1000
-        sys.stdout.write(json.dumps(found | {"MB": peak_mb}))
-        leave(0)  # threads of the libraries may abort an interpreter on its way out
-    else:
-        main([int(count) for count in sys.argv[1:]] or [1_000, 10_000, 100_000, 1_000_000])
+    main([int(count) for count in sys.argv[1:]] or [1_000, 10_000, 100_000, 1_000_000])

@@ -1,14 +1,6 @@
-"""A step of the fit: against its kernels, on a scene four times as long, and what memory it takes.
+"""A step of the fit: against its kernels, on a scene four times as long, and its memory."""
 
-Run as a program it prints the peak memory of one step with a million Gaussians: that needs a
-process of its own.
-"""
-
-import json
-import os
 import resource
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -18,6 +10,7 @@ from bench_raster import STAGES, Stages
 from bench_records import Figure
 from bench_scenes import street_like_splats
 from bench_work import ADAM_BYTES, SSIM_BYTES_PER_VALUE, SSIM_FLOP_PER_VALUE
+from own_process import in_own_process
 from splat_drawing import render
 
 from lidarpainter_models.gaussians.fitting.config import FitConfig, RefinementConfig
@@ -237,18 +230,12 @@ def frame_growth_figures(rounds, *, blocks=(1, 4, 16), size=SIZE):
 
 def memory_figures(*, size=MEMORY_SIZE):
     """Peak memory of a step with so many Gaussians beyond parameters and Adam's moments."""
-    told = subprocess.run(
-        [sys.executable, __file__, *map(str, size)],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    extra = json.loads(told.stdout)["extra_bytes"]
+    extra = in_own_process(_extra_bytes, *size)
     return [Figure(name="memory.training_step", value=extra / 1e9, unit="GB", limit=1.5)]
 
 
-def _measure_memory(count, width_px, height_px):
+def _extra_bytes(count, width_px, height_px):
+    torch.set_num_threads(1)
     small = Fit(100, width_px, height_px)
     small.step()  # compiles and allocates what does not depend on the number of Gaussians
     del small
@@ -258,7 +245,7 @@ def _measure_memory(count, width_px, height_px):
     Path("/proc/self/clear_refs").write_text("5", "ascii")
     fit.step()
     kept_bytes = count * FLOATS_PER_GAUSSIAN * 4 * 3  # parameters and two moments
-    sys.stdout.write(json.dumps({"extra_bytes": _peak_bytes() - before - kept_bytes}))
+    return _peak_bytes() - before - kept_bytes
 
 
 def _resident_bytes():
@@ -269,8 +256,3 @@ def _peak_bytes():
     lines = Path("/proc/self/status").read_text("ascii").splitlines()
     peak = next(line for line in lines if line.startswith("VmHWM"))
     return int(peak.split()[1]) * 1024
-
-
-if __name__ == "__main__":
-    torch.set_num_threads(1)
-    _measure_memory(*(int(argument) for argument in sys.argv[1:]))

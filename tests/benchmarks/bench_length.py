@@ -9,12 +9,12 @@ tenth of the frames and four steps, and means nothing but that the program works
 """
 
 import argparse
-import json
-import subprocess
 import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+
+from own_process import in_own_process
 
 from flows.environment import prepare_environment
 from flows.presets import preview
@@ -59,8 +59,9 @@ def written(name, width_px, folder, *, quick):
     return write_street(street, folder)
 
 
-def costs_of(folder, width_px, *, quick):
+def costs_of(folder, width_px, quick):
     """Prepare and fit one log; its figures."""
+    prepare_environment()
     chosen = preview("synthetic/street")
     fit = replace(chosen.fit, steps=4) if quick else chosen.fit
     observation = replace(chosen.observation, width_px=width_px)
@@ -84,22 +85,15 @@ def in_its_own_process(name, width_px, *, quick):
     """As `costs_of`; peaks of memory are a process's, and another one writes the log."""
     with tempfile.TemporaryDirectory() as place:
         folder = written(name, width_px, Path(place), quick=quick)
-        command = [sys.executable, __file__, "--width", str(width_px), "--folder", str(folder)]
-        command += ["--quick"] * quick
-        done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-    return json.loads(done.stdout)
+        return in_own_process(costs_of, folder, width_px, quick)
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--width", type=int, default=320)
-    parser.add_argument("--folder", type=Path, help="the figures of this log alone, as JSON")
     parser.add_argument("--quick", action="store_true", help="few frames and steps")
     options = parser.parse_args()
     prepare_environment()  # memory here, and threads of the processes that this one starts
-    if options.folder:
-        json.dump(costs_of(options.folder, options.width, quick=options.quick), sys.stdout)
-        return
     costs = {name: in_its_own_process(name, options.width, quick=options.quick) for name in LOGS}
     rows = [
         (name, [f"{found[figure]:,.0f}" for figure in FIGURES]) for name, found in costs.items()

@@ -39,28 +39,18 @@ def multiply_adds():
     _multiply_add_in_halves(20_000, np.float32(0.999), np.float32(1e-3), lanes)
 
 
-def best_cpu_s(work, repeats):
+def best_cpu_s(work, repeats, clock=time.process_time):
     """Least CPU time of the process (all threads) over some runs: what others take does not count.
 
-    A first run compiles and is not counted.
+    By `time.perf_counter` wall time, which means something only while the cores are free. A first
+    run compiles and is not counted.
     """
     work()
     best = float("inf")
     for _ in range(repeats):
-        before = time.process_time()
+        before = clock()
         work()
-        best = min(best, time.process_time() - before)
-    return best
-
-
-def best_wall_s(work, repeats):
-    """Least wall time over some runs; means something only while the cores are free."""
-    work()
-    best = float("inf")
-    for _ in range(repeats):
-        before = time.perf_counter()
-        work()
-        best = min(best, time.perf_counter() - before)
+        best = min(best, clock() - before)
     return best
 
 

@@ -8,13 +8,12 @@ own; the memory is that process's peak beyond what it had before. v1.0-trainval 
 
 import argparse
 import json
-import multiprocessing
-import resource
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
+from own_process import in_own_process, peak_bytes
 from rich.console import Console
 from rich.table import Table
 
@@ -49,10 +48,6 @@ def write_table(path, num_rows):
         file.write("\n]")
 
 
-def peak_bytes():
-    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-
-
 def measure(path, num_rows):
     before, start = peak_bytes(), time.process_time()
     table = NuscenesTable(path, "sample_token")
@@ -74,8 +69,7 @@ def main():
         path = Path(folder) / "sample_data.json"
         write_table(path, num_rows)
         size = path.stat().st_size
-        with multiprocessing.get_context("spawn").Pool(1) as pool:
-            indexed, memory, looked_up = pool.apply(measure, (path, num_rows))
+        indexed, memory, looked_up = in_own_process(measure, path, num_rows)
     table = Table("rows", "size", "indexed", "rows a second", "memory", "rows of a sample")
     table.add_row(
         f"{num_rows:,}",

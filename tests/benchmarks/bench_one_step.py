@@ -12,9 +12,7 @@ wiring that differs from the model's in one choice. Each measurement has a proce
 
 import argparse
 import json
-import multiprocessing
 import time
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -24,6 +22,7 @@ from one_step_ablations import ablation_tables
 from one_step_costs import describe_wiring
 from one_step_training_step import build_training_step
 from one_step_wirings import WIRINGS, build_wiring
+from own_process import in_own_process
 
 from lidarpainter_models.painter.one_step.config import PRESETS
 from lidarpainter_models.painter.one_step.painter import STRIDE_PX
@@ -60,7 +59,7 @@ def compare_wirings(height_px, width_px, rounds):
     found: dict[str, list[dict[str, Any]]] = {wiring: [] for wiring in WIRINGS}
     for _ in range(rounds):
         for wiring in WIRINGS:
-            found[wiring].append(_in_own_process(measure_wiring, wiring, height_px, width_px))
+            found[wiring].append(in_own_process(measure_wiring, wiring, height_px, width_px))
     slowest_s = median(run["cpu_s"] for run in found[SLOWEST])
     image = found[SLOWEST][0]["image"]
     return {
@@ -116,12 +115,6 @@ def _padded(height_px, width_px):
     return tuple(-(-size // STRIDE_PX) * STRIDE_PX for size in (height_px, width_px))
 
 
-def _in_own_process(measure, *arguments):
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(max_workers=1, mp_context=context) as pool:
-        return pool.submit(measure, *arguments).result()
-
-
 def _options():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     kinds = parser.add_subparsers(dest="kind", required=True)
@@ -152,7 +145,7 @@ def main():
             found = compare_wirings(height_px, width_px, options.rounds)
         else:
             found = {
-                preset: _in_own_process(measure_training, preset, height_px, width_px)
+                preset: in_own_process(measure_training, preset, height_px, width_px)
                 for preset in TRAINED_PRESETS
             }
     print(json.dumps(found, indent=1, default=str))  # noqa: T201 - a script

@@ -1,17 +1,18 @@
 """The rasteriser stage by stage: each against its floor, then the whole, two threads and growth."""
 
+import time
 from itertools import pairwise
 
 import numba
 import numpy as np
 import torch
-from bench_machine import best_cpu_s, best_wall_s, multiply_adds
+from bench_machine import best_cpu_s, multiply_adds
 from bench_records import Figure
 from bench_scenes import LEARNED, street_like_splats
 from bench_work import BACKWARD_LANE_FLOP, FORWARD_LANE_FLOP, count_lanes, raster_bytes
-from splat_drawing import render, split
+from splat_drawing import render
 
-from lidarpainter_models.kernels.gaussian_raster import cpu, render_views
+from lidarpainter_models.kernels.gaussian_raster import cpu
 from lidarpainter_models.kernels.gaussian_raster.binning import list_tiles
 from lidarpainter_models.kernels.gaussian_raster.blending import Images, blend
 from lidarpainter_models.kernels.gaussian_raster.blending_gradients import entry_sums
@@ -56,9 +57,8 @@ class Stages:
         return entry_sums(self.records, features, self.lists, self.drawn, self.to_drawn)
 
     def unproject(self):
-        one_view = self.gaussians._replace(camera_from_body=self.gaussians.camera_from_body[None])
-        room = cpu._gradients_of_view(cpu._room_for_gradients(one_view), 0)
-        unproject(self.gaussians, self.view, self.records, self.lists, self.slots, room, False)
+        room = cpu._room_for_gradients(self.gaussians)
+        unproject(self.gaussians, self.view, self.records, self.lists, self.slots, room)
 
 
 STAGES = ("project", "list_tiles", "blend", "blend_gradients", "unproject")
@@ -178,7 +178,8 @@ def thread_figures(size, repeats):
     for _ in range(repeats):
         for name, threads in walls:
             numba.set_num_threads(threads)
-            walls[name, threads] = min(walls[name, threads], best_wall_s(works[name], 1))
+            wall_s = best_cpu_s(works[name], 1, time.perf_counter)
+            walls[name, threads] = min(walls[name, threads], wall_s)
     numba.set_num_threads(1)
     return [
         Figure(
@@ -190,30 +191,6 @@ def thread_figures(size, repeats):
             limit=None if name.startswith("machine") else 1.7,
         )
         for name in works
-    ]
-
-
-def view_figures(size, repeats, *, num_views=3):
-    """Several views with all gradients in one call, against as many calls."""
-    numba.set_num_threads(1)
-    splats = street_like_splats(*size)
-    gaussians, rest = split(splats)
-    transforms = rest["camera_from_body"].detach().repeat(num_views, 1, 1, 1)
-    learned = [splats[name] for name in LEARNED[:-1]]
-
-    def together():
-        cameras = [rest["camera"]] * num_views
-        images = render_views(gaussians, transforms, cameras, backend="cpu")
-        torch.autograd.grad(sum(_loss(image) for image in images), learned)
-
-    one_ms = 1e3 * best_cpu_s(lambda: step(splats), repeats)
-    return [
-        Figure(
-            name=f"gaussian_raster.{num_views}_views",
-            value=1e3 * best_cpu_s(together, repeats),
-            unit="ms",
-            floor=num_views * one_ms,
-        )
     ]
 
 

@@ -36,9 +36,9 @@ class Timed:
     def __init__(self):
         self.spent_s = defaultdict(list)
 
-    def implementation(self, kernel, function, *which):
+    def implementation(self, kernel, function, *which, **kind):
         """In place of `implementation`: the function, timed."""
-        found = implementation(kernel, function, *which)
+        found = implementation(kernel, function, *which, **kind)
         return self.timed(f"{kernel}.{function}", found)
 
     def timed(self, name, function):
@@ -70,12 +70,12 @@ def step_times(choice, repeats, size=SIZE):
         importlib.import_module(f"lidarpainter_models.kernels.{name}") for name in KERNELS
     ]
     raster = importlib.import_module("lidarpainter_models.kernels.gaussian_raster.cpu")
-    kept = torch.autograd.backward, raster._DrawViews.backward
+    kept = torch.autograd.backward, raster._DrawView.backward
     try:
         for door in doors:
             door.implementation = timed.implementation
         torch.autograd.backward = timed.timed("backward", kept[0])
-        raster._DrawViews.backward = staticmethod(timed.timed("raster backward", kept[1]))
+        raster._DrawView.backward = staticmethod(timed.timed("raster backward", kept[1]))
         with kernels_chosen(choice):
             fit = fit_with_sky(size)
             step = timed.timed("step", fit.step)
@@ -84,13 +84,13 @@ def step_times(choice, repeats, size=SIZE):
     finally:
         for door in doors:
             door.implementation = implementation
-        torch.autograd.backward, raster._DrawViews.backward = kept[0], staticmethod(kept[1])
+        torch.autograd.backward, raster._DrawView.backward = kept[0], staticmethod(kept[1])
     return {name: 1e3 * min(spent[3:]) for name, spent in timed.spent_s.items()}
 
 
 def without_raster(times):
     """Milliseconds of a step but for drawing and its gradient."""
-    return times["step"] - times[f"{RASTERISER}.draw_views"] - times["raster backward"]
+    return times["step"] - times[f"{RASTERISER}.draw_view"] - times["raster backward"]
 
 
 def twin_figures(repeats, *, size=SIZE):

@@ -29,7 +29,6 @@ from bench_raster import (
     raster_figures,
     reference_figures,
     thread_figures,
-    view_figures,
 )
 from bench_records import Figure, baseline_of, kept_to, table, write_figures
 from bench_twins import twin_figures
@@ -67,24 +66,32 @@ def measure(*, quick):
     torch.set_num_threads(1)
     machine = Machine(fma_peak_flops(5 if quick else 20), copy_bandwidth(2 if quick else 10))
     if quick:
-        figures = raster_figures(machine, QUICK_SCENE, 1) + reference_figures(QUICK_SCENE, 1)
-        figures += thread_figures(QUICK_SCENE, 1) + view_figures(QUICK_SCENE, 1)
-        figures += iteration_figures(machine, 1, size=QUICK_SCENE)
-        figures += twin_figures(1, size=QUICK_SCENE)
-        figures += growth_figures(
-            1, gaussians=(1000, 2000), sizes=((80, 48), (160, 96)), on_pixels=1000
-        )
-        figures += frame_growth_figures(1, blocks=(1, 2), size=QUICK_SCENE)
-        figures += memory_figures(size=QUICK_SCENE)
-        return machine.figures() + figures + point_figures(machine, 1, counts=(1000, 2000))
-    figures = raster_figures(machine, SCENE, 15)
-    figures += (
-        thread_figures(SCENE, 15) + view_figures(SCENE, 5) + reference_figures(REFERENCE_SCENE, 7)
-    )
-    figures += iteration_figures(machine, 15) + twin_figures(15)
-    figures += point_figures(machine, 9)
-    figures += growth_figures(3) + frame_growth_figures(48) + memory_figures()
-    return machine.figures() + figures
+        scene, small = QUICK_SCENE, {"size": QUICK_SCENE}
+        growing = {"gaussians": (1000, 2000), "sizes": ((80, 48), (160, 96)), "on_pixels": 1000}
+        return [
+            *machine.figures(),
+            *raster_figures(machine, scene, 1),
+            *reference_figures(scene, 1),
+            *thread_figures(scene, 1),
+            *iteration_figures(machine, 1, **small),
+            *twin_figures(1, **small),
+            *growth_figures(1, **growing),
+            *frame_growth_figures(1, blocks=(1, 2), **small),
+            *memory_figures(**small),
+            *point_figures(machine, 1, counts=(1000, 2000)),
+        ]
+    return [
+        *machine.figures(),
+        *raster_figures(machine, SCENE, 15),
+        *thread_figures(SCENE, 15),
+        *reference_figures(REFERENCE_SCENE, 7),
+        *iteration_figures(machine, 15),
+        *twin_figures(15),
+        *point_figures(machine, 9),
+        *growth_figures(3),
+        *frame_growth_figures(48),
+        *memory_figures(),
+    ]
 
 
 def main():

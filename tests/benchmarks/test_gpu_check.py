@@ -65,20 +65,17 @@ def test_the_page_names_what_a_step_spends_most_on_and_sums_up_the_rest():
     assert "| `3 others` | 6.0 | 0.750 |" in page
 
 
-INTERPRETED_LONG = ("sparse_adam", "ssim")
-
-
 def test_without_a_gpu_the_first_line_says_so():
     assert findings_of(is_gpu=False).page().startswith("No GPU was found. On the CPU instead")
 
 
-@pytest.mark.parametrize(
-    "kernel",
-    [
-        pytest.param(kernel, marks=[pytest.mark.slow] if kernel in INTERPRETED_LONG else [])
-        for kernel in kernel_trials.TRIALS
-    ],
-)
+def trials(names):
+    """Kernels whose trials run in seconds; those that take longer in the nightly tests."""
+    long = ("sparse_adam", "ssim")
+    return [pytest.param(name, marks=[pytest.mark.slow] * (name in long)) for name in names]
+
+
+@pytest.mark.parametrize("kernel", trials(kernel_trials.TRIALS))
 def test_a_trial_runs_on_another_device_and_gives_what_the_cpu_gives(kernel, monkeypatch):
     trial = kernel_trials.TRIALS[kernel]
     with strict_runs(monkeypatch) as device:
@@ -88,12 +85,7 @@ def test_a_trial_runs_on_another_device_and_gives_what_the_cpu_gives(kernel, mon
 
 @pytest.mark.parametrize("backend", [TRITON])
 @pytest.mark.parametrize(
-    "kernel",
-    [
-        pytest.param(kernel, marks=[pytest.mark.slow] if kernel in INTERPRETED_LONG else [])
-        for kernel in kernel_trials.TRIALS
-        if "triton" in available_backends(kernel)
-    ],
+    "kernel", trials(name for name in kernel_trials.TRIALS if "triton" in available_backends(name))
 )
 def test_a_trial_by_triton_gives_what_the_cpu_gives(kernel, backend):
     trial = kernel_trials.TRIALS[kernel]

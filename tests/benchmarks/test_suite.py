@@ -4,14 +4,12 @@ import json
 import sys
 from typing import Any
 
-import numpy as np
 import pytest
 import suite
 import torch
-from bench_machine import fma_peak_flops
 from bench_raster import Stages, doublings
 from bench_records import Figure, baseline_of, compared, kept_to, write_figures
-from bench_scenes import street_like_points, street_like_splats
+from bench_scenes import street_like_splats
 from bench_work import count_lanes
 
 from lidarpainter_models.kernels.gaussian_raster.projection import IS_VISIBLE
@@ -73,11 +71,6 @@ def test_growth_is_told_per_doubling():
     assert figures["g.doubling.100-400_px"] == pytest.approx(3.0)
 
 
-def test_peak_of_one_core_is_that_of_vector_multiply_adds():
-    # a scalar chain reaches 2 operations in 4 cycles
-    assert fma_peak_flops(3, rounds=2000) > 8e9
-
-
 def test_lanes_counted_are_those_of_the_lists_and_hold_every_blend():
     stages = Stages(street_like_splats(400, 64, 48))
     lanes = count_lanes(stages.records, stages.lists, 48, 64)
@@ -87,11 +80,3 @@ def test_lanes_counted_are_those_of_the_lists_and_hold_every_blend():
     stages.records = nobody
     empty = count_lanes(nobody, stages.list_tiles(), 48, 64)
     assert (empty.evaluated, empty.blended) == (0, 0)
-
-
-def test_scenes_are_seeded_and_fill_the_image():
-    first, second = street_like_splats(50, 64, 48), street_like_splats(50, 64, 48)
-    assert np.array_equal(first["means"].detach().numpy(), second["means"].detach().numpy())
-    points = street_like_points(1000, 64, 48)
-    assert int(points["pixels_uv"][:, 0].max()) < 64
-    assert int(points["radius_px"].max()) > 0

@@ -7,6 +7,7 @@ own (gradients, several views) has a suite below `tests/kernels/`.
 import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,6 @@ from lidarpainter_models.kernels.backends import available_backends
 from lidarpainter_models.kernels.box_owners import box_owners
 from lidarpainter_models.kernels.point_blend import blend_points
 from lidarpainter_models.kernels.point_splat import splat_points
-from lidarpainter_models.kernels.ssim import l1_ssim_loss, ssim_map
 
 SUITES = Path(__file__).resolve().parents[1] / "kernels"
 HEIGHT_PX, WIDTH_PX = 30, 45
@@ -41,20 +41,10 @@ class Case:
 def random_points(count: int, generator: torch.Generator) -> dict[str, Any]:
     size = torch.tensor([WIDTH_PX + 8, HEIGHT_PX + 8])
     pixels = (torch.rand(count, 2, generator=generator) * size - 4).long()
-    depth_m = 20 * torch.rand(count, generator=generator) - 2
+    depth_m = torch.randint(-1, 20, (count,), generator=generator) / 2.0  # many are as far
+    depth_m[::17], depth_m[5::29] = torch.inf, torch.nan
     radius_px = torch.randint(0, 4, (count,), generator=generator)
     return {"pixels_uv": pixels, "depth_m": depth_m, "radius_px": radius_px}
-
-
-def splat(pixels_uv: Tensor, depth_m: Tensor, radius_px: Tensor, backend: Any) -> Tensor:
-    return splat_points(
-        pixels_uv,
-        depth_m,
-        radius_px=radius_px,
-        height_px=HEIGHT_PX,
-        width_px=WIDTH_PX,
-        backend=backend,
-    )
 
 
 def random_discs(count: int, generator: torch.Generator) -> dict[str, Any]:
@@ -69,15 +59,6 @@ def random_discs(count: int, generator: torch.Generator) -> dict[str, Any]:
     }
 
 
-def random_images(side_px: int, generator: torch.Generator) -> dict[str, Any]:
-    side_px = max(side_px, 1)  # no image has no pixel
-    shape = (side_px, side_px + side_px // 2, 3)
-    return {
-        "first": torch.rand(shape, generator=generator),
-        "second": torch.rand(shape, generator=generator),
-    }
-
-
 def random_boxes(count: int, generator: torch.Generator) -> dict[str, Any]:
     tangents = 2 * torch.randn(7, 6, generator=generator).double()
     return {
@@ -88,20 +69,11 @@ def random_boxes(count: int, generator: torch.Generator) -> dict[str, Any]:
 
 
 CASES = {
-    "box_owners": Case(
-        random_boxes,
-        lambda points_m, box_from_points, size_m, backend: box_owners(
-            points_m, box_from_points, size_m, margin_m=0.2, floor_m=0.3, backend=backend
-        ),
-        tolerance=0.0,
+    "box_owners": Case(random_boxes, partial(box_owners, margin_m=0.2, floor_m=0.3), 0.0),
+    "point_splat": Case(
+        random_points, partial(splat_points, height_px=HEIGHT_PX, width_px=WIDTH_PX), 0.0
     ),
-    "point_splat": Case(random_points, splat, tolerance=0.0),
-    "point_blend": Case(random_discs, blend_points, tolerance=2e-5),
-    "ssim": Case(
-        random_images,
-        lambda first, second, backend: ssim_map(first, second, backend=backend),
-        tolerance=2e-5,
-    ),
+    "point_blend": Case(random_discs, blend_points, 2e-5),
 }
 KERNELS = sorted(
     module.name
@@ -109,15 +81,12 @@ KERNELS = sorted(
     if module.ispkg and "reference" in available_backends(module.name)
 )
 COUNTS = [0, 1, 2, 33, 257]
-INTERPRETED_AT_MOST = {"ssim": 2}
-"""Larger images are tried beside their gradients, in fewer cases."""
 FAST = [
     pytest.param(kernel, backend, count, marks=TRITON.marks if backend == "triton" else [])
     for kernel in CASES
     for backend in available_backends(kernel)
     for count in COUNTS
     if backend != "reference"
-    and (backend != "triton" or count <= INTERPRETED_AT_MOST.get(kernel, max(COUNTS)))
 ]
 
 
@@ -147,7 +116,7 @@ def test_a_fast_kernel_agrees_with_the_reference(kernel, backend, count, strided
     found = case.call(**moved, backend=backend)
     expected = case.call(**inputs, backend="reference")
     before = drawn(kernel, count, strided=strided)
-    assert all(torch.equal(inputs[name], before[name]) for name in inputs)
+    torch.testing.assert_close(inputs, before, rtol=0, atol=0, equal_nan=True)
     for one, other in zip(tensors(found), tensors(expected), strict=True):
         torch.testing.assert_close(one.cpu(), other, rtol=case.tolerance, atol=case.tolerance)
 
@@ -167,19 +136,6 @@ def test_a_backend_that_is_not_here_is_refused(kernel):
     for backend in missing:
         with pytest.raises(BackendError, match=f"no '{backend}' backend here"):
             CASES[kernel].call(**drawn(kernel, 3, strided=False), backend=backend)
-
-
-@pytest.mark.parametrize("backend", ["cpu", TRITON])
-def test_gradient_of_the_image_loss_is_that_of_the_reference(backend):
-    images = random_images(17, torch.Generator().manual_seed(0))
-    gradients = []
-    for name in (backend, "reference"):
-        rendered = images["first"].clone().requires_grad_()
-        shown = rendered.to(home_of(name))
-        l1_ssim_loss(shown, images["second"].to(shown.device), backend=name).backward()
-        gradients.append(rendered.grad)
-    scale = float(gradients[1].abs().max())
-    torch.testing.assert_close(gradients[0], gradients[1], rtol=0, atol=1e-4 * scale)
 
 
 def tensors(found: Tensor | tuple[Tensor, ...]) -> tuple[Tensor, ...]:

@@ -21,7 +21,7 @@ def machine(monkeypatch):
     return has
 
 
-def taken(kernel, device, function="draw_views"):
+def taken(kernel, device, function="draw_view"):
     return implementation(kernel, function, "auto", device).__module__.rsplit(".")[-1]
 
 

@@ -21,9 +21,7 @@ def seeded(count, interpreted):
 
 def on_home(blocks, backend):
     """The blocks on the device that a backend runs on."""
-    home = home_of(backend)
-    names = ("order", "first", "body", "low", "high", "reach")
-    return Blocks(**{name: getattr(blocks, name).to(home) for name in names})
+    return Blocks._make(tensor.to(home_of(backend)) for tensor in blocks)
 
 
 def refreshed(blocks, means, log_scale, is_stale, backend, reach_sigmas=3.5):

@@ -12,11 +12,14 @@ from lidarpainter_models.kernels.pixel_losses import (
     SOLID,
     PixelFacts,
     PixelRules,
-    clear_sky_loss,
-    depth_loss,
     pixel_terms,
 )
-from lidarpainter_models.kernels.pixel_losses.reference import composed, looks_like_sky
+from lidarpainter_models.kernels.pixel_losses.reference import (
+    clear_sky_loss,
+    composed,
+    depth_loss,
+    looks_like_sky,
+)
 
 HEIGHT_PX, WIDTH_PX = 13, 17
 RULES = PixelRules(sky_tolerance=0.3, depth_tolerance=0.05, min_transmittance=0.2)
@@ -49,7 +52,6 @@ def image_of(rgb, depth_m, alpha):
         alpha=alpha,
         features=torch.zeros(HEIGHT_PX, WIDTH_PX, 0),
         visible=torch.zeros(0, dtype=torch.bool),
-        radius_px=torch.zeros(0),
     )
 
 
@@ -189,7 +191,6 @@ def test_opaque_pixels_send_no_gradient_to_the_sky():
         alpha=alpha,
         features=torch.zeros(1, 5, 0),
         visible=torch.zeros(0, dtype=torch.bool),
-        radius_px=torch.zeros(0),
     )
     composed(splat, sky_rgb, 0.2).sum().backward()
     expected = torch.tensor([[1.0, 0.5, 0.21, 0.0, 0.0]])

@@ -1,7 +1,6 @@
 """Light of Gaussians: numba against plain torch, and plain torch against what is known."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -60,6 +59,7 @@ def one_surface(distance_m=10.0):
         normals=torch.tensor([[1.0, 0.0, 0.0]]),
         facing=torch.ones(1),
         least_facing=torch.zeros(1),
+        body_radius_m=torch.tensor([distance_m]),
     )
     appearance = Appearance(
         light=torch.full((1, 3), 0.2),
@@ -114,9 +114,9 @@ def test_light_of_a_lamp_falls_with_the_square_of_distance(backend):
 
 def test_surfaces_and_light_of_different_number_are_refused():
     surfaces, appearance, around, lamps, poses = one_surface()
-    two = replace(appearance, light=torch.zeros(2, 3))
+    two = appearance._replace(light=torch.zeros(2, 3))
     with pytest.raises(ShapeError, match="1 surfaces have the light of 2"):
         see((surfaces, two, around, lamps, poses), None, "reference")
-    lost = replace(surfaces, body_index=torch.ones(1, dtype=torch.int32))
+    lost = surfaces._replace(body_index=torch.ones(1, dtype=torch.int32))
     with pytest.raises(ShapeError, match="body 1 of 1"):
         see((lost, appearance, around, lamps, poses), None, "reference")

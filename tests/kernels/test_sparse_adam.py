@@ -236,14 +236,3 @@ def test_parameters_need_not_lie_side_by_side_in_memory(backend):
         run.step(torch.arange(5), gradients, RATES)
         run.step(torch.arange(2), Parameters(*(value[:2] for value in gradients)), RATES)
     assert all(map(torch.equal, dense.finished(), strided.finished()))
-
-
-@pytest.mark.parametrize("_backend", [TRITON])
-def test_tensors_off_the_gpu_are_refused_where_nothing_is_interpreted(_backend, monkeypatch):
-    run = Run(random_parameters(4, torch.Generator().manual_seed(1)), "triton")
-    kernel = triton_module("triton_kernels").present
-    monkeypatch.setattr(triton_module().triton, "JITFunction", type(kernel))
-    run.device = torch.device("cpu")
-    run.kept = Parameters(*(value.cpu() for value in run.kept))
-    with pytest.raises(BackendError, match="needs tensors on a CUDA device"):
-        run.shown(torch.arange(2))

@@ -7,7 +7,7 @@ import torch
 from splat_drawing import TRITON, WITHOUT_TRITON, home_of
 
 from lidarpainter_models.errors import BackendError, ShapeError
-from lidarpainter_models.kernels.ssim import l1_ssim_loss, ssim, ssim_map
+from lidarpainter_models.kernels.ssim import l1_ssim_loss, ssim_map
 from lidarpainter_models.kernels.ssim.reference import window_weights
 
 # float32 against float64: rounding of the windowed sums; the reference in float32 reaches 2e-5
@@ -99,7 +99,7 @@ def test_a_single_pixel_sees_only_zeros_around_it(backend):
     expected = (2 * mean_1 * mean_2 + 1e-4) / (mean_1**2 + mean_2**2 + 1e-4)
     expected *= (2 * covariance + 9e-4) / (variance_1 + variance_2 + 9e-4)
     images = [torch.full((1, 1, 3), value) for value in (first, second)]
-    actual = at_home(ssim, *images, backend=backend)
+    actual = at_home(ssim_map, *images, backend=backend).mean()
     assert float(actual) == pytest.approx(expected, rel=1e-5)
 
 
@@ -170,7 +170,7 @@ def test_the_reference_gradient_is_the_slope_of_the_reference():
     rendered, target = (rgb.double() for rgb in noisy_pair(6, 7, noise=0.3))
     rendered.requires_grad_()
     assert torch.autograd.gradcheck(
-        lambda rgb: ssim(rgb, target, backend="reference"), (rendered,), fast_mode=True
+        lambda rgb: ssim_map(rgb, target, backend="reference"), (rendered,), fast_mode=True
     )
 
 
@@ -179,7 +179,7 @@ def test_loss_is_a_mean_over_all_pixels_of_weighted_errors():
     full = l1_ssim_loss(rendered, target)
     half = l1_ssim_loss(rendered, target, pixel_weight=torch.full((24, 24), 0.5))
     assert float(half) == pytest.approx(float(full) / 2, rel=1e-6)
-    expected = (rendered - target).abs().mean() + 0.2 * (1 - ssim(rendered, target))
+    expected = (rendered - target).abs().mean() + 0.2 * (1 - ssim_map(rendered, target).mean())
     assert float(full) == pytest.approx(float(expected), rel=1e-6)
     assert float(l1_ssim_loss(rendered, target, pixel_weight=torch.zeros(24, 24))) == 0
 
@@ -236,13 +236,13 @@ def test_upstream_gradients_scale_the_loss_gradient(backend):
 
 def test_auto_takes_the_reference_for_float64_and_the_numba_door_refuses_it():
     rendered, target = (rgb.double() for rgb in noisy_pair(12, 12))
-    assert ssim(rendered, target).dtype == torch.float64
+    assert ssim_map(rendered, target).dtype == torch.float64
     with pytest.raises(BackendError, match="float32"):
-        ssim(rendered, target, backend="cpu")
+        ssim_map(rendered, target, backend="cpu")
 
 
 def test_images_that_do_not_fit_are_refused():
     with pytest.raises(ShapeError, match="one size"):
-        ssim(torch.zeros(4, 5, 3), torch.zeros(5, 4, 3))
+        ssim_map(torch.zeros(4, 5, 3), torch.zeros(5, 4, 3))
     with pytest.raises(ShapeError, match="one weight per pixel"):
         l1_ssim_loss(torch.zeros(4, 5, 3), torch.zeros(4, 5, 3), pixel_weight=torch.ones(5, 4))

@@ -89,9 +89,11 @@ def disagreement(found: list[Tensor], expected: list[Tensor]) -> float:
 
 
 def moved(part: Any, device: torch.device) -> Any:
-    """A tensor on a device, or a dataclass of which some fields are, or hold, tensors."""
+    """A tensor on a device, or a (named) tuple or a dataclass that holds such."""
     if isinstance(part, Tensor):
         return part.to(device)
+    if isinstance(part, tuple):
+        return type(part)(*(moved(value, device) for value in part))
     if not is_dataclass(part) or isinstance(part, type):
         return part
     kept = {field.name: getattr(part, field.name) for field in fields(part)}
@@ -176,7 +178,6 @@ def _pixel_terms(backend: Backend, device: torch.device) -> list[Tensor]:
         alpha=leaves[2],
         features=torch.zeros(*SIZE_PX, 0, device=device),
         visible=torch.zeros(0, dtype=torch.bool, device=device),
-        radius_px=torch.zeros(0, device=device),
     )
     facts = PixelFacts(
         rgb=draw.uniform(*SIZE_PX, 3),

@@ -3,7 +3,13 @@
 import torch
 
 from lidarpainter_models.geometry.transforms import rigid_from_tangent
-from lidarpainter_models.kernels.scene_light import Appearance, Lamps, Surfaces, Surroundings
+from lidarpainter_models.kernels.scene_light import (
+    Appearance,
+    Lamps,
+    Surfaces,
+    Surroundings,
+    body_radii,
+)
 
 BODIES = 4
 
@@ -16,13 +22,16 @@ def random_scene(count, lamps=7, seed=0):
         return torch.rand(*size, generator=generator)
 
     unit = torch.nn.functional.normalize
+    means = 30 * (rand(count, 3) - 0.5)
+    body = torch.randint(0, BODIES, (count,), generator=generator).int()
     surfaces = Surfaces(
-        means=30 * (rand(count, 3) - 0.5),
-        body_index=torch.randint(0, BODIES, (count,), generator=generator).int(),
+        means=means,
+        body_index=body,
         reach_m=rand(count),
         normals=unit(rand(count, 3) - 0.5, dim=1) * rand(count, 1),
         facing=rand(count),
         least_facing=0.1 * rand(count),
+        body_radius_m=body_radii(means, body),
     )
     appearance = Appearance(
         light=rand(count, 3),

@@ -25,8 +25,8 @@ from torch.utils.backend_registration import _setup_privateuseone_for_python_bac
 
 from lidarpainter_models.kernels import gaussian_raster
 from lidarpainter_models.kernels.backends import RASTERISER
+from lidarpainter_models.kernels.gaussian_raster import Splats
 from lidarpainter_models.kernels.gaussian_raster import cpu as numba_raster
-from lidarpainter_models.kernels.gaussian_raster.splats import Splats
 from lidarpainter_models.painter.nano.painter import NanoPainter
 
 NAME = "strict"
@@ -218,15 +218,15 @@ class _FromHost(torch.autograd.Function):
         return gradient.held
 
 
-def _draw_views(splats: Splats, features, bodies, cameras, out):
+def _draw_view(splats: Splats, features, bodies, camera, out):
     """The rasteriser of the device: numba's."""
     names = ("means", "rotation_wxyz", "scale_m", "opacity", "sh", "body_index")
     own = Splats(**{name: _ToHost.apply(getattr(splats, name)) for name in names})
     held_out = None if out is None else out.held
-    drawn = numba_raster.draw_views(
-        own, _ToHost.apply(features), _ToHost.apply(bodies), cameras, held_out
+    drawn = numba_raster.draw_view(
+        own, _ToHost.apply(features), _ToHost.apply(bodies), camera, held_out
     )
-    return [tuple(_FromHost.apply(image) for image in images) for images in drawn]
+    return tuple(_FromHost.apply(image) for image in drawn)
 
 
 @contextmanager
@@ -235,7 +235,7 @@ def strict_runs(patch: Any) -> Iterator[torch.device]:
     device, chosen, make = strict_device(), gaussian_raster.implementation, torch.tensor
 
     def implementation(kernel: str, name: str, backend: Any, where: torch.device) -> Callable:
-        return _draw_views if where.type == NAME else chosen(kernel, name, backend, where)
+        return _draw_view if where.type == NAME else chosen(kernel, name, backend, where)
 
     def tensor(data: Any, *, dtype=None, device=None, requires_grad=False) -> Tensor:
         made = make(data, dtype=dtype, requires_grad=requires_grad)

@@ -84,9 +84,9 @@ def scene(coefficients, features, count=5):
     splats.append(torch.rand(count, features))
     for tensor in splats:
         tensor.requires_grad_()
-    poses = torch.eye(4).double().expand(1, 1, 4, 4).contiguous()
+    poses = torch.eye(4).double()[None]
     camera = pinhole(fx_px=9.0, fy_px=9.0, cx_px=9.0, cy_px=9.0, width_px=18, height_px=18)
-    return [*splats, poses, torch.zeros(count, dtype=torch.int32), (camera,), None]
+    return [*splats, poses, torch.zeros(count, dtype=torch.int32), camera, None]
 
 
 def catch_launches(architecture):
@@ -112,7 +112,7 @@ def catch_launches(architecture):
 def main():
     architecture, coefficients, features = (int(word) for word in sys.argv[1:])
     found = catch_launches(architecture)
-    drawn = backend._DrawViews.apply(*scene(coefficients, features))
+    drawn = backend._DrawView.apply(*scene(coefficients, features))
     sum(image.sum() for image in drawn[:4]).backward()
     sys.stdout.write(json.dumps(found))
 

@@ -12,7 +12,7 @@ import torch
 from kernel_trials import TRIALS
 from triton_compilation import catch_launches
 
-from lidarpainter_models.kernels import backends, gpu_packages
+from lidarpainter_models.kernels import backends
 
 
 def main():
@@ -20,7 +20,7 @@ def main():
     found = catch_launches(architecture)
     doors: Any = backends
     doors.why_no_triton = lambda: None
-    gpu_packages.check_triton_device = lambda *_: None
+    doors.is_interpreting = lambda: True
     for kernel in kernels:
         TRIALS[kernel].run("triton", torch.device("cpu"))
     sys.stdout.write(json.dumps(found))

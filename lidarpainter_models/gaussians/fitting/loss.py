@@ -21,10 +21,9 @@ from lidarpainter_models.kernels.gaussian_raster import SplatImage
 from lidarpainter_models.kernels.pixel_losses import (
     PixelFacts,
     PixelRules,
-    clear_sky_loss,
-    depth_loss,
     pixel_terms,
 )
+from lidarpainter_models.kernels.pixel_losses.reference import clear_sky_loss, depth_loss
 from lidarpainter_models.kernels.ssim import l1_ssim_loss
 from lidarpainter_models.observations.views import GuidanceView
 

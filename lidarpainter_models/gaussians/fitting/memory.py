@@ -13,7 +13,7 @@ from lidarpainter_models.errors import ConfigError
 from lidarpainter_models.gaussians.fitting.config import FitConfig
 from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.kernels.sky_texture import SkyLayout
-from lidarpainter_models.kernels.sparse_adam.state import VECTOR
+from lidarpainter_models.kernels.sparse_adam import VECTOR
 from lidarpainter_models.lidar.lidar_map import MapPoints
 from lidarpainter_models.observations.views import GuidanceView, SceneObservations
 

@@ -57,7 +57,7 @@ def _project_inside(
 def insert_samples(
     best: BestSamples, rows: np.ndarray, weight: np.ndarray, rgb: np.ndarray, view: int
 ) -> None:
-    """Put one image's samples among the best of their points (rows), in place."""
+    """See `colour_sampling.insert_samples`."""
     slot_weight, slot_rgb, slot_view = best
     for i in numba.prange(rows.shape[0]):
         row, w = rows[i], weight[i]
@@ -85,10 +85,7 @@ def steps_inside(
     reach: int,
     tolerance: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """For points on a rim, the step (columns, rows) to the nearest inner cell of their surface.
-
-    Where none lies within reach the step is zero and the flag false.
-    """
+    """See `colour_sampling.steps_inside`."""
     steps = np.zeros((depth_m.shape[0], 2), dtype=np.float32)
     is_found = np.zeros(depth_m.shape[0], dtype=np.bool_)
     for i in numba.prange(depth_m.shape[0]):
@@ -112,10 +109,7 @@ def sample_levels(
     middle: np.ndarray,
     coarsest: np.ndarray,
 ) -> np.ndarray:
-    """Bilinear colours (rows, 3) uint8 from the level of a pyramid that each row names.
-
-    Each level has half the pixels of the one before; positions are those of the finest.
-    """
+    """See `colour_sampling.sample_levels`."""
     rgb = np.empty((pixels_uv.shape[0], 3), dtype=np.uint8)
     for i in numba.prange(pixels_uv.shape[0]):
         u, v = pixels_uv[i, 0], pixels_uv[i, 1]
@@ -145,12 +139,7 @@ def _bilinear(image: np.ndarray, u: float, v: float, rgb: np.ndarray) -> None:
 
 @numba.njit(cache=True, nogil=True, parallel=True)
 def combine_samples(best: BestSamples, view_gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One colour (uint8) per point from its samples, and whether it has any.
-
-    Samples are brought to one exposure by the gain of their view. The weighted median in
-    brightness is the typical one; the colour is the mean, weighted by the square of the weights,
-    of the samples that agree with it.
-    """
+    """See `colour_sampling.combine_samples`."""
     slot_weight, slot_rgb, slot_view = best
     points = slot_weight.shape[0]
     rgb = np.zeros((points, 3), dtype=np.uint8)

@@ -4,13 +4,12 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numba
 import numpy as np
 from torch import Tensor
 
-from lidarpainter_models.kernels.frustum_culling.blocks import Blocks, Look
+from lidarpainter_models.kernels.frustum_culling import Blocks, Look
 
 
 def refresh_bounds(
@@ -18,52 +17,32 @@ def refresh_bounds(
 ) -> None:
     """See `frustum_culling.refresh_bounds`."""
     _refresh_bounds(
-        blocks.order.numpy(),
-        blocks.first.numpy(),
-        is_stale.numpy(),
-        means.numpy(),
-        log_scale.numpy(),
-        reach_sigmas,
-        _bounds(blocks),
+        _arrays(blocks), is_stale.numpy(), means.numpy(), log_scale.numpy(), reach_sigmas
     )
 
 
 def mark_seen(blocks: Blocks, views: Sequence[Look], is_seen: Tensor) -> None:
     """See `frustum_culling.mark_seen`."""
     for view in views:
-        _mark_seen(
-            blocks.order.numpy(),
-            blocks.first.numpy(),
-            blocks.body.numpy(),
-            _bounds(blocks),
-            view.camera_from_body.numpy(),
-            view.frustum,
-            is_seen.numpy(),
-        )
+        _mark_seen(_arrays(blocks), view.camera_from_body.numpy(), view.frustum, is_seen.numpy())
 
 
-class _Bounds(NamedTuple):
-    low: np.ndarray
-    high: np.ndarray
-    reach: np.ndarray
-
-
-def _bounds(blocks: Blocks) -> _Bounds:
-    """The arrays of the bounds; what is written to them is written to the blocks."""
-    return _Bounds(blocks.low.numpy(), blocks.high.numpy(), blocks.reach.numpy())
+def _arrays(blocks: Blocks) -> Blocks:
+    """Blocks as arrays; what is written to them is written to the blocks."""
+    return Blocks._make(tensor.numpy() for tensor in blocks)
 
 
 @numba.njit(cache=True, nogil=True)
-def _refresh_bounds(order, first, is_stale, means, log_scale, reach_sigmas, bounds):
+def _refresh_bounds(blocks, is_stale, means, log_scale, reach_sigmas):
     """Bounds of the stale blocks; a Gaussian that is not finite is never drawn and has none."""
     for block in range(len(is_stale)):
         if not is_stale[block]:
             continue
-        low, high = bounds.low[block], bounds.high[block]
+        low, high = blocks.low[block], blocks.high[block]
         low[:], high[:] = np.inf, -np.inf
         largest = -np.inf
-        for place in range(first[block], first[block + 1]):
-            row = order[place]
+        for place in range(blocks.first[block], blocks.first[block + 1]):
+            row = blocks.order[place]
             size = max(log_scale[row, 0], log_scale[row, 1], log_scale[row, 2])
             # a maximum may pass over what is no number
             scales = log_scale[row, 0] + log_scale[row, 1] + log_scale[row, 2]
@@ -74,7 +53,7 @@ def _refresh_bounds(order, first, is_stale, means, log_scale, reach_sigmas, boun
             for axis in range(3):
                 low[axis] = min(low[axis], means[row, axis])
                 high[axis] = max(high[axis], means[row, axis])
-        bounds.reach[block] = reach_sigmas * math.exp(largest)
+        blocks.reach[block] = reach_sigmas * math.exp(largest)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -103,13 +82,13 @@ def _is_in_view(low, high, reach, transform, frustum):
 
 
 @numba.njit(cache=True, nogil=True)
-def _mark_seen(order, first, body, bounds, camera_from_body, frustum, is_seen):
+def _mark_seen(blocks, camera_from_body, frustum, is_seen):
     """Mark the rows of all blocks in view."""
-    for block in range(len(body)):
-        transform = camera_from_body[body[block]]
-        low, high, reach = bounds.low[block], bounds.high[block], bounds.reach[block]
-        if body[block] > 0:
+    for block in range(len(blocks.body)):
+        transform = camera_from_body[blocks.body[block]]
+        low, high, reach = blocks.low[block], blocks.high[block], blocks.reach[block]
+        if blocks.body[block] > 0:
             reach += frustum.actor_slack_m
         if _is_in_view(low, high, reach, transform, frustum):
-            for place in range(first[block], first[block + 1]):
-                is_seen[order[place]] = True
+            for place in range(blocks.first[block], blocks.first[block + 1]):
+                is_seen[blocks.order[place]] = True

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lidarpainter_models.kernels.frustum_culling.blocks import Blocks, Look, plane_rows
+from lidarpainter_models.kernels.frustum_culling import Blocks, Look, plane_rows
 
 
 def refresh_bounds(
@@ -19,7 +19,7 @@ def refresh_bounds(
     """See `frustum_culling.refresh_bounds`."""
     largest = log_scale.amax(dim=1)
     is_finite = (means.sum(dim=1) + largest).isfinite()
-    block, row = blocks.of_ordered, blocks.order
+    block, row = _of_ordered(blocks), blocks.order
     finite = is_finite[row][:, None]
     count = len(blocks.body)
     low = _of_each(block, torch.where(finite, means[row], torch.inf), count, "amin")
@@ -34,11 +34,18 @@ def refresh_bounds(
 
 def mark_seen(blocks: Blocks, views: Sequence[Look], is_seen: Bool[Tensor, " gaussians"]) -> None:
     """See `frustum_culling.mark_seen`."""
+    of_ordered = _of_ordered(blocks)
     for view in views:
         is_in_view = _is_in_view(blocks, view)
         is_seen |= torch.zeros_like(is_seen).index_copy(
-            0, blocks.order, is_in_view.index_select(0, blocks.of_ordered)
+            0, blocks.order, is_in_view.index_select(0, of_ordered)
         )
+
+
+def _of_ordered(blocks: Blocks) -> Int[Tensor, " gaussians"]:
+    """The block of each entry of `order`."""
+    sizes = blocks.first[1:] - blocks.first[:-1]
+    return torch.repeat_interleave(sizes, output_size=len(blocks.order))
 
 
 def _is_in_view(blocks: Blocks, view: Look) -> Bool[Tensor, " blocks"]:

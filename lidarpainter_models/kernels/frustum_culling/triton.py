@@ -9,19 +9,18 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from lidarpainter_models.kernels.frustum_culling.blocks import Blocks, Look, plane_rows
+from lidarpainter_models.kernels.frustum_culling import Blocks, Look, plane_rows
 from lidarpainter_models.kernels.frustum_culling.triton_kernels import (
     bound_blocks,
     mark_blocks,
 )
-from lidarpainter_models.kernels.gpu_packages import check_triton_device, dense_in_place
+from lidarpainter_models.kernels.gpu_packages import dense_in_place
 
 
 def refresh_bounds(
     blocks: Blocks, means: Tensor, log_scale: Tensor, is_stale: Tensor, reach_sigmas: float
 ) -> None:
     """See `frustum_culling.refresh_bounds`."""
-    check_triton_device(means.device, bound_blocks)
     if len(blocks.body) == 0:
         return
     # a number among the arguments of a launch is a float32
@@ -41,7 +40,6 @@ def refresh_bounds(
 
 def mark_seen(blocks: Blocks, views: Sequence[Look], is_seen: Tensor) -> None:
     """See `frustum_culling.mark_seen`."""
-    check_triton_device(is_seen.device, mark_blocks)
     if len(blocks.body) == 0 or len(views) == 0:
         return
     with torch.cuda.device_of(is_seen), dense_in_place((is_seen,)) as (dense,):

@@ -5,6 +5,8 @@ Rendering", except that a Gaussian ends where its alpha falls under `ALPHA_CUT` 
 standard deviations (Hanson et al. 2025, "Speedy-Splat").
 """
 
+from lidarpainter_models.geometry.cameras import Camera
+
 TILE_PX = 16
 """Side of a square screen tile."""
 
@@ -28,3 +30,15 @@ NEAR_M = 0.1
 
 BLUR_PX2 = 0.3
 """Added to the variance of every footprint, so that none is thinner than a pixel."""
+
+
+def linear_tangents(camera: Camera) -> tuple[float, float, float, float]:
+    """Tangents within which projection stays linear: lowest and highest x/z, then those of y/z."""
+    margin_x = TANGENT_MARGIN * 0.5 * camera.width_px / camera.fx_px
+    margin_y = TANGENT_MARGIN * 0.5 * camera.height_px / camera.fy_px
+    return (
+        -camera.cx_px / camera.fx_px - margin_x,
+        (camera.width_px - camera.cx_px) / camera.fx_px + margin_x,
+        -camera.cy_px / camera.fy_px - margin_y,
+        (camera.height_px - camera.cy_px) / camera.fy_px + margin_y,
+    )

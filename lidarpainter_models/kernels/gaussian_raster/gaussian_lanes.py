@@ -104,17 +104,15 @@ def pick(typingctx, array, rows, stride, column):
 
 
 @intrinsic
-def put(typingctx, array, rows, stride, column, value, adds):
-    """Write a column of eight rows of a contiguous float32 array, or add to it in float32."""
-    signature = types.void(array, rows, types.int64, types.int64, value, types.boolean)
+def put(typingctx, array, rows, stride, column, value):
+    """Write a column of eight rows of a contiguous float32 array."""
+    signature = types.void(array, rows, types.int64, types.int64, value)
     singles = ir.VectorType(ir.FloatType(), EIGHT)
 
     def generate(context, builder, signature, arguments):
-        pointers = list(_pointers(context, builder, (array, rows), arguments[:4]))
+        pointers = _pointers(context, builder, (array, rows), arguments[:4])
         wide = spread_to(DOUBLES, context, builder, arguments[4], value)
         new = builder.fptrunc(wide, singles)
-        old = _gathered(builder, map(builder.load, pointers), ir.FloatType())
-        new = builder.select(arguments[5], builder.fadd(old, new), new)
         for lane, pointer in enumerate(pointers):
             builder.store(builder.extract_element(new, index(lane)), pointer)
 

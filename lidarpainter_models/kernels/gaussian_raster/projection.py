@@ -53,7 +53,7 @@ RECORD_FLOATS = 16
 MEAN_X, MEAN_X_FRACTION, MEAN_Y, MEAN_Y_FRACTION = 0, 1, 2, 3
 ACROSS, SHEAR, ALONG, LOG_OPACITY = 4, 5, 6, 7
 RED, GREEN, BLUE, DEPTH = 8, 9, 10, 11
-HALF_WIDTH, HALF_HEIGHT, SIGMA, IS_VISIBLE = 12, 13, 14, 15
+HALF_WIDTH, HALF_HEIGHT, IS_VISIBLE = 12, 13, 15
 
 LOG_CUT = math.log(ALPHA_CUT)
 LARGEST = 1e30
@@ -63,16 +63,16 @@ CHUNKS = 64
 
 
 class Gaussians(NamedTuple):
-    """C-contiguous float32 arrays as `Splats` names them, float64 transforms."""
+    """C-contiguous float32 arrays as `Splats` names them, float64 transforms, int32 bodies."""
 
     means: np.ndarray
     rotation_wxyz: np.ndarray
     scale_m: np.ndarray
     opacity: np.ndarray
     sh: np.ndarray
-    body_index: np.ndarray
     features: np.ndarray
     camera_from_body: np.ndarray
+    body_index: np.ndarray
 
 
 class View(NamedTuple):
@@ -168,7 +168,7 @@ def view_direction(mean: Vector, rotation: Matrix, translation: Vector) -> Vecto
 
 @numba.njit(**EXACT)
 def _write(records: np.ndarray, rows: Rows, column: int, value: float) -> None:
-    put(records, rows.places, RECORD_FLOATS, column, value, False)
+    put(records, rows.places, RECORD_FLOATS, column, value)
 
 
 @numba.njit(**EXACT)
@@ -206,16 +206,13 @@ def _write_centre(position: float, records: np.ndarray, rows: Rows, column: int)
 @numba.njit(**EXACT)
 def _write_shape(
     footprint: Footprint, determinant: float, log_opacity: float, records: np.ndarray, rows: Rows
-) -> float:
-    """Write the footprint's form; return its largest standard deviation, pixels."""
+) -> None:
+    """Write the footprint's form."""
     inverse_yy = 1.0 / footprint.yy
     _write(records, rows, ACROSS, 0.5 * footprint.yy / determinant)
     _write(records, rows, SHEAR, -footprint.xy * inverse_yy)
     _write(records, rows, ALONG, 0.5 * inverse_yy)
     _write(records, rows, LOG_OPACITY, log_opacity)
-    middle = 0.5 * (footprint.xx + footprint.yy)
-    spread = math.sqrt(largest(middle * middle - determinant, 0.0))
-    return math.sqrt(middle + spread)
 
 
 @numba.njit(**EXACT)
@@ -239,7 +236,7 @@ def _write_place(
 @numba.njit(**EXACT)
 def _hide(records: np.ndarray, rows: Rows) -> None:
     for place in rows.places:
-        records[place, IS_VISIBLE] = records[place, SIGMA] = 0.0
+        records[place, IS_VISIBLE] = 0.0
 
 
 @numba.njit(**EXACT)
@@ -269,9 +266,8 @@ def _project_eight(
     if not any_of(visible):
         _hide(records, rows)
         return
-    sigma = _write_shape(footprint, determinant, log_opacity, records, rows)
+    _write_shape(footprint, determinant, log_opacity, records, rows)
     visible = visible & (_write_colour(gaussians, rows, footprint, weights, records) < LARGEST)
-    _write(records, rows, SIGMA, choose(visible, sigma, 0.0))
     _write(records, rows, IS_VISIBLE, choose(visible, 1.0, 0.0))
 
 
@@ -290,7 +286,7 @@ def _project_run(
 def project(gaussians: Gaussians, view: View) -> np.ndarray:
     """Screen records of all Gaussians.
 
-    In those that cannot be seen only `IS_VISIBLE` and `SIGMA`, both 0, mean anything.
+    In those that cannot be seen only `IS_VISIBLE`, 0, means anything.
     """
     count = len(gaussians.means)
     records = np.empty((count, RECORD_FLOATS), np.float32)

@@ -12,21 +12,12 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from lidarpainter_models.kernels.gaussian_raster import blending_gradients as sums
+from lidarpainter_models.kernels.gaussian_raster import projection as screen
 from lidarpainter_models.kernels.gaussian_raster import small_vectors as v3
 from lidarpainter_models.kernels.gaussian_raster import spherical_harmonics
 from lidarpainter_models.kernels.gaussian_raster.binning import TileLists
 from lidarpainter_models.kernels.gaussian_raster.blending_gradients import (
-    SUM_ABS_X,
-    SUM_ABS_Y,
-    SUM_DEPTH,
-    SUM_G,
-    SUM_GU,
-    SUM_GUU,
-    SUM_GUY,
-    SUM_GY,
-    SUM_GYY,
-    SUM_RED,
-    SUMS,
     add_entries,
     prefetch_entries,
 )
@@ -53,13 +44,6 @@ from lidarpainter_models.kernels.gaussian_raster.gaussian_lanes import (
 )
 from lidarpainter_models.kernels.gaussian_raster.lane_types import choose
 from lidarpainter_models.kernels.gaussian_raster.projection import (
-    ACROSS,
-    ALONG,
-    CHUNKS,
-    IS_VISIBLE,
-    RECORD_FLOATS,
-    RED,
-    SHEAR,
     Footprint,
     Gaussians,
     View,
@@ -70,10 +54,7 @@ from lidarpainter_models.kernels.gaussian_raster.small_vectors import Matrix, Ve
 
 
 class Gradients(NamedTuple):
-    """Gradients of the arrays in `projection.Gaussians`; transforms per run in float64.
-
-    Those that several views share hold sums; the last two belong to one view.
-    """
+    """Gradients of the float arrays in `projection.Gaussians`; transforms per run in float64."""
 
     means: np.ndarray
     rotation_wxyz: np.ndarray
@@ -81,8 +62,8 @@ class Gradients(NamedTuple):
     opacity: np.ndarray
     sh: np.ndarray
     features: np.ndarray
-    absolute: np.ndarray
     camera_from_body: np.ndarray
+    absolute: np.ndarray
 
 
 class _Eight(NamedTuple):
@@ -92,7 +73,7 @@ class _Eight(NamedTuple):
     lanes: np.ndarray
     """0 to 7: their rows in `sums`."""
     sums: np.ndarray
-    """Each Gaussian's sums over its entries, (8, SUMS)."""
+    """Each Gaussian's sums over its entries, (8, sums.SUMS)."""
     features: np.ndarray
     """The same of one Gaussian's features."""
     weights: np.ndarray
@@ -101,24 +82,28 @@ class _Eight(NamedTuple):
 
 @numba.njit(**EXACT)
 def _sum_of(eight: _Eight, column: int) -> float:
-    return pick(eight.sums, eight.lanes, SUMS, column)
+    return pick(eight.sums, eight.lanes, sums.SUMS, column)
+
+
+@numba.njit(**EXACT)
+def _recorded(eight: _Eight, records: np.ndarray, column: int) -> float:
+    return pick(records, eight.rows.places, screen.RECORD_FLOATS, column)
 
 
 @numba.njit(**EXACT)
 def _screen_gradient(eight: _Eight, records: np.ndarray) -> tuple[float, float]:
     """Gradient with respect to the projected centre, pixels."""
-    places = eight.rows.places
-    x = 2.0 * pick(records, places, RECORD_FLOATS, ACROSS) * _sum_of(eight, SUM_GU)
-    along = pick(records, places, RECORD_FLOATS, ALONG)
-    shear = pick(records, places, RECORD_FLOATS, SHEAR)
-    return x, x * shear + 2.0 * along * _sum_of(eight, SUM_GY)
+    x = 2.0 * _recorded(eight, records, screen.ACROSS) * _sum_of(eight, sums.SUM_GU)
+    along = _recorded(eight, records, screen.ALONG)
+    shear = _recorded(eight, records, screen.SHEAR)
+    return x, x * shear + 2.0 * along * _sum_of(eight, sums.SUM_GY)
 
 
 @numba.njit(**EXACT)
 def _colour_gradient(eight: _Eight, visible: bool, records: np.ndarray, channel: int) -> float:
     """Gradient of a channel's colour, none where it was cut off at black."""
-    colour = pick(records, eight.rows.places, RECORD_FLOATS, RED + channel)
-    return choose(visible & (colour > 0.0), _sum_of(eight, SUM_RED + channel), 0.0)
+    colour = _recorded(eight, records, screen.RED + channel)
+    return choose(visible & (colour > 0.0), _sum_of(eight, sums.SUM_RED + channel), 0.0)
 
 
 @numba.njit(**EXACT)
@@ -129,7 +114,6 @@ def _store_colour(
     footprint: Footprint,
     records: np.ndarray,
     gradients: Gradients,
-    adds: bool,
 ) -> Vector:
     """Store the gradient of the coefficients; return that of the view direction, metres."""
     places, weights = eight.rows.places, eight.weights
@@ -148,7 +132,7 @@ def _store_colour(
         for channel in range(3):
             place = 3 * k + channel
             found = choose(visible, weight * to_colour[channel], 0.0)
-            put(gradients.sh, places, 3 * coefficients, place, found, adds)
+            put(gradients.sh, places, 3 * coefficients, place, found)
             harmonic = pick(gaussians.sh, places, 3 * coefficients, place)
             to_weight += harmonic * to_colour[channel]
         set_lanes(weights, k, to_weight)
@@ -191,36 +175,35 @@ def _unproject_eight(  # noqa: PLR0913 - a compiled loop body
     records: np.ndarray,
     gradients: Gradients,
     transforms: np.ndarray,
-    adds: bool,
 ) -> None:
     rows, places = eight.rows, eight.rows.places
-    visible = pick(records, places, RECORD_FLOATS, IS_VISIBLE) > 0.0
+    visible = _recorded(eight, records, screen.IS_VISIBLE) > 0.0
     rotation, translation = transforms_of(gaussians.camera_from_body, rows, of_one_body)
     mean = vector_of(gaussians.means, rows)
     point = v3.add(v3.apply(rotation, mean), translation)
     footprint = footprint_of(gaussians, rows, point, rotation, translation, view)
     to_screen = _screen_gradient(eight, records)
-    across = pick(records, places, RECORD_FLOATS, ACROSS)
-    absolute_x, absolute_y = across * _sum_of(eight, SUM_ABS_X), _sum_of(eight, SUM_ABS_Y)
+    across = _recorded(eight, records, screen.ACROSS)
+    absolute_x, absolute_y = across * _sum_of(eight, sums.SUM_ABS_X), _sum_of(eight, sums.SUM_ABS_Y)
     absolute = 2.0 * math.sqrt(absolute_x * absolute_x + absolute_y * absolute_y)
-    put(gradients.absolute, places, 1, 0, choose(visible, absolute, 0.0), False)
-    to_opacity = _sum_of(eight, SUM_G) / pick(gaussians.opacity, places, 1, 0)
-    put(gradients.opacity, places, 1, 0, choose(visible, to_opacity, 0.0), adds)
-    sum_uu, sum_uy = _sum_of(eight, SUM_GUU), _sum_of(eight, SUM_GUY)
-    to_covariance = covariance_gradient(footprint, sum_uu, sum_uy, _sum_of(eight, SUM_GYY))
+    put(gradients.absolute, places, 1, 0, choose(visible, absolute, 0.0))
+    to_opacity = _sum_of(eight, sums.SUM_G) / pick(gaussians.opacity, places, 1, 0)
+    put(gradients.opacity, places, 1, 0, choose(visible, to_opacity, 0.0))
+    sum_uu, sum_uy = _sum_of(eight, sums.SUM_GUU), _sum_of(eight, sums.SUM_GUY)
+    to_covariance = covariance_gradient(footprint, sum_uu, sum_uy, _sum_of(eight, sums.SUM_GYY))
     to_axes, to_point = axes_gradient(footprint, to_covariance, view)
-    to_centre = centre_gradient(footprint, to_screen, _sum_of(eight, SUM_DEPTH), view)
+    to_centre = centre_gradient(footprint, to_screen, _sum_of(eight, sums.SUM_DEPTH), view)
     to_point = v3.add(to_point, to_centre)
     scale = vector_of(gaussians.scale_m, rows)
     to_scale, to_wxyz, to_rotation = shape_gradient(footprint, scale, to_axes)
     for axis in range(3):
-        put(gradients.scale_m, places, 3, axis, choose(visible, to_scale[axis], 0.0), adds)
+        put(gradients.scale_m, places, 3, axis, choose(visible, to_scale[axis], 0.0))
     for k in range(4):
-        put(gradients.rotation_wxyz, places, 4, k, choose(visible, to_wxyz[k], 0.0), adds)
-    to_direction = _store_colour(gaussians, eight, visible, footprint, records, gradients, adds)
+        put(gradients.rotation_wxyz, places, 4, k, choose(visible, to_wxyz[k], 0.0))
+    to_direction = _store_colour(gaussians, eight, visible, footprint, records, gradients)
     to_mean = v3.add(v3.apply(v3.transposed(rotation), to_point), to_direction)
     for axis in range(3):
-        put(gradients.means, places, 3, axis, choose(visible, to_mean[axis], 0.0), adds)
+        put(gradients.means, places, 3, axis, choose(visible, to_mean[axis], 0.0))
     # the direction is mean + rotation^T translation
     to_rotation = v3.added(to_rotation, v3.outer(to_point, mean))
     to_rotation = v3.added(to_rotation, v3.outer(translation, to_direction))
@@ -237,40 +220,36 @@ def _sum_entries(
     count: int,
     records: np.ndarray,
     gradients: Gradients,
-    adds: bool,
 ) -> bool:
     """Sum up the entries of eight Gaussians, store their features'; whether any is visible."""
     is_any = False
     for lane in range(EIGHT):
         place = eight.rows.places[lane]
-        if records[place, IS_VISIBLE] > 0.0:
+        if records[place, screen.IS_VISIBLE] > 0.0:
             is_any = True
             add_entries(lists, place, slots[0], slots[1], eight.sums[lane], eight.features)
         else:
             eight.features[:] = 0.0
         if lane < count:
             for k in range(len(eight.features)):
-                found = np.float32(eight.features[k])
-                before = gradients.features[place, k] if adds else np.float32(0.0)
-                gradients.features[place, k] = before + found
+                gradients.features[place, k] = eight.features[k]
     return is_any
 
 
 @numba.njit(**EXACT)
-def _store_nothing(rows: Rows, gradients: Gradients, adds: bool) -> None:
+def _store_nothing(rows: Rows, gradients: Gradients) -> None:
     """Gradients of Gaussians that the view does not see."""
     for place in rows.places:
         gradients.absolute[place] = 0.0
-        if not adds:
-            gradients.means[place] = 0.0
-            gradients.rotation_wxyz[place] = 0.0
-            gradients.scale_m[place] = 0.0
-            gradients.opacity[place] = 0.0
-            gradients.sh[place] = 0.0
+        gradients.means[place] = 0.0
+        gradients.rotation_wxyz[place] = 0.0
+        gradients.scale_m[place] = 0.0
+        gradients.opacity[place] = 0.0
+        gradients.sh[place] = 0.0
 
 
 @numba.njit(**EXACT)
-def _unproject_run(  # noqa: PLR0913 - a compiled loop body
+def _unproject_run(
     gaussians: Gaussians,
     view: View,
     records: np.ndarray,
@@ -278,23 +257,22 @@ def _unproject_run(  # noqa: PLR0913 - a compiled loop body
     slots: tuple[np.ndarray, np.ndarray],
     gradients: Gradients,
     run: int,
-    adds: bool,
 ) -> None:
     eight = _Eight(
         Rows(np.empty(EIGHT, np.int64), np.empty(EIGHT, np.int64)),
         np.arange(EIGHT),
-        np.zeros((EIGHT, SUMS)),
+        np.zeros((EIGHT, sums.SUMS)),
         np.empty(slots[1].shape[1]),
         np.empty(16 * EIGHT),
     )
     count = len(records)
-    first, end = run * count // CHUNKS, (run + 1) * count // CHUNKS
+    first, end = run * count // screen.CHUNKS, (run + 1) * count // screen.CHUNKS
     for start in range(first, end, EIGHT):
         of_one_body = rows_of(gaussians.body_index, start, end, eight.rows)
         for ahead in range(start + EIGHT, min(start + 2 * EIGHT, end)):
             prefetch_entries(lists, ahead, records, slots[0])
         here = min(EIGHT, end - start)
-        if _sum_entries(lists, slots, eight, here, records, gradients, adds):
+        if _sum_entries(lists, slots, eight, here, records, gradients):
             _unproject_eight(
                 gaussians,
                 eight,
@@ -304,10 +282,9 @@ def _unproject_run(  # noqa: PLR0913 - a compiled loop body
                 records,
                 gradients,
                 gradients.camera_from_body[run],
-                adds,
             )
         else:
-            _store_nothing(eight.rows, gradients, adds)
+            _store_nothing(eight.rows, gradients)
 
 
 @compiled_entry
@@ -318,15 +295,14 @@ def unproject(
     lists: TileLists,
     slots: tuple[np.ndarray, np.ndarray],
     gradients: Gradients,
-    adds: bool,
 ) -> None:
-    """Write, or add to what other views gave, the gradients of everything `project` read.
+    """Write the gradients of everything `project` read.
 
     `records` are those of `projection.project`, `lists` of `binning.list_tiles`, `slots` of
-    `blending_gradients.entry_sums`. `gradients` is room, or the sums so far if `adds`; the
-    transforms' must be zeros. Every row is written.
+    `blending_gradients.entry_sums`. `gradients` is room; the transforms' must be zeros. Every
+    row is written.
     """
-    jump = jump_of(CHUNKS)
-    for place in numba.prange(CHUNKS):
-        run = place * jump % CHUNKS
-        _unproject_run(gaussians, view, records, lists, slots, gradients, run, adds)
+    jump = jump_of(screen.CHUNKS)
+    for place in numba.prange(screen.CHUNKS):
+        run = place * jump % screen.CHUNKS
+        _unproject_run(gaussians, view, records, lists, slots, gradients, run)

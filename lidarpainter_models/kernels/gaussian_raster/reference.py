@@ -6,7 +6,6 @@ constants. Gaussians that cannot reach a tile are left out of it, which changes 
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,6 +13,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
+from lidarpainter_models.geometry.transforms import rotation_from_quaternion
+from lidarpainter_models.kernels.gaussian_raster import DrawnImages, Splats
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
     ALPHA_CUT,
     BLUR_PX2,
@@ -21,10 +22,9 @@ from lidarpainter_models.kernels.gaussian_raster.blending_limits import (
     MAX_ALPHA,
     MIN_TRANSMITTANCE,
     NEAR_M,
-    TANGENT_MARGIN,
     TILE_PX,
+    linear_tangents,
 )
-from lidarpainter_models.kernels.gaussian_raster.splats import DrawnImages, Splats
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,44 +42,29 @@ class ScreenGaussians:
     """Half width and height of the region where alpha reaches `ALPHA_CUT`; no gradient."""
 
 
-def draw_views(
+def draw_view(
     splats: Splats,
     features: Float[Tensor, "gaussians features"],
-    camera_from_body: Float[Tensor, "views bodies 4 4"],
-    cameras: Sequence[Camera],
-    screen_gradients_out: Float[Tensor, "views gaussians"] | None,
-) -> list[DrawnImages]:
-    """Images as `SplatImage` lists them: rgb, depth, alpha, features, visible, radius."""
-    return [
-        draw_view(
-            project_gaussians(splats, features, camera_from_body[place], camera),
-            len(splats),
-            camera,
-            None if screen_gradients_out is None else screen_gradients_out[place],
-        )
-        for place, camera in enumerate(cameras)
-    ]
-
-
-def draw_view(
-    screen: ScreenGaussians, count: int, view: Camera, screen_gradient_out: Tensor | None
+    camera_from_body: Float[Tensor, "bodies 4 4"],
+    camera: Camera,
+    screen_gradient_out: Float[Tensor, " gaussians"] | None,
 ) -> DrawnImages:
-    """The images of one view of `count` Gaussians."""
+    """Images as `SplatImage` lists them."""
+    screen = project_gaussians(splats, features, camera_from_body, camera)
     watch = None
     if screen_gradient_out is not None:
         watch = ScreenGradientWatch(screen.index, screen_gradient_out)
     rows = []
-    for top in range(0, view.height_px, TILE_PX):
-        tiles = [
-            _draw_tile(screen, left, top, view, watch) for left in range(0, view.width_px, TILE_PX)
-        ]
+    for top in range(0, camera.height_px, TILE_PX):
+        columns = range(0, camera.width_px, TILE_PX)
+        tiles = [_draw_tile(screen, left, top, camera, watch) for left in columns]
         rows.append(torch.cat(tiles, dim=1))
     image = torch.cat(rows, dim=0)
     if watch is not None and image.requires_grad:
         image.register_hook(watch.restart)
-    visible, radius_px = screen_radii(screen, count)
     alpha, values = image[..., 0], image[..., 1:]
-    return values[..., :3], values[..., 3], alpha, values[..., 4:], visible, radius_px
+    visible = are_visible(screen, len(splats))
+    return values[..., :3], values[..., 3], alpha, values[..., 4:], visible
 
 
 def project_gaussians(
@@ -117,31 +102,11 @@ def project_gaussians(
     )
 
 
-def screen_radii(screen: ScreenGaussians, count: int) -> tuple[Tensor, Tensor]:
-    """Which of all Gaussians are visible, and three deviations along their longer axis, pixels."""
+def are_visible(screen: ScreenGaussians, count: int) -> Bool[Tensor, " gaussians"]:
+    """Which of all Gaussians are on the screen."""
     visible = torch.zeros(count, dtype=torch.bool, device=screen.index.device)
     visible[screen.index] = True
-    radius_px = screen.half_size_px.new_zeros(count)
-    xx, xy, yy = screen.covariance_px2.detach().reshape(-1, 4)[:, [0, 1, 3]].unbind(dim=1)
-    largest = 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
-    radius_px[screen.index] = 3.0 * largest.sqrt()
-    return visible, radius_px
-
-
-def _rotation_matrices(rotation_wxyz: Float[Tensor, "visible 4"]) -> Float[Tensor, "visible 3 3"]:
-    w, x, y, z = torch.nn.functional.normalize(rotation_wxyz, dim=1).unbind(dim=1)
-    entries = [
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    ]
-    return torch.stack(entries, dim=1).reshape(-1, 3, 3)
+    return visible
 
 
 def _screen_covariance(
@@ -152,18 +117,12 @@ def _screen_covariance(
     view: Camera,
 ) -> Float[Tensor, "visible 2 2"]:
     """J W S W^T J^T before blurring; J is taken at a tangent not far outside the image."""
-    axes = rotation @ _rotation_matrices(splats.rotation_wxyz[kept]) * splats.scale_m[kept, None]
+    turned = rotation @ rotation_from_quaternion(splats.rotation_wxyz[kept])
+    axes = turned * splats.scale_m[kept, None]
     z = point[:, 2]
-    margin_x = TANGENT_MARGIN * 0.5 * view.width_px / view.fx_px
-    margin_y = TANGENT_MARGIN * 0.5 * view.height_px / view.fy_px
-    tangent_x = (point[:, 0] / z).clamp(
-        -view.cx_px / view.fx_px - margin_x,
-        (view.width_px - view.cx_px) / view.fx_px + margin_x,
-    )
-    tangent_y = (point[:, 1] / z).clamp(
-        -view.cy_px / view.fy_px - margin_y,
-        (view.height_px - view.cy_px) / view.fy_px + margin_y,
-    )
+    lowest_x, highest_x, lowest_y, highest_y = linear_tangents(view)
+    tangent_x = (point[:, 0] / z).clamp(lowest_x, highest_x)
+    tangent_y = (point[:, 1] / z).clamp(lowest_y, highest_y)
     row_x = (axes[:, 0] - tangent_x[:, None] * axes[:, 2]) * (view.fx_px / z)[:, None]
     row_y = (axes[:, 1] - tangent_y[:, None] * axes[:, 2]) * (view.fy_px / z)[:, None]
     rows = torch.stack([row_x, row_y], dim=1)

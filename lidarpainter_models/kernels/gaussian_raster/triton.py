@@ -1,9 +1,9 @@
 """The rasteriser on an NVIDIA GPU by Triton kernels of this project: pip alone, no compiler.
 
-Projection, tile lists and blending are kernels below `triton_kernels/`; torch sorts the lists. All
-views of a call share one wait for the device: the numbers of pairs of Gaussians and tiles, which
-say how much room the lists need. Input is read as float32 (transforms as float64). Sums are taken
-in a fixed order, so equal input gives equal bits.
+Projection, tile lists and blending are kernels below `triton_kernels/`; torch sorts the lists. The
+device is waited for once: the number of pairs of Gaussians and tiles says how much room the lists
+need. Input is read as float32 (transforms as float64). Sums are taken in a fixed order, so equal
+input gives equal bits.
 """
 
 from collections.abc import Sequence
@@ -16,9 +16,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.kernels.gaussian_raster.blending_limits import TANGENT_MARGIN, TILE_PX
-from lidarpainter_models.kernels.gaussian_raster.projection import IS_VISIBLE, RECORD_FLOATS, SIGMA
-from lidarpainter_models.kernels.gaussian_raster.splats import DrawnImages, Splats
+from lidarpainter_models.kernels.gaussian_raster import DrawnImages, Splats
+from lidarpainter_models.kernels.gaussian_raster.blending_limits import TILE_PX, linear_tangents
 from lidarpainter_models.kernels.gaussian_raster.triton_kernels.blending import blend
 from lidarpainter_models.kernels.gaussian_raster.triton_kernels.blending_gradients import (
     SLOT,
@@ -30,45 +29,30 @@ from lidarpainter_models.kernels.gaussian_raster.triton_kernels.projection impor
 from lidarpainter_models.kernels.gaussian_raster.triton_kernels.projection_gradients import (
     unproject,
 )
-from lidarpainter_models.kernels.gpu_packages import check_triton_device
+from lidarpainter_models.kernels.gaussian_raster.triton_kernels.records import FLOATS, IS_VISIBLE
 
-IMAGES = 6
-"""Tensors that a view gives: four images, visible and radius."""
 GAUSSIANS_AT_ONCE = 64
 PAIRS_AT_ONCE = 256
 ENTRIES_AT_ONCE = 32
 
 
-def draw_views(
+def draw_view(
     splats: Splats,
     features: Float[Tensor, "gaussians features"],
-    camera_from_body: Float[Tensor, "views bodies 4 4"],
-    cameras: Sequence[Camera],
-    screen_gradients_out: Float[Tensor, "views gaussians"] | None,
-) -> list[DrawnImages]:
-    """Images as `SplatImage` lists them: rgb, depth, alpha, features, visible, radius.
-
-    Raises:
-        BackendError: the tensors are not on a CUDA device, nor does Triton interpret.
-    """
-    check_triton_device(splats.means.device, project)
-    tensors = (
-        splats.means,
-        splats.rotation_wxyz,
-        splats.scale_m,
-        splats.opacity,
-        splats.sh,
-        features,
-    )
+    camera_from_body: Float[Tensor, "bodies 4 4"],
+    camera: Camera,
+    screen_gradient_out: Float[Tensor, " gaussians"] | None,
+) -> DrawnImages:
+    """Images as `SplatImage` lists them."""
     with torch.cuda.device_of(splats.means):
-        drawn = _DrawViews.apply(
-            *(tensor.float().contiguous() for tensor in tensors),
+        drawn: DrawnImages = _DrawView.apply(
+            *(tensor.float().contiguous() for tensor in (*splats.learned, features)),
             camera_from_body.double().contiguous(),
             splats.body_index.int().contiguous(),
-            cameras,
-            screen_gradients_out,
+            camera,
+            screen_gradient_out,
         )
-    return [drawn[first : first + IMAGES] for first in range(0, len(drawn), IMAGES)]
+    return drawn
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -98,80 +82,41 @@ class _Lists:
     entry_of_pair: Tensor
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _DrawnView:
-    """What a backward pass needs to know of one view."""
-
-    projected: _Projected
-    lists: _Lists
-    light: Float[Tensor, "height width"]
-
-
-class _DrawViews(torch.autograd.Function):
+class _DrawView(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:  # noqa: ANN401
-        *tensors, cameras, screen_gradients_out = arguments
-        lenses = torch.tensor([_lens(view) for view in cameras], dtype=torch.float64)
-        lenses = lenses.to(tensors[0].device, non_blocking=True)
-        screens = [_project(tensors, place, view, lenses) for place, view in enumerate(cameras)]
-        pairs = torch.stack([screen.first_pair[-1] for screen in screens]).tolist()
-        drawn: list[Tensor] = []
-        ctx.views = []
-        for screen, count in zip(screens, pairs, strict=True):
-            lists = _list_tiles(screen, count)
-            rgb, depth, light, feature_image = _blend(screen, lists, tensors[5])
-            ctx.views.append(_DrawnView(projected=screen, lists=lists, light=light))
-            visible = screen.records[:, IS_VISIBLE] > 0.0
-            drawn += [rgb, depth, 1.0 - light, feature_image, visible]
-            drawn.append(3.0 * screen.records[:, SIGMA])
-        floats = [drawn[k] for k in range(len(drawn)) if k % IMAGES in (0, 1, 3)]
-        ctx.save_for_backward(*tensors, *floats)
-        ctx.mark_non_differentiable(*(drawn[k] for k in range(len(drawn)) if k % IMAGES >= 4))
-        ctx.screen_gradients_out = screen_gradients_out
-        return tuple(drawn)
+        *tensors, camera, ctx.screen_gradient_out = arguments
+        screen = _project(tensors, camera)
+        lists = _list_tiles(screen, int(screen.first_pair[-1]))
+        rgb, depth, light, feature_image = _blend(screen, lists, tensors[5])
+        visible = screen.records[:, IS_VISIBLE.value] > 0.0
+        ctx.kept = screen, lists, light
+        ctx.save_for_backward(*tensors, rgb, depth, feature_image)
+        ctx.mark_non_differentiable(visible)
+        return rgb, depth, 1.0 - light, feature_image, visible
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *output_gradients: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
-        count = len(ctx.saved_tensors) - 3 * len(ctx.views)
-        tensors, images = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
+        *tensors, rgb, depth, feature_image = ctx.saved_tensors
+        screen, lists, light = ctx.kept
         found = [torch.zeros_like(tensor) for tensor in tensors[:7]]
-        absolute = tensors[0].new_zeros((len(ctx.views), len(tensors[0])))
+        absolute = tensors[0].new_zeros(len(tensors[0]))
         with torch.cuda.device_of(absolute):
-            for place, drawn in enumerate(ctx.views):
-                rgb, depth, feature_image = images[3 * place : 3 * place + 3]
-                given = output_gradients[IMAGES * place : IMAGES * place + 4]
-                own = (rgb, depth, drawn.light, feature_image)
-                sums = _sums(drawn, tensors[5], own, given, found[5])
-                _unproject(drawn.projected, tensors, place, sums, found, absolute[place])
-        if ctx.screen_gradients_out is not None:
-            ctx.screen_gradients_out.copy_(absolute)
+            images = (rgb, depth, light, feature_image)
+            sums = _sums(screen, lists, tensors[5], images, output_gradients[:4], found[5])
+            _unproject(screen, tensors, sums, found, absolute)
+        if ctx.screen_gradient_out is not None:
+            ctx.screen_gradient_out.copy_(absolute)
         return (*found, None, None, None)
 
 
-def _lens(view: Camera) -> list[float]:
-    """Focal lengths, principal point, and the tangents within which projection stays linear."""
-    margin_x = TANGENT_MARGIN * 0.5 * view.width_px / view.fx_px
-    margin_y = TANGENT_MARGIN * 0.5 * view.height_px / view.fy_px
-    return [
-        view.fx_px,
-        view.fy_px,
-        view.cx_px,
-        view.cy_px,
-        -view.cx_px / view.fx_px - margin_x,
-        (view.width_px - view.cx_px) / view.fx_px + margin_x,
-        -view.cy_px / view.fy_px - margin_y,
-        (view.height_px - view.cy_px) / view.fy_px + margin_y,
-    ]
-
-
-def _project(
-    tensors: Sequence[Tensor], place: int, view: Camera, lenses: Float[Tensor, "views 8"]
-) -> _Projected:
+def _project(tensors: Sequence[Tensor], view: Camera) -> _Projected:
     means, rotation_wxyz, scale_m, opacity, sh, _, camera_from_body, body_index = tensors
     count = len(means)
-    lens = lenses[place]
-    records = means.new_empty((count, RECORD_FLOATS))
+    numbers = (view.fx_px, view.fy_px, view.cx_px, view.cy_px, *linear_tangents(view))
+    lens = torch.tensor(numbers, dtype=torch.float64).to(means.device, non_blocking=True)
+    records = means.new_empty((count, FLOATS.value))
     first_pair = torch.zeros(count + 1, dtype=torch.int64, device=means.device)
     if count:
         tiles = torch.empty(count, dtype=torch.int32, device=means.device)
@@ -182,7 +127,7 @@ def _project(
             opacity,
             sh,
             body_index,
-            camera_from_body[place],
+            camera_from_body,
             lens,
             records,
             tiles,
@@ -253,14 +198,14 @@ def _blend(
 
 
 def _sums(
-    drawn: _DrawnView,
+    screen: _Projected,
+    lists: _Lists,
     features: Tensor,
     images: Sequence[Tensor],
     given: Sequence[Tensor],
     to_features: Tensor,
 ) -> Tensor:
     """Sums over the pixels of each Gaussian; the gradient of the features is added to theirs."""
-    screen, lists = drawn.projected, drawn.lists
     entries, channels = len(lists.gaussian), features.shape[1]
     slots = features.new_zeros((entries, SLOT.value))
     feature_slots = features.new_zeros((entries, channels))
@@ -301,12 +246,11 @@ def _sums(
 def _unproject(
     screen: _Projected,
     tensors: Sequence[Tensor],
-    place: int,
     sums: Tensor,
     found: Sequence[Tensor],
     absolute: Tensor,
 ) -> None:
-    """Add a view's gradients to those found so far; `absolute` and transforms are its own."""
+    """Add the gradients to `found`, which holds zeros as `absolute` does."""
     means, rotation_wxyz, scale_m, opacity, sh, _, camera_from_body, body_index = tensors
     to_means, to_rotation, to_scale, to_opacity, to_sh, _, to_transforms = found
     if len(means) == 0:
@@ -318,7 +262,7 @@ def _unproject(
         opacity,
         sh,
         body_index,
-        camera_from_body[place],
+        camera_from_body,
         screen.lens,
         screen.records,
         sums,
@@ -327,7 +271,7 @@ def _unproject(
         to_scale,
         to_opacity,
         to_sh,
-        to_transforms[place],
+        to_transforms,
         absolute,
         len(means),
         COEFFICIENTS=sh.shape[1],

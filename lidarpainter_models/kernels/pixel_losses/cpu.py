@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
-from lidarpainter_models.kernels.pixel_losses.pixel_facts import PixelFacts, PixelRules, PixelTerms
+from lidarpainter_models.kernels.pixel_losses import PixelFacts, PixelRules, PixelTerms
 
 _EDGE = 1e-4
 

@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
-from lidarpainter_models.kernels.pixel_losses.pixel_facts import (
+from lidarpainter_models.kernels.pixel_losses import (
     OPEN,
     SKY,
     SOLID,

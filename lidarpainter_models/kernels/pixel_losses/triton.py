@@ -10,8 +10,7 @@ import triton
 from torch import Tensor
 
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
-from lidarpainter_models.kernels.gpu_packages import check_triton_device
-from lidarpainter_models.kernels.pixel_losses.pixel_facts import PixelFacts, PixelRules, PixelTerms
+from lidarpainter_models.kernels.pixel_losses import PixelFacts, PixelRules, PixelTerms
 from lidarpainter_models.kernels.pixel_losses.triton_kernels import (
     MATRIX,
     TERMS,
@@ -27,12 +26,7 @@ SUMS_AT_ONCE = 1024
 def pixel_terms(
     image: SplatImage, sky_rgb: Tensor, facts: PixelFacts, rules: PixelRules, exposure: Tensor
 ) -> PixelTerms:
-    """See `pixel_losses.pixel_terms`.
-
-    Raises:
-        BackendError: the image is not on a CUDA device, nor does Triton interpret.
-    """
-    check_triton_device(image.rgb.device, judge)
+    """See `pixel_losses.pixel_terms`."""
     drawn = (image.rgb, image.depth_m, image.alpha, sky_rgb, facts.rgb, facts.lidar_depth_m)
     rgb, depth_m, alpha, sky, target, lidar, exposure = (
         tensor.float().contiguous() for tensor in (*drawn, exposure)

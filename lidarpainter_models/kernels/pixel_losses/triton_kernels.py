@@ -6,11 +6,11 @@ Terms are judged in float64, as `cpu.py` does: a logarithm near the edge of alph
 import triton
 import triton.language as tl
 
-from lidarpainter_models.kernels.pixel_losses import pixel_facts
+from lidarpainter_models.kernels import pixel_losses
 from lidarpainter_models.kernels.pixel_losses.reference import ALPHA_EDGE, LEAST_KNOWN_ALPHA
 
-SKY, SOLID = tl.constexpr(pixel_facts.SKY), tl.constexpr(pixel_facts.SOLID)
-OPEN = tl.constexpr(pixel_facts.OPEN)
+SKY, SOLID = tl.constexpr(pixel_losses.SKY), tl.constexpr(pixel_losses.SOLID)
+OPEN = tl.constexpr(pixel_losses.OPEN)
 EDGE, KNOWN = tl.constexpr(ALPHA_EDGE), tl.constexpr(LEAST_KNOWN_ALPHA)
 TERMS = tl.constexpr(3)
 """Sums of a program: the sky's term, that of depth, and the pixels with known depth."""

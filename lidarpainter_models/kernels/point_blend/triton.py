@@ -8,7 +8,6 @@ import torch
 import triton
 from torch import Tensor
 
-from lidarpainter_models.kernels.gpu_packages import check_triton_device
 from lidarpainter_models.kernels.point_blend.triton_kernels import UNITS, scatter_shares
 
 POINTS_AT_ONCE = 128
@@ -24,7 +23,6 @@ def blend_points(
     tolerance: float,
 ) -> tuple[Tensor, Tensor]:
     """See `point_blend.blend_points`; computes in float32."""
-    check_triton_device(depth_m.device, scatter_shares)
     (height_px, width_px), channels = surface_depth_m.shape, attributes.shape[1]
     sums = torch.zeros(
         (height_px, width_px, channels + 1), dtype=torch.int64, device=depth_m.device

@@ -4,21 +4,8 @@ import numba
 import numpy as np
 from numpy import ndarray
 
-from lidarpainter_models.kernels.point_contrasts import (
-    BORDER_PX,
-    GUESSES,
-    HIDDEN,
-    HIDDEN_M,
-    LATE,
-    LEAST_AHEAD_M,
-    LEAST_DEPTH_M,
-    LEAST_SCALE_M,
-    LEVELS_PER_OCTAVE,
-    NEAR_M,
-    READOUT,
-    AssumedCamera,
-    SeenContrasts,
-)
+from lidarpainter_models.kernels import point_contrasts as rules
+from lidarpainter_models.kernels.point_contrasts import AssumedCamera, SeenContrasts
 
 
 def depths_before(points: ndarray, camera: AssumedCamera) -> ndarray:
@@ -71,11 +58,11 @@ def _placed(
     flow_y = -(twist[2] * x - twist[0] * z + twist[4])
     flow_z = -(twist[0] * y - twist[1] * x + twist[5])
     after_s, u, v, down, place = 0.0, 0.0, 0.0, 0.0, (x, y, z)
-    for _ in range(GUESSES):
+    for _ in range(rules.GUESSES):
         gone_s = camera.late_s + after_s
         moved = (x + gone_s * flow_x, y + gone_s * flow_y, z + gone_s * flow_z)
         place = _turned(camera.turned_from_camera, moved[0], moved[1], moved[2])
-        ahead = max(place[2], LEAST_AHEAD_M)
+        ahead = max(place[2], rules.LEAST_AHEAD_M)
         u = lens[0] * place[0] / ahead + lens[2]
         v = lens[1] * place[1] / ahead + lens[3]
         across = min(max(u / lens[4] - 0.5, -0.5), 0.5)
@@ -115,13 +102,13 @@ def _is_seen(
     u: float, v: float, depth: float, octaves: float, lens: ndarray, nearest_m: ndarray
 ) -> bool:
     """Whether a point is compared there."""
-    if not (depth > NEAR_M and abs(octaves) < 1):
+    if not (depth > rules.NEAR_M and abs(octaves) < 1):
         return False
-    if not (u > BORDER_PX and u < lens[4] - BORDER_PX):
+    if not (u > rules.BORDER_PX and u < lens[4] - rules.BORDER_PX):
         return False
-    if not (v > BORDER_PX and v < lens[5] - BORDER_PX):
+    if not (v > rules.BORDER_PX and v < lens[5] - rules.BORDER_PX):
         return False
-    return bool(depth <= float(nearest_m[int(v), int(u)]) * HIDDEN + HIDDEN_M)
+    return bool(depth <= float(nearest_m[int(v), int(u)]) * rules.HIDDEN + rules.HIDDEN_M)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -138,17 +125,17 @@ def _look(
     lens, change = camera.lens, np.zeros((3, 5))
     for index in range(len(points)):
         u, v, (x, y, depth), flow, down = _placed(points[index], camera)
-        hub_m = max(hub_depth_m[index], LEAST_DEPTH_M)
-        octaves = np.log2(hub_m / max(depth, LEAST_DEPTH_M))
+        hub_m = max(hub_depth_m[index], rules.LEAST_DEPTH_M)
+        octaves = np.log2(hub_m / max(depth, rules.LEAST_DEPTH_M))
         is_seen = _is_seen(u, v, depth, octaves, lens, nearest_m)
-        found = _sampled(levels, level + LEVELS_PER_OCTAVE * octaves, v, u)
+        found = _sampled(levels, level + rules.LEVELS_PER_OCTAVE * octaves, v, u)
         contrast, slope_u, slope_v = found
         change[0, 1], change[0, 2] = -depth, y
         change[1, 0], change[1, 2] = depth, -x
         change[2, 0], change[2, 1] = -y, x
         for axis in range(3):
-            change[axis, LATE], change[axis, READOUT] = flow[axis], flow[axis] * down
-        scale, ahead = max(depth, LEAST_SCALE_M), max(depth, LEAST_AHEAD_M)
+            change[axis, rules.LATE], change[axis, rules.READOUT] = flow[axis], flow[axis] * down
+        scale, ahead = max(depth, rules.LEAST_SCALE_M), max(depth, rules.LEAST_AHEAD_M)
         seen.contrast[index], seen.is_seen[index] = contrast, is_seen
         seen.gradient[index, 0] = slope_u / scale if is_seen else 0.0
         seen.gradient[index, 1] = slope_v / scale if is_seen else 0.0

@@ -4,21 +4,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 from numpy import ndarray
 
-from lidarpainter_models.kernels.point_contrasts import (
-    BORDER_PX,
-    GUESSES,
-    HIDDEN,
-    HIDDEN_M,
-    LATE,
-    LEAST_AHEAD_M,
-    LEAST_DEPTH_M,
-    LEAST_SCALE_M,
-    LEVELS_PER_OCTAVE,
-    NEAR_M,
-    READOUT,
-    AssumedCamera,
-    SeenContrasts,
-)
+from lidarpainter_models.kernels import point_contrasts as rules
+from lidarpainter_models.kernels.point_contrasts import AssumedCamera, SeenContrasts
 
 
 def depths_before(
@@ -39,14 +26,14 @@ def seen_contrasts(
     """See `point_contrasts.seen_contrasts`."""
     pixels_uv, depth_m, change = _projected(points, camera)
     size = camera.lens[4:]
-    nearer = np.maximum(hub_depth_m, LEAST_DEPTH_M) / np.maximum(depth_m, LEAST_DEPTH_M)
+    nearer = np.maximum(hub_depth_m, rules.LEAST_DEPTH_M) / np.maximum(depth_m, rules.LEAST_DEPTH_M)
     octaves = np.log2(nearer)
-    is_seen = (depth_m > NEAR_M) & (np.abs(octaves) < 1)
-    is_seen &= ((pixels_uv > BORDER_PX) & (pixels_uv < size - BORDER_PX)).all(1)
+    is_seen = (depth_m > rules.NEAR_M) & (np.abs(octaves) < 1)
+    is_seen &= ((pixels_uv > rules.BORDER_PX) & (pixels_uv < size - rules.BORDER_PX)).all(1)
     column, row = np.clip(pixels_uv, 0, size - 1).astype(int).T
-    is_seen &= depth_m <= nearest_m[row, column].astype(float) * HIDDEN + HIDDEN_M
-    found = _sampled(levels, pixels_uv, level + LEVELS_PER_OCTAVE * octaves)
-    scale = np.maximum(depth_m, LEAST_SCALE_M)[:, None]  # a gradient per metre of the surface
+    is_seen &= depth_m <= nearest_m[row, column].astype(float) * rules.HIDDEN + rules.HIDDEN_M
+    found = _sampled(levels, pixels_uv, level + rules.LEVELS_PER_OCTAVE * octaves)
+    scale = np.maximum(depth_m, rules.LEAST_SCALE_M)[:, None]  # a gradient per metre of the surface
     return SeenContrasts(
         contrast=found[:, 0],
         is_seen=is_seen,
@@ -65,10 +52,10 @@ def _projected(
     start = points @ pose[:3, :3].T + pose[:3, 3]
     flow = -(np.cross(camera.twist_per_s[:3], start) + camera.twist_per_s[3:])
     after_s = np.zeros(len(points))
-    for _ in range(GUESSES):
+    for _ in range(rules.GUESSES):
         moved = start + (camera.late_s + after_s)[:, None] * flow
         x, y, depth_m = (moved @ turned.T).T
-        ahead = np.maximum(depth_m, LEAST_AHEAD_M)
+        ahead = np.maximum(depth_m, rules.LEAST_AHEAD_M)
         pixels_uv = focal * np.stack([x, y], 1) / ahead[:, None] + centre
         share = np.clip(pixels_uv / size - 0.5, -0.5, 0.5)
         after_s = share @ camera.across_s
@@ -76,8 +63,8 @@ def _projected(
     change[:, 0, 1], change[:, 0, 2] = -depth_m, y
     change[:, 1, 0], change[:, 1, 2] = depth_m, -x
     change[:, 2, 0], change[:, 2, 1] = -y, x
-    change[:, :, LATE] = flow @ turned.T
-    change[:, :, READOUT] = change[:, :, LATE] * share[:, 1:]
+    change[:, :, rules.LATE] = flow @ turned.T
+    change[:, :, rules.READOUT] = change[:, :, rules.LATE] * share[:, 1:]
     slant = (pixels_uv - centre)[..., None] / ahead[:, None, None]
     across = focal[:, None] * change[:, :2] / ahead[:, None, None]
     return pixels_uv, depth_m, across - slant * change[:, 2:]

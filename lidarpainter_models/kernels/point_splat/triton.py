@@ -8,7 +8,6 @@ import torch
 import triton
 from torch import Tensor
 
-from lidarpainter_models.kernels.gpu_packages import check_triton_device
 from lidarpainter_models.kernels.point_splat import reference
 from lidarpainter_models.kernels.point_splat.triton_kernels import claim_discs
 
@@ -20,7 +19,6 @@ def splat_points(
     pixels_uv: Tensor, depth_m: Tensor, radius_px: Tensor, height_px: int, width_px: int
 ) -> Tensor:
     """See `point_splat.splat_points`; depths other than float32 are left to the reference."""
-    check_triton_device(depth_m.device, claim_discs)
     if depth_m.dtype != torch.float32:
         return reference.splat_points(pixels_uv, depth_m, radius_px, height_px, width_px)
     keys = torch.full((height_px, width_px), _FREE, dtype=torch.int64, device=depth_m.device)

@@ -3,16 +3,16 @@
 # ruff: noqa: ANN001, ANN202 - numba infers these types
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numba
 import numpy as np
 import torch
 from torch import Tensor
 
-from lidarpainter_models.kernels.frustum_culling.blocks import Frustum
+from lidarpainter_models.kernels import scene_light
+from lidarpainter_models.kernels.frustum_culling import Frustum
 from lidarpainter_models.kernels.gaussian_raster.blending_limits import NEAR_M
-from lidarpainter_models.kernels.scene_light import parts
 from lidarpainter_models.kernels.side_by_side import kernels_to_oneself
 from lidarpainter_models.weather import darkness, water
 from lidarpainter_models.weather.light import to_display
@@ -36,34 +36,17 @@ _PER_DOWN = np.float32(1 / darkness.BEAM_DOWN_RAD)
 _PER_EDGE = np.float32(1 / darkness.BEAM_EDGE_RAD)
 _PER_ACROSS = np.float32(1 / darkness.BEAM_ACROSS_RAD)
 _STRAY = np.float32(darkness.STRAY_LIGHT)
-_WIDEST_BEAM = np.float32(parts.WIDEST_BEAM)
-_FAINT = np.float32(parts.FAINT)
-_PER_STRAY_M2 = np.float32(1 / parts.STRAY_REACH_M**2)
+_WIDEST_BEAM = np.float32(scene_light.WIDEST_BEAM)
+_FAINT = np.float32(scene_light.FAINT)
+_PER_STRAY_M2 = np.float32(1 / scene_light.STRAY_REACH_M**2)
 _WATER = np.float32(water.WATER_REFLECTANCE)
 _PER_TURN = np.float32(1 / (2 * math.pi))
-_PER_SOFTNESS = np.float32(1 / parts.SKYLINE_SOFTNESS)
-_MOST_GAIN = np.float32(parts.MOST_GAIN)
-_PER_SH = np.float32(1 / parts.SH_CONSTANT)
+_PER_SOFTNESS = np.float32(1 / scene_light.SKYLINE_SOFTNESS)
+_MOST_GAIN = np.float32(scene_light.MOST_GAIN)
+_PER_SH = np.float32(1 / scene_light.SH_CONSTANT)
 _SMALL_M, _LEAST_LEVEL_M, _DARK = np.float32(1e-3), np.float32(0.1), np.float32(1e-6)
 
-
-class _Surfaces(NamedTuple):
-    means: np.ndarray
-    body: np.ndarray
-    reach_m: np.ndarray
-    normals: np.ndarray
-    facing: np.ndarray
-    least_facing: np.ndarray
-    world_from_body: np.ndarray
-
-
-class _Appearance(NamedTuple):
-    light: np.ndarray
-    reflectance: np.ndarray
-    harmonics: np.ndarray
-    per_base: np.ndarray
-    shine: np.ndarray
-    skyline: np.ndarray
+Part = TypeVar("Part", scene_light.Surfaces, scene_light.Appearance, scene_light.Surroundings)
 
 
 class _Lamps(NamedTuple):
@@ -76,27 +59,22 @@ class _Lamps(NamedTuple):
     """Lamps that may reach body b are those of_bodies[starts[b] : starts[b + 1]]."""
 
 
-class _Surroundings(NamedTuple):
-    extinction_per_m: np.float32
-    airlight: np.ndarray
-    sky_light: np.ndarray
-    skylines: np.ndarray
-
-
-def irradiance(surfaces: parts.Surfaces, world_from_body: Tensor, lamps: parts.Lamps) -> Tensor:
+def irradiance(
+    surfaces: scene_light.Surfaces, world_from_body: Tensor, lamps: scene_light.Lamps
+) -> Tensor:
     """See `scene_light.irradiance`."""
     found = np.zeros((len(surfaces.means), 3), np.float32)
     with kernels_to_oneself():
         every = torch.ones(len(world_from_body), len(lamps.reach_m))
-        _irradiance(_surfaces(surfaces, world_from_body), _lamps(lamps, every > 0), found)
+        _irradiance(_arrays(surfaces), _array(world_from_body), _lamps(lamps, every > 0), found)
     return torch.from_numpy(found)
 
 
 def seen_harmonics(
-    surfaces: parts.Surfaces,
-    appearance: parts.Appearance,
-    surroundings: parts.Surroundings,
-    lamps: parts.Lamps,
+    surfaces: scene_light.Surfaces,
+    appearance: scene_light.Appearance,
+    surroundings: scene_light.Surroundings,
+    lamps: scene_light.Lamps,
     frustum: Frustum | None,
     world_from_body: Tensor,
     camera_from_body: Tensor,
@@ -104,26 +82,13 @@ def seen_harmonics(
     """See `scene_light.seen_harmonics`."""
     count, rest = appearance.harmonics.shape[:2]
     found = np.empty((count, 1 + rest, 3), np.float32)
-    own = _Appearance(
-        _array(appearance.light),
-        _array(appearance.reflectance),
-        _array(appearance.harmonics),
-        _array(appearance.per_base),
-        _array(appearance.shine),
-        _array(appearance.skyline, torch.int32),
-    )
-    around = _Surroundings(
-        np.float32(surroundings.extinction_per_m),
-        _array(surroundings.airlight),
-        _array(surroundings.sky_light),
-        _array(surroundings.skylines),
-    )
     with kernels_to_oneself():
         _seen_harmonics(
-            _surfaces(surfaces, world_from_body),
-            own,
-            around,
-            _lamps(lamps, parts.lamps_that_reach(surfaces, world_from_body, lamps)),
+            _arrays(surfaces),
+            _array(world_from_body),
+            _arrays(appearance),
+            _arrays(surroundings),
+            _lamps(lamps, scene_light.lamps_that_reach(surfaces, world_from_body, lamps)),
             _sides(frustum),
             _array(camera_from_body),
             found,
@@ -138,23 +103,20 @@ def _sides(frustum: Frustum | None) -> np.ndarray:
     return np.array((frustum.lowest, frustum.highest, frustum.stretch), np.float32)
 
 
-def _array(tensor: Tensor, dtype: torch.dtype = torch.float32) -> np.ndarray:
+def _array(tensor: Tensor) -> np.ndarray:
+    """Float32, or int32 where it counts something."""
+    dtype = torch.float32 if tensor.is_floating_point() else torch.int32
     return tensor.detach().to(dtype).contiguous().numpy()
 
 
-def _surfaces(surfaces: parts.Surfaces, world_from_body: Tensor) -> _Surfaces:
-    return _Surfaces(
-        _array(surfaces.means),
-        _array(surfaces.body_index, torch.int32),
-        _array(surfaces.reach_m),
-        _array(surfaces.normals),
-        _array(surfaces.facing),
-        _array(surfaces.least_facing),
-        _array(world_from_body),
+def _arrays(part: Part) -> Part:
+    """The same named tuple of arrays, as compiled code takes it."""
+    return part._make(
+        _array(value) if isinstance(value, Tensor) else np.float32(value) for value in part
     )
 
 
-def _lamps(lamps: parts.Lamps, counts: Tensor) -> _Lamps:
+def _lamps(lamps: scene_light.Lamps, counts: Tensor) -> _Lamps:
     """Lamps, and those that count for each body."""
     starts = torch.nn.functional.pad(counts.sum(dim=1).cumsum(0), (1, 0))
     return _Lamps(
@@ -162,8 +124,8 @@ def _lamps(lamps: parts.Lamps, counts: Tensor) -> _Lamps:
         _array(lamps.heading_world),
         _array(lamps.power_rgb),
         _array(lamps.reach_m),
-        _array(counts.nonzero()[:, 1], torch.int32),
-        _array(starts, torch.int32),
+        _array(counts.nonzero()[:, 1]),
+        _array(starts),
     )
 
 
@@ -215,10 +177,10 @@ def _lamp_share(lamps, j, x, y, z, squared):
 
 
 @numba.njit(**_INNER)
-def _add_lamps(surfaces, i, lamps, sums):
+def _add_lamps(surfaces, world_from_body, i, lamps, sums):
     """Add the irradiance of the lamps to sums, as far as the surface sends it back."""
-    body = surfaces.body[i]
-    pose = surfaces.world_from_body[body]
+    body = surfaces.body_index[i]
+    pose = world_from_body[body]
     mean = surfaces.means[i]
     px = _turned(pose, 0, mean) + pose[0, 3]
     py = _turned(pose, 1, mean) + pose[1, 3]
@@ -235,9 +197,9 @@ def _add_lamps(surfaces, i, lamps, sums):
 
 
 @numba.njit(**_COMPILED, parallel=True)
-def _irradiance(surfaces, lamps, found):
+def _irradiance(surfaces, world_from_body, lamps, found):
     for i in numba.prange(len(surfaces.means)):
-        _add_lamps(surfaces, i, lamps, found[i])
+        _add_lamps(surfaces, world_from_body, i, lamps, found[i])
 
 
 @numba.njit(**_INNER)
@@ -312,18 +274,18 @@ def _write(own, around, i, distance_m, light, shown, found):
 
 @numba.njit(**_INNER)
 def _see(  # noqa: PLR0913 - all that a surface's colour hangs on
-    surfaces, own, around, lamps, i, camera_from_body, point, scratch, found
+    surfaces, world_from_body, own, around, lamps, i, camera_from_body, point, scratch, found
 ):
     """Write the harmonics of a surface that lies at a point in the camera frame."""
     light, shown = scratch[0], scratch[1]
     light[0] = light[1] = light[2] = _ZERO
     if len(lamps.of_bodies):
-        _add_lamps(surfaces, i, lamps, light)
+        _add_lamps(surfaces, world_from_body, i, lamps, light)
     for c in range(3):
         light[c] = own.light[i, c] + own.reflectance[i, c] * light[c]
         shown[c] = light[c]
     if own.shine[i] > 0.0:
-        back, world = camera_from_body[0].T, surfaces.world_from_body[0]
+        back, world = camera_from_body[0].T, world_from_body[0]
         in_street = (_turned(back, 0, point), _turned(back, 1, point), _turned(back, 2, point))
         x, y = _turned(world, 0, in_street), _turned(world, 1, in_street)
         _mirror(own, around, i, x, y, _turned(world, 2, in_street), shown)
@@ -332,18 +294,31 @@ def _see(  # noqa: PLR0913 - all that a surface's colour hangs on
 
 
 @numba.njit(**_COMPILED, parallel=True)
-def _seen_harmonics(surfaces, own, around, lamps, sides, camera_from_body, found):
+def _seen_harmonics(  # noqa: PLR0913 - as `_see`
+    surfaces, world_from_body, own, around, lamps, sides, camera_from_body, found
+):
     count = len(surfaces.means)
     for run in numba.prange(RUNS):
         scratch = np.empty((2, 3), np.float32)
         for i in range(run * count // RUNS, (run + 1) * count // RUNS):
-            pose, mean = camera_from_body[surfaces.body[i]], surfaces.means[i]
+            pose, mean = camera_from_body[surfaces.body_index[i]], surfaces.means[i]
             point = (
                 _turned(pose, 0, mean) + pose[0, 3],
                 _turned(pose, 1, mean) + pose[1, 3],
                 _turned(pose, 2, mean) + pose[2, 3],
             )
             if _is_in_view(point, surfaces.reach_m[i], sides):
-                _see(surfaces, own, around, lamps, i, camera_from_body, point, scratch, found)
+                _see(
+                    surfaces,
+                    world_from_body,
+                    own,
+                    around,
+                    lamps,
+                    i,
+                    camera_from_body,
+                    point,
+                    scratch,
+                    found,
+                )
             else:
                 found[i] = _ZERO

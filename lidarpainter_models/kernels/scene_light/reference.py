@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidarpainter_models.kernels.frustum_culling.blocks import Frustum
-from lidarpainter_models.kernels.scene_light.parts import (
+from lidarpainter_models.kernels.frustum_culling import Frustum
+from lidarpainter_models.kernels.scene_light import (
     FAINT,
     MOST_GAIN,
     SH_CONSTANT,

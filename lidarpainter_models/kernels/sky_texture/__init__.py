@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lidarpainter_models.errors import ShapeError
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.kernels.backends import Backend, float32_backend, implementation
+from lidarpainter_models.kernels.backends import Backend, implementation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,9 +87,7 @@ def sample_sky(
     """
     if texture.shape != (layout.rows, layout.columns, 3):
         raise ShapeError(f"a texture of {layout} has another shape than {tuple(texture.shape)}")
-    sample = implementation(
-        "sky_texture", "sample", float32_backend("sky_texture", backend, texture), texture.device
-    )
+    sample = implementation("sky_texture", "sample", backend, texture.device, dtype=texture.dtype)
     return sample(texture.detach(), rays, layout)
 
 
@@ -116,7 +114,7 @@ def scatter_gradient(
             f"{tuple(gradient.shape)} and {tuple(weight.shape)}"
         )
     scatter = implementation(
-        "sky_texture", "scatter", float32_backend("sky_texture", backend, gradient), gradient.device
+        "sky_texture", "scatter", backend, gradient.device, dtype=gradient.dtype
     )
     return scatter(gradient, weight, rays, layout)
 
@@ -142,7 +140,5 @@ def step_texels(
             f"texture, gradient and weight differ in size: {tuple(texture.shape)}, "
             f"{tuple(gradient.shape)}, {tuple(weight.shape)}"
         )
-    step = implementation(
-        "sky_texture", "adam", float32_backend("sky_texture", backend, texture), texture.device
-    )
+    step = implementation("sky_texture", "adam", backend, texture.device, dtype=texture.dtype)
     step(texture, moments, gradient, weight, learning_rate)

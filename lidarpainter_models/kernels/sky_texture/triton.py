@@ -9,7 +9,7 @@ import triton
 from torch import Tensor
 
 from lidarpainter_models.geometry.cameras import Camera
-from lidarpainter_models.kernels.gpu_packages import check_triton_device, dense_in_place
+from lidarpainter_models.kernels.gpu_packages import dense_in_place
 from lidarpainter_models.kernels.sky_texture import SkyLayout, SkyRays, TexelMoments
 from lidarpainter_models.kernels.sky_texture.triton_kernels import (
     BLOCK,
@@ -31,7 +31,6 @@ SUM_BITS = 62
 
 def locate(camera: Camera, layout: SkyLayout, wanted: Tensor) -> Tensor:
     """See `sky_texture.sky_rays`."""
-    check_triton_device(wanted.device, locate_pixels)
     places = torch.empty((*wanted.shape, 2), device=wanted.device)
     rotation = camera.world_from_camera[:3, :3].detach().flatten().tolist()
     with torch.cuda.device_of(places):
@@ -55,7 +54,6 @@ def locate(camera: Camera, layout: SkyLayout, wanted: Tensor) -> Tensor:
 
 def sample(texture: Tensor, rays: SkyRays, layout: SkyLayout) -> Tensor:
     """See `sky_texture.sample_sky`."""
-    check_triton_device(texture.device, sample_pixels)
     count = rays.wanted.numel()
     rgb = texture.new_empty((*rays.wanted.shape, 3))
     if count == 0:
@@ -83,7 +81,6 @@ def scatter(
     Terms are rounded to integers at most 2^-24 as large as the largest on their texel, images of
     less than 2^33 pixels provided: finer than a sum of float32. A sum that is not finite is NaN.
     """
-    check_triton_device(gradient.device, add_terms)
     count, texels = weight.numel(), layout.rows * layout.columns
     sums, peaks = _accumulators(texels, gradient.device)
     texel_gradient = gradient.new_empty((layout.rows, layout.columns, 3))
@@ -105,7 +102,6 @@ def adam(
     texture: Tensor, moments: TexelMoments, gradient: Tensor, weight: Tensor, learning_rate: float
 ) -> None:
     """See `sky_texture.step_texels`."""
-    check_triton_device(texture.device, step_adam)
     kept = (texture, moments.first, moments.second, moments.visits)
     with torch.cuda.device_of(texture), dense_in_place(kept) as dense:
         step_adam[_programs(weight.numel())](

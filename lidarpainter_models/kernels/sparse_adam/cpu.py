@@ -24,7 +24,7 @@ import numba
 import numpy as np
 from torch import Tensor
 
-from lidarpainter_models.kernels.sparse_adam.state import (
+from lidarpainter_models.kernels.sparse_adam import (
     BETA1,
     BETA2,
     MISSED_RUN_ENDS,
@@ -99,22 +99,11 @@ def catch_up(state: AdamState, kept: Parameters) -> None:
     )
 
 
-class _Columns(NamedTuple):
-    """Parameters as float32 arrays, C-contiguous; harmonics (rows, numbers)."""
-
-    means: np.ndarray
-    rotation_wxyz: np.ndarray
-    log_scale: np.ndarray
-    opacity_logit: np.ndarray
-    harmonics: np.ndarray
-    more_harmonics: np.ndarray
-
-
-def _columns(parameters: Parameters) -> _Columns:
-    """The compiled code's view of parameters; what it writes to contiguous ones is theirs."""
+def _columns(parameters: Parameters) -> Parameters:
+    """Parameters as arrays, harmonics (rows, numbers); a contiguous tensor's is its own memory."""
     arrays = [value.contiguous().numpy() for value in parameters]
     flat = [value.reshape(len(value), value.shape[1] * 3) for value in arrays[4:]]
-    return _Columns(*arrays[:4], *flat)
+    return Parameters._make((*arrays[:4], *flat))
 
 
 class _Nodes(NamedTuple):

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from lidarpainter_models.kernels.sparse_adam.state import BETA1, BETA2, MISSED_RUN_ENDS
+from lidarpainter_models.kernels.sparse_adam import BETA1, BETA2, MISSED_RUN_ENDS
 
 
 class MissedSteps(NamedTuple):

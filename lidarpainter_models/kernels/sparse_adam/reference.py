@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lidarpainter_models.kernels.sparse_adam import BETA1, BETA2, AdamState, Parameters
 from lidarpainter_models.kernels.sparse_adam.missed_steps import gathered_steps, single_steps
-from lidarpainter_models.kernels.sparse_adam.state import BETA1, BETA2, AdamState, Parameters
 
 _MEANS, _LOG_SCALE = slice(0, 3), slice(7, 10)
 

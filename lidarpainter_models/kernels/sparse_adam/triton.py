@@ -10,16 +10,16 @@ import torch
 import triton
 from torch import Tensor
 
-from lidarpainter_models.kernels.gpu_packages import check_triton_device, dense_in_place
-from lidarpainter_models.kernels.sparse_adam import triton_kernels as kernels
-from lidarpainter_models.kernels.sparse_adam.device_rates import DeviceRates
-from lidarpainter_models.kernels.sparse_adam.state import (
+from lidarpainter_models.kernels.gpu_packages import dense_in_place
+from lidarpainter_models.kernels.sparse_adam import (
     BETA1,
     BETA2,
     MISSED_RUN_ENDS,
     AdamState,
     Parameters,
 )
+from lidarpainter_models.kernels.sparse_adam import triton_kernels as kernels
+from lidarpainter_models.kernels.sparse_adam.device_rates import DeviceRates
 
 ROWS_AT_ONCE = 8
 NUMBERS_AT_ONCE = 64
@@ -28,7 +28,6 @@ NUMBERS_AT_ONCE = 64
 
 def present_rows(state: AdamState, kept: Parameters, rows: Tensor, out: Parameters) -> None:
     """See `sparse_adam.present_rows`."""
-    check_triton_device(rows.device, kernels.present)
     if len(rows) == 0:
         return
     with torch.cuda.device_of(rows), dense_in_place(out) as written:
@@ -62,7 +61,6 @@ def step_rows(
     rates: list[float],
 ) -> None:
     """See `sparse_adam.step_rows`."""
-    check_triton_device(rows.device, kernels.step)
     if len(rows) == 0:
         return
     before = len(state.missed) - 1
@@ -96,7 +94,6 @@ def step_rows(
 
 def catch_up(state: AdamState, kept: Parameters) -> None:
     """See `sparse_adam.catch_up`."""
-    check_triton_device(state.last.device, kernels.catch_up_rows)
     if len(state.last) == 0:
         return
     with torch.cuda.device_of(state.last), dense_in_place(kept) as written:

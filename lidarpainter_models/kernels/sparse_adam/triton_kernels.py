@@ -9,12 +9,13 @@ import math
 import triton
 import triton.language as tl
 
-from lidarpainter_models.kernels.sparse_adam import device_rates, state
+from lidarpainter_models.kernels import sparse_adam
+from lidarpainter_models.kernels.sparse_adam import device_rates
 
-BETA1, BETA2 = tl.constexpr(state.BETA1), tl.constexpr(state.BETA2)
-LOG1, LOG2 = tl.constexpr(math.log(state.BETA1)), tl.constexpr(math.log(state.BETA2))
+BETA1, BETA2 = tl.constexpr(sparse_adam.BETA1), tl.constexpr(sparse_adam.BETA2)
+LOG1, LOG2 = tl.constexpr(math.log(sparse_adam.BETA1)), tl.constexpr(math.log(sparse_adam.BETA2))
 NUMBERS = tl.constexpr(device_rates.NODE_NUMBERS)
-RUNS = tl.constexpr(len(state.MISSED_RUN_ENDS))
+RUNS = tl.constexpr(len(sparse_adam.MISSED_RUN_ENDS))
 KINDS = tl.constexpr(device_rates.KINDS)
 LOG_SCALE = tl.constexpr(7)
 """First of three columns, as the means' is 0; rotations lie between them."""
@@ -24,13 +25,8 @@ LOG_SCALE = tl.constexpr(7)
 def write_nodes(rates, run_ends, nodes, missed_steps, now, BLOCK: tl.constexpr):
     """Write the nodes of one run of missed steps, for a block of rows' numbers of missed steps.
 
-    Args:
-        rates: of the latest steps up to `now`, a row of kinds each.
-        run_ends: last step of each run, after a zero.
-        nodes: what is written, by missed steps (from one on), run, number and kind.
-        missed_steps: the most that a row may have missed.
-        now: number of the last step.
-        BLOCK: numbers of missed steps of a program.
+    `rates` are those of the latest steps up to `now`; `nodes` is by missed steps (from one on),
+    run, number and kind; `missed_steps` is the most that a row may have missed.
     """
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     run = tl.program_id(1)
@@ -185,26 +181,8 @@ def present(
 ):
     """Write the given rows of the kept parameters, moved by the steps they missed, to `out`.
 
-    Args:
-        kept: the kept parameters.
-        out: parameters, a row for each given one.
-        first: moments, as the next one.
-        second: moments.
-        last: step after which each row was left.
-        rows: the given ones.
-        nodes: see `write_nodes`.
-        run_ends: last step of each run, after a zero.
-        kind_of_column: of the moments.
-        eps: of the columns.
-        count: of given rows.
-        now: number of the last step.
-        KEPT: columns of the kept harmonics.
-        KEPT_MORE: columns of the kept further harmonics.
-        OUT: columns of the harmonics of `out`.
-        OUT_MORE: columns of the further ones.
-        COLUMNS: of the moments.
-        ROOM: columns of a program.
-        BLOCK: rows of a program.
+    `last` is the step after which each row was left. A program has `ROOM` columns for the
+    `COLUMNS` of the moments; `KEPT` to `OUT_MORE` are those of harmonics and further ones.
     """
     column = tl.arange(0, ROOM)
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -281,32 +259,9 @@ def step(
 ):
     """Adam's step number `now` on the given rows with a gradient, in place; its rates are kept.
 
-    A row whose gradient is zero throughout has missed this step as well.
-
-    Args:
-        kept: the kept parameters.
-        seen: the given rows as `present` wrote them.
-        gradients: theirs.
-        rates: this step's, by kind.
-        first: moments, as the next one.
-        second: moments.
-        last: step after which each row was left.
-        rows: the given ones.
-        kept_rates: of the missed steps, a row of kinds each.
-        kind_of_column: of the moments.
-        eps: of the columns.
-        count: of given rows.
-        now: number of this step.
-        filled: rows of `kept_rates` so far.
-        growth: one over the first moment's bias.
-        spread: square root of the second moment's bias.
-        KEPT: columns of the kept harmonics.
-        KEPT_MORE: columns of the kept further harmonics.
-        SEEN: columns of the given harmonics.
-        SEEN_MORE: columns of the given further ones.
-        COLUMNS: of the moments.
-        ROOM: columns of a program.
-        BLOCK: rows of a program.
+    A row whose gradient is zero throughout has missed this step as well. `seen` is as `present`
+    wrote it; the rates go to row `filled` of `kept_rates`; `growth` is one over the first moment's
+    bias, `spread` the square root of the second's. For the rest see `present`.
     """
     column = tl.arange(0, ROOM)
     kind = tl.load(kind_of_column + column, mask=column < COLUMNS, other=0)

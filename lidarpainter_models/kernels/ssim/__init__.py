@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidarpainter_models.errors import ShapeError
-from lidarpainter_models.kernels.backends import Backend, float32_backend, implementation
+from lidarpainter_models.kernels.backends import Backend, implementation
 
 
 def ssim_map(
@@ -19,29 +19,15 @@ def ssim_map(
 ) -> Float[Tensor, "height width 3"]:
     """SSIM around every pixel for each channel, in [-1, 1].
 
-    Differentiable in the first image; the second is taken as constant. `auto` takes numba for
-    float32 on the CPU, Triton for float32 on a GPU, and the torch reference for float64.
+    Differentiable in the first image; the second is taken as constant.
 
     Raises:
         ShapeError: the images differ in shape, or are not (height, width, 3).
-        BackendError: the version asked for cannot take the images: numba float32 on the CPU alone,
-            Triton those of a GPU.
+        BackendError: the version asked for cannot take the images, see `implementation`.
     """
     _check_images(first_rgb, second_rgb)
-    compute = implementation(
-        "ssim", "ssim_map", float32_backend("ssim", backend, first_rgb), first_rgb.device
-    )
+    compute = implementation("ssim", "ssim_map", backend, first_rgb.device, dtype=first_rgb.dtype)
     return compute(first_rgb, second_rgb.detach())
-
-
-def ssim(
-    first_rgb: Float[Tensor, "height width 3"],
-    second_rgb: Float[Tensor, "height width 3"],
-    *,
-    backend: Backend = "auto",
-) -> Float[Tensor, ""]:
-    """Mean of `ssim_map` over pixels and channels; 1 for equal images."""
-    return ssim_map(first_rgb, second_rgb, backend=backend).mean()
 
 
 def l1_ssim_loss(
@@ -67,8 +53,7 @@ def l1_ssim_loss(
 
     Raises:
         ShapeError: images or weights do not fit together.
-        BackendError: the version asked for cannot take the images: numba float32 on the CPU alone,
-            Triton those of a GPU.
+        BackendError: the version asked for cannot take the images, see `implementation`.
     """
     _check_images(rendered, target)
     if pixel_weight is not None and pixel_weight.shape != rendered.shape[:2]:
@@ -77,9 +62,7 @@ def l1_ssim_loss(
             f"{tuple(rendered.shape)}"
         )
     weight = None if pixel_weight is None else pixel_weight.detach().to(rendered.dtype)
-    compute = implementation(
-        "ssim", "l1_ssim_loss", float32_backend("ssim", backend, rendered), rendered.device
-    )
+    compute = implementation("ssim", "l1_ssim_loss", backend, rendered.device, dtype=rendered.dtype)
     return compute(rendered, target.detach(), weight, ssim_weight)
 
 

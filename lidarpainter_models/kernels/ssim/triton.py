@@ -10,7 +10,6 @@ import torch
 import triton
 from torch import Tensor
 
-from lidarpainter_models.kernels.gpu_packages import check_triton_device
 from lidarpainter_models.kernels.ssim.triton_kernels import compare, spread
 
 COLUMNS_AT_ONCE, ROWS_AT_ONCE = 128, 16
@@ -19,12 +18,7 @@ rows more than it writes."""
 
 
 def ssim_map(first_rgb: Tensor, second_rgb: Tensor) -> Tensor:
-    """SSIM around every pixel; differentiable in the first image.
-
-    Raises:
-        BackendError: the images are not on a CUDA device, nor does Triton interpret.
-    """
-    check_triton_device(first_rgb.device, compare)
+    """SSIM around every pixel; differentiable in the first image."""
     found: Tensor = _SsimMap.apply(*_as_read(first_rgb, second_rgb))
     return found
 
@@ -32,12 +26,7 @@ def ssim_map(first_rgb: Tensor, second_rgb: Tensor) -> Tensor:
 def l1_ssim_loss(
     rendered: Tensor, target: Tensor, pixel_weight: Tensor | None, ssim_weight: float
 ) -> Tensor:
-    """The loss defined at `lidarpainter_models.kernels.ssim.l1_ssim_loss`.
-
-    Raises:
-        BackendError: the images are not on a CUDA device, nor does Triton interpret.
-    """
-    check_triton_device(rendered.device, compare)
+    """The loss defined at `lidarpainter_models.kernels.ssim.l1_ssim_loss`."""
     images, weight = _as_read(rendered, target), None
     if pixel_weight is not None:
         (weight,) = _as_read(pixel_weight)

@@ -7,6 +7,7 @@ import torch
 from splat_drawing import pinhole, render
 from torch import Tensor
 
+from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 from lidarpainter_models.kernels.gaussian_raster import SplatImage
 
 DIFFERENTIABLE = (
@@ -53,11 +54,9 @@ def random_splats(
     z = torch.where(uniform(count) < 0.05, -1.0, 1.0) * (1.0 + 20.0 * uniform(count))
     x = (1.4 * uniform(count) - 0.7) * width_px / focal_px * z
     y = (1.4 * uniform(count) - 0.7) * height_px / focal_px * z
-    turns = torch.nn.functional.normalize(
-        torch.tensor([1.0, 0.0, 0.0, 0.0]).double() + 0.05 * normal(num_bodies, 4), dim=1
-    )
+    turns = torch.tensor([1.0, 0.0, 0.0, 0.0]).double() + 0.05 * normal(num_bodies, 4)
     camera_from_body = torch.eye(4, dtype=torch.float64).repeat(num_bodies, 1, 1)
-    camera_from_body[:, :3, :3] = _rotations(turns)
+    camera_from_body[:, :3, :3] = rotation_from_quaternion(turns)
     camera_from_body[:, :3, 3] = 0.3 * normal(num_bodies, 3)
     splats = {
         "means": torch.stack([x, y, z], dim=1),
@@ -80,16 +79,6 @@ def random_splats(
         height_px=height_px,
     )
     return splats
-
-
-def _rotations(wxyz):
-    w, x, y, z = wxyz.unbind(dim=1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
 
 
 def draw_and_go_back(splats, *, backend, dtype):

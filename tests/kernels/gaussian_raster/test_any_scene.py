@@ -1,6 +1,6 @@
-"""A thousand scenes nobody would draw: fast backends agree with float64 autograd or give zero.
+"""Hundreds of scenes nobody would draw: fast backends agree with float64 autograd or give zero.
 
-Small images and few Gaussians, each of an extreme kind, so that a thousand of them take seconds.
+Small images and few Gaussians, each of an extreme kind, so that hundreds of them take seconds.
 A pixel that sits on a threshold (the alpha cut, the stop, the clamp, two Gaussians at one depth)
 may fall on either side in float32: what such a flip can move is granted, and nothing more.
 """
@@ -20,7 +20,7 @@ LEARNED = ("means", "rotation_wxyz", "scale_m", "opacity", "sh")
 IMAGE_ERROR = 2e-5
 GRADIENT_ERROR = 2e-3
 MOST_FLIPS = 3
-"""Scenes of the thousand that may hold a pixel on a threshold; none was seen to."""
+"""Scenes of them that may hold a pixel on a threshold; none was seen to."""
 
 
 def gaussian_of(kind, generator):
@@ -91,7 +91,7 @@ def drawn(scene, backend, dtype):
     return image, {name: gradient.double() for name, gradient in gradients.items()}
 
 
-def disagreement(scene, backend="cpu"):
+def disagreement(scene, backend):
     """Why a backend is wrong about a scene; None where it is right."""
     image, gradients = drawn(scene, backend, torch.float32)
     images = {name: getattr(image, name).detach() for name in ("rgb", "depth_m", "alpha")}
@@ -139,13 +139,15 @@ def disagreements(backend, count):
     return found
 
 
-def test_a_thousand_scenes_are_finite_and_agree_with_float64():
-    found = disagreements("cpu", 1000)
-    assert len(found) <= MOST_FLIPS, found
-
-
-@pytest.mark.parametrize("backend", [TRITON])
-@pytest.mark.parametrize("count", [10, pytest.param(300, marks=pytest.mark.slow)])
-def test_some_scenes_agree_by_triton_too(backend, count):
+@pytest.mark.parametrize(
+    ("backend", "count"),
+    [
+        ("cpu", 300),
+        pytest.param("cpu", 1000, marks=pytest.mark.slow),
+        pytest.param("triton", 10, marks=TRITON.marks),
+        pytest.param("triton", 300, marks=[*TRITON.marks, pytest.mark.slow]),
+    ],
+)
+def test_scenes_are_finite_and_agree_with_float64(backend, count):
     found = disagreements(backend, count)
     assert len(found) <= (MOST_FLIPS if count > 100 else 0), found

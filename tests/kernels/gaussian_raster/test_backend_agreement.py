@@ -9,18 +9,17 @@ gsplat clamps alpha at 0.999 and not at 0.99, so no Gaussian here is that opaque
 """
 
 import sys
-from dataclasses import replace
 from functools import partial
 from types import ModuleType, SimpleNamespace
 
 import documented_gsplat
 import pytest
 import torch
-from splat_drawing import TRITON, split
+from splat_drawing import TRITON
 
 from lidarpainter_models.errors import BackendError
 from lidarpainter_models.kernels import backends
-from lidarpainter_models.kernels.gaussian_raster import cuda, render_views
+from lidarpainter_models.kernels.gaussian_raster import cuda
 from lidarpainter_models.kernels.gpu_packages import import_gsplat, why_no_gsplat
 
 ON_CUDA = pytest.param(
@@ -42,7 +41,7 @@ def stand_in(request, monkeypatch):
     if "stand-in" not in request.node.name:
         return
     module = ModuleType(cuda.__name__)
-    module.draw_views = partial(cuda.draw_with, documented_gsplat)
+    module.draw_view = partial(cuda.draw_with, documented_gsplat)
     monkeypatch.setitem(sys.modules, cuda.__name__, module)
     monkeypatch.setattr(backends, "available_backends", lambda _kernel: ("cuda", "reference"))
 
@@ -83,68 +82,6 @@ def test_gradients_agree(splats, draw, backend):
         assert float(error) < GRADIENT_ERROR[backend], name
     error = (actual.absolute_gradient.cpu() - expected.absolute_gradient).norm()
     assert float(error) < GRADIENT_ERROR[backend] * float(expected.absolute_gradient.norm())
-
-
-def three_views(splats, device):
-    """Two views of one size, apart, and a smaller one that looks at nothing."""
-    scene = splats(200, features=2)
-    scene["opacity"] = scene["opacity"].clamp(max=0.98)
-    camera = scene.pop("camera")
-    gaussians, rest = split(
-        {
-            name: value.to(device, torch.float32 if value.is_floating_point() else value.dtype)
-            for name, value in scene.items()
-        }
-    )
-    transforms = rest["camera_from_body"].repeat(3, 1, 1, 1)
-    transforms[1, :, 0, 3] += 0.5
-    transforms[2, :, 2, 3] -= 1e3
-    cameras = [camera, camera, replace(camera, width_px=31)]
-    return gaussians, rest["features"], transforms.requires_grad_(), cameras
-
-
-def loss_of(images):
-    return sum((image.rgb.square().sum() + image.alpha.sum()) for image in images)
-
-
-@pytest.mark.parametrize("backend", ["stand-in", ON_CUDA])
-def test_packed_views_are_those_drawn_one_by_one(splats, backend):
-    device = "cuda" if backend == "cuda" else "cpu"
-    gaussians, features, transforms, cameras = three_views(splats, device)
-    expected = render_views(gaussians, transforms, cameras, features=features, backend="reference")
-    loss_of(expected).backward()
-    truth, transforms.grad = transforms.grad, None
-    out = torch.full((3, 200), 7.0, device=device)
-    images = render_views(
-        gaussians,
-        transforms,
-        cameras,
-        features=features,
-        screen_gradients_out=out,
-        backend=named(backend),
-    )
-    loss_of(images).backward()
-    for image, law in zip(images, expected, strict=True):
-        assert float((image.rgb - law.rgb).detach().abs().mean()) < 1e-5
-        assert torch.equal(image.visible, law.visible)
-    assert float((transforms.grad - truth).norm()) < GRADIENT_ERROR["cuda"] * float(truth.norm())
-    assert bool((out[:2] > 0).any(dim=1).all())
-    assert float(out[2].abs().max()) == 0
-
-
-def test_one_packed_call_holds_all_views_of_one_size(splats, monkeypatch):
-    scene = three_views(splats, "cpu")
-    transforms = scene[2]
-    transforms.data[2] = transforms.data[0]
-    calls, isect_tiles = [], documented_gsplat.isect_tiles
-
-    def counted(*arguments, **options):
-        calls.append(options.get("n_images"))
-        return isect_tiles(*arguments, **options)
-
-    monkeypatch.setattr(documented_gsplat, "isect_tiles", counted)
-    cuda.draw_with(documented_gsplat, *scene, None)
-    assert calls == [2, 1]
 
 
 def pretend_gsplat(monkeypatch, backend):

@@ -5,9 +5,6 @@ from concurrent.futures import ThreadPoolExecutor
 import numba
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from splat_drawing import pinhole, render
 from splat_errors import CASES, image_errors, relative_errors
 
 EPS = torch.finfo(torch.float32).eps
@@ -34,7 +31,6 @@ def test_image_and_gradients_match_float64_autograd(splats, draw, case):
     expected = draw(inputs, backend="reference", dtype=torch.float64)
     actual = draw(inputs, backend="cpu", dtype=torch.float32)
     assert torch.equal(actual.image.visible, expected.image.visible)
-    assert torch.allclose(actual.image.radius_px.double(), expected.image.radius_px, rtol=1e-5)
     assert max(image_errors(actual.image, expected.image).values()) < IMAGE_ERROR
     errors = relative_errors(actual.gradients, expected.gradients)
     most = OPAQUE_GRADIENT_ERROR if case == "large and opaque" else GRADIENT_ERROR
@@ -99,59 +95,3 @@ def test_strided_and_double_input_draws_the_same(splats, draw):
     assert torch.equal(plain.image.rgb.double(), other.image.rgb.double())
     assert other.gradients["means"].dtype == torch.float64
     assert torch.allclose(plain.gradients["means"], other.gradients["means"], rtol=1e-4, atol=1e-4)
-
-
-def test_second_backward_pass_gives_the_same_gradient(splats):
-    inputs = splats(50)
-    inputs = {
-        k: v.float() if torch.is_tensor(v) and k != "body_index" else v for k, v in inputs.items()
-    }
-    inputs["means"].requires_grad_()
-    loss = render(inputs, backend="cpu").rgb.square().sum()
-    (first,) = torch.autograd.grad(loss, inputs["means"], retain_graph=True)
-    (second,) = torch.autograd.grad(loss, inputs["means"])
-    assert torch.equal(first, second)
-
-
-@settings(max_examples=20, deadline=None, derandomize=True)
-@given(
-    seed=st.integers(0, 2**31),
-    count=st.integers(1, 25),
-    width_px=st.integers(1, 40),
-    height_px=st.integers(1, 40),
-    stretch=st.floats(-4.0, 4.0),
-)
-def test_any_shape_in_any_image_is_drawn_as_the_reference_does(
-    seed, count, width_px, height_px, stretch
-):
-    # fixtures and hypothesis do not mix: the scene is built here
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape):
-        return torch.randn(*shape, generator=generator, dtype=torch.float32)
-
-    inputs = {
-        "means": normal(count, 3) * torch.tensor([1.0, 1.0, 2.0]) + torch.tensor([0.0, 0.0, 2.0]),
-        "rotation_wxyz": normal(count, 4),
-        "scale_m": torch.exp(normal(count, 3) + torch.tensor([stretch, -2.0, -2.0])),
-        "opacity": torch.sigmoid(3.0 * normal(count)),
-        "sh": 0.5 * normal(count, 4, 3),
-        "body_index": torch.zeros(count, dtype=torch.int32),
-        "camera_from_body": torch.eye(4)[None],
-    }
-    camera = pinhole(
-        fx_px=20.0,
-        fy_px=20.0,
-        cx_px=width_px / 2,
-        cy_px=height_px / 2,
-        width_px=width_px,
-        height_px=height_px,
-    )
-    actual = render(inputs | {"camera": camera}, backend="cpu")
-    double = {k: v.double() if v.is_floating_point() else v for k, v in inputs.items()}
-    expected = render(double | {"camera": camera}, backend="reference")
-    assert torch.equal(actual.visible, expected.visible)
-    # one flip of the alpha cut in an image of a few pixels weighs 1/255 / pixels
-    flip = 2.0 / 255.0 / (width_px * height_px)
-    errors = image_errors(actual, expected)
-    assert max(errors.values()) < 5e-6 + flip, errors

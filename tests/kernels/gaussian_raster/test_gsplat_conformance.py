@@ -1,12 +1,10 @@
 """Our conventions are gsplat's, as far as gsplat says them in plain torch.
 
-`gsplat.cuda._torch_impl` holds its projection, harmonics, tile lists and the blending of given
-pairs, and needs no GPU. It does not hold the early stop, which is a CUDA kernel: that, and what the
-CUDA functions give back, is known from gsplat's documentation alone (`documented_gsplat`).
+`gsplat.cuda._torch_impl` holds its projection, harmonics and tile lists, and needs no GPU. What its
+CUDA functions blend and give back is known from its documentation alone (`documented_gsplat`).
 """
 
 import inspect
-import sys
 from types import ModuleType
 
 import documented_gsplat
@@ -144,52 +142,6 @@ def _alpha_of_pixels(screen, width_px, height_px):
     return screen.opacity[:, None] * torch.exp(-power)
 
 
-def volume_rendering():
-    """The two functions of nerfacc that gsplat's blending calls, after their documentation."""
-
-    def render_weight_from_alpha(alphas, ray_indices, n_rays):
-        weights, light = torch.zeros_like(alphas), torch.ones(n_rays).to(alphas)
-        for place in range(len(alphas)):  # samples of a ray lie side by side, nearest first
-            ray = ray_indices[place]
-            weights[place] = light[ray] * alphas[place]
-            light[ray] *= 1.0 - alphas[place]
-        return weights, light[ray_indices]
-
-    def accumulate_along_rays(weights, values, ray_indices, n_rays):
-        values = torch.ones(len(weights), 1).to(weights) if values is None else values
-        summed = torch.zeros(n_rays, values.shape[1]).to(weights)
-        return summed.index_add_(0, ray_indices, weights[:, None] * values)
-
-    module = ModuleType("nerfacc")
-    module.render_weight_from_alpha = render_weight_from_alpha
-    module.accumulate_along_rays = accumulate_along_rays
-    return module
-
-
-def test_blending_at_pixel_centres_is_gsplats(splats, monkeypatch):
-    monkeypatch.setitem(sys.modules, "nerfacc", volume_rendering())
-    scene = splats(25, seed=6, width_px=20, height_px=12, coefficients=4)
-    scene["opacity"] = scene["opacity"].clamp(max=0.3)  # no pixel stops early
-    screen = project_gaussians(*_of(scene))
-    pixel, gaussian = torch.nonzero(_alpha_of_pixels(screen, 20, 12).T >= ALPHA_CUT, as_tuple=True)
-    precision = torch.linalg.inv(screen.covariance_px2).reshape(-1, 4)[:, [0, 1, 3]]
-    rgb, alpha = law.accumulate(
-        screen.centre_px[None],
-        precision[None],
-        screen.opacity[None],
-        screen.values[None, :, :3],
-        gaussian,
-        pixel,
-        torch.zeros_like(pixel),
-        20,
-        12,
-    )
-    image = render(scene, backend="reference")
-    assert float(alpha.max()) > 0.3
-    assert torch.allclose(image.rgb, rgb[0], atol=ROUNDING)
-    assert torch.allclose(image.alpha, alpha[0, ..., 0], atol=ROUNDING)
-
-
 def test_the_adapter_draws_the_law_with_gsplats_own_lists(splats):
     def isect_tiles(centre_px, radii, depth_m, *size, packed, n_images, image_ids, gaussian_ids):
         assert packed
@@ -205,8 +157,8 @@ def test_the_adapter_draws_the_law_with_gsplats_own_lists(splats):
     scene = splats(60, seed=8, features=1)
     scene["opacity"] = scene["opacity"].clamp(max=0.98)
     gaussians, features, poses, camera = _of(scene)
-    ((rgb, depth_m, _, _, visible, _),) = cuda.draw_with(
-        gsplat, gaussians, features, poses[None], [camera], None
+    rgb, depth_m, _, _, visible, _ = cuda.draw_with(
+        gsplat, gaussians, features, poses, camera, None
     )
     image = render(scene, backend="reference")
     assert float((rgb - image.rgb).abs().mean()) < 1e-6

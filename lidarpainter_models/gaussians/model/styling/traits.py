@@ -15,7 +15,7 @@ from lidarpainter_models.gaussians.model.gaussian_set import GaussianSet
 from lidarpainter_models.gaussians.model.styling.scene_style import StyledPlace
 from lidarpainter_models.geometry.transforms import rotation_from_quaternion
 from lidarpainter_models.kernels.frustum_culling import MOST_SIGMAS
-from lidarpainter_models.kernels.scene_light import Surfaces
+from lidarpainter_models.kernels.scene_light import Surfaces, body_radii
 from lidarpainter_models.weather.darkness import FACING, HEADLAMP_HEIGHT_M, LEAST_GRAZING
 from lidarpainter_models.weather.light import to_linear
 
@@ -220,6 +220,7 @@ def surface_traits(gaussians: GaussianSet, place: StyledPlace) -> SurfaceTraits:
             normals=normals,
             facing=facing,
             least_facing=facing * LEAST_GRAZING,
+            body_radius_m=body_radii(means, body),
         ),
         day_light=day_light,
         base_rgb=base_rgb,

@@ -8,18 +8,8 @@ import triton
 import triton.language as tl
 
 from lidarpainter_models.kernels.gaussian_raster import blending_limits as limits
-from lidarpainter_models.kernels.gaussian_raster.triton_kernels.records import (
-    ACROSS,
-    ALONG,
-    DEPTH,
-    LOG_OPACITY,
-    MEAN_X,
-    MEAN_Y,
-    RED,
-    SHEAR,
-    TILE_PX,
-    record_of,
-)
+from lidarpainter_models.kernels.gaussian_raster.triton_kernels import records as screen
+from lidarpainter_models.kernels.gaussian_raster.triton_kernels.records import record_of
 
 CUT = tl.constexpr(limits.ALPHA_CUT)
 TOP = tl.constexpr(limits.MAX_ALPHA)
@@ -33,8 +23,8 @@ BATCH = tl.constexpr(16)
 def tile_pixels(tile, columns, width, height):
     """Row and column in the tile, place in the image, and whether it lies there, of each lane."""
     lane = tl.arange(0, PIXELS)
-    row, column = lane // TILE_PX, lane % TILE_PX
-    left, top = tile % columns * TILE_PX, tile // columns * TILE_PX
+    row, column = lane // screen.TILE_PX, lane % screen.TILE_PX
+    left, top = tile % columns * screen.TILE_PX, tile // columns * screen.TILE_PX
     inside = (left + column < width) & (top + row < height)
     place = (top + row).to(tl.int64) * width + left + column
     return row, column, place, inside
@@ -43,13 +33,13 @@ def tile_pixels(tile, columns, width, height):
 @triton.jit
 def footprint(record, tile, columns, row, column):
     """Offsets (u, dy) in the sheared frame of a footprint, and the alpha before its clamp."""
-    left, top = tile % columns * TILE_PX, tile // columns * TILE_PX
-    x = (tl.load(record + MEAN_X) - left) + tl.load(record + MEAN_X + 1)
-    y = (tl.load(record + MEAN_Y) - top) + tl.load(record + MEAN_Y + 1)
+    left, top = tile % columns * screen.TILE_PX, tile // columns * screen.TILE_PX
+    x = (tl.load(record + screen.MEAN_X) - left) + tl.load(record + screen.MEAN_X + 1)
+    y = (tl.load(record + screen.MEAN_Y) - top) + tl.load(record + screen.MEAN_Y + 1)
     dy = row.to(tl.float32) + 0.5 - y
-    u = column.to(tl.float32) + 0.5 - x + tl.load(record + SHEAR) * dy
-    exponent = tl.load(record + LOG_OPACITY) - tl.load(record + ALONG) * dy * dy
-    return u, dy, tl.exp(exponent - tl.load(record + ACROSS) * u * u)
+    u = column.to(tl.float32) + 0.5 - x + tl.load(record + screen.SHEAR) * dy
+    exponent = tl.load(record + screen.LOG_OPACITY) - tl.load(record + screen.ALONG) * dy * dy
+    return u, dy, tl.exp(exponent - tl.load(record + screen.ACROSS) * u * u)
 
 
 @triton.jit
@@ -100,10 +90,10 @@ def blend(
             record = record_of(records, index)
             _, _, raw = footprint(record, tile, columns, row, column)
             _, weight, _, light = taken_light(raw, light)
-            red += weight * tl.load(record + RED)
-            green += weight * tl.load(record + RED + 1)
-            blue += weight * tl.load(record + RED + 2)
-            far += weight * tl.load(record + DEPTH)
+            red += weight * tl.load(record + screen.RED)
+            green += weight * tl.load(record + screen.RED + 1)
+            blue += weight * tl.load(record + screen.RED + 2)
+            far += weight * tl.load(record + screen.DEPTH)
             if CHANNELS > 0:
                 own = features + index.to(tl.int64) * CHANNELS + channel
                 value = tl.load(own, mask=channel < CHANNELS, other=0.0)

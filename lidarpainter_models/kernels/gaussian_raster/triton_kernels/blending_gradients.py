@@ -9,7 +9,6 @@ run.
 import triton
 import triton.language as tl
 
-from lidarpainter_models.kernels.gaussian_raster import blending_gradients as numba_gradients
 from lidarpainter_models.kernels.gaussian_raster.triton_kernels.blending import (
     BATCH,
     PIXELS,
@@ -27,17 +26,9 @@ from lidarpainter_models.kernels.gaussian_raster.triton_kernels.records import (
     record_of,
 )
 
-SUM_G = tl.constexpr(numba_gradients.SUM_G)
-SUM_GU = tl.constexpr(numba_gradients.SUM_GU)
-SUM_GUU = tl.constexpr(numba_gradients.SUM_GUU)
-SUM_GY = tl.constexpr(numba_gradients.SUM_GY)
-SUM_GUY = tl.constexpr(numba_gradients.SUM_GUY)
-SUM_GYY = tl.constexpr(numba_gradients.SUM_GYY)
-SUM_RED = tl.constexpr(numba_gradients.SUM_RED)
-SUM_DEPTH = tl.constexpr(numba_gradients.SUM_DEPTH)
-SUM_ABS_X = tl.constexpr(numba_gradients.SUM_ABS_X)
-SUM_ABS_Y = tl.constexpr(numba_gradients.SUM_ABS_Y)
-SUMS = tl.constexpr(numba_gradients.SUMS)
+# places of an entry's sums in its slot: see the numba `blending_gradients`
+SUM_G, SUM_GU, SUM_GUU, SUM_GY, SUM_GUY, SUM_GYY = map(tl.constexpr, range(6))
+SUM_RED, SUM_DEPTH, SUM_ABS_X, SUM_ABS_Y = map(tl.constexpr, (6, 9, 10, 11))
 SLOT = tl.constexpr(16)
 """Room of an entry's sums: 64 bytes."""
 

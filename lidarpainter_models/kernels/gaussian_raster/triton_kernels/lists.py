@@ -7,12 +7,8 @@ spans, in a tile row, the columns between its leftmost and its rightmost point t
 import triton
 import triton.language as tl
 
+from lidarpainter_models.kernels.gaussian_raster.triton_kernels import records as screen
 from lidarpainter_models.kernels.gaussian_raster.triton_kernels.records import (
-    ACROSS,
-    ALONG,
-    DEPTH,
-    SHEAR,
-    TILE_PX,
     load_place,
     record_of,
     tile_box,
@@ -31,11 +27,11 @@ def _edge(slope, square, bend, tip, low, high):
 def _tile_columns(record, place, row, mask, columns):
     """First and one past the last tile column that ellipses reach in a tile row."""
     x, y, half_width, half_height = place
-    across = tl.load(record + ACROSS, mask=mask, other=1.0).to(tl.float64)
-    shear = tl.load(record + SHEAR, mask=mask, other=0.0).to(tl.float64)
-    along = tl.load(record + ALONG, mask=mask, other=1.0).to(tl.float64)
-    low = tl.maximum(row * TILE_PX + 0.5 - y, -half_height)
-    high = tl.minimum((row + 1) * TILE_PX - 0.5 - y, half_height)
+    across = tl.load(record + screen.ACROSS, mask=mask, other=1.0).to(tl.float64)
+    shear = tl.load(record + screen.SHEAR, mask=mask, other=0.0).to(tl.float64)
+    along = tl.load(record + screen.ALONG, mask=mask, other=1.0).to(tl.float64)
+    low = tl.maximum(row * screen.TILE_PX + 0.5 - y, -half_height)
+    high = tl.minimum((row + 1) * screen.TILE_PX - 0.5 - y, half_height)
     square, bend = along * half_height * half_height / across, -along / across
     tip = -shear * half_height * half_height / tl.maximum(half_width, 1e-12)
     right = _edge(shear, square, bend, tip, low, high)
@@ -47,15 +43,7 @@ def _tile_columns(record, place, row, mask, columns):
 def write_keys(records, owner, first_pair, keys, pairs, columns, rows, BLOCK: tl.constexpr):
     """Write what sorts pairs by tile and then by depth; those that miss their tile come last.
 
-    Args:
-        records: of all Gaussians.
-        owner: the Gaussian of each pair; its pairs lie side by side.
-        first_pair: of each Gaussian.
-        keys: int64, room for every pair.
-        pairs: how many there are.
-        columns: of tiles.
-        rows: of tiles.
-        BLOCK: pairs of a program.
+    A Gaussian's pairs lie side by side from `first_pair` on; `columns` and `rows` are of tiles.
     """
     pair = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     exists = pair < pairs
@@ -71,7 +59,7 @@ def write_keys(records, owner, first_pair, keys, pairs, columns, rows, BLOCK: tl
     is_tight = (width == 1) | (end_row - first_row == 1)
     reaches = is_tight | ((first_reached <= column) & (column < end_reached))
     tile = tl.where(reaches, row * columns + column, rows * columns)
-    depth = tl.load(record + DEPTH, mask=exists, other=0.0)
+    depth = tl.load(record + screen.DEPTH, mask=exists, other=0.0)
     # positive floats sort as their bit patterns do
     key = (tile.to(tl.int64) << 32) | depth.to(tl.int32, bitcast=True).to(tl.int64)
     tl.store(keys + pair, key, mask=exists)

@@ -7,25 +7,10 @@ import triton.language as tl
 
 from lidarpainter_models.kernels.gaussian_raster import blending_limits as limits
 from lidarpainter_models.kernels.gaussian_raster import projection as numba_projection
+from lidarpainter_models.kernels.gaussian_raster.triton_kernels import records as screen
 from lidarpainter_models.kernels.gaussian_raster.triton_kernels import vectors as v3
 from lidarpainter_models.kernels.gaussian_raster.triton_kernels.harmonics import basis
-from lidarpainter_models.kernels.gaussian_raster.triton_kernels.records import (
-    ACROSS,
-    ALONG,
-    DEPTH,
-    HALF_HEIGHT,
-    HALF_WIDTH,
-    IS_VISIBLE,
-    LOG_OPACITY,
-    MEAN_X,
-    MEAN_Y,
-    RED,
-    SHEAR,
-    SIGMA,
-    TILE_PX,
-    record_of,
-    tile_box,
-)
+from lidarpainter_models.kernels.gaussian_raster.triton_kernels.records import record_of, tile_box
 
 NEAR_M = tl.constexpr(limits.NEAR_M)
 CUT = tl.constexpr(limits.ALPHA_CUT)
@@ -119,7 +104,7 @@ def _write_colour(record, direction, sh, index, mask, COEFFICIENTS: tl.constexpr
         for k in tl.static_range(COEFFICIENTS):
             colour += weights[k] * tl.load(start + 3 * k + channel, mask=mask, other=0.0)
         total += colour  # not a number stays so here, where the maximum may drop it
-        _write(record + RED + channel, tl.maximum(colour, 0.0), mask)
+        _write(record + screen.RED + channel, tl.maximum(colour, 0.0), mask)
     return tl.abs(total) < LARGEST
 
 
@@ -129,15 +114,12 @@ def _write_shape(record, xx, xy, yy, opacity, mask):
     determinant = xx * yy - xy * xy
     log_opacity = tl.log(opacity)
     reach = tl.maximum(2.0 * (log_opacity - LOG_CUT), 0.0)
-    middle = 0.5 * (xx + yy)
-    spread = tl.sqrt(tl.maximum(middle * middle - determinant, 0.0))
-    _write(record + ACROSS, 0.5 * yy / determinant, mask)
-    _write(record + SHEAR, -xy / yy, mask)
-    _write(record + ALONG, 0.5 / yy, mask)
-    _write(record + LOG_OPACITY, log_opacity, mask)
-    _write(record + SIGMA, tl.sqrt(middle + spread), mask)
-    half_width = _write(record + HALF_WIDTH, tl.sqrt(reach * xx), mask)
-    return half_width, _write(record + HALF_HEIGHT, tl.sqrt(reach * yy), mask)
+    _write(record + screen.ACROSS, 0.5 * yy / determinant, mask)
+    _write(record + screen.SHEAR, -xy / yy, mask)
+    _write(record + screen.ALONG, 0.5 / yy, mask)
+    _write(record + screen.LOG_OPACITY, log_opacity, mask)
+    half_width = _write(record + screen.HALF_WIDTH, tl.sqrt(reach * xx), mask)
+    return half_width, _write(record + screen.HALF_HEIGHT, tl.sqrt(reach * yy), mask)
 
 
 @triton.jit(do_not_specialize=["count", "width", "height"])
@@ -160,7 +142,7 @@ def project(
 ):
     """Write the records of Gaussians, and how many tiles their bounding boxes cover.
 
-    In records that cannot be seen only `IS_VISIBLE` and `SIGMA`, both 0, mean anything.
+    In records that cannot be seen only `IS_VISIBLE`, 0, means anything.
     """
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     exists = index < count
@@ -189,16 +171,15 @@ def project(
     seen = seen & (xx * yy - xy * xy > 0.0) & (xx + yy < LARGEST)
     xx, xy, yy = tl.where(seen, xx, 1.0), tl.where(seen, xy, 0.0), tl.where(seen, yy, 1.0)
     half_width, half_height = _write_shape(record, xx, xy, yy, opaque, seen)
-    x = _write_centre(record + MEAN_X, optics[0] * point[0] / point[2] + optics[2], seen)
-    y = _write_centre(record + MEAN_Y, optics[1] * point[1] / point[2] + optics[3], seen)
+    x = _write_centre(record + screen.MEAN_X, optics[0] * point[0] / point[2] + optics[2], seen)
+    y = _write_centre(record + screen.MEAN_Y, optics[1] * point[1] / point[2] + optics[3], seen)
     seen = seen & (x + half_width >= 0.5) & (x - half_width <= width - 0.5)
     seen = seen & (y + half_height >= 0.5) & (y - half_height <= height - 0.5)
-    _write(record + DEPTH, point[2], seen)
+    _write(record + screen.DEPTH, point[2], seen)
     direction, _ = view_direction(mean, rotation, translation)
     seen = seen & _write_colour(record, direction, sh, index, seen, COEFFICIENTS)
-    tl.store(record + IS_VISIBLE, tl.where(seen, 1.0, 0.0), mask=exists)
-    tl.store(record + SIGMA, tl.zeros([BLOCK], tl.float32), mask=exists & (seen == 0))
-    columns, rows = tl.cdiv(width, TILE_PX), tl.cdiv(height, TILE_PX)
+    tl.store(record + screen.IS_VISIBLE, tl.where(seen, 1.0, 0.0), mask=exists)
+    columns, rows = tl.cdiv(width, screen.TILE_PX), tl.cdiv(height, screen.TILE_PX)
     box = tile_box((x, y, half_width, half_height), columns, rows)
     tiles = (box[1] - box[0]) * (box[3] - box[2])
     tl.store(tile_count + index, tl.where(seen, tiles, 0), mask=exists)

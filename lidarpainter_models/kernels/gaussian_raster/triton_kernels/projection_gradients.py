@@ -7,20 +7,9 @@ than kept. Only lanes that were drawn read and write, so what is not finite in o
 import triton
 import triton.language as tl
 
+from lidarpainter_models.kernels.gaussian_raster.triton_kernels import blending_gradients as slots
+from lidarpainter_models.kernels.gaussian_raster.triton_kernels import records as screen
 from lidarpainter_models.kernels.gaussian_raster.triton_kernels import vectors as v3
-from lidarpainter_models.kernels.gaussian_raster.triton_kernels.blending_gradients import (
-    SLOT,
-    SUM_ABS_X,
-    SUM_ABS_Y,
-    SUM_DEPTH,
-    SUM_G,
-    SUM_GU,
-    SUM_GUU,
-    SUM_GUY,
-    SUM_GY,
-    SUM_GYY,
-    SUM_RED,
-)
 from lidarpainter_models.kernels.gaussian_raster.triton_kernels.harmonics import basis, slopes
 from lidarpainter_models.kernels.gaussian_raster.triton_kernels.projection import (
     BLUR_PX2,
@@ -30,14 +19,7 @@ from lidarpainter_models.kernels.gaussian_raster.triton_kernels.projection impor
     screen_rows,
     view_direction,
 )
-from lidarpainter_models.kernels.gaussian_raster.triton_kernels.records import (
-    ACROSS,
-    ALONG,
-    IS_VISIBLE,
-    RED,
-    SHEAR,
-    record_of,
-)
+from lidarpainter_models.kernels.gaussian_raster.triton_kernels.records import record_of
 
 
 @triton.jit
@@ -47,10 +29,10 @@ def _covariance_gradient(slot, xx, xy, yy, mask):
     slope = xy * by_yy
     by_remaining = 1.0 / (xx - slope * xy)
     # exponent = -u^2 / (2 remaining) - dy^2 / (2 yy), u = dx - slope dy
-    guu = tl.load(slot + SUM_GUU, mask=mask, other=0.0)
+    guu = tl.load(slot + slots.SUM_GUU, mask=mask, other=0.0)
     to_remaining = 0.5 * guu * by_remaining * by_remaining
-    to_slope = by_remaining * tl.load(slot + SUM_GUY, mask=mask, other=0.0) * by_yy
-    to_yy = 0.5 * tl.load(slot + SUM_GYY, mask=mask, other=0.0) * by_yy * by_yy
+    to_slope = by_remaining * tl.load(slot + slots.SUM_GUY, mask=mask, other=0.0) * by_yy
+    to_yy = 0.5 * tl.load(slot + slots.SUM_GYY, mask=mask, other=0.0) * by_yy * by_yy
     return (
         to_remaining,
         to_slope - 2.0 * slope * to_remaining,
@@ -61,13 +43,13 @@ def _covariance_gradient(slot, xx, xy, yy, mask):
 @triton.jit
 def _centre_gradient(slot, record, point, lens, mask):
     """Gradient of centres in the camera frame through their pixel position and depth."""
-    across = tl.load(record + ACROSS, mask=mask, other=0.0).to(tl.float64)
-    shear = tl.load(record + SHEAR, mask=mask, other=0.0).to(tl.float64)
-    along = tl.load(record + ALONG, mask=mask, other=0.0).to(tl.float64)
-    to_u = 2.0 * across * tl.load(slot + SUM_GU, mask=mask, other=0.0)
-    to_v = to_u * shear + 2.0 * along * tl.load(slot + SUM_GY, mask=mask, other=0.0)
+    across = tl.load(record + screen.ACROSS, mask=mask, other=0.0).to(tl.float64)
+    shear = tl.load(record + screen.SHEAR, mask=mask, other=0.0).to(tl.float64)
+    along = tl.load(record + screen.ALONG, mask=mask, other=0.0).to(tl.float64)
+    to_u = 2.0 * across * tl.load(slot + slots.SUM_GU, mask=mask, other=0.0)
+    to_v = to_u * shear + 2.0 * along * tl.load(slot + slots.SUM_GY, mask=mask, other=0.0)
     to_x, to_y = to_u * lens[0] / point[2], to_v * lens[1] / point[2]
-    to_depth = tl.load(slot + SUM_DEPTH, mask=mask, other=0.0)
+    to_depth = tl.load(slot + slots.SUM_DEPTH, mask=mask, other=0.0)
     return (to_x, to_y, to_depth - (to_x * point[0] + to_y * point[1]) / point[2])
 
 
@@ -128,8 +110,8 @@ def _store_colour(
     start = index.to(tl.int64) * (3 * COEFFICIENTS)
     for channel in tl.static_range(3):
         # a colour held at zero does not move
-        lit = mask & (tl.load(record + RED + channel, mask=mask, other=0.0) > 0.0)
-        to_colour = tl.load(slot + SUM_RED + channel, mask=lit, other=0.0)
+        lit = mask & (tl.load(record + screen.RED + channel, mask=mask, other=0.0) > 0.0)
+        to_colour = tl.load(slot + slots.SUM_RED + channel, mask=lit, other=0.0)
         for k in tl.static_range(COEFFICIENTS):
             place = start + 3 * k + channel
             before = tl.load(to_sh + place, mask=mask, other=0.0)
@@ -188,9 +170,9 @@ def unproject(
     """
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     record = record_of(records, index)
-    slot = sums + index.to(tl.int64) * SLOT
+    slot = sums + index.to(tl.int64) * slots.SLOT
     exists = index < count
-    mask = exists & (tl.load(record + IS_VISIBLE, mask=exists, other=0.0) > 0.0)
+    mask = exists & (tl.load(record + screen.IS_VISIBLE, mask=exists, other=0.0) > 0.0)
     optics = load_lens(lens)
     body = tl.load(body_index + index, mask=mask, other=0)
     rotation, translation = v3.load_pose(camera_from_body, body, mask)
@@ -219,12 +201,12 @@ def unproject(
     )
     v3.add_vector(to_means, index, mask, v3.add(v3.apply(back, to_point), to_direction))
     before = tl.load(to_opacity + index, mask=mask, other=0.0)
-    of_opacity = tl.load(slot + SUM_G, mask=mask, other=0.0)
+    of_opacity = tl.load(slot + slots.SUM_G, mask=mask, other=0.0)
     of_opacity = of_opacity / tl.load(opacity + index, mask=mask, other=1.0)
     tl.store(to_opacity + index, before + of_opacity.to(tl.float32), mask=mask)
-    absolute_x = tl.load(slot + SUM_ABS_X, mask=mask, other=0.0)
-    absolute_x = absolute_x * tl.load(record + ACROSS, mask=mask, other=0.0)
-    absolute_y = tl.load(slot + SUM_ABS_Y, mask=mask, other=0.0)
+    absolute_x = tl.load(slot + slots.SUM_ABS_X, mask=mask, other=0.0)
+    absolute_x = absolute_x * tl.load(record + screen.ACROSS, mask=mask, other=0.0)
+    absolute_y = tl.load(slot + slots.SUM_ABS_Y, mask=mask, other=0.0)
     absolute = 2.0 * tl.sqrt(absolute_x * absolute_x + absolute_y * absolute_y)
     tl.store(screen_gradient + index, absolute.to(tl.float32), mask=mask)
     # axes are rotation times those in the body; the direction is mean + rotation^T translation

@@ -10,22 +10,11 @@ import triton
 import triton.language as tl
 
 from lidarpainter_models.kernels.gaussian_raster import blending_limits as limits
-from lidarpainter_models.kernels.gaussian_raster import projection as numba_projection
 from lidarpainter_models.kernels.gaussian_raster.screen_ellipses import ROUNDING_PX as SLACK_PX
 
-FLOATS = tl.constexpr(numba_projection.RECORD_FLOATS)
-MEAN_X = tl.constexpr(numba_projection.MEAN_X)
-MEAN_Y = tl.constexpr(numba_projection.MEAN_Y)
-ACROSS = tl.constexpr(numba_projection.ACROSS)
-SHEAR = tl.constexpr(numba_projection.SHEAR)
-ALONG = tl.constexpr(numba_projection.ALONG)
-LOG_OPACITY = tl.constexpr(numba_projection.LOG_OPACITY)
-RED = tl.constexpr(numba_projection.RED)
-DEPTH = tl.constexpr(numba_projection.DEPTH)
-HALF_WIDTH = tl.constexpr(numba_projection.HALF_WIDTH)
-HALF_HEIGHT = tl.constexpr(numba_projection.HALF_HEIGHT)
-SIGMA = tl.constexpr(numba_projection.SIGMA)
-IS_VISIBLE = tl.constexpr(numba_projection.IS_VISIBLE)
+FLOATS = tl.constexpr(16)
+MEAN_X, MEAN_Y, ACROSS, SHEAR, ALONG, LOG_OPACITY = map(tl.constexpr, (0, 2, 4, 5, 6, 7))
+RED, DEPTH, HALF_WIDTH, HALF_HEIGHT, IS_VISIBLE = map(tl.constexpr, (8, 11, 12, 13, 15))
 
 TILE_PX = tl.constexpr(limits.TILE_PX)
 ROUNDING_PX = tl.constexpr(SLACK_PX)
