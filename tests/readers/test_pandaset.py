@@ -7,6 +7,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
+from pickled_tables import pickled_table
 from small_pandaset import PandasetFolder
 
 from lidarpainter_models.errors import DataError
@@ -207,7 +208,7 @@ def test_log_without_point_classes_gives_a_scene_without(pandaset, tmp_path):
 
 
 @pytest.mark.parametrize("as_pandas", [1, 2])
-def test_tables_of_old_and_new_pandas_are_read(pickled_table, as_pandas, tmp_path):
+def test_tables_of_old_and_new_pandas_are_read(as_pandas, tmp_path):
     columns = {
         "uuid": np.array(["a", None, "c"], dtype=object),
         "x": np.array([1.0, np.nan, 3.0]),

@@ -28,15 +28,7 @@ def view_at(forward_m, frame=0, *, camera="front", yaw_rad=0.0, sky=False):
     pose[0, 3] = forward_m
     return TrainingView(
         key=(frame, camera),
-        camera=Camera(
-            world_from_camera=pose,
-            fx_px=FOCAL_PX,
-            fy_px=FOCAL_PX,
-            cx_px=WIDTH_PX / 2,
-            cy_px=HEIGHT_PX / 2,
-            width_px=WIDTH_PX,
-            height_px=HEIGHT_PX,
-        ),
+        camera=Camera.centred(pose, FOCAL_PX, width_px=WIDTH_PX, height_px=HEIGHT_PX),
         timestamp_ns=frame * FRAME_NS,
         rgb_u8=torch.zeros(HEIGHT_PX, WIDTH_PX, 3, dtype=torch.uint8),
         sky_mask=torch.full((HEIGHT_PX, WIDTH_PX), sky),
